@@ -1,0 +1,1 @@
+"""Persistent embodied world models in JAX."""

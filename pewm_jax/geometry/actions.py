@@ -1,0 +1,86 @@
+"""Actions → poses, and back.
+
+An action is (dx, dy, dyaw) in the agent's body frame: metres forward, metres to the left,
+radians counter-clockwise; the agent first moves, then turns. Discrete actions are rows of a
+table: 0 forward, 1 turn left, 2 turn right.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import ActionConfig
+from pewm_jax.types import Array
+
+FORWARD, TURN_LEFT, TURN_RIGHT = 0, 1, 2
+NAMES = ("forward", "turn left", "turn right")
+
+
+def discrete_table(config: ActionConfig) -> np.ndarray:
+    """Return the (3, 3) table: row a is what discrete action a does, (dx, dy, dyaw)."""
+    turn = math.radians(config.turn_deg)
+    return np.array([[config.step_m, 0, 0], [0, 0, turn], [0, 0, -turn]], np.float32)
+
+
+def continuous(config: ActionConfig, actions: Array) -> Array:
+    """Return actions as (..., 3) floats; integer actions are looked up in the table."""
+    if jnp.issubdtype(jnp.asarray(actions).dtype, jnp.integer):
+        return jnp.asarray(discrete_table(config))[actions]
+    return jnp.asarray(actions)
+
+
+def rotation_z(angle: Array) -> Array:
+    """Return (..., 3, 3) rotations about the world's z axis (up), radians."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+    rows = [jnp.stack(r, -1) for r in ((c, -s, zero), (s, c, zero), (zero, zero, one))]
+    return jnp.stack(rows, -2)
+
+
+def heading(world_from_camera: Array) -> Array:
+    """Return the yaw of cameras (..., 4, 4): the angle of their z axis on the ground."""
+    forward = world_from_camera[..., :3, 2]
+    return jnp.arctan2(forward[..., 1], forward[..., 0])
+
+
+def step_pose(world_from_camera: Array, action_3: Array) -> Array:
+    """Return the (4, 4) pose after one (dx, dy, dyaw) action; height and pitch stay."""
+    yaw = heading(world_from_camera)
+    move = rotation_z(yaw) @ jnp.stack([action_3[0], action_3[1], jnp.zeros_like(action_3[0])])
+    rotation = rotation_z(action_3[2]) @ world_from_camera[:3, :3]
+    top = jnp.concatenate([rotation, (world_from_camera[:3, 3] + move)[:, None]], 1)
+    return jnp.concatenate([top, world_from_camera[3:]], 0)
+
+
+def integrate(world_from_camera: Array, actions_T3: Array) -> Array:
+    """Follow actions from a pose.
+
+    Args:
+        world_from_camera: (4, 4) pose of frame 0.
+        actions_T3: (T, 3) actions; action k leads from frame k to frame k + 1.
+
+    Returns:
+        (T + 1, 4, 4) poses of frames 0 … T.
+    """
+
+    def step(pose, action):
+        after = step_pose(pose, action)
+        return after, after
+
+    start = jnp.asarray(world_from_camera, jnp.float32)
+    _, rest = jax.lax.scan(step, start, jnp.asarray(actions_T3, jnp.float32))
+    return jnp.concatenate([start[None], rest], 0)
+
+
+def actions_between(world_from_camera_T: Array) -> Array:
+    """Return the (T − 1, 3) actions between consecutive upright poses (T, 4, 4)."""
+    pose = jnp.asarray(world_from_camera_T)
+    yaw = heading(pose)
+    delta = pose[1:, :3, 3] - pose[:-1, :3, 3]
+    body = jnp.einsum("tji,tj->ti", rotation_z(yaw[:-1]), delta)
+    turn = (yaw[1:] - yaw[:-1] + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    return jnp.stack([body[:, 0], body[:, 1], turn], -1)

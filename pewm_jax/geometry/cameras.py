@@ -1,0 +1,111 @@
+"""Pinhole cameras: intrinsics, rigid transforms, projection and unprojection.
+
+Works on NumPy and JAX arrays alike with any leading shape. See ``pewm_jax.types`` for the axes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.types import Array, Camera
+
+
+def intrinsics_from_fov(height: int, width: int, horizontal_fov_deg: float) -> np.ndarray:
+    """Return (4,) fx, fy, cx, cy of square pixels with the principal point in the middle."""
+    focal = width / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
+    return np.array([focal, focal, width / 2, height / 2], np.float32)
+
+
+def resize_intrinsics(intrinsics_4: Array, scale_x: float, scale_y: float) -> Array:
+    """Scale intrinsics to an image resized by these factors (exact with centres at +0.5)."""
+    return intrinsics_4 * np.array([scale_x, scale_y, scale_x, scale_y], np.float32)
+
+
+def pose_from_yaw(position_3: np.ndarray, yaw: float, pitch: float = 0.0) -> np.ndarray:
+    """Return the (4, 4) ``world_from_camera`` of an upright camera.
+
+    Args:
+        position_3: camera centre in the world, metres.
+        yaw: heading, radians, counter-clockwise from above; 0 looks along world +x.
+        pitch: radians, positive looks up.
+    """
+    cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+    forward = np.array([cy * cp, sy * cp, sp])
+    right = np.array([sy, -cy, 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = position_3
+    return pose.astype(np.float32)
+
+
+def invert_rigid(transform: Array) -> Array:
+    """Invert rigid transforms (..., 4, 4) exactly: Rᵀ and −Rᵀt."""
+    rotation_inverse = jnp.swapaxes(transform[..., :3, :3], -1, -2)
+    translation = -rotation_inverse @ transform[..., :3, 3:]
+    top = jnp.concatenate([rotation_inverse, translation], -1)
+    bottom = jnp.broadcast_to(transform[..., 3:, :], (*top.shape[:-2], 1, 4))
+    return jnp.concatenate([top, bottom], -2)
+
+
+def relative_to_first(camera: Camera) -> Camera:
+    """Express cameras (..., T) in the frame of the first of them."""
+    pose = jnp.asarray(camera.world_from_camera)
+    first_from_world = invert_rigid(pose[..., :1, :, :])
+    return Camera(camera.intrinsics_4, first_from_world @ pose)
+
+
+def transform_points(transform: Array, points_3: Array) -> Array:
+    """Apply rigid transforms (..., 4, 4) to points (..., P, 3)."""
+    rotation, translation = transform[..., :3, :3], transform[..., :3, 3]
+    return points_3 @ jnp.swapaxes(rotation, -1, -2) + translation[..., None, :]
+
+
+def pixel_grid(height: int, width: int) -> np.ndarray:
+    """Return (H, W, 2) pixel centres (u, v): 0.5, 1.5, …"""
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([u, v], -1).astype(np.float32)
+
+
+def ray_directions(intrinsics_4: Array, height: int, width: int) -> Array:
+    """Return (..., H, W, 3) directions K⁻¹(u, v, 1) in the camera, z = 1 (not unit length)."""
+    fx, fy, cx, cy = (intrinsics_4[..., i, None, None] for i in range(4))
+    grid = pixel_grid(height, width)
+    x, y = (grid[..., 0] - cx) / fx, (grid[..., 1] - cy) / fy
+    return jnp.stack([x, y, jnp.ones_like(x)], -1)
+
+
+def unproject(depth_HW: Array, camera: Camera) -> Array:
+    """Lift depth images to world points.
+
+    Args:
+        depth_HW: (..., H, W) z-depth in metres.
+        camera: cameras of the same leading shape.
+
+    Returns:
+        (..., H, W, 3) world points of the pixel centres; meaningless where depth is 0.
+    """
+    height, width = depth_HW.shape[-2:]
+    points = ray_directions(camera.intrinsics_4, height, width) * depth_HW[..., None]
+    flat = points.reshape(*points.shape[:-3], height * width, 3)
+    return transform_points(camera.world_from_camera, flat).reshape(points.shape)
+
+
+def project(points_world_P3: Array, camera: Camera) -> tuple[Array, Array]:
+    """Project world points into cameras.
+
+    Args:
+        points_world_P3: (..., P, 3), leading shape broadcasts with the cameras'.
+        camera: cameras of leading shape (...).
+
+    Returns:
+        ``(uv_P2, z_P)``: pixel coordinates (centres at +0.5) and z-depth in metres. Where z is
+        not positive the point is behind the camera and uv is finite but meaningless.
+    """
+    points = transform_points(invert_rigid(camera.world_from_camera), points_world_P3)
+    z = points[..., 2]
+    safe = jnp.where(z > 1e-6, z, 1.0)
+    fx, fy, cx, cy = (camera.intrinsics_4[..., i, None] for i in range(4))
+    return jnp.stack([points[..., 0] / safe * fx + cx, points[..., 1] / safe * fy + cy], -1), z

@@ -1,0 +1,133 @@
+"""The pytrees that travel through the library, and the letters in their names.
+
+Letters: B batch, T frames, S context frames, H W pixels, t h w latent grid, C channels,
+N video tokens, M map tokens, L text tokens, D width, K heads, V map slots, F map features.
+
+Conventions, stated once:
+
+* Camera axes are OpenCV's (x right, y down, z forward). ``world_from_camera`` is a 4×4 rigid
+  transform in metres. The world is gravity-aligned with z up.
+* ``intrinsics`` are ``(fx, fy, cx, cy)`` in pixels, pixel centres at +0.5: the centre of the
+  top-left pixel is (0.5, 0.5), an image of width W spans u in [0, W].
+* Depth is z in metres (not the length of the ray); 0 means "no measurement".
+* Action k leads from frame k to frame k + 1, so T frames have T − 1 actions.
+* Colours are uint8 in [0, 255] on disk and in batches, float32 in [−1, 1] inside the networks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeAlias
+
+import jax
+
+Array: TypeAlias = Any
+"""A JAX or NumPy array (batches start as NumPy and become JAX arrays under jit)."""
+Params: TypeAlias = dict[str, Any]
+"""Network parameters: plain nested dictionaries of arrays."""
+
+
+def _pytree(cls):
+    """Register a frozen dataclass as a pytree whose fields are all children."""
+    names = [field.name for field in dataclasses.fields(cls)]
+    return jax.tree_util.register_dataclass(cls, data_fields=names, meta_fields=[])
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """Pinhole cameras, any leading shape.
+
+    Attributes:
+        intrinsics_4: (..., 4) fx, fy, cx, cy in pixels, centres at +0.5.
+        world_from_camera: (..., 4, 4) camera-to-world, OpenCV axes, metres.
+    """
+
+    intrinsics_4: Array
+    world_from_camera: Array
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """Posed RGB-D frames, any leading shape before T.
+
+    Attributes:
+        rgb_THWC: (..., T, H, W, 3) uint8 in [0, 255], or float32 in [−1, 1].
+        depth_THW: (..., T, H, W) float32 metres along z, 0 = no measurement.
+        camera: cameras of leading shape (..., T).
+    """
+
+    rgb_THWC: Array
+    depth_THW: Array
+    camera: Camera
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """One training example or a batch of them: what is to be imagined and what was seen before.
+
+    Attributes:
+        frames: T frames; frame 0 is observed, the others are to be generated.
+        context: S earlier frames of the same episode, from which the memory is built.
+        context_valid_S: (..., S) bool, False where the episode had no more earlier frames.
+    """
+
+    frames: Frames
+    context: Frames
+    context_valid_S: Array
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
+class VoxelMap:
+    """A sparse voxel feature map with static capacity (see ``pewm_jax.memory.voxel_map``).
+
+    Attributes:
+        slot_of_cell: (cells,) int32, the slot that holds a cell, −1 where unobserved.
+        cell_of_slot_V: (V,) int32, the cell a slot holds, −1 where the slot is free.
+        features_VF: (V, F) float, per-cell maximum, −inf where the slot is free.
+        origin_3: (3,) float32, world position of the grid's lower corner, metres.
+        occupied: () int32, number of slots in use.
+        dropped: () int32, cells seen but not kept because the capacity was full (per insertion).
+        outside: () int32, points that fell outside the grid's extent.
+    """
+
+    slot_of_cell: Array
+    cell_of_slot_V: Array
+    features_VF: Array
+    origin_3: Array
+    occupied: Array
+    dropped: Array
+    outside: Array
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
+class MapTokens:
+    """A fixed number of occupied cells, as the denoiser attends to them.
+
+    Attributes:
+        features_MF: (..., M, F) cell features, 0 where masked.
+        points_world_M3: (..., M, 3) cell centres in the world, metres.
+        valid_M: (..., M) bool.
+    """
+
+    features_MF: Array
+    points_world_M3: Array
+    valid_M: Array
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
+class WorldState:
+    """All that a rollout carries from one clip to the next.
+
+    Attributes:
+        frame: the last frame, T = 1, rgb float32 in [−1, 1].
+        map: everything seen or imagined so far.
+    """
+
+    frame: Frames
+    map: VoxelMap
