@@ -1,0 +1,1 @@
+"""Chapter 9, how good it is: images, seen-before masks, protocol, scores, report."""

@@ -1,0 +1,123 @@
+"""How far one image is from another: PSNR, SSIM, depth error, whole or under a mask.
+
+Scores are kept as *sums under masks* (``error_sums``) until the very end, so that one pass over
+the samples yields every table: per clip, per frame index, per mask, in any grouping. Colours are
+compared in [0, 1] (the networks' [−1, 1] is shifted and clipped first).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.types import Array, Frames
+
+WINDOW, SIGMA = 11, 1.5
+"""SSIM's Gaussian window and its standard deviation, pixels (Wang et al. 2004)."""
+PSNR_CEILING = 100.0
+"""Decibels given to images that are equal, so that averages stay finite."""
+MASKS = ("seen", "unseen", "all")
+"""Which pixels: seen before, never seen, all of them."""
+SUMS = ("squared", "colours", "ssim", "windows", "depth_abs", "depth_rel", "depths")
+"""What ``error_sums`` adds up, in order."""
+
+
+def unit_colours(rgb: Array) -> Array:
+    """Bring colours to float32 in [0, 1] from uint8 or from float in [−1, 1], clipped."""
+    rgb = jnp.asarray(rgb)
+    if rgb.dtype == jnp.uint8:
+        return rgb.astype(jnp.float32) / 255
+    return jnp.clip((rgb.astype(jnp.float32) + 1) / 2, 0, 1)
+
+
+def psnr(mean_squared_error: Array) -> Array:
+    """Return decibels for errors of colours in [0, 1]; at most ``PSNR_CEILING``."""
+    floor = 10 ** (-PSNR_CEILING / 10)
+    return -10 * jnp.log10(jnp.maximum(mean_squared_error, floor))
+
+
+def gaussian_window() -> np.ndarray:
+    """Return the (11,) window of SSIM, summing to one."""
+    offset = np.arange(WINDOW) - WINDOW // 2
+    window = np.exp(-(offset**2) / (2 * SIGMA**2))
+    return (window / window.sum()).astype(np.float32)
+
+
+def _band(length: int) -> np.ndarray:
+    """Return the (length − 10, length) matrix that slides the window along one axis."""
+    rows = length - WINDOW + 1
+    band = np.zeros((rows, length), np.float32)
+    for row in range(rows):
+        band[row, row : row + WINDOW] = gaussian_window()
+    return band
+
+
+def ssim_map(a_HWC: Array, b_HWC: Array) -> Array:
+    """Structural similarity around each pixel (Wang et al. 2004, Eq. 13; K1 = .01, K2 = .03).
+
+    Args:
+        a_HWC: (..., H, W, 3) colours in [0, 1], H and W at least 11.
+        b_HWC: the same shape.
+
+    Returns:
+        (..., H − 10, W − 10), averaged over colours: only pixels whose whole 11 × 11 Gaussian
+        window lies in the image have a value, as in the original. Its mean is the usual SSIM.
+    """
+    height, width = a_HWC.shape[-3:-1]
+    rows, columns = jnp.asarray(_band(height)), jnp.asarray(_band(width))
+
+    def blur(x):
+        along_width = jnp.einsum("vw,...hwc->...hvc", columns, x, precision="highest")
+        return jnp.einsum("uh,...hvc->...uvc", rows, along_width, precision="highest")
+
+    c1, c2 = 0.01**2, 0.03**2
+    mean_a, mean_b = blur(a_HWC), blur(b_HWC)
+    variance_a = blur(a_HWC * a_HWC) - mean_a**2
+    variance_b = blur(b_HWC * b_HWC) - mean_b**2
+    covariance = blur(a_HWC * b_HWC) - mean_a * mean_b
+    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
+    structure = (2 * covariance + c2) / (variance_a + variance_b + c2)
+    return (luminance * structure).mean(-1)
+
+
+def error_sums(predicted: Frames, true: Frames, seen_THW: Array, unseen_THW: Array) -> Array:
+    """Add up the errors of imagined frames under each mask.
+
+    Args:
+        predicted: T imagined frames.
+        true: T recorded frames of the same size.
+        seen_THW: (T, H, W) bool, pixels whose surface was seen before.
+        unseen_THW: (T, H, W) bool, pixels whose surface was never seen.
+
+    Returns:
+        (T, 3, 7): for every frame and every mask of ``MASKS`` the sums of ``SUMS``. SSIM counts
+        pixels whose window lies inside the image; depth counts pixels that have a true depth
+        and a predicted one (an agent that copies a hole predicts nothing there).
+    """
+    guess, truth = unit_colours(predicted.rgb_THWC), unit_colours(true.rgb_THWC)
+    squared_THW = ((guess - truth) ** 2).sum(-1)
+    similarity = ssim_map(guess, truth)
+    has_depth = (jnp.asarray(true.depth_THW) > 0) & (jnp.asarray(predicted.depth_THW) > 0)
+    off_THW = jnp.abs(jnp.asarray(predicted.depth_THW) - true.depth_THW)
+    relative_THW = off_THW / jnp.where(has_depth, true.depth_THW, 1)
+    edge = WINDOW // 2
+    per_mask = []
+    for mask in (seen_THW, unseen_THW, jnp.ones_like(seen_THW)):
+        inner = mask[:, edge:-edge, edge:-edge]
+        measured = mask & has_depth
+        sums = [
+            jnp.where(mask, squared_THW, 0).sum((1, 2)),
+            3 * mask.sum((1, 2)),
+            jnp.where(inner, similarity, 0).sum((1, 2)),
+            inner.sum((1, 2)),
+            jnp.where(measured, off_THW, 0).sum((1, 2)),
+            jnp.where(measured, relative_THW, 0).sum((1, 2)),
+            measured.sum((1, 2)),
+        ]
+        per_mask.append(jnp.stack([s.astype(jnp.float32) for s in sums], -1))
+    return jnp.stack(per_mask, 1)
+
+
+error_sums_batch = jax.jit(jax.vmap(error_sums))
+"""``error_sums`` over a batch of clips: (B, T, 3, 7)."""

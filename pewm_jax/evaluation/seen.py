@@ -1,0 +1,89 @@
+"""Which pixels of a frame show surfaces that earlier frames have already seen.
+
+Exact up to the sampling of the images: a pixel's true point in space is projected into each
+earlier frame and compared with that frame's true depth. No network is involved.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.geometry.cameras import project, unproject
+from pewm_jax.types import Array, Camera, Frames
+
+TOLERANCE_M, TOLERANCE_RELATIVE = 0.05, 0.03
+"""Two depths of one surface agree within the larger of 5 cm and 3 %."""
+
+
+def _agrees(depth_P: Array, z_P: Array) -> Array:
+    close = jnp.maximum(TOLERANCE_M, TOLERANCE_RELATIVE * z_P)
+    return (depth_P > 0) & (jnp.abs(depth_P - z_P) <= close)
+
+
+def visible_in(points_world_P3: Array, depth_HW: Array, camera: Camera) -> Array:
+    """Tell which points a depth image shows.
+
+    A point is shown if it projects inside the image, in front of the camera, and the depth there
+    agrees with its own: the depth of the nearest pixel, or 1/depth interpolated between the four
+    pixels around it. (1/depth is linear in the image on a plane, so that a floor seen at a
+    grazing angle, where depth changes by more than the tolerance from row to row, is recognised.)
+
+    Args:
+        points_world_P3: (P, 3) points in the world, metres.
+        depth_HW: (H, W) z-depth, metres, 0 = no measurement.
+        camera: the image's camera.
+
+    Returns:
+        (P,) bool.
+    """
+    height, width = depth_HW.shape
+    uv, z = project(points_world_P3, camera)
+    u, v = uv[:, 0], uv[:, 1]
+    inside = (z > 1e-3) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+
+    def at(row, column):
+        row = jnp.clip(row, 0, height - 1).astype(jnp.int32)
+        column = jnp.clip(column, 0, width - 1).astype(jnp.int32)
+        return depth_HW[row, column]
+
+    nearest = at(jnp.floor(v), jnp.floor(u))
+    left, top = jnp.floor(u - 0.5), jnp.floor(v - 0.5)
+    across, down = u - 0.5 - left, v - 0.5 - top
+    corners = jnp.stack([at(top + i, left + j) for i in (0, 1) for j in (0, 1)])
+    weights = jnp.stack(
+        [(1 - down) * (1 - across), (1 - down) * across, down * (1 - across), down * across]
+    )
+    measured = (corners > 0).all(0)
+    inverse = (weights / jnp.where(corners > 0, corners, 1)).sum(0)
+    between = jnp.where(measured, 1 / inverse, 0)
+    return inside & (_agrees(nearest, z) | _agrees(between, z))
+
+
+def seen_masks(target: Frames, context: Frames) -> tuple[Array, Array]:
+    """Split the pixels of frames into seen before and never seen.
+
+    Args:
+        target: T frames with true depth and poses.
+        context: S frames observed earlier, with true depth and poses.
+
+    Returns:
+        ``(seen_THW, unseen_THW)``, bool. A pixel without depth is in neither.
+    """
+    depth_THW = jnp.asarray(target.depth_THW)
+    points = unproject(depth_THW, target.camera).reshape(-1, 3)
+
+    def look(seen_P, frame):
+        depth_HW, camera = frame
+        return seen_P | visible_in(points, depth_HW, camera), None
+
+    none = jnp.zeros(points.shape[0], bool)
+    frames = (jnp.asarray(context.depth_THW), jax.tree.map(jnp.asarray, context.camera))
+    seen_P, _ = jax.lax.scan(look, none, frames)
+    measured = depth_THW > 0
+    seen_THW = seen_P.reshape(depth_THW.shape) & measured
+    return seen_THW, measured & ~seen_THW
+
+
+seen_masks_batch = jax.jit(jax.vmap(seen_masks))
+"""``seen_masks`` over a batch of clips."""
