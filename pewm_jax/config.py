@@ -306,18 +306,26 @@ class EvalConfig:
     clips: int = 48
     """Clips scored per seed."""
     chain: int = 1
-    """Clips generated one after the other from one start (long rollouts score drift)."""
+    """Clips generated one after the other from one start in what the table scores."""
+    stride: int = 1
+    """Recorded actions between two frames of a scored clip."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the sampling noise."""
     videos: int = 4
     """Long rollouts shown side by side in the report."""
+    video_clips: int = 4
+    """Clips generated one after the other in a long rollout (long rollouts show drift)."""
     batch: int = 16
     """Clips sampled at once."""
 
     def __post_init__(self):
         """Validate."""
         _require(len(self.seeds) >= 1, "evaluate.seeds needs at least one seed.")
-        _require(min(self.clips, self.chain, self.batch) >= 1, "clips, chain, batch must be ≥ 1.")
+        _require(
+            min(self.clips, self.chain, self.stride, self.video_clips, self.batch) >= 1,
+            "evaluate.clips, chain, stride, video_clips and batch must be at least 1.",
+        )
+        _require(self.videos >= 0, "evaluate.videos must be 0 or more.")
 
 
 @dataclasses.dataclass(frozen=True)
