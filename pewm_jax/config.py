@@ -167,6 +167,11 @@ class MemoryConfig:
             "attend to more cells than the map holds; raise capacity or lower tokens.",
         )
         _require(
+            self.positions == "sinusoid" or self.heads >= 4,
+            f"memory.heads is {self.heads}: with projective positions head k looks through camera "
+            "k mod 4 of a latent frame; use at least 4 heads.",
+        )
+        _require(
             self.head_dim % 8 == 0,
             f"memory.head_dim is {self.head_dim}: use a multiple of 8, the projective rotary "
             "embedding splits a head in two times two halves.",
@@ -185,6 +190,8 @@ class DiffusionConfig:
     """Last β of the scaled-linear schedule."""
     snr_shift: float = 1.0
     """CogVideoX's SNR shift s: ᾱ → ᾱ / (s + (1 − s) ᾱ). 3 for its 2B model, 1 for 5B."""
+    zero_terminal_snr: bool = True
+    """Rescale the schedule so that the last step is pure noise."""
     target: Literal["x0", "v", "eps"] = "x0"
     """What the network predicts. x0 for the pixel codec, v for VAE latents."""
     max_weight: float = 5.0
@@ -210,6 +217,12 @@ class DiffusionConfig:
             "(diffusion.train_steps).",
         )
         _require(self.snr_shift > 0, "diffusion.snr_shift must be above 0.")
+        _require(
+            not (self.target == "eps" and self.zero_terminal_snr),
+            "diffusion.target eps cannot be used with zero_terminal_snr: at the last step the "
+            "input is pure noise and x0 cannot be recovered from ε; use v or x0, or switch "
+            "zero_terminal_snr off.",
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Chapter 5, how the model imagines: noise schedule, objective, sampler."""

@@ -1,0 +1,92 @@
+"""The training loss of both stages (paper, Eqs. 3 and 4; see ``schedule`` for the targets)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import Config
+from pewm_jax.diffusion import schedule
+from pewm_jax.memory import voxel_map
+from pewm_jax.models import codec, world_model
+from pewm_jax.types import Array, Clip, Frames, MapTokens, Params
+
+
+def as_signal(frames: Frames) -> Frames:
+    """Return frames with colours as floats in [−1, 1]."""
+    return Frames(codec.signal_from_rgb(frames.rgb_THWC), frames.depth_THW, frames.camera)
+
+
+def remember(config: Config, context: Frames, valid_S: Array) -> voxel_map.VoxelMap:
+    """Build the map of one world from its context frames (unbatched, colours in [−1, 1]).
+
+    The grid is centred on the last valid context frame's camera.
+    """
+    last = jnp.argmax(jnp.where(valid_S, jnp.arange(valid_S.shape[0]), -1))
+    centre = context.camera.world_from_camera[last, :3, 3]
+    voxels = voxel_map.empty(config.memory, centre, world_model.feature_channels(config))
+    return voxel_map.insert_frames(config.memory, voxels, context, valid_S)
+
+
+def recall(config: Config, voxels: voxel_map.VoxelMap, camera) -> MapTokens:
+    """Return the tokens of one world's map for one clip's cameras (T,)."""
+    size = (config.clip.height, config.clip.width)
+    return voxel_map.tokens(config.memory, voxels, camera, size)
+
+
+def clip_tokens(config: Config, clip: Clip) -> MapTokens:
+    """Build every clip's map from its context and return its tokens, leading axis B."""
+
+    def one(context: Frames, valid_S: Array, camera) -> MapTokens:
+        return recall(config, remember(config, as_signal(context), valid_S), camera)
+
+    return jax.vmap(one)(clip.context, clip.context_valid_S, clip.frames.camera)
+
+
+def loss(
+    config: Config, params: Params, clip: Clip, key: Array, *, memory: bool
+) -> tuple[Array, dict[str, Array]]:
+    """Return the loss of one batch and its parts.
+
+    Args:
+        config: the experiment.
+        params: the world model's parameters.
+        clip: a batch, leading axis B, colours uint8 or float.
+        key: randomness of times, noise and image noise.
+        memory: False in stage 1, True in stage 2.
+
+    Returns:
+        ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of x0, averaged over
+        everything with valid depth; for target v or ε the plain squared error of the target.
+    """
+    frames = as_signal(clip.frames)
+    x0 = codec.encode_rgbd(config, frames.rgb_THWC, frames.depth_THW)
+    batch = x0.shape[0]
+    time_key, noise_key, level_key, image_key = jax.random.split(key, 4)
+    diffusion = config.diffusion
+    timesteps = jax.random.randint(time_key, (batch,), 0, diffusion.train_steps)
+    noise = jax.random.normal(noise_key, x0.shape)
+    x_t = schedule.add_noise(diffusion, x0, noise, timesteps)
+
+    level = jnp.exp(
+        diffusion.image_noise_mean
+        + diffusion.image_noise_std * jax.random.normal(level_key, (batch, 1, 1, 1))
+    )
+    first = frames.rgb_THWC[:, 0]
+    first = first + level * jax.random.normal(image_key, first.shape)
+    conditioning = world_model.condition(config, first, frames.depth_THW[:, 0], frames.camera)
+    tokens = clip_tokens(config, clip) if memory else None
+    prediction = world_model.apply(config, params, x_t, conditioning, timesteps, tokens)
+
+    error = (prediction - schedule.target(diffusion, x0, noise, timesteps)) ** 2
+    if diffusion.target == "x0":
+        error = error * schedule.x0_weight(diffusion, timesteps)[:, None, None, None, None]
+    measured = codec.encode(
+        config.codec, (frames.depth_THW > 0).astype(jnp.float32)[..., None]
+    )
+    split = codec.rgb_channels(config)
+    rgb = error[..., :split].mean()
+    depth = (error[..., split:] * measured).sum() / jnp.maximum(measured.sum(), 1)
+    channels = error.shape[-1]
+    total = (rgb * split + depth * (channels - split)) / channels
+    return total, {"loss_rgb": rgb, "loss_depth": depth}

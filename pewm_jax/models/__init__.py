@@ -1,0 +1,1 @@
+"""Chapter 3, the networks: codec, layers, diffusion transformer, memory blocks, world model."""

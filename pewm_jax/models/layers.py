@@ -1,0 +1,127 @@
+"""The layers that the diffusion transformer and the memory blocks share.
+
+Flax linen modules; parameters are float32, computation is in the dtype of the activations, norms
+and softmax are in float32.
+"""
+
+from __future__ import annotations
+
+import math
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.types import Array
+
+zeros = nn.initializers.zeros_init()
+
+
+def dense(features: int, dtype: jnp.dtype, name: str, *, zero: bool = False) -> nn.Dense:
+    """Return a linear layer with bias; ``zero`` starts it at exactly nothing."""
+    kernel = zeros if zero else nn.initializers.lecun_normal()
+    return nn.Dense(features, dtype=dtype, kernel_init=kernel, name=name)
+
+
+def layer_norm(x: Array, name: str, epsilon: float = 1e-5) -> Array:
+    """Affine layer norm over the last axis, computed in float32, returned in x's dtype.
+
+    Call inside a compact module.
+    """
+    return nn.LayerNorm(epsilon=epsilon, dtype=jnp.float32, name=name)(x).astype(x.dtype)
+
+
+def sinusoid(values: Array, channels: int, max_period: float = 1e4) -> Array:
+    """Return (..., channels) cosines then sines of values at geometric frequencies.
+
+    CogVideoX's time embedding: ``Timesteps(flip_sin_to_cos=True, downscale_freq_shift=0)`` of
+    diffusers.
+    """
+    half = channels // 2
+    frequency = np.exp(-math.log(max_period) * np.arange(half) / half).astype(np.float32)
+    angle = values[..., None].astype(jnp.float32) * frequency
+    return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], -1)
+
+
+def modulate(x: Array, shift_BD: Array, scale_BD: Array) -> Array:
+    """Return x·(1 + scale) + shift, with (B, D) modulation of (B, N, D) tokens."""
+    return x * (1 + scale_BD[:, None]) + shift_BD[:, None]
+
+
+def rotate(x: Array, angles: Array) -> Array:
+    """Rotate channel pairs (0, 1), (2, 3), … of x by angles.
+
+    Args:
+        x: (..., d) with d even.
+        angles: (..., d/2) radians, broadcasting with x's leading shape.
+    """
+    cos, sin = jnp.cos(angles), jnp.sin(angles)
+    pairs = x.reshape(*x.shape[:-1], -1, 2).astype(jnp.float32)
+    a, b = pairs[..., 0], pairs[..., 1]
+    turned = jnp.stack([a * cos - b * sin, b * cos + a * sin], -1)
+    return turned.reshape(*turned.shape[:-2], -1).astype(x.dtype)
+
+
+def rope_angles(frames: int, height: int, width: int, head_dim: int) -> np.ndarray:
+    """Return (t·h·w, head_dim/2) rotary angles of a token grid, theta 1e4.
+
+    A head is split 1/4 time, 3/8 height, 3/8 width (``get_3d_rotary_pos_embed`` of diffusers,
+    integer positions).
+    """
+    parts = (head_dim // 4, head_dim // 8 * 3, head_dim // 8 * 3)
+    grid = np.meshgrid(np.arange(frames), np.arange(height), np.arange(width), indexing="ij")
+    angles = []
+    for positions, channels in zip(grid, parts, strict=True):
+        frequency = 1e4 ** (-np.arange(0, channels, 2) / channels)
+        angles.append(positions.reshape(-1, 1) * frequency)
+    return np.concatenate(angles, -1).astype(np.float32)
+
+
+def attention(q_BKND: Array, k_BKMD: Array, v_BKMD: Array) -> Array:
+    """Scaled dot-product attention with the softmax in float32: (B, K, N, d)."""
+    logits = jnp.einsum("bknd,bkmd->bknm", q_BKND, k_BKMD, preferred_element_type=jnp.float32)
+    weights = jax.nn.softmax(logits / math.sqrt(q_BKND.shape[-1]), -1)
+    return jnp.einsum("bknm,bkmd->bknd", weights.astype(v_BKMD.dtype), v_BKMD)
+
+
+def split_heads(x_BND: Array, heads: int) -> Array:
+    """(B, N, K·d) → (B, K, N, d)."""
+    batch, tokens, width = x_BND.shape
+    return x_BND.reshape(batch, tokens, heads, width // heads).transpose(0, 2, 1, 3)
+
+
+def merge_heads(x_BKND: Array) -> Array:
+    """(B, K, N, d) → (B, N, K·d)."""
+    batch, heads, tokens, channels = x_BKND.shape
+    return x_BKND.transpose(0, 2, 1, 3).reshape(batch, tokens, heads * channels)
+
+
+class FeedForward(nn.Module):
+    """Linear, tanh-gelu, linear."""
+
+    ratio: int
+
+    @nn.compact
+    def __call__(self, x_BND: Array) -> Array:
+        """(B, N, D) → (B, N, D)."""
+        width = x_BND.shape[-1]
+        hidden = dense(self.ratio * width, x_BND.dtype, "up")(x_BND)
+        return dense(width, x_BND.dtype, "down")(nn.gelu(hidden, approximate=True))
+
+
+class TimeEmbedding(nn.Module):
+    """Sinusoid of the diffusion time → linear, SiLU, linear."""
+
+    width: int
+    """Channels of the sinusoid: the model width in CogVideoX."""
+    time_dim: int
+    """Channels of the embedding."""
+    dtype: jnp.dtype
+
+    @nn.compact
+    def __call__(self, timesteps_B: Array) -> Array:
+        """(B,) → (B, time_dim)."""
+        wave = sinusoid(timesteps_B, self.width).astype(self.dtype)
+        hidden = dense(self.time_dim, self.dtype, "linear_1")(wave)
+        return dense(self.time_dim, self.dtype, "linear_2")(nn.silu(hidden))

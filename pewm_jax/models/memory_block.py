@@ -1,0 +1,194 @@
+"""The memory expert block: how the denoiser reads the map (paper, Eq. 2 and Fig. 2).
+
+``concat(H, camera embedding)`` and the map tokens M each get their own adaptive layernorm from
+the time embedding; H attends to M; α_M gates the attention, α_H the feed-forward:
+
+    H ← H + α_M · Attn(H_norm, M_norm)
+    H ← H + α_H · FF(LN(H))
+
+Both gates start at zero, so that a fresh block is the identity and stage 2 begins exactly at the
+stage-1 model. Where a clip's map is empty the whole block is skipped, exactly.
+"""
+
+from __future__ import annotations
+
+import math
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import Config
+from pewm_jax.models import layers
+from pewm_jax.models.memory_geometry import Sightings, frequencies
+from pewm_jax.types import Array
+
+PEAK = 6.0
+"""Logit by which a cell in the middle of the patch looked at stands out at the start."""
+
+
+def masked_attention(logits: Array, mask: Array, sink_K: Array, values: Array) -> Array:
+    """Attend to what is not masked, or to nothing.
+
+    Softmax over the last axis with one more, valueless, entry per head (the sink): a query that
+    finds nothing, or for which everything is masked, gets zeros, never NaN.
+
+    Args:
+        logits: (..., K, n, M) float32.
+        mask: broadcastable to logits, True where a token may be seen.
+        sink_K: (K,) logit of the sink.
+        values: (..., K, M, d).
+    """
+    sink = sink_K[:, None, None].astype(jnp.float32)
+    logits = jnp.where(mask, logits, -jnp.inf)
+    top = jax.lax.stop_gradient(jnp.maximum(logits.max(-1, keepdims=True), sink))
+    weights = jnp.exp(logits - top)
+    total = weights.sum(-1, keepdims=True) + jnp.exp(sink - top)
+    return (weights / total).astype(values.dtype) @ values
+
+
+class SinusoidAttention(nn.Module):
+    """Plain cross-attention of all video tokens to all map tokens (the paper)."""
+
+    heads: int
+    head_dim: int
+
+    @nn.compact
+    def __call__(self, video_BND: Array, memory_BMD: Array, valid_BM: Array) -> Array:
+        """Return (B, N, K·d)."""
+        dtype, width = video_BND.dtype, self.heads * self.head_dim
+        q = layers.split_heads(layers.dense(width, dtype, "to_q")(video_BND), self.heads)
+        k = layers.split_heads(layers.dense(width, dtype, "to_k")(memory_BMD), self.heads)
+        v = layers.split_heads(layers.dense(width, dtype, "to_v")(memory_BMD), self.heads)
+        q, k = (layers.layer_norm(x, f"norm_{n}", 1e-6) for x, n in ((q, "q"), (k, "k")))
+        logits = jnp.einsum("bknd,bkmd->bknm", q, k, preferred_element_type=jnp.float32)
+        sink = self.param("sink", layers.zeros, (self.heads,))
+        mixed = masked_attention(
+            logits / math.sqrt(self.head_dim), valid_BM[:, None, None], sink, v
+        )
+        return layers.merge_heads(mixed)
+
+
+class ProjectiveAttention(nn.Module):
+    """Cross-attention by where cells project, per latent frame and camera."""
+
+    heads: int
+    head_dim: int
+    grid: int
+    """Patches along the longer side of the image."""
+
+    def _constant(self, key: Array, shape: tuple[int, int]) -> Array:
+        """Start queries so that each head peaks at its own random place within the patch."""
+        heads, head_dim = shape
+        offset = jax.random.uniform(key, (heads, 2), minval=-0.5, maxval=0.5)
+        angle = offset[..., None] * jnp.asarray(frequencies(head_dim, self.grid))
+        size = math.sqrt(PEAK / math.sqrt(head_dim))
+        return layers.rotate(jnp.full(shape, size), angle.reshape(heads, -1))
+
+    @nn.compact
+    def __call__(self, video_BND: Array, memory_BMD: Array, seen: Sightings) -> Array:
+        """Return (B, N, K·(d + 3)): attended features and mean place per head."""
+        dtype, heads, head_dim = video_BND.dtype, self.heads, self.head_dim
+        batch, frames, cameras, tokens, _ = seen.angles_tqMR.shape
+        width = heads * head_dim
+        through = np.arange(heads) % cameras
+        depth = seen.place_tqM3[..., 2]
+
+        q = layers.split_heads(layers.dense(width, dtype, "to_q")(video_BND), heads)
+        k = layers.split_heads(layers.dense(width, dtype, "to_k")(memory_BMD), heads)
+        v = layers.split_heads(layers.dense(width, dtype, "to_v")(memory_BMD), heads)
+        gain = nn.initializers.constant(0.3)
+
+        def norm(x: Array, name: str) -> Array:
+            scaled = nn.LayerNorm(
+                epsilon=1e-6, use_bias=False, scale_init=gain, dtype=jnp.float32, name=name
+            )
+            return scaled(x).astype(dtype)
+
+        size = math.sqrt(PEAK / math.sqrt(head_dim))
+        q_constant = self.param("q_constant", self._constant, (heads, head_dim))
+        k_constant = self.param(
+            "k_constant", nn.initializers.constant(size), (heads, head_dim)
+        )
+        k_depth = self.param("k_depth", layers.zeros, (heads, head_dim))
+        nearer = self.param("nearer", nn.initializers.constant(0.5), (heads,))
+        sink = self.param("sink", layers.zeros, (heads,))
+
+        q = norm(q, "norm_q") + q_constant[:, None].astype(dtype)
+        q = q.reshape(batch, heads, frames, -1, head_dim).transpose(0, 2, 1, 3, 4)
+        q = layers.rotate(q, seen.query_angles_nR)
+        k = norm(k, "norm_k")[:, None] + k_constant[:, None].astype(dtype)
+        log_z = depth[:, :, through]
+        k = k + (log_z[..., None] * k_depth[:, None]).astype(dtype)
+        k = layers.rotate(k, seen.angles_tqMR[:, :, through])
+
+        logits = jnp.einsum("btknd,btkmd->btknm", q, k, preferred_element_type=jnp.float32)
+        logits = logits / math.sqrt(head_dim) - (nearer[:, None] * log_z)[..., None, :]
+        place = seen.place_tqM3[:, :, through].astype(dtype)
+        v = jnp.broadcast_to(v[:, None], (batch, frames, heads, tokens, head_dim))
+        mixed = masked_attention(
+            logits,
+            seen.visible_tqM[:, :, through, None],
+            sink,
+            jnp.concatenate([v, place], -1),
+        )
+        mixed = mixed.transpose(0, 1, 3, 2, 4)
+        return mixed.reshape(batch, video_BND.shape[1], -1)
+
+
+class MemoryBlock(nn.Module):
+    """One memory expert block."""
+
+    config: Config
+
+    @nn.compact
+    def __call__(
+        self,
+        video_BND: Array,
+        time_BE: Array,
+        camera_BNC: Array,
+        memory_BMD: Array,
+        valid_BM: Array,
+        seen: Sightings | None,
+    ) -> Array:
+        """Read the map.
+
+        Args:
+            video_BND: (B, N, D) hidden states H.
+            time_BE: (B, E) time embedding.
+            camera_BNC: (B, N, C) camera embedding of each video token.
+            memory_BMD: (B, M, Dm) embedded map tokens.
+            valid_BM: (B, M) bool, False tokens contribute nothing.
+            seen: the tokens through the clip's cameras, for projective positions.
+        """
+        memory, dtype = self.config.memory, video_BND.dtype
+        width, memory_width = video_BND.shape[-1], memory_BMD.shape[-1]
+        sizes = [width, width, memory_width, memory_width, width]
+        modulation = layers.dense(sum(sizes) + width, dtype, "linear", zero=True)(nn.silu(time_BE))
+        shift, scale, m_shift, m_scale, m_gate, gate = jnp.split(
+            modulation, np.cumsum(sizes).tolist(), -1
+        )
+        query = layers.dense(width, dtype, "with_camera")(
+            jnp.concatenate([video_BND, camera_BNC], -1)
+        )
+        query = layers.modulate(layers.layer_norm(query, "norm_video"), shift, scale)
+        keys = layers.modulate(layers.layer_norm(memory_BMD, "norm_memory"), m_shift, m_scale)
+
+        if seen is None:
+            attend = SinusoidAttention(memory.heads, memory.head_dim, name="attention")
+            mixed = attend(query, keys, valid_BM)
+        else:
+            patch = self.config.codec.spatial * self.config.dit.patch
+            grid = max(self.config.clip.height, self.config.clip.width) // patch
+            attend = ProjectiveAttention(memory.heads, memory.head_dim, grid, name="attention")
+            mixed = attend(query, keys, seen)
+        mixed = layers.dense(width, dtype, "to_out")(mixed)
+
+        out = video_BND + m_gate[:, None] * mixed
+        forward = layers.FeedForward(memory.mlp_ratio, name="ff")(
+            layers.layer_norm(out, "norm2")
+        )
+        out = out + gate[:, None] * forward
+        remembers = valid_BM.any(-1)[:, None, None]
+        return jnp.where(remembers, out, video_BND)

@@ -1,0 +1,114 @@
+"""Where each remembered cell stands, as memory attention wants to know it.
+
+Two schemes:
+
+* ``sinusoid`` (the paper): a 3D sinusoid of the cell's position in the camera of the clip's first
+  frame, concatenated to its features.
+* ``projective``: every cell is moved into the camera of every frame. Its image coordinates give
+  the key a rotary embedding, the centre of a patch gives the query the same one, so that a query's
+  logit is largest for cells that project into its patch; cells behind the camera or far outside
+  the image are masked. A latent frame covers several frames, each with its own camera: head k
+  looks through camera k mod q. Nothing here changes when cameras and map are moved together by a
+  rigid motion.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import Config
+from pewm_jax.geometry.cameras import invert_rigid, project, transform_points
+from pewm_jax.geometry.plucker import fold_frames
+from pewm_jax.types import Array, Camera
+
+MARGIN = 0.25
+"""Cells up to this share of the image outside its border are still looked at."""
+NEAREST_M = 0.05
+"""Cells nearer to the camera plane than this are masked, metres."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Sightings:
+    """Map tokens as seen through the cameras of every latent frame (q cameras each).
+
+    Attributes:
+        angles_tqMR: (B, t, q, M, d/2) rotary angles of the keys.
+        place_tqM3: (B, t, q, M, 3) image coordinates in [−1, 1] and log depth.
+        visible_tqM: (B, t, q, M) bool.
+        query_angles_nR: (n, d/2) rotary angles of the n patches of one latent frame.
+    """
+
+    angles_tqMR: Array
+    place_tqM3: Array
+    visible_tqM: Array
+    query_angles_nR: Array
+
+
+def frequencies(head_dim: int, grid: int) -> np.ndarray:
+    """Return (head_dim/4,) radians per patch: wavelengths of 2 patches up to 4 × the grid."""
+    count = head_dim // 4
+    share = np.arange(count) / max(count - 1, 1)
+    return (2 * math.pi / (2.0 * (2.0 * grid) ** share)).astype(np.float32)
+
+
+def _angles(uv_2: Array, head_dim: int, grid: int) -> Array:
+    """Return (..., d/2) angles of positions (..., 2) in patches: half for u, half for v."""
+    angle = uv_2[..., :, None] * jnp.asarray(frequencies(head_dim, grid))
+    return angle.reshape(*uv_2.shape[:-1], -1)
+
+
+def sightings(config: Config, camera: Camera, points_M3: Array, valid_M: Array) -> Sightings:
+    """Move map tokens into all cameras of a batch of clips.
+
+    Args:
+        config: the experiment.
+        camera: (B, T) cameras of the clips.
+        points_M3: (B, M, 3) cell centres in the world.
+        valid_M: (B, M) bool.
+    """
+    clip, codec = config.clip, config.codec
+    patch = codec.spatial * config.dit.patch
+    rows, columns = clip.height // patch, clip.width // patch
+    head_dim, grid = config.memory.head_dim, max(rows, columns)
+
+    uv, z = project(points_M3[:, None], camera)
+    size = np.array([clip.width, clip.height], np.float32)
+    margin = MARGIN * size
+    inside = jnp.all((uv > -margin) & (uv < size + margin), -1)
+    visible = inside & (z > NEAREST_M) & valid_M[:, None]
+    uv = jnp.where(visible[..., None], uv, 0.0)
+    log_z = jnp.log(jnp.where(visible, z, 1.0))
+    place = jnp.concatenate([2 * uv / size - 1, log_z[..., None]], -1)
+
+    fold = jax.vmap(lambda x: fold_frames(x, codec.temporal))
+    v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
+    centres = np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)
+    return Sightings(
+        angles_tqMR=_angles(fold(uv) / patch, head_dim, grid),
+        place_tqM3=fold(place),
+        visible_tqM=fold(visible),
+        query_angles_nR=_angles(jnp.asarray(centres), head_dim, grid),
+    )
+
+
+def sinusoid_3d(config: Config, camera: Camera, points_M3: Array) -> Array:
+    """Return (B, M, 6·10) sines and cosines of positions in each clip's first camera.
+
+    Wavelengths are geometric from 4 cells' smallest side to 4 × the map's largest extent.
+    """
+    first = Camera(camera.intrinsics_4[:, 0], camera.world_from_camera[:, 0])
+    local = transform_points(invert_rigid(first.world_from_camera), points_M3)
+    shortest = 4 * min(config.memory.cell_m)
+    extent = max(c * n for c, n in zip(config.memory.cell_m, config.memory.cells, strict=True))
+    wavelengths = np.geomspace(shortest, 4 * extent, 10)
+    angle = local[..., None] * (2 * math.pi / wavelengths).astype(np.float32)
+    angle = angle.reshape(*local.shape[:-1], -1)
+    return jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1)
+
+

@@ -1,0 +1,219 @@
+"""The world model: the diffusion transformer, conditioned on what was seen and what is done.
+
+Input channels, in order: noisy colour and depth latents, clean latents of the observed first
+frame (zero for later latent frames), camera (Plücker) channels. After every transformer block a
+memory block reads the map. Parameters: ``{"backbone": dit, "memory": {camera, tokens, blocks}}``;
+without the ``memory`` entry, or without map tokens, it is the stage-1 model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import Config
+from pewm_jax.geometry.plucker import camera_latents
+from pewm_jax.models import codec, dit, layers
+from pewm_jax.models.memory_block import MemoryBlock
+from pewm_jax.models.memory_geometry import Sightings, sightings, sinusoid_3d
+from pewm_jax.types import Array, Camera, MapTokens, Params
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Conditioning:
+    """What the denoiser is told besides the map, leading axis B.
+
+    Attributes:
+        first_BthwC: clean latents of the observed frame at t = 0, zero for later latent frames.
+        rays_BthwC: camera embedding at the latent rate.
+        camera: (B, T) cameras of the clip's frames.
+        text_BLC: text tokens; zeros stand for the empty prompt.
+    """
+
+    first_BthwC: Array
+    rays_BthwC: Array
+    camera: Camera
+    text_BLC: Array
+
+
+def feature_channels(config: Config) -> int:
+    """Return the number of features F of a map cell."""
+    return {"patch_colours": 6}[config.memory.encoder]
+
+
+def camera_channels(config: Config) -> int:
+    """Return the camera channels at the latent rate, 24 for a temporal factor of 4."""
+    return 6 * config.codec.temporal
+
+
+def in_channels(config: Config) -> int:
+    """Return the input channels of the patch embedding."""
+    return 2 * codec.latent_channels(config) + camera_channels(config)
+
+
+def condition(config: Config, rgb_BHWC: Array, depth_BHW: Array, camera: Camera) -> Conditioning:
+    """Build the conditioning of a batch of clips.
+
+    Args:
+        config: the experiment.
+        rgb_BHWC: (B, H, W, 3) the observed first frame, float in [−1, 1].
+        depth_BHW: (B, H, W) its depth, metres.
+        camera: (B, T) cameras of all frames of the clip, world frame.
+    """
+    batch = rgb_BHWC.shape[0]
+    frames, h, w = codec.latent_shape(config)
+    first = codec.encode_rgbd(config, rgb_BHWC[:, None], depth_BHW[:, None])
+    padding = jnp.zeros((batch, frames - 1, h, w, first.shape[-1]), first.dtype)
+    clip = config.clip
+    rays = jax.vmap(
+        lambda c: camera_latents(
+            c, clip.height, clip.width, config.codec.spatial, config.codec.temporal
+        )
+    )(camera)
+    text = jnp.zeros((batch, config.dit.text_length, config.dit.text_dim))
+    return Conditioning(jnp.concatenate([first, padding], 1), rays, camera, text)
+
+
+def _memory_parts(config: Config) -> tuple[layers.nn.Dense, layers.nn.Dense]:
+    """Return the embeddings of camera channels (per token) and of map tokens."""
+    dtype = jnp.dtype(config.train.dtype)
+    memory_width = config.memory.heads * config.memory.head_dim
+    camera = layers.dense(config.dit.width // 2, dtype, "camera")
+    return camera, layers.dense(memory_width, dtype, "tokens")
+
+
+def _token_channels(config: Config) -> int:
+    positions = 60 if config.memory.positions == "sinusoid" else 0
+    return feature_channels(config) + positions
+
+
+def init(config: Config, key: Array, *, memory: bool = True) -> Params:
+    """Initialise the backbone and, with ``memory``, the memory blocks (identity at the start)."""
+    backbone_key, memory_key = jax.random.split(key)
+    out_channels = codec.latent_channels(config)
+    params: Params = {
+        "backbone": dit.init(config.dit, backbone_key, in_channels(config), out_channels)
+    }
+    if memory:
+        params["memory"] = init_memory(config, memory_key)
+    return params
+
+
+def init_memory(config: Config, key: Array) -> Params:
+    """Initialise the memory blocks alone; their gates are zero."""
+    camera, tokens = _memory_parts(config)
+    camera_key, tokens_key, blocks_key = jax.random.split(key, 3)
+    memory, width = config.memory, config.dit.width
+    half = memory.head_dim // 2
+    q = config.codec.temporal
+    seen = None
+    if memory.positions == "projective":
+        seen = Sightings(
+            jnp.zeros((1, 1, q, 1, half)),
+            jnp.zeros((1, 1, q, 1, 3)),
+            jnp.ones((1, 1, q, 1), bool),
+            jnp.zeros((1, half)),
+        )
+    example = (
+        jnp.zeros((1, 1, width)),
+        jnp.zeros((1, config.dit.time_dim)),
+        jnp.zeros((1, 1, width // 2)),
+        jnp.zeros((1, 1, memory.heads * memory.head_dim)),
+        jnp.ones((1, 1), bool),
+        seen,
+    )
+    blocks = jax.vmap(lambda k: MemoryBlock(config).init(k, *example)["params"])(
+        jax.random.split(blocks_key, config.dit.layers)
+    )
+    patch = config.dit.patch
+    return {
+        "camera": camera.init(camera_key, jnp.zeros((1, camera_channels(config) * patch**2)))[
+            "params"
+        ],
+        "tokens": tokens.init(tokens_key, jnp.zeros((1, _token_channels(config))))["params"],
+        "blocks": blocks,
+    }
+
+
+def apply(
+    config: Config,
+    params: Params,
+    noisy_BthwC: Array,
+    conditioning: Conditioning,
+    timesteps_B: Array,
+    tokens: MapTokens | None = None,
+) -> Array:
+    """Predict the target (x0, v or ε) from noisy latents.
+
+    Args:
+        config: the experiment.
+        params: ``{"backbone": …, "memory": …}``.
+        noisy_BthwC: (B, t, h, w, C) noisy colour and depth latents.
+        conditioning: the observed frame, cameras and text.
+        timesteps_B: (B,) diffusion times.
+        tokens: map tokens with leading axis B; None is the stage-1 model.
+
+    Returns:
+        (B, t, h, w, C) float32 prediction.
+    """
+    dtype = jnp.dtype(config.train.dtype)
+    latents = jnp.concatenate(
+        [noisy_BthwC, conditioning.first_BthwC, conditioning.rays_BthwC], -1
+    ).astype(dtype)
+    expert, expert_params = None, None
+    if tokens is not None and "memory" in params:
+        memory = params["memory"]
+        camera_layer, token_layer = _memory_parts(config)
+        rays = dit.patchify(conditioning.rays_BthwC.astype(dtype), config.dit.patch)
+        camera = camera_layer.apply({"params": memory["camera"]}, rays)
+        points, valid = tokens.points_world_M3, tokens.valid_M
+        features, seen = tokens.features_MF, None
+        if config.memory.positions == "projective":
+            seen = sightings(config, conditioning.camera, points, valid)
+        else:
+            place = sinusoid_3d(config, conditioning.camera, points)
+            features = jnp.concatenate([features, place], -1)
+        embedded = token_layer.apply({"params": memory["tokens"]}, features.astype(dtype))
+        expert_params = memory["blocks"]
+
+        def expert(layer, video, time):
+            block = MemoryBlock(config)
+            return block.apply({"params": layer}, video, time, camera, embedded, valid, seen)
+
+    out = dit.apply(
+        config.dit,
+        params["backbone"],
+        latents,
+        conditioning.text_BLC,
+        timesteps_B,
+        expert=expert,
+        expert_params=expert_params,
+    )
+    return out.astype(jnp.float32)
+
+
+def flops_per_clip(config: Config, *, memory: bool) -> float:
+    """Return the forward FLOPs (2 per multiply-add) of one clip's matrix products."""
+    t, h, w = codec.latent_shape(config)
+    patch = config.dit.patch
+    video = t * (h // patch) * (w // patch)
+    tokens, width, ratio = video + config.dit.text_length, config.dit.width, config.dit.mlp_ratio
+    block = tokens * width * width * (4 + 2 * ratio) + 2 * tokens * tokens * width
+    ends = video * width * patch**2 * (in_channels(config) + codec.latent_channels(config))
+    ends += config.dit.text_length * config.dit.text_dim * width
+    total = config.dit.layers * block + ends
+    if memory:
+        m = config.memory
+        inner, looks = m.heads * m.head_dim, m.tokens
+        geometry = 3 * m.heads if m.positions == "projective" else 0
+        read = video * width * (1.5 * width + inner + 2 * m.mlp_ratio * width)
+        read += video * (inner + geometry) * width + 2 * looks * inner * inner
+        read += video * looks * (2 * inner + geometry)
+        total += config.dit.layers * read
+        total += video * camera_channels(config) * patch**2 * width / 2
+        total += looks * _token_channels(config) * inner
+    return 2.0 * math.ceil(total)
