@@ -1,0 +1,167 @@
+"""Choose leaves of a parameter tree by regular expressions over their paths, strictly.
+
+A leaf's path is its keys joined by slashes: ``{"memory": {"gate": x}}`` holds ``memory/gate``.
+A pattern must match a whole path (``re.fullmatch``). What trains, what decays, what is placed
+where and what is converted are all said this way, and nothing is guessed: a leaf that no pattern
+covers, or a pattern that covers no leaf, is an error that lists them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from pewm_jax.config import UserError
+from pewm_jax.types import Params
+
+T = TypeVar("T")
+_LISTED = 8
+
+
+class TreeError(UserError):
+    """Paths and patterns, or two trees, that do not fit; the message lists what is left over."""
+
+
+def flatten(tree: Any) -> dict[str, Any]:
+    """Turn any pytree into ``{path: leaf}``, in the tree's order."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {_path(keys): leaf for keys, leaf in leaves}
+
+
+def unflatten(leaves: Mapping[str, Any]) -> Params:
+    """Turn ``{path: leaf}`` into nested dictionaries, the inverse of ``flatten`` on them.
+
+    Raises:
+        TreeError: a path is both a leaf and a branch.
+    """
+    tree: Params = {}
+    for path, leaf in leaves.items():
+        *branch, name = path.split("/")
+        node = tree
+        for key in branch:
+            node = node.setdefault(key, {})
+            if not isinstance(node, dict):
+                raise TreeError(f"{path} runs through {key}, which is a leaf and not a branch.")
+        if name in node:
+            raise TreeError(f"{path} occurs twice, once as a branch.")
+        node[name] = leaf
+    return tree
+
+
+def assign(rules: Sequence[tuple[str, T]], tree: Any, what: str = "rules") -> Any:
+    """Give every leaf the value of the first rule whose pattern matches its path.
+
+    Example::
+
+        assign(((r".*/kernel", True), (r".*/bias", False)), params)  # a weight-decay mask
+
+    Args:
+        rules: (pattern, value) pairs; the first match wins.
+        tree: any pytree.
+        what: name of the rules in the error message.
+
+    Returns:
+        A tree of the same structure with values in place of leaves.
+
+    Raises:
+        TreeError: leaves that no rule matches.
+    """
+    compiled = [(re.compile(pattern), value) for pattern, value in rules]
+    unmatched: list[str] = []
+
+    def choose(keys: Any, _leaf: Any) -> Any:
+        path = _path(keys)
+        for pattern, value in compiled:
+            if pattern.fullmatch(path):
+                return value
+        unmatched.append(path)
+        return None
+
+    out = jax.tree_util.tree_map_with_path(choose, tree)
+    if unmatched:
+        raise TreeError(f"No rule of the {what} matches {listing(unmatched)}; add one.")
+    return out
+
+
+def split(tree: Params, patterns: Sequence[str]) -> tuple[Params, Params]:
+    """Split nested dictionaries into what the patterns match and the rest.
+
+    Both halves keep their paths; ``merge`` puts them together again.
+
+    Raises:
+        TreeError: a pattern that matches no leaf.
+    """
+    leaves = flatten(tree)
+    chosen: set[str] = set()
+    for pattern in patterns:
+        found = {path for path in leaves if re.fullmatch(pattern, path)}
+        if not found:
+            raise TreeError(f"The pattern {pattern!r} matches none of {listing(leaves)}.")
+        chosen |= found
+    inside = {path: leaf for path, leaf in leaves.items() if path in chosen}
+    outside = {path: leaf for path, leaf in leaves.items() if path not in chosen}
+    return unflatten(inside), unflatten(outside)
+
+
+def select(tree: Params, patterns: Sequence[str]) -> Params:
+    """Keep the leaves that a pattern matches; see ``split``."""
+    return split(tree, patterns)[0]
+
+
+def exclude(tree: Params, patterns: Sequence[str]) -> Params:
+    """Drop the leaves that a pattern matches; see ``split``."""
+    return split(tree, patterns)[1]
+
+
+def merge(*trees: Params) -> Params:
+    """Join nested dictionaries that share no leaf, the inverse of ``split``.
+
+    Raises:
+        TreeError: leaves that occur in more than one tree.
+    """
+    leaves: dict[str, Any] = {}
+    for tree in trees:
+        more = flatten(tree)
+        twice = leaves.keys() & more.keys()
+        if twice:
+            raise TreeError(f"Trees to be merged both hold {listing(twice)}.")
+        leaves |= more
+    return unflatten(leaves)
+
+
+def mismatches(tree: Any, like: Any) -> list[str]:
+    """List how a tree differs from another in paths and shapes; empty when they fit."""
+    have, want = flatten(tree), flatten(like)
+    out = [f"{path} is missing" for path in want if path not in have]
+    out += [f"{path} is unexpected" for path in have if path not in want]
+    for path in want.keys() & have.keys():
+        shape, expected = np.shape(have[path]), np.shape(want[path])
+        if shape != expected:
+            out.append(f"{path} has shape {shape} instead of {expected}")
+    return sorted(out)
+
+
+def require_like(tree: Any, like: Any, what: str) -> None:
+    """Insist that a tree has the paths and shapes of another.
+
+    Raises:
+        TreeError: with the list of differences, prefixed by ``what``.
+    """
+    wrong = mismatches(tree, like)
+    if wrong:
+        raise TreeError(f"{what} does not fit this configuration: {listing(wrong)}.")
+
+
+def listing(items: Iterable[str]) -> str:
+    """Join a few items for a message and count the others."""
+    items = sorted(items)
+    more = len(items) - _LISTED
+    return ", ".join(items[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _path(keys: Any) -> str:
+    return jax.tree_util.keystr(keys, simple=True, separator="/")
