@@ -1,0 +1,261 @@
+"""A split on disk: ArrayRecord shards, and ``dataset.json`` written last.
+
+A split folder without ``dataset.json`` is unfinished and is never read. Shards are written aside
+and renamed; ``dataset.json`` names every shard with its number of records, size and SHA-256, so
+that a shard cut short is noticed when the split is opened.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from array_record.python import array_record_module
+from grain import sources
+
+from pewm_jax.config import UserError
+from pewm_jax.data.episodes import VERSION, Episode, read_episode
+
+MANIFEST = "dataset.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Shard:
+    """One file of a split.
+
+    Attributes:
+        file: its name inside the split folder.
+        records: how many episodes it holds.
+        bytes: its size.
+        sha256: of the whole file.
+    """
+
+    file: str
+    records: int
+    bytes: int
+    sha256: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Manifest:
+    """What ``dataset.json`` says.
+
+    Attributes:
+        split: name of the split.
+        shards: its files, in reading order.
+        settings: what the split was made with.
+        frames: frames in all episodes together.
+    """
+
+    split: str
+    shards: tuple[Shard, ...]
+    settings: Mapping[str, Any]
+    frames: int
+
+    @property
+    def records(self) -> int:
+        """Number of episodes."""
+        return sum(shard.records for shard in self.shards)
+
+
+def write_shard(path: Path, records: Iterable[bytes]) -> int:
+    """Write records to an ArrayRecord file, aside and then renamed.
+
+    Returns:
+        The number of records written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    count = 0
+    try:
+        # Images are compressed already, and one record per group makes a single one cheap to read.
+        writer = array_record_module.ArrayRecordWriter(str(partial), "group_size:1,uncompressed")
+        try:
+            for record in records:
+                writer.write(record)
+                count += 1
+        finally:
+            writer.close()
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return count
+
+
+def describe_shard(path: Path) -> Shard:
+    """Count, measure and hash a shard."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return Shard(path.name, count_records(path), path.stat().st_size, digest)
+
+
+def count_records(path: Path) -> int:
+    """Return the number of records of an ArrayRecord file.
+
+    Raises:
+        UserError: it is not one, or it was cut short.
+    """
+    reader = None
+    try:
+        reader = array_record_module.ArrayRecordReader(str(path))
+        count = reader.num_records()
+    except (RuntimeError, ValueError) as error:
+        raise UserError(
+            f"{path} is not a readable ArrayRecord file ({str(error).splitlines()[0]}); it is "
+            "truncated or damaged, delete it and make it again."
+        ) from None
+    finally:
+        if reader is not None:
+            with contextlib.suppress(RuntimeError, ValueError):
+                reader.close()
+    if count == 0:
+        raise UserError(
+            f"{path} holds no readable record: it is truncated or damaged, delete it and make it "
+            "again."
+        )
+    return count
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON aside, then rename."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    partial.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", "utf-8")
+    partial.replace(path)
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Publish a split: from now on it reads as whole."""
+    value = {
+        "format": "pewm-dataset",
+        "version": VERSION,
+        "split": manifest.split,
+        "records": manifest.records,
+        "frames": manifest.frames,
+        "settings": dict(manifest.settings),
+        "shards": [dataclasses.asdict(shard) for shard in manifest.shards],
+    }
+    write_json(folder / MANIFEST, value)
+
+
+def read_manifest(folder: Path, check_files: bool = True) -> Manifest:
+    """Read ``dataset.json`` and compare the shards' sizes with it (hashes: ``validate``).
+
+    Raises:
+        UserError: no such folder, an unfinished split, or a shard that is missing or cut short.
+    """
+    path = folder / MANIFEST
+    if not folder.is_dir():
+        raise UserError(
+            f"{folder} does not exist; make it with `python -m pewm_jax.data collect` or `import`."
+        )
+    if not path.is_file():
+        inside = splits(folder)
+        hint = (
+            f"it holds the splits {', '.join(inside)}, name one of them"
+            if inside
+            else "the collection did not finish, run the same command again to resume it"
+        )
+        raise UserError(f"{folder} has no {MANIFEST}: {hint}.")
+    try:
+        value = json.loads(path.read_text("utf-8"))
+        manifest = Manifest(
+            split=value["split"],
+            shards=tuple(Shard(**shard) for shard in value["shards"]),
+            settings=value["settings"],
+            frames=value["frames"],
+        )
+        version = value["version"]
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        raise UserError(f"{path} does not parse ({error!r}); make the split again.") from None
+    if version != VERSION:
+        raise UserError(
+            f"{path} has format version {version}, this library reads version {VERSION}; make the "
+            "split again."
+        )
+    for shard in manifest.shards if check_files else ():
+        _check_size(folder / shard.file, shard)
+    return manifest
+
+
+def _check_size(path: Path, shard: Shard) -> None:
+    if not path.is_file():
+        raise UserError(f"{path} is missing but {MANIFEST} lists it; make the split again.")
+    size = path.stat().st_size
+    if size != shard.bytes:
+        raise UserError(
+            f"{path} has {size} bytes where {MANIFEST} says {shard.bytes}: the shard is truncated "
+            "or was changed; delete it and make the split again."
+        )
+
+
+def splits(path: Path) -> list[str]:
+    """Return the names of the finished splits inside a dataset folder."""
+    return sorted(file.parent.name for file in path.glob(f"*/{MANIFEST}"))
+
+
+class EpisodeSource(Sequence[Episode]):
+    """Random access to the episodes of a finished split, read through Grain.
+
+    ``source[i]`` opens episode i; its images are decoded only when asked for. Picklable, so that
+    loader processes can each open their own files.
+
+    Raises:
+        UserError: the split is absent, unfinished, or a shard was cut short.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        self.manifest = read_manifest(self.path)
+        files = [str(self.path / shard.file) for shard in self.manifest.shards]
+        try:
+            self._records = sources.ArrayRecordDataSource(files)
+        except (RuntimeError, ValueError) as error:
+            raise UserError(
+                f"{self.path}: the shards do not open ({str(error).splitlines()[0]}); make the "
+                "split again."
+            ) from None
+        if len(self._records) != self.manifest.records:
+            raise UserError(
+                f"{self.path}: the shards hold {len(self._records)} records where {MANIFEST} says "
+                f"{self.manifest.records}; make the split again."
+            )
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __repr__(self) -> str:
+        return f"EpisodeSource({str(self.path)!r}, episodes={len(self)})"
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"episode {index} of {self.path}, which has {len(self)}")
+        position = int(index) % len(self)
+        return read_episode(self._record(position), self.where(position))
+
+    def _record(self, index: int) -> bytes:
+        try:
+            return self._records[index]
+        except (RuntimeError, ValueError) as error:
+            raise UserError(
+                f"{self.where(index)} does not read ({str(error).splitlines()[0]}); the shard is "
+                "damaged, delete it and make the split again."
+            ) from None
+
+    def where(self, index: int) -> str:
+        """Return the place of an episode in words: file and record."""
+        for shard in self.manifest.shards:
+            if index < shard.records:
+                return f"{self.path / shard.file}, record {index}"
+            index -= shard.records
+        return str(self.path)

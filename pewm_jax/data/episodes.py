@@ -1,0 +1,365 @@
+"""The episode: what it holds, and how it becomes bytes and comes back.
+
+One record is one episode. It starts with a magic word and a JSON header that says where every
+array and every encoded image lies, so that single frames are decoded without touching the others.
+Byte by byte in ``docs/data_format.md``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pewm_jax.config import UserError
+from pewm_jax.types import Camera, Frames
+
+MAGIC = b"PEWMEPIS"
+VERSION = 1
+MILLIMETRES = 1000.0
+DEPTH_LIMIT_M = 65.535
+"""Depths beyond what 16 bits of millimetres hold are stored as 0, "no measurement"."""
+PNG_LEVEL = 1
+
+CONVENTIONS = {
+    "camera": "OpenCV axes: x right, y down, z forward",
+    "world": "gravity-aligned, z up",
+    "world_from_camera": "4x4 rigid transform, camera to world, one per frame",
+    "intrinsics": "fx, fy, cx, cy; the centre of the top-left pixel is (0.5, 0.5)",
+    "depth": "along z, not along the ray; 0 = no measurement",
+    "actions": "dx forward, dy left, dyaw counter-clockwise; first move, then turn; "
+    "action k leads from frame k to frame k + 1",
+    "action_ids": "0 forward, 1 turn left, 2 turn right",
+    "ids": "instance per pixel plus 1; 0 = nothing",
+}
+UNITS = {
+    "world_from_camera": "metre",
+    "depth": "millimetre on disk, metre once decoded",
+    "intrinsics": "pixel",
+    "actions": "metre, metre, radian",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeArrays:
+    """What an episode is written from.
+
+    Attributes:
+        rgb_THWC: (T, H, W, 3) uint8.
+        depth_THW: (T, H, W) float metres along z, 0 = no measurement.
+        intrinsics_4: (4,) fx, fy, cx, cy in pixels, centres at +0.5.
+        world_from_camera: (T, 4, 4) camera-to-world.
+        actions: (T − 1, 3) dx, dy, dyaw, or None where the camera does not move like the agent.
+        action_ids: (T − 1,) discrete actions, or None.
+        ids_THW: (T, H, W) instance ids from −1 (nothing) to 65534, or None.
+    """
+
+    rgb_THWC: np.ndarray
+    depth_THW: np.ndarray
+    intrinsics_4: np.ndarray
+    world_from_camera: np.ndarray
+    actions: np.ndarray | None = None
+    action_ids: np.ndarray | None = None
+    ids_THW: np.ndarray | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Episode:
+    """An episode as it lies on disk: small arrays are at hand, images are decoded when asked for.
+
+    Attributes:
+        name: name of the episode, e.g. ``house-000012/follow``.
+        scene: name of the scene it was recorded in.
+        length: T, its number of frames.
+        height: image height in pixels.
+        width: image width in pixels.
+        intrinsics_4: (4,) float32.
+        world_from_camera: (T, 4, 4) float32.
+        actions: (T − 1, 3) float32 or None.
+        action_ids: (T − 1,) int32 or None.
+        info: free-form facts about the episode, e.g. ``return_frame`` of a revisit episode.
+        header: the whole JSON header.
+        record: the bytes.
+    """
+
+    name: str
+    scene: str
+    length: int
+    height: int
+    width: int
+    intrinsics_4: np.ndarray
+    world_from_camera: np.ndarray
+    actions: np.ndarray | None
+    action_ids: np.ndarray | None
+    info: Mapping[str, Any]
+    header: Mapping[str, Any] = dataclasses.field(repr=False)
+    record: bytes = dataclasses.field(repr=False)
+
+    @property
+    def has_ids(self) -> bool:
+        """Whether instance ids were recorded."""
+        return "ids" in self.header["streams"]
+
+    def camera(self, indices: Sequence[int] | np.ndarray | None = None) -> Camera:
+        """Return the cameras of some frames (all by default), intrinsics repeated per frame."""
+        pose = self.world_from_camera if indices is None else self.world_from_camera[indices]
+        return Camera(np.broadcast_to(self.intrinsics_4, (len(pose), 4)).copy(), pose)
+
+    def frames(self, indices: Sequence[int] | np.ndarray | None = None) -> Frames:
+        """Decode some frames (all by default), in the order asked for.
+
+        Returns:
+            NumPy frames: rgb uint8, depth float32 in metres.
+
+        Raises:
+            UserError: an image does not decode, naming the frame.
+        """
+        chosen = np.arange(self.length) if indices is None else np.asarray(indices, np.int64)
+        rgb = np.empty((len(chosen), self.height, self.width, 3), np.uint8)
+        depth = np.empty((len(chosen), self.height, self.width), np.float32)
+        for row, index in enumerate(chosen):
+            rgb[row] = self._image("rgb", int(index))[..., ::-1]
+            depth[row] = self._image("depth", int(index))
+        depth /= MILLIMETRES
+        return Frames(rgb, depth, self.camera(chosen))
+
+    def ids(self, indices: Sequence[int] | np.ndarray | None = None) -> np.ndarray:
+        """Decode instance ids (T, H, W) int32, −1 = nothing.
+
+        Raises:
+            UserError: the episode has none.
+        """
+        if not self.has_ids:
+            raise UserError(f"episode {self.name} has no instance ids; collect it with --ids.")
+        chosen = range(self.length) if indices is None else indices
+        return np.stack([self._image("ids", int(i)).astype(np.int32) - 1 for i in chosen])
+
+    def _image(self, stream: str, index: int) -> np.ndarray:
+        if not 0 <= index < self.length:
+            raise IndexError(f"frame {index} of {self.name}, which has {self.length} frames")
+        offset, size = self.header["streams"][stream]["spans"][index]
+        code = np.frombuffer(self.record, np.uint8, size, offset)
+        image = cv2.imdecode(code, cv2.IMREAD_UNCHANGED)
+        shape = (self.height, self.width, 3) if stream == "rgb" else (self.height, self.width)
+        if image is None or image.shape != shape:
+            raise UserError(
+                f"episode {self.name}, frame {index}, {stream}: the image does not decode to "
+                f"{self.width}×{self.height} pixels; the record is damaged, collect or import it "
+                "again."
+            )
+        return image
+
+
+def write_episode(
+    arrays: EpisodeArrays, name: str, scene: str, info: Mapping[str, Any] | None = None
+) -> bytes:
+    """Encode an episode as one record; the same input gives the same bytes.
+
+    Args:
+        arrays: what was recorded.
+        name: name of the episode.
+        scene: name of the scene.
+        info: JSON values to keep in the header.
+
+    Raises:
+        UserError: arrays whose shapes or dtypes do not fit together.
+    """
+    _check_arrays(arrays, name)
+    frames, height, width = arrays.depth_THW.shape
+    streams: dict[str, list[bytes]] = {
+        "rgb": [_png(image[..., ::-1]) for image in arrays.rgb_THWC],
+        "depth": [_png(image) for image in to_millimetres(arrays.depth_THW)],
+    }
+    if arrays.ids_THW is not None:
+        streams["ids"] = [_png((image + 1).astype(np.uint16)) for image in arrays.ids_THW]
+    small = {
+        "intrinsics": np.asarray(arrays.intrinsics_4, "<f4"),
+        "world_from_camera": np.asarray(arrays.world_from_camera, "<f4"),
+        "actions": None if arrays.actions is None else np.asarray(arrays.actions, "<f4"),
+        "action_ids": None if arrays.action_ids is None else np.asarray(arrays.action_ids, "<i4"),
+    }
+    header: dict[str, Any] = {
+        "format": "pewm-episode",
+        "version": VERSION,
+        "name": name,
+        "scene": scene,
+        "frames": frames,
+        "height": height,
+        "width": width,
+        "units": UNITS,
+        "conventions": CONVENTIONS,
+        "info": dict(info or {}),
+        "arrays": {},
+        "streams": {},
+    }
+    return _pack(header, {k: v for k, v in small.items() if v is not None}, streams)
+
+
+def to_millimetres(depth: np.ndarray) -> np.ndarray:
+    """Return metres as uint16 millimetres, rounded; beyond 65.535 m or not finite becomes 0."""
+    millimetres = np.rint(np.asarray(depth, np.float64) * MILLIMETRES)
+    with np.errstate(invalid="ignore"):
+        kept = (millimetres > 0) & (millimetres <= DEPTH_LIMIT_M * MILLIMETRES)
+    return np.where(kept, millimetres, 0).astype(np.uint16)
+
+
+def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
+    """Parse the header of a record; spans become offsets from the start of the record.
+
+    Raises:
+        UserError: not an episode, another format version, or a header that does not parse.
+    """
+    if len(record) < len(MAGIC) + 4 or record[: len(MAGIC)] != MAGIC:
+        raise UserError(
+            f"{where} is not a pewm episode (its first bytes differ); read a file made by "
+            "`python -m pewm_jax.data collect` or `import`."
+        )
+    (length,) = struct.unpack_from("<I", record, len(MAGIC))
+    start = len(MAGIC) + 4
+    try:
+        header = json.loads(record[start : start + length])
+        version = header["version"]
+    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError):
+        raise UserError(
+            f"{where}: the episode's header does not parse; the record is damaged, collect or "
+            "import it again."
+        ) from None
+    if version != VERSION:
+        raise UserError(
+            f"{where} has format version {version}, this library reads version {VERSION}; "
+            "collect or import it again."
+        )
+    return _absolute(header, start + length)
+
+
+def read_episode(record: bytes, where: str = "record") -> Episode:
+    """Open a record; nothing but the small arrays is decoded.
+
+    Args:
+        record: the bytes of ``write_episode``.
+        where: name of the place in error messages.
+
+    Raises:
+        UserError: damaged, of another version, or with counts that do not match.
+    """
+    header = read_header(record, where)
+    frames = header["frames"]
+    expected = {
+        "intrinsics": (4,),
+        "world_from_camera": (frames, 4, 4),
+        "actions": (frames - 1, 3),
+        "action_ids": (frames - 1,),
+    }
+    arrays: dict[str, np.ndarray | None] = dict.fromkeys(expected)
+    for field, place in header["arrays"].items():
+        if tuple(place["shape"]) != expected.get(field):
+            raise UserError(
+                f"{where}, field {field}: shape {tuple(place['shape'])} for {frames} frames, "
+                f"expected {expected.get(field)}; the counts do not match, write it again."
+            )
+        count = int(np.prod(place["shape"]))
+        _check_span(record, place["offset"], count * 4, where, field)
+        flat = np.frombuffer(record, place["dtype"], count, place["offset"])
+        arrays[field] = flat.reshape(place["shape"]).copy()
+    for stream in ("rgb", "depth", *header["streams"]):
+        spans = header["streams"].get(stream, {"spans": []})["spans"]
+        if len(spans) != frames:
+            raise UserError(
+                f"{where}, field {stream}: {len(spans)} images for {frames} frames; the counts do "
+                "not match, write it again."
+            )
+        if spans:
+            _check_span(record, *spans[-1], where, stream)
+    intrinsics, pose = arrays["intrinsics"], arrays["world_from_camera"]
+    if intrinsics is None or pose is None:
+        raise UserError(f"{where} lacks intrinsics or world_from_camera; write it again.")
+    return Episode(
+        name=header["name"],
+        scene=header["scene"],
+        length=frames,
+        height=header["height"],
+        width=header["width"],
+        intrinsics_4=intrinsics,
+        world_from_camera=pose,
+        actions=arrays["actions"],
+        action_ids=arrays["action_ids"],
+        info=header["info"],
+        header=header,
+        record=record,
+    )
+
+
+def _png(image: np.ndarray) -> bytes:
+    done, code = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
+    assert done
+    return code.tobytes()
+
+
+def _pack(
+    header: dict[str, Any], arrays: Mapping[str, np.ndarray], streams: Mapping[str, list[bytes]]
+) -> bytes:
+    """Lay out arrays, then images, and describe them with offsets from the end of the header."""
+    blobs: list[bytes] = []
+    offset = 0
+    for field, array in arrays.items():
+        header["arrays"][field] = {
+            "offset": offset,
+            "dtype": array.dtype.str,
+            "shape": list(array.shape),
+        }
+        blobs.append(array.tobytes())
+        offset += array.nbytes
+    for stream, images in streams.items():
+        spans = []
+        for image in images:
+            spans.append([offset, len(image)])
+            blobs.append(image)
+            offset += len(image)
+        header["streams"][stream] = {"codec": "png", "spans": spans}
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    return b"".join([MAGIC, struct.pack("<I", len(text)), text, *blobs])
+
+
+def _absolute(header: dict[str, Any], payload: int) -> dict[str, Any]:
+    for place in header["arrays"].values():
+        place["offset"] += payload
+    for stream in header["streams"].values():
+        stream["spans"] = [(offset + payload, size) for offset, size in stream["spans"]]
+    return header
+
+
+def _check_span(record: bytes, offset: int, size: int, where: str, field: str) -> None:
+    if offset + size > len(record):
+        raise UserError(
+            f"{where}, field {field}: the record ends after {len(record)} bytes but the field "
+            f"reaches to {offset + size}; it is truncated, collect or import it again."
+        )
+
+
+def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
+    """Refuse arrays that do not fit together."""
+    rgb, depth = arrays.rgb_THWC, arrays.depth_THW
+    if depth.ndim != 3 or len(depth) == 0:
+        raise UserError(f"episode {name}: depth has shape {depth.shape}, expected (T, H, W).")
+    frames = len(depth)
+    expected = {
+        "rgb": (rgb, (*depth.shape, 3)),
+        "intrinsics": (arrays.intrinsics_4, (4,)),
+        "world_from_camera": (arrays.world_from_camera, (frames, 4, 4)),
+        "actions": (arrays.actions, (frames - 1, 3)),
+        "action_ids": (arrays.action_ids, (frames - 1,)),
+        "ids": (arrays.ids_THW, depth.shape),
+    }
+    for field, (array, shape) in expected.items():
+        if array is not None and np.shape(array) != shape:
+            raise UserError(
+                f"episode {name}, field {field}: shape {np.shape(array)} for {frames} frames of "
+                f"depth, expected {shape}; the counts do not match."
+            )
+    if rgb.dtype != np.uint8:
+        raise UserError(f"episode {name}, field rgb: dtype {rgb.dtype}, expected uint8 in 0…255.")

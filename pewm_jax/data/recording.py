@@ -1,0 +1,200 @@
+"""One episode from settings and an index: scene, walk, pictures, bytes.
+
+Every episode is a pure function of the settings and its index, whatever process makes it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from pewm_jax.config import ActionConfig, ConfigError
+from pewm_jax.data.episodes import EpisodeArrays, write_episode
+from pewm_jax.data.navigation import NavGrid, navigable
+from pewm_jax.data.render import render
+from pewm_jax.data.scenes import Scene, house, load_scene
+from pewm_jax.data.trajectories import Policy, make_trajectory
+from pewm_jax.geometry.cameras import intrinsics_from_fov
+from pewm_jax.types import Camera
+
+SPLITS = ("train", "validation", "revisit")
+"""Folders written; ``revisit`` holds the test scenes, walked out and back."""
+HOUSES_PER_SEED = 1_000_000
+HEADROOM_M = 0.1
+"""Free room above the camera where the agent may stand, metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CollectConfig:
+    """Walk an agent through houses and write what it sees as episodes."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder to write; gets train/, validation/ and revisit/."""
+    train: int = 320
+    """Episodes to train on."""
+    validation: int = 8
+    """Episodes to watch training with."""
+    test: int = 24
+    """Revisit episodes (out and back over the same places) in test scenes, in revisit/."""
+    frames: int = 96
+    """Frames of an episode."""
+    size: int = 64
+    """Width and height of the images, pixels."""
+    hfov: float = 90.0
+    """Horizontal field of view, degrees."""
+    camera_height: float = 1.25
+    """Height of the camera above the floor, metres."""
+    step_m: float = 0.25
+    """Length of a forward step, metres (continuous actions: the largest)."""
+    turn_deg: float = 30.0
+    """Angle of a turn, degrees (continuous actions: the largest)."""
+    turn_around: float = 0.5
+    """Probability of a full turn at the start of an episode; revisit episodes always have it."""
+    policy: Literal["follow", "walk"] = "follow"
+    """`follow`: shortest paths between far goals. `walk`: straight on until something is there."""
+    continuous: bool = False
+    """Small continuous (dx, dy, dyaw) actions instead of forward / turn left / turn right."""
+    ids: bool = False
+    """Also write instance ids."""
+    episodes_per_house: int = 1
+    """Episodes recorded in one house before the next is made."""
+    scene: tuple[Path, ...] = ()
+    """Meshes to walk in instead of made houses (GLB, OBJ, PLY); several are shared out over the
+    splits, a single one serves all of them."""
+    up: Literal["auto", "y", "z"] = "auto"
+    """Which axis of the meshes points up; `auto`: y for GLB and glTF, z for the others."""
+    seed: int = 0
+    """Seed of houses and trajectories."""
+    workers: int = 0
+    """Processes; 0 = as many as there are CPU cores. The result does not depend on it."""
+    shard_episodes: int = 8
+    """Episodes per file."""
+    overwrite: bool = False
+    """Replace a dataset that was made with other settings."""
+
+    def __post_init__(self):
+        """Validate."""
+        ActionConfig(self.step_m, self.turn_deg)
+        positive = ("frames", "size", "shard_episodes", "episodes_per_house", "camera_height")
+        for name in positive:
+            if getattr(self, name) <= 0:
+                raise ConfigError(f"--{dashed(name)} is {getattr(self, name)}: use 1 or more.")
+        for name in ("train", "validation", "test", "workers", "seed"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"--{name} is {getattr(self, name)}: use 0 or more.")
+        if max(self.train, self.validation, self.test) > HOUSES_PER_SEED:
+            raise ConfigError(f"a split can hold at most {HOUSES_PER_SEED} episodes.")
+        if self.train + self.validation + self.test == 0:
+            raise ConfigError("--train, --validation and --test are all 0: nothing to collect.")
+        if not 0 <= self.turn_around <= 1:
+            raise ConfigError(f"--turn-around is {self.turn_around}: use a probability, 0 to 1.")
+        if not 1 <= self.hfov < 180:
+            raise ConfigError(f"--hfov is {self.hfov}: use 1 up to below 180 degrees.")
+        if self.frames < 2:
+            raise ConfigError("--frames is 1: an episode needs at least 2 frames.")
+
+    @property
+    def actions(self) -> ActionConfig:
+        """What one action does."""
+        return ActionConfig(self.step_m, self.turn_deg)
+
+    def episodes(self, split: str) -> int:
+        """Episodes of a split."""
+        return {"train": self.train, "validation": self.validation, "revisit": self.test}[split]
+
+
+def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
+    """Return what determines the bytes of a split, as plain values."""
+    settings = dataclasses.asdict(config)
+    for name in ("out", "train", "validation", "test", "workers", "overwrite"):
+        del settings[name]
+    settings["scene"] = [f"{p.name} ({p.stat().st_size} bytes)" for p in config.scene]
+    return {"made_by": "collect", "episodes": config.episodes(split), **settings}
+
+
+def house_seed(config: CollectConfig, split: str, index: int) -> int:
+    """Return the seed of an episode's house; no seed serves two splits, whatever the settings."""
+    number = config.seed * HOUSES_PER_SEED + index // config.episodes_per_house
+    return number * len(SPLITS) + SPLITS.index(split)
+
+
+def scenes_of(config: CollectConfig, split: str) -> tuple[Path, ...]:
+    """Return the meshes of a split: disjoint between splits where there are enough of them."""
+    scenes = config.scene
+    used = [name for name in SPLITS if config.episodes(name)]
+    if len(scenes) < len(used):
+        return scenes
+    order = np.random.default_rng(config.seed).permutation(len(scenes))
+    # One mesh for every small split, the others to the first (largest) one.
+    position = used.index(split)
+    chosen = order[: len(scenes) - len(used) + 1] if position == 0 else [order[-position]]
+    return tuple(scenes[i] for i in sorted(chosen))
+
+
+def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
+    """Make one episode: scene, walk, pictures, bytes.
+
+    Raises:
+        UserError: a mesh that does not load or has no floor to stand on.
+    """
+    if config.scene:
+        scenes = scenes_of(config, split)
+        scene, grid = _mesh(scenes[index % len(scenes)], config.up, config.camera_height)
+    else:
+        scene, grid = _house(house_seed(config, split, index), config.camera_height)
+    policy: Policy = "revisit" if split == "revisit" else config.policy
+    walk = make_trajectory(
+        grid,
+        config.actions,
+        config.frames,
+        np.random.default_rng([config.seed, SPLITS.index(split), index]),
+        policy,
+        config.turn_around,
+        config.continuous,
+    )
+    intrinsics = intrinsics_from_fov(config.size, config.size, config.hfov)
+    pose = walk.world_from_camera(grid.floor_z + config.camera_height)
+    seen = render(scene, Camera(intrinsics, pose), config.size, config.size)
+    arrays = EpisodeArrays(
+        rgb_THWC=seen.rgb_THWC,
+        depth_THW=seen.depth_THW,
+        intrinsics_4=intrinsics,
+        world_from_camera=pose,
+        actions=walk.actions,
+        action_ids=walk.action_ids,
+        ids_THW=seen.ids_THW if config.ids else None,
+    )
+    info: dict[str, Any] = {
+        "policy": policy,
+        "camera_height_m": config.camera_height,
+        "floor_z_m": round(float(grid.floor_z), 6),
+        "step_m": config.step_m,
+        "turn_deg": config.turn_deg,
+    }
+    if walk.return_frame is not None:
+        info["return_frame"] = walk.return_frame
+    return write_episode(arrays, f"{split}-{index:06d}", scene.name, info)
+
+
+@functools.lru_cache(maxsize=1)
+def _house(seed: int, camera_height: float) -> tuple[Scene, NavGrid]:
+    scene = house(seed)
+    return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
+
+
+@functools.lru_cache(maxsize=2)
+def _mesh(
+    path: Path, up: Literal["auto", "y", "z"], camera_height: float
+) -> tuple[Scene, NavGrid]:
+    scene = load_scene(path, up)
+    return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
+
+
+def dashed(name: str) -> str:
+    """Return a setting's name as it is written on the command line."""
+    return name.replace("_", "-")

@@ -1,0 +1,304 @@
+"""How the agent walks: policies over a navigation grid, in discrete or continuous actions.
+
+A trajectory is a list of planar poses (x, y, yaw), one per frame, and the actions between them.
+No policy ever moves through a wall: a forward move is made only where the whole segment is free.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+import numpy as np
+
+from pewm_jax.config import ActionConfig, UserError
+from pewm_jax.data.navigation import NavGrid, clearance, distance_field, is_free, sample_free
+from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT
+from pewm_jax.geometry.cameras import pose_from_yaw
+
+Policy = Literal["follow", "walk", "revisit"]
+TURN_COST_M = 0.02
+"""A turn must bring the goal this much nearer, metres: keeps the agent from zigzagging."""
+CLEARANCE_M = 0.45
+"""The agent prefers to stay this far from walls and furniture."""
+GOALS_TRIED = 24
+"""Free cells drawn as candidates of the next goal; one of the farther half is taken."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """Where the agent was and what it did.
+
+    Attributes:
+        pose_T3: (T, 3) float64 x, y, yaw in the world, metres and radians.
+        actions: (T − 1, 3) float64 dx, dy, dyaw.
+        action_ids: (T − 1,) int32, or None for continuous actions.
+        return_frame: the frame at which a revisit trajectory turns back, or None.
+    """
+
+    pose_T3: np.ndarray
+    actions: np.ndarray
+    action_ids: np.ndarray | None
+    return_frame: int | None = None
+
+    def world_from_camera(self, camera_z: float) -> np.ndarray:
+        """Return (T, 4, 4) float32 level cameras at this height."""
+        return np.stack(
+            [pose_from_yaw(np.array([x, y, camera_z]), yaw) for x, y, yaw in self.pose_T3]
+        )
+
+
+def advance(pose_3: np.ndarray, action_3: np.ndarray) -> np.ndarray:
+    """Return the planar pose after one action: first move, then turn."""
+    x, y, yaw = pose_3
+    c, s = math.cos(yaw), math.sin(yaw)
+    dx, dy, turn = action_3
+    return np.array([x + c * dx - s * dy, y + s * dx + c * dy, yaw + turn])
+
+
+def action_to(pose_3: np.ndarray, after_3: np.ndarray) -> np.ndarray:
+    """Return the action that leads from one planar pose to another."""
+    c, s = math.cos(pose_3[2]), math.sin(pose_3[2])
+    dx, dy = after_3[:2] - pose_3[:2]
+    turn = (after_3[2] - pose_3[2] + math.pi) % (2 * math.pi) - math.pi
+    return np.array([c * dx + s * dy, -s * dx + c * dy, turn])
+
+
+class _Agent:
+    """An agent in a grid that records what it does, up to a number of frames."""
+
+    def __init__(
+        self,
+        grid: NavGrid,
+        actions: ActionConfig,
+        frames: int,
+        rng: np.random.Generator,
+        continuous: bool,
+    ):
+        self.grid, self.config, self.frames, self.rng = grid, actions, frames, rng
+        self.continuous = continuous
+        self.turn = math.radians(actions.turn_deg)
+        self.table = np.array([[actions.step_m, 0, 0], [0, 0, self.turn], [0, 0, -self.turn]])
+        self.clearance_m = clearance(grid)
+        start = sample_free(grid, rng, 1)[0]
+        self.poses = [np.array([start[0], start[1], rng.uniform(-math.pi, math.pi)])]
+        self.actions: list[np.ndarray] = []
+        self.ids: list[int] = []
+
+    @property
+    def pose(self) -> np.ndarray:
+        return self.poses[-1]
+
+    @property
+    def done(self) -> bool:
+        return len(self.poses) >= self.frames
+
+    def record(self, action_3: np.ndarray, action_id: int = -1) -> None:
+        """Carry out an action, unless the trajectory is complete."""
+        if not self.done:
+            self.poses.append(advance(self.pose, action_3))
+            self.actions.append(np.asarray(action_3, np.float64))
+            self.ids.append(action_id)
+
+    def act(self, action_id: int) -> None:
+        self.record(self.table[action_id], action_id)
+
+    def clear(self, target_xy: np.ndarray) -> bool:
+        """Whether the straight way to a point is free."""
+        start = self.pose[:2]
+        count = 2 + int(np.linalg.norm(target_xy - start) / (0.5 * self.grid.cell_m))
+        way = start + np.linspace(0, 1, count)[:, None] * (target_xy - start)
+        return bool(np.all(is_free(self.grid, way)))
+
+    def ahead(self, yaw: float, length_m: float | None = None) -> np.ndarray:
+        length = self.config.step_m if length_m is None else length_m
+        return self.pose[:2] + length * np.array([math.cos(yaw), math.sin(yaw)])
+
+    def turn_around(self) -> None:
+        """Look about: a full circle."""
+        side = TURN_LEFT if self.rng.random() < 0.5 else TURN_RIGHT
+        for _ in range(round(2 * math.pi / self.turn)):
+            self.act(side)
+
+    def trajectory(self, return_frame: int | None = None) -> Trajectory:
+        ids = None if self.continuous else np.array(self.ids, np.int32)
+        actions = np.array(self.actions, np.float64).reshape(-1, 3)
+        return Trajectory(np.stack(self.poses), actions, ids, return_frame)
+
+
+def make_trajectory(
+    grid: NavGrid,
+    actions: ActionConfig,
+    frames: int,
+    rng: np.random.Generator,
+    policy: Policy = "follow",
+    turn_around: float = 0.5,
+    continuous: bool = False,
+) -> Trajectory:
+    """Walk through a scene.
+
+    Args:
+        grid: where the agent can stand.
+        actions: step length and turning angle (upper bounds for continuous actions).
+        frames: number of frames T; T − 1 actions are made.
+        rng: everything random comes from here.
+        policy: ``follow`` walks shortest paths between far goals, ``walk`` goes straight until
+            something is in the way, ``revisit`` looks around, goes out to a far goal and comes
+            back over the very same places.
+        turn_around: probability of a full turn at the start (``revisit`` always makes it).
+        continuous: small (dx, dy, dyaw) instead of the three discrete actions.
+
+    Raises:
+        UserError: too few frames for the policy, or angles that cannot make a half turn.
+    """
+    agent = _Agent(grid, actions, frames, rng, continuous)
+    if policy == "revisit":
+        return _revisit(agent)
+    if rng.random() < turn_around:
+        agent.turn_around()
+    if policy == "walk":
+        _walk(agent)
+    else:
+        _follow(agent)
+    return agent.trajectory()
+
+
+def _half_turn(config: ActionConfig) -> int:
+    turns = 180 / config.turn_deg
+    if abs(turns - round(turns)) > 1e-6:
+        raise UserError(
+            f"turn_deg is {config.turn_deg}: a revisit trajectory turns back by 180 degrees, so "
+            "use an angle that divides 180, such as 30, or make no revisit episodes."
+        )
+    return round(turns)
+
+
+def _revisit(agent: _Agent) -> Trajectory:
+    """Look around, go out, turn back, and retrace the way with the opposite heading."""
+    total = agent.frames
+    half = _half_turn(agent.config)
+    out = (total - 1 - 3 * half) // 2
+    if out < 4:
+        raise UserError(
+            f"{total} frames are too few for a revisit episode with turns of "
+            f"{agent.config.turn_deg} degrees; use at least {3 * half + 9}."
+        )
+    agent.turn_around()
+    begin = len(agent.poses) - 1
+    agent.frames = begin + 1 + out
+    _follow(agent)
+    agent.frames = total
+    way = agent.poses[begin:]
+    ids = agent.ids[begin:]
+    return_frame = len(agent.poses) - 1
+    side = TURN_LEFT if agent.rng.random() < 0.5 else TURN_RIGHT
+    for _ in range(half):
+        agent.act(side)
+    opposite = {FORWARD: FORWARD, TURN_LEFT: TURN_RIGHT, TURN_RIGHT: TURN_LEFT, -1: -1}
+    for place, action_id in zip(reversed(way[:-1]), reversed(ids), strict=True):
+        if action_id >= 0:
+            agent.act(opposite[action_id])
+        else:
+            agent.record(action_to(agent.pose, place + np.array([0, 0, math.pi])))
+    while not agent.done:
+        agent.act(side)
+    return agent.trajectory(return_frame)
+
+
+def _follow(agent: _Agent) -> None:
+    """Walk shortest paths to far goals, one after the other."""
+    while not agent.done:
+        field = _next_goal(agent)
+        stalled, best = 0, _value(agent, field, agent.pose[None, :2])[0]
+        while not agent.done and stalled < 3:
+            if agent.continuous:
+                _drift(agent, _best_heading(agent, field)[0])
+            else:
+                heading, turns = _best_heading(agent, field)
+                for _ in range(abs(turns)):
+                    agent.act(TURN_LEFT if turns > 0 else TURN_RIGHT)
+                if agent.clear(agent.ahead(heading)):
+                    agent.act(FORWARD)
+            value = _value(agent, field, agent.pose[None, :2])[0]
+            stalled = 0 if value < best - 0.2 * agent.config.step_m else stalled + 1
+            best = min(best, value)
+            if _distance(agent.grid, field, agent.pose[None, :2])[0] < 2 * agent.config.step_m:
+                break
+        if stalled >= 3 and not agent.done:  # a corner the steps do not fit: leave it
+            _walk(agent, steps=4)
+
+
+def _next_goal(agent: _Agent) -> np.ndarray:
+    """Draw a far goal, and return the field of distances to it."""
+    here = distance_field(agent.grid, agent.pose[:2])
+    candidates = sample_free(agent.grid, agent.rng, GOALS_TRIED)
+    distance = _distance(agent.grid, here, candidates)
+    distance = np.where(np.isfinite(distance), distance, -1.0)
+    far = np.argsort(distance, kind="stable")[GOALS_TRIED // 2 :]
+    return distance_field(agent.grid, candidates[agent.rng.choice(far)])
+
+
+def _distance(grid: NavGrid, field_YX: np.ndarray, xy_N2: np.ndarray) -> np.ndarray:
+    """Look a field up at points; outside the grid it is infinite."""
+    cell = np.floor((xy_N2 - np.asarray(grid.origin_xy)) / grid.cell_m).astype(int)
+    height, width = field_YX.shape
+    inside = (cell >= 0).all(-1) & (cell[:, 0] < width) & (cell[:, 1] < height)
+    cell = np.where(inside[:, None], cell, 0)
+    return np.where(inside, field_YX[cell[:, 1], cell[:, 0]], np.inf)
+
+
+def _value(agent: _Agent, field_YX: np.ndarray, xy_N2: np.ndarray) -> np.ndarray:
+    """Distance to the goal, plus a dislike of walls."""
+    near = np.maximum(0, CLEARANCE_M - _distance(agent.grid, agent.clearance_m, xy_N2))
+    return _distance(agent.grid, field_YX, xy_N2) + 0.3 * np.where(np.isfinite(near), near, 0)
+
+
+def _best_heading(agent: _Agent, field_YX: np.ndarray) -> tuple[float, int]:
+    """Return the heading whose next step is best, and how many turns it takes (left > 0)."""
+    count = max(2, round(2 * math.pi / agent.turn))
+    turns = np.arange(count) - count // 2
+    turns = turns[np.argsort(np.abs(turns), kind="stable")]
+    # Look one step and three steps ahead: grid distances are too coarse for one step alone.
+    value = np.full(count, np.inf)
+    for i, turn in enumerate(turns):
+        yaw = agent.pose[2] + turn * agent.turn
+        if agent.clear(agent.ahead(yaw)):
+            near = _value(agent, field_YX, agent.ahead(yaw)[None])[0]
+            far_point = agent.ahead(yaw, 3 * agent.config.step_m)
+            if agent.clear(far_point):
+                far = _value(agent, field_YX, far_point[None])[0]
+                near = min(near, far + 2 * agent.config.step_m)
+            value[i] = near + TURN_COST_M * abs(turn)
+    best = int(np.argmin(value))
+    return float(agent.pose[2] + turns[best] * agent.turn), int(turns[best])
+
+
+def _drift(agent: _Agent, heading: float) -> None:
+    """Make one continuous action towards a heading: bounded turn, slower in curves."""
+    config, rng = agent.config, agent.rng
+    error = (heading - agent.pose[2] + math.pi) % (2 * math.pi) - math.pi
+    turn = float(np.clip(error, -agent.turn, agent.turn)) * rng.uniform(0.5, 1.0)
+    speed = config.step_m * rng.uniform(0.5, 1.0) * max(0.0, math.cos(error))
+    side = 0.1 * config.step_m * rng.uniform(-1.0, 1.0)
+    after = advance(agent.pose, np.array([speed, side, turn]))
+    if agent.clear(after[:2]):
+        agent.record(np.array([speed, side, turn]))
+    else:
+        agent.record(np.array([0.0, 0.0, turn if turn else agent.turn]))
+
+
+def _walk(agent: _Agent, steps: int | None = None) -> None:
+    """Go straight; at an obstacle, or now and then, turn to a free heading."""
+    left = agent.frames if steps is None else steps
+    while not agent.done and left > 0:
+        left -= 1
+        if agent.clear(agent.ahead(agent.pose[2])) and agent.rng.random() > 0.05:
+            if agent.continuous:
+                _drift(agent, agent.pose[2])
+            else:
+                agent.act(FORWARD)
+            continue
+        side = TURN_LEFT if agent.rng.random() < 0.5 else TURN_RIGHT
+        for _ in range(int(agent.rng.integers(1, 2 + round(math.pi / agent.turn)))):
+            agent.act(side)
