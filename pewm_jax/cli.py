@@ -1,0 +1,200 @@
+"""Command lines: settings from a preset, a JSON file and flags; errors in one sentence."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import tyro
+
+from pewm_jax import config as configuration
+from pewm_jax.config import ConfigError, UserError
+
+T = TypeVar("T")
+_FRAME = "─│╭╮╰╯"
+
+
+def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:
+    """Run a command and turn what goes wrong into an exit code and one sentence on stderr.
+
+    Args:
+        main: the command; takes the arguments and returns an exit code (None is 0).
+        argv: the arguments, by default those of the process.
+
+    Returns:
+        0, or 2 for bad input, or 130 (or an ``exit_code`` the error carries) for an interruption.
+    """
+    try:
+        return main(sys.argv[1:] if argv is None else argv) or 0
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as error:
+        print(str(error) or "Interrupted.", file=sys.stderr)
+        return getattr(error, "exit_code", 130)
+
+
+def parse(
+    kind: type[T],
+    argv: Sequence[str],
+    *,
+    default: T,
+    prog: str,
+    description: str | None = None,
+) -> T:
+    """Read a configuration from flags such as ``--train.stage1.steps 10``.
+
+    ``--config FILE`` lays a JSON file of settings over the default first. ``--help`` prints every
+    field with its docstring and leaves.
+
+    Args:
+        kind: the frozen dataclass to read.
+        argv: the arguments.
+        default: what is not given.
+        prog: the command, for the help text.
+        description: the first paragraph of the help text.
+
+    Raises:
+        ConfigError: an unknown flag (with the nearest known one), or a value that is refused.
+    """
+    file, flags = _take_config_file(argv, kind)
+    if file is not None:
+        default = overlay(default, file)
+    _refuse_unknown(flags, kind, prog)
+    if "-h" in flags or "--help" in flags:
+        return tyro.cli(
+            kind,
+            args=["--help"],
+            default=default,
+            prog=prog,
+            description=description,
+            use_underscores=True,
+        )
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
+            return tyro.cli(kind, args=flags, default=default, prog=prog, use_underscores=True)
+    except SystemExit:
+        raise ConfigError(_sentence(told.getvalue(), prog)) from None
+
+
+def overlay(default: T, path: Path) -> T:
+    """Lay the settings in a JSON file, nested like the configuration, over a default.
+
+    Raises:
+        ConfigError: the file is absent, not JSON, or holds settings that do not exist or fit.
+    """
+    try:
+        values = json.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"--config {path} cannot be read ({error.strerror}).") from None
+    except ValueError as error:
+        raise ConfigError(f"--config {path} is not valid JSON ({error}).") from None
+    if not isinstance(values, dict):
+        raise ConfigError(
+            f'--config {path} must hold a table such as {{"train": {{"seed": 1}}}}, not '
+            f"a {type(values).__name__}."
+        )
+    merged = _deep_merge(configuration.to_dict(default), values)
+    return configuration.from_dict(type(default), merged, path.name)
+
+
+def choose(name: str, known: Sequence[str], what: str) -> str:
+    """Return ``name`` if it is known.
+
+    Raises:
+        ConfigError: it is not; the message names the nearest and all others.
+    """
+    if name in known:
+        return name
+    raise ConfigError(
+        f"There is no {what} {name!r}{_nearest(name, known)}; there is {', '.join(known)}."
+    )
+
+
+def _take_config_file(argv: Sequence[str], kind: type) -> tuple[Path | None, list[str]]:
+    """Take ``--config FILE`` out of the arguments, unless the dataclass has such a field."""
+    flags = list(argv)
+    if "--config" in dict(_flags(kind)):
+        return None, flags
+    for index, flag in enumerate(flags):
+        if flag.startswith("--config="):
+            return Path(flag.removeprefix("--config=")), flags[:index] + flags[index + 1 :]
+        if flag == "--config":
+            if index + 1 == len(flags):
+                raise ConfigError("--config needs the name of a JSON file of settings.")
+            return Path(flags[index + 1]), flags[:index] + flags[index + 2 :]
+    return None, flags
+
+
+def _refuse_unknown(flags: Sequence[str], kind: type, prog: str) -> None:
+    known = [name for name, _ in _flags(kind)] + ["--help"]
+    for flag in flags:
+        if not flag.startswith("--"):
+            continue
+        name = flag.split("=")[0].replace("-", "_").replace("__", "--", 1)
+        spellings = (name, _negated(name))
+        if not any(spelling in known for spelling in spellings):
+            raise ConfigError(
+                f"{flag.split('=')[0]} is not a setting{_nearest(name, known)}; "
+                f"`python {prog} --help` lists them all."
+            )
+
+
+def _negated(name: str) -> str:
+    """Return the flag that ``--a.no_b`` negates."""
+    head, dot, last = name[2:].rpartition(".")
+    return f"--{head}{dot}{last.removeprefix('no_')}"
+
+
+def _flags(kind: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
+    """List a dataclass's flags with their fields, sections included."""
+    defaults = {f.name: f for f in dataclasses.fields(kind)}
+    for name, field in defaults.items():
+        if dataclasses.is_dataclass(field.default):
+            yield from _flags(field.default, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", field
+
+
+def _nearest(name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, known, 1, 0.5)
+    if not close:
+        last = name.rsplit(".", 1)[-1].lstrip("-")
+        close = [flag for flag in known if flag.rsplit(".", 1)[-1].lstrip("-") == last][:1]
+    return f": did you mean {close[0]}?" if close else ""
+
+
+def _sentence(box: str, prog: str) -> str:
+    """Take the message out of the frame that the parser draws around it."""
+    lines = []
+    for line in box.splitlines()[1:]:
+        words = line.strip(_FRAME + " ")
+        if not words and lines:
+            break
+        if words:
+            lines.append(words)
+    text = " ".join(lines).strip()
+    if text.startswith("Error parsing "):
+        where, _, text_rest = text.removeprefix("Error parsing ").partition(": ")
+        text = f"{where}: {text_rest}" if where.startswith("--") else text_rest
+    end = "" if text.endswith((".", "!", "?")) else "."
+    return text + end if text else f"The settings cannot be read; see `python {prog} --help`."
+
+
+def _deep_merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for name, value in over.items():
+        below = merged.get(name)
+        if isinstance(value, dict) and isinstance(below, dict):
+            merged[name] = _deep_merge(below, value)
+        else:
+            merged[name] = value
+    return merged

@@ -1,0 +1,6 @@
+"""Chapter 7: how it learns.
+
+Read in this order: ``stages`` (what trains when), ``optimizer``, ``state``, ``sharding``,
+``step`` (one pure function), ``checkpoint``, ``log``, ``loop`` (the only part with side effects
+and a clock).
+"""

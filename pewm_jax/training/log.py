@@ -1,0 +1,176 @@
+"""What a training tells: a line of JSON and a TensorBoard event per logged step, and a live view.
+
+On a terminal the live view is a progress bar, elsewhere a line every ten seconds.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+import types
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Self
+
+import tensorboardX
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+LINE_EVERY_S = 10.0
+"""Seconds between lines of the live view where the output is not a terminal."""
+
+
+class MetricsLog:
+    """Appends scalars to ``metrics.jsonl`` and to TensorBoard; a context manager.
+
+    What a run logged beyond the step it is resumed from is dropped, so that every step stands
+    there once.
+
+    Args:
+        run: the run's folder.
+        stage: number of the stage about to be trained.
+        step: steps of it that are done.
+    """
+
+    def __init__(self, run: Path, stage: int, step: int):
+        self._stage = stage
+        path = run / "metrics.jsonl"
+        drop_after(path, stage, step)
+        self._file = path.open("a")
+        self._events = tensorboardX.SummaryWriter(
+            str(run / "tensorboard" / f"stage{stage}"), purge_step=step + 1 if step else None
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: types.TracebackType | None,
+    ) -> None:
+        self._file.close()
+        self._events.close()
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Log the scalars of one step."""
+        line = {"stage": self._stage, "step": step, **metrics, "time": round(time.time(), 3)}
+        self._file.write(json.dumps(line) + "\n")
+        self._file.flush()
+        for name, value in metrics.items():
+            self._events.add_scalar(name, value, step)
+        self._events.flush()
+
+
+def drop_after(path: Path, stage: int, step: int) -> None:
+    """Drop the lines of a log that come after a step of a stage, and a half-written last line."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        try:
+            entry = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        if (entry["stage"], entry["step"]) <= (stage, step):
+            kept.append(line + "\n")
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text("".join(kept))
+    partial.replace(path)
+
+
+class Pace:
+    """Seconds per step, smoothed; time spent on other things is left out."""
+
+    def __init__(self, now: float):
+        self._last = now
+        self.step_seconds = math.nan
+
+    def pause(self, seconds: float) -> None:
+        """Leave out time in which no step was made."""
+        self._last += seconds
+
+    def tick(self, now: float) -> float:
+        """Note that a step is done; returns the smoothed seconds per step."""
+        seconds, self._last = max(now - self._last, 1e-9), now
+        known = not math.isnan(self.step_seconds)
+        self.step_seconds = 0.9 * self.step_seconds + 0.1 * seconds if known else seconds
+        return self.step_seconds
+
+
+class LiveView:
+    """Shows how far a stage is, how well it learns and how fast; a context manager.
+
+    Args:
+        label: name of the stage.
+        total: its steps.
+        done: steps done before.
+        console: where to print; standard output by default.
+    """
+
+    def __init__(self, label: str, total: int, done: int, console: Console | None = None):
+        self._console = console or Console(file=sys.stdout, soft_wrap=True, highlight=False)
+        self._label, self._total = label, total
+        self._told = time.monotonic()
+        self._bar: Progress | None = None
+        if self._console.is_terminal:
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=20),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[words]}"),
+                console=self._console,
+            )
+            self._task = self._bar.add_task(label, total=total, completed=done, words="")
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: types.TracebackType | None,
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        self._console.print(text, markup=False)
+        self._told = time.monotonic()
+
+    def update(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Show a step that is done; the last one is always shown."""
+        words = describe(metrics, (self._total - step) * metrics["step_seconds"])
+        if self._bar is not None:
+            self._bar.update(self._task, completed=step, words=words)
+        elif step == self._total or time.monotonic() - self._told >= LINE_EVERY_S:
+            self.say(f"{self._label} {step}/{self._total} {words}")
+
+
+def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
+    """Put the figures of a step into one line."""
+    return (
+        f"loss {metrics['loss']:.4f} · lr {metrics['learning_rate']:.2e} · "
+        f"grad {metrics['grad_norm']:.2f} · {duration(metrics['step_seconds'])}/step · "
+        f"{metrics['samples_per_second']:.1f} samples/s · "
+        f"{metrics['flops_per_second'] / 1e9:.1f} GFLOP/s · {duration(seconds_left)} left"
+    )
+
+
+def duration(seconds: float) -> str:
+    """Write a duration as people do: ``85 ms``, ``12.3 s``, ``4 min 05 s``, ``2 h 10 min``."""
+    if seconds < 1:
+        return f"{seconds * 1000:.0f} ms"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"

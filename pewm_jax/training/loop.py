@@ -1,0 +1,225 @@
+"""The loop: stages one after the other, resumable at any step. Everything with a clock is here.
+
+The metrics of step k − 1 are read after step k is dispatched, batches are placed ahead, and
+checkpoints are written in the background, so the devices never wait for the host.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+from jax.sharding import Mesh
+
+from pewm_jax.config import Config, StageConfig, UserError
+from pewm_jax.data import loader
+from pewm_jax.training import runs, sharding, stages
+from pewm_jax.training.checkpoint import Checkpoints
+from pewm_jax.training.feed import Feed
+from pewm_jax.training.log import LiveView, MetricsLog, Pace, duration
+from pewm_jax.training.signals import Interrupted, Stop
+from pewm_jax.training.stages import Stage
+from pewm_jax.training.state import TrainState, inference_params
+from pewm_jax.training.step import (
+    Metrics,
+    abstract_state,
+    compile_step,
+    initial_state,
+    stage_key,
+)
+from pewm_jax.types import Params
+
+Preview = Callable[[Params, int, int], Path]
+"""Called with inference weights, stage number and step; writes a picture and returns its path."""
+
+
+def train(
+    config: Config, *, preview: Preview | None = None, say: Callable[[str], None] = print
+) -> Path:
+    """Train all planned stages, going on where an earlier start of the same run stopped.
+
+    Args:
+        config: the experiment; ``config.train.run`` is the folder that is written.
+        preview: makes sample pictures every ``config.train.preview_every`` steps and at the end
+            of a stage.
+        say: prints a line.
+
+    Returns:
+        The run's folder, ready for ``pewm_jax.load``.
+
+    Raises:
+        UserError: the folder is of another configuration or in use, the data do not fit, or the
+            loss is not finite.
+        Interrupted: Ctrl-C or SIGTERM came; everything is saved.
+    """
+    planned = stages.planned(config)
+    mesh = sharding.make_mesh()
+    for stage in planned:
+        sharding.require_divisible(config, stage, mesh)
+    run = runs.prepare(config)
+    if runs.is_finished(run, config):
+        say(f"{run} is already trained: nothing to do.")
+        return run
+    with runs.alone(run), Stop() as stop:
+        start: Params | None = None
+        for stage in planned:
+            start = _train_stage(
+                config, stage, mesh, run=run, start=start, preview=preview, stop=stop
+            )
+    say(f"Trained: {run / runs.WEIGHTS}")
+    return run
+
+
+def _train_stage(
+    config: Config,
+    stage: Stage,
+    mesh: Mesh,
+    *,
+    run: Path,
+    start: Params | None,
+    preview: Preview | None,
+    stop: Stop,
+) -> Params:
+    """Train one stage, or find it done; returns its inference weights."""
+    settings = stage.settings(config)
+    like = abstract_state(config, stage, mesh)
+    with Checkpoints(run, config, stage) as checkpoints:
+        done = checkpoints.latest() or 0
+        if done >= settings.steps:
+            params = checkpoints.restore_weights(like)
+            runs.publish(run, stage, done, params)
+            return params
+        with (
+            LiveView(f"stage {stage.number}", settings.steps, done) as view,
+            MetricsLog(run, stage.number, done) as log,
+        ):
+
+            def state_to_start_from() -> TrainState:
+                if not done:
+                    return initial_state(config, stage, mesh, start)
+                view.say(f"stage {stage.number}: going on after step {done}")
+                return checkpoints.restore(like)
+
+            worker = _Worker(config, stage, mesh, stop, view, log, checkpoints, preview)
+            state = worker.run(state_to_start_from, done)
+        params = inference_params(stage, state)
+        checkpoints.wait()
+        runs.publish(run, stage, settings.steps, params)
+        return params
+
+
+@dataclasses.dataclass
+class _Worker:
+    """Turns one stage's state from its first to its last step."""
+
+    config: Config
+    stage: Stage
+    mesh: Mesh
+    stop: Stop
+    view: LiveView
+    log: MetricsLog
+    checkpoints: Checkpoints
+    preview: Preview | None
+    pace: Pace = dataclasses.field(default_factory=lambda: Pace(time.monotonic()))
+
+    @property
+    def settings(self) -> StageConfig:
+        return self.stage.settings(self.config)
+
+    def run(self, make_state: Callable[[], TrainState], done: int) -> TrainState:
+        """Do the steps after ``done``, once the first batch is there; returns the last state."""
+        config, settings = self.config, self.settings
+        batches = loader.clips(
+            config,
+            "train",
+            seed=config.train.seed + self.stage.number,
+            batch=settings.batch,
+            start_step=done,
+        )
+        key = jax.device_put(stage_key(config, self.stage), sharding.replicated(self.mesh))
+        with Feed(iter(batches), sharding.of_batch(self.mesh)) as feed:
+            clip = next(feed)
+            state = make_state()
+            step_fn = self._compile(clip)
+            self.pace = Pace(time.monotonic())
+            pending: tuple[int, Metrics] | None = None
+            for step in range(done + 1, settings.steps + 1):
+                state, metrics = step_fn(state, clip, key)
+                if pending is not None:
+                    self._report(*pending)
+                pending = (step, metrics)
+                last = step == settings.steps
+                if last or step % config.train.save_every == 0 or self.stop.number is not None:
+                    self._report(*pending)
+                    pending = None
+                    self._save(state)
+                if self.preview is not None and self._wants_preview(step):
+                    self._show(state, step)
+                if self.stop.number is not None and not last:
+                    self._leave(step)
+                if not last:
+                    clip = next(feed)
+        return state
+
+    def _compile(self, clip):
+        self.view.say(f"stage {self.stage.number}: compiling the training step …")
+        began = time.monotonic()
+        step_fn = compile_step(self.config, self.stage, self.mesh, clip)
+        took = duration(time.monotonic() - began)
+        self.view.say(f"stage {self.stage.number}: compiled the training step in {took}")
+        return step_fn
+
+    def _report(self, step: int, metrics: Metrics) -> None:
+        """Read a step's metrics, check, show and log them."""
+        values = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        if not (math.isfinite(values["loss"]) and math.isfinite(values["grad_norm"])):
+            raise UserError(self._not_finite(step, values))
+        seconds = self.pace.tick(time.monotonic())
+        values |= {
+            "step_seconds": seconds,
+            "samples_per_second": self.settings.batch / seconds,
+            "flops_per_second": self.settings.batch
+            * stages.flops_per_clip(self.config, self.stage)
+            / seconds,
+        }
+        self.view.update(step, values)
+        if step == 1 or step % self.config.train.log_every == 0 or step == self.settings.steps:
+            self.log.write(step, values)
+
+    def _not_finite(self, step: int, values: dict[str, float]) -> str:
+        saved = self.checkpoints.latest()
+        kept = f"the checkpoint of step {saved} is intact" if saved else "nothing was saved yet"
+        return (
+            f"Stage {self.stage.number} stopped at step {step}: loss {values['loss']} and gradient "
+            f"norm {values['grad_norm']} are not both finite ({kept}); train again in another "
+            f"--train.run with a lower --train.{self.stage.name}.learning_rate."
+        )
+
+    def _wants_preview(self, step: int) -> bool:
+        every = self.config.train.preview_every
+        return every > 0 and (step % every == 0 or step == self.settings.steps)
+
+    def _save(self, state: TrainState) -> None:
+        began = time.monotonic()
+        self.checkpoints.save(state)
+        self.pace.pause(time.monotonic() - began)
+
+    def _show(self, state: TrainState, step: int) -> None:
+        if self.preview is None:
+            return
+        began = time.monotonic()
+        path = self.preview(inference_params(self.stage, state), self.stage.number, step)
+        self.pace.pause(time.monotonic() - began)
+        self.view.say(f"stage {self.stage.number}: sample picture {path}")
+
+    def _leave(self, step: int) -> None:
+        self.checkpoints.wait()
+        raise Interrupted(
+            f"Stopped after step {step} of stage {self.stage.number}; everything is saved: the "
+            "same command goes on from there.",
+            self.stop.number or 0,
+        )

@@ -1,0 +1,52 @@
+"""Adam with warm-up, clipping and decoupled weight decay, for the trained leaves alone.
+
+The optimizer only ever sees the trained subtree: frozen leaves have no moments, no gradient is
+computed for them, and their norm does not enter the clipping.
+"""
+
+from __future__ import annotations
+
+import optax
+
+from pewm_jax import tree
+from pewm_jax.config import Config, StageConfig
+from pewm_jax.training.stages import Stage
+from pewm_jax.types import Params
+
+DECAYED = (
+    (r"(.*/)?kernel", True),
+    (r".*", False),
+)
+"""Which leaves weight decay pulls to zero: matrices, and not biases, scales, gates, embeddings."""
+
+
+def schedule(settings: StageConfig) -> optax.Schedule:
+    """Return the learning rate as a function of the number of steps done (0 at the first).
+
+    Linear warm-up that is already above zero at the first step and reaches the peak after
+    ``warmup`` steps, then constant or a half cosine that would reach zero one step after the last.
+    """
+    warmup = optax.linear_schedule(
+        settings.learning_rate / (settings.warmup + 1), settings.learning_rate, settings.warmup
+    )
+    if settings.decay == "constant":
+        rest = optax.constant_schedule(settings.learning_rate)
+    else:
+        rest = optax.cosine_decay_schedule(
+            settings.learning_rate, max(settings.steps - settings.warmup, 1)
+        )
+    return optax.join_schedules([warmup, rest], [settings.warmup])
+
+
+def make(config: Config, stage: Stage) -> optax.GradientTransformation:
+    """Build the optimizer of a stage; ``init`` and ``update`` take the trained subtree."""
+
+    def decayed(trained: Params) -> Params:
+        return tree.assign(DECAYED, trained, "weight-decay mask")
+
+    return optax.chain(
+        optax.clip_by_global_norm(config.train.clip_norm),
+        optax.scale_by_adam(),
+        optax.add_decayed_weights(config.train.weight_decay, mask=decayed),
+        optax.scale_by_learning_rate(schedule(stage.settings(config))),
+    )

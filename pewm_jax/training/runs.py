@@ -1,0 +1,135 @@
+"""The folder of a run: which configuration it belongs to, and who is writing to it.
+
+::
+
+    runs/demo/config.json           written first: what this run is
+              metrics.jsonl         one line per logged step
+              tensorboard/          the same for TensorBoard
+              checkpoints/stage1/   by Orbax, see ``checkpoint``
+              previews/             sample pictures
+              weights.safetensors   what inference uses, written when a stage is finished
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pewm_jax import config as configuration
+from pewm_jax import weights
+from pewm_jax.config import Config, ConfigError, UserError
+from pewm_jax.training import stages
+from pewm_jax.types import Params
+
+CONFIG = "config.json"
+WEIGHTS = "weights.safetensors"
+
+FREE = (
+    "evaluate",
+    "data.workers",
+    "diffusion.sample_steps",
+    "diffusion.guidance",
+    "train.run",
+    "train.save_every",
+    "train.keep",
+    "train.log_every",
+    "train.preview_every",
+)
+"""Settings that may change between one start of a run and the next: none alters what is learnt."""
+
+
+def identity(config: Config) -> dict[str, Any]:
+    """Return the settings that make a run what it is, flat: ``{"train.seed": 0, …}``."""
+    flat = _flatten(json.loads(json.dumps(configuration.to_dict(config))))
+    return {
+        name: value
+        for name, value in flat.items()
+        if not any(name == free or name.startswith(free + ".") for free in FREE)
+    }
+
+
+def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
+    """List the settings in which two identities differ, with both values."""
+    return [
+        f"{name} {there.get(name)} there, {here.get(name)} here"
+        for name in sorted(there.keys() | here.keys())
+        if there.get(name) != here.get(name)
+    ]
+
+
+def phrase(wrong: list[str]) -> str:
+    """Join differences for a message, the first few in full."""
+    more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
+    return "; ".join(wrong[:4]) + more
+
+
+def prepare(config: Config) -> Path:
+    """Make the run's folder, or make sure that an existing one is of this configuration.
+
+    Raises:
+        ConfigError: the folder holds training of another configuration.
+        UserError: the path is not a folder.
+    """
+    run = Path(config.train.run)
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"train.run {run} cannot be made ({error.strerror}); choose another."
+        ) from None
+    path = run / CONFIG
+    begun = (run / WEIGHTS).exists() or any(run.glob("checkpoints/*/[0-9]*"))
+    if begun:
+        wrong = differences(identity(configuration.load(path)), identity(config))
+        if wrong:
+            raise ConfigError(
+                f"{run} was trained with another configuration ({phrase(wrong)}): give this one "
+                f"its own folder with --train.run, or put the settings back, or delete {run}."
+            )
+    configuration.save(config, path)
+    return run
+
+
+def is_finished(run: Path, config: Config) -> bool:
+    """Tell whether the last planned stage has left its weights."""
+    path = run / WEIGHTS
+    if not path.exists():
+        return False
+    return weights.metadata(path).get("stage") == str(stages.planned(config)[-1].number)
+
+
+def publish(run: Path, stage: stages.Stage, step: int, params: Params) -> Path:
+    """Write the weights that ``pewm_jax.load`` reads; returns the file."""
+    path = run / WEIGHTS
+    weights.save(path, params, {"stage": str(stage.number), "step": str(step)})
+    return path
+
+
+@contextlib.contextmanager
+def alone(run: Path) -> Iterator[None]:
+    """Keep every other training out of the folder; the lock dies with the process.
+
+    Raises:
+        UserError: another process is training there.
+    """
+    with (run / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(
+                f"Another process is training in {run}: wait for it, or use another --train.run."
+            ) from None
+        yield
+
+
+def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:
+    if not isinstance(node, dict):
+        return {prefix: node}
+    out: dict[str, Any] = {}
+    for name, value in node.items():
+        out |= _flatten(value, f"{prefix}.{name}" if prefix else name)
+    return out

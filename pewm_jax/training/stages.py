@@ -1,0 +1,69 @@
+"""What is trained when: the paper's two stages as a table.
+
+Stage 1 fine-tunes the backbone, without any memory, to the domain, to camera control and to
+RGB-D. Stage 2 adds the memory blocks, which start as the identity, and trains nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pewm_jax.config import Config, ConfigError, StageConfig
+from pewm_jax.models import world_model
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One stage of training; static and hashable.
+
+    Attributes:
+        number: 1 or 2.
+        memory: whether the memory blocks exist and read the map.
+        trained: patterns over parameter paths (see ``pewm_jax.tree``); all else is frozen.
+    """
+
+    number: int
+    memory: bool
+    trained: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """``stage1`` or ``stage2``: the name of settings, folders and log entries."""
+        return f"stage{self.number}"
+
+    def settings(self, config: Config) -> StageConfig:
+        """Return this stage's settings."""
+        return getattr(config.train, self.name)
+
+
+STAGES = (
+    Stage(number=1, memory=False, trained=(r"backbone/.*",)),
+    Stage(number=2, memory=True, trained=(r"memory/.*",)),
+)
+
+
+def planned(config: Config) -> tuple[Stage, ...]:
+    """Return the stages that have steps to do, in order.
+
+    Raises:
+        ConfigError: no stage has any.
+    """
+    stages = tuple(stage for stage in STAGES if stage.settings(config).steps > 0)
+    if not stages:
+        raise ConfigError(
+            "train.stage1.steps and train.stage2.steps are both 0: nothing would be trained; "
+            "give one of them steps."
+        )
+    return stages
+
+
+def flops_per_clip(config: Config, stage: Stage) -> float:
+    """Estimate the FLOPs that one clip costs in one step of training.
+
+    The forward pass and the gradients of activations run through the whole network (2 forward
+    passes' worth), the gradients of weights only through what is trained. Rematerialisation is
+    not counted: it is a cost of the implementation and not of the model.
+    """
+    whole = world_model.flops_per_clip(config, memory=stage.memory)
+    frozen = world_model.flops_per_clip(config, memory=False) if stage.memory else 0.0
+    return 2 * whole + (whole - frozen)

@@ -1,0 +1,81 @@
+"""All that changes during training, as one pytree.
+
+There is no random state: the randomness of a step is folded from the seed and the step's number,
+and the data position is that number too, so a restored state goes on exactly as it would have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax import tree
+from pewm_jax.config import Config
+from pewm_jax.models import world_model
+from pewm_jax.training import optimizer
+from pewm_jax.training.stages import Stage
+from pewm_jax.types import Array, Params
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TrainState:
+    """The state of one stage.
+
+    Attributes:
+        params: all parameters of the stage, trained and frozen, float32.
+        ema: exponential moving average of the trained parameters only.
+        opt_state: optimizer state of the trained parameters only.
+        step: () int32, steps done; also the position in the data.
+    """
+
+    params: Params
+    ema: Params
+    opt_state: Any
+    step: Array
+
+
+def create(config: Config, stage: Stage, key: Array, start: Params | None = None) -> TrainState:
+    """Make the state before the first step. Pure and jittable (``config``, ``stage`` static).
+
+    Args:
+        config: the experiment.
+        stage: the stage to begin.
+        key: PRNG key of the fresh weights.
+        start: weights of the stage before; they replace the fresh ones on their paths. They must
+            be exactly the leaves that this stage freezes.
+
+    Raises:
+        TreeError: ``start`` has other paths or shapes than the frozen leaves.
+    """
+    params = world_model.init(config, key, memory=stage.memory)
+    trained, frozen = tree.split(params, stage.trained)
+    if start is not None:
+        tree.require_like(start, frozen, f"The weights that stage {stage.number} starts from")
+        params = tree.merge(trained, start)
+    return TrainState(
+        params=params,
+        ema=jax.tree.map(jnp.copy, trained),
+        opt_state=optimizer.make(config, stage).init(trained),
+        step=jnp.zeros((), jnp.int32),
+    )
+
+
+def update_ema(ema: Params, trained: Params, step: Array, decay: float) -> Params:
+    """Move the average towards the trained parameters.
+
+    The decay grows from 2/11 at the first step to ``decay`` (min(decay, (1 + n) / (10 + n)) after
+    n steps), so that short runs are not weighed down by their random start.
+    """
+    done = step.astype(jnp.float32) + 1.0
+    decay_now = jnp.minimum(decay, (1.0 + done) / (10.0 + done))
+    return jax.tree.map(lambda old, new: old + (1.0 - decay_now) * (new - old), ema, trained)
+
+
+def inference_params(stage: Stage, state: TrainState) -> Params:
+    """Return what inference uses: the average where trained, the frozen weights elsewhere."""
+    frozen = tree.exclude(state.params, stage.trained)
+    return tree.merge(state.ema, frozen)

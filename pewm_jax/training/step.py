@@ -1,0 +1,124 @@
+"""One step of training: a pure function, and the one place where it is compiled.
+
+Only the trained subtree is differentiated, so frozen leaves pass through bit-identical and the
+compiler never computes the gradients of frozen weights.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.sharding import Mesh
+
+from pewm_jax import tree
+from pewm_jax.config import Config
+from pewm_jax.diffusion import objective
+from pewm_jax.training import optimizer, sharding
+from pewm_jax.training.stages import Stage
+from pewm_jax.training.state import TrainState, create, update_ema
+from pewm_jax.types import Array, Clip, Params
+
+Metrics = dict[str, Array]
+
+
+def train_step(
+    config: Config, stage: Stage, state: TrainState, clip: Clip, key: Array
+) -> tuple[TrainState, Metrics]:
+    """Do one optimizer step.
+
+    Args:
+        config: the experiment (static).
+        stage: what is trained (static).
+        state: the state before.
+        clip: a batch with leading B, uint8 colours and metric depth.
+        key: the stage's PRNG key, the same for all steps; the step's number is folded in.
+
+    Returns:
+        The state after, and scalars: ``loss``, ``grad_norm`` (before clipping),
+        ``learning_rate``, and what the objective measures.
+    """
+    trained, frozen = tree.split(state.params, stage.trained)
+    step_key = jax.random.fold_in(key, state.step)
+
+    def loss_of(trained: Params) -> tuple[Array, Metrics]:
+        params = tree.merge(trained, frozen)
+        return objective.loss(config, params, clip, step_key, memory=stage.memory)
+
+    (loss, measured), gradients = jax.value_and_grad(loss_of, has_aux=True)(trained)
+    updates, opt_state = optimizer.make(config, stage).update(gradients, state.opt_state, trained)
+    trained = cast("Params", optax.apply_updates(trained, updates))
+    metrics = {
+        **measured,
+        "loss": loss,
+        "grad_norm": _norm(gradients),
+        "learning_rate": optimizer.schedule(stage.settings(config))(state.step),
+    }
+    after = TrainState(
+        params=tree.merge(trained, frozen),
+        ema=update_ema(state.ema, trained, state.step, config.train.ema),
+        opt_state=opt_state,
+        step=state.step + 1,
+    )
+    return after, jax.tree.map(jnp.asarray, metrics)
+
+
+def stage_key(config: Config, stage: Stage) -> Array:
+    """Return the PRNG key of a stage, from which weights and noise are drawn."""
+    return jax.random.fold_in(jax.random.key(config.train.seed), stage.number)
+
+
+def abstract_state(config: Config, stage: Stage, mesh: Mesh) -> Any:
+    """Return the state's shapes, types and placements without computing anything."""
+    shapes = jax.eval_shape(functools.partial(create, config, stage), stage_key(config, stage))
+    return sharding.abstract(shapes, sharding.of_state(mesh, shapes))
+
+
+def initial_state(
+    config: Config, stage: Stage, mesh: Mesh, start: Params | None = None
+) -> TrainState:
+    """Create the state in its place on the devices; see ``state.create``."""
+    if start is not None:
+        start = jax.device_put(start, sharding.replicated(mesh))
+    shardings = jax.tree.map(lambda leaf: leaf.sharding, abstract_state(config, stage, mesh))
+    make = jax.jit(functools.partial(create, config, stage), out_shardings=shardings)
+    return make(stage_key(config, stage), start)
+
+
+def compile_step(
+    config: Config, stage: Stage, mesh: Mesh, clip: Any
+) -> Callable[[TrainState, Clip, Array], tuple[TrainState, Metrics]]:
+    """Compile ``train_step`` ahead of time for one batch shape.
+
+    Args:
+        config: the experiment.
+        stage: what is trained.
+        mesh: the devices.
+        clip: a batch, or the shapes of one.
+
+    Returns:
+        The compiled ``(state, clip, key) -> (state, metrics)``; it consumes the state it is given
+        (its buffers are donated) and wants clip and key placed as ``sharding`` says.
+    """
+    state = abstract_state(config, stage, mesh)
+    everywhere = sharding.replicated(mesh)
+    placed = jax.tree.map(lambda leaf: leaf.sharding, state)
+    split = sharding.of_batch(mesh)
+    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split), clip)
+    key = stage_key(config, stage)
+    step = jax.jit(
+        functools.partial(train_step, config, stage),
+        in_shardings=(placed, split, everywhere),
+        out_shardings=(placed, everywhere),
+        donate_argnums=0,
+    )
+    abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
+    return step.lower(state, batch, abstract_key).compile()
+
+
+def _norm(gradients: Params) -> Array:
+    return jnp.sqrt(sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(gradients)))

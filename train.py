@@ -1,0 +1,49 @@
+"""Train a world model: `python train.py demo`, with any setting changed by a flag."""
+
+import sys
+from collections.abc import Sequence
+
+from pewm_jax.evaluation.preview import make_preview
+
+import configs
+from pewm_jax import cli
+from pewm_jax.training import loop, runs
+
+USAGE = """usage: python train.py PRESET [--config FILE.json] [--SETTING VALUE …]
+
+Presets (one file each in configs/):
+{presets}
+
+Example:
+  python train.py demo --train.run runs/mine --train.stage1.steps 1000
+
+`python train.py PRESET --help` lists every setting with its meaning and its value there.
+The same command again goes on where an interrupted training stopped."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Train what the arguments say; returns the exit code."""
+    known = configs.names()
+    if argv and argv[0] in ("-h", "--help"):
+        lines = [f"  {name:<10}{configs.describe(name)}" for name in known]
+        print(USAGE.format(presets="\n".join(lines)))
+        return 0
+    if not argv or argv[0].startswith("-"):
+        raise cli.ConfigError(
+            f"Name a preset first: python train.py {known[0]} ({', '.join(known)})."
+        )
+    preset = cli.choose(argv[0], known, "preset")
+    config = cli.parse(
+        type(configs.load(preset)),
+        argv[1:],
+        default=configs.load(preset),
+        prog=f"train.py {preset}",
+        description=f"{configs.describe(preset)} Settings also come from --config FILE.json.",
+    )
+    preview = make_preview(config, runs.prepare(config)) if config.train.preview_every else None
+    loop.train(config, preview=preview)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))
