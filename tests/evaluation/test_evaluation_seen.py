@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.evaluation.seen import seen_masks
+from pewm_jax.evaluation import seen as masks
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pixel_grid, pose_from_yaw
 from pewm_jax.types import Camera, Frames
 
 SIZE = 64
+seen_masks = jax.jit(masks.seen_masks)
 INTRINSICS = intrinsics_from_fov(SIZE, SIZE, 90.0)
 
 

@@ -1,0 +1,135 @@
+"""Run the model over batches of chosen clips, compiled ahead and said aloud."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import Config
+from pewm_jax.rollout import rollout, start
+from pewm_jax.types import Array, Camera, Frames, Params, WorldState
+
+METHODS = ("memory", "empty", "copy")
+"""With the map; the same weights with an empty map; the last observed frame, repeated."""
+
+
+class Imagination:
+    """A model for batches of clips of one size; each part is compiled when first needed.
+
+    Args:
+        config: static.
+        params: weights.
+        batch: clips sampled at once.
+        context: frames a state is started from.
+        say: told what is being compiled and how long it took.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        params: Params,
+        batch: int,
+        context: int,
+        say: Callable[[str], Any] = print,
+    ):
+        self.config, self.batch, self.context = config, batch, context
+        self.params = jax.tree.map(jnp.asarray, params)
+        self._say = say
+        self._begin: Callable[..., WorldState] | None = None
+        self._clip: dict[bool, Callable[..., tuple[WorldState, Frames]]] = {}
+
+    def prepare(self, memories: Iterable[bool]) -> None:
+        """Compile the start, and the sampler with (True) or without (False) its map."""
+        states = jax.eval_shape(self._start_batch, self.params, self._abstract_context())
+        if self._begin is None:
+            self._begin = _compile(
+                f"the start from {self.context} frames",
+                self._start_batch,
+                (self.params, self._abstract_context()),
+                self._say,
+            )
+        actions = jax.ShapeDtypeStruct((self.batch, self.config.clip.frames - 1, 3), jnp.float32)
+        keys = jax.eval_shape(clip_keys, jax.ShapeDtypeStruct((self.batch, 2), jnp.uint32))
+        for memory in memories:
+            if memory not in self._clip:
+                self._clip[memory] = _compile(
+                    f"the sampler with {'its' if memory else 'an empty'} map "
+                    f"({self.config.diffusion.sample_steps} steps, {self.batch} clips at once)",
+                    jax.vmap(
+                        functools.partial(rollout, self.config, memory=memory), (None, 0, 0, 0)
+                    ),
+                    (self.params, states, actions, keys),
+                    self._say,
+                )
+
+    def run(
+        self,
+        context: Frames,
+        actions_BN3: np.ndarray,
+        seeds_B2: np.ndarray,
+        *,
+        memory: bool,
+        params: Params | None = None,
+    ) -> tuple[WorldState, WorldState, Frames]:
+        """Imagine N = chain · (T − 1) frames for every clip of a batch.
+
+        Args:
+            context: (B, S) observed frames, the present last, colours uint8.
+            actions_BN3: actions that lead from the present through the N frames.
+            seeds_B2: sampling seed and clip number; equal ones draw equal noise, whatever the
+                batch and whether or not the map is used.
+            memory: use the map, or the same weights with an empty one.
+            params: other weights of the same shapes.
+
+        Returns:
+            ``(first, last, frames)``: the state before, the state after, (B, N) NumPy frames.
+        """
+        self.prepare([memory])
+        assert self._begin is not None
+        params = self.params if params is None else params
+        first = state = self._begin(params, context)
+        keys = clip_keys(jnp.asarray(seeds_B2, jnp.uint32))
+        per_clip = self.config.clip.frames - 1
+        made = []
+        for index in range(actions_BN3.shape[1] // per_clip):
+            part = jnp.asarray(actions_BN3[:, index * per_clip : (index + 1) * per_clip])
+            now = jax.vmap(jax.random.fold_in, (0, None))(keys, index)
+            state, frames = self._clip[memory](params, state, part, now)
+            made.append(jax.device_get(frames))
+        return first, state, jax.tree.map(lambda *parts: np.concatenate(parts, 1), *made)
+
+    def _start_batch(self, params: Params, context: Frames) -> WorldState:
+        return jax.vmap(functools.partial(start, self.config), (None, 0))(params, context)
+
+    def _abstract_context(self) -> Frames:
+        lead, clip = (self.batch, self.context), self.config.clip
+        spec = jax.ShapeDtypeStruct
+        return Frames(
+            spec((*lead, clip.height, clip.width, 3), jnp.uint8),
+            spec((*lead, clip.height, clip.width), jnp.float32),
+            Camera(spec((*lead, 4), jnp.float32), spec((*lead, 4, 4), jnp.float32)),
+        )
+
+
+def clip_keys(seeds_B2: Array) -> Array:
+    """Return one random key per clip from (B, 2) integers: sampling seed, clip number."""
+    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed[0]), seed[1]))(seeds_B2)
+
+
+def copy_last(context: Frames, count: int) -> Frames:
+    """Repeat the present frame of every clip: the forecast that nothing will change."""
+    return jax.tree.map(lambda array: np.repeat(np.asarray(array)[:, -1:], count, 1), context)
+
+
+def _compile(name: str, function: Callable, arguments: tuple, say: Callable[[str], Any]) -> Any:
+    say(f"compiling {name} …")
+    began = time.perf_counter()
+    compiled = jax.jit(function).lower(*arguments).compile()
+    say(f"compiled {name} in {time.perf_counter() - began:.1f} s")
+    return compiled

@@ -1,0 +1,49 @@
+"""Scores that survive an interruption: one small file per finished piece of work.
+
+Pieces lie in a folder named by the fingerprint of weights and protocol, so that pieces of other
+weights can never be mistaken for these; opening the folder drops them. A piece is written aside
+and renamed, and one that does not read counts as not done.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+
+class Partials:
+    """Named sets of arrays of one evaluation.
+
+    Args:
+        folder: where all partial results of a report lie.
+        fingerprint: of weights and protocol; other fingerprints' pieces are deleted.
+    """
+
+    def __init__(self, folder: Path, fingerprint: str):
+        self.folder = folder / fingerprint[:16]
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for other in folder.iterdir():
+            if other != self.folder and other.is_dir():
+                shutil.rmtree(other)
+
+    def get(self, name: str) -> dict[str, np.ndarray] | None:
+        """Return a finished piece, or None."""
+        path = self.folder / f"{name}.npz"
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                return {key: arrays[key] for key in arrays.files}
+        except (FileNotFoundError, zipfile.BadZipFile, ValueError, EOFError, KeyError):
+            return None
+
+    def put(self, name: str, **arrays: np.ndarray) -> dict[str, np.ndarray]:
+        """Keep a finished piece and return it."""
+        path = self.folder / f"{name}.npz"
+        aside = path.with_name(f"{path.name}.{os.getpid()}.partial")
+        with aside.open("wb") as file:
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+        aside.replace(path)
+        return arrays

@@ -1,0 +1,193 @@
+"""What exactly is scored: which clips, from which start, with what context and which actions.
+
+Nothing here is random. Clips start on the way back of every held-out episode, where the agent
+sees places again; their context is thinned the same way for every method; the recorded motion
+drives the model. ``fingerprint`` names a protocol and its weights: equal names, equal numbers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import jax
+import numpy as np
+
+from pewm_jax.config import Config, UserError, to_dict
+from pewm_jax.data.episodes import Episode
+from pewm_jax.geometry.actions import actions_between, continuous, integrate
+from pewm_jax.types import Frames
+
+VERSION = 1
+"""Raised whenever the same settings would give other numbers."""
+POSE_TOLERANCE = 2e-3
+"""How far poses integrated from actions may be from the recorded ones (metres, matrix entries)."""
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipChoice:
+    """One clip to imagine.
+
+    Attributes:
+        episode: index of the episode.
+        name: its name.
+        scene: where it was recorded.
+        start: the frame that is the present; all earlier ones may be context.
+        context_S: (S,) frames given to ``rollout.start``, oldest first, the present last. Where
+            an episode has fewer, the oldest is repeated, which leaves the map as it is.
+        targets_N: (N,) frames to be imagined.
+    """
+
+    episode: int
+    name: str
+    scene: str
+    start: int
+    context_S: tuple[int, ...]
+    targets_N: tuple[int, ...]
+
+
+def context_frames(start: int, count: int) -> tuple[int, ...]:
+    """Return ``count`` frames spread evenly over 0 … start, the present (start) last."""
+    spread = np.unique(np.round(np.linspace(start, 0, count)).astype(int))
+    padded = np.concatenate([np.repeat(spread[:1], count - len(spread)), spread])
+    return tuple(int(index) for index in padded)
+
+
+def way_back(episode: Episode) -> int:
+    """Return the frame where the way back begins: as recorded, else the middle."""
+    frame = episode.info.get("return_frame")
+    return episode.length // 2 if frame is None else int(frame)
+
+
+def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) -> list[ClipChoice]:
+    """Choose what to imagine: starts spread evenly over the way back of every episode.
+
+    Args:
+        config: ``clip.frames``, ``data.context`` and ``evaluate.stride`` are read.
+        episodes: held-out episodes.
+        clips: how many to choose at most; fewer if the episodes have fewer distinct starts.
+        chain: clips generated one after the other from each start.
+
+    Returns:
+        The choices, first starts of all episodes first, so that any leading part of the list
+        covers as many episodes as it can.
+
+    Raises:
+        UserError: no episode is long enough.
+    """
+    length = chain * (config.clip.frames - 1) * config.evaluate.stride
+    per_episode = -(-clips // max(len(episodes), 1))
+    ranked: list[tuple[int, ClipChoice]] = []
+    longest = 0
+    for index in range(len(episodes)):
+        episode = episodes[index]
+        longest = max(longest, episode.length)
+        last = episode.length - 1 - length
+        if last < 0:
+            continue
+        first = min(way_back(episode), last)
+        starts = np.unique(np.round(np.linspace(first, last, per_episode)).astype(int))
+        for rank, start in enumerate(starts):
+            targets = int(start) + config.evaluate.stride * np.arange(
+                1, length // config.evaluate.stride + 1
+            )
+            choice = ClipChoice(
+                episode=index,
+                name=episode.name,
+                scene=episode.scene,
+                start=int(start),
+                context_S=context_frames(int(start), config.data.context),
+                targets_N=tuple(int(target) for target in targets),
+            )
+            ranked.append((rank, choice))
+    if not ranked:
+        raise UserError(
+            f"no episode of {config.data.path}/{config.evaluate.split} is long enough: "
+            f"{chain} clips need {length + 1} frames and the longest has {longest}; collect "
+            "longer episodes or lower evaluate.chain, video_clips or stride."
+        )
+    ranked.sort(key=lambda item: item[0])
+    return [choice for _, choice in ranked[:clips]]
+
+
+def load_clip(
+    config: Config, episodes: Sequence[Episode], choice: ClipChoice
+) -> tuple[Frames, Frames, np.ndarray]:
+    """Read one chosen clip.
+
+    Returns:
+        ``(context, targets, actions_N3)``: S context frames, N true frames, and the N actions
+        that lead from the present through them, composed from the recorded poses.
+
+    Raises:
+        UserError: the recorded actions or the upright motion of poses do not lead to the
+            recorded poses, or the frames have another size than the model's.
+    """
+    episode = episodes[choice.episode]
+    context = episode.frames(list(choice.context_S))
+    targets = episode.frames(list(choice.targets_N))
+    size = (config.clip.height, config.clip.width)
+    if targets.rgb_THWC.shape[1:3] != size:
+        height, width = targets.rgb_THWC.shape[1:3]
+        raise UserError(
+            f"episode {choice.name} has frames of {height}×{width} and this model was trained on "
+            f"{size[0]}×{size[1]}: collect or import the data at the model's size."
+        )
+    poses = np.concatenate(
+        [context.camera.world_from_camera[-1:], targets.camera.world_from_camera]
+    )
+    actions_N3 = np.asarray(actions_between(poses))
+    _check_motion(np.asarray(integrate(poses[0], actions_N3)), poses, choice, "upright motion")
+    if episode.actions is not None:
+        recorded = np.asarray(continuous(config.actions, episode.actions))
+        steps = recorded[choice.start : choice.targets_N[-1]]
+        every = np.asarray(integrate(poses[0], steps))
+        taken = every[[index - choice.start for index in (choice.start, *choice.targets_N)]]
+        _check_motion(taken, poses, choice, "recorded actions")
+    return context, targets, actions_N3
+
+
+def _check_motion(integrated: np.ndarray, poses: np.ndarray, choice: ClipChoice, what: str) -> None:
+    error = np.abs(integrated - poses).max((1, 2))
+    if error.max() > POSE_TOLERANCE:
+        worst = int(error.argmax())
+        frame = (choice.start, *choice.targets_N)[worst]
+        raise UserError(
+            f"episode {choice.name}: at frame {frame} the {what} and the recorded pose disagree "
+            f"by {error[worst]:.3g}; run `python -m pewm_jax.data validate` on the data."
+        )
+
+
+def stack(trees: list[T], size: int) -> T:
+    """Stack pytrees along a new leading axis, repeating the last one up to ``size``."""
+    padded = trees + [trees[-1]] * (size - len(trees))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
+
+
+def file_hash(path: Path) -> str:
+    """Return the sha256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def fingerprint(config: Config, weights: str, dataset: str) -> str:
+    """Name everything that the numbers depend on, except which seeds were run.
+
+    Args:
+        config: the run's configuration with the evaluation's overrides.
+        weights: sha256 of the weights.
+        dataset: sha256 of the data set's index.
+    """
+    settings = to_dict(config)
+    for key in ("seeds", "videos"):
+        settings["evaluate"].pop(key)
+    for key in ("train", "data"):
+        settings.pop(key)
+    settings["context"] = config.data.context
+    content = {"version": VERSION, "settings": settings, "weights": weights, "data": dataset}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,232 @@
+"""Imagine every chosen clip with every method and add up the errors, resumably."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax.config import Config, UserError
+from pewm_jax.data.episodes import Episode
+from pewm_jax.data.progress import Meter
+from pewm_jax.evaluation.images import error_sums_batch, unit_colours
+from pewm_jax.evaluation.imagine import METHODS, Imagination, copy_last
+from pewm_jax.evaluation.partial import Partials
+from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, stack
+from pewm_jax.evaluation.seen import seen_masks_batch
+from pewm_jax.memory.voxel_map import to_points
+from pewm_jax.types import Frames, VoxelMap
+
+
+@dataclasses.dataclass(frozen=True)
+class Scored:
+    """Errors of a set of clips.
+
+    Attributes:
+        choices: the C clips.
+        sums: method → (seeds, C, N, 3, 7) as ``images.error_sums``; one seed for copying.
+    """
+
+    choices: list[ClipChoice]
+    sums: dict[str, np.ndarray]
+
+    @property
+    def episodes(self) -> np.ndarray:
+        """(C,) the episode of every clip."""
+        return np.array([choice.episode for choice in self.choices])
+
+
+@dataclasses.dataclass(frozen=True)
+class LongRollouts:
+    """Long rollouts, scored, and the first few of them kept to be shown.
+
+    Attributes:
+        scored: errors over all of them.
+        chain: clips generated one after the other.
+        shown: how many are kept.
+        kept: per method ``rgb`` (shown, N, H, W, 3) uint8 and ``depth`` (shown, N, H, W) metres;
+            for ``memory`` also the map at the start and the end: ``first_points``,
+            ``first_features``, ``first_valid``, and the same with ``last``.
+    """
+
+    scored: Scored
+    chain: int
+    shown: int
+    kept: dict[str, dict[str, np.ndarray]]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Batch:
+    context: Frames
+    targets: Frames
+    actions_BN3: np.ndarray
+    numbers_B: np.ndarray
+    seen: Any
+    unseen: Any
+    real: int
+
+    def seeds(self, seed: int) -> np.ndarray:
+        return np.stack([np.full_like(self.numbers_B, seed), self.numbers_B], -1)
+
+    def sums(self, frames: Frames) -> np.ndarray:
+        sums = error_sums_batch(frames, self.targets, self.seen, self.unseen)
+        return np.asarray(sums)[: self.real]
+
+
+def _load(
+    config: Config, episodes: Sequence[Episode], choices: Sequence[ClipChoice], first: int
+) -> _Batch:
+    size = config.evaluate.batch
+    parts = [load_clip(config, episodes, choice) for choice in choices]
+    context = stack([part[0] for part in parts], size)
+    targets = stack([part[1] for part in parts], size)
+    actions = stack([part[2] for part in parts], size)
+    seen, unseen = seen_masks_batch(targets, context)
+    return _Batch(
+        context, targets, actions, first + np.arange(size), seen, unseen, real=len(choices)
+    )
+
+
+def score_table(
+    config: Config,
+    episodes: Sequence[Episode],
+    model: Imagination,
+    partials: Partials,
+    say: Callable[[str], Any] = print,
+) -> Scored:
+    """Score ``evaluate.clips`` clips of ``evaluate.chain`` with every method and seed.
+
+    Pieces that ``partials`` already holds are not done again.
+
+    Raises:
+        UserError: no episode is long enough, or the data disagrees with itself or the model, or
+            the model makes values that are not finite.
+    """
+    choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
+    starts = range(0, len(choices), config.evaluate.batch)
+    pieces: dict[tuple[str, int, int], np.ndarray] = {}
+    todo: list[tuple[str, int, int]] = []
+    for first in starts:
+        for method in METHODS:
+            for seed in config.evaluate.seeds if method != "copy" else (0,):
+                found = partials.get(f"table-{method}-seed{seed}-clip{first:04d}")
+                if found is None:
+                    todo.append((method, seed, first))
+                else:
+                    pieces[method, seed, first] = found["sums"]
+    if pieces:
+        say(f"{len(pieces)} of {len(pieces) + len(todo)} pieces were scored before and are kept")
+    model.prepare(sorted({method == "memory" for method, _, _ in todo if method != "copy"}))
+    frames_each = config.evaluate.chain * (config.clip.frames - 1)
+    total = sum(
+        frames_each * min(config.evaluate.batch, len(choices) - first) for _, _, first in todo
+    )
+    with Meter("scoring", total, "frames") as meter:
+        loaded: tuple[int, _Batch] | None = None
+        for method, seed, first in todo:
+            if loaded is None or loaded[0] != first:
+                some = choices[first : first + config.evaluate.batch]
+                loaded = first, _load(config, episodes, some, first)
+            batch = loaded[1]
+            frames = _imagine(model, batch, method, seed)[2]
+            piece = partials.put(
+                f"table-{method}-seed{seed}-clip{first:04d}", sums=batch.sums(frames)
+            )
+            pieces[method, seed, first] = piece["sums"]
+            meter.advance(frames_each * batch.real)
+    if todo:
+        say(meter.summary())
+    sums = {
+        method: np.stack(
+            [
+                np.concatenate([pieces[method, seed, first] for first in starts])
+                for seed in (config.evaluate.seeds if method != "copy" else (0,))
+            ]
+        )
+        for method in METHODS
+    }
+    return Scored(choices, sums)
+
+
+def _imagine(model: Imagination, batch: _Batch, method: str, seed: int) -> tuple[Any, Any, Frames]:
+    if method == "copy":
+        return None, None, copy_last(batch.context, batch.actions_BN3.shape[1])
+    first, last, frames = model.run(
+        batch.context, batch.actions_BN3, batch.seeds(seed), memory=method == "memory"
+    )
+    if not all(np.isfinite(leaf).all() for leaf in (frames.rgb_THWC, frames.depth_THW)):
+        raise UserError(
+            "the model imagines values that are not finite: its weights are damaged or its "
+            "training diverged; train it again."
+        )
+    return first, last, frames
+
+
+def long_choices(config: Config, episodes: Sequence[Episode]) -> tuple[list[ClipChoice], int]:
+    """Choose one long rollout per episode from where its way back begins.
+
+    Returns:
+        ``(choices, chain)``: at most one batch, and the clips per rollout:
+        ``evaluate.video_clips`` or the most that the episodes have room for.
+    """
+    count = min(config.evaluate.batch, len(episodes))
+    for chain in range(config.evaluate.video_clips, 1, -1):
+        try:
+            return choose(config, episodes, count, chain), chain
+        except UserError:
+            continue
+    return choose(config, episodes, count, 1), 1
+
+
+def roll_long(
+    config: Config,
+    episodes: Sequence[Episode],
+    model: Imagination,
+    partials: Partials,
+    say: Callable[[str], Any] = print,
+) -> LongRollouts:
+    """Make long rollouts with every method (first seed), score all, keep the first few.
+
+    Raises:
+        UserError: as ``score_table``.
+    """
+    choices, chain = long_choices(config, episodes)
+    shown = min(config.evaluate.videos, len(choices))
+    name = {method: f"long-{method}-seed{config.evaluate.seeds[0]}" for method in METHODS}
+    pieces = {method: partials.get(name[method]) for method in METHODS}
+    todo = [m for m in METHODS if (p := pieces[m]) is None or len(p["rgb"]) < shown]
+    if todo:
+        model.prepare(sorted({method == "memory" for method in todo if method != "copy"}))
+        batch = _load(config, episodes, choices, 0)
+        count = chain * (config.clip.frames - 1)
+        with Meter("long rollouts", len(todo) * count * batch.real, "frames") as meter:
+            for method in todo:
+                first, last, frames = _imagine(model, batch, method, config.evaluate.seeds[0])
+                colours = np.asarray(unit_colours(frames.rgb_THWC[:shown]))
+                kept = {
+                    "sums": batch.sums(frames),
+                    "rgb": np.rint(colours * 255).astype(np.uint8),
+                    "depth": np.asarray(frames.depth_THW[:shown], np.float32),
+                }
+                if method == "memory":
+                    kept |= _map_points(config, first.map, shown, "first")
+                    kept |= _map_points(config, last.map, shown, "last")
+                pieces[method] = partials.put(name[method], **kept)
+                meter.advance(count * batch.real)
+        say(meter.summary())
+    kept_all = {method: piece for method, piece in pieces.items() if piece is not None}
+    sums = {method: piece["sums"][None] for method, piece in kept_all.items()}
+    return LongRollouts(Scored(choices, sums), chain, shown, kept_all)
+
+
+def _map_points(config: Config, maps: VoxelMap, shown: int, when: str) -> dict[str, np.ndarray]:
+    some = jax.tree.map(lambda leaf: leaf[:shown], maps)
+    points, features, valid = jax.vmap(lambda one: to_points(config.memory, one))(some)
+    return {
+        f"{when}_points": np.asarray(points),
+        f"{when}_features": np.asarray(features),
+        f"{when}_valid": np.asarray(valid),
+    }

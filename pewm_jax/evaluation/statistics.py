@@ -1,0 +1,163 @@
+"""From sums under masks to the numbers of the table, with honest standard errors.
+
+Clips of one episode show the same rooms, so they are not independent: standard errors are
+clustered by episode (Liang & Zeger 1986; with one clip per episode this is σ / √n). Sampling
+seeds are averaged within a clip first: more seeds sharpen a clip's score but are no new evidence
+about new places.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.evaluation.images import MASKS, PSNR_CEILING, SUMS
+
+METRICS = ("psnr", "ssim", "depth_mae", "depth_rel")
+"""dB; structural similarity; metres; share of the true depth."""
+LEAST_SHARE = 0.01
+"""A clip or frame with fewer of its pixels than this under a mask has no score there."""
+
+
+def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
+    """Turn sums into scores.
+
+    Args:
+        sums: (..., 3, 7) as ``error_sums``, over whatever frames were added up.
+
+    Returns:
+        ``scores[mask][metric]`` of shape (...), NaN where the mask covers too little.
+    """
+    result: dict[str, dict[str, np.ndarray]] = {}
+    everything = sums[..., MASKS.index("all"), SUMS.index("colours")]
+    for k, mask in enumerate(MASKS):
+        part = {name: sums[..., k, i].astype(np.float64) for i, name in enumerate(SUMS)}
+        enough = part["colours"] >= np.maximum(LEAST_SHARE * everything, 1)
+
+        def mean(total: str, count: str, part=part, enough=enough) -> np.ndarray:
+            known = enough & (part[count] > 0)
+            return np.where(known, part[total] / np.where(known, part[count], 1), np.nan)
+
+        error = np.maximum(mean("squared", "colours"), 10 ** (-PSNR_CEILING / 10))
+        result[mask] = {
+            "psnr": -10 * np.log10(error),
+            "ssim": mean("ssim", "windows"),
+            "depth_mae": mean("depth_abs", "depths"),
+            "depth_rel": mean("depth_rel", "depths"),
+        }
+    return result
+
+
+def summary(values: np.ndarray, episodes: np.ndarray) -> dict[str, Any]:
+    """Average clips and state how sure the average is.
+
+    Args:
+        values: (clips,) one number per clip, NaN where a clip has none.
+        episodes: (clips,) the episode each clip comes from.
+
+    Returns:
+        ``mean``, ``stderr`` clustered by episode (None where fewer than two episodes have a
+        value), and ``n``, the number of clips.
+    """
+    known = np.isfinite(values)
+    values, episodes = values[known], episodes[known]
+    count = len(values)
+    if count == 0:
+        return {"mean": None, "stderr": None, "n": 0}
+    mean = float(values.mean())
+    groups = np.unique(episodes)
+    stderr = None
+    if len(groups) > 1:
+        off = [float((values[episodes == group] - mean).sum()) for group in groups]
+        correction = len(groups) / (len(groups) - 1)
+        stderr = math.sqrt(correction * sum(total**2 for total in off)) / count
+    return {"mean": mean, "stderr": stderr, "n": count}
+
+
+def table(sums: Mapping[str, np.ndarray], episodes: np.ndarray) -> dict[str, Any]:
+    """Score every method under every mask.
+
+    Args:
+        sums: method → (seeds, clips, T, 3, 7).
+        episodes: (clips,) the episode each clip comes from.
+
+    Returns:
+        ``results[method][mask][metric] = {mean, stderr, n}``.
+    """
+    results: dict[str, Any] = {}
+    for method, sums_SCT37 in sums.items():
+        by_mask = scores(sums_SCT37.sum(2))
+        results[method] = {
+            mask: {m: summary(by_mask[mask][m].mean(0), episodes) for m in METRICS}
+            for mask in MASKS
+        }
+    return results
+
+
+def margin(better: np.ndarray, base: np.ndarray, episodes: np.ndarray) -> dict[str, Any]:
+    """Compare two methods clip by clip: the same clips, seeds and noise.
+
+    Args:
+        better: (seeds, clips, T, 3, 7) sums of the first method.
+        base: the same of the second.
+        episodes: (clips,) the episode each clip comes from.
+
+    Returns:
+        ``[mask][metric]``: ``mean`` of first − second (for depth errors less is better),
+        ``stderr`` over episodes, ``n`` clips, ``episodes``, ``per_seed`` means and
+        ``stderr_over_seeds``.
+    """
+    first, second = scores(better.sum(2)), scores(base.sum(2))
+    result: dict[str, Any] = {}
+    for mask in MASKS:
+        result[mask] = {}
+        for metric in METRICS:
+            gain_SC = first[mask][metric] - second[mask][metric]
+            known = np.isfinite(gain_SC).all(0)
+            per_seed = gain_SC[:, known].mean(1) if known.any() else np.zeros(0)
+            spread = None
+            if len(per_seed) > 1:
+                spread = float(per_seed.std(ddof=1) / math.sqrt(len(per_seed)))
+            result[mask][metric] = {
+                **summary(gain_SC.mean(0), episodes),
+                "episodes": len(np.unique(episodes[known])),
+                "per_seed": [float(value) for value in per_seed],
+                "stderr_over_seeds": spread,
+            }
+    return result
+
+
+def per_frame(sums: Mapping[str, np.ndarray], episodes: np.ndarray) -> dict[str, Any]:
+    """Score every frame index on its own.
+
+    Args:
+        sums: method → (seeds, clips, T, 3, 7).
+        episodes: (clips,) the episode each clip comes from.
+
+    Returns:
+        ``[method][mask][metric] = {mean: [T], stderr: [T], n: [T]}``; entry 0 is the first
+        imagined frame. None where no clip has a score.
+    """
+    result: dict[str, Any] = {}
+    for method, sums_SCT37 in sums.items():
+        by_mask = scores(sums_SCT37)
+        result[method] = {}
+        for mask in MASKS:
+            result[method][mask] = {}
+            for metric in METRICS:
+                values_CT = by_mask[mask][metric].mean(0)
+                points = [summary(values_CT[:, t], episodes) for t in range(values_CT.shape[1])]
+                result[method][mask][metric] = {
+                    key: [point[key] for point in points] for key in ("mean", "stderr", "n")
+                }
+    return result
+
+
+def seen_share(sums_SCT37: np.ndarray) -> float:
+    """Return the share of pixels with depth that were seen before, over all clips."""
+    pixels = sums_SCT37[0, ..., SUMS.index("colours")].sum((0, 1))
+    seen, unseen = (float(pixels[MASKS.index(mask)]) for mask in ("seen", "unseen"))
+    return seen / max(seen + unseen, 1.0)

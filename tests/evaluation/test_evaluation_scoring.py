@@ -1,0 +1,131 @@
+"""Scoring end to end with a model that knows the answer, and resuming it."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+from evaluation_scene import knowing_rollout, tiny, write_split
+
+from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.evaluation import imagine, scoring
+from pewm_jax.evaluation.imagine import Imagination
+from pewm_jax.evaluation.partial import Partials
+from pewm_jax.evaluation.statistics import margin, table
+
+PARAMS = {"offset": np.float32(0)}
+
+
+@pytest.fixture(scope="module")
+def episodes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "revisit"
+    return EpisodeSource(write_split(folder, episodes=2))
+
+
+def knowing_model(monkeypatch, config, late=0):
+    monkeypatch.setattr(imagine, "rollout", functools.partial(knowing_rollout, late=late))
+    return Imagination(config, PARAMS, config.evaluate.batch, config.data.context, lambda _: None)
+
+
+def test_a_model_that_remembers_wins_by_a_mile(monkeypatch, episodes, tmp_path):
+    config = tiny(tmp_path, clips=3)
+    model = knowing_model(monkeypatch, config)
+    scored = scoring.score_table(config, episodes, model, Partials(tmp_path, "f" * 64), print)
+    assert scored.sums["memory"].shape == (2, 3, 4, 3, 7)
+    assert scored.sums["copy"].shape == (1, 3, 4, 3, 7)
+    results = table(scored.sums, scored.episodes)
+    # Only rounding of colours to 8 bits and of depth to millimetres is left.
+    assert results["memory"]["all"]["psnr"]["mean"] > 50
+    assert results["memory"]["all"]["ssim"]["mean"] > 0.999
+    assert results["memory"]["all"]["depth_mae"]["mean"] < 1e-3
+    assert results["empty"]["all"]["psnr"]["mean"] < 15
+    assert results["empty"]["all"]["depth_mae"]["mean"] == pytest.approx(1, abs=0.01)
+    assert results["copy"]["all"]["psnr"]["mean"] < 25
+    gain = margin(scored.sums["memory"], scored.sums["empty"], scored.episodes)["seen"]["psnr"]
+    assert gain["mean"] > 10 * gain["stderr"]
+    assert gain["mean"] > 35
+
+
+def test_a_model_that_is_one_frame_late_is_noticed(monkeypatch, episodes, tmp_path):
+    config = tiny(tmp_path, clips=2)
+    model = knowing_model(monkeypatch, config, late=1)
+    scored = scoring.score_table(config, episodes, model, Partials(tmp_path, "f" * 64), print)
+    assert table(scored.sums, scored.episodes)["memory"]["all"]["psnr"]["mean"] < 25
+
+
+def test_batches_do_not_change_the_numbers(monkeypatch, episodes, tmp_path):
+    sums = []
+    for batch in (1, 3):
+        config = tiny(tmp_path, clips=3, batch=batch)
+        model = knowing_model(monkeypatch, config)
+        partials = Partials(tmp_path / str(batch), "f" * 64)
+        sums.append(scoring.score_table(config, episodes, model, partials, print).sums)
+    for method in sums[0]:
+        np.testing.assert_allclose(sums[0][method], sums[1][method], rtol=1e-4, atol=1e-4)
+
+
+def test_scored_pieces_are_not_done_again(monkeypatch, episodes, tmp_path):
+    config = tiny(tmp_path, clips=4, chain=2)
+    model = knowing_model(monkeypatch, config)
+    whole = scoring.score_table(config, episodes, model, Partials(tmp_path / "a", "f" * 64), print)
+
+    calls, run = [], Imagination.run
+
+    def failing(self, *args, **kwargs):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return run(self, *args, **kwargs)
+
+    monkeypatch.setattr(Imagination, "run", failing)
+    with pytest.raises(KeyboardInterrupt):
+        scoring.score_table(config, episodes, model, Partials(tmp_path / "b", "f" * 64), print)
+    said = []
+    resumed = scoring.score_table(
+        config, episodes, model, Partials(tmp_path / "b", "f" * 64), said.append
+    )
+    # Two batches × two seeds × two sampled methods, each imagined exactly once (plus the cut one).
+    assert len(calls) == 8 + 1
+    assert "scored before" in said[0]
+    for method in whole.sums:
+        np.testing.assert_array_equal(whole.sums[method], resumed.sums[method])
+
+
+def test_pieces_of_other_weights_are_dropped_and_broken_ones_ignored(tmp_path):
+    old = Partials(tmp_path, "a" * 64)
+    old.put("piece", x=np.arange(3))
+    assert old.get("piece")["x"].tolist() == [0, 1, 2]
+    path = old.folder / "piece.npz"
+    path.write_bytes(path.read_bytes()[:-30])
+    assert old.get("piece") is None
+    new = Partials(tmp_path, "b" * 64)
+    assert new.get("piece") is None
+    assert not old.folder.exists()
+
+
+def test_long_rollouts_keep_pictures_and_the_map(monkeypatch, episodes, tmp_path):
+    config = tiny(tmp_path, video_clips=9)
+    model = knowing_model(monkeypatch, config)
+    partials = Partials(tmp_path, "f" * 64)
+    long = scoring.roll_long(config, episodes, model, partials, print)
+    assert long.chain == 5  # 5 × 4 frames after a start fit into 24 frames; 6 do not
+    assert long.shown == 1
+    assert long.kept["memory"]["rgb"].shape == (1, 20, 16, 16, 3)
+    assert long.kept["memory"]["first_valid"].any()
+    episode = episodes[long.scored.choices[0].episode]
+    truth = episode.frames(list(long.scored.choices[0].targets_N))
+    off = truth.rgb_THWC.astype(int) - long.kept["memory"]["rgb"][0]
+    assert np.abs(off).max() <= 3
+    monkeypatch.setattr(Imagination, "run", None)
+    again = scoring.roll_long(config, episodes, model, partials, print)
+    np.testing.assert_array_equal(again.kept["empty"]["rgb"], long.kept["empty"]["rgb"])
+
+
+def test_equal_seeds_draw_equal_noise_whatever_the_batch():
+    seeds = np.array([[0, 0], [0, 1], [1, 0]], np.uint32)
+    data = jax.random.key_data(imagine.clip_keys(seeds))
+    one = jax.random.key_data(imagine.clip_keys(seeds[1:2]))
+    np.testing.assert_array_equal(data[1], one[0])
+    assert len({tuple(row) for row in np.asarray(data).tolist()}) == 3
