@@ -1,0 +1,203 @@
+"""Rooms, doorways and windows of a house, as rectangles on the ground."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+WALL_M = 0.12
+"""Thickness of walls."""
+DOOR_TOP_M = 2.08
+"""Height of doorways."""
+SMALLEST_M = 2.7
+"""Shortest side of a room between wall centres."""
+SHARE_M = 1.5
+"""Shortest common wall that gets a doorway."""
+Rect = tuple[float, float, float, float]
+"""x0, y0, x1, y1 in metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Opening:
+    """A hole in one wall of a room.
+
+    Attributes:
+        side: wall it is in: 0 south (y low), 1 east, 2 north, 3 west.
+        low: start along the wall (x for south and north, y otherwise), world metres.
+        high: end along the wall.
+        bottom: lower edge above the floor.
+        top: upper edge above the floor.
+        kind: ``door`` or ``window``.
+    """
+
+    side: int
+    low: float
+    high: float
+    bottom: float
+    top: float
+    kind: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Room:
+    """One room: the rectangle between its walls' surfaces, its use, and its openings."""
+
+    rect: Rect
+    use: str
+    openings: tuple[Opening, ...]
+
+    @property
+    def area(self) -> float:
+        """Floor area in square metres."""
+        return (self.rect[2] - self.rect[0]) * (self.rect[3] - self.rect[1])
+
+    def span(self, side: int) -> tuple[float, float]:
+        """Return where a wall starts and ends along its axis."""
+        x0, y0, x1, y1 = self.rect
+        return (x0, x1) if side % 2 == 0 else (y0, y1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """The ground plan of a house: rooms, and doorways as (room, room, rectangle)."""
+
+    rooms: tuple[Room, ...]
+    doorways: tuple[tuple[int, int, Rect], ...]
+    height: float
+
+
+def draw_plan(rng: np.random.Generator) -> Plan:
+    """Draw a plan of 3 to 8 rooms in which every room can be reached."""
+    count = int(rng.integers(3, 9))
+    cells = _split(rng, count)
+    shared = _shared_walls(cells)
+    doorways = _doorways(rng, cells, shared)
+    openings: list[list[Opening]] = [[] for _ in cells]
+    for a, b, side, low, high in doorways:
+        openings[a].append(Opening(side, low, high, 0.0, DOOR_TOP_M, "door"))
+        openings[b].append(Opening((side + 2) % 4, low, high, 0.0, DOOR_TOP_M, "door"))
+    rects = [_inset(cell, WALL_M / 2) for cell in cells]
+    outer = (0.0, 0.0, max(c[2] for c in cells), max(c[3] for c in cells))
+    for index, cell in enumerate(cells):
+        openings[index] += _windows(rng, cell, outer)
+    uses = _uses(rng, [(r[2] - r[0]) * (r[3] - r[1]) for r in rects])
+    rooms = tuple(
+        Room(rect, use, tuple(holes))
+        for rect, use, holes in zip(rects, uses, openings, strict=True)
+    )
+    passages = tuple(
+        (a, b, _passage(cells[a], side, low, high)) for a, b, side, low, high in doorways
+    )
+    return Plan(rooms, passages, float(rng.uniform(2.5, 2.8)))
+
+
+def _split(rng: np.random.Generator, count: int) -> list[Rect]:
+    """Cut a rectangle into that many rooms, larger ones first, across their longer side."""
+    while True:
+        area = count * rng.uniform(12.5, 17.0)
+        aspect = rng.uniform(0.75, 1.35)
+        width = round(float(np.sqrt(area * aspect)), 1)
+        cells: list[Rect] = [(0.0, 0.0, width, round(area / width, 1))]
+        while len(cells) < count:
+            sizes = np.array([(c[2] - c[0]) * (c[3] - c[1]) for c in cells])
+            pick = int(rng.choice(len(cells), p=sizes**2 / (sizes**2).sum()))
+            if (
+                max(cells[pick][2] - cells[pick][0], cells[pick][3] - cells[pick][1])
+                < 2 * SMALLEST_M
+            ):
+                pick = int(sizes.argmax())
+            x0, y0, x1, y1 = cells.pop(pick)
+            across, fraction = x1 - x0 > y1 - y0, rng.uniform(0.36, 0.64)
+            length = x1 - x0 if across else y1 - y0
+            if length < 2 * SMALLEST_M:
+                break
+            cut = round(float(np.clip(fraction * length, SMALLEST_M, length - SMALLEST_M)), 2)
+            if across:
+                cells += [(x0, y0, x0 + cut, y1), (x0 + cut, y0, x1, y1)]
+            else:
+                cells += [(x0, y0, x1, y0 + cut), (x0, y0 + cut, x1, y1)]
+        if len(cells) == count and _connected(count, _shared_walls(cells)):
+            return cells
+
+
+def _shared_walls(cells: list[Rect]) -> list[tuple[int, int, int, float, float]]:
+    """Return (a, b, side of a, low, high) for every wall long enough for a doorway."""
+    found = []
+    for a, ra in enumerate(cells):
+        for b, rb in enumerate(cells):
+            for side, axis in ((1, 0), (2, 1)):
+                if abs(ra[axis + 2] - rb[axis]) > 1e-6:
+                    continue
+                along = 1 - axis
+                low, high = max(ra[along], rb[along]), min(ra[along + 2], rb[along + 2])
+                if high - low >= SHARE_M:
+                    found.append((a, b, side, low, high))
+    return found
+
+
+def _connected(count: int, walls: list[tuple[int, int, int, float, float]]) -> bool:
+    a, b = [w[0] for w in walls], [w[1] for w in walls]
+    graph = coo_matrix((np.ones(len(walls)), (a, b)), shape=(count, count))
+    return connected_components(graph, directed=False)[0] == 1
+
+
+def _doorways(
+    rng: np.random.Generator, cells: list[Rect], walls: list[tuple[int, int, int, float, float]]
+) -> list[tuple[int, int, int, float, float]]:
+    """Choose a random spanning tree of the shared walls plus a few more, and cut doorways."""
+    group = list(range(len(cells)))
+    chosen = []
+    for index in rng.permutation(len(walls)):
+        a, b, side, low, high = walls[index]
+        new = group[a] != group[b]
+        if not new and rng.uniform() > 0.3:
+            continue
+        group = [group[a] if g == group[b] else g for g in group]
+        wide = high - low > 3.0 and rng.uniform() < 0.3
+        width = rng.uniform(1.5, 2.0) if wide else rng.uniform(0.95, 1.1)
+        start = rng.uniform(low + 0.2, high - 0.2 - width)
+        chosen.append((a, b, side, round(start, 2), round(start + width, 2)))
+    return chosen
+
+
+def _inset(rect: Rect, by: float) -> Rect:
+    return rect[0] + by, rect[1] + by, rect[2] - by, rect[3] - by
+
+
+def _passage(cell: Rect, side: int, low: float, high: float) -> Rect:
+    """Return the rectangle through the wall on the east (1) or north (2) side of a cell."""
+    half = WALL_M / 2
+    if side == 1:
+        return cell[2] - half, low, cell[2] + half, high
+    return low, cell[3] - half, high, cell[3] + half
+
+
+def _windows(rng: np.random.Generator, cell: Rect, outer: Rect) -> list[Opening]:
+    """Put windows into outer walls."""
+    found = []
+    for side, index in ((0, 1), (1, 2), (2, 3), (3, 0)):
+        if abs(cell[index] - outer[index]) > 1e-6 or rng.uniform() < 0.3:
+            continue
+        low, high = (cell[0], cell[2]) if side % 2 == 0 else (cell[1], cell[3])
+        width = min(rng.uniform(1.0, 1.9), high - low - 1.0)
+        start = rng.uniform(low + 0.5, high - 0.5 - width)
+        bottom = rng.uniform(0.85, 1.05)
+        found.append(Opening(side, start, start + width, bottom, bottom + 1.1, "window"))
+    return found
+
+
+def _uses(rng: np.random.Generator, areas: list[float]) -> list[str]:
+    """Give the largest room to living, the smallest to washing, and share out the rest."""
+    order = np.argsort(areas)[::-1]
+    middle = ["bedroom", "kitchen", "study", "dining", "kids", "bedroom"]
+    rest = [*middle[:2], *rng.permutation(middle[2:])][: len(areas) - 2]
+    if len(areas) > 6:
+        rest[-1] = "hall"
+    names = ["living", *rest, "bathroom"]
+    uses = [""] * len(areas)
+    for room, name in zip(order, names, strict=True):
+        uses[room] = str(name)
+    return uses

@@ -1,0 +1,344 @@
+"""What stands where: furniture placed in a room so that every doorway stays reachable.
+
+A piece is accepted only if it keeps clear of others, of doorways and of windows, and if the
+floor that an agent can stand on still connects all doorways of the room.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy import ndimage
+
+from pewm_jax.data import furniture as f
+from pewm_jax.data import furniture_more as m
+from pewm_jax.data.floorplan import Rect, Room
+from pewm_jax.data.furniture import Maker, Tones
+from pewm_jax.data.shapes import Piece
+
+CLEAR_M = 0.3
+"""Room an agent needs on each side of its centre: its radius and a margin."""
+CELL_M = 0.1
+"""Cell of the floor grid on which reachability is checked."""
+TRIES = 12
+"""Places tried for a piece before it is left out."""
+
+PROGRAMMES: dict[str, tuple[tuple[Maker, ...], tuple[Maker, ...]]] = {
+    "living": (
+        (f.sofa, f.tv_stand, f.bookshelf),
+        (f.armchair, m.plant, m.floor_lamp, m.fireplace, m.piano, f.dresser, f.armchair, m.plant),
+    ),
+    "bedroom": (
+        (f.bed, f.wardrobe, f.nightstand),
+        (f.dresser, m.plant, m.floor_lamp, f.armchair, f.bookshelf, f.desk),
+    ),
+    "kitchen": (
+        (m.kitchen_counter, m.fridge, m.stove),
+        (m.plant, f.dresser, m.kitchen_counter),
+    ),
+    "bathroom": (
+        (m.bathtub, m.toilet, m.washbasin),
+        (m.washing_machine, m.plant, f.dresser),
+    ),
+    "study": (
+        (f.desk, f.bookshelf, f.bookshelf),
+        (f.armchair, m.floor_lamp, m.plant, f.sofa, m.piano),
+    ),
+    "dining": (
+        (f.dresser, m.plant),
+        (m.fireplace, m.floor_lamp, f.bookshelf, m.piano, m.plant),
+    ),
+    "kids": (
+        (f.bed, m.toy_chest, f.wardrobe),
+        (f.desk, f.bookshelf, m.toy_chest, m.plant, m.floor_lamp),
+    ),
+    "hall": (
+        (m.coat_rack, f.dresser),
+        (m.plant, f.wardrobe, m.floor_lamp, f.armchair, f.bookshelf),
+    ),
+}
+"""For each use of a room: what it must have, and what it may have."""
+TABLES = {"kitchen": 0.7, "dining": 1.0, "living": 0.25}
+"""Chance of a dining table in the middle."""
+RUGS = {"living": 0.9, "bedroom": 0.7, "kids": 0.9, "study": 0.5, "hall": 0.6, "dining": 0.4}
+"""Chance of a rug."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Placed:
+    """A piece and where it is: ``world_from_piece`` (4, 4)."""
+
+    piece: Piece
+    world_from_piece: np.ndarray
+
+
+class Furnisher:
+    """Places pieces in one room and keeps account of walls and floor."""
+
+    def __init__(self, room: Room, rng: np.random.Generator, tones: Tones, height: float):
+        """Start with the bare room."""
+        self.room, self.rng, self.tones, self.height = room, rng, tones, height
+        self.placed: list[Placed] = []
+        self.footprints: list[Rect] = []
+        self.used: list[list[Rect]] = [[] for _ in range(4)]
+        for hole in room.openings:
+            gap = 0.12
+            self.used[hole.side].append((hole.low - gap, hole.bottom, hole.high + gap, hole.top))
+        self.doors = [
+            _apron(room, hole.side, hole.low, hole.high)
+            for hole in room.openings
+            if hole.kind == "door"
+        ]
+        x0, y0, x1, y1 = room.rect
+        self.shape = (int((y1 - y0) / CELL_M), int((x1 - x0) / CELL_M))
+        self.blocked = np.zeros(self.shape, bool)
+        edge = round((CLEAR_M - 0.05) / CELL_M)
+        self.blocked[:edge], self.blocked[-edge:] = True, True
+        self.blocked[:, :edge], self.blocked[:, -edge:] = True, True
+        self.open_cells = int((~self.blocked).sum())
+
+    def furnish(self) -> list[Placed]:
+        """Fill the room by the programme of its use."""
+        rng, use = self.rng, self.room.use
+        must, may = PROGRAMMES[use]
+        for maker in must:
+            self.at_wall(maker(rng, self.tones))
+            if maker is f.bed and self.placed and self.placed[-1].piece.kind == "bed":
+                self.beside_last(f.nightstand(rng, self.tones))
+            if maker is f.desk and self.placed and self.placed[-1].piece.kind == "desk":
+                self.before_last(f.office_chair(rng, self.tones), 0.72, turned=True)
+            if maker is f.sofa and rng.uniform() < 0.8:
+                self.before_last(f.coffee_table(rng, self.tones), 1.25, turned=False)
+        if rng.uniform() < TABLES.get(use, 0.0):
+            self.table_with_chairs()
+        for index in rng.permutation(len(may)):
+            if rng.uniform() < 0.85:
+                self.at_wall(may[index](rng, self.tones))
+        if rng.uniform() < RUGS.get(use, 0.3):
+            self.rug()
+        self.hang(m.clock(rng, self.tones), 1.6) if rng.uniform() < 0.3 else None
+        self.hang(m.wall_shelf(rng, self.tones), 1.1) if rng.uniform() < 0.7 else None
+        for _ in range(int(rng.integers(3, 6))):
+            self.hang(m.picture(rng, self.tones), rng.uniform(1.25, 1.45))
+        self.ceiling_lamp()
+        return self.placed
+
+    def at_wall(self, piece: Piece) -> bool:
+        """Put a piece with its back to some wall; False if there is no place."""
+        width, depth, high = piece.size
+        for _ in range(TRIES):
+            side = int(self.rng.integers(4))
+            low, high_end = self.room.span(side)
+            if high_end - low < width + 0.1:
+                continue
+            if self.rng.uniform() < 0.35:
+                at = low + width / 2 + 0.03
+            elif self.rng.uniform() < 0.5:
+                at = high_end - width / 2 - 0.03
+            else:
+                at = self.rng.uniform(low + width / 2 + 0.03, high_end - width / 2 - 0.03)
+            span = (at - width / 2, 0.0, at + width / 2, high)
+            if any(_overlap(span, other) for other in self.used[side]):
+                continue
+            if self._stand(piece, _against(self.room, side, at, depth, width), side, at):
+                self.used[side].append(span)
+                return True
+        return False
+
+    def beside_last(self, piece: Piece) -> bool:
+        """Put a piece at the wall next to the last one."""
+        side, at, width = self._last
+        for sign in self.rng.permutation([-1, 1]):
+            centre = at + sign * (width / 2 + piece.size[0] / 2 + 0.04)
+            low, high = self.room.span(side)
+            if not low + piece.size[0] / 2 <= centre <= high - piece.size[0] / 2:
+                continue
+            span = (centre - piece.size[0] / 2, 0.0, centre + piece.size[0] / 2, piece.size[2])
+            if any(_overlap(span, other) for other in self.used[side]):
+                continue
+            rect = _against(self.room, side, centre, piece.size[1], piece.size[0])
+            if self._stand(piece, rect, side, centre):
+                self.used[side].append(span)
+                return True
+        return False
+
+    def before_last(self, piece: Piece, distance: float, *, turned: bool) -> bool:
+        """Put a piece in front of the last one at the wall, facing it or facing away."""
+        side, at, _ = self._last
+        frame = _frame(self.room, side, at)
+        depth = piece.size[1]
+        local = np.eye(4)
+        if turned:
+            local[:2, :2] *= -1
+            local[1, 3] = distance + depth
+        else:
+            local[1, 3] = distance
+        pose = frame @ local
+        return self._free_standing(piece, pose)
+
+    def table_with_chairs(self) -> bool:
+        """Put a dining table somewhere in the room with chairs around it."""
+        rng, x0y0x1y1 = self.rng, self.room.rect
+        table = f.dining_table(rng, self.tones)
+        for _ in range(2 * TRIES):
+            turn = int(rng.integers(2))
+            w, d = table.size[:2] if turn == 0 else table.size[1::-1]
+            room = [x0y0x1y1[i + 2] - x0y0x1y1[i] - 1.6 for i in range(2)]
+            if room[0] < w or room[1] < d:
+                continue
+            centre = [
+                rng.uniform(x0y0x1y1[i] + 0.8 + s / 2, x0y0x1y1[i + 2] - 0.8 - s / 2)
+                for i, s in enumerate((w, d))
+            ]
+            pose = _turned(turn, centre) @ _shift(0, -table.size[1] / 2)
+            if not self._free_standing(table, pose):
+                continue
+            middle = table.size[1] / 2
+            spots = [(0.3, -0.42, 0), (-0.3, -0.42, 0), (0.3, 0.42, 2), (-0.3, 0.42, 2)]
+            seed = int(rng.integers(1 << 30))
+            for x, y, k in spots if rng.uniform() < 0.6 else spots[1::2] + spots[:1]:
+                chair = f.chair(np.random.default_rng(seed), self.tones)
+                there = np.sign(y) * (middle + 0.12)
+                local = _shift(x, middle + there) @ _turned(k, (0, 0)) @ _shift(0, -0.3)
+                self._free_standing(chair, pose @ local, margin=-0.2)
+            return True
+        return False
+
+    def rug(self) -> None:
+        """Lay a rug in the middle."""
+        piece = m.rug(self.rng, self.tones)
+        x0, y0, x1, y1 = self.room.rect
+        turn = int(y1 - y0 > x1 - x0)
+        w, d = piece.size[:2] if turn == 0 else piece.size[1::-1]
+        if x1 - x0 > w + 0.4 and y1 - y0 > d + 0.4:
+            middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2]) + self.rng.uniform(-0.15, 0.15, 2)
+            pose = _turned(turn, middle) @ _shift(0, -piece.size[1] / 2)
+            self.placed.append(Placed(piece, pose))
+
+    def hang(self, piece: Piece, bottom: float) -> None:
+        """Hang a piece on a free stretch of wall."""
+        width, _, high = piece.size
+        for _ in range(TRIES):
+            side = int(self.rng.integers(4))
+            low, end = self.room.span(side)
+            if end - low < width + 0.3:
+                continue
+            at = self.rng.uniform(low + width / 2 + 0.12, end - width / 2 - 0.12)
+            span = (
+                at - width / 2 - 0.06,
+                bottom - 0.05,
+                at + width / 2 + 0.06,
+                bottom + high + 0.05,
+            )
+            if not any(_overlap(span, other) for other in self.used[side]):
+                pose = _frame(self.room, side, at)
+                pose[2, 3] = bottom
+                self.placed.append(Placed(piece, pose))
+                self.used[side].append(span)
+                return
+
+    def ceiling_lamp(self) -> None:
+        """Hang a lamp from the middle of the ceiling."""
+        x0, y0, x1, y1 = self.room.rect
+        pose = _shift((x0 + x1) / 2, (y0 + y1) / 2)
+        pose[2, 3] = self.height
+        self.placed.append(Placed(m.ceiling_lamp(self.rng, self.tones), pose))
+
+    def _stand(self, piece: Piece, rect: Rect, side: int, at: float) -> bool:
+        if not self._accept(rect, 0.0):
+            return False
+        self.placed.append(Placed(piece, _frame(self.room, side, at)))
+        self._last = (side, at, piece.size[0])
+        return True
+
+    def _free_standing(self, piece: Piece, pose: np.ndarray, margin: float = 0.0) -> bool:
+        half, depth = piece.size[0] / 2, piece.size[1]
+        corners = np.array([[-half, 0, 0, 1], [half, depth, 0, 1]]) @ pose.T
+        low, high = corners[:, :2].min(0), corners[:, :2].max(0)
+        rect = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        x0, y0, x1, y1 = self.room.rect
+        inside = rect[0] > x0 and rect[1] > y0 and rect[2] < x1 and rect[3] < y1
+        if not inside or not self._accept(rect, margin):
+            return False
+        self.placed.append(Placed(piece, pose))
+        return True
+
+    def _accept(self, rect: Rect, margin: float) -> bool:
+        """Take a footprint if it is clear and the doorways stay connected; else change nothing."""
+        grown = (rect[0] - margin, rect[1] - margin, rect[2] + margin, rect[3] + margin)
+        if any(_overlap(grown, other) for other in self.footprints):
+            return False
+        if any(_overlap(rect, door) for door in self.doors):
+            return False
+        x0, y0 = self.room.rect[:2]
+        first = [max(0, int(np.floor((rect[i] - (x0, y0)[i] - CLEAR_M) / CELL_M))) for i in (0, 1)]
+        last = [int(np.ceil((rect[i + 2] - (x0, y0)[i] + CLEAR_M) / CELL_M)) for i in (0, 1)]
+        region = (slice(first[1], last[1]), slice(first[0], last[0]))
+        before = self.blocked[region].copy()
+        self.blocked[region] = True
+        if self._reachable():
+            self.footprints.append(rect)
+            return True
+        self.blocked[region] = before
+        return False
+
+    def _reachable(self) -> bool:
+        """Whether free floor connects all doorways and most of what is free."""
+        free = ~self.blocked
+        labels, count = ndimage.label(free)
+        if count == 0:
+            return False
+        sizes = np.bincount(labels.ravel())[1:]
+        largest = int(sizes.argmax()) + 1
+        if sizes[largest - 1] < max(0.22 * self.open_cells, 0.85 * sizes.sum()):
+            return False
+        x0, y0 = self.room.rect[:2]
+        for door in self.doors:
+            cx, cy = (door[0] + door[2]) / 2, (door[1] + door[3]) / 2
+            row = np.clip(int((cy - y0) / CELL_M), 0, self.shape[0] - 1)
+            column = np.clip(int((cx - x0) / CELL_M), 0, self.shape[1] - 1)
+            if labels[row, column] != largest:
+                return False
+        return True
+
+
+def _overlap(a: Rect, b: Rect) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _against(room: Room, side: int, at: float, depth: float, width: float) -> Rect:
+    """Return the footprint of a piece at a wall."""
+    x0, y0, x1, y1 = room.rect
+    low, high = at - width / 2, at + width / 2
+    return (
+        (low, y0, high, y0 + depth),
+        (x1 - depth, low, x1, high),
+        (low, y1 - depth, high, y1),
+        (x0, low, x0 + depth, high),
+    )[side]
+
+
+def _apron(room: Room, side: int, low: float, high: float) -> Rect:
+    """Return the floor inside a room that its doorway needs."""
+    return _against(room, side, (low + high) / 2, 0.75, high - low)
+
+
+def _shift(x: float, y: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:2, 3] = x, y
+    return pose
+
+
+def _turned(quarters: int, at_2) -> np.ndarray:
+    """Return a pose turned by quarter circles about z."""
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
+    pose = _shift(float(at_2[0]), float(at_2[1]))
+    pose[:2, :2] = [[c, -s], [s, c]]
+    return pose
+
+
+def _frame(room: Room, side: int, at: float) -> np.ndarray:
+    """Return the frame of a wall at a place along it: y points into the room."""
+    x0, y0, x1, y1 = room.rect
+    return _turned(side, ((at, y0), (x1, at), (at, y1), (x0, at))[side])

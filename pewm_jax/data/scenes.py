@@ -1,0 +1,308 @@
+"""Any triangle mesh → a `Scene`: flat arrays ready for casting rays and shading hits.
+
+A scene is built once; colours, texture coordinates and baked light of a triangle are stored as
+one row, affine in the barycentric coordinates of a hit, so that shading gathers once per pixel.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+from embreex.rtcore_scene import EmbreeScene
+
+from pewm_jax.config import UserError
+from pewm_jax.data import lighting
+from pewm_jax.data.houses import generate_house
+from pewm_jax.data.materials import LEVELS, Textures, pack
+
+GREY = np.array([170, 170, 170], np.uint8)
+"""Colour of a mesh that brings none."""
+_UNREADABLE = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    EOFError,
+    ImportError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zlib.error,
+)
+"""What trimesh's many parsers raise on files that they cannot make sense of."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """A static world of triangles, z up, metres.
+
+    Attributes:
+        name: identifies the scene in episodes.
+        vertices_V3: (V, 3) float64 world positions.
+        faces_F3: (F, 3) int32 vertex indices.
+        normals_F3: (F, 3) float64 unit face normals.
+        object_F: (F,) int32 instance id of each face, an index into ``objects``.
+        objects: names of the instances.
+        shading_F16: (F, 16) float32; five quantities q (light × colour as r, g, b; texture
+            s, t) stored as q₀, q₁ − q₀, q₂ − q₀ over the corners; last, texels per metre.
+        texture_F: (F,) int32 first row of the face's image in the level table.
+        textures: the images.
+        metadata: plain values that came with the scene (rooms, seed).
+    """
+
+    name: str
+    vertices_V3: np.ndarray
+    faces_F3: np.ndarray
+    normals_F3: np.ndarray
+    object_F: np.ndarray
+    objects: tuple[str, ...]
+    shading_F16: np.ndarray
+    texture_F: np.ndarray
+    textures: Textures
+    metadata: dict[str, Any]
+
+    @functools.cached_property
+    def centre_3(self) -> np.ndarray:
+        """Middle of the bounding box; rays are cast relative to it to keep float32 exact."""
+        return np.asarray((self.vertices_V3.min(0) + self.vertices_V3.max(0)) / 2)
+
+    @functools.cached_property
+    def tracer(self) -> EmbreeScene:
+        """Embree's structure over ``vertices_V3 − centre_3``; built on first use per process."""
+        return lighting.embree(self.vertices_V3 - self.centre_3, self.faces_F3)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave Embree's structure behind when travelling to another process."""
+        return {key: value for key, value in self.__dict__.items() if key != "tracer"}
+
+
+def house(seed: int) -> Scene:
+    """Return the procedural house of a seed, ready to render."""
+    mesh = generate_house(seed)
+    return from_trimesh(mesh, mesh.metadata["name"])
+
+
+def load_scene(path: Path, up: Literal["auto", "z", "y"] = "auto") -> Scene:
+    """Read a mesh file of any kind that trimesh loads (GLB, OBJ, PLY, STL, …).
+
+    Args:
+        path: the file.
+        up: which axis of the file points up; ``auto`` takes y for glTF, as its specification
+            says, and z for all others.
+
+    Raises:
+        UserError: the file is absent or unreadable, or holds no usable triangles.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path} is not a file: give the path of a mesh (GLB, OBJ, PLY, …).")
+    try:
+        loaded = trimesh.load_scene(path)
+    except _UNREADABLE as error:
+        raise UserError(
+            f"{path} could not be read as a mesh ({_one_line(error)}): check that the file is "
+            "whole and of a kind that trimesh loads (GLB, OBJ, PLY, …)."
+        ) from None
+    if up == "auto":
+        up = "y" if path.suffix.lower() in {".glb", ".gltf"} else "z"
+    return from_trimesh(loaded, path.stem, up, where=str(path))
+
+
+def from_trimesh(
+    scene: trimesh.Scene | trimesh.Trimesh,
+    name: str,
+    up: Literal["z", "y"] = "z",
+    *,
+    where: str | None = None,
+) -> Scene:
+    """Turn a trimesh scene, with its instances, textures and colours, into a `Scene`.
+
+    Meshes without colours are grey and shaded softly, and so is a scene whose metadata says
+    ``shading: soft``; all others keep their colours as they are, as scans bring their own light.
+
+    Args:
+        scene: meshes in metres; entries that are not triangle meshes are left out.
+        name: name of the result.
+        up: axis that points up; y is turned to z.
+        where: what to call the scene in error messages, its name by default.
+
+    Raises:
+        UserError: there are no triangles, or vertices are not finite.
+    """
+    where = where or name
+    if isinstance(scene, trimesh.Trimesh):
+        scene = trimesh.Scene(scene)
+    soft = scene.metadata.get("shading") == "soft"
+    parts: list[_Part] = []
+    surfaces: dict[str, _Surface] = {}
+    for node in scene.graph.nodes_geometry:
+        transform, key = scene.graph[node]
+        mesh = scene.geometry[key]
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+            continue
+        if key not in surfaces:
+            surfaces[key] = _surface(mesh, where)
+        parts.append(_place(str(node), np.asarray(transform), up, surfaces[key], where))
+    if not parts:
+        raise UserError(
+            f"{where} holds no triangles, so there is nothing to see: give a surface mesh, "
+            "not a point cloud or an empty file."
+        )
+    return _assemble(parts, name, soft, dict(scene.metadata))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Surface:
+    """One geometry before it is placed: positions, corner colours in [0, 1], uv, image."""
+
+    vertices_V3: np.ndarray
+    faces_F3: np.ndarray
+    colour_F33: np.ndarray
+    uv_F32: np.ndarray
+    image: np.ndarray | None
+    bare: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class _Part:
+    """One placed instance."""
+
+    node: str
+    vertices_V3: np.ndarray
+    surface: _Surface
+    mirrored: bool
+
+
+def _surface(mesh: trimesh.Trimesh, where: str) -> _Surface:
+    """Read positions and colours of one mesh; the image stays shared between instances."""
+    vertices = np.asarray(mesh.vertices, np.float64)
+    faces = np.asarray(mesh.faces, np.int32)
+    if faces.max() >= len(vertices) or faces.min() < 0:
+        raise UserError(
+            f"{where} has faces that point past its {len(vertices)} vertices: export it again."
+        )
+    colour = np.ones((len(faces), 3, 3), np.float32)
+    uv = np.zeros((len(faces), 3, 2), np.float32)
+    visual = mesh.visual
+    if isinstance(visual, trimesh.visual.TextureVisuals):
+        image, factor = _image_of(visual.material)
+        coordinates = None if visual.uv is None else np.asarray(visual.uv, np.float32)
+        if coordinates is None or coordinates.shape != (len(vertices), 2):
+            image = None if image is None else image.mean((0, 1), keepdims=True).astype(np.uint8)
+        else:
+            corners = np.nan_to_num(coordinates)[faces]
+            uv = np.stack([corners[..., 0], 1 - corners[..., 1]], -1)
+        tint = visual.vertex_attributes.get("color")
+        if tint is not None and len(tint) == len(vertices):
+            tint = np.asarray(tint)
+            scale = 255.0 if np.issubdtype(tint.dtype, np.integer) else 1.0
+            colour = (tint[:, :3] / scale).astype(np.float32)[faces]
+        bare = image is None and tint is None and factor is None
+        base = GREY / 255 if bare else (np.ones(3) if factor is None else factor)
+        return _Surface(vertices, faces, colour * base.astype(np.float32), uv, image, bare)
+    if visual.kind == "vertex":
+        colours = np.asarray(visual.vertex_colors)[:, :3].astype(np.float32) / 255
+        return _Surface(vertices, faces, colours[faces], uv, None, bare=False)
+    if visual.kind == "face":
+        colours = np.asarray(visual.face_colors)[:, :3].astype(np.float32) / 255
+        return _Surface(vertices, faces, colour * colours[:, None], uv, None, bare=False)
+    return _Surface(vertices, faces, colour * np.float32(GREY / 255), uv, None, bare=True)
+
+
+def _image_of(material: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return the (H, W, 3) uint8 image and the (3,) factor in [0, 1] of a material."""
+    if isinstance(material, trimesh.visual.material.PBRMaterial):
+        image, factor = material.baseColorTexture, material.baseColorFactor
+    else:
+        image = getattr(material, "image", None)
+        factor = getattr(material, "diffuse", None) if image is None else None
+    pixels = None if image is None else np.asarray(image.convert("RGB"))
+    if factor is None:
+        return pixels, None
+    factor = np.asarray(factor)
+    scale = 255.0 if np.issubdtype(factor.dtype, np.integer) else 1.0
+    return pixels, (factor[:3] / scale).astype(np.float64)
+
+
+def _place(node: str, transform: np.ndarray, up: str, surface: _Surface, where: str) -> _Part:
+    """Move one instance into the z-up world."""
+    vertices = surface.vertices_V3 @ transform[:3, :3].T + transform[:3, 3]
+    if not np.isfinite(vertices[surface.faces_F3]).all():
+        raise UserError(
+            f"{where} has vertices that are not finite numbers (in {node}): repair the mesh."
+        )
+    if up == "y":
+        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], -1)
+    vertices = np.where(np.isfinite(vertices), vertices, 0.0)
+    return _Part(node, vertices, surface, bool(np.linalg.det(transform[:3, :3]) < 0))
+
+
+def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any]) -> Scene:
+    """Concatenate instances, bake light and lay out the shading rows."""
+    starts = np.cumsum([0] + [len(part.vertices_V3) for part in parts[:-1]])
+    vertices = np.concatenate([part.vertices_V3 for part in parts])
+    faces = np.concatenate(
+        [part.surface.faces_F3 + start for part, start in zip(parts, starts, strict=True)]
+    ).astype(np.int32)
+    counts = [len(part.surface.faces_F3) for part in parts]
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    double_area = np.linalg.norm(cross, axis=-1, keepdims=True)
+    facing = np.repeat([-1.0 if part.mirrored else 1.0 for part in parts], counts)
+    normals = cross / double_area.clip(1e-12) * facing[:, None]
+    colour = np.concatenate([part.surface.colour_F33 for part in parts])
+    uv = np.concatenate([part.surface.uv_F32 for part in parts])
+    images: list[np.ndarray] = [np.full((1, 1, 3), 255, np.uint8)]
+    rows: dict[int, int] = {}
+    image_of_part = []
+    for part in parts:
+        image = part.surface.image
+        if image is not None and id(image) not in rows:
+            rows[id(image)] = len(images)
+            images.append(image)
+        image_of_part.append(0 if image is None else rows[id(image)])
+    texture = np.repeat(np.array(image_of_part, np.int32) * LEVELS, counts)
+    textures = pack(images)
+    size = textures.size_L2[texture]
+    edges = (uv[:, 1:] - uv[:, :1]) * size[:, None, :]
+    texels = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+    density = np.sqrt(texels / double_area[:, 0].clip(1e-12))
+    scene = Scene(
+        name=name,
+        vertices_V3=vertices,
+        faces_F3=faces,
+        normals_F3=normals,
+        object_F=np.repeat(np.arange(len(parts), dtype=np.int32), counts),
+        objects=tuple(part.node for part in parts),
+        shading_F16=np.zeros((len(faces), 16), np.float32),
+        texture_F=texture,
+        textures=textures,
+        metadata=metadata,
+    )
+    bare = np.repeat(np.array([part.surface.bare for part in parts]), counts)
+    if soft:
+        centred = vertices - scene.centre_3
+        colour = colour * lighting.soft_light(scene.tracer, centred, faces, normals)
+    elif bare.any():
+        light = lighting.face_light(normals)[:, None, :]
+        colour = np.where(bare[:, None, None], colour * light, colour)
+    values = np.concatenate([colour, uv], -1)
+    scene.shading_F16[:, :5] = values[:, 0]
+    scene.shading_F16[:, 5:10] = values[:, 1] - values[:, 0]
+    scene.shading_F16[:, 10:15] = values[:, 2] - values[:, 0]
+    scene.shading_F16[:, 15] = density
+    return scene
+
+
+def _one_line(error: BaseException) -> str:
+    """Return an exception as a short single line."""
+    return " ".join(str(error).split())[:160] or type(error).__name__

@@ -1,0 +1,142 @@
+"""Boxes, prisms, balls and sheets, gathered into one coloured mesh and a few textured ones.
+
+A piece of furniture lives in its own frame: x along the wall, y away from it (the back is at
+y = 0), z up, metres. Faces keep their own vertices, so that baked light has hard edges.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+Colour = Sequence[float] | np.ndarray
+"""Red, green, blue in [0, 1]."""
+
+_QUADS = np.array(
+    [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+)
+_CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float)
+BOX_24 = _CORNERS[_QUADS].reshape(24, 3)
+"""Corners of a unit box, four per face, counter-clockwise seen from outside."""
+BOX_FACES = np.array([[4 * q, 4 * q + i, 4 * q + i + 1] for q in range(6) for i in (1, 2)])
+
+
+@dataclasses.dataclass
+class Piece:
+    """A thing under construction.
+
+    Attributes:
+        kind: what it is, e.g. ``sofa``.
+        size: width along the wall, depth away from it, height; the space it needs, metres.
+    """
+
+    kind: str
+    size: tuple[float, float, float]
+    boxes: list[tuple[float, ...]] = dataclasses.field(default_factory=list)
+    meshes: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = dataclasses.field(
+        default_factory=list
+    )
+    sheets: list[tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=list)
+
+    def box(
+        self, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], colour: Colour
+    ) -> None:
+        """Add an axis-aligned box given its three intervals."""
+        r, g, b = colour
+        self.boxes.append((x[0], y[0], z[0], x[1], y[1], z[1], r, g, b))
+
+    def prism(
+        self,
+        centre: tuple[float, float],
+        z: tuple[float, float],
+        radius: tuple[float, float],
+        colour: Colour,
+        sides: int = 10,
+    ) -> None:
+        """Add an upright prism, cone or frustum: radius at the bottom and at the top."""
+        points, faces = _unit_prism(sides)
+        scale = np.where(points[:, 2:] > 0, radius[1], radius[0])
+        height = z[0] + (z[1] - z[0]) * points[:, 2:]
+        placed = np.concatenate([points[:, :2] * scale + np.array(centre), height], 1)
+        self.meshes.append((placed, faces, np.asarray(colour, float)))
+
+    def ball(self, centre: Sequence[float], radii: Sequence[float], colour: Colour) -> None:
+        """Add an ellipsoid."""
+        points, faces = _unit_ball()
+        placed = points * np.asarray(radii) + np.asarray(centre)
+        self.meshes.append((placed, faces, np.asarray(colour, float)))
+
+    def sheet(self, corners_43: Sequence[Sequence[float]], image: np.ndarray) -> None:
+        """Add a picture: corners bottom-left, bottom-right, top-right, top-left as seen."""
+        self.sheets.append((np.asarray(corners_43, float), image))
+
+    def solid(self) -> trimesh.Trimesh | None:
+        """Return everything but the sheets as one mesh with vertex colours."""
+        vertices, faces, colours = [], [], []
+        if self.boxes:
+            table = np.array(self.boxes)
+            low, high = table[:, None, :3], table[:, None, 3:6]
+            vertices.append((low + BOX_24 * (high - low)).reshape(-1, 3))
+            offset = 24 * np.arange(len(table))[:, None, None]
+            faces.append((BOX_FACES + offset).reshape(-1, 3))
+            colours.append(np.repeat(table[:, 6:], 24, 0))
+        start = sum(len(v) for v in vertices)
+        for points, triangles, colour in self.meshes:
+            vertices.append(points)
+            faces.append(triangles + start)
+            colours.append(np.broadcast_to(colour, points.shape))
+            start += len(points)
+        if not vertices:
+            return None
+        return coloured(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colours))
+
+    def pictures(self) -> list[trimesh.Trimesh]:
+        """Return the sheets as textured meshes."""
+        uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+        faces = np.array([[0, 1, 2], [0, 2, 3]])
+        return [textured(corners, faces, uv, image) for corners, image in self.sheets]
+
+
+def coloured(vertices_V3: np.ndarray, faces_F3: np.ndarray, rgb_V3: np.ndarray) -> trimesh.Trimesh:
+    """Return a mesh with vertex colours given in [0, 1]."""
+    rgba = np.full((len(vertices_V3), 4), 255, np.uint8)
+    rgba[:, :3] = np.clip(np.asarray(rgb_V3) * 255 + 0.5, 0, 255)
+    return trimesh.Trimesh(vertices_V3, faces_F3, vertex_colors=rgba, process=False)
+
+
+def textured(
+    vertices_V3: np.ndarray, faces_F3: np.ndarray, uv_V2: np.ndarray, image_HW3: np.ndarray
+) -> trimesh.Trimesh:
+    """Return a mesh with an image; uv (0, 0) is the image's bottom left corner."""
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(image_HW3), metallicFactor=0.0, roughnessFactor=1.0
+    )
+    visual = trimesh.visual.TextureVisuals(uv=uv_V2, material=material)
+    return trimesh.Trimesh(vertices_V3, faces_F3, visual=visual, process=False)
+
+
+@functools.lru_cache(maxsize=32)
+def _unit_prism(sides: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a prism of radius 1 and height 1 with split vertices: sides, then the two caps."""
+    angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], 1)
+    top = ring + [0, 0, 1]
+    after = np.roll(np.arange(sides), -1)
+    wall = np.stack([ring, ring[after], top[after], top], 1).reshape(-1, 3)
+    quads = 4 * np.arange(sides)[:, None]
+    faces = [np.concatenate([quads + [0, 1, 2], quads + [0, 2, 3]])]
+    fan = np.stack([np.zeros(sides - 2, int), np.arange(1, sides - 1), np.arange(2, sides)], 1)
+    faces += [fan + 4 * sides, fan[:, ::-1] + 5 * sides]
+    return np.concatenate([wall, top, ring]), np.concatenate(faces)
+
+
+@functools.lru_cache(maxsize=1)
+def _unit_ball() -> tuple[np.ndarray, np.ndarray]:
+    """Return an icosphere of 80 triangles."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    return np.array(ball.vertices), np.array(ball.faces)
