@@ -1,0 +1,158 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax.config import ConfigError, DiffusionConfig
+from pewm_jax.diffusion import objective, sampler, schedule
+from pewm_jax.models import world_model
+from pewm_jax.types import Clip
+from tests.helpers import random_frames, randomise, tiny_config
+
+
+def test_the_schedule_ends_in_pure_noise_and_falls():
+    alphas = schedule.alphas_cumprod(DiffusionConfig())
+    assert alphas[-1] == 0
+    assert np.all(np.diff(alphas) < 0)
+    assert 0.99 < alphas[0] < 1
+    shifted = schedule.alphas_cumprod(DiffusionConfig(snr_shift=3.0))
+    assert np.all(shifted[1:-1] < alphas[1:-1]), "a shift above 1 means more noise"
+
+
+@pytest.mark.parametrize("kind", ["x0", "v", "eps"])
+def test_every_target_leads_back_to_x0(kind):
+    config = DiffusionConfig(target=kind, zero_terminal_snr=kind != "eps")
+    rng = np.random.default_rng(0)
+    x0, noise = rng.normal(size=(2, 5, 3)).astype(np.float32)
+    times = jnp.array([0, 3, 500, 900, 999])
+    x_t = schedule.add_noise(config, x0, noise, times)
+    asked = schedule.target(config, x0, noise, times)
+    np.testing.assert_allclose(schedule.to_x0(config, asked, x_t, times), x0, atol=2e-3)
+
+
+def test_weighted_x0_error_equals_v_error():
+    config = DiffusionConfig(max_weight=1e9)
+    rng = np.random.default_rng(0)
+    x0, noise, guess = rng.normal(size=(3, 4, 6)).astype(np.float32)
+    times = jnp.array([100, 400, 700, 999])
+    a = np.sqrt(schedule.alphas_cumprod(config))[np.asarray(times)][:, None]
+    x_t = np.asarray(schedule.add_noise(config, x0, noise, times))
+    v_guess = (a * x_t - guess) / np.sqrt(1 - a**2)
+    v = schedule.target(dataclasses.replace(config, target="v"), x0, noise, times)
+    by_v = ((v_guess - v) ** 2).mean(-1)
+    by_x0 = schedule.x0_weight(config, times) * ((guess - x0) ** 2).mean(-1)
+    np.testing.assert_allclose(by_x0, by_v, rtol=1e-3)
+
+
+def test_epsilon_with_zero_terminal_snr_is_refused():
+    with pytest.raises(ConfigError, match="use v or x0"):
+        DiffusionConfig(target="eps")
+
+
+@pytest.mark.parametrize("steps", [1, 7, 50])
+def test_ddim_with_a_perfect_denoiser_finds_the_truth(steps):
+    config = DiffusionConfig(sample_steps=steps)
+    x0 = np.random.default_rng(0).normal(size=(2, 3)).astype(np.float32)
+    noise = jax.random.normal(jax.random.key(0), (2, 3))
+    out = jax.jit(lambda n: sampler.ddim(config, lambda _x, _t: jnp.asarray(x0), n))(noise)
+    np.testing.assert_allclose(out, x0, atol=1e-6)
+
+
+def test_ddim_keeps_the_noise_of_its_path():
+    """With the exact x0 known, every intermediate x_t is add_noise(x0, the same noise)."""
+    config = DiffusionConfig(sample_steps=10)
+    x0 = jnp.full((1, 4), 0.5)
+    noise = jax.random.normal(jax.random.key(1), (1, 4))
+    seen = []
+
+    def denoise(x, times):
+        jax.debug.callback(lambda a, b: seen.append((np.array(a), np.array(b))), x, times)
+        return x0
+
+    jax.block_until_ready(sampler.ddim(config, denoise, noise))
+    jax.effects_barrier()
+    assert len(seen) == 10
+    for x, times in seen:
+        np.testing.assert_allclose(x, schedule.add_noise(config, x0, noise, times), atol=1e-4)
+
+
+def test_steps_trail():
+    steps = schedule.trailing_steps(DiffusionConfig(sample_steps=10))
+    np.testing.assert_array_equal(steps, np.arange(999, 0, -100))
+
+
+def make_clip(config, seed=0, batch=2, context=3):
+    rng = np.random.default_rng(seed)
+    clips = [
+        Clip(
+            random_frames(rng, config.clip.frames),
+            random_frames(rng, context),
+            np.arange(context) > 0,
+        )
+        for _ in range(batch)
+    ]
+    return jax.tree.map(lambda *x: np.stack(x), *clips)
+
+
+@pytest.mark.parametrize("kind", ["x0", "v"])
+def test_the_loss_is_finite_and_stage_1_ignores_the_memory(kind):
+    config = tiny_config(diffusion=DiffusionConfig(target=kind))
+    clip, key = make_clip(config), jax.random.key(0)
+    params = randomise(world_model.init(config, key))
+    other = dataclasses.replace(clip, context=jax.tree.map(np.zeros_like, clip.context))
+    loss = jax.jit(objective.loss, static_argnums=0, static_argnames="memory")
+    stage1 = [float(loss(config, params, c, key, memory=False)[0]) for c in (clip, other)]
+    stage2 = [float(loss(config, params, c, key, memory=True)[0]) for c in (clip, other)]
+    assert np.isfinite(stage1 + stage2).all()
+    assert stage1[0] == stage1[1]
+    assert stage2[0] != stage2[1]
+
+
+def test_pixels_without_depth_do_not_train_depth():
+    config = tiny_config()
+    clip, key = make_clip(config), jax.random.key(0)
+    params = randomise(world_model.init(config, key, memory=False))
+    blank = dataclasses.replace(
+        clip, frames=dataclasses.replace(clip.frames, depth_THW=clip.frames.depth_THW * 0)
+    )
+    _, parts = objective.loss(config, params, blank, key, memory=False)
+    assert float(parts["loss_depth"]) == 0
+    _, parts = objective.loss(config, params, clip, key, memory=False)
+    assert float(parts["loss_depth"]) > 0
+
+
+def test_invalid_context_frames_are_not_remembered():
+    config = tiny_config()
+    clip = make_clip(config)
+    tokens = objective.clip_tokens(config, clip)
+    changed = np.array(clip.context.rgb_THWC)
+    changed[:, 0] = 255 - changed[:, 0]
+    context = dataclasses.replace(clip.context, rgb_THWC=changed)
+    again = objective.clip_tokens(config, dataclasses.replace(clip, context=context))
+    np.testing.assert_array_equal(tokens.features_MF, again.features_MF)
+    assert tokens.valid_M.any()
+
+
+def test_guidance_interpolates_between_with_and_without_map():
+    config = tiny_config()
+    clip, key = make_clip(config), jax.random.key(0)
+    params = randomise(world_model.init(config, key))
+    frames = objective.as_signal(clip.frames)
+    conditioning = world_model.condition(
+        config, frames.rgb_THWC[:, 0], frames.depth_THW[:, 0], jax.tree.map(jnp.asarray, frames.camera)
+    )
+    tokens = objective.clip_tokens(config, clip)
+    noise = jax.random.normal(key, (2, 3, 4, 6, 256))
+
+    def run(guidance, tokens):
+        diffusion = dataclasses.replace(config.diffusion, guidance=guidance, sample_steps=1)
+        return sampler.sample(
+            dataclasses.replace(config, diffusion=diffusion), params, conditioning, tokens, noise
+        )
+
+    with_map, without = run(1.0, tokens), run(1.0, None)
+    np.testing.assert_allclose(run(0.0, tokens), without, atol=1e-5)
+    np.testing.assert_allclose(run(3.0, tokens), without + 3 * (with_map - without), atol=1e-3)
+    assert np.abs(with_map - without).max() > 1e-4

@@ -1,0 +1,73 @@
+"""What several test files share: a tiny world model, random weights, random posed frames."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import (
+    ClipConfig,
+    CodecConfig,
+    Config,
+    DiffusionConfig,
+    DiTConfig,
+    MemoryConfig,
+)
+from pewm_jax.geometry import cameras
+from pewm_jax.types import Camera, Frames
+
+
+def tiny_config(**sections) -> Config:
+    config = Config(
+        clip=ClipConfig(frames=9, height=16, width=24),
+        codec=CodecConfig(spatial=4),
+        dit=DiTConfig(
+            layers=2, heads=2, head_dim=16, patch=2, text_length=3, text_dim=8, time_dim=16
+        ),
+        memory=MemoryConfig(
+            cell_m=(0.5, 0.5, 0.5),
+            cells=(24, 24, 8),
+            capacity=2048,
+            tokens=32,
+            encoder_patch=2,
+            heads=4,
+            head_dim=8,
+        ),
+        diffusion=DiffusionConfig(sample_steps=3),
+    )
+    return dataclasses.replace(config, **sections)
+
+
+def randomise(params, seed=0, scale=0.2):
+    """Replace every leaf, norms and zero-initialised gates included, by random numbers."""
+    leaves, tree = jax.tree.flatten(params)
+    rng = np.random.default_rng(seed)
+    drawn = [jnp.asarray(rng.normal(0, scale, x.shape), jnp.float32) + 0.5 * x for x in leaves]
+    return jax.tree.unflatten(tree, drawn)
+
+
+def random_camera(rng, frames, height=16, width=24, upright=False) -> Camera:
+    poses = []
+    for _ in range(frames):
+        pitch = 0.0 if upright else rng.uniform(-0.4, 0.4)
+        poses.append(cameras.pose_from_yaw(rng.uniform(-1, 1, 3), rng.uniform(-3, 3), pitch))
+    intrinsics = cameras.intrinsics_from_fov(height, width, 90.0)
+    return Camera(np.tile(intrinsics, (frames, 1)), np.stack(poses))
+
+
+def random_frames(rng, frames, height=16, width=24) -> Frames:
+    return Frames(
+        rng.integers(0, 256, (frames, height, width, 3), dtype=np.uint8),
+        rng.uniform(0.5, 4.0, (frames, height, width)).astype(np.float32),
+        random_camera(rng, frames, height, width, upright=True),
+    )
+
+
+def rigid(rng) -> np.ndarray:
+    """A random rotation about any axis, and a translation."""
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.linalg.det(q))
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = q, rng.uniform(-3, 3, 3)
+    return motion.astype(np.float32)

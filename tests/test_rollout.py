@@ -1,0 +1,111 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax import rollout as rollouts
+from pewm_jax.config import UserError
+from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.memory import voxel_map
+from pewm_jax.models import world_model
+from pewm_jax.types import Frames
+from tests.helpers import random_frames, randomise, tiny_config
+
+CONFIG = tiny_config()
+roll = jax.jit(rollouts.rollout, static_argnums=0, static_argnames="memory")
+ACTIONS = jnp.asarray([0, 0, 1, 0, 2, 0, 0, 1] * 2)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return randomise(world_model.init(CONFIG, jax.random.key(0)))
+
+
+def a_state(params, seed=0, count=3):
+    return rollouts.start(CONFIG, params, random_frames(np.random.default_rng(seed), count))
+
+
+def test_frames_come_one_per_action_along_the_integrated_poses(params):
+    state = a_state(params)
+    after, frames = roll(CONFIG, params, state, ACTIONS, jax.random.key(1))
+    assert frames.rgb_THWC.shape == (16, 16, 24, 3)
+    assert frames.depth_THW.shape == (16, 16, 24)
+    moves = action_geometry.continuous(CONFIG.actions, ACTIONS)
+    poses = action_geometry.integrate(state.frame.camera.world_from_camera[0], moves)
+    np.testing.assert_allclose(frames.camera.world_from_camera, poses[1:], atol=1e-5)
+    np.testing.assert_array_equal(after.frame.rgb_THWC[0], frames.rgb_THWC[-1])
+    assert float(jnp.abs(frames.rgb_THWC).max()) <= 1
+
+
+def test_discrete_and_continuous_actions_agree(params):
+    state, key = a_state(params), jax.random.key(1)
+    moves = action_geometry.continuous(CONFIG.actions, ACTIONS)
+    _, by_name = roll(CONFIG, params, state, ACTIONS, key)
+    _, by_number = roll(CONFIG, params, state, moves, key)
+    np.testing.assert_array_equal(by_name.rgb_THWC, by_number.rgb_THWC)
+
+
+def test_imagined_frames_enter_the_map_exactly_as_observed_ones(params):
+    state = a_state(params)
+    after, frames = roll(CONFIG, params, state, ACTIONS[:8], jax.random.key(1))
+    expected = voxel_map.insert_frames(CONFIG.memory, state.map, frames)
+    for name in ("slot_of_cell", "features_VF", "occupied"):
+        np.testing.assert_array_equal(getattr(after.map, name), getattr(expected, name))
+    assert int(after.map.occupied) > int(state.map.occupied)
+
+
+def test_the_map_changes_what_is_imagined_unless_ignored(params):
+    key = jax.random.key(1)
+    state = a_state(params)
+    emptied = dataclasses.replace(
+        state, map=voxel_map.empty(CONFIG.memory, state.map.origin_3, 6)
+    )
+    _, with_map = roll(CONFIG, params, state, ACTIONS[:8], key)
+    _, ignored = roll(CONFIG, params, state, ACTIONS[:8], key, memory=False)
+    _, without = roll(CONFIG, params, emptied, ACTIONS[:8], key)
+    np.testing.assert_array_equal(ignored.rgb_THWC, without.rgb_THWC)
+    assert float(jnp.abs(with_map.rgb_THWC - ignored.rgb_THWC).max()) > 1e-3
+
+
+def test_rollout_is_a_pure_function_of_its_arguments_and_vmaps(params):
+    states = [a_state(params, s) for s in range(2)]
+    keys = jax.random.split(jax.random.key(5), 2)
+    plans = jnp.stack([ACTIONS, ACTIONS[::-1]])
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    many = jax.jit(jax.vmap(lambda s, a, k: rollouts.rollout(CONFIG, params, s, a, k)))
+    _, both = many(stacked, plans, keys)
+    for i in range(2):
+        _, one = roll(CONFIG, params, states[i], plans[i], keys[i])
+        np.testing.assert_allclose(both.rgb_THWC[i], one.rgb_THWC, atol=2e-3)
+        _, again = roll(CONFIG, params, states[i], plans[i], keys[i])
+        np.testing.assert_array_equal(again.rgb_THWC, one.rgb_THWC)
+
+
+def test_start_takes_bytes_or_floats_and_remembers_every_frame(params):
+    frames = random_frames(np.random.default_rng(0), 3)
+    floats = Frames(frames.rgb_THWC / np.float32(127.5) - 1, frames.depth_THW, frames.camera)
+    a, b = (rollouts.start(CONFIG, params, f) for f in (frames, floats))
+    np.testing.assert_allclose(a.map.features_VF, b.map.features_VF, atol=1e-6)
+    last = jax.tree.map(lambda x: x[-1:], frames)
+    assert int(a.map.occupied) > int(rollouts.start(CONFIG, params, last).map.occupied)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda f: jax.tree.map(lambda x: x[:0], f), "S ≥ 1"),
+        (lambda f: dataclasses.replace(f, depth_THW=f.depth_THW[:, :8]), "resize the frames"),
+        (lambda f: dataclasses.replace(f, camera=jax.tree.map(lambda x: x[:1], f.camera)), "poses"),
+    ],
+)
+def test_start_refuses_frames_that_do_not_fit(params, change, sentence):
+    with pytest.raises(UserError, match=sentence):
+        rollouts.start(CONFIG, params, change(random_frames(np.random.default_rng(0), 2)))
+
+
+@pytest.mark.parametrize("actions", [jnp.zeros((7,), int), jnp.zeros((0,), int), jnp.zeros((8, 2))])
+def test_rollout_refuses_actions_that_do_not_fill_clips(params, actions):
+    with pytest.raises(UserError, match="multiple of 8|dx, dy, dyaw"):
+        rollouts.rollout(CONFIG, params, a_state(params), actions, jax.random.key(0))
