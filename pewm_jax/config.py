@@ -238,7 +238,7 @@ class DataConfig:
     context: int = 24
     """Earlier frames of the same episode given to the memory."""
     workers: int = 0
-    """Loader processes; 0 reads in a thread of the training process."""
+    """Threads that read and decode ahead of training; 0 means one."""
 
     def __post_init__(self):
         """Validate."""
@@ -335,10 +335,10 @@ class EvalConfig:
         """Validate."""
         _require(len(self.seeds) >= 1, "evaluate.seeds needs at least one seed.")
         _require(
-            min(self.clips, self.chain, self.stride, self.video_clips, self.batch) >= 1,
-            "evaluate.clips, chain, stride, video_clips and batch must be at least 1.",
+            min(self.clips, self.chain, self.stride, self.videos, self.video_clips, self.batch)
+            >= 1,
+            "evaluate.clips, chain, stride, videos, video_clips and batch must be at least 1.",
         )
-        _require(self.videos >= 0, "evaluate.videos must be 0 or more.")
 
 
 @dataclasses.dataclass(frozen=True)
