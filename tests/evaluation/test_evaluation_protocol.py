@@ -98,7 +98,7 @@ def test_actions_that_disagree_with_poses_are_refused(tmp_path):
 def test_frames_of_another_size_are_refused(tmp_path):
     other = [read_episode(record(0, size=24))]
     config = tiny(tmp_path)
-    with pytest.raises(UserError, match="24×24.*16×16"):
+    with pytest.raises(UserError, match=r"24×24.*16×16"):
         load_clip(config, other, choose(config, other, 1, 1)[0])
 
 

@@ -1,0 +1,165 @@
+"""The report's pictures and videos, made from long rollouts that were kept."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pewm_jax.config import Config
+from pewm_jax.data.episodes import Episode
+from pewm_jax.evaluation.pictures import (
+    as_bytes,
+    dim,
+    enlarge,
+    farthest,
+    from_above,
+    grid,
+    map_bounds,
+)
+from pewm_jax.evaluation.protocol import ClipChoice, load_clip
+from pewm_jax.evaluation.scoring import LongRollouts
+from pewm_jax.evaluation.seen import seen_masks
+from pewm_jax.evaluation.video import encode_h264, side_by_side
+from pewm_jax.geometry.actions import heading
+from pewm_jax.memory.features import colours
+from pewm_jax.types import Frames
+
+ABOVE_CAMERA_M = 0.4
+"""Map cells higher than this above the camera are left out when looking from above."""
+CAPTIONS = {"memory": "with its map", "empty": "empty map"}
+"""How pictures name the methods."""
+HOLD = 4
+"""Video frames for which the observed picture stands still."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gallery:
+    """Everything to look at.
+
+    Attributes:
+        videos: (caption, MP4) of each long rollout shown.
+        strip: still pictures of one of them: truth, with its map, empty map.
+        strip_note: which rollout that is and when its pictures were taken.
+        masks: the same true pictures with never-seen pixels greyed out.
+        above: the map from above before and after that rollout.
+    """
+
+    videos: list[tuple[str, bytes]]
+    strip: np.ndarray
+    strip_note: str
+    masks: np.ndarray
+    above: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shown:
+    choice: ClipChoice
+    context: Frames
+    truth: Frames
+    seen_THW: np.ndarray
+    made: dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts) -> Gallery:
+    """Draw the pictures and encode the videos.
+
+    The stills show the rollout with the most pixels seen before: chosen by geometry alone, never
+    by how well a method did.
+    """
+    shown = [_gather(config, episodes, long, index) for index in range(long.shown)]
+    best = max(range(len(shown)), key=lambda index: float(shown[index].seen_THW.mean()))
+    some = shown[best]
+    count = len(some.truth.depth_THW)
+    steps = np.unique(np.round(np.linspace(0, count, 8)).astype(int))
+    names = ["observed" if step == 0 else f"step {step}" for step in steps]
+    truth = _with_present(some.context, as_bytes(some.truth.rgb_THWC))
+    rows = [("truth", [truth[step] for step in steps])]
+    for method, (rgb, _) in some.made.items():
+        rows.append((CAPTIONS[method], [_with_present(some.context, rgb)[step] for step in steps]))
+    seen = np.concatenate([np.ones_like(some.seen_THW[:1]), some.seen_THW])
+    masked = [dim(enlarge(truth[step], 128), _enlarge_mask(seen[step], 128)) for step in steps]
+    return Gallery(
+        videos=[_video(config, long, item) for item in shown],
+        strip=grid(rows, names),
+        strip_note=(
+            f"Episode {some.choice.name} from frame {some.choice.start}; steps "
+            f"{', '.join(str(step) for step in steps[1:])} of {count}. Of the {long.shown} "
+            "rollouts shown above it is the one with the most pixels seen before."
+        ),
+        masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
+        above=_above(config, long, best, some),
+    )
+
+
+def _gather(config: Config, episodes: Sequence[Episode], long: LongRollouts, index: int) -> _Shown:
+    choice = long.scored.choices[index]
+    context, truth, _ = load_clip(config, episodes, choice)
+    seen, _ = seen_masks(truth, context)
+    made = {
+        method: (long.kept[method]["rgb"][index], long.kept[method]["depth"][index])
+        for method in CAPTIONS
+    }
+    return _Shown(choice, context, truth, np.asarray(seen), made)
+
+
+def _with_present(context: Frames, rgb_THWC: np.ndarray) -> np.ndarray:
+    return np.concatenate([as_bytes(np.asarray(context.rgb_THWC[-1:])), rgb_THWC])
+
+
+def _enlarge_mask(mask_HW: np.ndarray, width: int) -> np.ndarray:
+    factor = max(1, width // mask_HW.shape[1])
+    big = np.repeat(np.repeat(mask_HW, factor, 0), factor, 1)
+    rows = np.linspace(0, big.shape[0] - 1, round(mask_HW.shape[0] * width / mask_HW.shape[1]))
+    columns = np.linspace(0, big.shape[1] - 1, width)
+    return big[np.round(rows).astype(int)][:, np.round(columns).astype(int)]
+
+
+def _video(config: Config, long: LongRollouts, item: _Shown) -> tuple[str, bytes]:
+    depth0 = np.asarray(item.context.depth_THW[-1:])
+    columns = [("truth", as_bytes(item.truth.rgb_THWC), item.truth.depth_THW)]
+    columns += [(CAPTIONS[method], rgb, depth) for method, (rgb, depth) in item.made.items()]
+    columns = [
+        (name, _with_present(item.context, rgb), np.concatenate([depth0, depth]))
+        for name, rgb, depth in columns
+    ]
+    count = len(item.truth.depth_THW)
+    share = item.seen_THW.mean((1, 2))
+    footers = ["the present, observed by all three"] + [
+        f"imagined frame {t + 1} of {count}: {100 * share[t]:.0f} % of it was seen before"
+        for t in range(count)
+    ]
+    pictures = side_by_side(columns, footers, far_m=farthest(item.truth))
+    per_clip = config.clip.frames - 1
+    caption = (
+        f"{item.choice.name}, from frame {item.choice.start}: {count} frames imagined in "
+        f"{long.chain} clips of {per_clip}, stride {config.evaluate.stride}, sampling seed "
+        f"{config.evaluate.seeds[0]}."
+    )
+    return caption, encode_h264([pictures[0]] * (HOLD - 1) + pictures)
+
+
+def _above(config: Config, long: LongRollouts, index: int, item: _Shown) -> np.ndarray:
+    """Draw the map before and after a rollout side by side, to one scale."""
+    kept = long.kept["memory"]
+    poses = np.asarray(item.context.camera.world_from_camera)
+    later = np.asarray(item.truth.camera.world_from_camera)
+    ceiling = poses[-1, 2, 3] + ABOVE_CAMERA_M
+    clouds = []
+    for when in ("first", "last"):
+        valid = kept[f"{when}_valid"][index] & (kept[f"{when}_points"][index][:, 2] < ceiling)
+        points = kept[f"{when}_points"][index][valid]
+        shades = np.asarray(colours(kept[f"{when}_features"][index][valid]))
+        clouds.append((points, as_bytes(shades)))
+    bounds = map_bounds(*[points for points, _ in clouds], poses[:, :3, 3])
+    panels = []
+    tracks = [("what was observed", poses), ("and after imagining the way on", later)]
+    for (title, track), (points, shades) in zip(tracks, clouds, strict=True):
+        path = track if track is poses else np.concatenate([poses[-1:], track])
+        yaw = float(heading(track[-1]))
+        cell_m = config.memory.cell_m
+        panels.append(
+            from_above(points, shades, cell_m, path[:, :3, 3], yaw, title=title, bounds=bounds)
+        )
+    return np.concatenate(panels, 1)

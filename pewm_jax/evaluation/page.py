@@ -1,0 +1,252 @@
+"""The report as one HTML page that needs nothing else: pictures and videos are inside it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from html import escape
+from typing import Any
+
+from pewm_jax.evaluation.gallery import ABOVE_CAMERA_M, Gallery
+from pewm_jax.evaluation.pictures import png
+from pewm_jax.evaluation.plots import COLOURS, Line, chart
+from pewm_jax.evaluation.seen import TOLERANCE_M, TOLERANCE_RELATIVE
+
+STYLE = """
+:root { color-scheme: light dark; --ink: #1c2028; --paper: #fff; --quiet: #666d7a;
+  --line: #dfe2e8; --tint: #f5f7fa; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e8eaee; --paper: #15181d;
+  --quiet: #9aa2b1; --line: #333944; --tint: #1d2128; } }
+body { font: 16px/1.55 system-ui, sans-serif; color: var(--ink); background: var(--paper);
+  max-width: 1080px; margin: 0 auto; padding: 2.5rem 1.25rem 5rem; }
+h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .4rem; }
+h2 { font-size: 1.3rem; margin: 2.8rem 0 .6rem; }
+p, figcaption, dd, li { max-width: 76ch; } p.lead { font-size: 1.15rem; }
+.quiet, figcaption { color: var(--quiet); } figcaption { font-size: .9rem; margin-top: .4rem; }
+figure { margin: 1.2rem 0; } img, video { max-width: 100%; border: 1px solid var(--line);
+  border-radius: 6px; background: #fff; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+.scroll { overflow-x: auto; } th, td { padding: .34rem .9rem .34rem 0; text-align: right;
+  white-space: nowrap; } th:first-child, td:first-child { text-align: left; }
+thead th { border-bottom: 2px solid var(--line); font-weight: 600; }
+tr.head td { padding-top: 1rem; font-weight: 600; text-align: left;
+  border-bottom: 1px solid var(--line); } tr.gain td { background: var(--tint); }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(330px, 1fr)); gap: 1rem; }
+svg { width: 100%; height: auto; font: 12px system-ui, sans-serif; }
+svg text { fill: var(--ink); } svg .t { font-weight: 600; font-size: 13px; }
+svg .m { text-anchor: middle; fill: var(--quiet); } svg .e { text-anchor: end; fill: var(--quiet); }
+svg .g { stroke: var(--line); } .key { display: inline-block; width: 1.4em; height: .3em;
+  vertical-align: middle; margin: 0 .4em 0 1.2em; border-radius: 2px; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .3rem 1.4rem; }
+dt { color: var(--quiet); } dd { margin: 0; overflow-wrap: anywhere; }
+code { font-size: .9em; overflow-wrap: anywhere; }
+"""
+INTRODUCTION = (
+    "An agent walks through places that the model was never trained on, goes out and comes back. "
+    "From what it observed on the way, the model imagines what comes next: with the 3D map it has "
+    "drawn up, and with the same weights and an empty map."
+)
+METHOD_NAMES = {
+    "memory": "with its map",
+    "empty": "same weights, empty map",
+    "copy": "copying the last frame",
+}
+"""How the page names the methods."""
+MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
+"""How the page names the masks."""
+METRIC_NAMES = {
+    "psnr": ("PSNR, dB ↑", 2),
+    "ssim": ("SSIM ↑", 3),
+    "depth_mae": ("depth error, m ↓", 3),
+    "depth_rel": ("relative depth error ↓", 3),
+}
+"""Heading and digits of each metric."""
+
+
+def number(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
+    """Write ``mean ± stderr`` of an entry, or a dash."""
+    if entry["mean"] is None:
+        return "–"
+    text = f"{entry['mean']:{'+' if sign else ''}.{digits}f}"
+    return text if entry["stderr"] is None else f"{text} ± {entry['stderr']:.{digits}f}"
+
+
+def verdict(entry: Mapping[str, Any], where: str) -> str:
+    """Say in a sentence what the map changes (PSNR of memory minus empty)."""
+    mean, stderr = entry["mean"], entry["stderr"]
+    if mean is None:
+        return f"No clip has enough pixels {where} to compare."
+    if stderr is None:
+        return (
+            f"On pixels {where} the map changes PSNR by {mean:+.2f} dB; with clips of one episode "
+            "only, how sure that is cannot be said."
+        )
+    amount = f"{abs(mean):.2f} ± {stderr:.2f} dB"
+    if mean > 2 * stderr:
+        ratio = f", {mean / stderr:.0f} times the standard error" if stderr > 0 else ""
+        return f"On pixels {where} the map brings the model {amount} closer to the truth{ratio}."
+    if mean < -2 * stderr:
+        return f"On pixels {where} the map makes the model worse, by {amount}."
+    return f"On pixels {where} the map makes no clear difference ({mean:+.2f} ± {stderr:.2f} dB)."
+
+
+def embed(kind: str, content: bytes) -> str:
+    """Return a data URI."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
+    """Write the page.
+
+    Args:
+        metrics: what ``metrics.json`` holds.
+        gallery: pictures and videos.
+    """
+    seen = verdict(metrics["margin"]["seen"]["psnr"], "seen before")
+    unseen = verdict(metrics["margin"]["unseen"]["psnr"], "never seen")
+    sections = [
+        "<h1>Does the model remember what it saw?</h1>",
+        f'<p class="quiet">{INTRODUCTION}</p>',
+        f'<p class="lead"><strong>{escape(seen)}</strong> {escape(unseen)}</p>',
+        _videos(gallery),
+        _stills(gallery),
+        "<h2>Scores</h2>",
+        _table(metrics),
+        _curves(metrics),
+        _map(gallery),
+        _protocol(metrics["protocol"]),
+    ]
+    return "\n".join(
+        [
+            '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<title>Does the model remember?</title>\n<style>{STYLE}</style>\n</head>\n<body>",
+            *sections,
+            "</body>\n</html>\n",
+        ]
+    )
+
+
+def _videos(gallery: Gallery) -> str:
+    figures = [
+        f'<figure><video controls autoplay loop muted playsinline src="{embed("video/mp4", film)}">'
+        f"</video><figcaption>{escape(caption)}</figcaption></figure>"
+        for caption, film in gallery.videos
+    ]
+    return (
+        "<h2>Long rollouts, side by side</h2><p>Left the recording, in the middle the model with "
+        "its map, on the right the same model with an empty map. Above colour, below depth "
+        "(bright is near). All three start from the same observed picture and follow the same "
+        "actions; after each clip the model goes on from its own last frame. The first episodes of "
+        "the held-out set, not chosen.</p>" + "".join(figures)
+    )
+
+
+def _stills(gallery: Gallery) -> str:
+    return (
+        f'<figure><img alt="truth, with its map, empty map" '
+        f'src="{embed("image/png", png(gallery.strip))}">'
+        f"<figcaption>{escape(gallery.strip_note)}</figcaption></figure>"
+        f'<figure><img alt="seen before" src="{embed("image/png", png(gallery.masks))}">'
+        "<figcaption>What counts as seen before, in colour; what no observed frame had shown is "
+        "grey. A pixel counts as seen if its true point in space projects into an observed frame "
+        "and that frame's true depth agrees within the larger of "
+        f"{100 * TOLERANCE_M:.0f} cm and {100 * TOLERANCE_RELATIVE:.0f} %. No network is asked."
+        "</figcaption></figure>"
+    )
+
+
+def _table(metrics: Mapping[str, Any]) -> str:
+    heads = "".join(f"<th>{name}</th>" for name, _ in METRIC_NAMES.values())
+    rows = []
+    for mask, name in MASK_NAMES.items():
+        rows.append(f'<tr class="head"><td colspan="6">{name}</td></tr>')
+        for method, label in METHOD_NAMES.items():
+            scores = metrics["results"][method][mask]
+            cells = "".join(
+                f"<td>{number(scores[m], digits)}</td>" for m, (_, digits) in METRIC_NAMES.items()
+            )
+            rows.append(f"<tr><td>{label}</td>{cells}<td>{scores['psnr']['n']}</td></tr>")
+        gains = metrics["margin"][mask]
+        cells = "".join(
+            f"<td>{number(gains[m], digits, sign=True)}</td>"
+            for m, (_, digits) in METRIC_NAMES.items()
+        )
+        rows.append(
+            f'<tr class="gain"><td>map minus empty map</td>{cells}'
+            f"<td>{gains['psnr']['n']}</td></tr>"
+        )
+    seeds = metrics["protocol"]["seeds"]
+    per_seed = ", ".join(f"{value:+.2f}" for value in metrics["margin"]["seen"]["psnr"]["per_seed"])
+    return (
+        f'<div class="scroll"><table><thead><tr><th></th>{heads}<th>clips</th></tr></thead><tbody>'
+        + "".join(rows)
+        + "</tbody></table></div>"
+        "<p class='quiet'>Mean ± standard error over clips. Sampling seeds are averaged within a "
+        "clip first, and the error is clustered by episode, because clips of one episode show the "
+        "same rooms. The difference is taken clip by clip with the same noise. "
+        f"Gain on pixels seen before, seed by seed ({', '.join(map(str, seeds))}): "
+        f"{per_seed} dB.</p>"
+    )
+
+
+def _lines(per_frame: Mapping[str, Any], mask: str, metric: str) -> list[Line]:
+    return [
+        Line(label, COLOURS[method], points["mean"], points["stderr"])
+        for method, label in METHOD_NAMES.items()
+        for points in [per_frame[method][mask][metric]]
+    ]
+
+
+def _curves(metrics: Mapping[str, Any]) -> str:
+    label = "imagined frame"
+    here, far = metrics["per_frame"], metrics["long"]["per_frame"]
+    charts = [
+        chart("PSNR, pixels seen before", label, _lines(here, "seen", "psnr"), unit="dB"),
+        chart("PSNR, pixels never seen", label, _lines(here, "unseen", "psnr"), unit="dB"),
+        chart("Depth error, seen before", label, _lines(here, "seen", "depth_mae"), unit="m"),
+        chart("Long rollouts: PSNR, seen before", label, _lines(far, "seen", "psnr"), unit="dB"),
+    ]
+    keys = "".join(
+        f'<span class="key" style="background:{COLOURS[method]}"></span>{label}'
+        for method, label in METHOD_NAMES.items()
+    )
+    count = metrics["protocol"]["long_rollouts"]["rollouts"]
+    return (
+        f"<h2>Frame by frame</h2><p>{keys}</p>"
+        f'<div class="charts">{"".join(f"<div>{c}</div>" for c in charts)}</div>'
+        "<p class='quiet'>Bands are one standard error. The last chart follows "
+        f"{count} rollouts, one per episode, over several clips: the model lives on its own "
+        "frames.</p>"
+    )
+
+
+def _map(gallery: Gallery) -> str:
+    return (
+        "<h2>The map, from above</h2>"
+        f'<figure><img alt="the map from above" src="{embed("image/png", png(gallery.above))}">'
+        "<figcaption>Each square is one cell of the model's 3D map in the colour it remembers, "
+        "drawn from below to above. Cells more than "
+        f"{ABOVE_CAMERA_M:g} m above the camera (the ceiling) are left out. The red line is the "
+        "agent's path through the frames the map was built from, the arrow where it looks. On the "
+        "right, the same map after the rollout of the stills above wrote its imagined frames into "
+        "it.</figcaption></figure>"
+    )
+
+
+def _protocol(protocol: Mapping[str, Any]) -> str:
+    skip = {"config", "clip_list", "scene_names"}
+    items = []
+    for key, value in protocol.items():
+        if key in skip:
+            continue
+        if isinstance(value, dict):
+            text = ", ".join(f"{k.replace('_', ' ')} {v}" for k, v in value.items())
+        else:
+            text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+        items.append(f"<dt>{escape(key.replace('_', ' '))}</dt><dd>{escape(text)}</dd>")
+    return (
+        "<h2>How this was measured</h2><p>Every number of this page is in "
+        "<code>metrics.json</code> beside it, with the configuration and the list of clips.</p>"
+        f"<dl>{''.join(items)}</dl>"
+    )

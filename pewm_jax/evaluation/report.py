@@ -1,0 +1,215 @@
+"""A run folder in, ``report/`` out: metrics.json, index.html and strip.png."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from pewm_jax.config import Config, UserError, to_dict
+from pewm_jax.data.dataset import MANIFEST, EpisodeSource
+from pewm_jax.evaluation import statistics
+from pewm_jax.evaluation.gallery import make_gallery
+from pewm_jax.evaluation.imagine import Imagination
+from pewm_jax.evaluation.page import render, verdict
+from pewm_jax.evaluation.partial import Partials
+from pewm_jax.evaluation.pictures import save_png
+from pewm_jax.evaluation.protocol import file_hash, fingerprint
+from pewm_jax.evaluation.scoring import LongRollouts, Scored, roll_long, score_table
+from pewm_jax.rollout import load
+
+WEIGHTS = "weights.safetensors"
+PAGE, METRICS, STRIP = "index.html", "metrics.json", "strip.png"
+
+
+def override(config: Config, **changes: Any) -> Config:
+    """Return the configuration with some of the evaluation's settings changed.
+
+    Args:
+        config: the run's.
+        changes: fields of ``EvalConfig``, and ``steps`` (DDIM steps) and ``data`` (folder of the
+            data set). None leaves a setting as it is.
+
+    Raises:
+        ConfigError: a value that cannot work.
+    """
+    changes = {key: value for key, value in changes.items() if value is not None}
+    steps, data = changes.pop("steps", None), changes.pop("data", None)
+    if steps is not None:
+        diffusion = dataclasses.replace(config.diffusion, sample_steps=steps)
+        config = dataclasses.replace(config, diffusion=diffusion)
+    if data is not None:
+        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
+    return dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, **changes))
+
+
+def evaluate(run: str | Path, *, say: Callable[[str], Any] = print, **changes: Any) -> Path:
+    """Score a trained run and write its report.
+
+    What was scored before an interruption is kept and not done again; a report that is complete
+    for these weights and this protocol is left as it is.
+
+    Args:
+        run: a run folder made by ``train.py``.
+        say: told what happens.
+        changes: as ``override``.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        UserError: the run, its weights or the data are absent, damaged, or do not fit together.
+    """
+    run = Path(run)
+    if not run.is_dir():
+        raise UserError(f"{run} does not exist; train a model first, e.g. `python train.py demo`.")
+    config, params = load(run)
+    if "memory" not in params:
+        raise UserError(
+            f"{run / WEIGHTS} has no memory blocks yet, only stage 1 is trained; finish training "
+            "with `python train.py`, which goes on where it stopped."
+        )
+    config = override(config, **changes)
+    split = Path(config.data.path) / config.evaluate.split
+    episodes = EpisodeSource(split)
+    weights_hash, data_hash = file_hash(run / WEIGHTS), file_hash(split / MANIFEST)
+    name = fingerprint(config, weights_hash, data_hash)
+    folder = run / "report"
+    if is_complete(folder, config, name):
+        say("the report is complete for these weights and this protocol; nothing to do")
+        return folder / PAGE
+    folder.mkdir(parents=True, exist_ok=True)
+    partials = Partials(folder / "partial", name)
+    model = Imagination(config, params, config.evaluate.batch, config.data.context, say)
+    scored = score_table(config, episodes, model, partials, say)
+    long = roll_long(config, episodes, model, partials, say)
+    say("drawing the report …")
+    metrics = measure(config, scored, long)
+    metrics["protocol"] |= {
+        "weights_sha256": weights_hash,
+        "dataset_sha256": data_hash,
+        "fingerprint": name,
+    }
+    gallery = make_gallery(config, episodes, long)
+    (folder / METRICS).unlink(missing_ok=True)
+    save_png(folder / STRIP, gallery.strip)
+    page = render(metrics, gallery)
+    _write(folder / PAGE, page)
+    metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()
+    _write(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")
+    say(verdict(metrics["margin"]["seen"]["psnr"], "seen before"))
+    say(verdict(metrics["margin"]["unseen"]["psnr"], "never seen"))
+    return folder / PAGE
+
+
+def is_complete(folder: Path, config: Config, name: str) -> bool:
+    """Tell whether a report folder holds the whole report of a fingerprint, seeds and videos."""
+    try:
+        metrics = json.loads((folder / METRICS).read_text("utf-8"))
+        protocol = metrics["protocol"]
+        return (
+            protocol["fingerprint"] == name
+            and protocol["seeds"] == list(config.evaluate.seeds)
+            and protocol["config"]["evaluate"]["videos"] == config.evaluate.videos
+            and metrics["page_sha256"] == file_hash(folder / PAGE)
+            and (folder / STRIP).is_file()
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
+    """Turn errors into everything that ``metrics.json`` holds, but for hashes.
+
+    Returns:
+        ``protocol``; ``results[method][mask][metric] = {mean, stderr, n}``;
+        ``margin[mask][metric]``, memory minus empty; ``per_frame[method][mask][metric]``; ``long``
+        with ``results``, ``margin`` and ``per_frame`` of long rollouts.
+    """
+    far = long.scored
+    return {
+        "protocol": protocol_of(config, scored, long),
+        "results": statistics.table(scored.sums, scored.episodes),
+        "margin": statistics.margin(scored.sums["memory"], scored.sums["empty"], scored.episodes),
+        "per_frame": statistics.per_frame(scored.sums, scored.episodes),
+        "long": {
+            "results": statistics.table(far.sums, far.episodes),
+            "margin": statistics.margin(far.sums["memory"], far.sums["empty"], far.episodes),
+            "per_frame": statistics.per_frame(far.sums, far.episodes),
+        },
+    }
+
+
+def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
+    """State what was measured, completely enough to be repeated."""
+    clip, choices = config.clip, scored.choices
+    scenes = sorted({choice.scene for choice in choices})
+    return {
+        "scenes": len(scenes),
+        "episodes": len({choice.episode for choice in choices}),
+        "clips": len(choices),
+        "seeds": list(config.evaluate.seeds),
+        "chain": config.evaluate.chain,
+        "context": config.data.context,
+        "frames": clip.frames,
+        "imagined_frames": config.evaluate.chain * (clip.frames - 1),
+        "stride": config.evaluate.stride,
+        "sampling_steps": config.diffusion.sample_steps,
+        "guidance": config.diffusion.guidance,
+        "resolution": f"{clip.width} × {clip.height} pixels",
+        "encoder": config.memory.encoder,
+        "positions": config.memory.positions,
+        "map": f"{config.memory.capacity} cells of {config.memory.cell_m} m, "
+        f"{config.memory.tokens} read per clip",
+        "dataset": config.data.path,
+        "split": config.evaluate.split,
+        "starts": "spread evenly over the way back of every episode; no randomness",
+        "observed": "context frames spread evenly from the episode's first frame to the present; "
+        "all go into the map, the model also sees the present one",
+        "motion": "the recorded one; poses integrated from actions agree with the recorded poses",
+        "seen": "a pixel whose true point projects into an observed frame where the true depth "
+        "agrees (nearest pixel or interpolated, larger of 5 cm and 3 %)",
+        "seen_share": round(statistics.seen_share(scored.sums["memory"]), 4),
+        "psnr": "of colours in [0, 1], from the mean squared error of all masked pixels of a clip; "
+        "equal images count as 100 dB",
+        "ssim": "11 × 11 Gaussian window, σ 1.5, valid windows, averaged over masked pixels",
+        "depth": "mean absolute error in metres, and relative to the true depth",
+        "stderr": "over clips, seeds averaged within a clip, clustered by episode",
+        "long_rollouts": {
+            "rollouts": len(long.scored.choices),
+            "clips_each": long.chain,
+            "frames_each": long.chain * (clip.frames - 1),
+            "seed": config.evaluate.seeds[0],
+            "shown": long.shown,
+        },
+        "versions": {"pewm_jax": _version(), "jax": jax.__version__},
+        "scene_names": scenes,
+        "clip_list": [[choice.name, choice.start] for choice in choices],
+        "config": to_dict(config),
+    }
+
+
+def _version() -> str:
+    try:
+        return metadata.version("pewm-jax")
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def report_paths(run: str | Path) -> Mapping[str, Path]:
+    """Return where a run's report lies: ``page``, ``metrics``, ``strip``."""
+    folder = Path(run) / "report"
+    return {"page": folder / PAGE, "metrics": folder / METRICS, "strip": folder / STRIP}
+
+
+def _write(path: Path, text: str) -> None:
+    """Write text aside, then rename."""
+    aside = path.with_name(path.name + ".partial")
+    aside.write_text(text, "utf-8")
+    aside.replace(path)
