@@ -1,0 +1,160 @@
+"""Clips cut from episodes: which frames are imagined, and which earlier ones are remembered."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pewm_jax.config import Config, UserError
+from pewm_jax.data.episodes import Episode
+from pewm_jax.types import Camera, Clip, Frames
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Frame numbers of one clip inside its episode.
+
+    Attributes:
+        frames_T: (T,) increasing, evenly spaced.
+        context_S: (≤ S,) increasing; the last one is ``frames_T[0]``.
+    """
+
+    frames_T: np.ndarray
+    context_S: np.ndarray
+
+
+def choose(config: Config, length: int, rng: np.random.Generator, where: str = "episode") -> Choice:
+    """Draw a clip from an episode: its stride, its start, and what of the past is remembered.
+
+    Every stride of ``data.stride_min … stride_max`` that fits is equally likely, and so is every
+    start. The context is spread over the whole past, one frame out of each of S − 1 equal parts
+    of it, always with the frame just before the clip, and ends with the clip's first frame.
+
+    Args:
+        config: ``clip.frames``, ``data.stride_min``, ``data.stride_max``, ``data.context``.
+        length: frames of the episode.
+        rng: everything random comes from here.
+        where: the episode's name in error messages.
+
+    Raises:
+        UserError: the episode is too short for one clip.
+    """
+    steps = config.clip.frames - 1
+    largest = min(config.data.stride_max, (length - 1) // steps)
+    if largest < config.data.stride_min:
+        need = steps * config.data.stride_min + 1
+        raise UserError(
+            f"{where} has {length} frames, a clip of {config.clip.frames} frames at stride "
+            f"{config.data.stride_min} needs {need}; collect longer episodes, or lower "
+            "data.stride_min or clip.frames."
+        )
+    stride = int(rng.integers(config.data.stride_min, largest + 1))
+    start = int(rng.integers(0, length - steps * stride))
+    return Choice(
+        start + stride * np.arange(steps + 1), choose_context(start, config.data.context, rng)
+    )
+
+
+def choose_context(start: int, slots: int, rng: np.random.Generator | None = None) -> np.ndarray:
+    """Return which frames up to ``start`` are remembered, at most ``slots`` of them.
+
+    Args:
+        start: first frame of the clip; always the last one remembered.
+        slots: S.
+        rng: where in each part of the past to look; None takes the middle, always the same.
+
+    Returns:
+        (≤ S,) increasing frame numbers.
+    """
+    past = slots - 1
+    if start <= past:
+        earlier = np.arange(start)
+    else:
+        edges = np.linspace(0, start, past + 1) if past else np.zeros(1)
+        at = np.full(past, 0.5) if rng is None else rng.random(past)
+        earlier = np.floor(edges[:-1] + at * np.diff(edges)).astype(int)
+        earlier = np.minimum(earlier, start - 1)
+        if past:
+            earlier[-1] = start - 1
+        earlier = np.unique(earlier)
+    return np.append(earlier, start)
+
+
+def cut(episode: Episode, choice: Choice, slots: int) -> Clip:
+    """Decode the chosen frames, each once.
+
+    Args:
+        episode: where they come from.
+        choice: which frames.
+        slots: S; slots without a frame are black, have no depth and the camera of the clip's
+            first frame, and are marked invalid.
+
+    Returns:
+        A NumPy clip without batch axis: rgb uint8, depth float32 metres.
+    """
+    wanted, place = np.unique(
+        np.concatenate([choice.frames_T, choice.context_S]), return_inverse=True
+    )
+    frames = episode.frames(wanted)
+    count = len(choice.frames_T)
+    valid = np.arange(slots) < len(choice.context_S)
+    fill = np.full(slots, place[0])
+    fill[: len(choice.context_S)] = place[count:]
+    context = _take(frames, fill)
+    context.rgb_THWC[~valid] = 0
+    context.depth_THW[~valid] = 0
+    return Clip(_take(frames, place[:count]), context, valid)
+
+
+def clip_at(
+    config: Config, episode: Episode, start: int, stride: int = 1, frames: int | None = None
+) -> Clip:
+    """Return a certain clip, always the same: its context is spread evenly over the past.
+
+    Args:
+        config: ``clip.frames`` and ``data.context``.
+        episode: where it comes from.
+        start: its first frame.
+        stride: actions between two of its frames.
+        frames: its length, by default ``clip.frames``.
+
+    Raises:
+        UserError: the episode ends before the clip does.
+    """
+    count = config.clip.frames if frames is None else frames
+    chosen = start + stride * np.arange(count)
+    if start < 0 or chosen[-1] >= episode.length:
+        raise UserError(
+            f"episode {episode.name} has {episode.length} frames, a clip from {start} to "
+            f"{chosen[-1]} does not lie in it; start earlier or collect longer episodes."
+        )
+    slots = config.data.context
+    return cut(episode, Choice(chosen, choose_context(start, slots)), slots)
+
+
+def stack(clips: Sequence[Clip]) -> Clip:
+    """Stack clips to a batch: every array gets a leading B."""
+
+    def frames(parts: Sequence[Frames]) -> Frames:
+        return Frames(
+            np.stack([part.rgb_THWC for part in parts]),
+            np.stack([part.depth_THW for part in parts]),
+            Camera(
+                np.stack([part.camera.intrinsics_4 for part in parts]),
+                np.stack([part.camera.world_from_camera for part in parts]),
+            ),
+        )
+
+    return Clip(
+        frames([clip.frames for clip in clips]),
+        frames([clip.context for clip in clips]),
+        np.stack([clip.context_valid_S for clip in clips]),
+    )
+
+
+def _take(frames: Frames, rows: np.ndarray) -> Frames:
+    """Copy some of the frames."""
+    camera = Camera(frames.camera.intrinsics_4[rows], frames.camera.world_from_camera[rows])
+    return Frames(frames.rgb_THWC[rows], frames.depth_THW[rows], camera)
