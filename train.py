@@ -40,7 +40,9 @@ def main(argv: Sequence[str]) -> int:
         prog=f"train.py {preset}",
         description=f"{configs.describe(preset)} Settings also come from --config FILE.json.",
     )
-    preview = make_preview(config, runs.prepare(config)) if config.train.preview_every else None
+    run = runs.prepare(config)
+    cli.cache_compilation(run.parent)
+    preview = make_preview(config, run) if config.train.preview_every else None
     loop.train(config, preview=preview)
     return 0
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import hashlib
 import io
 import json
+import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
 import tyro
 
 from pewm_jax import config as configuration
@@ -104,6 +107,19 @@ def overlay(default: T, path: Path) -> T:
         )
     merged = _deep_merge(configuration.to_dict(default), values)
     return configuration.from_dict(type(default), merged, path.name)
+
+
+def cache_compilation(folder: Path) -> None:
+    """Keep compiled programs in a folder, so that the next start need not compile them again.
+
+    Programs are kept apart by the processor's features, because they are compiled for them. Call
+    it from command lines only: it sets a global option of JAX.
+    """
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else [platform.processor()]
+    features = next((line for line in lines if line.startswith(("flags", "Features"))), lines[0])
+    kind = hashlib.sha256(features.encode()).hexdigest()[:12]
+    jax.config.update("jax_compilation_cache_dir", str((folder / ".cache" / kind).resolve()))
 
 
 def choose(name: str, known: Sequence[str], what: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,9 @@ import safetensors.numpy
 from pewm_jax import tree
 from pewm_jax.config import UserError
 from pewm_jax.types import Params
+
+_WORDS = "pewm_jax"
+"""The one key in the file's header, so that equal weights are equal files: their hash is a name."""
 
 
 def save(path: Path, params: Params, words: Mapping[str, str] | None = None) -> None:
@@ -29,9 +33,10 @@ def save(path: Path, params: Params, words: Mapping[str, str] | None = None) -> 
     tensors = {
         name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in leaves.items()
     }
+    header = {_WORDS: json.dumps(dict(words or {}), sort_keys=True)}
     partial = path.with_name(path.name + ".partial")
     with partial.open("wb") as file:
-        file.write(safetensors.numpy.save(tensors, dict(words or {})))
+        file.write(safetensors.numpy.save(tensors, header))
         file.flush()
         os.fsync(file.fileno())
     partial.replace(path)
@@ -80,7 +85,7 @@ def metadata(path: Path) -> dict[str, str]:
     _require_file(path)
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            return dict(file.metadata() or {})
+            return json.loads((file.metadata() or {}).get(_WORDS, "{}"))
     except (safetensors.SafetensorError, OSError) as error:
         raise _damaged(path, error) from None
 

@@ -52,3 +52,11 @@ def test_absent_or_unfitting_weights_are_refused(tmp_path):
         weights.load(tmp_path / "none")
     with pytest.raises(UserError, match="backbone/kernel is unexpected"):
         weights.check(PARAMS, {"backbone": {"other": jnp.ones(2)}}, "w")
+
+
+def test_equal_weights_are_equal_files(tmp_path):
+    words = {"stage": "1", "step": "200", "of": "demo"}
+    for name in "ab":
+        weights.save(tmp_path / name, PARAMS, words)
+    weights.save(tmp_path / "c", dict(reversed(PARAMS.items())), dict(reversed(words.items())))
+    assert len({(tmp_path / name).read_bytes() for name in "abc"}) == 1

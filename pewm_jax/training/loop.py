@@ -21,7 +21,7 @@ from pewm_jax.training import runs, sharding, stages
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.feed import Feed
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, duration
-from pewm_jax.training.signals import Interrupted, Stop
+from pewm_jax.training.signals import Stop
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import TrainState, inference_params
 from pewm_jax.training.step import (
@@ -70,6 +70,8 @@ def train(
             start = _train_stage(
                 config, stage, mesh, run=run, start=start, preview=preview, stop=stop
             )
+            if stop.number is not None and stage is not planned[-1]:
+                raise stop.interrupted(stage.number, stage.settings(config).steps)
     say(f"Trained: {run / runs.WEIGHTS}")
     return run
 
@@ -218,8 +220,4 @@ class _Worker:
 
     def _leave(self, step: int) -> None:
         self.checkpoints.wait()
-        raise Interrupted(
-            f"Stopped after step {step} of stage {self.stage.number}; everything is saved: the "
-            "same command goes on from there.",
-            self.stop.number or 0,
-        )
+        raise self.stop.interrupted(self.stage.number, step)

@@ -48,6 +48,14 @@ class Stop:
     ) -> None:
         self._restore()
 
+    def interrupted(self, stage: int, step: int) -> Interrupted:
+        """Return the error with which training leaves after a step, once all is saved."""
+        return Interrupted(
+            f"Stopped after step {step} of stage {stage}; everything is saved: the same command "
+            "goes on from there.",
+            self.number or 0,
+        )
+
     def _note(self, number: int, _frame: types.FrameType | None) -> None:
         self.number = number
         self._restore()

@@ -89,6 +89,24 @@ def initial_state(
     return make(stage_key(config, stage), start)
 
 
+def lower_step(config: Config, stage: Stage, mesh: Mesh, clip: Any) -> jax.stages.Lowered:
+    """Trace ``train_step`` for one batch shape, with placements and donation; see ``compile_step``."""
+    state = abstract_state(config, stage, mesh)
+    everywhere = sharding.replicated(mesh)
+    placed = jax.tree.map(lambda leaf: leaf.sharding, state)
+    split = sharding.of_batch(mesh)
+    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split), clip)
+    key = stage_key(config, stage)
+    step = jax.jit(
+        functools.partial(train_step, config, stage),
+        in_shardings=(placed, split, everywhere),
+        out_shardings=(placed, everywhere),
+        donate_argnums=0,
+    )
+    abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
+    return step.lower(state, batch, abstract_key)
+
+
 def compile_step(
     config: Config, stage: Stage, mesh: Mesh, clip: Any
 ) -> Callable[[TrainState, Clip, Array], tuple[TrainState, Metrics]]:
@@ -104,20 +122,7 @@ def compile_step(
         The compiled ``(state, clip, key) -> (state, metrics)``; it consumes the state it is given
         (its buffers are donated) and wants clip and key placed as ``sharding`` says.
     """
-    state = abstract_state(config, stage, mesh)
-    everywhere = sharding.replicated(mesh)
-    placed = jax.tree.map(lambda leaf: leaf.sharding, state)
-    split = sharding.of_batch(mesh)
-    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split), clip)
-    key = stage_key(config, stage)
-    step = jax.jit(
-        functools.partial(train_step, config, stage),
-        in_shardings=(placed, split, everywhere),
-        out_shardings=(placed, everywhere),
-        donate_argnums=0,
-    )
-    abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
-    return step.lower(state, batch, abstract_key).compile()
+    return lower_step(config, stage, mesh, clip).compile()
 
 
 def _norm(gradients: Params) -> Array:

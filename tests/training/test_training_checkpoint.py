@@ -1,0 +1,97 @@
+"""Checkpoints: exact, safe under donation, and never read half-written or for another run."""
+
+import jax
+import numpy as np
+import pytest
+import training_fakes as fakes
+
+from pewm_jax import tree
+from pewm_jax.config import UserError
+from pewm_jax.training import sharding, stages, step
+from pewm_jax.training.checkpoint import Checkpoints
+
+ONE, TWO = stages.STAGES
+
+
+def train(config, stage, run, steps, every=1):
+    """Train without waiting, saving as the steps go by; returns the states after each save."""
+    mesh = sharding.make_mesh(jax.devices()[:1])
+    state = step.initial_state(config, stage, mesh)
+    step_fn = step.compile_step(config, stage, mesh, fakes.clip(config, 8, 0))
+    clip = jax.device_put(fakes.clip(config, 8, 0), sharding.of_batch(mesh))
+    key, saved = step.stage_key(config, stage), {}
+    with Checkpoints(run, config, stage) as checkpoints:
+        for number in range(1, steps + 1):
+            state, _ = step_fn(state, clip, key)
+            if number % every == 0:
+                saved[number] = jax.tree.map(lambda leaf: np.array(leaf), state)
+                checkpoints.save(state)
+    return mesh, saved
+
+
+def same(left, right):
+    assert jax.tree.structure(left) == jax.tree.structure(right)
+    for path, leaf in tree.flatten(left).items():
+        assert np.asarray(leaf).tobytes() == np.asarray(tree.flatten(right)[path]).tobytes(), path
+
+
+@pytest.mark.parametrize("stage", [ONE, TWO])
+def test_the_state_comes_back_bit_identical_though_its_buffers_were_donated_on(
+    fake_model, tmp_path, stage
+):
+    config = fakes.config(keep=3)
+    mesh, saved = train(config, stage, tmp_path, 9, every=2)
+    like = step.abstract_state(config, stage, mesh)
+    with Checkpoints(tmp_path, config, stage) as checkpoints:
+        assert checkpoints.latest() == 8
+        same(checkpoints.restore(like), saved[8])
+        weights = checkpoints.restore_weights(like)
+    assert tree.mismatches(weights, saved[8].params) == []
+    same(tree.select(weights, stage.trained), saved[8].ema)
+    folder = tmp_path / "checkpoints" / stage.name
+    assert {path.name for path in folder.iterdir()} == {"4", "6", "8"}
+
+
+def test_a_checkpoint_of_another_configuration_is_refused_with_the_setting(fake_model, tmp_path):
+    config = fakes.config()
+    mesh, _ = train(config, ONE, tmp_path, 1)
+    other = fakes.with_train(config, seed=3)
+    with (
+        Checkpoints(tmp_path, other, ONE) as checkpoints,
+        pytest.raises(UserError, match=r"another configuration \(train\.seed 0 there, 3 here\)"),
+    ):
+        checkpoints.restore(step.abstract_state(other, ONE, mesh))
+
+
+def test_an_unfinished_checkpoint_is_not_there(fake_model, tmp_path):
+    config = fakes.config()
+    train(config, ONE, tmp_path, 2)
+    folder = tmp_path / "checkpoints" / "stage1"
+    (folder / "2").rename(folder / "2.orbax-checkpoint-tmp")
+    with Checkpoints(tmp_path, config, ONE) as checkpoints:
+        assert checkpoints.latest() == 1
+
+
+@pytest.mark.parametrize("part", ["state", "weights", "position"])
+def test_a_damaged_checkpoint_is_refused_in_a_sentence(fake_model, tmp_path, part):
+    config = fakes.config()
+    mesh, _ = train(config, ONE, tmp_path, 1)
+    for path in (tmp_path / "checkpoints" / "stage1" / "1" / part).rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with (
+        Checkpoints(tmp_path, config, ONE) as checkpoints,
+        pytest.raises(UserError, match=r"1 cannot be read .* delete that folder"),
+    ):
+        checkpoints.restore(step.abstract_state(config, ONE, mesh))
+
+
+def test_without_a_checkpoint_there_is_a_sentence(fake_model, tmp_path):
+    config = fakes.config()
+    with (
+        Checkpoints(tmp_path, config, ONE) as checkpoints,
+        pytest.raises(UserError, match="no complete checkpoint"),
+    ):
+        checkpoints.restore_weights(
+            step.abstract_state(config, ONE, sharding.make_mesh(jax.devices()[:1]))
+        )

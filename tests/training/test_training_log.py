@@ -1,0 +1,109 @@
+"""Logs: each step once, whatever was interrupted; figures that people can read."""
+
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from pewm_jax.training import log
+
+METRICS = {
+    "loss": 0.5,
+    "learning_rate": 1e-3,
+    "grad_norm": 1.0,
+    "step_seconds": 0.25,
+    "samples_per_second": 32.0,
+    "flops_per_second": 2.5e9,
+}
+
+
+def lines(path):
+    return [(e["stage"], e["step"]) for e in map(json.loads, path.read_text().splitlines())]
+
+
+def test_what_was_logged_beyond_the_restored_step_is_dropped(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    with log.MetricsLog(tmp_path, 1, 0) as out:
+        for step in (1, 2, 3):
+            out.write(step, METRICS)
+    with log.MetricsLog(tmp_path, 2, 0) as out:
+        for step in (1, 2, 3):
+            out.write(step, METRICS)
+    with path.open("a") as file:
+        file.write('{"stage": 2, "st')
+    with log.MetricsLog(tmp_path, 2, 2) as out:
+        assert lines(path) == [(1, 1), (1, 2), (1, 3), (2, 1), (2, 2)]
+        out.write(3, METRICS)
+    assert lines(path)[-1] == (2, 3)
+    assert not list(tmp_path.glob("*.partial"))
+    log.drop_after(path, 1, 1)
+    assert lines(path) == [(1, 1)]
+
+
+def test_tensorboard_files_are_written_per_stage(tmp_path):
+    for stage in (1, 2):
+        with log.MetricsLog(tmp_path, stage, 0) as out:
+            out.write(1, METRICS)
+    for stage in (1, 2):
+        (events,) = (tmp_path / "tensorboard" / f"stage{stage}").glob("events.*")
+        assert b"samples_per_second" in events.read_bytes()
+
+
+def view(total, done=0):
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=False, soft_wrap=True)
+    return log.LiveView("stage 1", total, done, console), stream
+
+
+def test_without_a_terminal_there_is_a_line_now_and_then_and_one_at_the_end(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(log.time, "monotonic", lambda: clock[0])
+    live, stream = view(total=100)
+    with live:
+        for step in range(1, 101):
+            clock[0] += 1.0
+            live.update(step, METRICS)
+    told = stream.getvalue().splitlines()
+    assert len(told) == 10
+    assert told[0].startswith("stage 1 10/100 loss 0.5000")
+    assert told[0].endswith("22.5 s left")
+    assert told[-1].startswith("stage 1 100/100")
+
+
+def test_a_line_names_rate_flops_and_time_left():
+    text = log.describe(METRICS, 90)
+    for part in ("0.5000", "1.00e-03", "250 ms/step", "32.0 samples/s", "2.5 GFLOP/s", "1 min 30"):
+        assert part in text
+
+
+def test_on_a_terminal_there_is_a_bar():
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=True, width=160)
+    with log.LiveView("stage 1", 10, 4, console) as live:
+        live.update(5, METRICS)
+        live.say("a picture")
+    assert "5/10" in stream.getvalue()
+    assert "a picture" in stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0 ms"),
+        (0.0852, "85 ms"),
+        (12.34, "12.3 s"),
+        (245, "4 min 05 s"),
+        (3599.7, "1 h 00 min"),
+        (7800, "2 h 10 min"),
+    ],
+)
+def test_durations(seconds, text):
+    assert log.duration(seconds) == text
+
+
+def test_pauses_do_not_count_as_steps():
+    pace = log.Pace(0.0)
+    assert pace.tick(2.0) == 2.0
+    pace.pause(10.0)
+    assert pace.tick(14.0) == pytest.approx(2.0)

@@ -1,0 +1,67 @@
+"""The learning rate, the clipping, the decay, and who pays for moments."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import training_fakes as fakes
+
+from pewm_jax.config import ConfigError, StageConfig
+from pewm_jax.training import optimizer, stages
+
+PARAMS = {"backbone": {"dense": {"kernel": jnp.full((4, 4), 2.0), "bias": jnp.full((4,), 2.0)}}}
+
+
+def test_warmup_starts_above_zero_rises_to_the_peak_and_the_cosine_falls_to_zero():
+    rate = optimizer.schedule(StageConfig(steps=100, warmup=10, learning_rate=1.0))
+    values = np.array([float(rate(step)) for step in range(101)])
+    assert 0 < values[0] < 0.2
+    assert np.all(np.diff(values[:11]) > 0)
+    assert values[10] == pytest.approx(1.0)
+    assert np.all(np.diff(values[10:]) < 0)
+    assert values[100] == pytest.approx(0.0, abs=1e-6)
+    assert values[55] == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("decay", ["constant", "cosine"])
+@pytest.mark.parametrize(("steps", "warmup"), [(1, 0), (1, 50), (5, 5), (50, 0)])
+def test_short_stages_have_a_usable_rate_at_every_step(decay, steps, warmup):
+    settings = StageConfig(steps=steps, warmup=warmup, decay=decay, learning_rate=1e-3)
+    values = [float(optimizer.schedule(settings)(step)) for step in range(steps)]
+    assert all(0 < value <= 1e-3 * (1 + 1e-6) for value in values)
+
+
+def test_only_matrices_decay():
+    config = fakes.with_train(fakes.config(), weight_decay=0.1)
+    adam = optimizer.make(config, stages.STAGES[0])
+    still = jax.tree.map(jnp.zeros_like, PARAMS)
+    updates, _ = adam.update(still, adam.init(PARAMS), PARAMS)
+    dense = updates["backbone"]["dense"]
+    assert np.all(np.asarray(dense["kernel"]) < 0)
+    np.testing.assert_array_equal(dense["bias"], 0)
+
+
+def test_gradients_beyond_the_norm_are_scaled_down_together():
+    config = fakes.config(clip_norm=1.0)
+    adam = optimizer.make(config, stages.STAGES[0])
+    rng = np.random.default_rng(0)
+    small = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), PARAMS)
+    norm = np.sqrt(sum(np.sum(np.square(leaf)) for leaf in jax.tree.leaves(small)))
+    unit = jax.tree.map(lambda leaf: leaf / norm, small)
+    huge = jax.tree.map(lambda leaf: leaf * 1e4, unit)
+    moments = [adam.update(g, adam.init(PARAMS), PARAMS)[1] for g in (unit, huge)]
+    for left, right in zip(*map(jax.tree.leaves, moments), strict=True):
+        np.testing.assert_allclose(left, right, rtol=1e-4)
+
+
+def test_nothing_to_train_is_refused_and_empty_stages_are_skipped():
+    with pytest.raises(ConfigError, match="both 0"):
+        stages.planned(fakes.config(stage1=0, stage2=0))
+    assert [s.number for s in stages.planned(fakes.config(stage1=0))] == [2]
+    assert [s.number for s in stages.planned(fakes.config())] == [1, 2]
+
+
+def test_training_flops_count_weight_gradients_only_where_trained(fake_model):
+    first, second = (stages.flops_per_clip(fakes.config(), stage) for stage in stages.STAGES)
+    assert first == 3 * 2.0
+    assert second == 2 * 3.0 + 1.0

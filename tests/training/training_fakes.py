@@ -1,0 +1,90 @@
+"""A world model of four small arrays, and random clips: what the trainer needs, in milliseconds."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax.config import ClipConfig, Config, DataConfig, StageConfig, TrainConfig
+from pewm_jax.data import loader
+from pewm_jax.diffusion import objective
+from pewm_jax.models import world_model
+from pewm_jax.types import Camera, Clip, Frames
+
+SIZE = 8
+
+
+def config(run="runs/fake", *, stage1=6, stage2=6, **train) -> Config:
+    settings = {"batch": 8, "warmup": 2, "learning_rate": 1e-2}
+    train = {"save_every": 3, "log_every": 1, "preview_every": 0, "ema": 0.5} | train
+    return Config(
+        clip=ClipConfig(frames=5, height=SIZE, width=SIZE),
+        data=DataConfig(context=1),
+        train=TrainConfig(
+            run=str(run),
+            stage1=StageConfig(steps=stage1, **settings),
+            stage2=StageConfig(steps=stage2, **settings),
+            **train,
+        ),
+    )
+
+
+def with_stage(config: Config, name: str, **changes) -> Config:
+    stage = dataclasses.replace(getattr(config.train, name), **changes)
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, **{name: stage}))
+
+
+def with_train(config: Config, **changes) -> Config:
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, **changes))
+
+
+def clip(config: Config, batch: int, seed: int) -> Clip:
+    rng = np.random.default_rng(seed)
+
+    def frames(count):
+        shape = (batch, count, config.clip.height, config.clip.width)
+        pose = np.broadcast_to(np.eye(4, dtype=np.float32), (batch, count, 4, 4))
+        camera = Camera(np.full((batch, count, 4), 4, np.float32), pose)
+        rgb = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+        return Frames(rgb, rng.uniform(1, 4, shape).astype(np.float32), camera)
+
+    context = config.data.context
+    return Clip(frames(config.clip.frames), frames(context), np.ones((batch, context), bool))
+
+
+def clips(config, split="train", *, seed, batch, start_step=0):
+    assert split == "train"
+    step = start_step
+    while True:
+        yield clip(config, batch, 1000 * seed + step)
+        step += 1
+
+
+def init(config, key, *, memory=True):
+    k1, k2 = jax.random.split(key)
+    params = {
+        "backbone": {"kernel": jax.random.normal(k1, (3, 3)) / 2, "bias": jnp.full((3,), 0.1)}
+    }
+    if memory:
+        params["memory"] = {"kernel": jax.random.normal(k2, (3, 3)), "gate": jnp.full((3,), 0.1)}
+    return params
+
+
+def loss(config, params, clip, key, *, memory):
+    rgb = jnp.asarray(clip.frames.rgb_THWC, jnp.float32) / 255
+    noisy = rgb + 0.1 * jax.random.normal(key, rgb.shape)
+    out = noisy @ params["backbone"]["kernel"] + params["backbone"]["bias"]
+    if memory:
+        out = out + (noisy @ params["memory"]["kernel"]) * params["memory"]["gate"]
+    error = jnp.mean((out - rgb) ** 2)
+    return error, {"loss_rgb": error}
+
+
+@pytest.fixture
+def fake_model(monkeypatch):
+    monkeypatch.setattr(world_model, "init", init)
+    monkeypatch.setattr(world_model, "flops_per_clip", lambda config, *, memory: 2.0 + memory)
+    monkeypatch.setattr(objective, "loss", loss)
+    monkeypatch.setattr(loader, "clips", clips)
