@@ -14,7 +14,9 @@ from scipy import ndimage
 from pewm_jax.data import furniture as f
 from pewm_jax.data import furniture_more as m
 from pewm_jax.data.floorplan import Rect, Room
-from pewm_jax.data.furniture import Maker, Tones
+from pewm_jax.data.furniture_parts import Tones
+from pewm_jax.data.placement import against, apron, overlap, shift, turned, wall_frame
+from pewm_jax.data.programmes import PROGRAMMES, RUGS, TABLES
 from pewm_jax.data.shapes import Piece
 
 CLEAR_M = 0.3
@@ -23,46 +25,6 @@ CELL_M = 0.1
 """Cell of the floor grid on which reachability is checked."""
 TRIES = 12
 """Places tried for a piece before it is left out."""
-
-PROGRAMMES: dict[str, tuple[tuple[Maker, ...], tuple[Maker, ...]]] = {
-    "living": (
-        (f.sofa, f.tv_stand, f.bookshelf),
-        (f.armchair, m.plant, m.floor_lamp, m.fireplace, m.piano, f.dresser, f.armchair, m.plant),
-    ),
-    "bedroom": (
-        (f.bed, f.wardrobe, f.nightstand),
-        (f.dresser, m.plant, m.floor_lamp, f.armchair, f.bookshelf, f.desk),
-    ),
-    "kitchen": (
-        (m.kitchen_counter, m.fridge, m.stove),
-        (m.plant, f.dresser, m.kitchen_counter),
-    ),
-    "bathroom": (
-        (m.bathtub, m.toilet, m.washbasin),
-        (m.washing_machine, m.plant, f.dresser),
-    ),
-    "study": (
-        (f.desk, f.bookshelf, f.bookshelf),
-        (f.armchair, m.floor_lamp, m.plant, f.sofa, m.piano),
-    ),
-    "dining": (
-        (f.dresser, m.plant),
-        (m.fireplace, m.floor_lamp, f.bookshelf, m.piano, m.plant),
-    ),
-    "kids": (
-        (f.bed, m.toy_chest, f.wardrobe),
-        (f.desk, f.bookshelf, m.toy_chest, m.plant, m.floor_lamp),
-    ),
-    "hall": (
-        (m.coat_rack, f.dresser),
-        (m.plant, f.wardrobe, m.floor_lamp, f.armchair, f.bookshelf),
-    ),
-}
-"""For each use of a room: what it must have, and what it may have."""
-TABLES = {"kitchen": 0.7, "dining": 1.0, "living": 0.25}
-"""Chance of a dining table in the middle."""
-RUGS = {"living": 0.9, "bedroom": 0.7, "kids": 0.9, "study": 0.5, "hall": 0.6, "dining": 0.4}
-"""Chance of a rug."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +48,7 @@ class Furnisher:
             gap = 0.12
             self.used[hole.side].append((hole.low - gap, hole.bottom, hole.high + gap, hole.top))
         self.doors = [
-            _apron(room, hole.side, hole.low, hole.high)
+            apron(room, hole.side, hole.low, hole.high)
             for hole in room.openings
             if hole.kind == "door"
         ]
@@ -139,9 +101,9 @@ class Furnisher:
             else:
                 at = self.rng.uniform(low + width / 2 + 0.03, high_end - width / 2 - 0.03)
             span = (at - width / 2, 0.0, at + width / 2, high)
-            if any(_overlap(span, other) for other in self.used[side]):
+            if any(overlap(span, other) for other in self.used[side]):
                 continue
-            if self._stand(piece, _against(self.room, side, at, depth, width), side, at):
+            if self._stand(piece, against(self.room, side, at, depth, width), side, at):
                 self.used[side].append(span)
                 return True
         return False
@@ -155,9 +117,9 @@ class Furnisher:
             if not low + piece.size[0] / 2 <= centre <= high - piece.size[0] / 2:
                 continue
             span = (centre - piece.size[0] / 2, 0.0, centre + piece.size[0] / 2, piece.size[2])
-            if any(_overlap(span, other) for other in self.used[side]):
+            if any(overlap(span, other) for other in self.used[side]):
                 continue
-            rect = _against(self.room, side, centre, piece.size[1], piece.size[0])
+            rect = against(self.room, side, centre, piece.size[1], piece.size[0])
             if self._stand(piece, rect, side, centre):
                 self.used[side].append(span)
                 return True
@@ -166,7 +128,7 @@ class Furnisher:
     def before_last(self, piece: Piece, distance: float, *, turned: bool) -> bool:
         """Put a piece in front of the last one at the wall, facing it or facing away."""
         side, at, _ = self._last
-        frame = _frame(self.room, side, at)
+        frame = wall_frame(self.room, side, at)
         depth = piece.size[1]
         local = np.eye(4)
         if turned:
@@ -191,7 +153,7 @@ class Furnisher:
                 rng.uniform(x0y0x1y1[i] + 0.8 + s / 2, x0y0x1y1[i + 2] - 0.8 - s / 2)
                 for i, s in enumerate((w, d))
             ]
-            pose = _turned(turn, centre) @ _shift(0, -table.size[1] / 2)
+            pose = turned(turn, centre) @ shift(0, -table.size[1] / 2)
             if not self._free_standing(table, pose):
                 continue
             middle = table.size[1] / 2
@@ -200,7 +162,7 @@ class Furnisher:
             for x, y, k in spots if rng.uniform() < 0.6 else spots[1::2] + spots[:1]:
                 chair = f.chair(np.random.default_rng(seed), self.tones)
                 there = np.sign(y) * (middle + 0.12)
-                local = _shift(x, middle + there) @ _turned(k, (0, 0)) @ _shift(0, -0.3)
+                local = shift(x, middle + there) @ turned(k, (0, 0)) @ shift(0, -0.3)
                 self._free_standing(chair, pose @ local, margin=-0.2)
             return True
         return False
@@ -213,7 +175,7 @@ class Furnisher:
         w, d = piece.size[:2] if turn == 0 else piece.size[1::-1]
         if x1 - x0 > w + 0.4 and y1 - y0 > d + 0.4:
             middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2]) + self.rng.uniform(-0.15, 0.15, 2)
-            pose = _turned(turn, middle) @ _shift(0, -piece.size[1] / 2)
+            pose = turned(turn, middle) @ shift(0, -piece.size[1] / 2)
             self.placed.append(Placed(piece, pose))
 
     def hang(self, piece: Piece, bottom: float) -> None:
@@ -231,8 +193,8 @@ class Furnisher:
                 at + width / 2 + 0.06,
                 bottom + high + 0.05,
             )
-            if not any(_overlap(span, other) for other in self.used[side]):
-                pose = _frame(self.room, side, at)
+            if not any(overlap(span, other) for other in self.used[side]):
+                pose = wall_frame(self.room, side, at)
                 pose[2, 3] = bottom
                 self.placed.append(Placed(piece, pose))
                 self.used[side].append(span)
@@ -241,14 +203,14 @@ class Furnisher:
     def ceiling_lamp(self) -> None:
         """Hang a lamp from the middle of the ceiling."""
         x0, y0, x1, y1 = self.room.rect
-        pose = _shift((x0 + x1) / 2, (y0 + y1) / 2)
+        pose = shift((x0 + x1) / 2, (y0 + y1) / 2)
         pose[2, 3] = self.height
         self.placed.append(Placed(m.ceiling_lamp(self.rng, self.tones), pose))
 
     def _stand(self, piece: Piece, rect: Rect, side: int, at: float) -> bool:
         if not self._accept(rect, 0.0):
             return False
-        self.placed.append(Placed(piece, _frame(self.room, side, at)))
+        self.placed.append(Placed(piece, wall_frame(self.room, side, at)))
         self._last = (side, at, piece.size[0])
         return True
 
@@ -267,9 +229,9 @@ class Furnisher:
     def _accept(self, rect: Rect, margin: float) -> bool:
         """Take a footprint if it is clear and the doorways stay connected; else change nothing."""
         grown = (rect[0] - margin, rect[1] - margin, rect[2] + margin, rect[3] + margin)
-        if any(_overlap(grown, other) for other in self.footprints):
+        if any(overlap(grown, other) for other in self.footprints):
             return False
-        if any(_overlap(rect, door) for door in self.doors):
+        if any(overlap(rect, door) for door in self.doors):
             return False
         x0, y0 = self.room.rect[:2]
         first = [max(0, int(np.floor((rect[i] - (x0, y0)[i] - CLEAR_M) / CELL_M))) for i in (0, 1)]
@@ -286,8 +248,9 @@ class Furnisher:
     def _reachable(self) -> bool:
         """Whether free floor connects all doorways and most of what is free."""
         free = ~self.blocked
-        labels, count = ndimage.label(free)
-        if count == 0:
+        labels = np.zeros(free.shape, np.int32)
+        ndimage.label(free, output=labels)
+        if not free.any():
             return False
         sizes = np.bincount(labels.ravel())[1:]
         largest = int(sizes.argmax()) + 1
@@ -301,44 +264,3 @@ class Furnisher:
             if labels[row, column] != largest:
                 return False
         return True
-
-
-def _overlap(a: Rect, b: Rect) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
-
-
-def _against(room: Room, side: int, at: float, depth: float, width: float) -> Rect:
-    """Return the footprint of a piece at a wall."""
-    x0, y0, x1, y1 = room.rect
-    low, high = at - width / 2, at + width / 2
-    return (
-        (low, y0, high, y0 + depth),
-        (x1 - depth, low, x1, high),
-        (low, y1 - depth, high, y1),
-        (x0, low, x0 + depth, high),
-    )[side]
-
-
-def _apron(room: Room, side: int, low: float, high: float) -> Rect:
-    """Return the floor inside a room that its doorway needs."""
-    return _against(room, side, (low + high) / 2, 0.75, high - low)
-
-
-def _shift(x: float, y: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:2, 3] = x, y
-    return pose
-
-
-def _turned(quarters: int, at_2) -> np.ndarray:
-    """Return a pose turned by quarter circles about z."""
-    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
-    pose = _shift(float(at_2[0]), float(at_2[1]))
-    pose[:2, :2] = [[c, -s], [s, c]]
-    return pose
-
-
-def _frame(room: Room, side: int, at: float) -> np.ndarray:
-    """Return the frame of a wall at a place along it: y points into the room."""
-    x0, y0, x1, y1 = room.rect
-    return _turned(side, ((at, y0), (x1, at), (at, y1), (x0, at))[side])

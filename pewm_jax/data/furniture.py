@@ -3,70 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 
 from pewm_jax.data import textures
+from pewm_jax.data.furniture_parts import Tones, books, bright, legs, things
 from pewm_jax.data.shapes import Piece
-from pewm_jax.data.textures import Rgb, hsv, shade
-
-
-@dataclasses.dataclass(frozen=True)
-class Tones:
-    """The palette of one room."""
-
-    wall: Rgb
-    wood: Rgb
-    fabric: Rgb
-    accent: Rgb
-    second: Rgb
-    white: Rgb
-    dark: Rgb
-
-
-Maker = Callable[[np.random.Generator, Tones], Piece]
-
-
-def bright(rng: np.random.Generator) -> Rgb:
-    """Return a saturated colour for small things."""
-    return hsv(rng.uniform(), rng.uniform(0.55, 0.9), rng.uniform(0.5, 0.95))
-
-
-def legs(
-    piece: Piece, width: float, y: tuple[float, float], top: float, thick: float, colour: Rgb
-) -> None:
-    """Add four legs under a top of that width between two depths."""
-    for x0 in (-width / 2, width / 2 - thick):
-        for y0 in (y[0], y[1] - thick):
-            piece.box((x0, x0 + thick), (y0, y0 + thick), (0, top), colour)
-
-
-def books(
-    piece: Piece,
-    rng: np.random.Generator,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    z: float,
-    tallest: float,
-) -> None:
-    """Fill a shelf with books of many colours, here and there a vase or a box."""
-    at = x[0]
-    while at < x[1] - 0.07:
-        what = rng.uniform()
-        if what < 0.72:
-            width = min(rng.uniform(0.06, 0.13), x[1] - at)
-            high = z + tallest * rng.uniform(0.6, 0.95)
-            piece.box(
-                (at, at + width * 0.94), (y[0], y[1] - rng.uniform(0, 0.05)), (z, high), bright(rng)
-            )
-            at += width
-        elif what < 0.86 and x[1] - at > 0.2:
-            centre = (at + 0.1, (y[0] + y[1]) / 2)
-            piece.prism(centre, (z, z + tallest * 0.7), (0.05, 0.09), bright(rng), 8)
-            at += 0.22
-        else:
-            at += rng.uniform(0.08, 0.2)
+from pewm_jax.data.textures import hsv, shade
 
 
 def bed(rng: np.random.Generator, tones: Tones) -> Piece:
@@ -126,35 +69,8 @@ def dresser(rng: np.random.Generator, tones: Tones) -> Piece:
                 (z, z + (high - 0.12) / rows - 0.04),
                 shade(colour, 1.25),
             )
-    things(piece, rng, (-width / 2 + 0.1, width / 2 - 0.1), (0.1, depth - 0.08), high, 3)
+    things(piece, rng, (-width / 2 + 0.1, width / 2 - 0.1), (0.1, depth - 0.08), z=high, count=3)
     return piece
-
-
-def things(
-    piece: Piece,
-    rng: np.random.Generator,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    z: float,
-    count: int,
-) -> None:
-    """Put vases, boxes, bowls, small plants and balls next to each other on a top."""
-    edges = np.linspace(x[0], x[1], count + 1)
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        cx, cy = (low + high) / 2, rng.uniform(y[0] + 0.05, max(y[0] + 0.06, y[1] - 0.05))
-        room = min((high - low) / 2 * 0.85, 0.14)
-        kind = rng.integers(5)
-        if kind == 0:
-            piece.prism((cx, cy), (z, z + 0.25), (room * 0.7, room * 0.4), bright(rng), 8)
-        elif kind == 1:
-            piece.box((cx - room, cx + room), (cy - 0.08, cy + 0.08), (z, z + 0.14), bright(rng))
-        elif kind == 2:
-            piece.prism((cx, cy), (z, z + 0.1), (room * 0.5, room), bright(rng), 8)
-        elif kind == 3:
-            piece.prism((cx, cy), (z, z + 0.1), (0.06, 0.08), bright(rng), 8)
-            piece.ball((cx, cy, z + 0.2), (0.11, 0.11, 0.13), hsv(0.3, 0.7, 0.5))
-        else:
-            piece.ball((cx, cy, z + room * 0.8), (room * 0.8,) * 3, bright(rng))
 
 
 def bookshelf(rng: np.random.Generator, tones: Tones) -> Piece:
@@ -172,7 +88,12 @@ def bookshelf(rng: np.random.Generator, tones: Tones) -> Piece:
         piece.box((-half + 0.03, half - 0.03), (0.02, depth), (z, z + 0.03), tones.wood)
         if k < count:
             books(
-                piece, rng, (-half + 0.04, half - 0.04), (0.06, depth - 0.03), z + 0.03, step - 0.05
+                piece,
+                rng,
+                (-half + 0.04, half - 0.04),
+                (0.06, depth - 0.03),
+                z=z + 0.03,
+                tallest=step - 0.05,
             )
     return piece
 
@@ -219,8 +140,8 @@ def coffee_table(rng: np.random.Generator, tones: Tones) -> Piece:
     else:
         piece = Piece("coffee_table", (1.05, 0.58, 0.42))
         piece.box((-0.52, 0.52), (0, 0.58), (0.36, 0.42), tones.wood)
-        legs(piece, 1.0, (0.02, 0.56), 0.36, 0.06, shade(tones.wood, 0.7))
-    things(piece, rng, (-0.3, 0.3), (0.2, 0.42), 0.42, 2)
+        legs(piece, 1.0, (0.02, 0.56), top=0.36, thick=0.06, colour=shade(tones.wood, 0.7))
+    things(piece, rng, (-0.3, 0.3), (0.2, 0.42), z=0.42, count=2)
     return piece
 
 
@@ -237,7 +158,7 @@ def tv_stand(rng: np.random.Generator, tones: Tones) -> Piece:
     piece.box((-half, half), (0.16, 0.22), (0.54, 0.54 + 1.16 * half), np.array([0.06, 0.06, 0.07]))
     low, high, x = 0.58, 0.50 + 1.16 * half, half - 0.04
     corners = [[x, 0.225, low], [-x, 0.225, low], [-x, 0.225, high], [x, 0.225, high]]
-    piece.sheet(corners, textures.screen(rng))
+    piece.sheet(corners, textures.screen(rng), glowing=True)
     return piece
 
 
@@ -251,7 +172,9 @@ def dining_table(rng: np.random.Generator, tones: Tones) -> Piece:
         piece = Piece("dining_table", (rng.uniform(1.2, 1.6), 0.85, 0.76))
         width = piece.size[0]
         piece.box((-width / 2, width / 2), (0, 0.85), (0.71, 0.76), tones.wood)
-        legs(piece, width - 0.06, (0.03, 0.82), 0.71, 0.07, shade(tones.wood, 0.75))
+        legs(
+            piece, width - 0.06, (0.03, 0.82), top=0.71, thick=0.07, colour=shade(tones.wood, 0.75)
+        )
     middle = piece.size[1] / 2
     piece.prism((0, middle), (0.76, 0.9), (0.08, 0.15), tones.accent, 10)
     for k in range(3):
@@ -265,7 +188,7 @@ def chair(rng: np.random.Generator, tones: Tones) -> Piece:
     """A wooden chair; its back is at y = 0."""
     colour = tones.wood if rng.uniform() < 0.5 else tones.accent
     piece = Piece("chair", (0.44, 0.46, 0.9))
-    legs(piece, 0.42, (0, 0.44), 0.43, 0.045, shade(colour, 0.75))
+    legs(piece, 0.42, (0, 0.44), top=0.43, thick=0.045, colour=shade(colour, 0.75))
     piece.box((-0.22, 0.22), (0, 0.46), (0.43, 0.48), shade(colour, 1.1))
     for x in (-0.21, 0.165):
         piece.box((x, x + 0.045), (0, 0.045), (0.48, 0.9), shade(colour, 0.75))
@@ -289,9 +212,9 @@ def desk(rng: np.random.Generator, tones: Tones) -> Piece:
     piece.box((-0.06, 0.06), (0.14, 0.22), (0.75, 0.85), dark)
     piece.box((-0.32, 0.32), (0.14, 0.18), (0.84, 1.22), dark)
     corners = [[0.3, 0.185, 0.86], [-0.3, 0.185, 0.86], [-0.3, 0.185, 1.2], [0.3, 0.185, 1.2]]
-    piece.sheet(corners, textures.screen(rng))
+    piece.sheet(corners, textures.screen(rng), glowing=True)
     piece.box((-0.22, 0.22), (0.36, 0.5), (0.75, 0.77), tones.dark)
-    books(piece, rng, (-half + 0.05, -half + 0.32), (0.05, 0.25), 0.75, 0.3)
+    books(piece, rng, (-half + 0.05, -half + 0.32), (0.05, 0.25), z=0.75, tallest=0.3)
     return piece
 
 

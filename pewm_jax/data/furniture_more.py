@@ -1,11 +1,11 @@
-"""More pieces: kitchen, bath, hall and children's things, plants, lamps, and what hangs on walls."""
+"""More pieces: kitchen, bath, hall, children's things, plants, lamps, what hangs on walls."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from pewm_jax.data import textures
-from pewm_jax.data.furniture import Tones, books, bright, things
+from pewm_jax.data.furniture_parts import Tones, books, bright, things
 from pewm_jax.data.shapes import Piece
 from pewm_jax.data.textures import hsv, shade
 
@@ -33,7 +33,7 @@ def kitchen_counter(rng: np.random.Generator, tones: Tones) -> Piece:
     piece.box((x, x + 0.5), (0.12, 0.5), (0.905, 0.915), _STEEL * 0.75)
     piece.box((x + 0.23, x + 0.27), (0.06, 0.1), (0.91, 1.18), _STEEL)
     piece.box((x + 0.23, x + 0.27), (0.06, 0.26), (1.15, 1.18), _STEEL)
-    things(piece, rng, (x + 0.6, half - 0.1), (0.15, 0.45), 0.91, units - 1)
+    things(piece, rng, (x + 0.6, half - 0.1), (0.15, 0.45), z=0.91, count=units - 1)
     return piece
 
 
@@ -210,7 +210,7 @@ def fireplace(rng: np.random.Generator, tones: Tones) -> Piece:
         flame = hsv(0.03 + 0.045 * k, 0.95, 1.0)
         piece.prism((-0.12 + 0.12 * k, 0.2), (0.06, 0.3 + 0.1 * (k == 1)), (0.11, 0.0), flame, 6)
     piece.box((-0.76, 0.76), (0, 0.45), (1.1, 1.17), tones.wood)
-    things(piece, rng, (-0.6, 0.6), (0.12, 0.35), 1.17, 4)
+    things(piece, rng, (-0.6, 0.6), (0.12, 0.35), z=1.17, count=4)
     piece.box((-0.5, 0.5), (0, 0.3), (1.17, 2.4), shade(stone, 1.1))
     return piece
 
@@ -222,9 +222,18 @@ def wall_shelf(rng: np.random.Generator, tones: Tones) -> Piece:
     for z in (0.0, 0.42):
         piece.box((-width / 2, width / 2), (0, 0.25), (z, z + 0.04), tones.wood)
         if rng.uniform() < 0.5:
-            books(piece, rng, (-width / 2 + 0.04, width / 2 - 0.04), (0.03, 0.22), z + 0.04, 0.3)
+            books(
+                piece,
+                rng,
+                (-width / 2 + 0.04, width / 2 - 0.04),
+                (0.03, 0.22),
+                z=z + 0.04,
+                tallest=0.3,
+            )
         else:
-            things(piece, rng, (-width / 2 + 0.04, width / 2 - 0.04), (0.06, 0.2), z + 0.04, 4)
+            things(
+                piece, rng, (-width / 2 + 0.04, width / 2 - 0.04), (0.06, 0.2), z=z + 0.04, count=4
+            )
     return piece
 
 

@@ -11,7 +11,7 @@ import trimesh
 from pewm_jax.data import textures
 from pewm_jax.data.floorplan import DOOR_TOP_M, Room, draw_plan
 from pewm_jax.data.furnish import Furnisher, Placed
-from pewm_jax.data.furniture import Tones
+from pewm_jax.data.furniture_parts import Tones
 from pewm_jax.data.shapes import Piece
 from pewm_jax.data.shell import doorway_piece, level_mesh, trim_piece, wall_mesh, window_meshes
 from pewm_jax.data.textures import hsv, shade
@@ -49,7 +49,8 @@ def generate_house(seed: int) -> trimesh.Scene:
         for index, room in enumerate(plan.rooms)
     ]
     for index, (room, tones) in enumerate(zip(plan.rooms, palettes, strict=True)):
-        _add_shell(scene, rng, f"room{index}-{room.use}", room, tones, plan.height)
+        name = f"room{index}-{room.use}"
+        _add_shell(scene, rng, room, name=name, tones=tones, height=plan.height)
         for number, placed in enumerate(Furnisher(room, rng, tones, plan.height).furnish()):
             _add_piece(scene, f"room{index}-{placed.piece.kind}-{number}", placed)
     for index, (a, _, rect) in enumerate(plan.doorways):
@@ -68,7 +69,7 @@ def generate_house(seed: int) -> trimesh.Scene:
 
 def _palette(rng: np.random.Generator, hue: float, use: str) -> Tones:
     """Draw a room's colours: walls of one hue, furniture in hues apart from it."""
-    saturation = rng.uniform(0.28, 0.55) if use != "bathroom" else rng.uniform(0.2, 0.4)
+    saturation = rng.uniform(0.25, 0.5) if use != "bathroom" else rng.uniform(0.2, 0.4)
     accent_hue = hue + rng.choice([0.42, 0.5, 0.58])
     fabric_hue = hue + rng.choice([0.25, 0.33, 0.67, 0.75])
     return Tones(
@@ -85,8 +86,9 @@ def _palette(rng: np.random.Generator, hue: float, use: str) -> Tones:
 def _add_shell(
     scene: trimesh.Scene,
     rng: np.random.Generator,
-    name: str,
     room: Room,
+    *,
+    name: str,
     tones: Tones,
     height: float,
 ) -> None:

@@ -12,8 +12,10 @@ from embreex.rtcore_scene import EmbreeScene
 
 SUN_3 = np.array([0.35, 0.55, 0.76])
 """Direction towards the soft main light (unit length)."""
-RAYS = 24
+RAYS = 16
 """Occlusion rays per vertex."""
+LIFT_M = 0.04
+"""Occlusion is judged this far above a surface, so that skirting and frames cast no halos."""
 
 
 def embree(vertices_V3: np.ndarray, faces_F3: np.ndarray) -> EmbreeScene:
@@ -27,7 +29,7 @@ def embree(vertices_V3: np.ndarray, faces_F3: np.ndarray) -> EmbreeScene:
 def face_light(normals_F3: np.ndarray) -> np.ndarray:
     """Return (F, 3) RGB light for unit face normals: warm from above, cool from below."""
     up = normals_F3[:, 2:] * 0.5 + 0.5
-    sky, ground = np.array([1.02, 1.0, 0.97]), np.array([0.76, 0.78, 0.84])
+    sky, ground = np.array([1.02, 1.0, 0.97]), np.array([0.84, 0.855, 0.89])
     side = 0.12 * np.tanh(1.5 * normals_F3[:, :2] @ SUN_3[:2])[:, None]
     return ground + (sky - ground) * up + side
 
@@ -54,7 +56,7 @@ def occlusion(
     tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
     frame = np.stack([tangent, np.cross(normals_P3, tangent), normals_P3], 1)
     rays = np.matmul(local.astype(np.float32), frame.astype(np.float32)).reshape(-1, 3)
-    origins = np.repeat((points_P3 + 2e-3 * normals_P3).astype(np.float32), RAYS, 0)
+    origins = np.repeat((points_P3 + LIFT_M * normals_P3).astype(np.float32), RAYS, 0)
     reaches = np.tile(reach.astype(np.float32), count)
     hit = tracer.run(origins, rays, dists=reaches, query="OCCLUDED") >= 0
     return 1.0 - hit.reshape(count, RAYS).mean(1)

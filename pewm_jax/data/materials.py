@@ -21,12 +21,14 @@ class Textures:
     Attributes:
         texels_P4: uint8 RGB and padding, every level of every image, row-major.
         offset_L: (images × LEVELS,) int32, first texel of a level.
-        size_L2: (images × LEVELS, 2) float32, width and height of a level in texels.
+        width_L: (images × LEVELS,) int32, texels in a row of a level.
+        height_L: (images × LEVELS,) int32, rows of a level.
     """
 
     texels_P4: np.ndarray
     offset_L: np.ndarray
-    size_L2: np.ndarray
+    width_L: np.ndarray
+    height_L: np.ndarray
 
 
 def pack(images: list[np.ndarray]) -> Textures:
@@ -52,7 +54,8 @@ def pack(images: list[np.ndarray]) -> Textures:
             sizes.append((level.shape[1], level.shape[0]))
     texels = np.zeros((total, 4), np.uint8)
     np.concatenate(parts, out=texels[:, :3])
-    return Textures(texels, np.array(offsets, np.int32), np.array(sizes, np.float32))
+    width_L, height_L = np.array(sizes, np.int32).T.copy()
+    return Textures(texels, np.array(offsets, np.int32), width_L, height_L)
 
 
 def sample(textures: Textures, level_P: np.ndarray, s_P: np.ndarray, t_P: np.ndarray) -> np.ndarray:
@@ -65,38 +68,48 @@ def sample(textures: Textures, level_P: np.ndarray, s_P: np.ndarray, t_P: np.nda
         t_P: float32, 0 → 1 from the top to the bottom border.
 
     Returns:
-        (P, 3) float32 in [0, 255].
+        (3, P) float32 in [0, 255]; channels first, as whole rows are fastest to work on.
     """
-    size = textures.size_L2[level_P]
-    width, height = size[:, 0], size[:, 1]
-    x = (s_P - np.floor(s_P)) * width
-    y = (t_P - np.floor(t_P)) * height
-    x -= 0.5
-    y -= 0.5
-    left, top = np.floor(x), np.floor(y)
-    x -= left
-    y -= top
-    w, h = width.astype(np.int32), height.astype(np.int32)
-    x0, y0 = left.astype(np.int32), top.astype(np.int32)
-    x1, y1 = x0 + 1, y0 + 1
-    x0 += w * (x0 < 0)
-    y0 += h * (y0 < 0)
-    x1 -= w * (x1 >= w)
-    y1 -= h * (y1 >= h)
-    offset = textures.offset_L[level_P]
-    row0, row1 = offset + y0 * w, offset + y1 * w
-    texels, x, y = textures.texels_P4, x[:, None], y[:, None]
-    upper = _mix(texels.take(row0 + x0, 0), texels.take(row0 + x1, 0), x)
-    lower = _mix(texels.take(row1 + x0, 0), texels.take(row1 + x1, 0), x)
-    lower -= upper
-    lower *= y
-    upper += lower
-    return upper[:, :3]
+    width, height = textures.width_L.take(level_P), textures.height_L.take(level_P)
+    x0, x1, right = _neighbours(s_P, width)
+    y0, y1, below = _neighbours(t_P, height)
+    both = right * below
+    right -= both
+    below -= both
+    neither = 1.0 - right - below - both
+    y0 *= width
+    y1 *= width
+    offset = textures.offset_L.take(level_P)
+    y0 += offset
+    y1 += offset
+    packed = textures.texels_P4.view(np.uint32)[:, 0]
+    corners = [
+        (packed.take(row + column).view(np.uint8).reshape(-1, 4), weight)
+        for row, column, weight in (
+            (y0, x0, neither),
+            (y0, x1, right),
+            (y1, x0, below),
+            (y1, x1, both),
+        )
+    ]
+    result = np.zeros((3, len(s_P)), np.float32)
+    for channel in range(3):
+        for texel, weight in corners:
+            result[channel] += texel[:, channel] * weight
+    return result
 
 
-def _mix(a_P4: np.ndarray, b_P4: np.ndarray, weight_P1: np.ndarray) -> np.ndarray:
-    a, b = a_P4.astype(np.float32), b_P4.astype(np.float32)
-    b -= a
-    b *= weight_P1
-    a += b
-    return a
+def _neighbours(
+    coordinate_P: np.ndarray, count_P: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the two texels around a coordinate along one axis and the weight of the second."""
+    position = coordinate_P - np.floor(coordinate_P)
+    position *= count_P
+    position -= 0.5
+    low = np.floor(position)
+    position -= low
+    first = low.astype(np.int32)
+    second = first + 1
+    first += count_P * (first < 0)
+    second -= count_P * (second >= count_P)
+    return first, second, position.astype(np.float32, copy=False)

@@ -81,7 +81,7 @@ def navigable(
     columns, rows = (int(n) for n in np.ceil((high[:2] + cell_m - origin) / cell_m))
     if rows * columns > 16_000_000:
         raise UserError(
-            f"{scene.name} spans {high[0] - low[0]:.0f} × {high[1] - low[1]:.0f} m, too much for "
+            f"{scene.name} spans {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m, too much for "
             f"cells of {cell_m} m: check that its unit is metres, or use larger cells."
         )
     floor_z = estimate_floor(scene)
@@ -89,11 +89,13 @@ def navigable(
     centres = np.stack(np.meshgrid(x, y), -1)
     landing = _landing(scene, centres, floor_z + agent_height_m)
     stand = np.abs(landing - floor_z) <= STEP_M
-    stand &= ~_obstructed(scene, centres, stand, floor_z, agent_height_m, cell_m)
-    margin = np.pad(stand, 1)
-    clearance = ndimage.distance_transform_edt(margin)[1:-1, 1:-1] * cell_m - cell_m / 2
-    labels, count = ndimage.label(clearance >= agent_radius_m)
-    if count == 0:
+    stand &= ~_obstructed(
+        scene, centres, stand, floor_z=floor_z, height_m=agent_height_m, cell_m=cell_m
+    )
+    away = np.asarray(ndimage.distance_transform_edt(np.pad(stand, 1)))[1:-1, 1:-1]
+    labels = np.zeros(stand.shape, np.int32)
+    ndimage.label((away - 0.5) * cell_m >= agent_radius_m, output=labels)
+    if not labels.any():
         raise UserError(
             f"{scene.name} has no place where an agent of radius {agent_radius_m} m can stand "
             f"(floor found at z = {floor_z:.2f} m): check that it is in metres and z is up."
@@ -138,6 +140,7 @@ def _obstructed(
     scene: Scene,
     centres_YX2: np.ndarray,
     stand_YX: np.ndarray,
+    *,
     floor_z: float,
     height_m: float,
     cell_m: float,

@@ -15,7 +15,7 @@ from pewm_jax.data.materials import LEVELS, sample
 from pewm_jax.data.scenes import Scene
 from pewm_jax.types import Camera
 
-CHUNK = 1 << 16
+CHUNK = 1 << 14
 """Pixels shaded at once: big enough to amortise calls, small enough for the caches."""
 
 
@@ -54,7 +54,7 @@ def render(scene: Scene, camera: Camera, height: int, width: int) -> Rendered:
             f"{intrinsics.shape}: add a leading axis to a single camera."
         )
     if height < 1 or width < 1:
-        raise UserError(f"an image of {height}×{width} pixels is empty: ask for at least 1×1.")
+        raise UserError(f"an image of {height} x {width} pixels is empty: ask for at least 1 x 1.")
     if not (np.isfinite(pose).all() and np.isfinite(intrinsics).all()):
         raise UserError("a camera to render has values that are not finite: check its pose.")
     frames = len(pose)
@@ -68,14 +68,12 @@ def render(scene: Scene, camera: Camera, height: int, width: int) -> Rendered:
         origins, directions = _rays(scene, pose[part], intrinsics[part], height, width)
         hits = scene.tracer.run(origins, directions, output=1)
         focal = np.repeat(intrinsics[part, 0].astype(np.float32), height * width)
-        _shade(
-            scene,
-            hits,
-            focal,
-            rgb[part].reshape(-1, 3),
-            depth[part].reshape(-1),
-            ids[part].reshape(-1),
-        )
+        colour, z, instance = _shade(scene, hits, focal)
+        pixels = rgb[part].reshape(-1, 3)
+        for channel in range(3):
+            pixels[:, channel] = colour[channel]
+        depth[part] = z.reshape(depth[part].shape)
+        ids[part] = instance.reshape(ids[part].shape)
     return Rendered(rgb, depth, ids)
 
 
@@ -95,36 +93,27 @@ def _rays(
 
 
 def _shade(
-    scene: Scene,
-    hits: dict[str, np.ndarray],
-    focal_P: np.ndarray,
-    rgb_P3: np.ndarray,
-    depth_P: np.ndarray,
-    ids_P: np.ndarray,
-) -> None:
-    """Write colour, depth and ids of hits into the output's pixels."""
-    face = hits["primID"]
-    missed = face < 0
-    some_missed = bool(missed.any())
-    if some_missed:
-        face = np.where(missed, 0, face)
-    z = hits["tfar"]
-    row = scene.shading_F16.take(face, 0)
-    value = row[:, 5:10] * hits["u"][:, None]
-    value += row[:, :5]
-    value += row[:, 10:15] * hits["v"][:, None]
-    texels_per_pixel = row[:, 15] * z
+    scene: Scene, hits: dict[str, np.ndarray], focal_P: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return colour (3, P) in [0, 255], z-depth (P,) and instance ids (P,) of hits."""
+    missed = hits["primID"] < 0
+    face = np.where(missed, 0, hits["primID"])
+    z = np.where(missed, np.float32(0), hits["tfar"])
+    row = scene.shading_16F.take(face, 1)
+    value, second = row[5:10], row[10:15]
+    value *= hits["u"]
+    value += row[:5]
+    second *= hits["v"]
+    value += second
+    texels_per_pixel = row[15]
+    texels_per_pixel *= z
     texels_per_pixel /= focal_P
     np.clip(texels_per_pixel, 1.0, float(1 << (LEVELS - 1)), out=texels_per_pixel)
-    level = scene.texture_F.take(face) + np.rint(np.log2(texels_per_pixel)).astype(np.int32)
-    colour = sample(scene.textures, level, value[:, 3], value[:, 4])
-    colour *= value[:, :3]
+    level = np.rint(np.log2(texels_per_pixel)).astype(np.int32)
+    level += scene.texture_F.take(face)
+    colour = sample(scene.textures, level, value[3], value[4])
+    colour *= value[:3]
     colour += 0.5
     np.minimum(colour, 255.0, out=colour)
-    rgb_P3[...] = colour
-    depth_P[...] = z
-    ids_P[...] = scene.object_F.take(face)
-    if some_missed:
-        rgb_P3[missed] = 0
-        depth_P[missed] = 0
-        ids_P[missed] = -1
+    colour *= ~missed
+    return colour, z, np.where(missed, np.int32(-1), scene.object_F.take(face))

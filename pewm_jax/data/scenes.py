@@ -21,9 +21,8 @@ from pewm_jax.config import UserError
 from pewm_jax.data import lighting
 from pewm_jax.data.houses import generate_house
 from pewm_jax.data.materials import LEVELS, Textures, pack
+from pewm_jax.data.surfaces import Surface, read_surface
 
-GREY = np.array([170, 170, 170], np.uint8)
-"""Colour of a mesh that brings none."""
 _UNREADABLE = (
     ArithmeticError,
     AssertionError,
@@ -52,7 +51,7 @@ class Scene:
         normals_F3: (F, 3) float64 unit face normals.
         object_F: (F,) int32 instance id of each face, an index into ``objects``.
         objects: names of the instances.
-        shading_F16: (F, 16) float32; five quantities q (light × colour as r, g, b; texture
+        shading_16F: (16, F) float32; five quantities q (light × colour as r, g, b; texture
             s, t) stored as q₀, q₁ − q₀, q₂ − q₀ over the corners; last, texels per metre.
         texture_F: (F,) int32 first row of the face's image in the level table.
         textures: the images.
@@ -65,7 +64,7 @@ class Scene:
     normals_F3: np.ndarray
     object_F: np.ndarray
     objects: tuple[str, ...]
-    shading_F16: np.ndarray
+    shading_16F: np.ndarray
     texture_F: np.ndarray
     textures: Textures
     metadata: dict[str, Any]
@@ -143,14 +142,15 @@ def from_trimesh(
         scene = trimesh.Scene(scene)
     soft = scene.metadata.get("shading") == "soft"
     parts: list[_Part] = []
-    surfaces: dict[str, _Surface] = {}
+    surfaces: dict[str, Surface] = {}
     for node in scene.graph.nodes_geometry:
-        transform, key = scene.graph[node]
+        transform, geometry = scene.graph[node]
+        key = str(geometry)
         mesh = scene.geometry[key]
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             continue
         if key not in surfaces:
-            surfaces[key] = _surface(mesh, where)
+            surfaces[key] = read_surface(mesh, where)
         parts.append(_place(str(node), np.asarray(transform), up, surfaces[key], where))
     if not parts:
         raise UserError(
@@ -161,79 +161,16 @@ def from_trimesh(
 
 
 @dataclasses.dataclass(frozen=True)
-class _Surface:
-    """One geometry before it is placed: positions, corner colours in [0, 1], uv, image."""
-
-    vertices_V3: np.ndarray
-    faces_F3: np.ndarray
-    colour_F33: np.ndarray
-    uv_F32: np.ndarray
-    image: np.ndarray | None
-    bare: bool
-
-
-@dataclasses.dataclass(frozen=True)
 class _Part:
     """One placed instance."""
 
     node: str
     vertices_V3: np.ndarray
-    surface: _Surface
+    surface: Surface
     mirrored: bool
 
 
-def _surface(mesh: trimesh.Trimesh, where: str) -> _Surface:
-    """Read positions and colours of one mesh; the image stays shared between instances."""
-    vertices = np.asarray(mesh.vertices, np.float64)
-    faces = np.asarray(mesh.faces, np.int32)
-    if faces.max() >= len(vertices) or faces.min() < 0:
-        raise UserError(
-            f"{where} has faces that point past its {len(vertices)} vertices: export it again."
-        )
-    colour = np.ones((len(faces), 3, 3), np.float32)
-    uv = np.zeros((len(faces), 3, 2), np.float32)
-    visual = mesh.visual
-    if isinstance(visual, trimesh.visual.TextureVisuals):
-        image, factor = _image_of(visual.material)
-        coordinates = None if visual.uv is None else np.asarray(visual.uv, np.float32)
-        if coordinates is None or coordinates.shape != (len(vertices), 2):
-            image = None if image is None else image.mean((0, 1), keepdims=True).astype(np.uint8)
-        else:
-            corners = np.nan_to_num(coordinates)[faces]
-            uv = np.stack([corners[..., 0], 1 - corners[..., 1]], -1)
-        tint = visual.vertex_attributes.get("color")
-        if tint is not None and len(tint) == len(vertices):
-            tint = np.asarray(tint)
-            scale = 255.0 if np.issubdtype(tint.dtype, np.integer) else 1.0
-            colour = (tint[:, :3] / scale).astype(np.float32)[faces]
-        bare = image is None and tint is None and factor is None
-        base = GREY / 255 if bare else (np.ones(3) if factor is None else factor)
-        return _Surface(vertices, faces, colour * base.astype(np.float32), uv, image, bare)
-    if visual.kind == "vertex":
-        colours = np.asarray(visual.vertex_colors)[:, :3].astype(np.float32) / 255
-        return _Surface(vertices, faces, colours[faces], uv, None, bare=False)
-    if visual.kind == "face":
-        colours = np.asarray(visual.face_colors)[:, :3].astype(np.float32) / 255
-        return _Surface(vertices, faces, colour * colours[:, None], uv, None, bare=False)
-    return _Surface(vertices, faces, colour * np.float32(GREY / 255), uv, None, bare=True)
-
-
-def _image_of(material: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return the (H, W, 3) uint8 image and the (3,) factor in [0, 1] of a material."""
-    if isinstance(material, trimesh.visual.material.PBRMaterial):
-        image, factor = material.baseColorTexture, material.baseColorFactor
-    else:
-        image = getattr(material, "image", None)
-        factor = getattr(material, "diffuse", None) if image is None else None
-    pixels = None if image is None else np.asarray(image.convert("RGB"))
-    if factor is None:
-        return pixels, None
-    factor = np.asarray(factor)
-    scale = 255.0 if np.issubdtype(factor.dtype, np.integer) else 1.0
-    return pixels, (factor[:3] / scale).astype(np.float64)
-
-
-def _place(node: str, transform: np.ndarray, up: str, surface: _Surface, where: str) -> _Part:
+def _place(node: str, transform: np.ndarray, up: str, surface: Surface, where: str) -> _Part:
     """Move one instance into the z-up world."""
     vertices = surface.vertices_V3 @ transform[:3, :3].T + transform[:3, 3]
     if not np.isfinite(vertices[surface.faces_F3]).all():
@@ -272,7 +209,7 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
         image_of_part.append(0 if image is None else rows[id(image)])
     texture = np.repeat(np.array(image_of_part, np.int32) * LEVELS, counts)
     textures = pack(images)
-    size = textures.size_L2[texture]
+    size = np.stack([textures.width_L[texture], textures.height_L[texture]], -1)
     edges = (uv[:, 1:] - uv[:, :1]) * size[:, None, :]
     texels = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
     density = np.sqrt(texels / double_area[:, 0].clip(1e-12))
@@ -283,7 +220,7 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
         normals_F3=normals,
         object_F=np.repeat(np.arange(len(parts), dtype=np.int32), counts),
         objects=tuple(part.node for part in parts),
-        shading_F16=np.zeros((len(faces), 16), np.float32),
+        shading_16F=np.zeros((16, len(faces)), np.float32),
         texture_F=texture,
         textures=textures,
         metadata=metadata,
@@ -291,15 +228,17 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
     bare = np.repeat(np.array([part.surface.bare for part in parts]), counts)
     if soft:
         centred = vertices - scene.centre_3
-        colour = colour * lighting.soft_light(scene.tracer, centred, faces, normals)
+        light = lighting.soft_light(scene.tracer, centred, faces, normals)
+        light[np.repeat([part.surface.glowing for part in parts], counts)] = 1.0
+        colour = colour * light
     elif bare.any():
         light = lighting.face_light(normals)[:, None, :]
         colour = np.where(bare[:, None, None], colour * light, colour)
     values = np.concatenate([colour, uv], -1)
-    scene.shading_F16[:, :5] = values[:, 0]
-    scene.shading_F16[:, 5:10] = values[:, 1] - values[:, 0]
-    scene.shading_F16[:, 10:15] = values[:, 2] - values[:, 0]
-    scene.shading_F16[:, 15] = density
+    scene.shading_16F[:5] = values[:, 0].T
+    scene.shading_16F[5:10] = (values[:, 1] - values[:, 0]).T
+    scene.shading_16F[10:15] = (values[:, 2] - values[:, 0]).T
+    scene.shading_16F[15] = density
     return scene
 
 

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 Colour = Sequence[float] | np.ndarray
 """Red, green, blue in [0, 1]."""
@@ -41,7 +43,7 @@ class Piece:
     meshes: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = dataclasses.field(
         default_factory=list
     )
-    sheets: list[tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=list)
+    sheets: list[tuple[np.ndarray, np.ndarray, bool]] = dataclasses.field(default_factory=list)
 
     def box(
         self, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], colour: Colour
@@ -71,9 +73,11 @@ class Piece:
         placed = points * np.asarray(radii) + np.asarray(centre)
         self.meshes.append((placed, faces, np.asarray(colour, float)))
 
-    def sheet(self, corners_43: Sequence[Sequence[float]], image: np.ndarray) -> None:
+    def sheet(
+        self, corners_43: Sequence[Sequence[float]], image: np.ndarray, *, glowing: bool = False
+    ) -> None:
         """Add a picture: corners bottom-left, bottom-right, top-right, top-left as seen."""
-        self.sheets.append((np.asarray(corners_43, float), image))
+        self.sheets.append((np.asarray(corners_43, float), image, glowing))
 
     def solid(self) -> trimesh.Trimesh | None:
         """Return everything but the sheets as one mesh with vertex colours."""
@@ -99,7 +103,10 @@ class Piece:
         """Return the sheets as textured meshes."""
         uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
         faces = np.array([[0, 1, 2], [0, 2, 3]])
-        return [textured(corners, faces, uv, image) for corners, image in self.sheets]
+        return [
+            textured(corners, faces, uv, image, glowing=glowing)
+            for corners, image, glowing in self.sheets
+        ]
 
 
 def coloured(vertices_V3: np.ndarray, faces_F3: np.ndarray, rgb_V3: np.ndarray) -> trimesh.Trimesh:
@@ -110,13 +117,24 @@ def coloured(vertices_V3: np.ndarray, faces_F3: np.ndarray, rgb_V3: np.ndarray) 
 
 
 def textured(
-    vertices_V3: np.ndarray, faces_F3: np.ndarray, uv_V2: np.ndarray, image_HW3: np.ndarray
+    vertices_V3: np.ndarray,
+    faces_F3: np.ndarray,
+    uv_V2: np.ndarray,
+    image_HW3: np.ndarray,
+    *,
+    glowing: bool = False,
 ) -> trimesh.Trimesh:
-    """Return a mesh with an image; uv (0, 0) is the image's bottom left corner."""
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(image_HW3), metallicFactor=0.0, roughnessFactor=1.0
+    """Return a mesh with an image; uv (0, 0) is the image's bottom left corner.
+
+    ``glowing`` marks surfaces that need no light to be seen, such as windows and screens.
+    """
+    material = PBRMaterial(
+        baseColorTexture=Image.fromarray(image_HW3),
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        emissiveFactor=[1.0, 1.0, 1.0] if glowing else None,
     )
-    visual = trimesh.visual.TextureVisuals(uv=uv_V2, material=material)
+    visual = TextureVisuals(uv=uv_V2, material=material)
     return trimesh.Trimesh(vertices_V3, faces_F3, visual=visual, process=False)
 
 
@@ -125,11 +143,11 @@ def _unit_prism(sides: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a prism of radius 1 and height 1 with split vertices: sides, then the two caps."""
     angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], 1)
-    top = ring + [0, 0, 1]
+    top = ring + np.array([0, 0, 1])
     after = np.roll(np.arange(sides), -1)
     wall = np.stack([ring, ring[after], top[after], top], 1).reshape(-1, 3)
     quads = 4 * np.arange(sides)[:, None]
-    faces = [np.concatenate([quads + [0, 1, 2], quads + [0, 2, 3]])]
+    faces = [np.concatenate([quads + np.array(corner) for corner in ((0, 1, 2), (0, 2, 3))])]
     fan = np.stack([np.zeros(sides - 2, int), np.arange(1, sides - 1), np.arange(2, sides)], 1)
     faces += [fan + 4 * sides, fan[:, ::-1] + 5 * sides]
     return np.concatenate([wall, top, ring]), np.concatenate(faces)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import trimesh
 
 from pewm_jax.data import textures
 from pewm_jax.data.floorplan import WALL_M, Opening, Rect, Room
-from pewm_jax.data.furniture import Tones
+from pewm_jax.data.furniture_parts import Tones
 from pewm_jax.data.shapes import Piece, textured
 from pewm_jax.data.textures import shade
 
@@ -22,7 +24,7 @@ def _cuts(low: float, high: float, marks: list[float]) -> np.ndarray:
     edges = sorted({low, high, *(m for m in marks if low < m < high)})
     parts = [
         np.linspace(a, b, max(1, int(np.ceil((b - a) / GRID_M))) + 1)[:-1]
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
+        for a, b in itertools.pairwise(edges)
     ]
     return np.append(np.concatenate(parts), high)
 
@@ -82,14 +84,24 @@ def trim_piece(room: Room, tones: Tones) -> Piece:
         edges = [start, *(e for door in doors for e in door), end]
         for a, b in zip(edges[::2], edges[1::2], strict=True):
             if b - a > 0.02:
-                _strip(piece, room, side, (a, b), (0.0, 0.09), 0.015, shade(colour, 0.95))
+                _strip(
+                    piece, room, side, (a, b), (0.0, 0.09), thick=0.015, colour=shade(colour, 0.95)
+                )
     for hole in room.openings:
         side, a, b, low, top = hole.side, hole.low, hole.high, hole.bottom, hole.top
         for span in ((a - 0.07, a), (b, b + 0.07)):
-            _strip(piece, room, side, span, (max(0.0, low - 0.07), top + 0.07), 0.02, colour)
-        _strip(piece, room, side, (a, b), (top, top + 0.07), 0.02, colour)
+            _strip(
+                piece,
+                room,
+                side,
+                span,
+                (max(0.0, low - 0.07), top + 0.07),
+                thick=0.02,
+                colour=colour,
+            )
+        _strip(piece, room, side, (a, b), (top, top + 0.07), thick=0.02, colour=colour)
         if hole.kind == "window":
-            _strip(piece, room, side, (a, b), (low - 0.07, low), 0.07, colour)
+            _strip(piece, room, side, (a, b), (low - 0.07, low), thick=0.07, colour=colour)
     return piece
 
 
@@ -99,6 +111,7 @@ def _strip(
     side: int,
     span: tuple[float, float],
     z: tuple[float, float],
+    *,
     thick: float,
     colour: np.ndarray,
 ) -> None:
@@ -152,6 +165,7 @@ def window_meshes(
             corner(back, left, hi),
         ],
         textures.window_view(rng),
+        glowing=True,
     )
     low_2 = np.minimum(wall, back) * (1 - axis)
     high_2 = np.maximum(wall, back) * (1 - axis)
