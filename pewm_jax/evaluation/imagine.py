@@ -45,7 +45,13 @@ class Imagination:
         self._clip: dict[bool, Callable[..., tuple[WorldState, Frames]]] = {}
 
     def prepare(self, memories: Iterable[bool]) -> None:
-        """Compile the start, and the sampler with (True) or without (False) its map."""
+        """Compile the start, and the sampler with (True) or without (False) its map.
+
+        Nothing is compiled twice, and nothing at all where no variant is asked for.
+        """
+        memories = [memory for memory in memories if memory not in self._clip]
+        if not memories:
+            return
         states = jax.eval_shape(self._start_batch, self.params, self._abstract_context())
         if self._begin is None:
             self._begin = _compile(
@@ -57,16 +63,13 @@ class Imagination:
         actions = jax.ShapeDtypeStruct((self.batch, self.config.clip.frames - 1, 3), jnp.float32)
         keys = jax.eval_shape(clip_keys, jax.ShapeDtypeStruct((self.batch, 2), jnp.uint32))
         for memory in memories:
-            if memory not in self._clip:
-                self._clip[memory] = _compile(
-                    f"the sampler with {'its' if memory else 'an empty'} map "
-                    f"({self.config.diffusion.sample_steps} steps, {self.batch} clips at once)",
-                    jax.vmap(
-                        functools.partial(rollout, self.config, memory=memory), (None, 0, 0, 0)
-                    ),
-                    (self.params, states, actions, keys),
-                    self._say,
-                )
+            self._clip[memory] = _compile(
+                f"the sampler with {'its' if memory else 'an empty'} map "
+                f"({self.config.diffusion.sample_steps} steps, {self.batch} clips at once)",
+                jax.vmap(functools.partial(rollout, self.config, memory=memory), (None, 0, 0, 0)),
+                (self.params, states, actions, keys),
+                self._say,
+            )
 
     def run(
         self,

@@ -59,8 +59,7 @@ def encode_h264(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> b
     """
     buffer = io.BytesIO()
     height, width = pictures[0].shape[:2]
-    options = {"movflags": "+faststart"}
-    with av.open(buffer, "w", format="mp4", options=options) as container:
+    with av.open(buffer, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=frames_per_second)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.options = {"crf": "21", "preset": "medium", "threads": "1"}

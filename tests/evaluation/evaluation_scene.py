@@ -96,7 +96,9 @@ def knowing_rollout(config, params, state, actions, key, *, memory=True, late=0)
     intrinsics = state.frame.camera.intrinsics_4[0]
     poses = integrate(pose, actions)
     shown = poses[1 - late : poses.shape[0] - late]
-    colour, depth = jax.vmap(lambda p: look(p, intrinsics, params["offset"]))(shown)
+    colour, depth = jax.vmap(lambda p: look(p, intrinsics, params["offset"], config.clip.height))(
+        shown
+    )
     noise = jax.random.uniform(key, colour.shape)
     rgb = 2 * (colour if memory else noise) - 1
     camera = Camera(jnp.broadcast_to(intrinsics, (len(poses) - 1, 4)), poses[1:])

@@ -24,14 +24,25 @@ def episodes(tmp_path_factory):
     return EpisodeSource(write_split(folder, episodes=2))
 
 
-def knowing_model(monkeypatch, config, late=0):
-    monkeypatch.setattr(imagine, "rollout", functools.partial(knowing_rollout, late=late))
-    return Imagination(config, PARAMS, config.evaluate.batch, config.data.context, lambda _: None)
+@pytest.fixture(scope="module")
+def knowing_model(tmp_path_factory):
+    """Make models that know the room; each kind is compiled once."""
+
+    @functools.cache
+    def make(batch=2, late=0):
+        config = tiny(tmp_path_factory.getbasetemp(), batch=batch)
+        model = Imagination(config, PARAMS, batch, config.data.context, lambda _: None)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(imagine, "rollout", functools.partial(knowing_rollout, late=late))
+            model.prepare([True, False])
+        return model
+
+    return make
 
 
-def test_a_model_that_remembers_wins_by_a_mile(monkeypatch, episodes, tmp_path):
+def test_a_model_that_remembers_wins_by_a_mile(knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, clips=3)
-    model = knowing_model(monkeypatch, config)
+    model = knowing_model()
     scored = scoring.score_table(config, episodes, model, Partials(tmp_path, "f" * 64), print)
     assert scored.sums["memory"].shape == (2, 3, 4, 3, 7)
     assert scored.sums["copy"].shape == (1, 3, 4, 3, 7)
@@ -48,27 +59,27 @@ def test_a_model_that_remembers_wins_by_a_mile(monkeypatch, episodes, tmp_path):
     assert gain["mean"] > 35
 
 
-def test_a_model_that_is_one_frame_late_is_noticed(monkeypatch, episodes, tmp_path):
+def test_a_model_that_is_one_frame_late_is_noticed(knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, clips=2)
-    model = knowing_model(monkeypatch, config, late=1)
+    model = knowing_model(late=1)
     scored = scoring.score_table(config, episodes, model, Partials(tmp_path, "f" * 64), print)
     assert table(scored.sums, scored.episodes)["memory"]["all"]["psnr"]["mean"] < 25
 
 
-def test_batches_do_not_change_the_numbers(monkeypatch, episodes, tmp_path):
+def test_batches_do_not_change_the_numbers(knowing_model, episodes, tmp_path):
     sums = []
-    for batch in (1, 3):
+    for batch in (2, 3):
         config = tiny(tmp_path, clips=3, batch=batch)
-        model = knowing_model(monkeypatch, config)
+        model = knowing_model(batch)
         partials = Partials(tmp_path / str(batch), "f" * 64)
         sums.append(scoring.score_table(config, episodes, model, partials, print).sums)
     for method in sums[0]:
         np.testing.assert_allclose(sums[0][method], sums[1][method], rtol=1e-4, atol=1e-4)
 
 
-def test_scored_pieces_are_not_done_again(monkeypatch, episodes, tmp_path):
+def test_scored_pieces_are_not_done_again(monkeypatch, knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, clips=4, chain=2)
-    model = knowing_model(monkeypatch, config)
+    model = knowing_model()
     whole = scoring.score_table(config, episodes, model, Partials(tmp_path / "a", "f" * 64), print)
 
     calls, run = [], Imagination.run
@@ -105,9 +116,9 @@ def test_pieces_of_other_weights_are_dropped_and_broken_ones_ignored(tmp_path):
     assert not old.folder.exists()
 
 
-def test_long_rollouts_keep_pictures_and_the_map(monkeypatch, episodes, tmp_path):
+def test_long_rollouts_keep_pictures_and_the_map(monkeypatch, knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, video_clips=9)
-    model = knowing_model(monkeypatch, config)
+    model = knowing_model()
     partials = Partials(tmp_path, "f" * 64)
     long = scoring.roll_long(config, episodes, model, partials, print)
     assert long.chain == 5  # 5 × 4 frames after a start fit into 24 frames; 6 do not

@@ -1,0 +1,276 @@
+"""The report of a tiny real run: schema, self-containedness, resuming, errors, previews."""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import io
+import json
+import re
+import shutil
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import av
+import jax
+import numpy as np
+import pytest
+from evaluation_scene import tiny, write_split
+from PIL import Image
+
+from pewm_jax import config as configs
+from pewm_jax import weights
+from pewm_jax.config import UserError
+from pewm_jax.evaluation import imagine, preview, report
+from pewm_jax.evaluation.imagine import Imagination
+from pewm_jax.evaluation.page import number, verdict
+from pewm_jax.models import world_model
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def command():
+    spec = importlib.util.spec_from_file_location("evaluate_command", ROOT / "evaluate.py")
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.main
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compile_once():
+    """Let equal programs of this file be compiled once; compiling is most of its time."""
+    compiled = {}
+
+    def cached(name, function, arguments, say):
+        shapes = jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), arguments)
+        key = name, str(shapes)
+        if key not in compiled:
+            compiled[key] = original(name, function, arguments, say)
+        return compiled[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        original = imagine._compile
+        patch.setattr(imagine, "_compile", cached)
+        yield
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, compile_once):
+    """A run folder with untrained weights, and its report."""
+    base = tmp_path_factory.mktemp("experiment")
+    config = tiny(base)
+    write_split(base / "data" / "revisit", episodes=2)
+    write_split(base / "data" / "validation", episodes=2)
+    folder = base / "run"
+    folder.mkdir()
+    configs.save(config, folder / "config.json")
+    params = jax.jit(lambda key: world_model.init(config, key, memory=True))(jax.random.key(0))
+    weights.save(folder / "weights.safetensors", params)
+    report.evaluate(folder, say=lambda _: None)
+    return folder
+
+
+@pytest.fixture
+def copied(run, tmp_path):
+    """The same run in a folder that a test may damage; its data stays where it is."""
+    return Path(shutil.copytree(run, tmp_path / "run"))
+
+
+def test_metrics_hold_every_method_mask_and_metric(run):
+    metrics = json.loads((run / "report" / "metrics.json").read_text())
+    for method in ("memory", "empty", "copy"):
+        for mask in ("seen", "unseen", "all"):
+            for metric in ("psnr", "ssim", "depth_mae", "depth_rel"):
+                entry = metrics["results"][method][mask][metric]
+                assert set(entry) == {"mean", "stderr", "n"}
+                frames = metrics["per_frame"][method][mask][metric]["mean"]
+                assert len(frames) == 4
+        assert np.isfinite(metrics["results"][method]["seen"]["psnr"]["mean"])
+    protocol = metrics["protocol"]
+    assert protocol["seeds"] == [0, 1]
+    assert (protocol["clips"], protocol["episodes"], protocol["scenes"]) == (4, 2, 2)
+    assert protocol["weights_sha256"] == report.file_hash(run / "weights.safetensors")
+    assert protocol["context"] == 6
+    assert protocol["sampling_steps"] == 2
+    assert protocol["encoder"] == "patch_colours"
+    assert configs.from_dict(configs.Config, protocol["config"]) == configs.load(
+        run / "config.json"
+    )
+    assert len(metrics["margin"]["seen"]["psnr"]["per_seed"]) == 2
+    assert len(metrics["long"]["per_frame"]["memory"]["all"]["psnr"]["mean"]) == 8
+
+
+def test_untrained_memory_changes_nothing(run):
+    # At the start of stage 2 the memory blocks are exactly the identity.
+    gain = json.loads((run / "report" / "metrics.json").read_text())["margin"]["all"]["psnr"]
+    assert gain["mean"] == pytest.approx(0, abs=1e-4)
+
+
+class Sources(HTMLParser):
+    """Collects everything a page would load."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def handle_starttag(self, tag, attrs):
+        self.found += [(tag, v) for k, v in attrs if k in {"src", "href", "poster", "data"}]
+
+
+def test_page_needs_no_other_file(run):
+    page = (run / "report" / "index.html").read_text()
+    sources = Sources()
+    sources.feed(page)
+    assert len(sources.found) == 4  # one video, stills, masks, map
+    assert all(source.startswith("data:") for _, source in sources.found)
+    assert not re.search(r"https?://|url\(|@import|<script|<link", page)
+
+
+def test_video_in_the_page_plays(run):
+    page = (run / "report" / "index.html").read_text()
+    film = base64.b64decode(re.search(r"data:video/mp4;base64,([^\"]+)", page).group(1))
+    with av.open(io.BytesIO(film)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+        frames = sum(1 for _ in container.decode(video=0))
+    assert frames == 2 * 4 + 1 + 3  # two clips, the present, and it stands still for a while
+
+
+def test_strip_is_a_picture(run):
+    with Image.open(run / "report" / "strip.png") as picture:
+        assert picture.width > 600
+
+
+def test_a_complete_report_is_left_alone(run, command, capsys, monkeypatch):
+    monkeypatch.setattr(Imagination, "prepare", None)
+    before = (run / "report" / "metrics.json").stat().st_mtime_ns
+    assert command([str(run)]) == 0
+    said = capsys.readouterr().out
+    assert "nothing to do" in said
+    assert said.strip().endswith(f"report: {run / 'report' / 'index.html'}")
+    assert (run / "report" / "metrics.json").stat().st_mtime_ns == before
+
+
+def test_a_damaged_page_is_drawn_again_without_imagining(copied, monkeypatch):
+    monkeypatch.setattr(Imagination, "run", None)
+    page = copied / "report" / "index.html"
+    whole = page.read_bytes()
+    page.write_bytes(whole[:1000])
+    report.evaluate(copied, say=lambda _: None)
+    assert page.read_bytes() == whole
+
+
+def test_more_seeds_keep_what_was_scored(copied):
+    said = []
+    report.evaluate(copied, say=said.append, seeds=(0, 1, 2))
+    assert any("10 of 14 pieces were scored before" in line for line in said)
+    metrics = json.loads((copied / "report" / "metrics.json").read_text())
+    assert metrics["protocol"]["seeds"] == [0, 1, 2]
+
+
+def test_other_weights_start_anew(copied):
+    params = weights.load(copied / "weights.safetensors")
+    changed = jax.tree.map(lambda leaf: leaf * np.float32(1.01), params)
+    weights.save(copied / "weights.safetensors", changed)
+    said = []
+    report.evaluate(copied, say=said.append)
+    assert not any("scored before" in line for line in said)
+    assert len(list((copied / "report" / "partial").iterdir())) == 1
+
+
+def refused(command, arguments, capsys):
+    assert command(arguments) == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_bad_input_ends_in_one_sentence(copied, command, capsys, tmp_path):
+    assert "does not exist" in refused(command, [str(tmp_path / "nothing")], capsys)
+    assert "missing does not exist" in refused(
+        command, [str(copied), "--data", str(tmp_path / "missing"), "--split", ""], capsys
+    ).replace("/ ", " ")
+    assert "evaluate.clips" in refused(command, [str(copied), "--clips", "0"], capsys)
+    assert "sample_steps" in refused(command, [str(copied), "--steps", "0"], capsys)
+
+
+def test_truncated_data_are_refused(copied, command, capsys, tmp_path):
+    config = configs.load(copied / "config.json")
+    data = Path(shutil.copytree(config.data.path, tmp_path / "data"))
+    shard = next((data / "revisit").glob("*.array_record"))
+    shard.write_bytes(shard.read_bytes()[:-100])
+    assert "truncated" in refused(command, [str(copied), "--data", str(data)], capsys)
+
+
+def test_weights_that_do_not_fit_are_refused(copied, command, capsys):
+    path = copied / "weights.safetensors"
+    whole = weights.load(path)
+    weights.save(path, {"backbone": whole["backbone"]})
+    assert "stage 1" in refused(command, [str(copied)], capsys)
+    path.write_bytes(path.read_bytes()[:50])
+    assert "weights.safetensors" in refused(command, [str(copied)], capsys)
+    weights.save(path, whole)
+    settings = json.loads((copied / "config.json").read_text())
+    settings["dit"]["layers"] = 3
+    (copied / "config.json").write_text(json.dumps(settings))
+    assert "weights.safetensors" in refused(command, [str(copied)], capsys)
+
+
+def test_an_interruption_is_said_and_has_its_own_exit_code(copied, command, capsys, monkeypatch):
+    def interrupted(*_args, **_kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Imagination, "run", interrupted)
+    assert command([str(copied), "--stride", "2"]) == 130
+    assert "go on" in capsys.readouterr().err
+
+
+def test_weights_that_diverged_are_refused(copied):
+    params = weights.load(copied / "weights.safetensors")
+    broken = jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), params)
+    weights.save(copied / "weights.safetensors", broken)
+    with pytest.raises(UserError, match="not finite"):
+        report.evaluate(copied, say=lambda _: None)
+
+
+@pytest.mark.parametrize(("stage", "rows"), [(1, 2), (2, 3)])
+def test_previews_show_each_method(run, tmp_path, stage, rows, monkeypatch):
+    monkeypatch.setattr(preview, "CLIPS", 2)  # the batch that was compiled for the report
+    config = configs.load(run / "config.json")
+    compiled = []
+    prepare = Imagination.prepare
+    monkeypatch.setattr(
+        Imagination, "prepare", lambda self, m: (compiled.append(self), prepare(self, m))[1]
+    )
+    params = weights.load(run / "weights.safetensors")
+    if stage == 1:
+        params = {"backbone": params["backbone"]}
+    draw = preview.make_preview(config, tmp_path)
+    path = draw(params, stage, 250)
+    assert path == tmp_path / "previews" / f"stage{stage}-000250.png"
+    with Image.open(path) as picture:
+        height = picture.height
+    other = draw(jax.tree.map(lambda leaf: leaf * 0.5, params), stage, 500)
+    assert len(set(map(id, compiled))) == 1
+    assert other.read_bytes() != path.read_bytes()
+    per_row = 96 + 6
+    assert (height - 34 - 24) // per_row == 2 * rows
+
+
+def test_a_preview_without_validation_data_says_what_to_do(run, tmp_path):
+    config = tiny(tmp_path)
+    with pytest.raises(UserError, match="validation does not exist"):
+        preview.make_preview(config, tmp_path)
+
+
+def test_verdicts_are_fair():
+    assert "3.00 ± 0.50 dB closer" in verdict({"mean": 3.0, "stderr": 0.5}, "seen before")
+    assert "worse" in verdict({"mean": -3.0, "stderr": 0.5}, "seen before")
+    assert "no clear difference" in verdict({"mean": 0.6, "stderr": 0.5}, "never seen")
+    assert "cannot be said" in verdict({"mean": 0.6, "stderr": None}, "never seen")
+    assert "No clip" in verdict({"mean": None, "stderr": None}, "never seen")
+    assert number({"mean": 1.0, "stderr": 0.25}, 2, sign=True) == "+1.00 ± 0.25"
+    assert number({"mean": None, "stderr": None}, 2) == "–"
