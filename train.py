@@ -3,10 +3,9 @@
 import sys
 from collections.abc import Sequence
 
-from pewm_jax.evaluation.preview import make_preview
-
 import configs
 from pewm_jax import cli
+from pewm_jax.evaluation.preview import make_preview
 from pewm_jax.training import loop, runs
 
 USAGE = """usage: python train.py PRESET [--config FILE.json] [--SETTING VALUE …]

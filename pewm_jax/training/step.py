@@ -90,7 +90,7 @@ def initial_state(
 
 
 def lower_step(config: Config, stage: Stage, mesh: Mesh, clip: Any) -> jax.stages.Lowered:
-    """Trace ``train_step`` for one batch shape, with placements and donation; see ``compile_step``."""
+    """Trace ``train_step`` for one batch shape; arguments as for ``compile_step``."""
     state = abstract_state(config, stage, mesh)
     everywhere = sharding.replicated(mesh)
     placed = jax.tree.map(lambda leaf: leaf.sharding, state)

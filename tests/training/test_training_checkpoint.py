@@ -24,7 +24,7 @@ def train(config, stage, run, steps, every=1):
         for number in range(1, steps + 1):
             state, _ = step_fn(state, clip, key)
             if number % every == 0:
-                saved[number] = jax.tree.map(lambda leaf: np.array(leaf), state)
+                saved[number] = jax.tree.map(np.array, state)
                 checkpoints.save(state)
     return mesh, saved
 
