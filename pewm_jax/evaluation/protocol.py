@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from pewm_jax.config import Config, UserError, to_dict
+from pewm_jax.data.clips import choose_context
 from pewm_jax.data.episodes import Episode
 from pewm_jax.geometry.actions import actions_between, continuous, integrate
 from pewm_jax.types import Frames
@@ -52,8 +53,8 @@ class ClipChoice:
 
 
 def context_frames(start: int, count: int) -> tuple[int, ...]:
-    """Return ``count`` frames spread evenly over 0 … start, the present (start) last."""
-    spread = np.unique(np.round(np.linspace(start, 0, count)).astype(int))
+    """Return ``count`` frames spread over the past as in training, the present (start) last."""
+    spread = choose_context(start, count)
     padded = np.concatenate([np.repeat(spread[:1], count - len(spread)), spread])
     return tuple(int(index) for index in padded)
 

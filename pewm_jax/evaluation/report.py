@@ -170,8 +170,8 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "dataset": config.data.path,
         "split": config.evaluate.split,
         "starts": "spread evenly over the way back of every episode; no randomness",
-        "observed": "context frames spread evenly from the episode's first frame to the present; "
-        "all go into the map, the model also sees the present one",
+        "observed": "context frames spread evenly over the episode's past, the present one last; all "
+        "go into the map, and the model also sees the present one itself",
         "motion": "the recorded one; poses integrated from actions agree with the recorded poses",
         "seen": "a pixel whose true point projects into an observed frame where the true depth "
         "agrees (nearest pixel or interpolated, larger of 5 cm and 3 %)",

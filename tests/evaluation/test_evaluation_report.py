@@ -145,7 +145,7 @@ def test_strip_is_a_picture(run):
 def test_a_complete_report_is_left_alone(run, command, capsys, monkeypatch):
     monkeypatch.setattr(Imagination, "prepare", None)
     before = (run / "report" / "metrics.json").stat().st_mtime_ns
-    assert command([str(run)]) == 0
+    assert command([str(run), "--seeds", "0", "1", "--clips", "4"]) == 0
     said = capsys.readouterr().out
     assert "nothing to do" in said
     assert said.strip().endswith(f"report: {run / 'report' / 'index.html'}")
