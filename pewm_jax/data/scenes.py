@@ -125,8 +125,9 @@ def from_trimesh(
 ) -> Scene:
     """Turn a trimesh scene, with its instances, textures and colours, into a `Scene`.
 
-    Meshes without colours are grey and shaded softly, and so is a scene whose metadata says
-    ``shading: soft``; all others keep their colours as they are, as scans bring their own light.
+    Meshes of one colour (grey where they bring none) are shaded by the direction of each face;
+    textures and vertex colours are kept as they are, as scans bring their own light. A scene
+    whose metadata says ``shading: soft`` gets light and ambient occlusion baked all over.
 
     Args:
         scene: meshes in metres; entries that are not triangle meshes are left out.

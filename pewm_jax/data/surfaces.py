@@ -18,7 +18,17 @@ GREY = np.array([170, 170, 170], np.uint8)
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """One geometry before it is placed: positions, corner colours in [0, 1], uv, image."""
+    """One geometry before it is placed.
+
+    Attributes:
+        vertices_V3: (V, 3) float64 in the geometry's own frame.
+        faces_F3: (F, 3) int32.
+        colour_F33: (F, 3, 3) float32, RGB in [0, 1] at each corner; multiplies the image.
+        uv_F32: (F, 3, 2) float32, from the image's top left corner.
+        image: (H, W, 3) uint8, or None.
+        bare: it has one colour all over, so that only shading can show its form.
+        glowing: it is seen without light.
+    """
 
     vertices_V3: np.ndarray
     faces_F3: np.ndarray
@@ -60,8 +70,8 @@ def read_surface(mesh: trimesh.Trimesh, where: str) -> Surface:
             tint = np.asarray(tint)
             scale = 255.0 if np.issubdtype(tint.dtype, np.integer) else 1.0
             colour = (tint[:, :3] / scale).astype(np.float32)[faces]
-        bare = image is None and tint is None and factor is None
-        base = GREY / 255 if bare else (np.ones(3) if factor is None else factor)
+        bare = image is None and tint is None
+        base = (GREY / 255 if bare else np.ones(3)) if factor is None else factor
         colour *= base.astype(np.float32)
         glow = getattr(visual.material, "emissiveFactor", None)
         glowing = glow is not None and float(np.max(glow)) > 0
