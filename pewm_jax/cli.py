@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 import platform
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -22,6 +23,10 @@ from pewm_jax.config import ConfigError, UserError
 
 T = TypeVar("T")
 _FRAME = "─│╭╮╰╯"
+_PLAIN = (
+    (r": invalid literal for int\(\) with base 10: (.*)", r" needs a whole number, got \1"),
+    (r": could not convert string to float: (.*)", r" needs a number, got \1"),
+)
 
 
 def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:
@@ -151,9 +156,9 @@ def _take_config_file(argv: Sequence[str], kind: type) -> tuple[Path | None, lis
 
 
 def _refuse_unknown(flags: Sequence[str], kind: type, prog: str) -> None:
-    known = [name for name, _ in _flags(kind)] + ["--help"]
+    known = [name for name, _ in _flags(kind)]
     for flag in flags:
-        if not flag.startswith("--"):
+        if not flag.startswith("--") or flag == "--help":
             continue
         name = flag.split("=")[0].replace("-", "_").replace("__", "--", 1)
         spellings = (name, _negated(name))
@@ -181,10 +186,10 @@ def _flags(kind: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
 
 
 def _nearest(name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, known, 1, 0.5)
-    if not close:
-        last = name.rsplit(".", 1)[-1].lstrip("-")
-        close = [flag for flag in known if flag.rsplit(".", 1)[-1].lstrip("-") == last][:1]
+    """Suggest a flag of the same last word, or else the one spelled most alike."""
+    last = name.rsplit(".", 1)[-1].lstrip("-")
+    close = [flag for flag in known if flag.rsplit(".", 1)[-1].lstrip("-") == last]
+    close = close or difflib.get_close_matches(name, known, 1, 0.5)
     return f": did you mean {close[0]}?" if close else ""
 
 
@@ -201,6 +206,10 @@ def _sentence(box: str, prog: str) -> str:
     if text.startswith("Error parsing "):
         where, _, text_rest = text.removeprefix("Error parsing ").partition(": ")
         text = f"{where}: {text_rest}" if where.startswith("--") else text_rest
+    for pattern, plain in _PLAIN:
+        text = re.sub(pattern, plain, text)
+    if text.startswith("Unrecognized"):
+        text += f"; `python {prog} --help` lists the settings"
     end = "" if text.endswith((".", "!", "?")) else "."
     return text + end if text else f"The settings cannot be read; see `python {prog} --help`."
 

@@ -1,0 +1,244 @@
+"""`python train.py`, as people run it: helped, refused in one sentence, stopped and resumed."""
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import configs
+import train
+from pewm_jax import cli, rollout
+from pewm_jax import config as configuration
+from pewm_jax.config import Config
+from pewm_jax.data.collect import collect
+from pewm_jax.data.recording import CollectConfig
+from pewm_jax.training import loop
+
+ROOT = Path(__file__).parents[1]
+QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+
+
+def settings(kind, prefix=""):
+    for field in dataclasses.fields(kind):
+        if dataclasses.is_dataclass(field.default):
+            yield from settings(field.default, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}"
+
+
+@pytest.fixture
+def taken(monkeypatch, tmp_path):
+    """What train.py hands to the loop, without training."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train.cli, "cache_compilation", lambda folder: None)
+    calls = []
+    monkeypatch.setattr(train, "make_preview", lambda config, run: ("preview", run))
+    monkeypatch.setattr(
+        loop, "train", lambda config, *, preview=None: calls.append((config, preview))
+    )
+    return calls
+
+
+def refused(capsys, *argv):
+    """Return the sentence with which train.py refuses the arguments."""
+    assert cli.run(train.main, argv) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    return err.removeprefix("error: ").strip()
+
+
+def test_help_lists_every_preset_with_its_description(capsys):
+    assert cli.run(train.main, ["--help"]) == 0
+    out = capsys.readouterr().out
+    assert {"demo", "tiny"} <= set(configs.names())
+    for name in configs.names():
+        assert re.search(rf"^  {name} +{re.escape(configs.describe(name))}$", out, re.MULTILINE)
+
+
+def test_help_of_a_preset_documents_every_setting(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as left:
+        cli.run(train.main, ["tiny", "--help"])
+    assert left.value.code == 0
+    out = capsys.readouterr().out
+    for name in settings(Config()):
+        entry = re.search(rf"--{re.escape(name)}[ ,][^\n]*\n?(?:(?!│ --)[^\n]*\n)*", out)
+        assert entry, name
+        text = re.sub(r"[│╭╮╰╯─]|\(default: .*?\)|--\S+|[A-Z]{3,}|\{.*?\}", "", entry.group())
+        assert len(text.split()) >= 2, f"{name} has no help text"
+
+
+def test_flags_override_the_preset_and_the_rest_is_kept(taken):
+    argv = ["tiny", "--train.stage1.steps", "10", "--data.path=elsewhere"]
+    argv += ["--memory.cell_m", "1", "1", "2", "--train.preview-every", "5"]
+    assert cli.run(train.main, argv) == 0
+    ((config, preview),) = taken
+    tiny = configs.load("tiny")
+    assert config.train.stage1.steps == 10
+    assert config.data.path == "elsewhere"
+    assert config.memory.cell_m == (1.0, 1.0, 2.0)
+    assert config.dit == tiny.dit
+    assert config.train.stage2 == tiny.train.stage2
+    assert preview == ("preview", Path("runs/tiny"))
+
+
+def test_no_pictures_are_prepared_where_none_are_wanted(taken):
+    assert cli.run(train.main, ["tiny", "--train.preview_every", "0"]) == 0
+    assert taken[0][1] is None
+
+
+def test_a_file_of_settings_lies_over_the_preset_and_under_the_flags(taken, tmp_path):
+    file = tmp_path / "mine.json"
+    file.write_text(json.dumps({"train": {"seed": 7, "stage1": {"steps": 3}}}))
+    argv = ["tiny", "--config", str(file), "--train.stage1.steps", "4"]
+    assert cli.run(train.main, argv) == 0
+    config = taken[0][0]
+    assert (config.train.seed, config.train.stage1.steps) == (7, 4)
+    assert config.train.stage1.batch == configs.load("tiny").train.stage1.batch
+
+
+def test_a_whole_saved_configuration_is_such_a_file_too(taken, tmp_path):
+    saved = dataclasses.replace(configs.load("tiny"), evaluate=Config().evaluate)
+    configuration.save(saved, tmp_path / "config.json")
+    assert cli.run(train.main, ["demo", f"--config={tmp_path / 'config.json'}"]) == 0
+    assert taken[0][0] == saved
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ('{"train": {"sede": 1}}', "train has no setting sede"),
+        ('{"dit": {"layers": "four"}}', "dit.layers must be int, got 'four'"),
+        ('{"train": {"seed": 1}', "is not valid JSON"),
+        ("[1]", "must hold a table"),
+        ('{"clip": {"frames": 8}}', "use 9"),
+    ],
+)
+def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, part):
+    file = tmp_path / "mine.json"
+    file.write_text(text)
+    assert part in refused(capsys, "tiny", "--config", str(file))
+    assert taken == []
+
+
+@pytest.mark.parametrize(
+    ("argv", "part"),
+    [
+        ([], "Name a preset first: python train.py demo"),
+        (["--train.seed", "1"], "Name a preset first"),
+        (["dmo"], "no preset 'dmo': did you mean demo?"),
+        (["tiny", "--train.stage1.stepz", "1"], "did you mean --train.stage1.steps?"),
+        (["tiny", "--steps", "1"], "did you mean --train.stage1.steps?"),
+        (["tiny", "--train.seed", "abc"], "--train.seed needs a whole number, got 'abc'."),
+        (["tiny", "--train.ema", "abc"], "--train.ema needs a number, got 'abc'."),
+        (["tiny", "--train.seed"], "Missing value for argument '--train.seed'"),
+        (["tiny", "--diffusion.target", "x1"], "Expected one of ('x0', 'v', 'eps')"),
+        (["tiny", "--memory.cell_m", "1", "2"], "'--memory.cell_m'. Expected 3 values"),
+        (["tiny", "--clip.frames", "8"], "clip.frames is 8: a clip has 4k + 1 frames"),
+        (["tiny", "--clip.height", "20"], "dit.patch = 8; change the clip's size or the patch"),
+        (["tiny", "stray"], "stray; `python train.py tiny --help` lists the settings."),
+        (["tiny", "--config"], "--config needs the name of a JSON file"),
+        (["tiny", "--config", "none.json"], "none.json cannot be read"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_one_sentence_that_names_the_fix(taken, capsys, argv, part):
+    assert part in refused(capsys, *argv)
+    assert taken == []
+    assert not Path("runs").exists()
+
+
+def test_an_interruption_is_told_and_exits_as_shells_expect(capsys):
+    def interrupted(_argv):
+        raise KeyboardInterrupt
+
+    assert cli.run(interrupted, []) == 130
+    assert capsys.readouterr().err == "Interrupted.\n"
+
+
+def start(*argv, **options):
+    command = [sys.executable, "-W", "error", "train.py", *map(str, argv)]
+    return subprocess.Popen(
+        command,
+        cwd=ROOT,
+        env={**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": QUICK},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )
+
+
+def finish(process):
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+def wait_for_lines(path, count, process):
+    for _ in range(6000):
+        if path.exists() and len(path.read_text().splitlines()) >= count:
+            return
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    pytest.fail(f"{path} has not reached {count} lines")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data")
+    collect(CollectConfig(out=path, train=2, validation=0, test=0, frames=24, size=16, workers=1))
+    return path
+
+
+def test_training_real_episodes_stopped_by_ctrl_c_and_started_again(data, tmp_path):
+    run = tmp_path / "runs" / "it"
+    argv = ["tiny", "--data.path", data, "--train.run", run, "--train.save_every", "1000"]
+    argv += ["--train.stage1.steps", "200", "--train.stage2.steps", "2", "--train.log_every", "2"]
+    process = start(*argv)
+    wait_for_lines(run / "metrics.jsonl", 3, process)
+    process.send_signal(signal.SIGINT)
+    code, out, err = finish(process)
+    assert code == 130, err
+    assert "compiling the training step …" in out
+    stopped = int(re.search(r"Stopped after step (\d+) of stage 1; everything is saved", err)[1])
+    assert "Traceback" not in err
+    assert not (run / "weights.safetensors").exists()
+
+    code, out, err = finish(start(*argv))
+    assert (code, err) == (0, "")
+    assert f"stage 1: going on after step {stopped}" in out
+    assert re.search(r"stage 1 200/200 loss .* samples/s · .* GFLOP/s", out)
+    assert out.splitlines()[-1] == f"Trained: {run / 'weights.safetensors'}"
+    steps = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    seen = [(entry["stage"], entry["step"]) for entry in steps]
+    assert seen == sorted(set(seen))
+    assert {(1, 200), (2, 2)} <= set(seen)
+    assert all(np.isfinite(entry["loss"]) for entry in steps)
+
+    config, params = rollout.load(run)
+    assert config.train.stage1.steps == 200
+    assert set(params) == {"backbone", "memory"}
+
+    code, out, err = finish(start(*argv))
+    assert (code, out, err) == (0, f"{run} is already trained: nothing to do.\n", "")
+
+    code, out, err = finish(start(*argv, "--dit.layers", "1"))
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "dit.layers 2 there, 1 here" in err
+
+
+def test_absent_data_are_a_sentence_and_the_run_can_be_started_again(tmp_path):
+    argv = ["tiny", "--data.path", tmp_path / "none", "--train.run", tmp_path / "runs" / "it"]
+    code, _, err = finish(start(*argv))
+    assert code == 2
+    assert re.fullmatch(r"error: .*none.*train does not exist.*\n", err)
