@@ -22,7 +22,7 @@ from pewm_jax import config as configuration
 from pewm_jax.config import ConfigError, UserError
 
 T = TypeVar("T")
-_FRAME = "─│╭╮╰╯"
+_RULE = "─╭╮╰╯-+ "
 _PLAIN = (
     (r": invalid literal for int\(\) with base 10: (.*)", r" needs a whole number, got \1"),
     (r": could not convert string to float: (.*)", r" needs a number, got \1"),
@@ -197,11 +197,11 @@ def _sentence(box: str, prog: str) -> str:
     """Take the message out of the frame that the parser draws around it."""
     lines = []
     for line in box.splitlines()[1:]:
-        words = line.strip(_FRAME + " ")
-        if not words and lines:
-            break
-        if words:
+        words = line.strip(" │|")
+        if words.strip(_RULE):
             lines.append(words)
+        elif lines:
+            break
     text = " ".join(lines).strip()
     if text.startswith("Error parsing "):
         where, _, text_rest = text.removeprefix("Error parsing ").partition(": ")
