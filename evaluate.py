@@ -1,23 +1,20 @@
-"""Score a trained run on held-out houses: python evaluate.py runs/demo."""
+"""Score a trained run on held-out scenes: `python evaluate.py runs/demo`."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-import tyro
-
-from pewm_jax.config import UserError
+from pewm_jax import cli
 from pewm_jax.evaluation.report import evaluate
 
 
 @dataclasses.dataclass(frozen=True)
-class Arguments:
-    """Score a trained run and write RUN/report/index.html. Absent options come from the run."""
+class Settings:
+    """What may differ from the run's own configuration; what is not given stays as it is."""
 
-    run: tyro.conf.Positional[Path]
-    """Folder made by train.py, e.g. runs/demo."""
     data: Path | None = None
     """Folder of the data set."""
     split: str | None = None
@@ -40,20 +37,24 @@ class Arguments:
     """Clips sampled at once."""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    options = vars(tyro.cli(Arguments, args=arguments)).copy()
+def main(argv: Sequence[str]) -> int:
+    """Write RUN/report/index.html and print its path; returns the exit code."""
+    about = "Score a trained run on held-out scenes and write RUN/report/index.html."
+    asks = bool(argv) and argv[0] in ("-h", "--help")
+    if not asks and (not argv or argv[0].startswith("-")):
+        raise cli.ConfigError("Name a run folder first: python evaluate.py runs/demo.")
+    prog = f"evaluate.py {'RUN' if asks else argv[0]}"
+    flags = ["--help"] if asks else argv[1:]
+    settings = cli.parse(Settings, flags, default=Settings(), prog=prog, description=about)
+    cli.cache_compilation(Path(argv[0]).parent)
     try:
-        page = evaluate(options.pop("run"), **options)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        page = evaluate(argv[0], **vars(settings))
     except KeyboardInterrupt:
-        print("stopped; run the same command again to go on from here", file=sys.stderr)
-        return 130
+        again = "Interrupted; what is scored is kept, run the same command again to go on."
+        raise KeyboardInterrupt(again) from None
     print(f"report: {page}")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(cli.run(main))

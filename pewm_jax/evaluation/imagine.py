@@ -19,6 +19,11 @@ METHODS = ("memory", "empty", "copy")
 """With the map; the same weights with an empty map; the last observed frame, repeated."""
 
 
+def aloud(line: str) -> None:
+    """Print a line at once, also where output is not a terminal."""
+    print(line, flush=True)
+
+
 class Imagination:
     """A model for batches of clips of one size; each part is compiled when first needed.
 
@@ -36,7 +41,7 @@ class Imagination:
         params: Params,
         batch: int,
         context: int,
-        say: Callable[[str], Any] = print,
+        say: Callable[[str], Any] = aloud,
     ):
         self.config, self.batch, self.context = config, batch, context
         self.params = jax.tree.map(jnp.asarray, params)

@@ -16,7 +16,7 @@ from pewm_jax.config import Config, UserError, to_dict
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import statistics
 from pewm_jax.evaluation.gallery import make_gallery
-from pewm_jax.evaluation.imagine import Imagination
+from pewm_jax.evaluation.imagine import Imagination, aloud
 from pewm_jax.evaluation.page import render, verdict
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
@@ -49,7 +49,7 @@ def override(config: Config, **changes: Any) -> Config:
     return dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, **changes))
 
 
-def evaluate(run: str | Path, *, say: Callable[[str], Any] = print, **changes: Any) -> Path:
+def evaluate(run: str | Path, *, say: Callable[[str], Any] = aloud, **changes: Any) -> Path:
     """Score a trained run and write its report.
 
     What was scored before an interruption is kept and not done again; a report that is complete
@@ -170,8 +170,8 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "dataset": config.data.path,
         "split": config.evaluate.split,
         "starts": "spread evenly over the way back of every episode; no randomness",
-        "observed": "context frames spread evenly over the episode's past, the present one last; all "
-        "go into the map, and the model also sees the present one itself",
+        "observed": "context frames spread evenly over the episode's past, the present one last; "
+        "all go into the map, and the model also sees the present one itself",
         "motion": "the recorded one; poses integrated from actions agree with the recorded poses",
         "seen": "a pixel whose true point projects into an observed frame where the true depth "
         "agrees (nearest pixel or interpolated, larger of 5 cm and 3 %)",

@@ -13,7 +13,7 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation.images import error_sums_batch, unit_colours
-from pewm_jax.evaluation.imagine import METHODS, Imagination, copy_last
+from pewm_jax.evaluation.imagine import METHODS, Imagination, aloud, copy_last
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, stack
 from pewm_jax.evaluation.seen import seen_masks_batch
@@ -95,7 +95,7 @@ def score_table(
     episodes: Sequence[Episode],
     model: Imagination,
     partials: Partials,
-    say: Callable[[str], Any] = print,
+    say: Callable[[str], Any] = aloud,
 ) -> Scored:
     """Score ``evaluate.clips`` clips of ``evaluate.chain`` with every method and seed.
 
@@ -186,7 +186,7 @@ def roll_long(
     episodes: Sequence[Episode],
     model: Imagination,
     partials: Partials,
-    say: Callable[[str], Any] = print,
+    say: Callable[[str], Any] = aloud,
 ) -> LongRollouts:
     """Make long rollouts with every method (first seed), score all, keep the first few.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import importlib.util
 import io
 import json
@@ -35,7 +36,9 @@ def command():
     spec = importlib.util.spec_from_file_location("evaluate_command", ROOT / "evaluate.py")
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.main
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module.cli, "cache_compilation", lambda _: None)
+        yield functools.partial(module.cli.run, module.main)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -193,6 +196,8 @@ def test_bad_input_ends_in_one_sentence(copied, command, capsys, tmp_path):
     assert "missing does not exist" in refused(
         command, [str(copied), "--data", str(tmp_path / "missing"), "--split", ""], capsys
     ).replace("/ ", " ")
+    assert "Name a run folder" in refused(command, [], capsys)
+    assert "did you mean --clips" in refused(command, [str(copied), "--clip", "1"], capsys)
     assert "evaluate.clips" in refused(command, [str(copied), "--clips", "0"], capsys)
     assert "sample_steps" in refused(command, [str(copied), "--steps", "0"], capsys)
 
@@ -217,6 +222,15 @@ def test_weights_that_do_not_fit_are_refused(copied, command, capsys):
     settings["dit"]["layers"] = 3
     (copied / "config.json").write_text(json.dumps(settings))
     assert "weights.safetensors" in refused(command, [str(copied)], capsys)
+
+
+def test_help_names_every_setting(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        command(["--help"])
+    assert stop.value.code == 0
+    said = capsys.readouterr().out
+    for flag in ("--clips", "--seeds", "--steps", "--data", "--video_clips", "--stride"):
+        assert flag in said
 
 
 def test_an_interruption_is_said_and_has_its_own_exit_code(copied, command, capsys, monkeypatch):
