@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -200,12 +200,6 @@ def _version() -> str:
         return metadata.version("pewm-jax")
     except metadata.PackageNotFoundError:
         return "not installed"
-
-
-def report_paths(run: str | Path) -> Mapping[str, Path]:
-    """Return where a run's report lies: ``page``, ``metrics``, ``strip``."""
-    folder = Path(run) / "report"
-    return {"page": folder / PAGE, "metrics": folder / METRICS, "strip": folder / STRIP}
 
 
 def _write(path: Path, text: str) -> None:
