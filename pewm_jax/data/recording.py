@@ -63,8 +63,8 @@ class CollectConfig:
     """Also write instance ids."""
     episodes_per_house: int = 1
     """Episodes recorded in one house before the next is made."""
-    scene: tuple[Path, ...] = ()
-    """Meshes to walk in instead of made houses (GLB, OBJ, PLY); several are shared out over the
+    scene: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """A mesh to walk in instead of made houses (GLB, OBJ, PLY); repeated, they are shared out over the
     splits, a single one serves all of them."""
     up: Literal["auto", "y", "z"] = "auto"
     """Which axis of the meshes points up; `auto`: y for GLB and glTF, z for the others."""

@@ -11,17 +11,23 @@ import math
 from typing import Literal
 
 import numpy as np
+from scipy import ndimage
 
 from pewm_jax.config import ActionConfig, UserError
-from pewm_jax.data.navigation import NavGrid, clearance, distance_field, is_free, sample_free
+from pewm_jax.data.navigation import (
+    NavGrid,
+    distance_field,
+    is_free,
+    sample_free,
+)
 from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT
 from pewm_jax.geometry.cameras import pose_from_yaw
 
 Policy = Literal["follow", "walk", "revisit"]
 TURN_COST_M = 0.02
 """A turn must bring the goal this much nearer, metres: keeps the agent from zigzagging."""
-CLEARANCE_M = 0.45
-"""The agent prefers to stay this far from walls and furniture."""
+CLEARANCE_M = 0.3
+"""The agent prefers to stay this far inside the free area."""
 GOALS_TRIED = 24
 """Free cells drawn as candidates of the next goal; one of the farther half is taken."""
 
@@ -80,7 +86,8 @@ class _Agent:
         self.continuous = continuous
         self.turn = math.radians(actions.turn_deg)
         self.table = np.array([[actions.step_m, 0, 0], [0, 0, self.turn], [0, 0, -self.turn]])
-        self.clearance_m = clearance(grid)
+        inside = ndimage.distance_transform_edt(np.pad(grid.free_YX, 1))
+        self.clearance_YX = np.asarray(inside)[1:-1, 1:-1] * grid.cell_m
         start = sample_free(grid, rng, 1)[0]
         self.poses = [np.array([start[0], start[1], rng.uniform(-math.pi, math.pi)])]
         self.actions: list[np.ndarray] = []
@@ -104,16 +111,18 @@ class _Agent:
     def act(self, action_id: int) -> None:
         self.record(self.table[action_id], action_id)
 
-    def clear(self, target_xy: np.ndarray) -> bool:
-        """Whether the straight way to a point is free."""
-        start = self.pose[:2]
-        count = 2 + int(np.linalg.norm(target_xy - start) / (0.5 * self.grid.cell_m))
-        way = start + np.linspace(0, 1, count)[:, None] * (target_xy - start)
-        return bool(np.all(is_free(self.grid, way)))
+    def clear(self, targets_N2: np.ndarray) -> np.ndarray:
+        """Return (...) bool: whether the straight way to each of these points is free."""
+        ways = np.asarray(targets_N2) - self.pose[:2]
+        longest = float(np.linalg.norm(ways, axis=-1).max())
+        steps = np.linspace(0, 1, 2 + int(longest / (0.25 * self.grid.cell_m)))
+        points = self.pose[:2] + ways[..., None, :] * steps[:, None]
+        return is_free(self.grid, points).all(-1)
 
-    def ahead(self, yaw: float, length_m: float | None = None) -> np.ndarray:
+    def ahead(self, yaw: float | np.ndarray, length_m: float | None = None) -> np.ndarray:
+        """Return (..., 2) points one step (or so far) away in these directions."""
         length = self.config.step_m if length_m is None else length_m
-        return self.pose[:2] + length * np.array([math.cos(yaw), math.sin(yaw)])
+        return self.pose[:2] + length * np.stack([np.cos(yaw), np.sin(yaw)], -1)
 
     def turn_around(self) -> None:
         """Look about: a full circle."""
@@ -241,16 +250,15 @@ def _next_goal(agent: _Agent) -> np.ndarray:
 
 def _distance(grid: NavGrid, field_YX: np.ndarray, xy_N2: np.ndarray) -> np.ndarray:
     """Look a field up at points; outside the grid it is infinite."""
-    cell = np.floor((xy_N2 - np.asarray(grid.origin_xy)) / grid.cell_m).astype(int)
-    height, width = field_YX.shape
-    inside = (cell >= 0).all(-1) & (cell[:, 0] < width) & (cell[:, 1] < height)
+    cell = grid.cell_of(xy_N2)
+    inside = ((cell >= 0) & (cell < field_YX.shape)).all(-1)
     cell = np.where(inside[:, None], cell, 0)
-    return np.where(inside, field_YX[cell[:, 1], cell[:, 0]], np.inf)
+    return np.where(inside, field_YX[cell[:, 0], cell[:, 1]], np.inf)
 
 
 def _value(agent: _Agent, field_YX: np.ndarray, xy_N2: np.ndarray) -> np.ndarray:
     """Distance to the goal, plus a dislike of walls."""
-    near = np.maximum(0, CLEARANCE_M - _distance(agent.grid, agent.clearance_m, xy_N2))
+    near = np.maximum(0, CLEARANCE_M - _distance(agent.grid, agent.clearance_YX, xy_N2))
     return _distance(agent.grid, field_YX, xy_N2) + 0.3 * np.where(np.isfinite(near), near, 0)
 
 
@@ -259,19 +267,15 @@ def _best_heading(agent: _Agent, field_YX: np.ndarray) -> tuple[float, int]:
     count = max(2, round(2 * math.pi / agent.turn))
     turns = np.arange(count) - count // 2
     turns = turns[np.argsort(np.abs(turns), kind="stable")]
+    yaw = agent.pose[2] + turns * agent.turn
     # Look one step and three steps ahead: grid distances are too coarse for one step alone.
     value = np.full(count, np.inf)
-    for i, turn in enumerate(turns):
-        yaw = agent.pose[2] + turn * agent.turn
-        if agent.clear(agent.ahead(yaw)):
-            near = _value(agent, field_YX, agent.ahead(yaw)[None])[0]
-            far_point = agent.ahead(yaw, 3 * agent.config.step_m)
-            if agent.clear(far_point):
-                far = _value(agent, field_YX, far_point[None])[0]
-                near = min(near, far + 2 * agent.config.step_m)
-            value[i] = near + TURN_COST_M * abs(turn)
-    best = int(np.argmin(value))
-    return float(agent.pose[2] + turns[best] * agent.turn), int(turns[best])
+    for steps in (1, 3):
+        points = agent.ahead(yaw, steps * agent.config.step_m)
+        reached = _value(agent, field_YX, points) + (steps - 1) * agent.config.step_m
+        value = np.minimum(value, np.where(agent.clear(points), reached, np.inf))
+    best = int(np.argmin(value + TURN_COST_M * np.abs(turns)))
+    return float(yaw[best]), int(turns[best])
 
 
 def _drift(agent: _Agent, heading: float) -> None:

@@ -1,0 +1,205 @@
+"""What can be wrong with an episode, found from the episode alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from pewm_jax.config import UserError
+from pewm_jax.data.consistency import find_disagreement
+from pewm_jax.data.episodes import DEPTH_LIMIT_M, Episode
+
+MEDIAN_DEPTH_M = (0.05, 40.0)
+"""Outside of this range the median depth of a recording is in a wrong unit, metres."""
+MOST_MISSING = 0.97
+"""Largest share of pixels without depth."""
+ORTHONORMAL = 1e-3
+"""Largest entry of |RᵀR − 1|."""
+ACTION_M, ACTION_RAD = 2e-3, 2e-3
+"""Largest difference between an action and the poses on its two sides."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """Something wrong, and where.
+
+    Attributes:
+        where: file and record.
+        frame: number of the frame, None where all frames are concerned.
+        field: name of the field.
+        what: the sentence.
+    """
+
+    where: str
+    frame: int | None
+    field: str
+    what: str
+
+    def __str__(self) -> str:
+        frame = "" if self.frame is None else f", frame {self.frame}"
+        return f"{self.where}{frame}, {self.field}: {self.what}"
+
+
+def check_episode(episode: Episode, where: str) -> list[Problem]:
+    """Return everything that is wrong with an episode; the cheap checks come first.
+
+    Args:
+        episode: what to check; all its images are decoded.
+        where: its place, for the messages.
+    """
+    found = [
+        *_check_intrinsics(episode, where),
+        *_check_poses(episode, where),
+        *_check_actions(episode, where),
+    ]
+    try:
+        depth_THW = episode.frames().depth_THW
+        if episode.has_ids:
+            episode.ids()
+    except UserError as error:
+        return [*found, Problem(where, None, "images", str(error))]
+    found += check_depth(depth_THW, where)
+    if not found:  # wrong poses or units would only be reported once more
+        found += _check_geometry(episode, depth_THW, where)
+    return found
+
+
+def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
+    """Check that depths (T, H, W) look like metres in a place that an agent can be in."""
+    valid = depth_THW[np.isfinite(depth_THW) & (depth_THW > 0)]
+    bad = np.flatnonzero(~np.isfinite(depth_THW).all((1, 2)))
+    if len(bad):
+        return [Problem(where, int(bad[0]), "depth", "holds values that are not finite.")]
+    median = float(np.median(valid)) if len(valid) else 0.0
+    low, high = MEDIAN_DEPTH_M
+    if len(valid) and not low <= median <= high:
+        wrong = "metres were read as millimetres" if median < low else "the scale is too small"
+        frame = _first_frame(depth_THW, median < low)
+        return [
+            Problem(
+                where,
+                frame,
+                "depth",
+                f"the median depth of the recording is {median:.3g} m: the unit is wrong ("
+                f"{wrong}?); correct the depth scale.",
+            )
+        ]
+    missing = float((depth_THW <= 0).mean())
+    if missing > MOST_MISSING:
+        return [
+            Problem(
+                where,
+                None,
+                "depth",
+                f"{missing:.0%} of the pixels have no depth (0, or beyond {DEPTH_LIMIT_M} m): the "
+                "unit is wrong or the depth images are empty; correct the depth scale.",
+            )
+        ]
+    return []
+
+
+def _first_frame(depth_THW: np.ndarray, small: bool) -> int:
+    low, high = MEDIAN_DEPTH_M
+    for index, image in enumerate(depth_THW):
+        seen = image[image > 0]
+        if len(seen) and ((np.median(seen) < low) if small else (np.median(seen) > high)):
+            return index
+    return 0
+
+
+def _check_geometry(episode: Episode, depth_THW: np.ndarray, where: str) -> Iterator[Problem]:
+    worst = find_disagreement(episode, depth_THW)
+    if worst is not None:
+        yield Problem(
+            where,
+            worst.second,
+            "depth",
+            f"disagrees with the poses: {worst.floating:.0%} of the points that frames such as "
+            f"{worst.first} see float in front of what this one sees; check the intrinsics, the "
+            "depth scale, the axes of the camera and the direction of the poses.",
+        )
+
+
+def _check_intrinsics(episode: Episode, where: str) -> Iterator[Problem]:
+    fx, fy, cx, cy = (float(value) for value in episode.intrinsics_4)
+    if not np.isfinite(episode.intrinsics_4).all() or min(fx, fy) <= 0:
+        yield Problem(where, None, "intrinsics", f"({fx}, {fy}, {cx}, {cy}) is no camera.")
+    elif not (0 < cx < episode.width and 0 < cy < episode.height):
+        yield Problem(
+            where,
+            None,
+            "intrinsics",
+            f"the principal point ({cx:.1f}, {cy:.1f}) lies outside of the "
+            f"{episode.width}×{episode.height} image: they belong to images of another size.",
+        )
+
+
+def _check_poses(episode: Episode, where: str) -> Iterator[Problem]:
+    pose = np.asarray(episode.world_from_camera, np.float64)
+    finite = np.isfinite(pose).all((1, 2))
+    if not finite.all():
+        frame = int(np.flatnonzero(~finite)[0])
+        yield Problem(where, frame, "world_from_camera", "holds NaN or infinity.")
+        return
+    rotation = pose[:, :3, :3]
+    off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max((1, 2))
+    mirrored = np.linalg.det(rotation) < 0
+    bottom = np.abs(pose[:, 3] - [0, 0, 0, 1]).max(1)
+    for frame in np.flatnonzero((off > ORTHONORMAL) | mirrored | (bottom > 1e-6))[:1]:
+        what = f"the rotation is not orthonormal (off by {off[frame]:.2g})"
+        if mirrored[frame] and off[frame] <= ORTHONORMAL:
+            what = "the rotation is a mirror image (determinant −1)"
+        if bottom[frame] > 1e-6:
+            what = "the last row is not (0, 0, 0, 1)"
+        yield Problem(
+            where, int(frame), "world_from_camera", f"{what}: it must be a rigid transform."
+        )
+
+
+def _check_actions(episode: Episode, where: str) -> Iterator[Problem]:
+    actions = episode.actions
+    if actions is None:
+        return
+    finite = np.isfinite(actions).all(1)
+    if not finite.all():
+        frame = int(np.flatnonzero(~finite)[0])
+        yield Problem(where, frame, "actions", "holds NaN or infinity.")
+        return
+    metres, radians = action_errors(episode.world_from_camera, actions)
+    for frame in np.flatnonzero((metres > ACTION_M) | (radians > ACTION_RAD))[:1]:
+        yield Problem(
+            where,
+            int(frame),
+            "actions",
+            f"the action leads {metres[frame]:.3g} m and {np.degrees(radians[frame]):.3g} degrees "
+            f"away from the pose of frame {frame + 1}: actions and poses disagree.",
+        )
+
+
+def action_errors(
+    world_from_camera: np.ndarray, actions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Carry out every action from its frame's pose and compare with the next frame's.
+
+    Args:
+        world_from_camera: (T, 4, 4) poses.
+        actions: (T − 1, 3) dx, dy, dyaw.
+
+    Returns:
+        (T − 1,) distances in metres and (T − 1,) angles in radians.
+    """
+    pose = np.asarray(world_from_camera, np.float64)
+    before, after = pose[:-1], pose[1:]
+    yaw = np.arctan2(before[:, 1, 2], before[:, 0, 2])
+    dx, dy, turn = np.asarray(actions, np.float64).T
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    moved = before[:, :3, 3] + np.stack([cos * dx - sin * dy, sin * dx + cos * dy, 0 * dx], -1)
+    turned = np.zeros((len(turn), 3, 3))
+    turned[:, 0, 0] = turned[:, 1, 1] = np.cos(turn)
+    turned[:, 1, 0], turned[:, 0, 1], turned[:, 2, 2] = np.sin(turn), -np.sin(turn), 1
+    between = np.swapaxes(turned @ before[:, :3, :3], 1, 2) @ after[:, :3, :3]
+    # The chord is exact for small angles, where the arc cosine of the trace is not.
+    chord = np.linalg.norm(between - np.eye(3), axis=(1, 2)) / np.sqrt(8)
+    return np.linalg.norm(after[:, :3, 3] - moved, axis=1), 2 * np.arcsin(np.minimum(chord, 1))

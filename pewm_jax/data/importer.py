@@ -1,0 +1,220 @@
+"""Import a recording of colour, depth and trajectory as an episode, checked before it counts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+import tyro
+
+from pewm_jax.config import ConfigError, UserError
+from pewm_jax.data.checks import ACTION_M, ACTION_RAD, action_errors, check_depth, check_episode
+from pewm_jax.data.dataset import (
+    MANIFEST,
+    Manifest,
+    Shard,
+    describe_shard,
+    read_manifest,
+    write_manifest,
+    write_shard,
+)
+from pewm_jax.data.episodes import EpisodeArrays, read_episode, write_episode
+from pewm_jax.data.progress import Meter
+from pewm_jax.data.recordings import RecordedFrame, read_recording
+from pewm_jax.geometry.actions import actions_between
+from pewm_jax.geometry.cameras import resize_intrinsics
+
+_AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportConfig:
+    """Import a recording: a folder of colour images, depth images and a trajectory.
+
+    The camera has OpenCV axes (x right, y down, z forward) and the trajectory is camera-to-world,
+    as Open3D and TUM write them.
+    """
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """The recording: image/, depth/ and a .log file (Open3D), or rgb.txt, depth.txt and
+    groundtruth.txt (TUM)."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """Dataset folder; the episode is added to its split."""
+    intrinsics: tuple[float, float, float, float]
+    """fx fy cx cy in pixels of the recorded images."""
+    pixel_centres: Literal["integer", "half"] = "integer"
+    """Where cx and cy have the centre of the first pixel: `integer` at 0 (Open3D, TUM, OpenCV),
+    `half` at 0.5."""
+    depth_scale: float = 1000.0
+    """Value of a depth image that means one metre: 1000 for millimetres, 5000 for TUM."""
+    stride: int = 1
+    """Keep every so many-th frame."""
+    size: tuple[int, int] | None = None
+    """Width and height to resize to, pixels; by default the images keep their size."""
+    trajectory: Path | None = None
+    """Trajectory file; by default groundtruth.txt or the only .log file of the recording."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "-y"
+    """Axis of the recording's world that points up, written --up=-y. Trajectories that start at
+    a level camera have y down, so up is -y; motion capture (TUM) has z."""
+    split: str = "train"
+    """Split to add to."""
+    name: str | None = None
+    """Name of the episode; by default that of the folder."""
+    overwrite: bool = False
+    """Replace an episode of the same name."""
+
+    def __post_init__(self):
+        """Validate."""
+        if self.stride < 1:
+            raise ConfigError(f"--stride is {self.stride}: use 1 or more.")
+        if not self.depth_scale > 0:
+            raise ConfigError(f"--depth-scale is {self.depth_scale}: use 1000 for millimetres.")
+        if self.size is not None and min(self.size) < 1:
+            raise ConfigError(f"--size is {self.size}: use a width and height in pixels.")
+        if min(self.intrinsics[:2]) <= 0:
+            raise ConfigError(f"--intrinsics {self.intrinsics}: fx and fy must be above 0.")
+        for what, value in (("split", self.split), ("name", self.name or "episode")):
+            if not value or any(c in value for c in "/\\") or value.startswith("."):
+                raise ConfigError(f"--{what} is {value!r}: use a plain name without slashes.")
+
+
+def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -> None:
+    """Read, convert, check and add a recording to a dataset.
+
+    A recording with something wrong is refused before anything is written.
+
+    Args:
+        config: what to read and how.
+        say: receives the lines to show.
+
+    Raises:
+        UserError: files that are missing or do not fit, or an episode that does not pass
+            validation.
+    """
+    name = config.name or config.src.resolve().name
+    folder = config.out / config.split
+    shards = _others(config, folder, name)
+    frames = read_recording(config.src, config.trajectory)[:: config.stride]
+    rgb, depth, source_size = _read_images(config, frames)
+    width, height = depth.shape[2], depth.shape[1]
+    half = 0.5 if config.pixel_centres == "integer" else 0.0
+    intrinsics = np.array(config.intrinsics, np.float32) + np.array([0, 0, half, half], np.float32)
+    scale = (width / source_size[0], height / source_size[1])
+    pose = world_from_recording(config.up) @ np.stack([f.world_from_camera for f in frames])
+    _refuse(check_depth(depth, str(config.src)))
+    arrays = EpisodeArrays(
+        rgb, depth, resize_intrinsics(intrinsics, *scale), pose, planar_actions(pose)
+    )
+    info = {"policy": "recorded", "stride": config.stride, "source": config.src.resolve().name}
+    record = write_episode(arrays, name, name, info)
+    _refuse(check_episode(read_episode(record), str(config.src)))
+    path = folder / f"recording-{name}.array_record"
+    write_shard(path, [record])
+    shards.append((describe_shard(path), len(frames)))
+    total = sum(count for _, count in shards)
+    settings = {"made_by": "import", "frames": {shard.file: count for shard, count in shards}}
+    write_manifest(
+        folder, Manifest(config.split, tuple(shard for shard, _ in shards), settings, total)
+    )
+    moves = "planar actions" if arrays.actions is not None else "poses only (moves in 6 degrees)"
+    say(f"{folder}: added {name}, {len(frames)} frames of {width}×{height} pixels, {moves}.")
+
+
+def world_from_recording(up: str) -> np.ndarray:
+    """Return the (4, 4) rotation that turns a recording's up axis to z, moving least axes."""
+    axis = np.array(_AXES[up[-1]], float) * (-1 if up.startswith("-") else 1)
+    keep = np.array(_AXES["y" if up[-1] == "x" else "x"], float)  # this one stays horizontal
+    rotation = np.eye(4)
+    rotation[:3, :3] = np.stack([keep, np.cross(axis, keep), axis])
+    return rotation
+
+
+def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
+    """Return the (T − 1, 3) actions of a camera that only moves and turns on the ground.
+
+    Returns:
+        None where the poses (T, 4, 4) cannot be reached that way (a hand-held camera).
+    """
+    if len(world_from_camera) < 2:
+        return None
+    actions = np.asarray(actions_between(np.asarray(world_from_camera, np.float32)))
+    metres, radians = action_errors(world_from_camera, actions)
+    return actions if bool(((metres < ACTION_M) & (radians < ACTION_RAD)).all()) else None
+
+
+def _others(config: ImportConfig, folder: Path, name: str) -> list[tuple[Shard, int]]:
+    """Return the shards that are there already, and how many frames each has."""
+    if not folder.exists():
+        return []
+    if not (folder / MANIFEST).is_file():
+        if any(folder.glob("*.array_record")) or any(folder.glob("*.json")):
+            raise UserError(
+                f"{folder} holds an unfinished collection; finish it, or give another --split."
+            )
+        return []
+    manifest = read_manifest(folder)
+    if manifest.settings.get("made_by") != "import":
+        raise UserError(f"{folder} was made by `collect`; import into another --split or folder.")
+    file = f"recording-{name}.array_record"
+    if any(shard.file == file for shard in manifest.shards) and not config.overwrite:
+        raise UserError(
+            f"{folder} already has an episode named {name}; give another --name or --overwrite."
+        )
+    frames = manifest.settings["frames"]
+    return [(shard, frames[shard.file]) for shard in manifest.shards if shard.file != file]
+
+
+def _read_images(
+    config: ImportConfig, frames: list[RecordedFrame]
+) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """Return rgb (T, H, W, 3), depth in metres (T, H, W), and the recorded width and height."""
+    first = _read(frames[0].colour, cv2.IMREAD_COLOR)
+    source = (first.shape[1], first.shape[0])
+    size = config.size or source
+    rgb, depth = [], []
+    with Meter(f"reading {config.src}", len(frames), "frames") as meter:
+        for frame in frames:
+            colour = _read(frame.colour, cv2.IMREAD_COLOR)
+            distance = _read(frame.depth, cv2.IMREAD_UNCHANGED)
+            for path, image in ((frame.colour, colour), (frame.depth, distance)):
+                if (image.shape[1], image.shape[0]) != source:
+                    raise UserError(
+                        f"{path} has {image.shape[1]}×{image.shape[0]} pixels, the first image "
+                        f"{source[0]}×{source[1]}: colour and depth must be registered and all of "
+                        "one size."
+                    )
+            if distance.ndim != 2:
+                raise UserError(f"{frame.depth} has {distance.shape[2]} channels: not a depth.")
+            shrink = size[0] < source[0]
+            how = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
+            rgb.append(cv2.resize(colour, size, interpolation=how)[..., ::-1])
+            depth.append(_nearest(distance, size) / config.depth_scale)
+            meter.advance(1)
+    return np.stack(rgb), np.stack(depth).astype(np.float32), source
+
+
+def _nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Resize by picking pixels: blended depths would lie between surfaces."""
+    height, width = image.shape
+    rows = ((np.arange(size[1]) + 0.5) * height / size[1]).astype(int)
+    columns = ((np.arange(size[0]) + 0.5) * width / size[0]).astype(int)
+    return image[rows][:, columns]
+
+
+def _read(path: Path, flags: int) -> np.ndarray:
+    if not path.is_file():
+        raise UserError(f"{path} does not exist but the recording lists it.")
+    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
+    if image is None:
+        raise UserError(f"{path} does not decode as an image; it is damaged.")
+    return image
+
+
+def _refuse(problems: list) -> None:
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise UserError(f"{problems[0]}{more} Nothing was written.")

@@ -1,0 +1,188 @@
+"""Other people's recordings: which files belong together, and where the camera was.
+
+Two shapes of folders are read. Open3D's: a folder of colour images, a folder of depth images and a
+``.log`` trajectory (a line of three integers, then a 4×4 camera-to-world matrix, per frame). TUM's:
+``rgb.txt``, ``depth.txt`` and ``groundtruth.txt`` whose lines begin with a time stamp.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pewm_jax.config import UserError
+
+COLOUR_FOLDERS = ("image", "color", "colour", "rgb")
+DEPTH_FOLDERS = ("depth",)
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm", ".bmp")
+TUM_TOLERANCE_S = 0.02
+"""Largest difference in time between the images and the pose of one frame, seconds."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedFrame:
+    """One frame of a recording.
+
+    Attributes:
+        colour: path of the colour image.
+        depth: path of the depth image.
+        world_from_camera: (4, 4) float64 camera-to-world in the recording's own world.
+    """
+
+    colour: Path
+    depth: Path
+    world_from_camera: np.ndarray
+
+
+def read_recording(folder: Path, trajectory: Path | None = None) -> list[RecordedFrame]:
+    """List the frames of a recording, in order.
+
+    Args:
+        folder: the recording.
+        trajectory: its trajectory, by default ``groundtruth.txt`` or the only ``.log`` file in it;
+            a name that ends in ``.log`` is read as Open3D's, any other as TUM's.
+
+    Raises:
+        UserError: files that are missing or do not parse, or counts that do not match.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder; give the folder of a recording.")
+    path = _find_trajectory(folder, trajectory)
+    frames = _read_log_folder(folder, path) if path.suffix == ".log" else _read_tum(folder, path)
+    if not frames:
+        raise UserError(f"{folder} has no frames: {path.name} matches no images.")
+    return frames
+
+
+def _find_trajectory(folder: Path, trajectory: Path | None) -> Path:
+    if trajectory is not None:
+        for path in (folder / trajectory, trajectory):
+            if path.is_file():
+                return path
+        raise UserError(f"--trajectory {trajectory} exists neither in {folder} nor by itself.")
+    if (folder / "groundtruth.txt").is_file():
+        return folder / "groundtruth.txt"
+    logs = sorted(folder.glob("*.log"))
+    if len(logs) != 1:
+        found = ", ".join(path.name for path in logs) or "none"
+        raise UserError(
+            f"{folder} needs one trajectory, groundtruth.txt or a .log file (found: {found}); "
+            "name it with --trajectory."
+        )
+    return logs[0]
+
+
+def _read_log_folder(folder: Path, trajectory: Path) -> list[RecordedFrame]:
+    colours = _images(folder, COLOUR_FOLDERS, "colour")
+    depths = _images(folder, DEPTH_FOLDERS, "depth")
+    poses = read_log(trajectory)
+    if not len(colours) == len(depths) == len(poses):
+        raise UserError(
+            f"{folder} has {len(colours)} colour images, {len(depths)} depth images and "
+            f"{len(poses)} poses in {trajectory.name}: the counts must match, one of each per frame."
+        )
+    return [RecordedFrame(*frame) for frame in zip(colours, depths, poses, strict=True)]
+
+
+def _images(folder: Path, names: tuple[str, ...], what: str) -> list[Path]:
+    for name in names:
+        if (folder / name).is_dir():
+            files = (folder / name).iterdir()
+            return sorted(path for path in files if path.suffix.lower() in SUFFIXES)
+    raise UserError(f"{folder} has no folder of {what} images; it must be named {names[0]}/.")
+
+
+def read_log(path: Path) -> np.ndarray:
+    """Read an Open3D ``.log`` trajectory as (T, 4, 4) camera-to-world.
+
+    Raises:
+        UserError: it does not parse, naming the line.
+    """
+    lines = [(i, line.split()) for i, line in enumerate(_lines(path), 1) if line.strip()]
+    if len(lines) % 5:
+        raise UserError(
+            f"{path} has {len(lines)} lines, a .log trajectory has 5 per frame (three integers, "
+            "then four rows of a matrix); it is cut short or of another format."
+        )
+    poses = np.empty((len(lines) // 5, 4, 4))
+    for k, (number, words) in enumerate(lines):
+        if k % 5:
+            poses[k // 5, k % 5 - 1] = _numbers(path, number, words, 4)
+    return poses
+
+
+def _read_tum(folder: Path, trajectory: Path) -> list[RecordedFrame]:
+    colours, depths = (_stamped(folder / name) for name in ("rgb.txt", "depth.txt"))
+    poses = [(stamp, words, number) for number, stamp, words in _stamped_lines(trajectory)]
+    depth_times, pose_times = (np.array([row[0] for row in rows]) for rows in (depths, poses))
+    frames = []
+    for stamp, name in colours:
+        depth, pose = _nearest(depth_times, stamp), _nearest(pose_times, stamp)
+        if depth is not None and pose is not None:
+            _, words, number = poses[pose]
+            matrix = _from_quaternion(trajectory, number, words)
+            frames.append(RecordedFrame(folder / name, folder / depths[depth][1], matrix))
+    if not frames:
+        raise UserError(
+            f"{folder}: no colour image of rgb.txt has a depth image and a pose within "
+            f"{TUM_TOLERANCE_S} s; check the time stamps."
+        )
+    return frames
+
+
+def _nearest(times: np.ndarray, stamp: float) -> int | None:
+    if not len(times):
+        return None
+    index = int(np.argmin(np.abs(times - stamp)))
+    return index if abs(times[index] - stamp) <= TUM_TOLERANCE_S else None
+
+
+def _stamped(path: Path) -> list[tuple[float, str]]:
+    if not path.is_file():
+        raise UserError(f"{path} does not exist; a TUM recording lists its images there.")
+    rows = []
+    for number, stamp, words in _stamped_lines(path):
+        if not words:
+            raise UserError(f"{path}, line {number}: a time stamp without a file name.")
+        rows.append((stamp, words[0]))
+    return rows
+
+
+def _stamped_lines(path: Path) -> list[tuple[int, float, list[str]]]:
+    rows = []
+    for number, line in enumerate(_lines(path), 1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            rows.append((number, float(_numbers(path, number, words[:1], 1)[0]), words[1:]))
+    return rows
+
+
+def _from_quaternion(path: Path, number: int, words: list[str]) -> np.ndarray:
+    values = _numbers(path, number, words, 7)
+    norm = float(np.linalg.norm(values[3:]))
+    if not abs(norm - 1) < 1e-2:
+        raise UserError(f"{path}, line {number}: the quaternion has length {norm:.3g}, not 1.")
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
+    pose[:3, 3] = values[:3]
+    return pose
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} does not read as text ({error}).") from None
+
+
+def _numbers(path: Path, line: int, words: list[str], count: int) -> np.ndarray:
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != count:
+        raise UserError(f"{path}, line {line}: expected {count} numbers, found {' '.join(words)!r}.")
+    return values

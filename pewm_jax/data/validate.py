@@ -1,0 +1,130 @@
+"""Validate data on disk: every file, every record, every frame; each problem in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from array_record.python import array_record_module
+
+from pewm_jax.config import UserError
+from pewm_jax.data.checks import Problem, check_episode
+from pewm_jax.data.dataset import (
+    MANIFEST,
+    Manifest,
+    count_records,
+    describe_shard,
+    read_manifest,
+    splits,
+)
+from pewm_jax.data.episodes import read_episode
+from pewm_jax.data.progress import Meter
+
+SHOWN = 20
+"""Problems printed at most."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ValidateConfig:
+    """Check a dataset, a split or a single file: sizes, hashes, counts, units, geometry."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """A dataset folder, one of its splits, or an .array_record file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What a validation found.
+
+    Attributes:
+        episodes: how many were checked.
+        frames: how many frames these have.
+        problems: all that is wrong.
+    """
+
+    episodes: int
+    frames: int
+    problems: list[Problem]
+
+
+def validate(config: ValidateConfig, say: Callable[[str], None] = print) -> Verdict:
+    """Check everything under a path.
+
+    Args:
+        config: where to look.
+        say: receives the lines to show.
+
+    Raises:
+        UserError: there is nothing to check at the path, or a split is unfinished or cut short.
+    """
+    path = config.path
+    if path.is_file():
+        files, problems = [path], []
+    else:
+        files, problems = _files(path)
+    total = sum(count_records(file) for file in files)
+    episodes = frames = 0
+    with Meter(f"validating {path}", total, "episodes") as meter:
+        for file in files:
+            for index in range(count_records(file)):
+                length, found = _check_record(file, index)
+                episodes, frames, problems = episodes + 1, frames + length, problems + found
+                meter.advance(1)
+    for problem in problems[:SHOWN]:
+        say(str(problem))
+    if len(problems) > SHOWN:
+        say(f"… and {len(problems) - SHOWN} more.")
+    if not problems:
+        say(f"{path}: {episodes} episodes, {frames} frames, all well.")
+    return Verdict(episodes, frames, problems)
+
+
+def _files(path: Path) -> tuple[list[Path], list[Problem]]:
+    """List the files of all splits under a path, and what is wrong with them as files."""
+    inside = splits(path) if path.is_dir() and not (path / MANIFEST).is_file() else []
+    files: list[Path] = []
+    problems: list[Problem] = []
+    for folder in [path / name for name in inside] or [path]:
+        manifest = read_manifest(folder)
+        problems += _check_hashes(folder, manifest)
+        files += [folder / shard.file for shard in manifest.shards]
+    return files, problems
+
+
+def _check_hashes(folder: Path, manifest: Manifest) -> list[Problem]:
+    problems = []
+    for shard in manifest.shards:
+        there = describe_shard(folder / shard.file)
+        for field in ("records", "sha256"):
+            if getattr(there, field) != getattr(shard, field):
+                what = (
+                    f"is {getattr(there, field)}, {MANIFEST} says {getattr(shard, field)}: the "
+                    "file was changed after it was made; make the split again."
+                )
+                problems.append(Problem(str(folder / shard.file), None, field, what))
+    return problems
+
+
+def _check_record(file: Path, index: int) -> tuple[int, list[Problem]]:
+    """Return the number of frames of a record and what is wrong with it."""
+    where = f"{file}, record {index}"
+    try:
+        episode = read_episode(_read(file, index), where)
+    except UserError as error:
+        return 0, [Problem(where, None, "record", str(error).removeprefix(f"{where}: "))]
+    return episode.length, check_episode(episode, where)
+
+
+def _read(file: Path, index: int) -> bytes:
+    reader = array_record_module.ArrayRecordReader(str(file))
+    try:
+        return reader.read([index])[0]
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise UserError(
+            f"does not read ({str(error).splitlines()[0]}); the file is damaged."
+        ) from None
+    finally:
+        reader.close()
