@@ -190,7 +190,7 @@ def _nearest(name: str, known: Sequence[str]) -> str:
     last = name.rsplit(".", 1)[-1].lstrip("-")
     close = [flag for flag in known if flag.rsplit(".", 1)[-1].lstrip("-") == last]
     close = close or difflib.get_close_matches(name, known, 1, 0.5)
-    return f": did you mean {close[0]}?" if close else ""
+    return f" (did you mean {close[0]}?)" if close else ""
 
 
 def _sentence(box: str, prog: str) -> str:

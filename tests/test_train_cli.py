@@ -136,7 +136,7 @@ def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, pa
     [
         ([], "Name a preset first: python train.py demo"),
         (["--train.seed", "1"], "Name a preset first"),
-        (["dmo"], "no preset 'dmo': did you mean demo?"),
+        (["dmo"], "no preset 'dmo' (did you mean demo?"),
         (["tiny", "--train.stage1.stepz", "1"], "did you mean --train.stage1.steps?"),
         (["tiny", "--steps", "1"], "did you mean --train.stage1.steps?"),
         (["tiny", "--train.seed", "abc"], "--train.seed needs a whole number, got 'abc'."),
@@ -223,6 +223,8 @@ def test_training_real_episodes_stopped_by_ctrl_c_and_started_again(data, tmp_pa
     assert seen == sorted(set(seen))
     assert {(1, 200), (2, 2)} <= set(seen)
     assert all(np.isfinite(entry["loss"]) for entry in steps)
+
+    assert any(path.is_file() for path in (run.parent / ".cache").rglob("*"))
 
     config, params = rollout.load(run)
     assert config.train.stage1.steps == 200

@@ -6,7 +6,6 @@ On a terminal the live view is a progress bar, elsewhere a line every ten second
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 import types
@@ -83,11 +82,15 @@ def drop_after(path: Path, stage: int, step: int) -> None:
 
 
 class Pace:
-    """Seconds per step, smoothed; time spent on other things is left out."""
+    """Seconds per step, smoothed; time spent on other things is left out.
+
+    The mean of the first ten steps, from then on a moving average of about as many.
+    """
 
     def __init__(self, now: float):
         self._last = now
-        self.step_seconds = math.nan
+        self._ticks = 0
+        self._mean = 0.0
 
     def pause(self, seconds: float) -> None:
         """Leave out time in which no step was made."""
@@ -96,9 +99,9 @@ class Pace:
     def tick(self, now: float) -> float:
         """Note that a step is done; returns the smoothed seconds per step."""
         seconds, self._last = max(now - self._last, 1e-9), now
-        known = not math.isnan(self.step_seconds)
-        self.step_seconds = 0.9 * self.step_seconds + 0.1 * seconds if known else seconds
-        return self.step_seconds
+        self._ticks += 1
+        self._mean += (seconds - self._mean) / min(self._ticks, 10)
+        return self._mean
 
 
 class LiveView:

@@ -107,3 +107,15 @@ def test_pauses_do_not_count_as_steps():
     assert pace.tick(2.0) == 2.0
     pace.pause(10.0)
     assert pace.tick(14.0) == pytest.approx(2.0)
+
+
+def test_the_pace_is_a_mean_at_first_and_forgets_later():
+    pace, now = log.Pace(0.0), 0.0
+    for seconds in (3.0, 1.0, 2.0):
+        now += seconds
+        mean = pace.tick(now)
+    assert mean == pytest.approx(2.0)
+    for _ in range(200):
+        now += 0.5
+        mean = pace.tick(now)
+    assert mean == pytest.approx(0.5, abs=1e-3)
