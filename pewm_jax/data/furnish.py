@@ -19,8 +19,8 @@ from pewm_jax.data.placement import against, apron, overlap, shift, turned, wall
 from pewm_jax.data.programmes import PROGRAMMES, RUGS, TABLES
 from pewm_jax.data.shapes import Piece
 
-CLEAR_M = 0.3
-"""Room an agent needs on each side of its centre: its radius and a margin."""
+CLEAR_M = 0.32
+"""Room an agent needs on each side of its centre: a radius of 0.2 m and a margin for grids."""
 CELL_M = 0.1
 """Cell of the floor grid on which reachability is checked."""
 TRIES = 12
@@ -43,6 +43,7 @@ class Furnisher:
         self.room, self.rng, self.tones, self.height = room, rng, tones, height
         self.placed: list[Placed] = []
         self.footprints: list[Rect] = []
+        self._last = (0, 0.0, 0.0)  # side, place along it and width of the last piece at a wall
         self.used: list[list[Rect]] = [[] for _ in range(4)]
         for hole in room.openings:
             gap = 0.12
@@ -53,11 +54,9 @@ class Furnisher:
             if hole.kind == "door"
         ]
         x0, y0, x1, y1 = room.rect
-        self.shape = (int((y1 - y0) / CELL_M), int((x1 - x0) / CELL_M))
-        self.blocked = np.zeros(self.shape, bool)
-        edge = round((CLEAR_M - 0.05) / CELL_M)
-        self.blocked[:edge], self.blocked[-edge:] = True, True
-        self.blocked[:, :edge], self.blocked[:, -edge:] = True, True
+        self.shape = (int((y1 - y0) / CELL_M) + 1, int((x1 - x0) / CELL_M) + 1)
+        self.blocked = np.ones(self.shape, bool)
+        self.blocked[self._cells((x0, y0, x1, y1), -CLEAR_M)] = False
         self.open_cells = int((~self.blocked).sum())
 
     def furnish(self) -> list[Placed]:
@@ -65,26 +64,34 @@ class Furnisher:
         rng, use = self.rng, self.room.use
         must, may = PROGRAMMES[use]
         for maker in must:
-            self.at_wall(maker(rng, self.tones))
-            if maker is f.bed and self.placed and self.placed[-1].piece.kind == "bed":
+            if not self.at_wall(maker(rng, self.tones)):
+                continue
+            if maker is f.bed:
                 self.beside_last(f.nightstand(rng, self.tones))
-            if maker is f.desk and self.placed and self.placed[-1].piece.kind == "desk":
+            elif maker is f.desk:
                 self.before_last(f.office_chair(rng, self.tones), 0.72, turned=True)
-            if maker is f.sofa and rng.uniform() < 0.8:
+            elif maker is f.sofa and rng.uniform() < 0.8:
                 self.before_last(f.coffee_table(rng, self.tones), 1.25, turned=False)
         if rng.uniform() < TABLES.get(use, 0.0):
             self.table_with_chairs()
         for index in rng.permutation(len(may)):
             if rng.uniform() < 0.85:
                 self.at_wall(may[index](rng, self.tones))
-        if rng.uniform() < RUGS.get(use, 0.3):
+        self.decorate()
+        return self.placed
+
+    def decorate(self) -> None:
+        """Add what takes no floor: a rug, things on the walls, a lamp at the ceiling."""
+        rng = self.rng
+        if rng.uniform() < RUGS.get(self.room.use, 0.3):
             self.rug()
-        self.hang(m.clock(rng, self.tones), 1.6) if rng.uniform() < 0.3 else None
-        self.hang(m.wall_shelf(rng, self.tones), 1.1) if rng.uniform() < 0.7 else None
+        if rng.uniform() < 0.3:
+            self.hang(m.clock(rng, self.tones), 1.6)
+        if rng.uniform() < 0.7:
+            self.hang(m.wall_shelf(rng, self.tones), 1.1)
         for _ in range(int(rng.integers(3, 6))):
             self.hang(m.picture(rng, self.tones), rng.uniform(1.25, 1.45))
         self.ceiling_lamp()
-        return self.placed
 
     def at_wall(self, piece: Piece) -> bool:
         """Put a piece with its back to some wall; False if there is no place."""
@@ -193,7 +200,11 @@ class Furnisher:
                 at + width / 2 + 0.06,
                 bottom + high + 0.05,
             )
-            if not any(overlap(span, other) for other in self.used[side]):
+            if any(overlap(span, other) for other in self.used[side]):
+                continue
+            # What reaches far into the room takes floor: heads and cameras would run into it.
+            rect = against(self.room, side, at, piece.size[1], width)
+            if piece.size[1] < 0.1 or self._accept(rect, over_others=True):
                 pose = wall_frame(self.room, side, at)
                 pose[2, 3] = bottom
                 self.placed.append(Placed(piece, pose))
@@ -208,7 +219,7 @@ class Furnisher:
         self.placed.append(Placed(m.ceiling_lamp(self.rng, self.tones), pose))
 
     def _stand(self, piece: Piece, rect: Rect, side: int, at: float) -> bool:
-        if not self._accept(rect, 0.0):
+        if not self._accept(rect):
             return False
         self.placed.append(Placed(piece, wall_frame(self.room, side, at)))
         self._last = (side, at, piece.size[0])
@@ -226,17 +237,14 @@ class Furnisher:
         self.placed.append(Placed(piece, pose))
         return True
 
-    def _accept(self, rect: Rect, margin: float) -> bool:
+    def _accept(self, rect: Rect, margin: float = 0.0, *, over_others: bool = False) -> bool:
         """Take a footprint if it is clear and the doorways stay connected; else change nothing."""
         grown = (rect[0] - margin, rect[1] - margin, rect[2] + margin, rect[3] + margin)
-        if any(overlap(grown, other) for other in self.footprints):
+        if not over_others and any(overlap(grown, other) for other in self.footprints):
             return False
         if any(overlap(rect, door) for door in self.doors):
             return False
-        x0, y0 = self.room.rect[:2]
-        first = [max(0, int(np.floor((rect[i] - (x0, y0)[i] - CLEAR_M) / CELL_M))) for i in (0, 1)]
-        last = [int(np.ceil((rect[i + 2] - (x0, y0)[i] + CLEAR_M) / CELL_M)) for i in (0, 1)]
-        region = (slice(first[1], last[1]), slice(first[0], last[0]))
+        region = self._cells(rect, CLEAR_M)
         before = self.blocked[region].copy()
         self.blocked[region] = True
         if self._reachable():
@@ -244,6 +252,13 @@ class Furnisher:
             return True
         self.blocked[region] = before
         return False
+
+    def _cells(self, rect: Rect, grow: float) -> tuple[slice, slice]:
+        """Return the rows and columns of cells whose centres lie in a rectangle grown by that."""
+        x0, y0 = self.room.rect[:2]
+        low = [int(np.ceil((rect[i] - o - grow) / CELL_M - 0.5)) for i, o in ((0, x0), (1, y0))]
+        high = [int(np.floor((rect[i] - o + grow) / CELL_M + 0.5)) for i, o in ((2, x0), (3, y0))]
+        return slice(max(0, low[1]), max(0, high[1])), slice(max(0, low[0]), max(0, high[0]))
 
     def _reachable(self) -> bool:
         """Whether free floor connects all doorways and most of what is free."""

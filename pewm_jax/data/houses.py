@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from pewm_jax.data import textures
+from pewm_jax.data.connectivity import all_reachable
 from pewm_jax.data.floorplan import DOOR_TOP_M, Room, draw_plan
 from pewm_jax.data.furnish import Furnisher, Placed
 from pewm_jax.data.furniture_parts import Tones
@@ -40,26 +41,39 @@ def generate_house(seed: int) -> trimesh.Scene:
         baked), ``rooms`` ([x0, y0, x1, y1] per room, metres), ``uses`` (one word per room) and
         ``doorways`` ([room, room, x0, y0, x1, y1]).
     """
-    rng = np.random.default_rng([_STREAM, seed])
+    attempt, scene = 0, None
+    while scene is None:
+        scene = _draw(np.random.default_rng([_STREAM, seed, attempt]))
+        attempt += 1
+    scene.metadata.update(name=f"house-{seed:06d}", seed=int(seed), shading="soft")
+    return scene
+
+
+def _draw(rng: np.random.Generator) -> trimesh.Scene | None:
+    """Draw one house; None if some room of it could not be reached."""
     plan = draw_plan(rng)
-    scene = trimesh.Scene()
     first_hue = rng.uniform()
     palettes = [
         _palette(rng, first_hue + 0.618034 * index, room.use)
         for index, room in enumerate(plan.rooms)
     ]
+    furnishers = [
+        Furnisher(room, rng, tones, plan.height)
+        for room, tones in zip(plan.rooms, palettes, strict=True)
+    ]
+    furniture = [furnisher.furnish() for furnisher in furnishers]
+    if not all_reachable(plan, [rect for each in furnishers for rect in each.footprints]):
+        return None
+    scene = trimesh.Scene()
     for index, (room, tones) in enumerate(zip(plan.rooms, palettes, strict=True)):
         name = f"room{index}-{room.use}"
         _add_shell(scene, rng, room, name=name, tones=tones, height=plan.height)
-        for number, placed in enumerate(Furnisher(room, rng, tones, plan.height).furnish()):
+        for number, placed in enumerate(furniture[index]):
             _add_piece(scene, f"room{index}-{placed.piece.kind}-{number}", placed)
     for index, (a, _, rect) in enumerate(plan.doorways):
         piece = doorway_piece(rect, DOOR_TOP_M, palettes[a])
         _add_piece(scene, f"doorway{index}", Placed(piece, np.eye(4)))
     scene.metadata.update(
-        name=f"house-{seed:06d}",
-        seed=int(seed),
-        shading="soft",
         rooms=[[float(value) for value in room.rect] for room in plan.rooms],
         uses=[room.use for room in plan.rooms],
         doorways=[[a, b, *map(float, rect)] for a, b, rect in plan.doorways],

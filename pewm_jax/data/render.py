@@ -65,7 +65,7 @@ def render(scene: Scene, camera: Camera, height: int, width: int) -> Rendered:
     step = max(1, CHUNK // (height * width))
     for first in range(0, frames, step):
         part = slice(first, min(first + step, frames))
-        origins, directions = _rays(scene, pose[part], intrinsics[part], height, width)
+        origins, directions = camera_rays(scene, pose[part], intrinsics[part], height, width)
         hits = scene.tracer.run(origins, directions, output=1)
         focal = np.repeat(intrinsics[part, 0].astype(np.float32), height * width)
         colour, z, instance = _shade(scene, hits, focal)
@@ -77,7 +77,7 @@ def render(scene: Scene, camera: Camera, height: int, width: int) -> Rendered:
     return Rendered(rgb, depth, ids)
 
 
-def _rays(
+def camera_rays(
     scene: Scene, pose_T44: np.ndarray, intrinsics_T4: np.ndarray, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return origins and directions (T·H·W, 3) float32; directions advance z by 1 m per unit."""

@@ -8,6 +8,8 @@ import sys
 import numpy as np
 import pytest
 
+from pewm_jax.data import connectivity, floorplan
+from pewm_jax.data import houses as houses_module
 from pewm_jax.data.houses import generate_house
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import from_trimesh, house
@@ -143,3 +145,20 @@ def test_light_is_softer_in_corners_than_in_the_open(houses):
     edge = np.minimum(first - [x0, y0], [x1, y1] - first).min(-1)
     light = scene.shading_16F[0, faces]
     assert light[edge < 0.01].mean() < 0.9 * light[edge > 1.0].mean()
+
+
+def test_a_blocked_room_is_noticed_and_the_house_drawn_again(monkeypatch):
+    plan = floorplan.draw_plan(np.random.default_rng(3))
+    assert connectivity.all_reachable(plan, [])
+    _, _, (x0, y0, x1, y1) = plan.doorways[0]
+    plug = (x0 - 0.4, y0 - 0.4, x1 + 0.4, y1 + 0.4)
+    assert not connectivity.all_reachable(plan, [plug])
+    narrowed = (x0 - 0.1, y0 - 0.1, x1 - 0.5 * (x1 - x0 > 0.5), y1 - 0.5 * (y1 - y0 > 0.5))
+    assert not connectivity.all_reachable(plan, [narrowed])
+    verdicts = iter([False, True])
+    first = generate_house(7)
+    monkeypatch.setattr(houses_module, "all_reachable", lambda *_: next(verdicts))
+    again = generate_house(7)
+    assert next(verdicts, "used up") == "used up"
+    assert again.metadata["rooms"] != first.metadata["rooms"]
+    assert again.metadata["name"] == "house-000007"
