@@ -71,10 +71,12 @@ def _parse(kind: type[T], command: str, flags: Sequence[str]) -> T:
 
 def _first_sentence(message: str, kind: str, prog: str) -> str:
     """Keep the statement of the parser's message: no rules, no repeated help."""
-    text = re.split(r"-{5,}", message.strip("- "))[0].strip()
+    parts = [part.strip() for part in re.split(r"-{5,}", message)]
+    text = next((part for part in parts if part.strip(".")), message)
     text = text.removeprefix(f"Error parsing {kind}: ").removeprefix(f"{kind}: ")
     if text.startswith("Missing from"):
         text = f"{text}; `python {prog} --help` explains"
+    text = text.removesuffix(" .")
     return text if text.endswith(".") else f"{text}."
 
 

@@ -74,7 +74,7 @@ def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
     if config.out.exists() and not config.out.is_dir():
         raise UserError(f"{config.out} is a file; give a folder to write the dataset to.")
     wanted = [split for split in SPLITS if config.episodes(split)]
-    states = {split: _examine(config, split) for split in wanted}
+    states: dict[str, State] = {split: _examine(config, split) for split in wanted}
     todo = [split for split in wanted if states[split] != "complete"]
     if not todo:
         say(f"{config.out} is complete with these settings: nothing to do.")
@@ -147,9 +147,7 @@ def _read_settings(path: Path) -> Mapping[str, Any]:
         raise UserError(f"{path} does not parse; delete its folder and collect again.") from None
 
 
-def _prepare(
-    config: CollectConfig, split: str, state: State, jobs: list[_Job]
-) -> dict[str, Shard]:
+def _prepare(config: CollectConfig, split: str, state: State, jobs: list[_Job]) -> dict[str, Shard]:
     """Mark a split as unfinished, clear away what is not whole, and return what is."""
     folder = config.out / split
     folder.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from array_record.python import array_record_module
+import array_record.python.array_record_module as array_file
 from grain import sources
 
 from pewm_jax.config import UserError
@@ -75,7 +75,7 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
     count = 0
     try:
         # Images are compressed already, and one record per group makes a single one cheap to read.
-        writer = array_record_module.ArrayRecordWriter(str(partial), "group_size:1,uncompressed")
+        writer = array_file.ArrayRecordWriter(str(partial), "group_size:1,uncompressed")
         try:
             for record in records:
                 writer.write(record)
@@ -105,7 +105,7 @@ def count_records(path: Path) -> int:
     """
     reader = None
     try:
-        reader = array_record_module.ArrayRecordReader(str(path))
+        reader = array_file.ArrayRecordReader(str(path))
         count = reader.num_records()
     except (RuntimeError, ValueError) as error:
         raise UserError(
@@ -122,6 +122,25 @@ def count_records(path: Path) -> int:
             "again."
         )
     return count
+
+
+def read_record(path: Path, index: int) -> bytes:
+    """Read one record of an ArrayRecord file.
+
+    Raises:
+        UserError: it does not read.
+    """
+    reader = array_file.ArrayRecordReader(str(path))
+    try:
+        return reader.read([index])[0]
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise UserError(
+            f"{path}, record {index} does not read ({str(error).splitlines()[0]}); the file is "
+            "damaged, delete it and make it again."
+        ) from None
+    finally:
+        with contextlib.suppress(RuntimeError, ValueError):
+            reader.close()
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -217,20 +236,21 @@ class EpisodeSource(Sequence[Episode]):
         self.manifest = read_manifest(self.path)
         files = [str(self.path / shard.file) for shard in self.manifest.shards]
         try:
-            self._records = sources.ArrayRecordDataSource(files)
+            self._records: Any = sources.ArrayRecordDataSource(files)
         except (RuntimeError, ValueError) as error:
             raise UserError(
                 f"{self.path}: the shards do not open ({str(error).splitlines()[0]}); make the "
                 "split again."
             ) from None
-        if len(self._records) != self.manifest.records:
+        self._length = len(self._records)
+        if self._length != self.manifest.records:
             raise UserError(
-                f"{self.path}: the shards hold {len(self._records)} records where {MANIFEST} says "
+                f"{self.path}: the shards hold {self._length} records where {MANIFEST} says "
                 f"{self.manifest.records}; make the split again."
             )
 
     def __len__(self) -> int:
-        return len(self._records)
+        return self._length
 
     def __repr__(self) -> str:
         return f"EpisodeSource({str(self.path)!r}, episodes={len(self)})"

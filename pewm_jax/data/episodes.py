@@ -274,7 +274,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
                 "not match, write it again."
             )
         if spans:
-            _check_span(record, *spans[-1], where, stream)
+            _check_span(record, spans[-1][0], spans[-1][1], where, stream)
     intrinsics, pose = arrays["intrinsics"], arrays["world_from_camera"]
     if intrinsics is None or pose is None:
         raise UserError(f"{where} lacks intrinsics or world_from_camera; write it again.")

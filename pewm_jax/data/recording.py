@@ -64,8 +64,8 @@ class CollectConfig:
     episodes_per_house: int = 1
     """Episodes recorded in one house before the next is made."""
     scene: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
-    """A mesh to walk in instead of made houses (GLB, OBJ, PLY); repeated, they are shared out over the
-    splits, a single one serves all of them."""
+    """A mesh to walk in instead of made houses (GLB, OBJ, PLY); may be given several times: the
+    meshes are shared out over the splits, a single one serves all of them."""
     up: Literal["auto", "y", "z"] = "auto"
     """Which axis of the meshes points up; `auto`: y for GLB and glTF, z for the others."""
     seed: int = 0
@@ -153,9 +153,9 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         config.actions,
         config.frames,
         np.random.default_rng([config.seed, SPLITS.index(split), index]),
-        policy,
-        config.turn_around,
-        config.continuous,
+        policy=policy,
+        turn_around=config.turn_around,
+        continuous=config.continuous,
     )
     intrinsics = intrinsics_from_fov(config.size, config.size, config.hfov)
     pose = walk.world_from_camera(grid.floor_z + config.camera_height)
@@ -188,9 +188,7 @@ def _house(seed: int, camera_height: float) -> tuple[Scene, NavGrid]:
 
 
 @functools.lru_cache(maxsize=2)
-def _mesh(
-    path: Path, up: Literal["auto", "y", "z"], camera_height: float
-) -> tuple[Scene, NavGrid]:
+def _mesh(path: Path, up: Literal["auto", "y", "z"], camera_height: float) -> tuple[Scene, NavGrid]:
     scene = load_scene(path, up)
     return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
 

@@ -82,7 +82,7 @@ def _read_log_folder(folder: Path, trajectory: Path) -> list[RecordedFrame]:
     if not len(colours) == len(depths) == len(poses):
         raise UserError(
             f"{folder} has {len(colours)} colour images, {len(depths)} depth images and "
-            f"{len(poses)} poses in {trajectory.name}: the counts must match, one of each per frame."
+            f"{len(poses)} poses in {trajectory.name}: the counts must match, one per frame."
         )
     return [RecordedFrame(*frame) for frame in zip(colours, depths, poses, strict=True)]
 
@@ -184,5 +184,7 @@ def _numbers(path: Path, line: int, words: list[str], count: int) -> np.ndarray:
     except ValueError:
         values = np.empty(0)
     if len(values) != count:
-        raise UserError(f"{path}, line {line}: expected {count} numbers, found {' '.join(words)!r}.")
+        raise UserError(
+            f"{path}, line {line}: expected {count} numbers, found {' '.join(words)!r}."
+        )
     return values

@@ -102,14 +102,14 @@ def depth_colours(depth_HW: np.ndarray, farthest_m: float) -> np.ndarray:
 def view_from_above(episode: Episode, width: int) -> np.ndarray:
     """Return the world from above (RGB, x to the right, y up) with the path drawn over it.
 
-    Surfaces have their colours, higher ones cover lower ones; the path goes from green to red,
-    with a white ring where a revisit episode turns back.
+    Surfaces have their colours, higher ones cover lower ones; the path goes from green to red. A
+    revisit episode has a white ring where it turns back, and a thinner line from there.
     """
     points, colours = _points(episode)
     path = np.asarray(episode.world_from_camera[:, :3, 3], np.float64)
     everything = np.concatenate([points[:, :2], path[:, :2]])
-    low, high = np.percentile(everything, 0.5, axis=0), np.percentile(everything, 99.5, axis=0)
-    low, high = np.minimum(low, path[:, :2].min(0)) - 0.3, np.maximum(high, path[:, :2].max(0)) + 0.3
+    low = np.minimum(np.percentile(everything, 0.5, axis=0), path[:, :2].min(0)) - 0.3
+    high = np.maximum(np.percentile(everything, 99.5, axis=0), path[:, :2].max(0)) + 0.3
     scale = min(width / (high[0] - low[0]), width / (high[1] - low[1]) * 0.6)
     shape = tuple(int(n) for n in np.ceil((high - low)[::-1] * scale))
     left = (width - shape[1]) // 2
@@ -127,16 +127,19 @@ def view_from_above(episode: Episode, width: int) -> np.ndarray:
     image[at[:, 1], at[:, 0]] = colours
     image = cv2.dilate(image, np.ones((3, 3), np.uint8))
     spots = pixels(path)
+    turn = episode.info.get("return_frame")
     for k in range(len(spots) - 1):
         done = k / max(1, len(spots) - 2)
         colour = (int(255 * done), int(255 * (1 - done)), 40)
-        _line(image, spots[k], spots[k + 1], colour)
+        wide = turn is not None and k < turn
+        _line(image, spots[k], spots[k + 1], colour, 7 if wide else 2)
     cv2.circle(image, _pixel(spots[0]), 6, (40, 255, 40), -1, cv2.LINE_AA)
     cv2.circle(image, _pixel(spots[-1]), 6, (255, 40, 40), -1, cv2.LINE_AA)
-    turn = episode.info.get("return_frame")
     if turn is not None:
         cv2.circle(image, _pixel(spots[turn]), 9, (255, 255, 255), 2, cv2.LINE_AA)
-    _line(image, np.array([10, shape[0] - 10]), np.array([10 + scale, shape[0] - 10]), (255,) * 3)
+    _line(
+        image, np.array([10, shape[0] - 10]), np.array([10 + scale, shape[0] - 10]), (255,) * 3, 2
+    )
     _write(image, "1 m", (10, shape[0] - 16))
     plan = np.full((shape[0], width, 3), BACKGROUND, np.uint8)
     plan[:, left : left + shape[1]] = image
@@ -170,13 +173,13 @@ def _thumb(image: np.ndarray, width: int, words: str = "") -> np.ndarray:
 
 def _write(image: np.ndarray, words: str, where: tuple[int, int]) -> None:
     for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(
-            image, words, where, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thick, cv2.LINE_AA
-        )
+        cv2.putText(image, words, where, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thick, cv2.LINE_AA)
 
 
-def _line(image: np.ndarray, start: np.ndarray, end: np.ndarray, colour: tuple) -> None:
-    cv2.line(image, _pixel(start), _pixel(end), colour, 2, cv2.LINE_AA)
+def _line(
+    image: np.ndarray, start: np.ndarray, end: np.ndarray, colour: tuple[int, ...], wide: int
+) -> None:
+    cv2.line(image, _pixel(start), _pixel(end), colour, wide, cv2.LINE_AA)
 
 
 def _pixel(spot: np.ndarray) -> tuple[int, int]:

@@ -37,13 +37,13 @@ class Trajectory:
     """Where the agent was and what it did.
 
     Attributes:
-        pose_T3: (T, 3) float64 x, y, yaw in the world, metres and radians.
+        planar_T3: (T, 3) float64 x, y, yaw in the world, metres and radians.
         actions: (T − 1, 3) float64 dx, dy, dyaw.
         action_ids: (T − 1,) int32, or None for continuous actions.
         return_frame: the frame at which a revisit trajectory turns back, or None.
     """
 
-    pose_T3: np.ndarray
+    planar_T3: np.ndarray
     actions: np.ndarray
     action_ids: np.ndarray | None
     return_frame: int | None = None
@@ -51,7 +51,7 @@ class Trajectory:
     def world_from_camera(self, camera_z: float) -> np.ndarray:
         """Return (T, 4, 4) float32 level cameras at this height."""
         return np.stack(
-            [pose_from_yaw(np.array([x, y, camera_z]), yaw) for x, y, yaw in self.pose_T3]
+            [pose_from_yaw(np.array([x, y, camera_z]), yaw) for x, y, yaw in self.planar_T3]
         )
 
 
@@ -117,7 +117,7 @@ class _Agent:
         longest = float(np.linalg.norm(ways, axis=-1).max())
         steps = np.linspace(0, 1, 2 + int(longest / (0.25 * self.grid.cell_m)))
         points = self.pose[:2] + ways[..., None, :] * steps[:, None]
-        return is_free(self.grid, points).all(-1)
+        return np.all(is_free(self.grid, points), axis=-1)
 
     def ahead(self, yaw: float | np.ndarray, length_m: float | None = None) -> np.ndarray:
         """Return (..., 2) points one step (or so far) away in these directions."""
@@ -141,6 +141,7 @@ def make_trajectory(
     actions: ActionConfig,
     frames: int,
     rng: np.random.Generator,
+    *,
     policy: Policy = "follow",
     turn_around: float = 0.5,
     continuous: bool = False,
@@ -251,8 +252,8 @@ def _next_goal(agent: _Agent) -> np.ndarray:
 def _distance(grid: NavGrid, field_YX: np.ndarray, xy_N2: np.ndarray) -> np.ndarray:
     """Look a field up at points; outside the grid it is infinite."""
     cell = grid.cell_of(xy_N2)
-    inside = ((cell >= 0) & (cell < field_YX.shape)).all(-1)
-    cell = np.where(inside[:, None], cell, 0)
+    inside = np.all((cell >= 0) & (cell < field_YX.shape), axis=-1)
+    cell = np.where(inside[..., None], cell, 0)
     return np.where(inside, field_YX[cell[:, 0], cell[:, 1]], np.inf)
 
 
@@ -289,7 +290,7 @@ def _drift(agent: _Agent, heading: float) -> None:
     if agent.clear(after[:2]):
         agent.record(np.array([speed, side, turn]))
     else:
-        agent.record(np.array([0.0, 0.0, turn if turn else agent.turn]))
+        agent.record(np.array([0.0, 0.0, turn or agent.turn]))
 
 
 def _walk(agent: _Agent, steps: int | None = None) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from array_record.python import array_record_module
 
 from pewm_jax.config import UserError
 from pewm_jax.data.checks import Problem, check_episode
@@ -18,6 +17,7 @@ from pewm_jax.data.dataset import (
     count_records,
     describe_shard,
     read_manifest,
+    read_record,
     splits,
 )
 from pewm_jax.data.episodes import read_episode
@@ -112,19 +112,7 @@ def _check_record(file: Path, index: int) -> tuple[int, list[Problem]]:
     """Return the number of frames of a record and what is wrong with it."""
     where = f"{file}, record {index}"
     try:
-        episode = read_episode(_read(file, index), where)
+        episode = read_episode(read_record(file, index), where)
     except UserError as error:
-        return 0, [Problem(where, None, "record", str(error).removeprefix(f"{where}: "))]
+        return 0, [Problem(where, None, "record", str(error).removeprefix(where).lstrip(":, "))]
     return episode.length, check_episode(episode, where)
-
-
-def _read(file: Path, index: int) -> bytes:
-    reader = array_record_module.ArrayRecordReader(str(file))
-    try:
-        return reader.read([index])[0]
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise UserError(
-            f"does not read ({str(error).splitlines()[0]}); the file is damaged."
-        ) from None
-    finally:
-        reader.close()
