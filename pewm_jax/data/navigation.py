@@ -155,9 +155,10 @@ def _obstructed(
         starts = np.concatenate(
             [np.repeat(points, len(z), 0), np.tile(z, len(points))[:, None]], axis=1
         )
-        starts[:, axis] -= cell_m / 2
+        # Rays of neighbours overlap a little: a wall right on the border of two cells counts.
+        starts[:, axis] -= 0.52 * cell_m
         starts = (starts - scene.centre_3).astype(np.float32)
-        reach = np.full(len(starts), cell_m, np.float32)
+        reach = np.full(len(starts), 1.04 * cell_m, np.float32)
         rays = np.tile(direction, (len(starts), 1))
         hit = scene.tracer.run(starts, rays, dists=reach, query="OCCLUDED") >= 0
         blocked |= hit.reshape(-1, len(z)).any(1)
