@@ -133,10 +133,10 @@ def view_from_above(episode: Episode, width: int) -> np.ndarray:
         colour = (int(255 * done), int(255 * (1 - done)), 40)
         wide = turn is not None and k < turn
         _line(image, spots[k], spots[k + 1], colour, 7 if wide else 2)
-    cv2.circle(image, _pixel(spots[0]), 6, (40, 255, 40), -1, cv2.LINE_AA)
-    cv2.circle(image, _pixel(spots[-1]), 6, (255, 40, 40), -1, cv2.LINE_AA)
+    cv2.circle(image, _pixel(spots[0]), 9, (40, 255, 40), -1, cv2.LINE_AA)
+    cv2.circle(image, _pixel(spots[-1]), 5, (255, 40, 40), -1, cv2.LINE_AA)
     if turn is not None:
-        cv2.circle(image, _pixel(spots[turn]), 9, (255, 255, 255), 2, cv2.LINE_AA)
+        cv2.circle(image, _pixel(spots[turn]), 12, (255, 255, 255), 2, cv2.LINE_AA)
     _line(
         image, np.array([10, shape[0] - 10]), np.array([10 + scale, shape[0] - 10]), (255,) * 3, 2
     )
