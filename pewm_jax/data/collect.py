@@ -193,6 +193,8 @@ def _run(jobs: list[_Job], workers: int) -> Iterator[tuple[_Job, Shard]]:
         for job in jobs:
             yield job, job.run()
         return
+    others = set(multiprocessing.active_children())
+    done = False
     # Spawned, not forked: JAX has threads, and a fork of a process with threads may hang.
     pool = concurrent.futures.ProcessPoolExecutor(
         min(workers, len(jobs)), multiprocessing.get_context("spawn"), _start_worker
@@ -201,18 +203,22 @@ def _run(jobs: list[_Job], workers: int) -> Iterator[tuple[_Job, Shard]]:
         futures = {pool.submit(job.run): job for job in jobs}
         for future in concurrent.futures.as_completed(futures):
             yield futures[future], future.result()
+        done = True
     except BrokenProcessPool:
         raise UserError(
             "a worker process died (killed, or out of memory); run the same command again to go "
             "on, with fewer --workers if memory is short."
         ) from None
     finally:
+        if not done:  # what they are writing is marked as partial, and is made again
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _start_worker() -> None:
-    """Prepare a worker: one thread, quiet on Ctrl-C, gone when its parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """Prepare a worker: one thread, deaf to Ctrl-C (its parent ends it), gone with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
     parent = multiprocessing.parent_process()
     if parent is not None:

@@ -141,31 +141,39 @@ def test_other_settings_are_refused_and_named(whole, tmp_path, mesh):
     assert len(EpisodeSource(out / "train")) == 4
 
 
-def test_a_killed_collection_goes_on(tmp_path, mesh):
-    """SIGKILL to the parent while its workers write; the result is that of an undisturbed run."""
-    options = {"train": 12, "validation": 0, "test": 0, "frames": 150, "size": 32, "workers": 2}
-    collect(settings(tmp_path / "calm", mesh, **{**options, "workers": 1}))
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_collection_goes_on(tmp_path, mesh, how):
+    """Killed, or interrupted by Ctrl-C, while workers write: the result is that of a calm run."""
+    options = {"train": 12, "validation": 0, "test": 0, "frames": 150, "size": 32}
+    collect(settings(tmp_path / "calm", mesh, **options))
     out = tmp_path / "killed"
-    flags = [f"--{k}={v}" for k, v in options.items()]
-    command = [sys.executable, "-m", "pewm_jax.data", "collect", str(out), f"--scene={mesh}"]
+    flags = [f"--{k}={v}" for k, v in {**options, "workers": 2, "shard-episodes": 1}.items()]
     process = subprocess.Popen(
-        [*command, "--shard-episodes=1", *flags], cwd=ROOT, env=environment()
+        [sys.executable, "-m", "pewm_jax.data", "collect", str(out), f"--scene={mesh}", *flags],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     )
     limit = time.monotonic() + 60
     while not list(out.glob("train/*.array_record")) and time.monotonic() < limit:
         time.sleep(0.005)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    if how == signal.SIGKILL:
+        process.kill()  # the workers live on until they notice
+    else:
+        os.killpg(process.pid, how)  # as a terminal does: parent and workers
+    told = process.communicate(timeout=60)[1]
+    if how == signal.SIGINT:
+        assert process.returncode == 130
+        assert told == "Interrupted; the same command goes on where it was.\n"
     assert not (out / "train" / "dataset.json").exists()
     with pytest.raises(UserError, match="did not finish"):
         EpisodeSource(out / "train")
-    time.sleep(0.5)  # the workers notice that their parent is gone
-    collect(settings(out, mesh, **{**options, "workers": 1}))
+    said = []
+    collect(settings(out, mesh, **options), said.append)
+    assert said[0].startswith("resuming: ")
     assert fingerprints(out) == fingerprints(tmp_path / "calm")
-
-
-def environment():
-    return {**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
 
 
 def test_no_house_serves_two_splits():
