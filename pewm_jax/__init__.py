@@ -1,1 +1,71 @@
-"""Persistent embodied world models in JAX."""
+"""Persistent embodied world models in JAX.
+
+Start here::
+
+    import pewm_jax
+
+    config, params = pewm_jax.load("runs/demo")
+    state = pewm_jax.start(config, params, frames)
+    state, clip = pewm_jax.rollout(config, params, state, actions, key)
+
+The names below are the public surface; they are imported when first used, so that a worker that
+only renders houses does not load the networks.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pewm_jax.config import Config, ConfigError, UserError
+    from pewm_jax.geometry.actions import integrate
+    from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+    from pewm_jax.models.codec import rgb_from_signal
+    from pewm_jax.rollouts import load, rollout, start
+    from pewm_jax.types import Camera, Clip, Frames, VoxelMap, WorldState
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Camera": "types",
+    "Clip": "types",
+    "Config": "config",
+    "ConfigError": "config",
+    "Frames": "types",
+    "UserError": "config",
+    "VoxelMap": "types",
+    "WorldState": "types",
+    "integrate": "geometry.actions",
+    "intrinsics_from_fov": "geometry.cameras",
+    "load": "rollouts",
+    "pose_from_yaw": "geometry.cameras",
+    "rgb_from_signal": "models.codec",
+    "rollout": "rollouts",
+    "start": "rollouts",
+}
+
+__all__ = [
+    "Camera",
+    "Clip",
+    "Config",
+    "ConfigError",
+    "Frames",
+    "UserError",
+    "VoxelMap",
+    "WorldState",
+    "integrate",
+    "intrinsics_from_fov",
+    "load",
+    "pose_from_yaw",
+    "rgb_from_signal",
+    "rollout",
+    "start",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import types
 import typing
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -58,9 +57,7 @@ class ClipConfig:
             f"clip.near_m {self.near_m} and clip.far_m {self.far_m}: near must be above 0 and "
             "below far.",
         )
-        _require(
-            self.height > 0 and self.width > 0, "clip.height and clip.width must be positive."
-        )
+        _require(self.height > 0 and self.width > 0, "clip.height and clip.width must be positive.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +140,8 @@ class MemoryConfig:
     """Occupied cells a map can hold; what does not fit is counted."""
     tokens: int = 512
     """Occupied cells that condition one clip, in view and nearest first."""
+    looks: int = 128
+    """Of these, how many each frame's camera looks at with projective positions."""
     positions: Literal["projective", "sinusoid"] = "projective"
     """How attention knows where a cell is: `projective` (seen through each frame's camera) or
     `sinusoid` (the paper: 3D sinusoid of the position in the first frame's camera)."""
@@ -417,27 +416,27 @@ def _coerce(hint: Any, value: Any, where: str) -> Any:
     """Check one plain value against a type hint; lists become tuples."""
     if dataclasses.is_dataclass(hint):
         return from_dict(typing.cast("type", hint), value, where)
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        if value not in args:
-            raise ConfigError(f"{where} is {value!r}; choose one of {', '.join(map(repr, args))}.")
+    args = typing.get_args(hint)
+    if typing.get_origin(hint) is tuple:
+        return _coerce_tuple(args, value, where)
+    if typing.get_origin(hint) is Literal:
+        choices = ", ".join(map(repr, args))
+        _require(value in args, f"{where} is {value!r}; choose one of {choices}.")
         return value
-    if origin is tuple:
-        if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{where} must be a list, got {value!r}.")
-        inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
-        if len(inner) != len(value):
-            raise ConfigError(f"{where} needs {len(inner)} values, got {len(value)}.")
-        return tuple(_coerce(h, v, where) for h, v in zip(inner, value, strict=True))
-    if origin is types.UnionType:
-        if value is None and type(None) in args:
-            return None
-        return _coerce(next(a for a in args if a is not type(None)), value, where)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+    number = isinstance(value, int) and not isinstance(value, bool)
+    if hint is float and number:
         return float(value)
-    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        raise ConfigError(f"{where} must be {hint.__name__}, got {value!r}.")
+    fits = number if hint is int else isinstance(value, hint)
+    _require(fits, f"{where} must be {hint.__name__}, got {value!r}.")
     return value
+
+
+def _coerce_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    """Check a list against the element types of a tuple."""
+    _require(isinstance(value, (list, tuple)), f"{where} must be a list, got {value!r}.")
+    inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+    _require(len(inner) == len(value), f"{where} needs {len(inner)} values, got {len(value)}.")
+    return tuple(_coerce(h, v, where) for h, v in zip(inner, value, strict=True))
 
 
 def save(config: Any, path: Path) -> None:
@@ -456,7 +455,9 @@ def load(path: Path, kind: type[T] = Config) -> T:
     try:
         values = json.loads(path.read_text())
     except FileNotFoundError:
-        raise ConfigError(f"{path} does not exist: is this a run folder made by train.py?") from None
+        raise ConfigError(
+            f"{path} does not exist: is this a run folder made by train.py?"
+        ) from None
     except json.JSONDecodeError as error:
         raise ConfigError(f"{path} is not valid JSON ({error}); restore it.") from None
     return from_dict(kind, values, path.name)

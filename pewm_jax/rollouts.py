@@ -46,12 +46,12 @@ def load(path: str | Path) -> tuple[Config, Params]:
     return config, params
 
 
-def start(config: Config, params: Params, frames: Frames) -> WorldState:  # noqa: ARG001
+def start(config: Config, params: Params, frames: Frames) -> WorldState:
     """Begin a world from a few posed RGB-D frames.
 
     Args:
         config: the experiment.
-        params: unused by weight-free encoders; part of the signature for those with weights.
+        params: parameters of the image encoder; the weight-free encoders need none.
         frames: S ≥ 1 frames (S, H, W, …), uint8 or float colours; all go into the map, the last
             one is the present.
 
@@ -61,7 +61,8 @@ def start(config: Config, params: Params, frames: Frames) -> WorldState:  # noqa
     Raises:
         UserError: the frames' shapes do not agree with each other or with the configuration.
     """
-    count, height, width = frames.depth_THW.shape[-3:] if frames.depth_THW.ndim >= 3 else (0, 0, 0)
+    del params
+    count = frames.depth_THW.shape[0] if frames.depth_THW.ndim else 0
     expected = (count, config.clip.height, config.clip.width)
     if count < 1 or frames.rgb_THWC.shape != (*expected, 3) or frames.depth_THW.shape != expected:
         raise UserError(

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax import rollout as rollouts
+from pewm_jax import rollouts
 from pewm_jax.config import UserError
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import voxel_map
@@ -59,9 +59,7 @@ def test_imagined_frames_enter_the_map_exactly_as_observed_ones(params):
 def test_the_map_changes_what_is_imagined_unless_ignored(params):
     key = jax.random.key(1)
     state = a_state(params)
-    emptied = dataclasses.replace(
-        state, map=voxel_map.empty(CONFIG.memory, state.map.origin_3, 6)
-    )
+    emptied = dataclasses.replace(state, map=voxel_map.empty(CONFIG.memory, state.map.origin_3, 6))
     _, with_map = roll(CONFIG, params, state, ACTIONS[:8], key)
     _, ignored = roll(CONFIG, params, state, ACTIONS[:8], key, memory=False)
     _, without = roll(CONFIG, params, emptied, ACTIONS[:8], key)
@@ -107,5 +105,5 @@ def test_start_refuses_frames_that_do_not_fit(params, change, sentence):
 
 @pytest.mark.parametrize("actions", [jnp.zeros((7,), int), jnp.zeros((0,), int), jnp.zeros((8, 2))])
 def test_rollout_refuses_actions_that_do_not_fill_clips(params, actions):
-    with pytest.raises(UserError, match="multiple of 8|dx, dy, dyaw"):
+    with pytest.raises(UserError, match=r"multiple of 8|dx, dy, dyaw"):
         rollouts.rollout(CONFIG, params, a_state(params), actions, jax.random.key(0))

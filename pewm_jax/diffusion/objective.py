@@ -81,9 +81,7 @@ def loss(
     error = (prediction - schedule.target(diffusion, x0, noise, timesteps)) ** 2
     if diffusion.target == "x0":
         error = error * schedule.x0_weight(diffusion, timesteps)[:, None, None, None, None]
-    measured = codec.encode(
-        config.codec, (frames.depth_THW > 0).astype(jnp.float32)[..., None]
-    )
+    measured = codec.encode(config.codec, (frames.depth_THW > 0).astype(jnp.float32)[..., None])
     split = codec.rgb_channels(config)
     rgb = error[..., :split].mean()
     depth = (error[..., split:] * measured).sum() / jnp.maximum(measured.sum(), 1)

@@ -42,9 +42,7 @@ def add_noise(config: DiffusionConfig, x0: Array, noise: Array, timesteps_B: Arr
     return a * x0 + b * noise
 
 
-def target(
-    config: DiffusionConfig, x0: Array, noise: Array, timesteps_B: Array
-) -> Array:
+def target(config: DiffusionConfig, x0: Array, noise: Array, timesteps_B: Array) -> Array:
     """Return what the network is asked for: x0, ε, or v = √ᾱ ε − √(1 − ᾱ) x0."""
     a, b = _coefficients(config, timesteps_B, x0.ndim)
     return {"x0": x0, "eps": noise, "v": a * noise - b * x0}[config.target]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import Config
-from pewm_jax.rollout import rollout, start
+from pewm_jax.rollouts import rollout, start
 from pewm_jax.types import Array, Camera, Frames, Params, WorldState
 
 METHODS = ("memory", "empty", "copy")

@@ -22,7 +22,7 @@ from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
 from pewm_jax.evaluation.protocol import file_hash, fingerprint
 from pewm_jax.evaluation.scoring import LongRollouts, Scored, roll_long, score_table
-from pewm_jax.rollout import load
+from pewm_jax.rollouts import load
 
 WEIGHTS = "weights.safetensors"
 PAGE, METRICS, STRIP = "index.html", "metrics.json", "strip.png"

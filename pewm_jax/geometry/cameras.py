@@ -64,7 +64,7 @@ def transform_points(transform: Array, points_3: Array) -> Array:
 
 
 def pixel_grid(height: int, width: int) -> np.ndarray:
-    """Return (H, W, 2) pixel centres (u, v): 0.5, 1.5, …"""
+    """Return (H, W, 2) pixel centres (u, v): 0.5, 1.5, and so on."""
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([u, v], -1).astype(np.float32)
 

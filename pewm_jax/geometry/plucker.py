@@ -40,9 +40,7 @@ def fold_frames(frames_TX: Array, temporal: int) -> Array:
     return repeated.reshape(-1, temporal, *frames_TX.shape[1:])
 
 
-def camera_latents(
-    camera: Camera, height: int, width: int, spatial: int, temporal: int
-) -> Array:
+def camera_latents(camera: Camera, height: int, width: int, spatial: int, temporal: int) -> Array:
     """Embed the cameras of one clip at the latent rate (paper, appendix Table 4).
 
     Args:

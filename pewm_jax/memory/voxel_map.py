@@ -140,7 +140,9 @@ def to_points(config: MemoryConfig, voxels: VoxelMap) -> tuple[Array, Array, Arr
     return points, features, valid
 
 
-def tokens(config: MemoryConfig, voxels: VoxelMap, camera: Camera, size: tuple[int, int]) -> MapTokens:
+def tokens(
+    config: MemoryConfig, voxels: VoxelMap, camera: Camera, size: tuple[int, int]
+) -> MapTokens:
     """Choose the M cells that condition one clip.
 
     Cells inside the view of any of the clip's cameras come first, nearest first (by the smallest

@@ -196,13 +196,14 @@ def apply(
     out_channels = params["proj_out"]["bias"].shape[0] // patch**2
     ends = Ends(config, out_channels, dtype)
     ends_params = {"params": {k: v for k, v in params.items() if k != "blocks"}}
-    video, text, time = ends.apply(
+    embedded: Any = ends.apply(
         ends_params,
         patchify(latents_BthwC, patch),
         text_BLC.astype(dtype),
         timesteps_B,
         method="embed",
     )
+    video, text, time = embedded
     angles = jnp.asarray(
         layers.rope_angles(frames, height // patch, width // patch, config.head_dim)
     )
@@ -215,5 +216,5 @@ def apply(
 
     body = jax.checkpoint(body) if config.remat else body
     (video, _), _ = jax.lax.scan(body, (video, text), (params["blocks"], expert_params))
-    patches = ends.apply(ends_params, video, time, method="project")
+    patches: Array = ends.apply(ends_params, video, time, method="project")
     return unpatchify(patches, frames, height, width, patch)

@@ -63,6 +63,16 @@ def rotate(x: Array, angles: Array) -> Array:
     return turned.reshape(*turned.shape[:-2], -1).astype(x.dtype)
 
 
+def rotate_halves(x: Array, angles: Array) -> Array:
+    """Rotate channel pairs (0, d/2), (1, d/2 + 1), … of x by angles (..., d/2).
+
+    The same as ``rotate`` up to the order of channels, and faster: no interleaving.
+    """
+    cos, sin = jnp.cos(angles), jnp.sin(angles)
+    a, b = jnp.split(x.astype(jnp.float32), 2, -1)
+    return jnp.concatenate([a * cos - b * sin, b * cos + a * sin], -1).astype(x.dtype)
+
+
 def rope_angles(frames: int, height: int, width: int, head_dim: int) -> np.ndarray:
     """Return (t·h·w, head_dim/2) rotary angles of a token grid, theta 1e4.
 

@@ -24,7 +24,7 @@ from pewm_jax.models import layers
 from pewm_jax.models.memory_geometry import Sightings, frequencies
 from pewm_jax.types import Array
 
-PEAK = 6.0
+PEAK = 12.0
 """Logit by which a cell in the middle of the patch looked at stands out at the start."""
 
 
@@ -84,16 +84,21 @@ class ProjectiveAttention(nn.Module):
         offset = jax.random.uniform(key, (heads, 2), minval=-0.5, maxval=0.5)
         angle = offset[..., None] * jnp.asarray(frequencies(head_dim, self.grid))
         size = math.sqrt(PEAK / math.sqrt(head_dim))
-        return layers.rotate(jnp.full(shape, size), angle.reshape(heads, -1))
+        return layers.rotate_halves(jnp.full(shape, size), angle.reshape(heads, -1))
+
+    def _look(self, x_BKMD: Array, index_BtKJ: Array) -> Array:
+        """Return (B, t, K, J, d): the tokens that each head's camera looks at."""
+        rows = jax.vmap(jax.vmap(lambda x, i: x[i]))(x_BKMD, index_BtKJ.swapaxes(1, 2))
+        return rows.swapaxes(1, 2)
 
     @nn.compact
     def __call__(self, video_BND: Array, memory_BMD: Array, seen: Sightings) -> Array:
         """Return (B, N, K·(d + 3)): attended features and mean place per head."""
         dtype, heads, head_dim = video_BND.dtype, self.heads, self.head_dim
-        batch, frames, cameras, tokens, _ = seen.angles_tqMR.shape
+        batch, frames, cameras = seen.angles_tqJR.shape[:3]
         width = heads * head_dim
         through = np.arange(heads) % cameras
-        depth = seen.place_tqM3[..., 2]
+        log_z = seen.place_tqJ3[..., 2][:, :, through]
 
         q = layers.split_heads(layers.dense(width, dtype, "to_q")(video_BND), heads)
         k = layers.split_heads(layers.dense(width, dtype, "to_k")(memory_BMD), heads)
@@ -108,28 +113,25 @@ class ProjectiveAttention(nn.Module):
 
         size = math.sqrt(PEAK / math.sqrt(head_dim))
         q_constant = self.param("q_constant", self._constant, (heads, head_dim))
-        k_constant = self.param(
-            "k_constant", nn.initializers.constant(size), (heads, head_dim)
-        )
+        k_constant = self.param("k_constant", nn.initializers.constant(size), (heads, head_dim))
         k_depth = self.param("k_depth", layers.zeros, (heads, head_dim))
-        nearer = self.param("nearer", nn.initializers.constant(0.5), (heads,))
+        nearer = self.param("nearer", nn.initializers.constant(2.0), (heads,))
         sink = self.param("sink", layers.zeros, (heads,))
 
         q = norm(q, "norm_q") + q_constant[:, None].astype(dtype)
         q = q.reshape(batch, heads, frames, -1, head_dim).transpose(0, 2, 1, 3, 4)
-        q = layers.rotate(q, seen.query_angles_nR)
-        k = norm(k, "norm_k")[:, None] + k_constant[:, None].astype(dtype)
-        log_z = depth[:, :, through]
+        q = layers.rotate_halves(q, seen.query_angles_nR)
+        k, v = (self._look(x, seen.index_tqJ[:, :, through]) for x in (norm(k, "norm_k"), v))
+        k = k + k_constant[:, None].astype(dtype)
         k = k + (log_z[..., None] * k_depth[:, None]).astype(dtype)
-        k = layers.rotate(k, seen.angles_tqMR[:, :, through])
+        k = layers.rotate_halves(k, seen.angles_tqJR[:, :, through])
 
         logits = jnp.einsum("btknd,btkmd->btknm", q, k, preferred_element_type=jnp.float32)
         logits = logits / math.sqrt(head_dim) - (nearer[:, None] * log_z)[..., None, :]
-        place = seen.place_tqM3[:, :, through].astype(dtype)
-        v = jnp.broadcast_to(v[:, None], (batch, frames, heads, tokens, head_dim))
+        place = seen.place_tqJ3[:, :, through].astype(dtype)
         mixed = masked_attention(
             logits,
-            seen.visible_tqM[:, :, through, None],
+            seen.visible_tqJ[:, :, through, None],
             sink,
             jnp.concatenate([v, place], -1),
         )
@@ -186,9 +188,7 @@ class MemoryBlock(nn.Module):
         mixed = layers.dense(width, dtype, "to_out")(mixed)
 
         out = video_BND + m_gate[:, None] * mixed
-        forward = layers.FeedForward(memory.mlp_ratio, name="ff")(
-            layers.layer_norm(out, "norm2")
-        )
+        forward = layers.FeedForward(memory.mlp_ratio, name="ff")(layers.layer_norm(out, "norm2"))
         out = out + gate[:, None] * forward
         remembers = valid_BM.any(-1)[:, None, None]
         return jnp.where(remembers, out, video_BND)

@@ -28,6 +28,8 @@ from pewm_jax.types import Array, Camera
 
 MARGIN = 0.25
 """Cells up to this share of the image outside its border are still looked at."""
+BEHIND = 1.4
+"""A cell this many times farther than the nearest one in its patch of the image is hidden."""
 NEAREST_M = 0.05
 """Cells nearer to the camera plane than this are masked, metres."""
 
@@ -38,23 +40,25 @@ class Sightings:
     """Map tokens as seen through the cameras of every latent frame (q cameras each).
 
     Attributes:
-        angles_tqMR: (B, t, q, M, d/2) rotary angles of the keys.
-        place_tqM3: (B, t, q, M, 3) image coordinates in [−1, 1] and log depth.
-        visible_tqM: (B, t, q, M) bool.
+        index_tqJ: (B, t, q, J) int32, which of the M map tokens are looked at.
+        angles_tqJR: (B, t, q, J, d/2) rotary angles of the keys.
+        place_tqJ3: (B, t, q, J, 3) image coordinates in [−1, 1] and log depth.
+        visible_tqJ: (B, t, q, J) bool.
         query_angles_nR: (n, d/2) rotary angles of the n patches of one latent frame.
     """
 
-    angles_tqMR: Array
-    place_tqM3: Array
-    visible_tqM: Array
+    index_tqJ: Array
+    angles_tqJR: Array
+    place_tqJ3: Array
+    visible_tqJ: Array
     query_angles_nR: Array
 
 
 def frequencies(head_dim: int, grid: int) -> np.ndarray:
-    """Return (head_dim/4,) radians per patch: wavelengths of 2 patches up to 4 × the grid."""
+    """Return (head_dim/4,) radians per patch: wavelengths of 1 patch up to 2 × the grid."""
     count = head_dim // 4
     share = np.arange(count) / max(count - 1, 1)
-    return (2 * math.pi / (2.0 * (2.0 * grid) ** share)).astype(np.float32)
+    return (2 * math.pi / (2.0 * grid) ** share).astype(np.float32)
 
 
 def _angles(uv_2: Array, head_dim: int, grid: int) -> Array:
@@ -63,8 +67,26 @@ def _angles(uv_2: Array, head_dim: int, grid: int) -> Array:
     return angle.reshape(*uv_2.shape[:-1], -1)
 
 
+def hidden(uv_TM2: Array, z_TM: Array, visible_TM: Array, size: np.ndarray, bin_px: int) -> Array:
+    """Return (T, M) bool: cells behind a much nearer one in the same bin of the image.
+
+    A coarse depth buffer with bins of ``bin_px`` pixels. Cells are thick, so a cell counts as
+    hidden only where it is ``BEHIND`` times farther than the nearest one.
+    """
+    columns = -(-int(size[0]) // bin_px)
+    place = jnp.clip(jnp.floor(uv_TM2 / bin_px), 0, np.ceil(size / bin_px) - 1).astype(jnp.int32)
+    index = place[..., 1] * columns + place[..., 0]
+    bins = columns * (-(-int(size[1]) // bin_px))
+    depth = jnp.where(visible_TM, z_TM, jnp.inf)
+    nearest = jax.vmap(lambda i, d: jnp.full((bins,), jnp.inf).at[i].min(d)[i])(index, depth)
+    return visible_TM & (z_TM > BEHIND * nearest)
+
+
 def sightings(config: Config, camera: Camera, points_M3: Array, valid_M: Array) -> Sightings:
-    """Move map tokens into all cameras of a batch of clips.
+    """Choose and place the map tokens that each camera of a batch of clips looks at.
+
+    Each camera gets the J = ``memory.looks`` nearest tokens in its view; tokens hidden behind
+    much nearer ones come last.
 
     Args:
         config: the experiment.
@@ -76,12 +98,19 @@ def sightings(config: Config, camera: Camera, points_M3: Array, valid_M: Array) 
     patch = codec.spatial * config.dit.patch
     rows, columns = clip.height // patch, clip.width // patch
     head_dim, grid = config.memory.head_dim, max(rows, columns)
+    looks = min(config.memory.looks, points_M3.shape[1])
 
     uv, z = project(points_M3[:, None], camera)
     size = np.array([clip.width, clip.height], np.float32)
     margin = MARGIN * size
     inside = jnp.all((uv > -margin) & (uv < size + margin), -1)
     visible = inside & (z > NEAREST_M) & valid_M[:, None]
+    behind = jax.vmap(lambda uv, z, seen: hidden(uv, z, seen, size, patch))(uv, z, visible)
+    rank = jnp.where(visible, z + jnp.where(behind, 1e3, 0.0), jnp.inf)
+    _, index = jax.lax.top_k(-rank, looks)
+
+    uv = jnp.take_along_axis(uv, index[..., None], 2)
+    z, visible = (jnp.take_along_axis(x, index, 2) for x in (z, visible))
     uv = jnp.where(visible[..., None], uv, 0.0)
     log_z = jnp.log(jnp.where(visible, z, 1.0))
     place = jnp.concatenate([2 * uv / size - 1, log_z[..., None]], -1)
@@ -90,9 +119,10 @@ def sightings(config: Config, camera: Camera, points_M3: Array, valid_M: Array) 
     v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
     centres = np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)
     return Sightings(
-        angles_tqMR=_angles(fold(uv) / patch, head_dim, grid),
-        place_tqM3=fold(place),
-        visible_tqM=fold(visible),
+        index_tqJ=fold(index),
+        angles_tqJR=_angles(fold(uv) / patch, head_dim, grid),
+        place_tqJ3=fold(place),
+        visible_tqJ=fold(visible),
         query_angles_nR=_angles(jnp.asarray(centres), head_dim, grid),
     )
 
@@ -110,5 +140,3 @@ def sinusoid_3d(config: Config, camera: Camera, points_M3: Array) -> Array:
     angle = local[..., None] * (2 * math.pi / wavelengths).astype(np.float32)
     angle = angle.reshape(*local.shape[:-1], -1)
     return jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1)
-
-

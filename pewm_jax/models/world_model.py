@@ -113,6 +113,7 @@ def init_memory(config: Config, key: Array) -> Params:
     seen = None
     if memory.positions == "projective":
         seen = Sightings(
+            jnp.zeros((1, 1, q, 1), jnp.int32),
             jnp.zeros((1, 1, q, 1, half)),
             jnp.zeros((1, 1, q, 1, 3)),
             jnp.ones((1, 1, q, 1), bool),
@@ -180,9 +181,11 @@ def apply(
         embedded = token_layer.apply({"params": memory["tokens"]}, features.astype(dtype))
         expert_params = memory["blocks"]
 
-        def expert(layer, video, time):
+        def read_map(layer: Params, video: Array, time: Array) -> Array:
             block = MemoryBlock(config)
             return block.apply({"params": layer}, video, time, camera, embedded, valid, seen)
+
+        expert = read_map
 
     out = dit.apply(
         config.dit,
@@ -208,12 +211,13 @@ def flops_per_clip(config: Config, *, memory: bool) -> float:
     total = config.dit.layers * block + ends
     if memory:
         m = config.memory
-        inner, looks = m.heads * m.head_dim, m.tokens
-        geometry = 3 * m.heads if m.positions == "projective" else 0
+        projective = m.positions == "projective"
+        inner, looks = m.heads * m.head_dim, min(m.looks, m.tokens) if projective else m.tokens
+        geometry = 3 * m.heads if projective else 0
         read = video * width * (1.5 * width + inner + 2 * m.mlp_ratio * width)
-        read += video * (inner + geometry) * width + 2 * looks * inner * inner
+        read += video * (inner + geometry) * width + 2 * m.tokens * inner * inner
         read += video * looks * (2 * inner + geometry)
         total += config.dit.layers * read
         total += video * camera_channels(config) * patch**2 * width / 2
-        total += looks * _token_channels(config) * inner
+        total += m.tokens * _token_channels(config) * inner
     return 2.0 * math.ceil(total)

@@ -141,7 +141,10 @@ def test_guidance_interpolates_between_with_and_without_map():
     params = randomise(world_model.init(config, key))
     frames = objective.as_signal(clip.frames)
     conditioning = world_model.condition(
-        config, frames.rgb_THWC[:, 0], frames.depth_THW[:, 0], jax.tree.map(jnp.asarray, frames.camera)
+        config,
+        frames.rgb_THWC[:, 0],
+        frames.depth_THW[:, 0],
+        jax.tree.map(jnp.asarray, frames.camera),
     )
     tokens = objective.clip_tokens(config, clip)
     noise = jax.random.normal(key, (2, 3, 4, 6, 256))

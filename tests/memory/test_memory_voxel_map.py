@@ -128,8 +128,12 @@ def test_every_point_of_a_frame_is_within_half_a_cell_of_its_centre():
     frames = Frames(rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW, frames.camera)
     voxels = voxel_map.empty(config, np.zeros(3), 6)
     voxels = voxel_map.insert_frames(config, voxels, frames, np.array([True, False]))
-    points = np.asarray(cameras.unproject(frames.depth_THW[0], Camera(
-        frames.camera.intrinsics_4[0], frames.camera.world_from_camera[0])))
+    points = np.asarray(
+        cameras.unproject(
+            frames.depth_THW[0],
+            Camera(frames.camera.intrinsics_4[0], frames.camera.world_from_camera[0]),
+        )
+    )
     centres, _, valid = voxel_map.to_points(config, voxels)
     centres = np.asarray(centres[valid])
     gap = np.abs(points.reshape(-1, 1, 3) - centres).max(-1)
@@ -143,9 +147,7 @@ def test_pixels_without_depth_leave_no_trace():
     config = tiny_config().memory
     rng = np.random.default_rng(0)
     frames = random_frames(rng, 1)
-    blank = Frames(
-        rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW * 0, frames.camera
-    )
+    blank = Frames(rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW * 0, frames.camera)
     voxels = voxel_map.insert_frames(config, voxel_map.empty(config, np.zeros(3), 6), blank)
     assert int(voxels.occupied) == 0
 

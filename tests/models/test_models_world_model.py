@@ -116,7 +116,7 @@ def test_each_latent_frame_looks_through_its_own_cameras():
     other = sightings(
         config, Camera(camera.intrinsics_4, poses), tokens.points_world_M3, tokens.valid_M
     )
-    changed = np.abs(seen.place_tqM3 - other.place_tqM3).max((0, 3, 4)) > 1e-6
+    changed = np.abs(seen.place_tqJ3 - other.place_tqJ3).max((0, 3, 4)) > 1e-6
     expected = np.zeros((3, 4), bool)
     expected[2, 1] = True
     np.testing.assert_array_equal(changed, expected)

@@ -1,0 +1,53 @@
+# Two commands do everything: `make demo` and `make test`. Both make .venv first.
+PYTHON ?= python3
+PY = .venv/bin/python
+RUN ?= runs/demo
+DATA ?= data/demo
+
+.PHONY: help demo test lint format bench clean
+
+help:
+	@echo "make demo    collect, train, imagine and score; ends with the path of a report page"
+	@echo "make test    the whole test suite"
+	@echo "make lint    ruff (format and rules) and pyright"
+	@echo "make format  let ruff rewrite the files"
+	@echo "make bench   speed, each beside a named peer"
+	@echo "make clean   remove .venv (data/ and runs/ stay)"
+
+.venv/made:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "error: $(PYTHON) is older than 3.11; name a newer one: make PYTHON=python3.12"; exit 2; }
+	@echo "setting up .venv (about a minute) …"
+	@$(PYTHON) -m venv .venv
+	@touch $@
+
+.venv/installed: .venv/made pyproject.toml
+	@$(PY) -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+.venv/installed-dev: .venv/made pyproject.toml
+	@$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@ .venv/installed
+
+demo: .venv/installed
+	@$(PY) -m pewm_jax.data collect $(DATA)
+	@$(PY) train.py demo --data.path $(DATA) --train.run $(RUN)
+	@$(PY) evaluate.py $(RUN)
+
+test: .venv/installed-dev
+	@$(PY) -m pytest -n 2 --dist loadfile $(ARGS)
+
+lint: .venv/installed-dev
+	@.venv/bin/ruff format --check .
+	@.venv/bin/ruff check .
+	@.venv/bin/pyright
+
+format: .venv/installed-dev
+	@.venv/bin/ruff format .
+	@.venv/bin/ruff check --fix .
+
+bench: .venv/installed
+	@for file in benchmarks/*.py; do echo "== $$file"; $(PY) $$file || exit 1; done
+
+clean:
+	rm -rf .venv
