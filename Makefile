@@ -30,7 +30,7 @@ help:
 	@touch $@ .venv/installed
 
 demo: .venv/installed
-	@$(PY) -m pewm_jax.data collect $(DATA)
+	@$(PY) -m pewm_jax.data collect $(DATA) --size 48
 	@$(PY) train.py demo --data.path $(DATA) --train.run $(RUN)
 	@$(PY) evaluate.py $(RUN)
 

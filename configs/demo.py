@@ -1,8 +1,46 @@
-"""The demo: procedural houses at 64×64 pixels, minutes on two cores."""
+"""Procedural houses at 48×48 pixels: two stages and a report in minutes on two CPU cores."""
 
-from pewm_jax.config import Config
+from pewm_jax.config import (
+    ClipConfig,
+    Config,
+    DataConfig,
+    DiffusionConfig,
+    DiTConfig,
+    MemoryConfig,
+    StageConfig,
+    TrainConfig,
+)
 
 
 def config() -> Config:
-    """Return the settings of the demo."""
-    return Config()
+    """Return the settings of the demo.
+
+    Each was chosen by trying (48 held-out clips or fewer, one seed: trials, not results):
+
+    * ``snr_shift`` 64 and ``max_weight`` 1: an 8×8 pixel patch of 4 frames is so redundant that
+      its mean colour shows through all but the heaviest noise. With a shift of 1 every patch
+      hallucinated its own colour and stage 1 reached 12.9 dB, with 64 it reached 15.2 dB.
+    * 48 pixels and not 64: half the time per step, at the same 6 × 6 or 8 × 8 patches of 8 pixels.
+    * memory narrower than the backbone: attention to the map is what a step's time goes to.
+    """
+    return Config(
+        clip=ClipConfig(height=48, width=48),
+        dit=DiTConfig(layers=4, heads=6, head_dim=32),
+        memory=MemoryConfig(
+            cell_m=(0.25, 0.25, 0.25),
+            tokens=384,
+            looks=96,
+            heads=8,
+            head_dim=24,
+            mlp_ratio=2,
+        ),
+        diffusion=DiffusionConfig(snr_shift=64.0, max_weight=1.0, sample_steps=6),
+        data=DataConfig(path="data/demo", context=20),
+        train=TrainConfig(
+            run="runs/demo",
+            stage1=StageConfig(steps=300, batch=16, learning_rate=1e-3, warmup=30),
+            stage2=StageConfig(steps=600, batch=16, learning_rate=2e-3, warmup=30),
+            ema=0.98,
+            preview_every=300,
+        ),
+    )
