@@ -219,7 +219,7 @@ def _revisit(agent: _Agent) -> Trajectory:
 def _follow(agent: _Agent) -> None:
     """Walk shortest paths to far goals, one after the other."""
     while not agent.done:
-        field = _next_goal(agent)
+        field, before = _next_goal(agent), len(agent.poses)
         stalled, best = 0, _value(agent, field, agent.pose[None, :2])[0]
         while not agent.done and stalled < 3:
             if agent.continuous:
@@ -235,7 +235,7 @@ def _follow(agent: _Agent) -> None:
             best = min(best, value)
             if _distance(agent.grid, field, agent.pose[None, :2])[0] < 2 * agent.config.step_m:
                 break
-        if stalled >= 3 and not agent.done:  # a corner the steps do not fit: leave it
+        if stalled >= 3 or len(agent.poses) == before:  # steps do not fit here: leave the place
             _walk(agent, steps=4)
 
 

@@ -20,7 +20,7 @@ import trimesh
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.checks import check_episode
 from pewm_jax.data.collect import collect
-from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.dataset import EpisodeSource, write_shard
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.recording import CollectConfig, house_seed, make_episode, scenes_of
 from pewm_jax.data.validate import ValidateConfig, validate
@@ -107,14 +107,15 @@ def test_a_resumed_collection_makes_only_what_is_missing(whole, tmp_path, mesh):
     config = settings(out, mesh)
     manifest = json.loads((train / "collecting.json").read_text())
     (train / "collecting.json").write_text(json.dumps(manifest["settings"]))
-    lost, cut, kept = (train / f"shard-{k:05d}-of-00004.array_record" for k in range(3))
+    lost, cut, kept, other = (train / f"shard-{k:05d}-of-00004.array_record" for k in range(4))
     lost.unlink()
+    write_shard(other, [make_episode(config, "train", k) for k in (3, 4)])
     cut.write_bytes(cut.read_bytes()[:5000])
     (train / "shard-00003-of-00004.array_record.123.partial").write_bytes(b"half")
     made = kept.stat().st_mtime_ns
     said = []
     collect(config, said.append)
-    assert said[1] == "resuming: 2 files are there, 2 are missing."
+    assert said[1] == "resuming: 1 files are there, 3 are missing."
     assert fingerprints(out) == whole[1]
     assert kept.stat().st_mtime_ns == made
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.config import ActionConfig, UserError
-from pewm_jax.data.navigation import line_is_free
+from pewm_jax.data.navigation import NavGrid, line_is_free
 from pewm_jax.data.trajectories import make_trajectory
 from pewm_jax.geometry.actions import actions_between, discrete_table, integrate
 
@@ -91,6 +91,19 @@ def test_a_revisit_comes_back_over_the_same_places(seed, continuous):
 def test_other_steps_and_angles_are_kept():
     made = walk(1, actions=ActionConfig(step_m=0.1, turn_deg=15.0))
     assert set(np.round(np.abs(made.actions).max(1), 6)) <= {0.1, round(math.radians(15), 6)}
+
+
+@pytest.mark.parametrize("policy", ["follow", "walk", "revisit"])
+@pytest.mark.parametrize("continuous", [False, True])
+def test_in_a_closet_the_agent_only_turns(policy, continuous):
+    """Where no step fits, every policy still ends, and stays inside."""
+    free = np.zeros((9, 9), bool)
+    free[4, 4] = True
+    closet = NavGrid(free, np.zeros(2), 0.1, 0.0)
+    rng = np.random.default_rng(0)
+    made = make_trajectory(closet, ActionConfig(), 60, rng, policy=policy, continuous=continuous)
+    assert np.ptp(made.planar_T3[:, :2], axis=0).max() < 0.1
+    assert np.ptp(made.planar_T3[:, 2]) > 1.0
 
 
 def test_what_cannot_be_walked_is_refused():
