@@ -20,7 +20,8 @@ import array_record.python.array_record_module as array_file
 from grain import sources
 
 from pewm_jax.config import UserError
-from pewm_jax.data.episodes import VERSION, Episode, read_episode
+from pewm_jax.data.episodes import Episode, read_episode
+from pewm_jax.data.layout import VERSION
 
 MANIFEST = "dataset.json"
 

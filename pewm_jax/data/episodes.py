@@ -1,15 +1,12 @@
 """The episode: what it holds, and how it becomes bytes and comes back.
 
-One record is one episode. It starts with a magic word and a JSON header that says where every
-array and every encoded image lies, so that single frames are decoded without touching the others.
-Byte by byte in ``docs/data_format.md``.
+One record is one episode. Its header says where every array and every encoded image lies, so that
+single frames are decoded without touching the others (``layout.py``, ``docs/data_format.md``).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
-import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,32 +14,20 @@ import cv2
 import numpy as np
 
 from pewm_jax.config import UserError
+from pewm_jax.data.layout import (
+    CONVENTIONS,
+    UNITS,
+    VERSION,
+    check_span,
+    pack_record,
+    read_header,
+)
 from pewm_jax.types import Camera, Frames
 
-MAGIC = b"PEWMEPIS"
-VERSION = 1
 MILLIMETRES = 1000.0
 DEPTH_LIMIT_M = 65.535
 """Depths beyond what 16 bits of millimetres hold are stored as 0, "no measurement"."""
 PNG_LEVEL = 1
-
-CONVENTIONS = {
-    "camera": "OpenCV axes: x right, y down, z forward",
-    "world": "gravity-aligned, z up",
-    "world_from_camera": "4x4 rigid transform, camera to world, one per frame",
-    "intrinsics": "fx, fy, cx, cy; the centre of the top-left pixel is (0.5, 0.5)",
-    "depth": "along z, not along the ray; 0 = no measurement",
-    "actions": "dx forward, dy left, dyaw counter-clockwise; first move, then turn; "
-    "action k leads from frame k to frame k + 1",
-    "action_ids": "0 forward, 1 turn left, 2 turn right",
-    "ids": "instance per pixel plus 1; 0 = nothing",
-}
-UNITS = {
-    "world_from_camera": "metre",
-    "depth": "millimetre on disk, metre once decoded",
-    "intrinsics": "pixel",
-    "actions": "metre, metre, radian",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,7 +182,7 @@ def write_episode(
         "arrays": {},
         "streams": {},
     }
-    return _pack(header, {k: v for k, v in small.items() if v is not None}, streams)
+    return pack_record(header, {k: v for k, v in small.items() if v is not None}, streams)
 
 
 def to_millimetres(depth: np.ndarray) -> np.ndarray:
@@ -206,35 +191,6 @@ def to_millimetres(depth: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         kept = (millimetres > 0) & (millimetres <= DEPTH_LIMIT_M * MILLIMETRES)
     return np.where(kept, millimetres, 0).astype(np.uint16)
-
-
-def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
-    """Parse the header of a record; spans become offsets from the start of the record.
-
-    Raises:
-        UserError: not an episode, another format version, or a header that does not parse.
-    """
-    if len(record) < len(MAGIC) + 4 or record[: len(MAGIC)] != MAGIC:
-        raise UserError(
-            f"{where} is not a pewm episode (its first bytes differ); read a file made by "
-            "`python -m pewm_jax.data collect` or `import`."
-        )
-    (length,) = struct.unpack_from("<I", record, len(MAGIC))
-    start = len(MAGIC) + 4
-    try:
-        header = json.loads(record[start : start + length])
-        version = header["version"]
-    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError):
-        raise UserError(
-            f"{where}: the episode's header does not parse; the record is damaged, collect or "
-            "import it again."
-        ) from None
-    if version != VERSION:
-        raise UserError(
-            f"{where} has format version {version}, this library reads version {VERSION}; "
-            "collect or import it again."
-        )
-    return _absolute(header, start + length)
 
 
 def read_episode(record: bytes, where: str = "record") -> Episode:
@@ -263,7 +219,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
                 f"expected {expected.get(field)}; the counts do not match, write it again."
             )
         count = int(np.prod(place["shape"]))
-        _check_span(record, place["offset"], count * 4, where, field)
+        check_span(record, place["offset"], count * 4, where, field)
         flat = np.frombuffer(record, place["dtype"], count, place["offset"])
         arrays[field] = flat.reshape(place["shape"]).copy()
     for stream in ("rgb", "depth", *header["streams"]):
@@ -274,7 +230,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
                 "not match, write it again."
             )
         if spans:
-            _check_span(record, spans[-1][0], spans[-1][1], where, stream)
+            check_span(record, spans[-1][0], spans[-1][1], where, stream)
     intrinsics, pose = arrays["intrinsics"], arrays["world_from_camera"]
     if intrinsics is None or pose is None:
         raise UserError(f"{where} lacks intrinsics or world_from_camera; write it again.")
@@ -298,47 +254,6 @@ def _png(image: np.ndarray) -> bytes:
     done, code = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
     assert done
     return code.tobytes()
-
-
-def _pack(
-    header: dict[str, Any], arrays: Mapping[str, np.ndarray], streams: Mapping[str, list[bytes]]
-) -> bytes:
-    """Lay out arrays, then images, and describe them with offsets from the end of the header."""
-    blobs: list[bytes] = []
-    offset = 0
-    for field, array in arrays.items():
-        header["arrays"][field] = {
-            "offset": offset,
-            "dtype": array.dtype.str,
-            "shape": list(array.shape),
-        }
-        blobs.append(array.tobytes())
-        offset += array.nbytes
-    for stream, images in streams.items():
-        spans = []
-        for image in images:
-            spans.append([offset, len(image)])
-            blobs.append(image)
-            offset += len(image)
-        header["streams"][stream] = {"codec": "png", "spans": spans}
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    return b"".join([MAGIC, struct.pack("<I", len(text)), text, *blobs])
-
-
-def _absolute(header: dict[str, Any], payload: int) -> dict[str, Any]:
-    for place in header["arrays"].values():
-        place["offset"] += payload
-    for stream in header["streams"].values():
-        stream["spans"] = [(offset + payload, size) for offset, size in stream["spans"]]
-    return header
-
-
-def _check_span(record: bytes, offset: int, size: int, where: str, field: str) -> None:
-    if offset + size > len(record):
-        raise UserError(
-            f"{where}, field {field}: the record ends after {len(record)} bytes but the field "
-            f"reaches to {offset + size}; it is truncated, collect or import it again."
-        )
 
 
 def _check_arrays(arrays: EpisodeArrays, name: str) -> None:

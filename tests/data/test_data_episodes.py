@@ -119,6 +119,7 @@ def test_the_record_is_laid_out_as_documented():
         (lambda b: b[:10], "not a pewm episode"),
         (lambda b: b"X" + b[1:], "not a pewm episode"),
         (lambda b: b[:100], "does not parse"),
+        (lambda b: b.replace(b'"streams"', b'"steams!"'), "does not parse"),
         (lambda b: b[:-1], "truncated"),
         (lambda b: b.replace(b'"version":1', b'"version":9'), "format version 9"),
         (lambda b: b.replace(b'"frames":12', b'"frames":13'), "counts do not match"),

@@ -1,0 +1,124 @@
+"""Where everything lies in a record: magic word, header, payload.
+
+Byte by byte in ``docs/data_format.md``.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.config import UserError
+
+MAGIC = b"PEWMEPIS"
+VERSION = 1
+FIELDS = (
+    "format",
+    "version",
+    "name",
+    "scene",
+    "frames",
+    "height",
+    "width",
+    "units",
+    "conventions",
+    "info",
+    "arrays",
+    "streams",
+)
+"""What every header has."""
+
+CONVENTIONS = {
+    "camera": "OpenCV axes: x right, y down, z forward",
+    "world": "gravity-aligned, z up",
+    "world_from_camera": "4x4 rigid transform, camera to world, one per frame",
+    "intrinsics": "fx, fy, cx, cy; the centre of the top-left pixel is (0.5, 0.5)",
+    "depth": "along z, not along the ray; 0 = no measurement",
+    "actions": "dx forward, dy left, dyaw counter-clockwise; first move, then turn; "
+    "action k leads from frame k to frame k + 1",
+    "action_ids": "0 forward, 1 turn left, 2 turn right",
+    "ids": "instance per pixel plus 1; 0 = nothing",
+}
+UNITS = {
+    "world_from_camera": "metre",
+    "depth": "millimetre on disk, metre once decoded",
+    "intrinsics": "pixel",
+    "actions": "metre, metre, radian",
+}
+
+
+def pack_record(
+    header: dict[str, Any], arrays: Mapping[str, np.ndarray], streams: Mapping[str, list[bytes]]
+) -> bytes:
+    """Lay out arrays, then images, and describe them with offsets from the end of the header."""
+    blobs: list[bytes] = []
+    offset = 0
+    for field, array in arrays.items():
+        header["arrays"][field] = {
+            "offset": offset,
+            "dtype": array.dtype.str,
+            "shape": list(array.shape),
+        }
+        blobs.append(array.tobytes())
+        offset += array.nbytes
+    for stream, images in streams.items():
+        spans = []
+        for image in images:
+            spans.append([offset, len(image)])
+            blobs.append(image)
+            offset += len(image)
+        header["streams"][stream] = {"codec": "png", "spans": spans}
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    return b"".join([MAGIC, struct.pack("<I", len(text)), text, *blobs])
+
+
+def _absolute(header: dict[str, Any], payload: int) -> dict[str, Any]:
+    for place in header["arrays"].values():
+        place["offset"] += payload
+    for stream in header["streams"].values():
+        stream["spans"] = [(offset + payload, size) for offset, size in stream["spans"]]
+    return header
+
+
+def check_span(record: bytes, offset: int, size: int, where: str, field: str) -> None:
+    """Refuse a record that ends before a field does."""
+    if offset + size > len(record):
+        raise UserError(
+            f"{where}, field {field}: the record ends after {len(record)} bytes but the field "
+            f"reaches to {offset + size}; it is truncated, collect or import it again."
+        )
+
+
+def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
+    """Parse the header of a record; spans become offsets from the start of the record.
+
+    Raises:
+        UserError: not an episode, another format version, or a header that does not parse.
+    """
+    if len(record) < len(MAGIC) + 4 or record[: len(MAGIC)] != MAGIC:
+        raise UserError(
+            f"{where} is not a pewm episode (its first bytes differ); read a file made by "
+            "`python -m pewm_jax.data collect` or `import`."
+        )
+    (length,) = struct.unpack_from("<I", record, len(MAGIC))
+    start = len(MAGIC) + 4
+    try:
+        header = json.loads(record[start : start + length])
+        version = header["version"]
+        if version == VERSION:
+            header = _absolute({field: header[field] for field in FIELDS}, start + length)
+    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError):
+        raise UserError(
+            f"{where}: the episode's header does not parse; the record is damaged, collect or "
+            "import it again."
+        ) from None
+    if version != VERSION:
+        raise UserError(
+            f"{where} has format version {version}, this library reads version {VERSION}; "
+            "collect or import it again."
+        )
+    return header
