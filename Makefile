@@ -3,6 +3,8 @@ PYTHON ?= python3
 PY = .venv/bin/python
 RUN ?= runs/demo
 DATA ?= data/demo
+PRESET ?= demo
+COLLECT ?= --size 48
 
 .PHONY: help demo test lint format bench clean
 
@@ -30,8 +32,8 @@ help:
 	@touch $@ .venv/installed
 
 demo: .venv/installed
-	@$(PY) -m pewm_jax.data collect $(DATA) --size 48
-	@$(PY) train.py demo --data.path $(DATA) --train.run $(RUN)
+	@$(PY) -m pewm_jax.data collect $(DATA) $(COLLECT)
+	@$(PY) train.py $(PRESET) --data.path $(DATA) --train.run $(RUN)
 	@$(PY) evaluate.py $(RUN)
 
 test: .venv/installed-dev

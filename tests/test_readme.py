@@ -1,0 +1,143 @@
+"""Every command and the example of README.md are run, in a small copy of the user's folder."""
+
+import dataclasses
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import configs
+from pewm_jax.data.houses import generate_house
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+ICL = ROOT.parent / "shared" / "data" / "icl_livingroom"
+COLLECT = ["--train", "2", "--validation", "1", "--test", "1", "--frames", "40"]
+SMALLER = {
+    "python -m pewm_jax.data collect data/demo --size 48": COLLECT,
+    "python -m pewm_jax.data collect data/mine --scene path.glb --size 48": COLLECT,
+    "python train.py demo": ["--config", "small.json"],
+    "python evaluate.py runs/demo": shlex.split(
+        "--clips 2 --seeds 0 1 --videos 1 --video_clips 1 --batch 2"
+    ),
+}
+"""Flags that make a command of the README small enough for a test."""
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def commands():
+    return [line for block in blocks("bash") for line in block.splitlines() if line.strip()]
+
+
+def run(arguments, cwd):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"}
+    done = subprocess.run(
+        arguments,
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, f"{arguments}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+    return done.stdout
+
+
+def small_settings():
+    demo = configs.load("demo")
+    tiny = configs.load("tiny")
+    stage = {"steps": 2, "batch": 2, "warmup": 1}
+    return {
+        "dit": dataclasses.asdict(tiny.dit),
+        "memory": {"tokens": 64, "looks": 32, "heads": 4, "head_dim": 8, "cells": [32, 32, 16]},
+        "diffusion": {"snr_shift": demo.diffusion.snr_shift, "sample_steps": 2},
+        "data": {"context": 4},
+        "train": {"stage1": stage, "stage2": stage, "preview_every": 2},
+    }
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder that looks like a clone, with a mesh and a recording of the user's in it."""
+    path = tmp_path_factory.mktemp("clone with spaces")
+    for name in ("train.py", "evaluate.py", "configs", "pewm_jax"):
+        (path / name).symlink_to(ROOT / name)
+    generate_house(4).export(path / "path.glb")
+    (path / "recordings").mkdir()
+    if ICL.is_dir():
+        (path / "recordings" / "livingroom").symlink_to(ICL)
+    (path / "small.json").write_text(json.dumps(small_settings()))
+    return path
+
+
+def test_the_commands_and_then_the_example_work_as_written(folder):
+    python = [c for c in commands() if c.startswith("python ")]
+    assert len(python) >= 10
+    assert set(SMALLER) <= set(python), "the README no longer has a command this test shortens"
+    for command in python:
+        if "recordings/livingroom" in command and not ICL.is_dir():
+            continue
+        arguments = [sys.executable, *shlex.split(command)[1:], *SMALLER.get(command, [])]
+        run(arguments, folder)
+    assert (folder / "runs/demo/report/index.html").stat().st_size > 10_000
+    assert (folder / "episode.png").is_file()
+
+    (example,) = blocks("python")
+    assert len([line for line in example.splitlines() if line.strip()]) <= 15
+    out = run([sys.executable, "-c", example], folder)
+    assert out.startswith("(8, 48, 48, 3) (8, 48, 48)\n")
+    assert "cells remembered" in out
+
+
+def test_make_demo_runs_all_of_it_and_does_nothing_twice(tmp_path):
+    settings = {
+        "PY": sys.executable,
+        "PRESET": "tiny",
+        "DATA": str(tmp_path / "data"),
+        "RUN": str(tmp_path / "run"),
+        "COLLECT": "--size 16 " + " ".join(COLLECT),
+    }
+    make = ["make", "-o", ".venv/installed", "demo", *(f"{k}={v}" for k, v in settings.items())]
+    out = run(make, ROOT)
+    page = tmp_path / "run" / "report" / "index.html"
+    assert out.strip().splitlines()[-1] == f"report: {page}"
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
+    run(make, ROOT)
+    changed = [p for p, at in before.items() if p.exists() and p.stat().st_mtime_ns != at]
+    assert not [p for p in changed if ".cache" not in p.parts], "everything was done already"
+
+
+def test_make_test_runs_the_suite():
+    out = run(
+        [
+            "make",
+            "-o",
+            ".venv/installed-dev",
+            "test",
+            f"PY={sys.executable}",
+            "ARGS=tests/test_tree.py",
+        ],
+        ROOT,
+    )
+    assert re.search(r"\d+ passed", out)
+
+
+def test_every_file_the_readme_names_exists():
+    for name in re.findall(r"\]\((?!http)([^)]+)\)", README):
+        assert (ROOT / name).is_file(), name
+    for name in re.findall(r"`([a-z_]+/|[a-z_]+\.py)`", README):
+        assert (ROOT / name).exists() or (ROOT / "pewm_jax" / name).exists(), name
+
+
+def test_every_block_of_commands_is_covered():
+    for command in commands():
+        assert command.startswith(("python ", "make demo", "make test")), command
