@@ -75,4 +75,5 @@ def x0_weight(config: DiffusionConfig, timesteps_B: Array) -> Array:
 def trailing_steps(config: DiffusionConfig) -> np.ndarray:
     """Return (sample_steps,) descending timesteps, the last training step first."""
     spacing = config.train_steps / config.sample_steps
-    return np.round(np.arange(config.train_steps, 0, -spacing)).astype(np.int32) - 1
+    levels = config.train_steps - spacing * np.arange(config.sample_steps)
+    return np.round(levels).astype(np.int32) - 1

@@ -83,6 +83,15 @@ def test_steps_trail():
     np.testing.assert_array_equal(steps, np.arange(999, 0, -100))
 
 
+def test_every_number_of_steps_is_exactly_that_many_and_starts_at_pure_noise():
+    for count in range(1, 1001):
+        steps = schedule.trailing_steps(DiffusionConfig(sample_steps=count))
+        assert len(steps) == count
+        assert steps[0] == 999
+        assert steps[-1] >= 0
+        assert np.all(np.diff(steps) < 0), count
+
+
 def make_clip(config, seed=0, batch=2, context=3):
     rng = np.random.default_rng(seed)
     clips = [
