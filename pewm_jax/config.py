@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 T = TypeVar("T")
+SMALLEST = 12
+"""Fewest pixels of a clip's side: the evaluation's SSIM slides a window of 11 over the image."""
 
 
 class UserError(ValueError):
@@ -26,6 +28,13 @@ class ConfigError(UserError):
 def _require(condition: bool, sentence: str) -> None:
     if not condition:
         raise ConfigError(sentence)
+
+
+def _require_positive(section: Any, where: str, *names: str) -> None:
+    """Refuse sizes and counts below 1, each by its own name."""
+    for name in names:
+        value = getattr(section, name)
+        _require(value >= 1, f"{where}.{name} is {value}: use at least 1.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +66,12 @@ class ClipConfig:
             f"clip.near_m {self.near_m} and clip.far_m {self.far_m}: near must be above 0 and "
             "below far.",
         )
-        _require(self.height > 0 and self.width > 0, "clip.height and clip.width must be positive.")
+        _require(
+            min(self.height, self.width) >= SMALLEST,
+            f"clip.height {self.height} and clip.width {self.width} must be at least {SMALLEST} "
+            "pixels: the structural similarity of the evaluation looks through a window of 11; "
+            "use 16 or more.",
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +102,10 @@ class CodecConfig:
     """Pixels per latent cell, each way."""
     temporal: int = 4
     """Frames per latent frame after the first."""
+
+    def __post_init__(self):
+        """Validate."""
+        _require_positive(self, "codec", "spatial", "temporal")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +138,8 @@ class DiTConfig:
 
     def __post_init__(self):
         """Validate."""
-        _require(self.layers >= 1, "dit.layers must be at least 1.")
+        _require_positive(self, "dit", "layers", "heads", "head_dim", "patch")
+        _require_positive(self, "dit", "text_length", "text_dim", "time_dim", "mlp_ratio")
         _require(
             self.head_dim % 16 == 0,
             f"dit.head_dim is {self.head_dim}: use a multiple of 16 (16, 32, 48, 64), the rotary "
@@ -160,15 +179,12 @@ class MemoryConfig:
         """Validate."""
         _require(all(size > 0 for size in self.cell_m), "memory.cell_m must be positive.")
         _require(all(count > 0 for count in self.cells), "memory.cells must be positive.")
+        _require_positive(self, "memory", "capacity", "tokens", "looks", "encoder_patch")
+        _require_positive(self, "memory", "heads", "head_dim", "mlp_ratio")
         _require(
             self.tokens <= self.capacity,
             f"memory.tokens {self.tokens} exceeds memory.capacity {self.capacity}: a clip cannot "
             "attend to more cells than the map holds; raise capacity or lower tokens.",
-        )
-        _require(
-            self.positions == "sinusoid" or self.heads >= 4,
-            f"memory.heads is {self.heads}: with projective positions head k looks through camera "
-            "k mod 4 of a latent frame; use at least 4 heads.",
         )
         _require(
             self.head_dim % 8 == 0,
@@ -215,7 +231,14 @@ class DiffusionConfig:
             f"diffusion.sample_steps is {self.sample_steps}: use 1 to {self.train_steps} "
             "(diffusion.train_steps).",
         )
+        _require(
+            self.train_steps >= 2,
+            f"diffusion.train_steps is {self.train_steps}: a schedule needs at least 2 noise "
+            "levels; use 1000.",
+        )
         _require(self.snr_shift > 0, "diffusion.snr_shift must be above 0.")
+        _require(self.max_weight > 0, "diffusion.max_weight must be above 0.")
+        _require(self.image_noise_std >= 0, "diffusion.image_noise_std must be at least 0.")
         _require(
             not (self.target == "eps" and self.zero_terminal_snr),
             "diffusion.target eps cannot be used with zero_terminal_snr: at the last step the "
@@ -247,6 +270,7 @@ class DataConfig:
             "1 ≤ min ≤ max.",
         )
         _require(self.context >= 1, "data.context must be at least 1 frame.")
+        _require(self.workers >= 0, f"data.workers is {self.workers}: use 0 or more threads.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -268,6 +292,7 @@ class StageConfig:
         """Validate."""
         _require(self.steps >= 0 and self.batch >= 1, "steps ≥ 0 and batch ≥ 1 are needed.")
         _require(self.learning_rate > 0, "learning_rate must be above 0.")
+        _require(self.warmup >= 0, f"warmup is {self.warmup}: use 0 (none) or more steps.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -307,6 +332,20 @@ class TrainConfig:
             min(self.save_every, self.log_every, self.keep) >= 1,
             "train.save_every, train.log_every and train.keep must be at least 1.",
         )
+        _require(self.seed >= 0, f"train.seed is {self.seed}: use 0 or a positive number.")
+        _require(
+            self.weight_decay >= 0, f"train.weight_decay is {self.weight_decay}: use 0 or more."
+        )
+        _require(
+            self.preview_every >= 0,
+            f"train.preview_every is {self.preview_every}: use 0 (no pictures) or more steps.",
+        )
+        _require(
+            self.stage1.steps > 0 or self.stage2.steps == 0,
+            f"train.stage1.steps is 0 and train.stage2.steps is {self.stage2.steps}: stage 2 "
+            "freezes the backbone, whose output starts at zero, so nothing would be learnt; give "
+            "train.stage1.steps at least 1.",
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -333,6 +372,7 @@ class EvalConfig:
     def __post_init__(self):
         """Validate."""
         _require(len(self.seeds) >= 1, "evaluate.seeds needs at least one seed.")
+        _require(min(self.seeds) >= 0, "evaluate.seeds must be 0 or positive numbers.")
         _require(
             min(self.clips, self.chain, self.stride, self.videos, self.video_clips, self.batch)
             >= 1,
@@ -375,6 +415,13 @@ class Config:
             (self.clip.frames - 1) % self.codec.temporal == 0,
             f"clip.frames {self.clip.frames} − 1 is not a multiple of codec.temporal "
             f"{self.codec.temporal}.",
+        )
+        per_latent = self.codec.temporal
+        _require(
+            self.memory.positions == "sinusoid" or self.memory.heads >= per_latent,
+            f"memory.heads is {self.memory.heads}: with projective positions head k looks through "
+            f"camera k mod {per_latent} (codec.temporal) of a latent frame; use at least "
+            f"{per_latent} heads, or memory.positions sinusoid.",
         )
         patch = self.memory.encoder_patch
         _require(
@@ -450,7 +497,8 @@ def load(path: Path, kind: type[T] = Config) -> T:
     """Read a configuration from JSON.
 
     Raises:
-        ConfigError: the file is absent, is not JSON, or holds settings that do not fit.
+        ConfigError: the file is absent or unreadable, is not JSON, or holds settings that do not
+            fit.
     """
     try:
         values = json.loads(path.read_text())
@@ -458,6 +506,8 @@ def load(path: Path, kind: type[T] = Config) -> T:
         raise ConfigError(
             f"{path} does not exist: is this a run folder made by train.py?"
         ) from None
-    except json.JSONDecodeError as error:
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read ({error.strerror}); allow reading it.") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid JSON ({error}); restore it.") from None
     return from_dict(kind, values, path.name)

@@ -13,7 +13,7 @@ from pewm_jax.diffusion import objective
 from pewm_jax.models import world_model
 from pewm_jax.types import Camera, Clip, Frames
 
-SIZE = 8
+SIZE = 16
 
 
 def config(run="runs/fake", *, stage1=6, stage2=6, **train) -> Config:
