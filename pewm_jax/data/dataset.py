@@ -12,7 +12,8 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,25 +71,45 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
 
     Returns:
         The number of records written.
+
+    Raises:
+        UserError: the file cannot be written, e.g. because the disk is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     count = 0
     try:
         # Images are compressed already, and one record per group makes a single one cheap to read.
-        writer = array_file.ArrayRecordWriter(str(partial), "group_size:1,uncompressed")
+        with _refused_writes(path):
+            writer = array_file.ArrayRecordWriter(str(partial), "group_size:1,uncompressed")
         try:
             for record in records:
-                writer.write(record)
+                with _refused_writes(path):
+                    writer.write(record)
                 count += 1
         finally:
-            writer.close()
+            with _refused_writes(path):
+                writer.close()
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
     return count
+
+
+@contextlib.contextmanager
+def _refused_writes(path: Path) -> Iterator[None]:
+    """Say in one sentence what ArrayRecord raises where the system refuses to write."""
+    try:
+        yield
+    except RuntimeError as error:
+        free = shutil.disk_usage(path.parent).free / 1e6
+        raise UserError(
+            f"{path} cannot be written ({str(error).splitlines()[0]}); {free:.0f} MB are free "
+            "there: make room, or check the limits and rights of the folder, and run the same "
+            "command again."
+        ) from None
 
 
 def describe_shard(path: Path) -> Shard:
@@ -202,11 +223,16 @@ def read_manifest(folder: Path, check_files: bool = True) -> Manifest:
             "split again."
         )
     for shard in manifest.shards if check_files else ():
-        _check_size(folder / shard.file, shard)
+        check_size(folder / shard.file, shard)
     return manifest
 
 
-def _check_size(path: Path, shard: Shard) -> None:
+def check_size(path: Path, shard: Shard) -> None:
+    """Compare a file's size with what ``dataset.json`` says.
+
+    Raises:
+        UserError: it is missing or of another size.
+    """
     if not path.is_file():
         raise UserError(f"{path} is missing but {MANIFEST} lists it; make the split again.")
     size = path.stat().st_size

@@ -128,8 +128,7 @@ class Episode:
         if not 0 <= index < self.length:
             raise IndexError(f"frame {index} of {self.name}, which has {self.length} frames")
         offset, size = self.header["streams"][stream]["spans"][index]
-        code = np.frombuffer(self.record, np.uint8, size, offset)
-        image = cv2.imdecode(code, cv2.IMREAD_UNCHANGED)
+        image = decode_image(memoryview(self.record)[offset : offset + size], cv2.IMREAD_UNCHANGED)
         shape = (self.height, self.width, 3) if stream == "rgb" else (self.height, self.width)
         if image is None or image.shape != shape:
             raise UserError(
@@ -248,6 +247,14 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
         header=header,
         record=record,
     )
+
+
+def decode_image(code: bytes | memoryview, flags: int) -> np.ndarray | None:
+    """Decode an image as ``cv2.imdecode`` does; None where it does not, empty or not an image."""
+    try:
+        return cv2.imdecode(np.frombuffer(code, np.uint8), flags)
+    except cv2.error:  # raised for no bytes at all, and for sizes that no image has
+        return None
 
 
 def _png(image: np.ndarray) -> bytes:

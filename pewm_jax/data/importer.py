@@ -22,7 +22,7 @@ from pewm_jax.data.dataset import (
     write_manifest,
     write_shard,
 )
-from pewm_jax.data.episodes import EpisodeArrays, read_episode, write_episode
+from pewm_jax.data.episodes import EpisodeArrays, decode_image, read_episode, write_episode
 from pewm_jax.data.progress import Meter
 from pewm_jax.data.recordings import RecordedFrame, read_recording
 from pewm_jax.geometry.actions import actions_between
@@ -208,9 +208,11 @@ def _nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def _read(path: Path, flags: int) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"{path} does not exist but the recording lists it.")
-    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
+    code = path.read_bytes()
+    image = decode_image(code, flags)
     if image is None:
-        raise UserError(f"{path} does not decode as an image; it is damaged.")
+        why = "damaged" if code else "empty"
+        raise UserError(f"{path} does not decode as an image; it is {why}.")
     return image
 
 

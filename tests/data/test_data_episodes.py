@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import pickle
+import resource
 import struct
 
 import cv2
@@ -157,6 +158,28 @@ def test_a_split_reads_in_order_through_pickle_and_by_slice(tmp_path):
     assert source.where(4).endswith("shard-00001-of-00002.array_record, record 2")
     with pytest.raises(IndexError):
         source[5]
+
+
+def test_an_empty_image_is_named():
+    episode = read_episode(write_episode(arrays(), "a", "b"))
+    spans = list(episode.header["streams"]["depth"]["spans"])
+    spans[3] = (spans[3][0], 0)
+    streams = {**episode.header["streams"], "depth": {"codec": "png", "spans": spans}}
+    damaged = dataclasses.replace(episode, header={**episode.header, "streams": streams})
+    with pytest.raises(UserError, match="episode a, frame 3, depth: the image does not decode"):
+        damaged.frames()
+
+
+def test_a_disk_that_is_full_ends_in_one_sentence(tmp_path):
+    record = write_episode(arrays(), "a", "b")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(record) // 2, before[1]))
+    try:
+        with pytest.raises(UserError, match=r"s\.array_record cannot be written .* MB are free"):
+            write_shard(tmp_path / "s.array_record", [record] * 3)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unfinished_split_is_not_read(tmp_path):

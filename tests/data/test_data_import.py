@@ -209,6 +209,11 @@ WRONG = {
         {},
         r"00004\.png does not decode",
     ),
+    "an empty image": (
+        lambda f: (f / "image" / "00004.png").write_bytes(b""),
+        {},
+        r"00004\.png does not decode as an image; it is empty",
+    ),
     "a smaller image": (
         lambda f: cv2.imwrite(str(f / "depth" / "00004.png"), np.ones((8, 8), np.uint16)),
         {},
