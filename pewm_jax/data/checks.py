@@ -73,19 +73,9 @@ def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
     if len(bad):
         return [Problem(where, int(bad[0]), "depth", "holds values that are not finite.")]
     median = float(np.median(valid)) if len(valid) else 0.0
-    low, high = MEDIAN_DEPTH_M
-    if len(valid) and not low <= median <= high:
-        wrong = "metres were read as millimetres" if median < low else "the scale is too small"
-        frame = _first_frame(depth_THW, median < low)
-        return [
-            Problem(
-                where,
-                frame,
-                "depth",
-                f"the median depth of the recording is {median:.3g} m: the unit is wrong ("
-                f"{wrong}?); correct the depth scale.",
-            )
-        ]
+    if len(valid) and not _plausible(median):
+        frame = _first_frame(depth_THW, median < MEDIAN_DEPTH_M[0])
+        return [_wrong_unit(where, frame, "the recording", median)]
     missing = float((depth_THW <= 0).mean())
     if missing > MOST_MISSING:
         return [
@@ -97,7 +87,27 @@ def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
                 "unit is wrong or the depth images are empty; correct the depth scale.",
             )
         ]
+    for frame, image in enumerate(depth_THW):
+        seen = image[image > 0]
+        if len(seen) > (1 - MOST_MISSING) * image.size and not _plausible(np.median(seen)):
+            return [_wrong_unit(where, frame, "this frame", float(np.median(seen)))]
     return []
+
+
+def _plausible(median: float) -> bool:
+    return MEDIAN_DEPTH_M[0] <= median <= MEDIAN_DEPTH_M[1]
+
+
+def _wrong_unit(where: str, frame: int, whose: str, median: float) -> Problem:
+    small = median < MEDIAN_DEPTH_M[0]
+    wrong = "metres were read as millimetres" if small else "the scale is too small"
+    return Problem(
+        where,
+        frame,
+        "depth",
+        f"the median depth of {whose} is {median:.3g} m: the unit is wrong ({wrong}?); correct "
+        "the depth scale.",
+    )
 
 
 def _first_frame(depth_THW: np.ndarray, small: bool) -> int:

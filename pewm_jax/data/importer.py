@@ -12,13 +12,22 @@ import numpy as np
 import tyro
 
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data.checks import ACTION_M, ACTION_RAD, action_errors, check_depth, check_episode
+from pewm_jax.data.checks import (
+    ACTION_M,
+    ACTION_RAD,
+    Problem,
+    action_errors,
+    check_depth,
+    check_episode,
+)
 from pewm_jax.data.dataset import (
     MANIFEST,
     Manifest,
     Shard,
+    check_size,
     describe_shard,
     read_manifest,
+    read_record,
     write_manifest,
     write_shard,
 )
@@ -105,13 +114,13 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
     intrinsics = np.array(config.intrinsics, np.float32) + np.array([0, 0, half, half], np.float32)
     scale = (width / source_size[0], height / source_size[1])
     pose = world_from_recording(config.up) @ np.stack([f.world_from_camera for f in frames])
-    _refuse(check_depth(depth, str(config.src)))
+    _refuse(check_depth(depth, str(config.src)), config, frames)
     arrays = EpisodeArrays(
         rgb, depth, resize_intrinsics(intrinsics, *scale), pose, planar_actions(pose)
     )
     info = {"policy": "recorded", "stride": config.stride, "source": config.src.resolve().name}
     record = write_episode(arrays, name, name, info)
-    _refuse(check_episode(read_episode(record), str(config.src)))
+    _refuse(check_episode(read_episode(record), str(config.src)), config, frames)
     path = folder / f"recording-{name}.array_record"
     write_shard(path, [record])
     shards.append((describe_shard(path), len(frames)))
@@ -150,22 +159,31 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[tuple[Shard, 
     """Return the shards that are there already, and how many frames each has."""
     if not folder.exists():
         return []
+    file = f"recording-{name}.array_record"
     if not (folder / MANIFEST).is_file():
-        if any(folder.glob("*.array_record")) or any(folder.glob("*.json")):
+        # An import that was killed leaves its shard: whole and checked, for it was renamed.
+        strays = sorted(folder.glob("recording-*.array_record"))
+        if len(strays) < len([*folder.glob("*.array_record"), *folder.glob("*.json")]):
             raise UserError(
                 f"{folder} holds an unfinished collection; finish it, or give another --split."
             )
-        return []
-    manifest = read_manifest(folder)
+        return [(describe_shard(path), _length(path)) for path in strays if path.name != file]
+    # The shard to replace may be newer than the list, where an import was killed between the two.
+    manifest = read_manifest(folder, check_files=False)
     if manifest.settings.get("made_by") != "import":
         raise UserError(f"{folder} was made by `collect`; import into another --split or folder.")
-    file = f"recording-{name}.array_record"
     if any(shard.file == file for shard in manifest.shards) and not config.overwrite:
         raise UserError(
             f"{folder} already has an episode named {name}; give another --name or --overwrite."
         )
-    frames = manifest.settings["frames"]
-    return [(shard, frames[shard.file]) for shard in manifest.shards if shard.file != file]
+    kept = [shard for shard in manifest.shards if shard.file != file]
+    for shard in kept:
+        check_size(folder / shard.file, shard)
+    return [(shard, manifest.settings["frames"][shard.file]) for shard in kept]
+
+
+def _length(path: Path) -> int:
+    return read_episode(read_record(path, 0), str(path)).length
 
 
 def _read_images(
@@ -175,9 +193,10 @@ def _read_images(
     first = _read(frames[0].colour, cv2.IMREAD_COLOR)
     source = (first.shape[1], first.shape[0])
     size = config.size or source
-    rgb, depth = [], []
+    rgb = np.empty((len(frames), size[1], size[0], 3), np.uint8)
+    depth = np.empty((len(frames), size[1], size[0]), np.float32)
     with Meter(f"reading {config.src}", len(frames), "frames") as meter:
-        for frame in frames:
+        for k, frame in enumerate(frames):
             colour = _read(frame.colour, cv2.IMREAD_COLOR)
             distance = _read(frame.depth, cv2.IMREAD_UNCHANGED)
             for path, image in ((frame.colour, colour), (frame.depth, distance)):
@@ -191,10 +210,10 @@ def _read_images(
                 raise UserError(f"{frame.depth} has {distance.shape[2]} channels: not a depth.")
             shrink = size[0] < source[0]
             how = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
-            rgb.append(cv2.resize(colour, size, interpolation=how)[..., ::-1])
-            depth.append(_nearest(distance, size) / config.depth_scale)
+            rgb[k] = cv2.resize(colour, size, interpolation=how)[..., ::-1]
+            depth[k] = _nearest(distance, size) / config.depth_scale
             meter.advance(1)
-    return np.stack(rgb), np.stack(depth).astype(np.float32), source
+    return rgb, depth, source
 
 
 def _nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -216,7 +235,13 @@ def _read(path: Path, flags: int) -> np.ndarray:
     return image
 
 
-def _refuse(problems: list) -> None:
-    if problems:
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise UserError(f"{problems[0]}{more} Nothing was written.")
+def _refuse(problems: list[Problem], config: ImportConfig, frames: list[RecordedFrame]) -> None:
+    """Refuse what has problems; the frame of the first is named by its depth image too."""
+    if not problems:
+        return
+    first = problems[0]
+    if first.frame is not None:
+        counted = f" (counted with --stride {config.stride})" if config.stride > 1 else ""
+        first = dataclasses.replace(first, where=f"{frames[first.frame].depth}{counted}")
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    raise UserError(f"{first}{more} Nothing was written.")

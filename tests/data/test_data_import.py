@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.importer import (
     ImportConfig,
+    _read_images,
     import_recording,
     planar_actions,
     world_from_recording,
@@ -153,6 +155,72 @@ def test_recordings_are_added_and_replaced_by_name(tmp_path, walk):
     with pytest.raises(UserError, match="was made by `collect`"):
         import_recording(config(tmp_path / "rec", tmp_path / "collected"))
     assert (collected / "dataset.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_an_import_that_was_killed_can_be_repeated(tmp_path, walk, monkeypatch, overwrite):
+    record(tmp_path / "rec", walk)
+    out = tmp_path / "out"
+    again = config(tmp_path / "rec", out, name="a", stride=2, overwrite=overwrite)
+    if overwrite:
+        for name in ("a", "b"):
+            import_recording(config(tmp_path / "rec", out, name=name), lambda _: None)
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pewm_jax.data.importer.write_manifest", killed)
+        with pytest.raises(KeyboardInterrupt):
+            import_recording(again, lambda _: None)
+    if overwrite:  # as it is where the new shard has another size than the old one
+        shard = out / "train" / "recording-a.array_record"
+        shard.write_bytes(shard.read_bytes() + bytes(64))
+    with pytest.raises(UserError):
+        EpisodeSource(out / "train")
+    import_recording(again, lambda _: None)
+    lengths = [24, 12] if overwrite else [12]
+    assert [episode.length for episode in EpisodeSource(out / "train")] == lengths
+    if overwrite:  # what is kept must still be whole
+        kept = out / "train" / "recording-b.array_record"
+        kept.write_bytes(kept.read_bytes()[:-1])
+        with pytest.raises(UserError, match=r"recording-b.*truncated"):
+            import_recording(again, lambda _: None)
+
+
+def test_the_shard_of_another_import_that_was_killed_is_taken_over(tmp_path, walk):
+    record(tmp_path / "rec", walk)
+    train = tmp_path / "out" / "train"
+    import_recording(config(tmp_path / "rec", tmp_path / "out", name="a"), lambda _: None)
+    (train / "dataset.json").unlink()
+    import_recording(config(tmp_path / "rec", tmp_path / "out", name="b"), lambda _: None)
+    assert [episode.name for episode in EpisodeSource(train)] == ["a", "b"]
+    assert EpisodeSource(train).manifest.frames == 48
+    (train / "dataset.json").rename(train / "collecting.json")
+    with pytest.raises(UserError, match="unfinished collection"):
+        import_recording(config(tmp_path / "rec", tmp_path / "out", name="b"), lambda _: None)
+
+
+def test_a_frame_in_another_unit_is_named_by_its_file(tmp_path, walk):
+    folder = record(tmp_path / "rec", walk)
+    path = folder / "depth" / "00015.png"
+    cv2.imwrite(str(path), np.full((SIZE, SIZE), 5, np.uint16))
+    says = rf"depth.00015\.png \(counted with --stride 5\), frame 3, depth: .*{5e-3} m: the unit"
+    with pytest.raises(UserError, match=says):
+        import_recording(config(folder, tmp_path / "out", stride=5), lambda _: None)
+
+
+def test_reading_takes_little_more_memory_than_what_is_read(tmp_path, walk):
+    folder = record(tmp_path / "rec", walk)
+    frames = read_recording(folder)
+    tracemalloc.start()
+    try:
+        _, depth, _ = _read_images(config(folder, tmp_path / "out"), frames)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert depth.dtype == np.float32
+    assert peak < 12 * depth.size  # 4 bytes of depth and 3 of colour, and one image at a time
 
 
 def test_a_hand_held_camera_has_poses_and_no_actions(walk):
