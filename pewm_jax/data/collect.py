@@ -8,6 +8,7 @@ neither that nor the number of processes leaves a trace in the files.
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import json
 import multiprocessing
@@ -25,6 +26,7 @@ import cv2
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import (
     MANIFEST,
+    UNFINISHED,
     Manifest,
     Shard,
     count_records,
@@ -36,9 +38,6 @@ from pewm_jax.data.dataset import (
 )
 from pewm_jax.data.progress import Meter
 from pewm_jax.data.recording import SPLITS, CollectConfig, dashed, make_episode, settings_of
-
-UNFINISHED = "collecting.json"
-"""Lies in a split folder while it is being made, and says with what settings."""
 
 State = Literal["fresh", "resume", "complete"]
 
@@ -200,7 +199,8 @@ def _run(jobs: list[_Job], workers: int) -> Iterator[tuple[_Job, Shard]]:
         min(workers, len(jobs)), multiprocessing.get_context("spawn"), _start_worker
     )
     try:
-        futures = {pool.submit(job.run): job for job in jobs}
+        with _deaf():  # workers are spawned here, and inherit it before any line of theirs runs
+            futures = {pool.submit(job.run): job for job in jobs}
         for future in concurrent.futures.as_completed(futures):
             yield futures[future], future.result()
         done = True
@@ -214,6 +214,19 @@ def _run(jobs: list[_Job], workers: int) -> Iterator[tuple[_Job, Shard]]:
             for worker in set(multiprocessing.active_children()) - others:
                 worker.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _deaf() -> Iterator[None]:
+    """Ignore Ctrl-C for a moment, here and for ever in the processes spawned meanwhile."""
+    if threading.current_thread() is not threading.main_thread():  # others cannot set signals
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
 
 
 def _start_worker() -> None:

@@ -25,6 +25,8 @@ from pewm_jax.data.episodes import Episode, read_episode
 from pewm_jax.data.layout import VERSION
 
 MANIFEST = "dataset.json"
+UNFINISHED = "collecting.json"
+"""Lies in a split folder while it is being made, and says with what settings."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ from pewm_jax.config import UserError
 from pewm_jax.data.checks import Problem, check_episode
 from pewm_jax.data.dataset import (
     MANIFEST,
+    UNFINISHED,
     Manifest,
     count_records,
     describe_shard,
@@ -86,12 +87,22 @@ def _files(path: Path) -> tuple[list[Path], list[Problem]]:
     """List the files of all splits under a path, and what is wrong with them as files."""
     inside = splits(path) if path.is_dir() and not (path / MANIFEST).is_file() else []
     files: list[Path] = []
-    problems: list[Problem] = []
+    problems = _unfinished(path) if inside else []
     for folder in [path / name for name in inside] or [path]:
         manifest = read_manifest(folder)
         problems += _check_hashes(folder, manifest)
         files += [folder / shard.file for shard in manifest.shards]
     return files, problems
+
+
+def _unfinished(path: Path) -> list[Problem]:
+    """Name the splits inside a dataset folder that hold data and are not read."""
+    begun = {
+        file.parent for mark in ("*.array_record", UNFINISHED) for file in path.glob(f"*/{mark}")
+    }
+    what = "is missing: the split is unfinished and is not read; run the same command again."
+    missing = sorted(folder for folder in begun if not (folder / MANIFEST).is_file())
+    return [Problem(str(folder), None, MANIFEST, what) for folder in missing]
 
 
 def _check_hashes(folder: Path, manifest: Manifest) -> list[Problem]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -19,7 +20,7 @@ import trimesh
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.checks import check_episode
-from pewm_jax.data.collect import collect
+from pewm_jax.data.collect import _run, collect
 from pewm_jax.data.dataset import EpisodeSource, write_shard
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.recording import CollectConfig, house_seed, make_episode, scenes_of
@@ -175,6 +176,17 @@ def test_a_killed_collection_goes_on(tmp_path, mesh, how):
     collect(settings(out, mesh, **options), said.append)
     assert said[0].startswith("resuming: ")
     assert fingerprints(out) == fingerprints(tmp_path / "calm")
+
+
+def test_workers_are_born_deaf_to_an_interruption(monkeypatch):
+    class Job:
+        run = functools.partial(signal.getsignal, signal.SIGINT)
+
+    monkeypatch.setattr("pewm_jax.data.collect._start_worker", os.getpid)  # it comes too late
+    before = signal.getsignal(signal.SIGINT)
+    heard = [handler for _, handler in _run([Job(), Job()], workers=2)]
+    assert heard == [signal.SIG_IGN] * 2
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_no_house_serves_two_splits():

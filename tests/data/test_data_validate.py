@@ -47,6 +47,12 @@ WRONG = {
     "metres as millimetres": ({"depth_THW": lambda d: d / 1000}, None, "depth", "unit is wrong"),
     "too far": ({"depth_THW": lambda d: d * 40}, None, "depth", "unit is wrong"),
     "beyond 16 bits": ({"depth_THW": lambda d: d * 1000}, None, "depth", "unit is wrong"),
+    "one frame too near": (
+        {"depth_THW": lambda d: put(7, d[7] / 1000)(d)},
+        7,
+        "depth",
+        "of this frame",
+    ),
     "no depth": ({"depth_THW": lambda d: d * 0}, None, "depth", "100% of the pixels"),
     "depth twice": ({"depth_THW": lambda d: d * 2}, ..., "depth", "disagrees with the poses"),
     "depth by 1.3": ({"depth_THW": lambda d: d * 1.3}, ..., "depth", "disagrees with the poses"),
@@ -148,6 +154,19 @@ def test_a_whole_dataset_is_walked_through(tmp_path):
     assert said == [f"{tmp_path}: 6 episodes, 120 frames, all well."]
     single = tmp_path / "train" / "shard-00000-of-00002.array_record"
     assert validate(ValidateConfig(single), said.append).episodes == 2
+
+
+@pytest.mark.parametrize("left", ["collecting.json", "shard-00000-of-00002.array_record"])
+def test_an_unfinished_split_beside_a_finished_one_is_named(tmp_path, left):
+    split(tmp_path / "train", frames=20)
+    (tmp_path / "revisit").mkdir()
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "revisit" / left).write_bytes(b"")
+    said = []
+    found = validate(ValidateConfig(tmp_path), said.append).problems
+    assert [(p.where, p.field) for p in found] == [(str(tmp_path / "revisit"), "dataset.json")]
+    assert "unfinished" in said[0]
+    assert "all well" not in said[-1]
 
 
 def test_a_bad_record_is_found_among_good_ones(tmp_path):
