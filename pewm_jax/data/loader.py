@@ -12,7 +12,7 @@ from pathlib import Path
 import grain
 import numpy as np
 
-from pewm_jax.config import Config, UserError
+from pewm_jax.config import Config, ConfigError, UserError
 from pewm_jax.data.clips import choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
@@ -40,10 +40,12 @@ def dataset(config: Config, split: str, seed: int, batch: int) -> grain.MapDatas
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit the
             configuration.
+        ConfigError: the episodes were collected with other steps or turns than ``actions`` says.
     """
     source = EpisodeSource(Path(config.data.path) / split)
     first = source[0]
     _check_size(config, first)
+    _check_actions(config, first)
     choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
     clips = grain.MapDataset.source(source).seed(seed).shuffle().repeat()
     return clips.random_map(_CutClip(config)).batch(batch, batch_fn=stack)
@@ -82,3 +84,14 @@ def _check_size(config: Config, episode: Episode) -> None:
             f"configuration wants {clip.width}×{clip.height}: collect or import with that size, or "
             f"set clip.width {episode.width} and clip.height {episode.height}."
         )
+
+
+def _check_actions(config: Config, episode: Episode) -> None:
+    """Compare the settings of the actions with what a collected episode was made with."""
+    for name in ("step_m", "turn_deg"):
+        made, wanted = episode.info.get(name), getattr(config.actions, name)
+        if made is not None and not np.isclose(made, wanted, rtol=1e-6):
+            raise ConfigError(
+                f"episode {episode.name} was collected with {name} {made:g}, the configuration has "
+                f"actions.{name} {wanted:g}: set --actions.{name} {made:g}."
+            )

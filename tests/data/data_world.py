@@ -55,10 +55,11 @@ def arrays(frames=12, size=16, seed=0, policy="follow", turn_around=0.0, width=N
     return EpisodeArrays(rgb, depth, intrinsics, pose, walk.actions, walk.action_ids)
 
 
-def split(folder, episodes=4, shards=2, **options):
+def split(folder, episodes=4, shards=2, info=None, **options):
     """Write a finished split of box episodes; returns its folder."""
     records = [
-        write_episode(arrays(seed=i, **options), f"episode-{i}", "box") for i in range(episodes)
+        write_episode(arrays(seed=i, **options), f"episode-{i}", "box", info)
+        for i in range(episodes)
     ]
     files = []
     for k in range(shards):

@@ -12,7 +12,7 @@ from data_world import split
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import ClipConfig, Config, DataConfig, UserError
+from pewm_jax.config import ActionConfig, ClipConfig, Config, ConfigError, DataConfig, UserError
 from pewm_jax.data import clips as clipping
 from pewm_jax.data import loader
 from pewm_jax.data.dataset import EpisodeSource
@@ -155,3 +155,12 @@ def test_what_does_not_fit_is_refused_before_training(folder):
         loader.clips(long, seed=0, batch=2)
     with pytest.raises(UserError, match="does not exist"):
         loader.clips(config(folder), "nowhere", seed=0, batch=2)
+
+
+@pytest.mark.parametrize(("name", "made"), [("step_m", 0.1), ("turn_deg", 15.0)])
+def test_actions_other_than_the_collected_ones_are_refused(tmp_path, name, made):
+    split(tmp_path / "train", frames=24, info={"step_m": 0.25, "turn_deg": 30.0, name: made})
+    with pytest.raises(ConfigError, match=rf"set --actions\.{name} {made:g}\.$"):
+        loader.clips(config(tmp_path), seed=0, batch=2)
+    fits = dataclasses.replace(config(tmp_path), actions=ActionConfig(**{name: made}))
+    assert next(loader.clips(fits, seed=0, batch=2)).frames.rgb_THWC.shape[0] == 2
