@@ -26,6 +26,17 @@ BlockExpert = Callable[[Any, Array, Array], Array]
 """``expert(layer_params, video_BND, time_BE) -> video_BND``, run after a block."""
 
 
+def open_gates(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
+    """Start shifts and scales at 0 and both gates at 1: a plain pre-norm transformer.
+
+    With gates at zero a backbone trained from nothing spends its first hundreds of steps on
+    opening them. (Only the memory blocks must start as the identity.)
+    """
+    del key
+    part = jnp.arange(shape[0]) // (shape[0] // 6)
+    return (part % 3 == 2).astype(dtype)
+
+
 class LayerNormZero(nn.Module):
     """Expert adaptive layernorm: one shared norm, separate modulation of video and text."""
 
@@ -35,7 +46,14 @@ class LayerNormZero(nn.Module):
     ) -> tuple[Array, Array, Array, Array]:
         """Return normalised video, normalised text, video gate (B, D), text gate (B, D)."""
         width, dtype = video_BND.shape[-1], video_BND.dtype
-        modulation = layers.dense(6 * width, dtype, "linear", zero=True)(nn.silu(time_BE))
+        linear = nn.Dense(
+            6 * width,
+            dtype=dtype,
+            kernel_init=layers.zeros,
+            bias_init=open_gates,
+            name="linear",
+        )
+        modulation = linear(nn.silu(time_BE))
         shift, scale, gate, text_shift, text_scale, text_gate = jnp.split(modulation, 6, -1)
         both = layers.layer_norm(jnp.concatenate([text_BLD, video_BND], 1), "norm")
         text, video = jnp.split(both, [text_BLD.shape[1]], 1)
@@ -148,7 +166,7 @@ def unpatchify(tokens_BNC: Array, frames: int, height: int, width: int, patch: i
 
 
 def init(config: DiTConfig, key: Array, in_channels: int, out_channels: int) -> Params:
-    """Initialise: float32, gates and output at zero, blocks stacked over layers."""
+    """Initialise: float32, output layer at zero, blocks stacked over layers."""
     ends_key, blocks_key = jax.random.split(key)
     time = jnp.zeros((1, config.time_dim))
     ends = Ends(config, out_channels, jnp.dtype(jnp.float32)).init(

@@ -83,7 +83,11 @@ def _memory_parts(config: Config) -> tuple[layers.nn.Dense, layers.nn.Dense]:
     dtype = jnp.dtype(config.train.dtype)
     memory_width = config.memory.heads * config.memory.head_dim
     camera = layers.dense(config.dit.width // 2, dtype, "camera")
-    return camera, layers.dense(memory_width, dtype, "tokens")
+    # The layer norm that follows would forget how large a feature is; next to a constant of
+    # size 1 in random directions it keeps it.
+    constant = layers.nn.initializers.normal(1.0)
+    tokens = layers.nn.Dense(memory_width, dtype=dtype, bias_init=constant, name="tokens")
+    return camera, tokens
 
 
 def _token_channels(config: Config) -> int:
