@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -11,8 +12,10 @@ import cv2
 import pytest
 from data_world import split
 
+from configs.demo import config as demo
 from pewm_jax.data.__main__ import COMMANDS, main
 from pewm_jax.data.progress import Meter
+from pewm_jax.data.validate import Verdict
 
 ROOT = Path(__file__).parents[2]
 
@@ -72,6 +75,23 @@ def test_wrong_arguments_end_in_one_sentence(argv, says, capsys, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     assert says in refused(capsys, *argv)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_commands_of_the_format_description_fit_together(monkeypatch):
+    ran = {command: [] for command in COMMANDS}
+    for name, command in (("collect", "collect"), ("import_recording", "import"), ("show", "show")):
+        monkeypatch.setattr(f"pewm_jax.data.__main__.{name}", ran[command].append)
+    monkeypatch.setattr(
+        "pewm_jax.data.__main__.validate",
+        lambda asked: ran["validate"].append(asked) or Verdict(0, 0, []),
+    )
+    text = (ROOT / "docs" / "data_format.md").read_text("utf-8")
+    lines = [x for x in text.splitlines() if x.startswith("python -m pewm_jax.data ")]
+    assert [main(shlex.split(line)[3:]) for line in lines] == [0] * len(lines)
+    assert all(ran.values())
+    folders = [made.out for made in ran["collect"] + ran["import"]]
+    assert len(set(folders)) == len(folders)  # an import is refused where a collection lies
+    assert {made.size for made in ran["collect"]} == {demo().clip.width}
 
 
 def test_what_the_system_refuses_ends_in_one_sentence(capsys, tmp_path):
