@@ -9,10 +9,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from pewm_jax import config as configs
 from pewm_jax import weights
@@ -125,7 +130,7 @@ def rollout(
     config: Config,
     params: Params,
     state: WorldState,
-    actions: Array,
+    actions: ArrayLike | Sequence[Any],
     key: Array,
     *,
     memory: bool = True,
@@ -138,7 +143,7 @@ def rollout(
         state: from ``start`` or from an earlier rollout.
         actions: (n·(T − 1),) discrete actions (0 forward, 1 turn left, 2 turn right) or
             (n·(T − 1), 3) continuous ones (dx, dy, dyaw: metres forward, metres left, radians
-            counter-clockwise); T is ``config.clip.frames``.
+            counter-clockwise); T is ``config.clip.frames``. A list or a NumPy array will do.
         key: randomness of the sampling noise.
         memory: False ignores the map (the empty-map baseline); it is still updated.
 
@@ -147,8 +152,10 @@ def rollout(
         colours float32 in [−1, 1], depth in metres.
 
     Raises:
-        UserError: the number of actions is not a positive multiple of T − 1.
+        UserError: the number of actions is not a positive multiple of T − 1, or a discrete action
+            is not 0, 1 or 2 (under jit, vmap and grad values are unknown and not checked).
     """
+    actions = jnp.asarray(actions)
     length = config.clip.frames - 1
     count = actions.shape[0] if actions.ndim else 0
     if count == 0 or count % length:
@@ -156,6 +163,7 @@ def rollout(
             f"rollout() got {count} actions; a clip takes {length}, so give a positive multiple "
             f"of {length}."
         )
+    _require_known(actions)
     moves = action_geometry.continuous(config.actions, actions)
     if moves.ndim != 2 or moves.shape[1] != 3:
         raise UserError(
@@ -171,3 +179,16 @@ def rollout(
     inputs = (moves.reshape(clips, length, 3), jax.random.split(key, clips))
     state, frames = jax.lax.scan(step, state, inputs)
     return state, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), frames)
+
+
+def _require_known(actions: Array) -> None:
+    """Refuse discrete actions outside the table, which a lookup would clamp to the last row."""
+    if isinstance(actions, Tracer) or not jnp.issubdtype(actions.dtype, jnp.integer):
+        return
+    wrong = sorted({int(a) for a in np.ravel(actions)} - set(range(len(action_geometry.NAMES))))
+    if wrong:
+        known = ", ".join(f"{a} {name}" for a, name in enumerate(action_geometry.NAMES))
+        raise UserError(
+            f"rollout() got the discrete actions {wrong}; there is {known} (continuous actions are "
+            "floats of shape (n, 3))."
+        )

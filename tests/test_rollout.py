@@ -107,3 +107,18 @@ def test_start_refuses_frames_that_do_not_fit(params, change, sentence):
 def test_rollout_refuses_actions_that_do_not_fill_clips(params, actions):
     with pytest.raises(UserError, match=r"multiple of 8|dx, dy, dyaw"):
         rollouts.rollout(CONFIG, params, a_state(params), actions, jax.random.key(0))
+
+
+def test_lists_and_numpy_arrays_are_actions_too(params):
+    state, key = a_state(params), jax.random.key(0)
+    plan = [0, 0, 1, 0, 2, 0, 0, 1]
+    expected = rollouts.rollout(CONFIG, params, state, jnp.asarray(plan), key)[1]
+    for given in (plan, np.asarray(plan, np.uint8)):
+        got = rollouts.rollout(CONFIG, params, state, given, key)[1]
+        np.testing.assert_array_equal(got.rgb_THWC, expected.rgb_THWC)
+
+
+@pytest.mark.parametrize("wrong", [3, -1])
+def test_rollout_refuses_discrete_actions_that_do_not_exist(params, wrong):
+    with pytest.raises(UserError, match=rf"discrete actions \[{wrong}\]; there is 0 forward, 1"):
+        rollouts.rollout(CONFIG, params, a_state(params), [0] * 7 + [wrong], jax.random.key(0))
