@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from pewm_jax import cli
-from pewm_jax.evaluation.report import evaluate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,9 +46,11 @@ def main(argv: Sequence[str]) -> int:
     prog = f"evaluate.py {'RUN' if asks else argv[0]}"
     flags = ["--help"] if asks else argv[1:]
     settings = cli.parse(Settings, flags, default=Settings(), prog=prog, description=about)
+    # Imported here and not above: help and refusals come at once, and Ctrl-C is clean meanwhile.
+    report = importlib.import_module("pewm_jax.evaluation.report")
     cli.cache_compilation(Path(argv[0]).parent)
     try:
-        page = evaluate(argv[0], **vars(settings))
+        page = report.evaluate(argv[0], **vars(settings))
     except KeyboardInterrupt:
         again = "Interrupted; what is scored is kept, run the same command again to go on."
         raise KeyboardInterrupt(again) from None

@@ -1,12 +1,11 @@
 """Train a world model: `python train.py demo`, with any setting changed by a flag."""
 
+import importlib
 import sys
 from collections.abc import Sequence
 
 import configs
 from pewm_jax import cli
-from pewm_jax.evaluation.preview import make_preview
-from pewm_jax.training import loop, runs
 
 USAGE = """usage: python train.py PRESET [--config FILE.json] [--SETTING VALUE …]
 
@@ -39,9 +38,12 @@ def main(argv: Sequence[str]) -> int:
         prog=f"train.py {preset}",
         description=f"{configs.describe(preset)} Settings also come from --config FILE.json.",
     )
-    run = runs.prepare(config)
+    # Imported here and not above: help and refusals come at once, and Ctrl-C is clean meanwhile.
+    loop = importlib.import_module("pewm_jax.training.loop")
+    pictures = importlib.import_module("pewm_jax.evaluation.preview")
+    run = loop.runs.check(config)
     cli.cache_compilation(run.parent)
-    preview = make_preview(config, run) if config.train.preview_every else None
+    preview = pictures.make_preview(config, run) if config.train.preview_every else None
     loop.train(config, preview=preview)
     return 0
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
+import errno
 import hashlib
+import importlib
 import io
 import json
 import platform
@@ -15,7 +17,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
 import tyro
 
 from pewm_jax import config as configuration
@@ -37,16 +38,32 @@ def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None 
         argv: the arguments, by default those of the process.
 
     Returns:
-        0, or 2 for bad input, or 130 (or an ``exit_code`` the error carries) for an interruption.
+        0, or 2 for bad input and for files that cannot be used,
+        or 130 (or an ``exit_code`` the error carries) for an interruption.
     """
     try:
         return main(sys.argv[1:] if argv is None else argv) or 0
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(f"error: {_file_sentence(error)}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt as error:
         print(str(error) or "Interrupted.", file=sys.stderr)
         return getattr(error, "exit_code", 130)
+
+
+def _file_sentence(error: OSError) -> str:
+    """Say which file could not be used, why, and what helps."""
+    where = f"{error.filename}: " if error.filename else ""
+    if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+        fix = "free some space there"
+    elif error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
+        fix = "allow access to it or name another folder"
+    else:
+        fix = "see to that"
+    return f"{where}{error.strerror or error}; {fix}, then run the same command again."
 
 
 def parse(
@@ -124,6 +141,7 @@ def cache_compilation(folder: Path) -> None:
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else [platform.processor()]
     features = next((line for line in lines if line.startswith(("flags", "Features"))), lines[0])
     kind = hashlib.sha256(features.encode()).hexdigest()[:12]
+    jax = importlib.import_module("jax")  # not above: it takes seconds, and refusals need none
     jax.config.update("jax_compilation_cache_dir", str((folder / ".cache" / kind).resolve()))
 
 

@@ -1,6 +1,7 @@
 """`python train.py`, as people run it: helped, refused in one sentence, stopped and resumed."""
 
 import dataclasses
+import errno
 import json
 import os
 import re
@@ -14,12 +15,15 @@ import numpy as np
 import pytest
 
 import configs
+import evaluate
+import pewm_jax
 import train
-from pewm_jax import cli, rollout
+from pewm_jax import cli
 from pewm_jax import config as configuration
 from pewm_jax.config import Config
 from pewm_jax.data.collect import collect
 from pewm_jax.data.recording import CollectConfig
+from pewm_jax.evaluation import preview
 from pewm_jax.training import loop
 
 ROOT = Path(__file__).parents[1]
@@ -40,7 +44,7 @@ def taken(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(train.cli, "cache_compilation", lambda folder: None)
     calls = []
-    monkeypatch.setattr(train, "make_preview", lambda config, run: ("preview", run))
+    monkeypatch.setattr(preview, "make_preview", lambda config, run: ("preview", run))
     monkeypatch.setattr(
         loop, "train", lambda config, *, preview=None: calls.append((config, preview))
     )
@@ -165,6 +169,43 @@ def test_an_interruption_is_told_and_exits_as_shells_expect(capsys):
     assert capsys.readouterr().err == "Interrupted.\n"
 
 
+@pytest.mark.parametrize(
+    ("number", "part"),
+    [(errno.ENOSPC, "free some space"), (errno.EACCES, "allow access"), (errno.EIO, "see to that")],
+)
+def test_a_file_that_cannot_be_used_is_a_sentence(capsys, number, part):
+    def broken(_argv):
+        raise OSError(number, os.strerror(number), "runs/it/config.json")
+
+    assert cli.run(broken, []) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"error: runs/it/config.json: {os.strerror(number)}; {part}")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", [train, evaluate])
+def test_the_heavy_parts_are_imported_only_where_an_interruption_is_clean(command):
+    code = (
+        f"import sys, {command.__name__}; assert not {{'jax', 'flax', 'orbax'}} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+@pytest.mark.parametrize(
+    ("command", "argv"), [(train, ["tiny", "--train.run", "it"]), (evaluate, ["it"])]
+)
+def test_ctrl_c_during_the_imports_is_told(monkeypatch, tmp_path, capsys, command, argv):
+    def interrupted(_name):
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(command.importlib, "import_module", interrupted)
+    monkeypatch.setattr(train.configs, "load", lambda _name: Config())
+    monkeypatch.setattr(train.configs, "describe", lambda _name: "")
+    assert cli.run(command.main, argv) == 130
+    assert capsys.readouterr().err == "Interrupted.\n"
+
+
 def start(*argv, **options):
     command = [sys.executable, "-W", "error", "train.py", *map(str, argv)]
     return subprocess.Popen(
@@ -226,7 +267,7 @@ def test_training_real_episodes_stopped_by_ctrl_c_and_started_again(data, tmp_pa
 
     assert any(path.is_file() for path in (run.parent / ".cache").rglob("*"))
 
-    config, params = rollout.load(run)
+    config, params = pewm_jax.load(run)
     assert config.train.stage1.steps == 200
     assert set(params) == {"backbone", "memory"}
 

@@ -8,7 +8,9 @@ Arrays restore to any number of devices.
 
 from __future__ import annotations
 
+import contextlib
 import types
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -55,14 +57,19 @@ class Checkpoints:
         error: BaseException | None,
         trace: types.TracebackType | None,
     ) -> None:
-        self._manager.close()
+        with self._writing():
+            self._manager.close()
 
     def latest(self) -> int | None:
         """Return the step of the newest complete checkpoint, if there is any."""
         return self._manager.latest_step()
 
     def save(self, state: TrainState) -> None:
-        """Copy the state off the devices and write it in the background."""
+        """Copy the state off the devices and write it in the background.
+
+        Raises:
+            UserError: this checkpoint, or the one before in the background, cannot be written.
+        """
         step = int(state.step)
         if step == self.latest():
             return
@@ -76,11 +83,13 @@ class Checkpoints:
             "state": ocp.args.StandardSave(_rest(self.stage, state)),
             "position": ocp.args.JsonSave(position),
         }
-        self._manager.save(step, args=ocp.args.Composite(**items))
+        with self._writing():
+            self._manager.save(step, args=ocp.args.Composite(**items))
 
     def wait(self) -> None:
-        """Block until everything is on disk."""
-        self._manager.wait_until_finished()
+        """Block until everything is on disk; raises as ``save`` does."""
+        with self._writing():
+            self._manager.wait_until_finished()
 
     def restore(self, like: TrainState) -> TrainState:
         """Read the newest checkpoint.
@@ -110,6 +119,20 @@ class Checkpoints:
         """Read only the inference weights of the newest checkpoint; see ``restore``."""
         items = {"weights": ocp.args.StandardRestore(inference_params(self.stage, like))}
         return self._read(self._require_step(), items)["weights"]
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Turn what goes wrong in writing into a sentence that says what is kept."""
+        try:
+            yield
+        except (OSError, ValueError, RuntimeError) as error:
+            whole = [int(path.name) for path in self.folder.glob("[0-9]*") if path.name.isdigit()]
+            kept = f"that of step {max(whole)} is kept" if whole else "none was written before"
+            reason = " ".join(str(error).split())[:160]
+            raise UserError(
+                f"A checkpoint in {self.folder} cannot be written ({reason}); {kept}: free space "
+                "or allow writing there, then run the same command again to go on."
+            ) from None
 
     def _require_step(self) -> int:
         step = self.latest()

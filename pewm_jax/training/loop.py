@@ -31,7 +31,7 @@ from pewm_jax.training.step import (
     initial_state,
     stage_key,
 )
-from pewm_jax.types import Params
+from pewm_jax.types import Clip, Params
 
 Preview = Callable[[Params, int, int], Path]
 """Called with inference weights, stage number and step; writes a picture and returns its path."""
@@ -60,11 +60,12 @@ def train(
     mesh = sharding.make_mesh()
     for stage in planned:
         sharding.require_divisible(config, stage, mesh)
-    run = runs.prepare(config)
-    if runs.is_finished(run, config):
-        say(f"{run} is already trained: nothing to do.")
-        return run
+    run = runs.check(config)
     with runs.alone(run), Stop() as stop:
+        runs.prepare(config)
+        if runs.is_finished(run, config):
+            say(f"{run} is already trained: nothing to do.")
+            return run
         start: Params | None = None
         for stage in planned:
             start = _train_stage(
@@ -127,6 +128,7 @@ class _Worker:
     checkpoints: Checkpoints
     preview: Preview | None
     pace: Pace = dataclasses.field(default_factory=lambda: Pace(time.monotonic()))
+    shown: bool = False
 
     @property
     def settings(self) -> StageConfig:
@@ -145,8 +147,7 @@ class _Worker:
         key = jax.device_put(stage_key(config, self.stage), sharding.replicated(self.mesh))
         with Feed(iter(batches), sharding.of_batch(self.mesh)) as feed:
             clip = next(feed)
-            state = make_state()
-            step_fn = self._compile(clip)
+            state, step_fn = self._compile(make_state, clip)
             self.pace = Pace(time.monotonic())
             pending: tuple[int, Metrics] | None = None
             for step in range(done + 1, settings.steps + 1):
@@ -167,13 +168,15 @@ class _Worker:
                     clip = next(feed)
         return state
 
-    def _compile(self, clip):
+    def _compile(self, make_state: Callable[[], TrainState], clip: Clip):
+        """Make the state, whose first weights are compiled too, and compile the step."""
         self.view.say(f"stage {self.stage.number}: compiling the training step …")
         began = time.monotonic()
+        state = make_state()
         step_fn = compile_step(self.config, self.stage, self.mesh, clip)
         took = duration(time.monotonic() - began)
         self.view.say(f"stage {self.stage.number}: compiled the training step in {took}")
-        return step_fn
+        return state, step_fn
 
     def _report(self, step: int, metrics: Metrics) -> None:
         """Read a step's metrics, check, show and log them."""
@@ -213,6 +216,9 @@ class _Worker:
     def _show(self, state: TrainState, step: int) -> None:
         if self.preview is None:
             return
+        if not self.shown:
+            self.view.say(f"stage {self.stage.number}: compiling the sampler for pictures …")
+        self.shown = True
         began = time.monotonic()
         path = self.preview(inference_params(self.stage, state), self.stage.number, step)
         self.pace.pause(time.monotonic() - began)

@@ -67,8 +67,10 @@ def phrase(wrong: list[str]) -> str:
     return "; ".join(wrong[:4]) + more
 
 
-def prepare(config: Config) -> Path:
+def check(config: Config) -> Path:
     """Make the run's folder, or make sure that an existing one is of this configuration.
+
+    Nothing is written into it; see ``prepare``.
 
     Raises:
         ConfigError: the folder holds training of another configuration.
@@ -90,7 +92,13 @@ def prepare(config: Config) -> Path:
                 f"{run} was trained with another configuration ({phrase(wrong)}): give this one "
                 f"its own folder with --train.run, or put the settings back, or delete {run}."
             )
-    configuration.save(config, path)
+    return run
+
+
+def prepare(config: Config) -> Path:
+    """Check the run's folder and write down its configuration; only within ``alone``."""
+    run = check(config)
+    configuration.save(config, run / CONFIG)
     return run
 
 

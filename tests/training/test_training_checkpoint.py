@@ -95,3 +95,20 @@ def test_without_a_checkpoint_there_is_a_sentence(fake_model, tmp_path):
         checkpoints.restore_weights(
             step.abstract_state(config, ONE, sharding.make_mesh(jax.devices()[:1]))
         )
+
+
+@pytest.mark.parametrize("where", ["save", "wait_until_finished"])
+def test_a_full_disk_is_a_sentence_that_says_which_checkpoint_is_kept(
+    fake_model, tmp_path, monkeypatch, where
+):
+    config = fakes.config()
+    train(config, ONE, tmp_path, 2)
+    state = step.initial_state(config, ONE, sharding.make_mesh(jax.devices()[:1]))
+
+    def full(*_args, **_options):
+        raise OSError(28, "No space left on device")
+
+    with Checkpoints(tmp_path, config, ONE) as checkpoints, monkeypatch.context() as patch:
+        patch.setattr(checkpoints._manager, where, full)
+        with pytest.raises(UserError, match=r"No space left .* that of step 2 is kept"):
+            checkpoints.save(state) if where == "save" else checkpoints.wait()

@@ -192,12 +192,45 @@ def test_previews_come_at_their_steps_and_at_the_end_of_a_stage(fake_model, tmp_
 
 
 def test_two_trainings_in_one_folder_are_refused(fake_model, tmp_path):
-    with runs.alone(tmp_path), pytest.raises(UserError, match="Another process"):
-        train(fakes.config(tmp_path))
-    train(fakes.config(tmp_path, stage2=0))
+    first = fakes.config(tmp_path, stage2=0)
+    with runs.alone(tmp_path):
+        runs.prepare(first)
+        with pytest.raises(UserError, match="Another process"):
+            train(fakes.config(tmp_path, seed=1))
+        assert configuration.load(tmp_path / "config.json") == first
+    train(first)
 
 
 def test_a_run_folder_that_is_a_file_is_refused(fake_model, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be made"):
         train(fakes.config(tmp_path / "file"))
+
+
+def test_nothing_is_compiled_unannounced(fake_model, tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(loop.LiveView, "say", lambda _view, text: told.append(text))
+
+    def noting(name):
+        real = getattr(loop, name)
+        return lambda *args: (told.append(name), real(*args))[1]
+
+    for name in ("initial_state", "compile_step"):
+        monkeypatch.setattr(loop, name, noting(name))
+
+    def preview(_params, _stage, step):
+        told.append(f"preview {step}")
+        return "picture.png"
+
+    train(fakes.config(tmp_path, stage1=2, stage2=0, preview_every=1), preview=preview)
+    told = [text for text in told if "compiled" not in text and "loss" not in text]
+    assert told == [
+        "stage 1: compiling the training step …",
+        "initial_state",
+        "compile_step",
+        "stage 1: compiling the sampler for pictures …",
+        "preview 1",
+        "stage 1: sample picture picture.png",
+        "preview 2",
+        "stage 1: sample picture picture.png",
+    ]
