@@ -1,8 +1,10 @@
 """Scores that survive an interruption: one small file per finished piece of work.
 
-Pieces lie in a folder named by the fingerprint of weights and protocol, so that pieces of other
-weights can never be mistaken for these; opening the folder drops them. A piece is written aside
-and renamed, and one that does not read counts as not done.
+Pieces lie in ``WEIGHTS/FINGERPRINT/``, named by the hash of the weights and by the fingerprint of
+weights and protocol, so that none can be mistaken for another's. Opening the folder drops pieces of
+other weights; those of other protocols stay, so that a quick look with fewer clips does not cost
+the scores of the full report. A piece is written aside and renamed, and one that does not read
+counts as not done.
 """
 
 from __future__ import annotations
@@ -20,14 +22,15 @@ class Partials:
 
     Args:
         folder: where all partial results of a report lie.
-        fingerprint: of weights and protocol; other fingerprints' pieces are deleted.
+        weights: hash of the weights; pieces of other weights are deleted.
+        fingerprint: of weights and protocol.
     """
 
-    def __init__(self, folder: Path, fingerprint: str):
-        self.folder = folder / fingerprint[:16]
+    def __init__(self, folder: Path, weights: str, fingerprint: str):
+        self.folder = folder / weights[:16] / fingerprint[:16]
         self.folder.mkdir(parents=True, exist_ok=True)
         for other in folder.iterdir():
-            if other != self.folder and other.is_dir():
+            if other != self.folder.parent and other.is_dir():
                 shutil.rmtree(other)
 
     def get(self, name: str) -> dict[str, np.ndarray] | None:

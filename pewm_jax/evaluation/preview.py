@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pewm_jax.config import Config
+from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.evaluation.imagine import Imagination
+from pewm_jax.evaluation.imagine import Imagination, aloud
 from pewm_jax.evaluation.pictures import as_bytes, grid, save_png
 from pewm_jax.evaluation.protocol import choose, load_clip, stack
 from pewm_jax.types import Params
@@ -18,26 +19,33 @@ from pewm_jax.types import Params
 SPLIT, CLIPS = "validation", 3
 
 
-def make_preview(config: Config, run: Path) -> Callable[[Params, int, int], Path]:
-    """Prepare previews for a training run.
+def make_preview(
+    config: Config, run: Path, say: Callable[[str], Any] = aloud
+) -> Callable[[Params, int, int], Path] | None:
+    """Prepare previews for a training run, where its data can be previewed.
+
+    A training needs no previews: without validation data, or where that cannot be replayed (too
+    short, or moved in ways that are not upright), one line says so and there are none.
 
     Args:
         config: the experiment; clips come from ``data.path``/validation.
         run: its folder; pictures go to ``previews/`` inside.
+        say: told why there are no previews.
 
     Returns:
         ``preview(params, stage, step)``: imagines the clips with the current weights and writes
         ``previews/stage2-000250.png`` with rows truth, with its map, empty map (stage 1: truth,
-        model). It is compiled once per stage.
-
-    Raises:
-        UserError: there is no validation data, or its episodes are too short.
+        model). It is compiled once per stage. None where there is nothing to preview.
     """
     quick = dataclasses.replace(config.evaluate, split=SPLIT, batch=CLIPS)
     config = dataclasses.replace(config, evaluate=quick)
-    episodes = EpisodeSource(Path(config.data.path) / SPLIT)
-    choices = choose(config, episodes, CLIPS, 1)
-    clips = [load_clip(config, episodes, choice) for choice in choices]
+    try:
+        episodes = EpisodeSource(Path(config.data.path) / SPLIT)
+        choices = choose(config, episodes, CLIPS, 1)
+        clips = [load_clip(config, episodes, choice) for choice in choices]
+    except UserError as error:
+        say(f"no previews of this training: {error}")
+        return None
     context = stack([clip[0] for clip in clips], CLIPS)
     actions = stack([clip[2] for clip in clips], CLIPS)
     seeds = np.stack([np.zeros(CLIPS, int), np.arange(CLIPS)], -1)

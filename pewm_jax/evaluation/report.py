@@ -85,7 +85,7 @@ def evaluate(run: str | Path, *, say: Callable[[str], Any] = aloud, **changes: A
         say("the report is complete for these weights and this protocol; nothing to do")
         return folder / PAGE
     folder.mkdir(parents=True, exist_ok=True)
-    partials = Partials(folder / "partial", name)
+    partials = Partials(folder / "partial", weights_hash, name)
     model = Imagination(config, params, config.evaluate.batch, config.data.context, say)
     scored = score_table(config, episodes, model, partials, say)
     long = roll_long(config, episodes, model, partials, say)

@@ -59,12 +59,17 @@ def walk(length, seed):
     return np.array(actions[: length - 1])
 
 
-def record(index, length=24, size=SIZE, scene=None):
-    """One episode of the room."""
+def record(index, length=24, size=SIZE, scene=None, nod=0.0):
+    """One episode of the room; from frame 14 on the camera is pitched by ``nod`` radians."""
     ids = walk(length, index)
     pose = pose_from_yaw(np.array([-0.5, 0.1 * index, 1.25]), 0.4 * index)
     moves = discrete_table(Config().actions)[ids]
     poses = np.asarray(integrate(pose, moves))
+    if nod:
+        cos, sin = np.cos(nod), np.sin(nod)
+        poses = poses.copy()
+        poses[14:, :3, :3] = poses[14:, :3, :3] @ [[1, 0, 0], [0, cos, -sin], [0, sin, cos]]
+        moves, ids = None, None
     intrinsics = intrinsics_from_fov(size, size, 90.0)
     colour, depth = jax.vmap(lambda p: look(p, intrinsics, 0.0, size))(poses)
     arrays = EpisodeArrays(
@@ -73,7 +78,7 @@ def record(index, length=24, size=SIZE, scene=None):
         intrinsics,
         poses,
         moves,
-        ids.astype(np.int32),
+        None if ids is None else ids.astype(np.int32),
     )
     info = {"return_frame": 12}
     return write_episode(arrays, f"room-{index}/revisit", scene or f"room-{index}", info)

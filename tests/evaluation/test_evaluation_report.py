@@ -172,6 +172,16 @@ def test_more_seeds_keep_what_was_scored(copied):
     assert metrics["protocol"]["seeds"] == [0, 1, 2]
 
 
+def test_a_quick_look_does_not_cost_the_full_scores(copied, monkeypatch):
+    page = copied / "report" / "index.html"
+    whole = page.read_bytes()
+    report.evaluate(copied, say=lambda _: None, clips=2)
+    assert page.read_bytes() != whole
+    monkeypatch.setattr(Imagination, "run", None)
+    report.evaluate(copied, say=lambda _: None)
+    assert page.read_bytes() == whole
+
+
 def test_other_weights_start_anew(copied):
     params = weights.load(copied / "weights.safetensors")
     changed = jax.tree.map(lambda leaf: leaf * np.float32(1.01), params)
@@ -274,10 +284,17 @@ def test_previews_show_each_method(run, tmp_path, stage, rows, monkeypatch):
     assert (height - 34 - 24) // per_row == 2 * rows
 
 
-def test_a_preview_without_validation_data_says_what_to_do(run, tmp_path):
-    config = tiny(tmp_path)
-    with pytest.raises(UserError, match="validation does not exist"):
-        preview.make_preview(config, tmp_path)
+def test_data_that_cannot_be_previewed_cost_one_line_and_not_the_training(tmp_path):
+    config, said = tiny(tmp_path), []
+    assert preview.make_preview(config, tmp_path, said.append) is None
+    assert len(said) == 1
+    assert said[0].startswith("no previews")
+    assert "validation does not exist" in said[0]
+
+    write_split(tmp_path / "data" / "validation", episodes=1, nod=0.3)
+    assert preview.make_preview(config, tmp_path, said.append) is None
+    assert len(said) == 2
+    assert "upright motion" in said[1]
 
 
 def test_verdicts_are_fair():

@@ -43,7 +43,9 @@ def knowing_model(tmp_path_factory):
 def test_a_model_that_remembers_wins_by_a_mile(knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, clips=3)
     model = knowing_model()
-    scored = scoring.score_table(config, episodes, model, Partials(tmp_path, "f" * 64), print)
+    scored = scoring.score_table(
+        config, episodes, model, Partials(tmp_path, "e" * 64, "f" * 64), print
+    )
     assert scored.sums["memory"].shape == (2, 3, 4, 3, 7)
     assert scored.sums["copy"].shape == (1, 3, 4, 3, 7)
     results = table(scored.sums, scored.episodes)
@@ -62,7 +64,9 @@ def test_a_model_that_remembers_wins_by_a_mile(knowing_model, episodes, tmp_path
 def test_a_model_that_is_one_frame_late_is_noticed(knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, clips=2)
     model = knowing_model(late=1)
-    scored = scoring.score_table(config, episodes, model, Partials(tmp_path, "f" * 64), print)
+    scored = scoring.score_table(
+        config, episodes, model, Partials(tmp_path, "e" * 64, "f" * 64), print
+    )
     assert table(scored.sums, scored.episodes)["memory"]["all"]["psnr"]["mean"] < 25
 
 
@@ -71,7 +75,7 @@ def test_batches_do_not_change_the_numbers(knowing_model, episodes, tmp_path):
     for batch in (2, 3):
         config = tiny(tmp_path, clips=3, batch=batch)
         model = knowing_model(batch)
-        partials = Partials(tmp_path / str(batch), "f" * 64)
+        partials = Partials(tmp_path / str(batch), "e" * 64, "f" * 64)
         sums.append(scoring.score_table(config, episodes, model, partials, print).sums)
     for method in sums[0]:
         np.testing.assert_allclose(sums[0][method], sums[1][method], rtol=1e-4, atol=1e-4)
@@ -80,7 +84,9 @@ def test_batches_do_not_change_the_numbers(knowing_model, episodes, tmp_path):
 def test_scored_pieces_are_not_done_again(monkeypatch, knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, clips=4, chain=2)
     model = knowing_model()
-    whole = scoring.score_table(config, episodes, model, Partials(tmp_path / "a", "f" * 64), print)
+    whole = scoring.score_table(
+        config, episodes, model, Partials(tmp_path / "a", "e" * 64, "f" * 64), print
+    )
 
     calls, run = [], Imagination.run
 
@@ -92,10 +98,12 @@ def test_scored_pieces_are_not_done_again(monkeypatch, knowing_model, episodes, 
 
     monkeypatch.setattr(Imagination, "run", failing)
     with pytest.raises(KeyboardInterrupt):
-        scoring.score_table(config, episodes, model, Partials(tmp_path / "b", "f" * 64), print)
+        scoring.score_table(
+            config, episodes, model, Partials(tmp_path / "b", "e" * 64, "f" * 64), print
+        )
     said = []
     resumed = scoring.score_table(
-        config, episodes, model, Partials(tmp_path / "b", "f" * 64), said.append
+        config, episodes, model, Partials(tmp_path / "b", "e" * 64, "f" * 64), said.append
     )
     # Two batches × two seeds × two sampled methods, each imagined exactly once (plus the cut one).
     assert len(calls) == 8 + 1
@@ -105,21 +113,31 @@ def test_scored_pieces_are_not_done_again(monkeypatch, knowing_model, episodes, 
 
 
 def test_pieces_of_other_weights_are_dropped_and_broken_ones_ignored(tmp_path):
-    old = Partials(tmp_path, "a" * 64)
+    old = Partials(tmp_path, "a" * 64, "f" * 64)
     old.put("piece", x=np.arange(3))
     assert old.get("piece")["x"].tolist() == [0, 1, 2]
     path = old.folder / "piece.npz"
     path.write_bytes(path.read_bytes()[:-30])
     assert old.get("piece") is None
-    new = Partials(tmp_path, "b" * 64)
+    new = Partials(tmp_path, "b" * 64, "f" * 64)
     assert new.get("piece") is None
     assert not old.folder.exists()
+
+
+def test_pieces_of_another_protocol_stay_and_stay_apart(tmp_path):
+    full = Partials(tmp_path, "a" * 64, "f" * 64)
+    full.put("piece", x=np.arange(3))
+    quick = Partials(tmp_path, "a" * 64, "c" * 64)
+    assert quick.get("piece") is None
+    quick.put("piece", x=np.zeros(1))
+    again = Partials(tmp_path, "a" * 64, "f" * 64)
+    assert again.get("piece")["x"].tolist() == [0, 1, 2]
 
 
 def test_long_rollouts_keep_pictures_and_the_map(monkeypatch, knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, video_clips=9)
     model = knowing_model()
-    partials = Partials(tmp_path, "f" * 64)
+    partials = Partials(tmp_path, "e" * 64, "f" * 64)
     long = scoring.roll_long(config, episodes, model, partials, print)
     assert long.chain == 5  # 5 × 4 frames after a start fit into 24 frames; 6 do not
     assert long.shown == 1
