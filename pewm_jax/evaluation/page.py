@@ -42,16 +42,29 @@ dt { color: var(--quiet); } dd { margin: 0; overflow-wrap: anywhere; }
 code { font-size: .9em; overflow-wrap: anywhere; }
 """
 INTRODUCTION = (
-    "An agent walks through places that the model was never trained on, goes out and comes back. "
+    "An agent walks through {places}, goes out and comes back. "
     "From what it observed on the way, the model imagines what comes next: with the 3D map it has "
     "drawn up, and with the same weights and an empty map."
 )
+PLACES = {
+    True: "places that the model was never trained on",
+    False: "places of which the model was trained in {shared} of {scenes} (so this does not show "
+    "how it does in new ones)",
+    None: "places that the model may have been trained on (its training data is not there to tell)",
+}
+"""By ``held_out`` of the protocol."""
 METHOD_NAMES = {
     "memory": "with its map",
     "empty": "same weights, empty map",
     "copy": "copying the last frame",
 }
 """How the page names the methods."""
+CLUSTERS = {
+    "scene": "clustered by scene, because clips of one scene show the same rooms",
+    "episode": "clustered by episode: all clips are of one scene, and how much other scenes would "
+    "differ cannot be said",
+}
+"""What a standard error covers, by ``clustered_by`` of the protocol."""
 MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
 """How the page names the masks."""
 METRIC_NAMES = {
@@ -78,7 +91,7 @@ def verdict(entry: Mapping[str, Any], where: str) -> str:
         return f"No clip has enough pixels {where} to compare."
     if stderr is None:
         return (
-            f"On pixels {where} the map changes PSNR by {mean:+.2f} dB; with clips of one episode "
+            f"On pixels {where} the map changes PSNR by {mean:+.2f} dB; with clips of one place "
             "only, how sure that is cannot be said."
         )
     amount = f"{abs(mean):.2f} ± {stderr:.2f} dB"
@@ -88,6 +101,14 @@ def verdict(entry: Mapping[str, Any], where: str) -> str:
     if mean < -2 * stderr:
         return f"On pixels {where} the map makes the model worse, by {amount}."
     return f"On pixels {where} the map makes no clear difference ({mean:+.2f} ± {stderr:.2f} dB)."
+
+
+def introduction(protocol: Mapping[str, Any]) -> str:
+    """Say what was done, and whether the places were new to the model."""
+    places = PLACES[protocol["held_out"]].format(
+        shared=len(protocol["trained_scenes"]), scenes=len(protocol["scene_names"])
+    )
+    return INTRODUCTION.format(places=places)
 
 
 def embed(kind: str, content: bytes) -> str:
@@ -106,7 +127,7 @@ def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
     unseen = verdict(metrics["margin"]["unseen"]["psnr"], "never seen")
     sections = [
         "<h1>Does the model remember what it saw?</h1>",
-        f'<p class="quiet">{INTRODUCTION}</p>',
+        f'<p class="quiet">{introduction(metrics["protocol"])}</p>',
         f'<p class="lead"><strong>{escape(seen)}</strong> {escape(unseen)}</p>',
         _videos(gallery),
         _stills(gallery),
@@ -138,7 +159,7 @@ def _videos(gallery: Gallery) -> str:
         "its map, on the right the same model with an empty map. Above colour, below depth "
         "(bright is near). All three start from the same observed picture and follow the same "
         "actions; after each clip the model goes on from its own last frame. The first episodes of "
-        "the held-out set, not chosen.</p>" + "".join(figures)
+        "the split, not chosen.</p>" + "".join(figures)
     )
 
 
@@ -177,14 +198,15 @@ def _table(metrics: Mapping[str, Any]) -> str:
             f"<td>{gains['psnr']['n']}</td></tr>"
         )
     seeds = metrics["protocol"]["seeds"]
+    cover = CLUSTERS[metrics["protocol"]["clustered_by"]]
     per_seed = ", ".join(f"{value:+.2f}" for value in metrics["margin"]["seen"]["psnr"]["per_seed"])
     return (
         f'<div class="scroll"><table><thead><tr><th></th>{heads}<th>clips</th></tr></thead><tbody>'
         + "".join(rows)
         + "</tbody></table></div>"
         "<p class='quiet'>Mean ± standard error over clips. Sampling seeds are averaged within a "
-        "clip first, and the error is clustered by episode, because clips of one episode show the "
-        "same rooms. The difference is taken clip by clip with the same noise. "
+        f"clip first, and the error is {cover}. "
+        "The difference is taken clip by clip with the same noise. "
         f"Gain on pixels seen before, seed by seed ({', '.join(map(str, seeds))}): "
         f"{per_seed} dB.</p>"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,10 @@ from pewm_jax.evaluation.scoring import LongRollouts, Scored, roll_long, score_t
 from pewm_jax.rollouts import load
 
 WEIGHTS = "weights.safetensors"
+TRAINED_ON = "train"
+"""The split that ``training`` reads."""
+REPORT_VERSION = 2
+"""Raised whenever the same scores would give another report."""
 PAGE, METRICS, STRIP = "index.html", "metrics.json", "strip.png"
 
 
@@ -70,6 +74,7 @@ def evaluate(run: str | Path, *, say: Callable[[str], Any] = aloud, **changes: A
     if not run.is_dir():
         raise UserError(f"{run} does not exist; train a model first, e.g. `python train.py demo`.")
     config, params = load(run)
+    trained_on = Path(config.data.path) / TRAINED_ON
     if "memory" not in params:
         raise UserError(
             f"{run / WEIGHTS} has no memory blocks yet, only stage 1 is trained; finish training "
@@ -91,10 +96,11 @@ def evaluate(run: str | Path, *, say: Callable[[str], Any] = aloud, **changes: A
     long = roll_long(config, episodes, model, partials, say)
     say("drawing the report …")
     metrics = measure(config, scored, long)
-    metrics["protocol"] |= {
+    metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {
         "weights_sha256": weights_hash,
         "dataset_sha256": data_hash,
         "fingerprint": name,
+        "report_version": REPORT_VERSION,
     }
     gallery = make_gallery(config, episodes, long)
     (folder / METRICS).unlink(missing_ok=True)
@@ -115,6 +121,7 @@ def is_complete(folder: Path, config: Config, name: str) -> bool:
         protocol = metrics["protocol"]
         return (
             protocol["fingerprint"] == name
+            and protocol["report_version"] == REPORT_VERSION
             and protocol["seeds"] == list(config.evaluate.seeds)
             and protocol["config"]["evaluate"]["videos"] == config.evaluate.videos
             and metrics["page_sha256"] == file_hash(folder / PAGE)
@@ -122,6 +129,26 @@ def is_complete(folder: Path, config: Config, name: str) -> bool:
         )
     except (OSError, ValueError, KeyError, TypeError):
         return False
+
+
+def held_out(scenes: Sequence[str], trained_on: Path) -> dict[str, Any]:
+    """Tell whether the model was trained in the scenes it is scored in, by their names.
+
+    Args:
+        scenes: names of the scenes scored.
+        trained_on: folder of the split the run was trained on.
+
+    Returns:
+        ``held_out``: True where no scene is shared, False where some are, None where the training
+        data is not there (any more) to tell; ``trained_scenes``: those scored that are shared.
+    """
+    try:
+        source = EpisodeSource(trained_on)
+        known = {source[index].scene for index in range(len(source))}
+    except UserError:
+        return {"held_out": None, "trained_scenes": []}
+    shared = sorted(known & set(scenes))
+    return {"held_out": not shared, "trained_scenes": shared}
 
 
 def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
@@ -135,13 +162,13 @@ def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any
     far = long.scored
     return {
         "protocol": protocol_of(config, scored, long),
-        "results": statistics.table(scored.sums, scored.episodes),
-        "margin": statistics.margin(scored.sums["memory"], scored.sums["empty"], scored.episodes),
-        "per_frame": statistics.per_frame(scored.sums, scored.episodes),
+        "results": statistics.table(scored.sums, scored.clusters),
+        "margin": statistics.margin(scored.sums["memory"], scored.sums["empty"], scored.clusters),
+        "per_frame": statistics.per_frame(scored.sums, scored.clusters),
         "long": {
-            "results": statistics.table(far.sums, far.episodes),
-            "margin": statistics.margin(far.sums["memory"], far.sums["empty"], far.episodes),
-            "per_frame": statistics.per_frame(far.sums, far.episodes),
+            "results": statistics.table(far.sums, far.clusters),
+            "margin": statistics.margin(far.sums["memory"], far.sums["empty"], far.clusters),
+            "per_frame": statistics.per_frame(far.sums, far.clusters),
         },
     }
 
@@ -149,7 +176,7 @@ def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any
 def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
     """State what was measured, completely enough to be repeated."""
     clip, choices = config.clip, scored.choices
-    scenes = sorted({choice.scene for choice in choices})
+    scenes = sorted({choice.scene for choice in choices + long.scored.choices})
     return {
         "scenes": len(scenes),
         "episodes": len({choice.episode for choice in choices}),
@@ -180,7 +207,8 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "equal images count as 100 dB",
         "ssim": "11 × 11 Gaussian window, σ 1.5, valid windows, averaged over masked pixels",
         "depth": "mean absolute error in metres, and relative to the true depth",
-        "stderr": "over clips, seeds averaged within a clip, clustered by episode",
+        "stderr": "over clips, seeds averaged within a clip, clustered by " + scored.clustered_by,
+        "clustered_by": scored.clustered_by,
         "long_rollouts": {
             "rollouts": len(long.scored.choices),
             "clips_each": long.chain,

@@ -34,9 +34,15 @@ class Scored:
     sums: dict[str, np.ndarray]
 
     @property
-    def episodes(self) -> np.ndarray:
-        """(C,) the episode of every clip."""
-        return np.array([choice.episode for choice in self.choices])
+    def clustered_by(self) -> str:
+        """What standard errors are clustered by: ``scene``, or ``episode`` if all share one."""
+        return "scene" if len({choice.scene for choice in self.choices}) > 1 else "episode"
+
+    @property
+    def clusters(self) -> np.ndarray:
+        """(C,) the number of the cluster of every clip: clips of one cluster share rooms."""
+        names = [getattr(choice, self.clustered_by) for choice in self.choices]
+        return np.unique(names, return_inverse=True)[1]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """From sums under masks to the numbers of the table, with honest standard errors.
 
-Clips of one episode show the same rooms, so they are not independent: standard errors are
-clustered by episode (Liang & Zeger 1986; with one clip per episode this is σ / √n). Sampling
-seeds are averaged within a clip first: more seeds sharpen a clip's score but are no new evidence
-about new places.
+Clips of one scene show the same rooms, so they are not independent: standard errors are clustered
+by scene (Liang & Zeger 1986; with one clip per scene this is σ / √n), or by episode where there is
+one scene only. Sampling seeds are averaged within a clip first: more seeds sharpen a clip's score
+but are no new evidence about new places.
 """
 
 from __future__ import annotations
@@ -51,38 +51,38 @@ def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
     return result
 
 
-def summary(values: np.ndarray, episodes: np.ndarray) -> dict[str, Any]:
+def summary(values: np.ndarray, clusters: np.ndarray) -> dict[str, Any]:
     """Average clips and state how sure the average is.
 
     Args:
         values: (clips,) one number per clip, NaN where a clip has none.
-        episodes: (clips,) the episode each clip comes from.
+        clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
-        ``mean``, ``stderr`` clustered by episode (None where fewer than two episodes have a
+        ``mean``, ``stderr`` clustered (None where fewer than two clusters have a
         value), and ``n``, the number of clips.
     """
     known = np.isfinite(values)
-    values, episodes = values[known], episodes[known]
+    values, clusters = values[known], clusters[known]
     count = len(values)
     if count == 0:
         return {"mean": None, "stderr": None, "n": 0}
     mean = float(values.mean())
-    groups = np.unique(episodes)
+    groups = np.unique(clusters)
     stderr = None
     if len(groups) > 1:
-        off = [float((values[episodes == group] - mean).sum()) for group in groups]
+        off = [float((values[clusters == group] - mean).sum()) for group in groups]
         correction = len(groups) / (len(groups) - 1)
         stderr = math.sqrt(correction * sum(total**2 for total in off)) / count
     return {"mean": mean, "stderr": stderr, "n": count}
 
 
-def table(sums: Mapping[str, np.ndarray], episodes: np.ndarray) -> dict[str, Any]:
+def table(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
     """Score every method under every mask.
 
     Args:
         sums: method → (seeds, clips, T, 3, 7).
-        episodes: (clips,) the episode each clip comes from.
+        clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
         ``results[method][mask][metric] = {mean, stderr, n}``.
@@ -91,23 +91,23 @@ def table(sums: Mapping[str, np.ndarray], episodes: np.ndarray) -> dict[str, Any
     for method, sums_SCT37 in sums.items():
         by_mask = scores(sums_SCT37.sum(2))
         results[method] = {
-            mask: {m: summary(by_mask[mask][m].mean(0), episodes) for m in METRICS}
+            mask: {m: summary(by_mask[mask][m].mean(0), clusters) for m in METRICS}
             for mask in MASKS
         }
     return results
 
 
-def margin(better: np.ndarray, base: np.ndarray, episodes: np.ndarray) -> dict[str, Any]:
+def margin(better: np.ndarray, base: np.ndarray, clusters: np.ndarray) -> dict[str, Any]:
     """Compare two methods clip by clip: the same clips, seeds and noise.
 
     Args:
         better: (seeds, clips, T, 3, 7) sums of the first method.
         base: the same of the second.
-        episodes: (clips,) the episode each clip comes from.
+        clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
         ``[mask][metric]``: ``mean`` of first − second (for depth errors less is better),
-        ``stderr`` over episodes, ``n`` clips, ``episodes``, ``per_seed`` means and
+        ``stderr`` over clusters, ``n`` clips, ``clusters``, ``per_seed`` means and
         ``stderr_over_seeds``.
     """
     first, second = scores(better.sum(2)), scores(base.sum(2))
@@ -122,20 +122,20 @@ def margin(better: np.ndarray, base: np.ndarray, episodes: np.ndarray) -> dict[s
             if len(per_seed) > 1:
                 spread = float(per_seed.std(ddof=1) / math.sqrt(len(per_seed)))
             result[mask][metric] = {
-                **summary(gain_SC.mean(0), episodes),
-                "episodes": len(np.unique(episodes[known])),
+                **summary(gain_SC.mean(0), clusters),
+                "clusters": len(np.unique(clusters[known])),
                 "per_seed": [float(value) for value in per_seed],
                 "stderr_over_seeds": spread,
             }
     return result
 
 
-def per_frame(sums: Mapping[str, np.ndarray], episodes: np.ndarray) -> dict[str, Any]:
+def per_frame(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
     """Score every frame index on its own.
 
     Args:
         sums: method → (seeds, clips, T, 3, 7).
-        episodes: (clips,) the episode each clip comes from.
+        clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
         ``[method][mask][metric] = {mean: [T], stderr: [T], n: [T]}``; entry 0 is the first
@@ -149,7 +149,7 @@ def per_frame(sums: Mapping[str, np.ndarray], episodes: np.ndarray) -> dict[str,
             result[method][mask] = {}
             for metric in METRICS:
                 values_CT = by_mask[mask][metric].mean(0)
-                points = [summary(values_CT[:, t], episodes) for t in range(values_CT.shape[1])]
+                points = [summary(values_CT[:, t], clusters) for t in range(values_CT.shape[1])]
                 result[method][mask][metric] = {
                     key: [point[key] for point in points] for key in ("mean", "stderr", "n")
                 }

@@ -25,7 +25,7 @@ from pewm_jax import weights
 from pewm_jax.config import UserError
 from pewm_jax.evaluation import imagine, preview, report
 from pewm_jax.evaluation.imagine import Imagination
-from pewm_jax.evaluation.page import number, verdict
+from pewm_jax.evaluation.page import introduction, number, verdict
 from pewm_jax.models import world_model
 
 ROOT = Path(__file__).parents[2]
@@ -66,6 +66,7 @@ def run(tmp_path_factory, compile_once):
     config = tiny(base)
     write_split(base / "data" / "revisit", episodes=2)
     write_split(base / "data" / "validation", episodes=2)
+    write_split(base / "data" / "train", episodes=1, scene="elsewhere")
     folder = base / "run"
     folder.mkdir()
     configs.save(config, folder / "config.json")
@@ -96,6 +97,8 @@ def test_metrics_hold_every_method_mask_and_metric(run):
     assert (protocol["clips"], protocol["episodes"], protocol["scenes"]) == (4, 2, 2)
     assert protocol["weights_sha256"] == report.file_hash(run / "weights.safetensors")
     assert protocol["context"] == 6
+    assert (protocol["held_out"], protocol["trained_scenes"]) == (True, [])
+    assert protocol["clustered_by"] == "scene"
     assert protocol["sampling_steps"] == 2
     assert protocol["encoder"] == "patch_colours"
     assert configs.from_dict(configs.Config, protocol["config"]) == configs.load(
@@ -295,6 +298,21 @@ def test_data_that_cannot_be_previewed_cost_one_line_and_not_the_training(tmp_pa
     assert preview.make_preview(config, tmp_path, said.append) is None
     assert len(said) == 2
     assert "upright motion" in said[1]
+
+
+def test_places_are_called_new_only_where_they_are(run, tmp_path):
+    page = (run / "report" / "index.html").read_text()
+    assert "never trained on" in page
+    train = write_split(tmp_path / "train", episodes=2)
+    found = report.held_out(["room-1", "room-7"], train)
+    assert found == {"held_out": False, "trained_scenes": ["room-1"]}
+    names = {"scene_names": ["room-1", "room-7"]}
+    assert "trained in 1 of 2" in introduction(found | names)
+    assert "never" not in introduction(found | names)
+    assert report.held_out(["room-7"], train)["held_out"] is True
+    unknown = report.held_out(["room-7"], tmp_path / "gone")
+    assert unknown["held_out"] is None
+    assert "may have been" in introduction(unknown | names)
 
 
 def test_verdicts_are_fair():

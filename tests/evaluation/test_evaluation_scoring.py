@@ -7,12 +7,14 @@ import functools
 import jax
 import numpy as np
 import pytest
-from evaluation_scene import knowing_rollout, tiny, write_split
+from evaluation_scene import knowing_rollout, record, tiny, write_split
 
 from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.episodes import read_episode
 from pewm_jax.evaluation import imagine, scoring
 from pewm_jax.evaluation.imagine import Imagination
 from pewm_jax.evaluation.partial import Partials
+from pewm_jax.evaluation.protocol import choose
 from pewm_jax.evaluation.statistics import margin, table
 
 PARAMS = {"offset": np.float32(0)}
@@ -48,7 +50,7 @@ def test_a_model_that_remembers_wins_by_a_mile(knowing_model, episodes, tmp_path
     )
     assert scored.sums["memory"].shape == (2, 3, 4, 3, 7)
     assert scored.sums["copy"].shape == (1, 3, 4, 3, 7)
-    results = table(scored.sums, scored.episodes)
+    results = table(scored.sums, scored.clusters)
     # Only rounding of colours to 8 bits and of depth to millimetres is left.
     assert results["memory"]["all"]["psnr"]["mean"] > 50
     assert results["memory"]["all"]["ssim"]["mean"] > 0.999
@@ -56,7 +58,7 @@ def test_a_model_that_remembers_wins_by_a_mile(knowing_model, episodes, tmp_path
     assert results["empty"]["all"]["psnr"]["mean"] < 15
     assert results["empty"]["all"]["depth_mae"]["mean"] == pytest.approx(1, abs=0.01)
     assert results["copy"]["all"]["psnr"]["mean"] < 25
-    gain = margin(scored.sums["memory"], scored.sums["empty"], scored.episodes)["seen"]["psnr"]
+    gain = margin(scored.sums["memory"], scored.sums["empty"], scored.clusters)["seen"]["psnr"]
     assert gain["mean"] > 10 * gain["stderr"]
     assert gain["mean"] > 35
 
@@ -67,7 +69,7 @@ def test_a_model_that_is_one_frame_late_is_noticed(knowing_model, episodes, tmp_
     scored = scoring.score_table(
         config, episodes, model, Partials(tmp_path, "e" * 64, "f" * 64), print
     )
-    assert table(scored.sums, scored.episodes)["memory"]["all"]["psnr"]["mean"] < 25
+    assert table(scored.sums, scored.clusters)["memory"]["all"]["psnr"]["mean"] < 25
 
 
 def test_batches_do_not_change_the_numbers(knowing_model, episodes, tmp_path):
@@ -110,6 +112,18 @@ def test_scored_pieces_are_not_done_again(monkeypatch, knowing_model, episodes, 
     assert "scored before" in said[0]
     for method in whole.sums:
         np.testing.assert_array_equal(whole.sums[method], resumed.sums[method])
+
+
+def test_clips_of_one_scene_are_one_cluster(tmp_path):
+    two = [read_episode(record(i, scene=f"house-{i // 2}")) for i in range(4)]
+    one = [read_episode(record(i, scene="house")) for i in range(3)]
+    config = tiny(tmp_path)
+    scored = scoring.Scored(choose(config, two, 4, 1), {})
+    assert scored.clustered_by == "scene"
+    assert scored.clusters.tolist() == [0, 0, 1, 1]
+    scored = scoring.Scored(choose(config, one, 3, 1), {})
+    assert scored.clustered_by == "episode"
+    assert scored.clusters.tolist() == [0, 1, 2]
 
 
 def test_pieces_of_other_weights_are_dropped_and_broken_ones_ignored(tmp_path):

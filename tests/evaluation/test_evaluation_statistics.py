@@ -98,7 +98,7 @@ def test_margin_is_paired():
     assert gain["stderr"] == pytest.approx(0, abs=1e-6)
     assert gain["per_seed"] == pytest.approx([3, 3, 3])
     assert gain["stderr_over_seeds"] == pytest.approx(0, abs=1e-6)
-    assert (gain["n"], gain["episodes"]) == (10, 5)
+    assert (gain["n"], gain["clusters"]) == (10, 5)
     reverse = margin(sums_of(base), sums_of(base / 10**0.3), episodes)
     assert reverse["seen"]["psnr"]["mean"] == pytest.approx(-3)
     assert got["all"]["depth_mae"]["mean"] < 0
