@@ -19,15 +19,17 @@ help:
 .venv/made:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: $(PYTHON) is older than 3.11; name a newer one: make PYTHON=python3.12"; exit 2; }
-	@echo "setting up .venv (about a minute) …"
-	@$(PYTHON) -m venv .venv
+	@$(PYTHON) -m venv .venv || \
+	  { rm -rf .venv; echo "error: no virtual environment; on Debian and Ubuntu: apt install python3-venv"; exit 2; }
 	@touch $@
 
 .venv/installed: .venv/made pyproject.toml
+	@echo "installing the library (about a minute) …"
 	@$(PY) -m pip install --quiet --disable-pip-version-check --editable .
 	@touch $@
 
 .venv/installed-dev: .venv/made pyproject.toml
+	@echo "installing the library and the tools of its tests (about a minute) …"
 	@$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	@touch $@ .venv/installed
 
