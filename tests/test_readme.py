@@ -58,6 +58,12 @@ def smaller(command):
 
 def run(arguments, cwd):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"}
+    for name in (
+        "MAKEFLAGS",
+        "MAKELEVEL",
+        "MFLAGS",
+    ):  # as a person calls it, also under `make test`
+        environment.pop(name, None)
     done = subprocess.run(
         arguments,
         cwd=cwd,

@@ -1,0 +1,36 @@
+"""Every setting of the library: frozen dataclasses, validated when built, to and from JSON.
+
+A field's docstring is its ``--help`` text. A value that cannot work is refused when the
+configuration is built, with a sentence that names the fix; nothing is checked deeper down.
+"""
+
+from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
+from pewm_jax.config.codec import CodecConfig
+from pewm_jax.config.diffusion import DiffusionConfig
+from pewm_jax.config.dit import DiTConfig
+from pewm_jax.config.errors import ConfigError, UserError
+from pewm_jax.config.experiment import Config
+from pewm_jax.config.files import from_dict, load, save, to_dict
+from pewm_jax.config.memory import MemoryConfig
+from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
+
+__all__ = [
+    "SMALLEST",
+    "ActionConfig",
+    "ClipConfig",
+    "CodecConfig",
+    "Config",
+    "ConfigError",
+    "DataConfig",
+    "DiTConfig",
+    "DiffusionConfig",
+    "EvalConfig",
+    "MemoryConfig",
+    "StageConfig",
+    "TrainConfig",
+    "UserError",
+    "from_dict",
+    "load",
+    "save",
+    "to_dict",
+]

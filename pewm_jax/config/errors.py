@@ -1,0 +1,26 @@
+"""How a setting, or any other input of a user's, is refused: in one sentence."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class UserError(ValueError):
+    """Bad input from a user, in one sentence: what is wrong, where, and what to do."""
+
+
+class ConfigError(UserError):
+    """A setting that cannot work; the message says what is wrong, where, and what to do."""
+
+
+def require(condition: bool, sentence: str) -> None:
+    """Refuse a setting with a sentence unless the condition holds."""
+    if not condition:
+        raise ConfigError(sentence)
+
+
+def require_positive(section: Any, where: str, *names: str) -> None:
+    """Refuse sizes and counts below 1, each by its own name."""
+    for name in names:
+        value = getattr(section, name)
+        require(value >= 1, f"{where}.{name} is {value}: use at least 1.")

@@ -1,0 +1,96 @@
+"""Configurations to and from plain values and JSON, strictly."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import typing
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pewm_jax.config.errors import ConfigError, require
+from pewm_jax.config.experiment import Config
+
+T = TypeVar("T")
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Turn a configuration into plain dictionaries, lists, numbers and strings."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(kind: type[T], values: dict[str, Any], where: str = "config") -> T:
+    """Build a configuration dataclass from plain dictionaries, strictly.
+
+    Args:
+        kind: the dataclass to build, e.g. ``Config``.
+        values: nested plain values; absent fields take their defaults.
+        where: name of this place in error messages.
+
+    Raises:
+        ConfigError: a key that does not exist, a value of the wrong type, or one that is refused.
+    """
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where} must be a table of settings, got {type(values).__name__}.")
+    fields = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    unknown = sorted(set(values) - fields)
+    if unknown:
+        raise ConfigError(
+            f"{where} has no setting {', '.join(unknown)}; it has {', '.join(sorted(fields))}."
+        )
+    hints = typing.get_type_hints(kind)
+    return kind(**{k: _coerce(hints[k], v, f"{where}.{k}") for k, v in values.items()})
+
+
+def _coerce(hint: Any, value: Any, where: str) -> Any:
+    """Check one plain value against a type hint; lists become tuples."""
+    if dataclasses.is_dataclass(hint):
+        return from_dict(typing.cast("type", hint), value, where)
+    args = typing.get_args(hint)
+    if typing.get_origin(hint) is tuple:
+        return _coerce_tuple(args, value, where)
+    if typing.get_origin(hint) is Literal:
+        choices = ", ".join(map(repr, args))
+        require(value in args, f"{where} is {value!r}; choose one of {choices}.")
+        return value
+    number = isinstance(value, int) and not isinstance(value, bool)
+    if hint is float and number:
+        return float(value)
+    fits = number if hint is int else isinstance(value, hint)
+    require(fits, f"{where} must be {hint.__name__}, got {value!r}.")
+    return value
+
+
+def _coerce_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    """Check a list against the element types of a tuple."""
+    require(isinstance(value, (list, tuple)), f"{where} must be a list, got {value!r}.")
+    inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+    require(len(inner) == len(value), f"{where} needs {len(inner)} values, got {len(value)}.")
+    return tuple(_coerce(h, v, where) for h, v in zip(inner, value, strict=True))
+
+
+def save(config: Any, path: Path) -> None:
+    """Write a configuration as JSON, aside and then renamed."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(to_dict(config), indent=2) + "\n")
+    partial.replace(path)
+
+
+def load(path: Path, kind: type[T] = Config) -> T:
+    """Read a configuration from JSON.
+
+    Raises:
+        ConfigError: the file is absent or unreadable, is not JSON, or holds settings that do not
+            fit.
+    """
+    try:
+        values = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path} does not exist: is this a run folder made by train.py?"
+        ) from None
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read ({error.strerror}); allow reading it.") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid JSON ({error}); restore it.") from None
+    return from_dict(kind, values, path.name)

@@ -1,0 +1,54 @@
+"""What is remembered, and how the denoiser reads it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from pewm_jax.config.errors import require, require_positive
+
+
+@dataclasses.dataclass(frozen=True)
+class MemoryConfig:
+    """What is remembered, and how the denoiser reads it."""
+
+    cell_m: tuple[float, float, float] = (0.25, 0.25, 0.25)
+    """Size of a map cell along x, y, z (z is up), metres. The paper: 0.25 0.25 1.0."""
+    cells: tuple[int, int, int] = (128, 128, 16)
+    """Cells of the grid along x, y, z; the extent in metres is cells × cell size."""
+    capacity: int = 4096
+    """Occupied cells a map can hold; what does not fit is counted."""
+    tokens: int = 512
+    """Occupied cells that condition one clip, in view and nearest first."""
+    looks: int = 128
+    """Of these, how many each frame's camera looks at with projective positions."""
+    positions: Literal["projective", "sinusoid"] = "projective"
+    """How attention knows where a cell is: `projective` (seen through each frame's camera) or
+    `sinusoid` (the paper: 3D sinusoid of the position in the first frame's camera)."""
+    encoder: Literal["patch_colours"] = "patch_colours"
+    """Image features kept in the map; `patch_colours` has no weights."""
+    encoder_patch: int = 2
+    """Pixels per feature patch, each way."""
+    heads: int = 6
+    """Heads of the memory attention."""
+    head_dim: int = 32
+    """Width of a memory head; a multiple of 8."""
+    mlp_ratio: int = 4
+    """Feed-forward width over model width in the memory blocks."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(all(size > 0 for size in self.cell_m), "memory.cell_m must be positive.")
+        require(all(count > 0 for count in self.cells), "memory.cells must be positive.")
+        require_positive(self, "memory", "capacity", "tokens", "looks", "encoder_patch")
+        require_positive(self, "memory", "heads", "head_dim", "mlp_ratio")
+        require(
+            self.tokens <= self.capacity,
+            f"memory.tokens {self.tokens} exceeds memory.capacity {self.capacity}: a clip cannot "
+            "attend to more cells than the map holds; raise capacity or lower tokens.",
+        )
+        require(
+            self.head_dim % 8 == 0,
+            f"memory.head_dim is {self.head_dim}: use a multiple of 8, the projective rotary "
+            "embedding splits a head in two times two halves.",
+        )

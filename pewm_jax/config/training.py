@@ -1,0 +1,141 @@
+"""What training reads, how it learns, and how the result is scored."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from pewm_jax.config.errors import require
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """What training reads."""
+
+    path: str = "data/demo"
+    """Folder made by `python -m pewm_jax.data collect` or `import` (with train/ inside)."""
+    stride_min: int = 1
+    """Smallest number of actions between two frames of a clip."""
+    stride_max: int = 3
+    """Largest number of actions between two frames of a clip."""
+    context: int = 24
+    """Earlier frames of the same episode given to the memory."""
+    workers: int = 0
+    """Threads that read and decode ahead of training; 0 means one."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(
+            1 <= self.stride_min <= self.stride_max,
+            f"data.stride_min {self.stride_min} and data.stride_max {self.stride_max}: need "
+            "1 ≤ min ≤ max.",
+        )
+        require(self.context >= 1, "data.context must be at least 1 frame.")
+        require(self.workers >= 0, f"data.workers is {self.workers}: use 0 or more threads.")
+
+
+@dataclasses.dataclass(frozen=True)
+class StageConfig:
+    """One stage of training."""
+
+    steps: int = 500
+    """Optimizer steps."""
+    batch: int = 16
+    """Clips per step."""
+    learning_rate: float = 1e-3
+    """Peak learning rate of Adam."""
+    warmup: int = 50
+    """Steps of linear warm-up."""
+    decay: Literal["constant", "cosine"] = "cosine"
+    """What the learning rate does after the warm-up."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(self.steps >= 0 and self.batch >= 1, "steps ≥ 0 and batch ≥ 1 are needed.")
+        require(self.learning_rate > 0, "learning_rate must be above 0.")
+        require(self.warmup >= 0, f"warmup is {self.warmup}: use 0 (none) or more steps.")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """How the model learns: two stages, as the paper trains."""
+
+    run: str = "runs/demo"
+    """Folder of this run: checkpoints, logs, pictures, report."""
+    stage1: StageConfig = StageConfig()
+    """The backbone learns without memory: domain, camera control, RGB-D."""
+    stage2: StageConfig = StageConfig()
+    """Only the memory blocks learn; all else stays bit-identical."""
+    weight_decay: float = 0.0
+    """Decoupled weight decay on matrices."""
+    clip_norm: float = 1.0
+    """Gradient norm above which gradients are scaled down."""
+    ema: float = 0.995
+    """Decay of the exponential moving average that inference uses."""
+    seed: int = 0
+    """Seed of weights, noise and data order."""
+    save_every: int = 100
+    """Steps between checkpoints."""
+    keep: int = 2
+    """Checkpoints kept."""
+    log_every: int = 10
+    """Steps between log lines."""
+    preview_every: int = 250
+    """Steps between sample pictures; 0 for none."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Compute precision; master weights stay float32."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(0 <= self.ema < 1, f"train.ema is {self.ema}: use a decay in [0, 1).")
+        require(self.clip_norm > 0, "train.clip_norm must be above 0.")
+        require(
+            min(self.save_every, self.log_every, self.keep) >= 1,
+            "train.save_every, train.log_every and train.keep must be at least 1.",
+        )
+        require(self.seed >= 0, f"train.seed is {self.seed}: use 0 or a positive number.")
+        require(
+            self.weight_decay >= 0, f"train.weight_decay is {self.weight_decay}: use 0 or more."
+        )
+        require(
+            self.preview_every >= 0,
+            f"train.preview_every is {self.preview_every}: use 0 (no pictures) or more steps.",
+        )
+        require(
+            self.stage1.steps > 0 or self.stage2.steps == 0,
+            f"train.stage1.steps is 0 and train.stage2.steps is {self.stage2.steps}: stage 2 "
+            "freezes the backbone, whose output starts at zero, so nothing would be learnt; give "
+            "train.stage1.steps at least 1.",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalConfig:
+    """What is measured on held-out scenes."""
+
+    split: str = "revisit"
+    """Folder inside data.path with the held-out revisit episodes."""
+    clips: int = 48
+    """Clips scored per seed."""
+    chain: int = 1
+    """Clips generated one after the other from one start in what the table scores."""
+    stride: int = 1
+    """Recorded actions between two frames of a scored clip."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the sampling noise."""
+    videos: int = 4
+    """Long rollouts shown side by side in the report."""
+    video_clips: int = 4
+    """Clips generated one after the other in a long rollout (long rollouts show drift)."""
+    batch: int = 16
+    """Clips sampled at once."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(len(self.seeds) >= 1, "evaluate.seeds needs at least one seed.")
+        require(min(self.seeds) >= 0, "evaluate.seeds must be 0 or positive numbers.")
+        require(
+            min(self.clips, self.chain, self.stride, self.videos, self.video_clips, self.batch)
+            >= 1,
+            "evaluate.clips, chain, stride, videos, video_clips and batch must be at least 1.",
+        )

@@ -1,0 +1,1 @@
+"""The last chapter, other people's weights in, ours out."""
