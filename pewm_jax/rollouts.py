@@ -24,6 +24,7 @@ from pewm_jax import weights
 from pewm_jax.config import Config, UserError
 from pewm_jax.diffusion import objective, sampler
 from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.memory import features as image_features
 from pewm_jax.memory import voxel_map
 from pewm_jax.models import codec, world_model
 from pewm_jax.types import Array, Camera, Frames, Params, WorldState
@@ -122,7 +123,8 @@ def imagine_clip(
     rgb, depth = codec.decode_rgbd(config, latents)
     future = Camera(intrinsics[1:], poses[1:])
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
-    voxels = voxel_map.insert_frames(config.memory, state.map, frames)
+    features = image_features.encode(config.memory, frames.rgb_THWC)
+    voxels = voxel_map.insert_frames(config.memory, state.map, frames, features)
     return WorldState(jax.tree.map(lambda x: x[-1:], frames), voxels), frames
 
 

@@ -8,6 +8,7 @@ import pytest
 from pewm_jax import rollouts
 from pewm_jax.config import UserError
 from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.memory import features as image_features
 from pewm_jax.memory import voxel_map
 from pewm_jax.models import world_model
 from pewm_jax.types import Frames
@@ -50,7 +51,8 @@ def test_discrete_and_continuous_actions_agree(params):
 def test_imagined_frames_enter_the_map_exactly_as_observed_ones(params):
     state = a_state(params)
     after, frames = roll(CONFIG, params, state, ACTIONS[:8], jax.random.key(1))
-    expected = voxel_map.insert_frames(CONFIG.memory, state.map, frames)
+    features = image_features.encode(CONFIG.memory, frames.rgb_THWC)
+    expected = voxel_map.insert_frames(CONFIG.memory, state.map, frames, features)
     for name in ("slot_of_cell", "features_VF", "occupied"):
         np.testing.assert_array_equal(getattr(after.map, name), getattr(expected, name))
     assert int(after.map.occupied) > int(state.map.occupied)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import Config
 from pewm_jax.diffusion import schedule
+from pewm_jax.memory import features as image_features
 from pewm_jax.memory import voxel_map
 from pewm_jax.models import codec, world_model
 from pewm_jax.types import Array, Clip, Frames, MapTokens, Params
@@ -25,7 +26,8 @@ def remember(config: Config, context: Frames, valid_S: Array) -> voxel_map.Voxel
     last = jnp.argmax(jnp.where(valid_S, jnp.arange(valid_S.shape[0]), -1))
     centre = context.camera.world_from_camera[last, :3, 3]
     voxels = voxel_map.empty(config.memory, centre, world_model.feature_channels(config))
-    return voxel_map.insert_frames(config.memory, voxels, context, valid_S)
+    features = image_features.encode(config.memory, context.rgb_THWC)
+    return voxel_map.insert_frames(config.memory, voxels, context, features, valid_S)
 
 
 def recall(config: Config, voxels: voxel_map.VoxelMap, camera) -> MapTokens:

@@ -7,7 +7,6 @@ through −c, the smallest one too; their middle is the cell's colour.
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import MemoryConfig
@@ -28,17 +27,13 @@ def patch_colours(rgb_THWC: Array, patch: int) -> Array:
 
 
 def encode(config: MemoryConfig, rgb_THWC: Array) -> Array:
-    """Return per-pixel features (T, H, W, F): the encoder's, bilinearly upsampled.
+    """Return the encoder's patch features (T, h, w, F); the map upsamples them itself.
 
     Args:
         config: names the encoder and its patch size.
         rgb_THWC: (T, H, W, 3) float in [−1, 1].
     """
-    features = patch_colours(rgb_THWC, config.encoder_patch)
-    frames, height, width, _ = rgb_THWC.shape
-    if config.encoder_patch == 1:
-        return features
-    return jax.image.resize(features, (frames, height, width, features.shape[-1]), "bilinear")
+    return patch_colours(rgb_THWC, config.encoder_patch)
 
 
 def colours(features_VF: Array) -> Array:

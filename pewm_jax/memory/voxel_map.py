@@ -18,7 +18,6 @@ import numpy as np
 
 from pewm_jax.config import MemoryConfig
 from pewm_jax.geometry.cameras import project, unproject
-from pewm_jax.memory import features as image_features
 from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 
 
@@ -108,17 +107,24 @@ def insert(
 
 
 def insert_frames(
-    config: MemoryConfig, voxels: VoxelMap, frames: Frames, valid_T: Array | None = None
+    config: MemoryConfig,
+    voxels: VoxelMap,
+    frames: Frames,
+    features_ThwF: Array,
+    valid_T: Array | None = None,
 ) -> VoxelMap:
-    """Insert posed RGB-D frames: encode, unproject every pixel, scatter-max.
+    """Insert posed depth frames: upsample their features, unproject every pixel, scatter-max.
 
     Args:
-        config: cell size, extent, capacity, encoder.
+        config: cell size, extent, capacity.
         voxels: the map.
-        frames: T frames, rgb float in [−1, 1]; pixels without depth are ignored.
+        frames: T frames, of which depth and cameras are used; pixels without depth are ignored.
+        features_ThwF: (T, h, w, F) features of a grid of patches that covers each frame; they
+            are upsampled bilinearly, patch centres at half-integers.
         valid_T: (T,) bool, False frames are ignored.
     """
-    features = image_features.encode(config, frames.rgb_THWC)
+    shape = (*frames.depth_THW.shape, features_ThwF.shape[-1])
+    features = jax.image.resize(features_ThwF, shape, "bilinear")
     points = unproject(frames.depth_THW, frames.camera)
     valid = frames.depth_THW > 0
     if valid_T is not None:
