@@ -12,6 +12,11 @@ from pewm_jax.config.errors import require, require_positive
 class MemoryConfig:
     """What is remembered, and how the denoiser reads it."""
 
+    kind: Literal["voxel", "none", "images", "map2d", "points"] = "voxel"
+    """What is remembered: `voxel` (the 3D feature map), `none` (nothing), `images` (a few
+    snapshots), `map2d` (a feature map seen from above), `points` (coloured points, no features)."""
+    depth: bool = True
+    """Whether the denoiser sees and makes depth; without it only observed frames are remembered."""
     cell_m: tuple[float, float, float] = (0.25, 0.25, 0.25)
     """Size of a map cell along x, y, z (z is up), metres. The paper: 0.25 0.25 1.0."""
     cells: tuple[int, int, int] = (128, 128, 16)
@@ -25,6 +30,10 @@ class MemoryConfig:
     positions: Literal["projective", "sinusoid"] = "projective"
     """How attention knows where a cell is: `projective` (seen through each frame's camera) or
     `sinusoid` (the paper: 3D sinusoid of the position in the first frame's camera)."""
+    frame: Literal["camera", "world"] = "camera"
+    """Where a `sinusoid` counts positions from: the clip's first camera, or the world's origin."""
+    snapshots: int = 8
+    """Frames that the memory `images` keeps; together they have at most `tokens` patches."""
     encoder: Literal["patch_colours"] = "patch_colours"
     """Image features kept in the map; `patch_colours` has no weights."""
     encoder_patch: int = 2
@@ -41,11 +50,17 @@ class MemoryConfig:
         require(all(size > 0 for size in self.cell_m), "memory.cell_m must be positive.")
         require(all(count > 0 for count in self.cells), "memory.cells must be positive.")
         require_positive(self, "memory", "capacity", "tokens", "looks", "encoder_patch")
+        require_positive(self, "memory", "snapshots")
         require_positive(self, "memory", "heads", "head_dim", "mlp_ratio")
         require(
             self.tokens <= self.capacity,
             f"memory.tokens {self.tokens} exceeds memory.capacity {self.capacity}: a clip cannot "
             "attend to more cells than the map holds; raise capacity or lower tokens.",
+        )
+        require(
+            self.kind != "images" or self.snapshots <= self.tokens,
+            f"memory.snapshots {self.snapshots} exceeds memory.tokens {self.tokens}: every "
+            "snapshot needs at least one token; raise tokens or lower snapshots.",
         )
         require(
             self.head_dim % 8 == 0,
