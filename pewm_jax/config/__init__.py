@@ -7,6 +7,7 @@ configuration is built, with a sentence that names the fix; nothing is checked d
 from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
 from pewm_jax.config.codec import CodecConfig
 from pewm_jax.config.diffusion import DiffusionConfig
+from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.dit import DiTConfig
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import Config
@@ -21,6 +22,7 @@ __all__ = [
     "CodecConfig",
     "Config",
     "ConfigError",
+    "DINOv2Config",
     "DataConfig",
     "DiTConfig",
     "DiffusionConfig",

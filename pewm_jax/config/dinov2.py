@@ -1,0 +1,94 @@
+"""DINOv2, the image encoder behind the map."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from pewm_jax.config.errors import ConfigError, require, require_positive
+
+HEAD_DIM = 64
+"""Width of a head in every published DINOv2."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DINOv2Config:
+    """A vision transformer in DINOv2's form; the defaults are ViT-S/14 without registers."""
+
+    layers: int = 12
+    """Transformer blocks."""
+    heads: int = 6
+    """Attention heads."""
+    width: int = 384
+    """Model width D: the number of features of a patch."""
+    patch: int = 14
+    """Pixels per patch, each way."""
+    pretrained_size: int = 518
+    """Pixels per side of the images whose patches the stored position embeddings belong to; for
+    other sizes they are interpolated."""
+    mlp_ratio: int = 4
+    """Feed-forward width over model width (SwiGLU keeps two thirds of it)."""
+    swiglu: bool = False
+    """Gated feed-forward, as in ViT-g."""
+    registers: int = 0
+    """Register tokens beside the class token: 0, or 4 in the models with registers."""
+    antialias: bool = False
+    """Whether position embeddings are filtered when they are interpolated to fewer patches: the
+    reference does so in its model with registers, and only there."""
+    epsilon: float = 1e-6
+    """Added to the variance in layer norms."""
+
+    @property
+    def grid(self) -> int:
+        """Stored position embeddings per side."""
+        return self.pretrained_size // self.patch
+
+    @property
+    def hidden(self) -> int:
+        """Width of the feed-forward's hidden layer (SwiGLU: of its gate)."""
+        width = self.width * self.mlp_ratio
+        return (int(width * 2 / 3) + 7) // 8 * 8 if self.swiglu else width
+
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "dinov2", "layers", "heads", "width", "patch", "mlp_ratio")
+        require_positive(self, "dinov2", "pretrained_size")
+        require(
+            self.width % self.heads == 0,
+            f"dinov2.width {self.width} is not a multiple of dinov2.heads {self.heads}.",
+        )
+        require(
+            self.pretrained_size >= self.patch,
+            f"dinov2.pretrained_size {self.pretrained_size} is smaller than one patch of "
+            f"{self.patch} pixels.",
+        )
+        require(
+            self.registers >= 0,
+            f"dinov2.registers is {self.registers}: use 0 or more (the published models: 0 or 4).",
+        )
+        require(self.epsilon > 0, f"dinov2.epsilon is {self.epsilon}: it must be positive.")
+
+
+_SIZES = {
+    "small": {"layers": 12, "heads": 6, "width": 384},
+    "base": {"layers": 12, "heads": 12, "width": 768},
+    "large": {"layers": 24, "heads": 16, "width": 1024},
+    "giant": {"layers": 40, "heads": 24, "width": 1536, "swiglu": True},
+}
+
+
+def published(
+    size: Literal["small", "base", "large", "giant"], registers: bool = False
+) -> DINOv2Config:
+    """Return the configuration of a published model: ViT-S, B, L or g with patches of 14 pixels.
+
+    Args:
+        size: which one.
+        registers: the variant with four register tokens.
+
+    Raises:
+        ConfigError: there is no such size.
+    """
+    if size not in _SIZES:
+        raise ConfigError(f"There is no DINOv2 {size!r}; there is {', '.join(_SIZES)}.")
+    return DINOv2Config(**_SIZES[size], registers=4 if registers else 0, antialias=registers)
