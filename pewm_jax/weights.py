@@ -1,23 +1,67 @@
-"""Network weights as one safetensors file: flat ``a/b/c`` keys, nothing to execute on loading."""
+"""Network weights as one safetensors file: flat ``a/b/c`` keys, nothing to execute on loading.
+
+Files are written and read tensor by tensor, so that no more than one tensor is held beside what
+the caller holds.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import json
+import math
 import os
-from collections.abc import Mapping
+import struct
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-import safetensors
-import safetensors.numpy
 
 from pewm_jax import tree
 from pewm_jax.config import UserError
-from pewm_jax.types import Params
+from pewm_jax.types import Array, Params
 
 _WORDS = "pewm_jax"
 """The one key in the file's header, so that equal weights are equal files: their hash is a name."""
+_DTYPES = {
+    "BOOL": np.dtype(bool),
+    "U8": np.dtype(np.uint8),
+    "I8": np.dtype(np.int8),
+    "I16": np.dtype(np.int16),
+    "U16": np.dtype(np.uint16),
+    "I32": np.dtype(np.int32),
+    "U32": np.dtype(np.uint32),
+    "I64": np.dtype(np.int64),
+    "U64": np.dtype(np.uint64),
+    "F16": np.dtype(np.float16),
+    "BF16": np.dtype(jnp.bfloat16),
+    "F32": np.dtype(np.float32),
+    "F64": np.dtype(np.float64),
+}
+_NAMES = {dtype: name for name, dtype in _DTYPES.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """One tensor of a safetensors file.
+
+    Attributes:
+        shape: its shape.
+        dtype: its dtype.
+        begin: its first byte in the file.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    begin: int
+
+    @property
+    def size(self) -> int:
+        """Return the bytes it takes."""
+        return math.prod(self.shape) * self.dtype.itemsize
 
 
 def save(path: Path, params: Params, words: Mapping[str, str] | None = None) -> None:
@@ -28,18 +72,74 @@ def save(path: Path, params: Params, words: Mapping[str, str] | None = None) -> 
         params: nested dictionaries of arrays, on any device.
         words: a few facts about them, kept in the file's header.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    leaves = tree.flatten(jax.device_get(params))
-    tensors = {
-        name: np.ascontiguousarray(leaf).reshape(np.shape(leaf)) for name, leaf in leaves.items()
-    }
+    leaves = tree.flatten(params)
+    like = {name: jax.ShapeDtypeStruct(np.shape(x), _dtype(x)) for name, x in leaves.items()}
     header = {_WORDS: json.dumps(dict(words or {}), sort_keys=True)}
+    write(path, like, leaves.items(), header)
+
+
+def write(
+    path: Path,
+    like: Mapping[str, Array | jax.ShapeDtypeStruct],
+    tensors: Iterable[tuple[str, Array]],
+    header: Mapping[str, str],
+) -> None:
+    """Write a safetensors file tensor by tensor, aside and then renamed.
+
+    Args:
+        path: the file; its folder is made.
+        like: name → anything with the tensor's shape and dtype.
+        tensors: the tensors, in any order, each once.
+        header: words for the file's header.
+
+    Raises:
+        ValueError: the tensors are not those announced.
+    """
+    order = sorted(like, key=lambda name: (-like[name].dtype.itemsize, name))
+    table: dict[str, object] = {"__metadata__": dict(header)}
+    end = 0
+    for name in order:
+        dtype = np.dtype(like[name].dtype)
+        begin, end = end, end + math.prod(like[name].shape) * dtype.itemsize
+        table[name] = {
+            "dtype": _NAMES[dtype],
+            "shape": list(like[name].shape),
+            "data_offsets": [begin, end],
+        }
+    text = json.dumps(table, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    with aside(path) as file:
+        file.write(struct.pack("<Q", len(text)) + text)
+        start, left = file.tell(), set(order)
+        for name, tensor in tensors:
+            array = np.asarray(jax.device_get(tensor))
+            if name not in left or (array.shape, array.dtype) != (
+                tuple(like[name].shape),
+                np.dtype(like[name].dtype),
+            ):
+                raise ValueError(f"{name} {array.shape} {array.dtype} was not announced so.")
+            left.remove(name)
+            offset: int = table[name]["data_offsets"][0]  # type: ignore[index]
+            file.seek(start + offset)
+            file.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+        if left:
+            raise ValueError(f"{tree.listing(left)} were announced and not given.")
+
+
+@contextlib.contextmanager
+def aside(path: Path) -> Iterator[BinaryIO]:
+    """Open a file beside ``path`` and rename it when all is written; nothing stays otherwise."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        file.write(safetensors.numpy.save(tensors, header))
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    try:
+        with partial.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 def load(path: Path) -> Params:
@@ -54,12 +154,54 @@ def load(path: Path) -> Params:
     Raises:
         UserError: the file is absent or damaged.
     """
-    _require_file(path)
+    return tree.unflatten({name: read_at(path, place) for name, place in places(path).items()})
+
+
+def places(path: Path) -> dict[str, Place]:
+    """Return where each tensor of a safetensors file lies, having read its header only.
+
+    Raises:
+        UserError: the file is absent, truncated or damaged.
+    """
+    table, start = _header(path)
+    table.pop("__metadata__", None)
+    found: dict[str, Place] = {}
+    spans = []
+    for name, entry in table.items():
+        try:
+            dtype, (begin, end) = _DTYPES[entry["dtype"]], entry["data_offsets"]
+            found[name] = Place(tuple(entry["shape"]), dtype, start + begin)
+        except (KeyError, TypeError, ValueError):
+            raise _damaged(path, f"its entry of {name} cannot be read: {entry}") from None
+        if end - begin != found[name].size:
+            raise _damaged(path, f"{name} takes {end - begin} bytes, not {found[name].size}")
+        spans.append((begin, end))
+    end = 0
+    for begin, until in sorted(spans):
+        if begin != end:
+            raise _damaged(path, "its tensors overlap or leave gaps")
+        end = until
+    size = path.stat().st_size
+    if start + end != size:
+        raise _damaged(path, f"it has {size} bytes and its header says {start + end}")
+    return found
+
+
+def read_at(path: Path, place: Place) -> np.ndarray:
+    """Read one tensor into memory of its own.
+
+    Raises:
+        UserError: the file is absent or ends too early.
+    """
+    array = np.empty(math.prod(place.shape), place.dtype)
     try:
-        leaves = safetensors.numpy.load_file(path)
-    except (safetensors.SafetensorError, OSError) as error:
-        raise _damaged(path, error) from None
-    return tree.unflatten(leaves)
+        with path.open("rb") as file:
+            file.seek(place.begin)
+            if file.readinto(array.view(np.uint8).data) != place.size:  # type: ignore[attr-defined]
+                raise _damaged(path, "it ends too early")
+    except OSError as error:
+        raise _damaged(path, str(error.strerror)) from None
+    return array.reshape(place.shape)
 
 
 def check(params: Params, like: Params, where: str) -> None:
@@ -82,18 +224,39 @@ def metadata(path: Path) -> dict[str, str]:
     Raises:
         UserError: the file is absent or damaged.
     """
-    _require_file(path)
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            return json.loads((file.metadata() or {}).get(_WORDS, "{}"))
-    except (safetensors.SafetensorError, OSError) as error:
-        raise _damaged(path, error) from None
+    places(path)
+    table, _ = _header(path)
+    return json.loads((table.get("__metadata__") or {}).get(_WORDS, "{}"))
 
 
-def _require_file(path: Path) -> None:
+def _dtype(leaf: Array) -> np.dtype:
+    return np.dtype(leaf.dtype) if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
+
+
+def _header(path: Path) -> tuple[dict, int]:
+    """Return the header's table and the byte at which the tensors begin."""
     if not path.is_file():
         raise UserError(f"{path} does not exist; train.py writes it when a stage is finished.")
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            start = file.read(8)
+            if len(start) < 8:
+                raise _damaged(path, "it is empty" if not start else "it ends too early")
+            (length,) = struct.unpack("<Q", start)
+            if length > size - 8:
+                raise _damaged(path, "it ends within its header")
+            table = json.loads(file.read(length))
+    except OSError as error:
+        raise _damaged(path, str(error.strerror)) from None
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise _damaged(path, "its header is not JSON") from None
+    if not isinstance(table, dict):
+        raise _damaged(path, "its header is not a table")
+    return table, 8 + length
 
 
-def _damaged(path: Path, error: Exception) -> UserError:
-    return UserError(f"{path} is damaged ({error}); delete it and start train.py again.")
+def _damaged(path: Path, why: str) -> UserError:
+    return UserError(f"{path} is damaged or cut short ({why}); copy it again or make it again.")

@@ -1,0 +1,233 @@
+"""Foreign weights as they lie on disk: one safetensors file, or shards and their index.
+
+Headers are read at once and checked against the files' sizes; tensors are read one by one, when
+asked for, so that nothing holds more than one of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from pewm_jax import tree, weights
+from pewm_jax.config import UserError
+from pewm_jax.types import Array
+
+
+class Source(Protocol):
+    """Named tensors that are read one by one.
+
+    Attributes:
+        where: the file or folder, for messages.
+    """
+
+    where: str
+
+    def names(self) -> Iterable[str]:
+        """Return the names of all tensors."""
+        ...
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of a tensor without reading it."""
+        ...
+
+    def dtype(self, name: str) -> np.dtype:
+        """Return the dtype of a tensor without reading it."""
+        ...
+
+    def read(self, name: str) -> Array:
+        """Read a tensor."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Arrays:
+    """Tensors that are in memory already, as a ``Source``."""
+
+    tensors: Mapping[str, Array]
+    where: str
+
+    def names(self) -> Iterable[str]:
+        """Return the names of all tensors."""
+        return self.tensors.keys()
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of a tensor."""
+        return tuple(self.tensors[name].shape)
+
+    def dtype(self, name: str) -> np.dtype:
+        """Return the dtype of a tensor."""
+        return np.dtype(self.tensors[name].dtype)
+
+    def read(self, name: str) -> Array:
+        """Return a tensor."""
+        return self.tensors[name]
+
+
+@dataclasses.dataclass(frozen=True)
+class Files:
+    """Tensors in safetensors files, as a ``Source``."""
+
+    where: str
+    places: Mapping[str, tuple[Path, weights.Place]]
+
+    def names(self) -> Iterable[str]:
+        """Return the names of all tensors."""
+        return self.places.keys()
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of a tensor without reading it."""
+        return self.places[name][1].shape
+
+    def dtype(self, name: str) -> np.dtype:
+        """Return the dtype of a tensor without reading it."""
+        return self.places[name][1].dtype
+
+    def read(self, name: str) -> Array:
+        """Read a tensor.
+
+        Raises:
+            UserError: the file ends before the tensor does.
+        """
+        path, place = self.places[name]
+        return weights.read_at(path, place)
+
+
+def open_folder(folder: Path) -> Files:
+    """Open the weights of one network in the layout of diffusers and transformers.
+
+    Args:
+        folder: holds ``*.safetensors.index.json`` and the shards it names, or one
+            ``*.safetensors``. Where there are several precisions (``model.fp16.safetensors``), the
+            plain one is taken.
+
+    Returns:
+        The tensors, none of them read yet.
+
+    Raises:
+        UserError: no weights, an index that names absent files or tensors, shards without their
+            index, tensors outside of the index, a truncated or damaged file.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder; give the folder that holds the weights.")
+    index = _plainest(folder.glob("*.safetensors.index*.json"))
+    if index is not None:
+        return _open_shards(folder, index)
+    files = sorted(folder.glob("*.safetensors"))
+    single = _plainest(files)
+    if single is None:
+        pickled = [p.name for p in sorted(folder.glob("*.bin")) + sorted(folder.glob("*.pt*"))]
+        instead = f"only {tree.listing(pickled)}, which can run code when loaded" * bool(pickled)
+        raise UserError(
+            f"{folder} holds no safetensors file{', ' * bool(pickled)}{instead}; save the network "
+            "there with save_pretrained(…, safe_serialization=True)."
+        )
+    if "-of-" in single.name:
+        raise UserError(
+            f"{folder} holds shards such as {single.name} but no *.safetensors.index.json that "
+            "lists them; copy the index there too."
+        )
+    return open_file(single)
+
+
+def open_file(path: Path) -> Files:
+    """Open one safetensors file.
+
+    Raises:
+        UserError: it is absent, truncated or damaged.
+    """
+    return Files(str(path), {n: (path, p) for n, p in weights.places(path).items()})
+
+
+def _open_shards(folder: Path, index: Path) -> Files:
+    table = read_json(index).get("weight_map")
+    if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
+        raise UserError(f"{index} has no table weight_map of tensors and files; copy it again.")
+    shards = sorted(set(table.values()))
+    absent = [name for name in shards if not (folder / name).is_file()]
+    if absent:
+        raise UserError(
+            f"{index} names files that are not there: {tree.listing(absent)}; copy them to "
+            f"{folder}."
+        )
+    places: dict[str, tuple[Path, weights.Place]] = {}
+    for shard in shards:
+        inside = weights.places(folder / shard)
+        wanted = {name for name, file in table.items() if file == shard}
+        if inside.keys() != wanted:
+            lacking, extra = wanted - inside.keys(), inside.keys() - wanted
+            what = f"lacks {tree.listing(lacking)}" if lacking else f"holds {tree.listing(extra)}"
+            word = "which the index places there" if lacking else "which the index does not name"
+            raise UserError(f"{folder / shard} {what}, {word}; copy the whole folder again.")
+        places |= {name: (folder / shard, place) for name, place in inside.items()}
+    return Files(str(folder), places)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON table.
+
+    Raises:
+        UserError: the file is absent, unreadable, not JSON or not a table.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist; copy the whole folder again.") from None
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}); allow reading it.") from None
+    except ValueError as error:
+        raise UserError(f"{path} is not valid JSON ({error}); copy it again.") from None
+    if not isinstance(values, dict):
+        raise UserError(f"{path} holds no table of settings; copy it again.")
+    return values
+
+
+def read_config(path: Path, classes: Sequence[str], key: str = "_class_name") -> dict[str, Any]:
+    """Read the settings of a network and insist on its class.
+
+    Args:
+        path: ``config.json``, ``scheduler_config.json`` or ``model_index.json``.
+        classes: the class names that can be read.
+        key: where the class name stands.
+
+    Returns:
+        The settings as they are in the file, the class name included.
+
+    Raises:
+        UserError: the file cannot be read or names another class.
+    """
+    values = read_json(path)
+    name = values.get(key)
+    if name not in classes:
+        raise UserError(
+            f"{path} is of class {name!r} ({key}); this can read {' and '.join(classes)} only."
+        )
+    return values
+
+
+def component(folder: Path, name: str) -> Path:
+    """Return the folder of one network, given it or the pipeline's folder around it.
+
+    Raises:
+        UserError: neither is there.
+    """
+    inside = folder / name
+    if inside.is_dir():
+        return inside
+    if any(folder.glob("*config.json")):
+        return folder
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder; give a diffusers pipeline's folder.")
+    raise UserError(
+        f"{folder} has no folder {name}/ and no config.json; give a diffusers pipeline's folder."
+    )
+
+
+def _plainest(paths: Iterable[Path] | Iterator[Path]) -> Path | None:
+    """Return the file with the fewest words in its name: the one of no special precision."""
+    return min(sorted(paths), key=lambda path: path.name.count("."), default=None)
