@@ -119,7 +119,14 @@ def imagine_clip(
     if memory and "memory" in params:
         tokens = jax.tree.map(lambda x: x[None], objective.recall(config, state.map, camera))
     shape = (1, *codec.latent_shape(config), codec.latent_channels(config))
-    latents = sampler.sample(config, params, conditioning, tokens, jax.random.normal(key, shape))
+    latents = sampler.sample(
+        config,
+        params,
+        conditioning,
+        tokens,
+        jax.random.normal(key, shape),
+        jax.random.fold_in(key, 1),
+    )
     rgb, depth = codec.decode_rgbd(config, latents)
     future = Camera(intrinsics[1:], poses[1:])
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)

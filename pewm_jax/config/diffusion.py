@@ -27,9 +27,24 @@ class DiffusionConfig:
     max_weight: float = 5.0
     """Upper bound of the loss weight 1 / (1 − ᾱ) on the squared error of x0 (= MSE in v)."""
     sample_steps: int = 10
-    """DDIM steps."""
+    """Evaluations of the denoiser per clip."""
+    sampler: Literal["ddim", "dpm"] = "ddim"
+    """`ddim`: deterministic (η = 0). `dpm`: DPM-Solver++ (2M) with fresh noise at every step."""
+    spacing: Literal["trailing", "leading", "linspace"] = "trailing"
+    """Which noise levels are visited. Only trailing begins at pure noise for every step count."""
+    steps_offset: int = 0
+    """Added to every visited level of leading spacing."""
+    stride: Literal["next", "fixed"] = "next"
+    """Where a step leads: to the next visited level, or train_steps // sample_steps levels down,
+    as CogVideoX's schedulers do. The two differ only where sample_steps does not divide
+    train_steps, and there a fixed stride misses the levels the denoiser is told."""
+    set_alpha_to_one: bool = True
+    """End the last step at a clean sample; False: at noise level 0, which is almost clean."""
     guidance: float = 1.0
     """Classifier-free guidance on the memory: 1 = off, above 1 pushes away from 'no memory'."""
+    dynamic_guidance: bool = False
+    """Let the guidance vary with the level, 1 + g (1 − cos(π ((N − t) / N)⁵)) / 2 after N =
+    sample_steps and the training level t, as CogVideoX's pipelines do."""
     image_noise_mean: float = -3.0
     """Mean of log σ of the noise put on the observed first frame in training."""
     image_noise_std: float = 0.5
@@ -50,6 +65,14 @@ class DiffusionConfig:
             self.train_steps >= 2,
             f"diffusion.train_steps is {self.train_steps}: a schedule needs at least 2 noise "
             "levels; use 1000.",
+        )
+        stride = self.train_steps // self.sample_steps
+        require(
+            self.spacing != "leading"
+            or 0 <= self.steps_offset < self.train_steps - stride * (self.sample_steps - 1),
+            f"diffusion.steps_offset is {self.steps_offset}: with {self.sample_steps} leading "
+            f"steps use 0 to {self.train_steps - 1 - stride * (self.sample_steps - 1)}, or the "
+            "first step would lie outside of the schedule.",
         )
         require(self.snr_shift > 0, "diffusion.snr_shift must be above 0.")
         require(self.max_weight > 0, "diffusion.max_weight must be above 0.")

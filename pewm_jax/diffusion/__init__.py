@@ -1,1 +1,1 @@
-"""Chapter 5, how the model imagines: noise schedule, objective, sampler."""
+"""Chapter 5, how the model imagines: noise schedule, objective, solver, sampler."""

@@ -1,45 +1,79 @@
-"""DDIM sampling under ``lax.scan`` (Song et al. 2021, η = 0; CogVideoX's trailing spacing)."""
+"""Sampling under ``lax.scan``: DDIM and DPM-Solver++ (2M, SDE), as CogVideoX's schedulers step."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import Config, DiffusionConfig
-from pewm_jax.diffusion import schedule
+from pewm_jax.diffusion import schedule, solver
 from pewm_jax.models import world_model
 from pewm_jax.types import Array, MapTokens, Params
 
+Denoiser: TypeAlias = Callable[[Array, Array], Array]
+"""``(x_t, timesteps_B) -> x0``; ``schedule.to_x0`` turns a v or an ε into it."""
 
-def ddim(config: DiffusionConfig, denoise: Callable[[Array, Array], Array], noise: Array) -> Array:
-    """Sample by DDIM.
+
+def ddim(
+    config: DiffusionConfig, denoise: Denoiser, noise: Array, *, every_step: bool = False
+) -> Array:
+    """Sample by DDIM (Song et al. 2021, η = 0; ``CogVideoXDDIMScheduler``).
 
     Args:
-        config: schedule and number of steps.
+        config: schedule and steps; its ``sampler`` is not looked at.
         denoise: ``(x_t, timesteps_B) -> x0``.
         noise: (B, …) standard normal start.
+        every_step: return what is held after every step, (sample_steps, B, …).
 
     Returns:
         (B, …) the sample.
     """
-    alphas = schedule.alphas_cumprod(config)
-    steps = schedule.trailing_steps(config)
-    now = alphas[steps]
-    after = np.append(alphas[steps[1:]], 1.0)
-    keep = np.sqrt((1 - after) / np.maximum(1 - now, 1e-12))
-    add = np.sqrt(after) - np.sqrt(now) * keep
-    rows = (jnp.asarray(steps), jnp.asarray(keep, jnp.float32), jnp.asarray(add, jnp.float32))
+    rows = solver.steps(dataclasses.replace(config, sampler="ddim"))
+    return _follow(rows, _plain(denoise), noise, every_step=every_step)
 
-    def step(x, row):
-        timestep, keep, add = row
-        x0 = denoise(x, jnp.full((x.shape[0],), timestep))
-        return keep * x + add * x0, None
 
-    sample, _ = jax.lax.scan(step, noise, rows)
-    return sample
+def dpm(
+    config: DiffusionConfig,
+    denoise: Denoiser,
+    noise: Array,
+    key: Array | None = None,
+    *,
+    step_noise: Array | None = None,
+    every_step: bool = False,
+) -> Array:
+    """Sample by SDE-DPM-Solver++ (2M) (Lu et al. 2022; ``CogVideoXDPMScheduler``).
+
+    Args:
+        config: schedule and steps; its ``sampler`` is not looked at.
+        denoise: ``(x_t, timesteps_B) -> x0``.
+        noise: (B, …) standard normal start.
+        key: randomness of the fresh noise; step k draws from ``fold_in(key, k)``.
+        step_noise: (sample_steps, B, …) the fresh noise itself, in place of a key.
+        every_step: return what is held after every step, (sample_steps, B, …).
+
+    Returns:
+        (B, …) the sample.
+
+    Raises:
+        ValueError: not exactly one of key and step_noise is given, or the latter's shape is wrong.
+    """
+    if (key is None) == (step_noise is None):
+        raise ValueError("dpm() draws fresh noise at every step: give it a key, or step_noise.")
+    shape = (config.sample_steps, *noise.shape)
+    if step_noise is not None and step_noise.shape != shape:
+        raise ValueError(f"dpm() got step_noise of shape {step_noise.shape}; it needs {shape}.")
+    if step_noise is None:
+        fresh = _draw(key, noise)
+    else:
+        given = jnp.asarray(step_noise)
+        fresh = given.__getitem__
+    rows = solver.steps(dataclasses.replace(config, sampler="dpm"))
+    return _follow(rows, _plain(denoise), noise, fresh, every_step=every_step)
 
 
 def sample(
@@ -48,10 +82,12 @@ def sample(
     conditioning: world_model.Conditioning,
     tokens: MapTokens | None,
     noise_BthwC: Array,
+    key: Array | None = None,
 ) -> Array:
-    """Sample one batch of clips' latents.
+    """Sample one batch of clips' latents with the configured sampler.
 
-    With ``diffusion.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map)).
+    With ``diffusion.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map));
+    with ``diffusion.dynamic_guidance`` g varies with the step, see ``schedule.guidance``.
 
     Args:
         config: the experiment.
@@ -59,21 +95,67 @@ def sample(
         conditioning: observed frame, cameras, text.
         tokens: map tokens, or None for no memory.
         noise_BthwC: standard normal start.
+        key: randomness of the steps; only ``diffusion.sampler`` dpm needs it.
 
     Returns:
         (B, t, h, w, C) latents.
+
+    Raises:
+        ValueError: the sampler is dpm and there is no key.
     """
-    guidance = config.diffusion.guidance
+    diffusion = config.diffusion
 
     def x0(x, timesteps, tokens):
         out = world_model.apply(config, params, x, conditioning, timesteps, tokens)
-        return schedule.to_x0(config.diffusion, out, x, timesteps)
+        return schedule.to_x0(diffusion, out, x, timesteps)
 
-    def denoise(x, timesteps):
+    def denoise(x, timesteps, weight):
         with_map = x0(x, timesteps, tokens)
-        if tokens is None or guidance == 1:
+        if tokens is None or diffusion.guidance == 1:
             return with_map
         without = x0(x, timesteps, None)
-        return without + guidance * (with_map - without)
+        return without + weight * (with_map - without)
 
-    return ddim(config.diffusion, denoise, noise_BthwC)
+    if diffusion.sampler == "ddim":
+        return _follow(solver.steps(diffusion), denoise, noise_BthwC)
+    if key is None:
+        raise ValueError("diffusion.sampler dpm draws fresh noise at every step: give it a key.")
+    return _follow(solver.steps(diffusion), denoise, noise_BthwC, _draw(key, noise_BthwC))
+
+
+def _plain(denoise: Denoiser) -> Callable[[Array, Array, Array], Array]:
+    """Give a denoiser the third argument, the weight of guidance, which it does not use."""
+    return lambda x, timesteps, _weight: denoise(x, timesteps)
+
+
+def _draw(key: Array, like: Array) -> Callable[[Array], Array]:
+    """Return step number → standard normal noise."""
+    return lambda k: jax.random.normal(jax.random.fold_in(key, k), like.shape, like.dtype)
+
+
+def _follow(
+    rows: solver.Steps,
+    denoise: Callable[[Array, Array, Array], Array],
+    start: Array,
+    fresh: Callable[[Array], Array] | None = None,
+    *,
+    every_step: bool = False,
+) -> Array:
+    """Scan the update of ``solver`` over its rows; ``fresh`` gives the noise of step k, if any."""
+
+    def step(carry, inputs):
+        x, earlier = carry
+        row, k = inputs
+        x0 = denoise(x, jnp.full((x.shape[0],), row.timestep), row.guidance)
+        if fresh is None:
+            x = row.keep * x + row.add * x0
+        else:
+            ahead = (1 + row.mix) * x0 - row.mix * earlier
+            x = row.keep * x + row.add * ahead + row.spread * fresh(k)
+            earlier = x0
+        return (x, earlier), x if every_step else None
+
+    first = (start, None if fresh is None else jnp.zeros_like(start))
+    inputs = (jax.tree.map(jnp.asarray, rows), np.arange(rows.timestep.shape[0]))
+    (sample, _), path = jax.lax.scan(step, first, inputs)
+    return path if every_step else sample

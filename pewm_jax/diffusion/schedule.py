@@ -1,4 +1,4 @@
-"""The noise schedule and the three prediction targets.
+"""The noise schedule, the three prediction targets, and the levels a sampler visits.
 
 CogVideoX's: scaled-linear betas, optional SNR shift, rescaled to zero terminal SNR
 (Lin et al. 2023, arXiv 2305.08891, Alg. 1), computed in float64.
@@ -72,8 +72,31 @@ def x0_weight(config: DiffusionConfig, timesteps_B: Array) -> Array:
     return jnp.asarray(weight, jnp.float32)[timesteps_B]
 
 
-def trailing_steps(config: DiffusionConfig) -> np.ndarray:
-    """Return (sample_steps,) descending timesteps, the last training step first."""
-    spacing = config.train_steps / config.sample_steps
-    levels = config.train_steps - spacing * np.arange(config.sample_steps)
-    return np.round(levels).astype(np.int32) - 1
+def timesteps(config: DiffusionConfig) -> np.ndarray:
+    """Return (sample_steps,) int32 visited levels, descending (Lin et al. 2023, Table 2).
+
+    Trailing spacing begins at the last training level. It is always as many levels as asked;
+    stepping through a range of floats, as the reference does, adds one for 62 of 1000 counts.
+    """
+    count, total = config.sample_steps, config.train_steps
+    if config.spacing == "linspace":
+        levels = np.round(np.linspace(0, total - 1, count))[::-1]
+    elif config.spacing == "leading":
+        levels = np.arange(count)[::-1] * (total // count) + config.steps_offset
+    else:
+        levels = np.round(total - total / count * np.arange(count)) - 1
+    return levels.astype(np.int32)
+
+
+def guidance(config: DiffusionConfig) -> np.ndarray:
+    """Return (sample_steps,) the weight of guidance at every visited level.
+
+    Constant, or with ``dynamic_guidance`` CogVideoX's 1 + g (1 − cos(π ((N − t) / N)⁵)) / 2
+    (``diffusers/pipelines/cogvideo/pipeline_cogvideox.py``): N counts sampling steps and t
+    training levels, so the weight swings between 1 and 1 + g from step to step, as there.
+    """
+    count = config.sample_steps
+    if not config.dynamic_guidance:
+        return np.full(count, config.guidance)
+    share = (count - timesteps(config).astype(np.float64)) / count
+    return 1 + config.guidance * (1 - np.cos(np.pi * share**5)) / 2

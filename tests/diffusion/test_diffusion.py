@@ -79,13 +79,13 @@ def test_ddim_keeps_the_noise_of_its_path():
 
 
 def test_steps_trail():
-    steps = schedule.trailing_steps(DiffusionConfig(sample_steps=10))
+    steps = schedule.timesteps(DiffusionConfig(sample_steps=10))
     np.testing.assert_array_equal(steps, np.arange(999, 0, -100))
 
 
 def test_every_number_of_steps_is_exactly_that_many_and_starts_at_pure_noise():
     for count in range(1, 1001):
-        steps = schedule.trailing_steps(DiffusionConfig(sample_steps=count))
+        steps = schedule.timesteps(DiffusionConfig(sample_steps=count))
         assert len(steps) == count
         assert steps[0] == 999
         assert steps[-1] >= 0
