@@ -222,6 +222,12 @@ def test_an_episode_in_a_made_house_is_valid_and_reproducible():
     assert np.median(episode.frames().depth_THW) > 0.5
 
 
+@pytest.mark.parametrize("index", [1, 5])
+def test_edges_of_tiny_pictures_are_no_disagreement(index):
+    config = CollectConfig(Path("x"), frames=60, size=16)
+    assert check_episode(read_episode(make_episode(config, "train", index)), "here") == []
+
+
 def test_continuous_actions_have_no_ids(mesh, tmp_path):
     config = settings(tmp_path, mesh, continuous=True)
     episode = read_episode(make_episode(config, "train", 0))
