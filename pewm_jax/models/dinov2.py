@@ -8,6 +8,7 @@ the interpolation of position embeddings by a tenth of a patch in its models wit
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import flax.linen as nn
@@ -15,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pewm_jax import config as configuration
+from pewm_jax import weights
 from pewm_jax.config import DINOv2Config, UserError
 from pewm_jax.models import layers
 from pewm_jax.types import Array, Params
@@ -126,9 +129,31 @@ def apply(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
         return Block(config).apply({"params": layer}, x_BND), None
 
     tokens, _ = jax.lax.scan(body, tokens, params["blocks"])
-    tokens = tokens[:, 1 + config.registers :]
-    tokens = _norm(config).apply({"params": params["norm"]}, tokens)
-    return jnp.reshape(tokens, (-1, height, width, config.width)).astype(dtype)
+    kept = tokens[:, 1 + config.registers :]
+    normed: Array = _norm(config).apply({"params": params["norm"]}, kept)
+    return normed.reshape(-1, height, width, config.width).astype(dtype)
+
+
+def load(folder: Path) -> tuple[DINOv2Config, Params]:
+    """Read a folder made by ``python -m pewm_jax.convert import dinov2``.
+
+    Returns:
+        The configuration and NumPy parameters in the stored dtype.
+
+    Raises:
+        UserError: something is absent or damaged, or the two do not fit.
+    """
+    if not (folder / "config.json").is_file():
+        raise UserError(
+            f"{folder} holds no DINOv2; make it with `python -m pewm_jax.convert import dinov2 SRC "
+            f"{folder}`."
+        )
+    config = configuration.load(folder / "config.json", DINOv2Config)
+    path = folder / "weights.safetensors"
+    params = weights.load(path)
+    like = jax.eval_shape(lambda: init(config, jax.random.key(0)))
+    weights.check(params, like, str(path))
+    return config, params
 
 
 def preprocess(rgb_BHWC: Array, size: int | tuple[int, int], patch: int = 14) -> Array:
