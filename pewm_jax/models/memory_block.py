@@ -7,7 +7,8 @@ the time embedding; H attends to M; α_M gates the attention, α_H the feed-forw
     H ← H + α_H · FF(LN(H))
 
 Both gates start at zero, so that a fresh block is the identity and stage 2 begins exactly at the
-stage-1 model. Where a clip's map is empty the whole block is skipped, exactly.
+stage-1 model. Where a clip's map is empty the whole block is skipped, exactly; with the memory
+``none`` every map is, so there the block keeps what does not read the map, its feed-forward.
 """
 
 from __future__ import annotations
@@ -190,5 +191,7 @@ class MemoryBlock(nn.Module):
         out = video_BND + m_gate[:, None] * mixed
         forward = layers.FeedForward(memory.mlp_ratio, name="ff")(layers.layer_norm(out, "norm2"))
         out = out + gate[:, None] * forward
+        if memory.kind == "none":
+            return out
         remembers = valid_BM.any(-1)[:, None, None]
         return jnp.where(remembers, out, video_BND)

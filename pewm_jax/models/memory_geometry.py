@@ -2,8 +2,8 @@
 
 Two schemes:
 
-* ``sinusoid`` (the paper): a 3D sinusoid of the cell's position in the camera of the clip's first
-  frame, concatenated to its features.
+* ``sinusoid`` (the paper): a 3D sinusoid of the cell's position, concatenated to its features. The
+  position is in the camera of the clip's first frame or, with ``memory.frame`` world, absolute.
 * ``projective``: every cell is moved into the camera of every frame. Its image coordinates give
   the key a rotary embedding, the centre of a patch gives the query the same one, so that a query's
   logit is largest for cells that project into its patch; cells behind the camera or far outside
@@ -128,12 +128,19 @@ def sightings(config: Config, camera: Camera, points_M3: Array, valid_M: Array) 
 
 
 def sinusoid_3d(config: Config, camera: Camera, points_M3: Array) -> Array:
-    """Return (B, M, 6·10) sines and cosines of positions in each clip's first camera.
+    """Return (B, M, 6·10) sines and cosines of the positions of map tokens.
 
     Wavelengths are geometric from 4 cells' smallest side to 4 × the map's largest extent.
+
+    Args:
+        config: the experiment; ``memory.frame`` says where positions count from.
+        camera: (B, T) cameras of the clips.
+        points_M3: (B, M, 3) world points, metres.
     """
-    first = Camera(camera.intrinsics_4[:, 0], camera.world_from_camera[:, 0])
-    local = transform_points(invert_rigid(first.world_from_camera), points_M3)
+    local = points_M3
+    if config.memory.frame == "camera":
+        first_from_world = invert_rigid(jnp.asarray(camera.world_from_camera)[:, 0])
+        local = transform_points(first_from_world, points_M3)
     shortest = 4 * min(config.memory.cell_m)
     extent = max(c * n for c, n in zip(config.memory.cell_m, config.memory.cells, strict=True))
     wavelengths = np.geomspace(shortest, 4 * extent, 10)

@@ -13,8 +13,9 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from pewm_jax.config import Config
+from pewm_jax.config import Config, ConfigError, DiTConfig
 from pewm_jax.geometry.plucker import camera_latents
 from pewm_jax.models import codec, dit, layers
 from pewm_jax.models.memory_block import MemoryBlock
@@ -53,6 +54,23 @@ def camera_channels(config: Config) -> int:
 def in_channels(config: Config) -> int:
     """Return the input channels of the patch embedding."""
     return 2 * codec.latent_channels(config) + camera_channels(config)
+
+
+def backbone(config: Config) -> DiTConfig:
+    """Return the transformer's settings with its channels filled in.
+
+    Raises:
+        ConfigError: channels were set and are not what codec and conditioning need.
+    """
+    needed = {"in_channels": in_channels(config), "out_channels": codec.latent_channels(config)}
+    for name, channels in needed.items():
+        value = getattr(config.dit, name)
+        if value not in (0, channels):
+            raise ConfigError(
+                f"dit.{name} is {value} and codec and conditioning need {channels}: set that, or "
+                "0 to have it filled in."
+            )
+    return dataclasses.replace(config.dit, **needed)
 
 
 def condition(config: Config, rgb_BHWC: Array, depth_BHW: Array, camera: Camera) -> Conditioning:
@@ -98,10 +116,7 @@ def _token_channels(config: Config) -> int:
 def init(config: Config, key: Array, *, memory: bool = True) -> Params:
     """Initialise the backbone and, with ``memory``, the memory blocks (identity at the start)."""
     backbone_key, memory_key = jax.random.split(key)
-    out_channels = codec.latent_channels(config)
-    params: Params = {
-        "backbone": dit.init(config.dit, backbone_key, in_channels(config), out_channels)
-    }
+    params: Params = {"backbone": dit.init(backbone(config), backbone_key)}
     if memory:
         params["memory"] = init_memory(config, memory_key)
     return params
@@ -166,17 +181,18 @@ def apply(
         (B, t, h, w, C) float32 prediction.
     """
     dtype = jnp.dtype(config.train.dtype)
-    latents = jnp.concatenate(
-        [noisy_BthwC, conditioning.first_BthwC, conditioning.rays_BthwC], -1
-    ).astype(dtype)
+    noisy, first = (_seen(config, x) for x in (noisy_BthwC, conditioning.first_BthwC))
+    latents = jnp.concatenate([noisy, first, conditioning.rays_BthwC], -1).astype(dtype)
     expert, expert_params = None, None
     if tokens is not None and "memory" in params:
         memory = params["memory"]
         camera_layer, token_layer = _memory_parts(config)
         rays = dit.patchify(conditioning.rays_BthwC.astype(dtype), config.dit.patch)
         camera = camera_layer.apply({"params": memory["camera"]}, rays)
-        points, valid = tokens.points_world_M3, tokens.valid_M
-        features, seen = tokens.features_MF, None
+        valid, seen = tokens.valid_M, None
+        points, features = (
+            jnp.where(valid[..., None], x, 0) for x in (tokens.points_world_M3, tokens.features_MF)
+        )
         if config.memory.positions == "projective":
             seen = sightings(config, conditioning.camera, points, valid)
         else:
@@ -200,7 +216,18 @@ def apply(
         expert=expert,
         expert_params=expert_params,
     )
-    return out.astype(jnp.float32)
+    return _seen(config, out.astype(jnp.float32))
+
+
+def _seen(config: Config, latents_C: Array) -> Array:
+    """Blank the depth channels of latents where the denoiser works without depth.
+
+    They stay, so that both variants have the same parameters.
+    """
+    if config.memory.depth:
+        return latents_C
+    colour = np.arange(latents_C.shape[-1]) < codec.rgb_channels(config)
+    return jnp.where(colour, latents_C, 0)
 
 
 def flops_per_clip(config: Config, *, memory: bool) -> float:

@@ -1,0 +1,99 @@
+"""Cells of the grid as plain integers, samples of a frame, and the rule of who is read first.
+
+What the rival memories share with the voxel map: the same grid, the same order of tokens.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import MemoryConfig
+from pewm_jax.geometry.cameras import project, unproject
+from pewm_jax.types import Array, Camera, Frames
+
+FAR_M = 1e4
+"""Added to the distance of what no camera has in view, so that it comes after all that is."""
+
+
+def origin(config: MemoryConfig, centre_3: Array) -> Array:
+    """Return (3,) the lower corner of a grid around a world position, snapped to whole cells."""
+    cell = np.asarray(config.cell_m, np.float32)
+    half = np.asarray(config.cells, np.float32) * cell / 2
+    return (jnp.round((jnp.asarray(centre_3) - half) / cell) * cell).astype(jnp.float32)
+
+
+def keys(config: MemoryConfig, origin_3: Array, points_3: Array) -> Array:
+    """Return (...,) int32: the number of the cell of each point (..., 3).
+
+    Points beyond the grid and points that are not numbers get the number of cells.
+    """
+    place = jnp.floor((points_3 - origin_3) / np.asarray(config.cell_m, np.float32))
+    inside = jnp.all((place >= 0) & (place < np.asarray(config.cells, np.float32)), -1)
+    x, y, z = (jnp.where(inside, place[..., i], 0).astype(jnp.int32) for i in range(3))
+    _, ny, nz = config.cells
+    return jnp.where(inside, (x * ny + y) * nz + z, math.prod(config.cells))
+
+
+def grid_of(height: int, width: int, most: int) -> tuple[int, int]:
+    """Return rows and columns of the largest even grid over an image with ``most`` places."""
+    rows = min(max(int(math.sqrt(most * height / width)), 1), height, most)
+    return rows, max(min(most // rows, round(rows * width / height), width), 1)
+
+
+def sample(
+    frames: Frames, rows: int, columns: int, valid_T: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Look at the pixels in the middle of the fields of an even grid over each frame.
+
+    Args:
+        frames: T frames.
+        rows: of the grid.
+        columns: of the grid.
+        valid_T: (T,) bool, False frames have no valid pixel.
+
+    Returns:
+        ``(points_TP3, rgb_TPC, valid_TP)``, P = rows × columns; pixels without depth are invalid.
+    """
+    count, height, width = frames.depth_THW.shape
+    row = ((np.arange(rows) + 0.5) * height / rows).astype(int)
+    column = ((np.arange(columns) + 0.5) * width / columns).astype(int)
+
+    def take(image: Array) -> Array:
+        picked = image[:, row][:, :, column]
+        return picked.reshape(count, rows * columns, *image.shape[3:])
+
+    depth = take(frames.depth_THW)
+    valid = (depth > 0) & jnp.isfinite(depth)
+    if valid_T is not None:
+        valid = valid & valid_T[:, None]
+    return take(unproject(frames.depth_THW, frames.camera)), take(frames.rgb_THWC), valid
+
+
+def in_view_first(
+    points_P3: Array, valid_P: Array, camera: Camera, size: tuple[int, int], count: int
+) -> Array:
+    """Return (≤ count,) indices of the points that condition one clip.
+
+    Points inside the view of any of the clip's cameras come first, nearest first (by the smallest
+    depth at which a camera sees them); then the others by distance to the nearest camera; invalid
+    ones last. Ties go to the lower index.
+
+    Args:
+        points_P3: world points, metres.
+        valid_P: (P,) bool.
+        camera: (T,) cameras of the clip.
+        size: image height and width in pixels.
+        count: how many at most; fewer where there are fewer points.
+    """
+    uv, z = project(points_P3[None], camera)
+    seen = jnp.all((uv >= 0) & (uv <= np.array([size[1], size[0]], np.float32)), -1) & (z > 0)
+    depth = jnp.where(seen, z, jnp.inf).min(0)
+    centres = camera.world_from_camera[:, None, :3, 3]
+    distance = jnp.linalg.norm(points_P3[None] - centres, axis=-1).min(0)
+    score = jnp.where(jnp.isfinite(depth), depth, FAR_M + distance)
+    score = jnp.where(valid_P, score, jnp.inf)
+    return jax.lax.top_k(-score, min(count, points_P3.shape[0]))[1]

@@ -1,0 +1,165 @@
+"""A compact set of snapshots that together show what was seen (after 3D-Mem, arXiv 2411.17735).
+
+3D-Mem clusters detected objects; without a detector, what a frame shows is the set of map cells
+its pixels fall into, and the snapshots are chosen by greedy maximum coverage of all cells seen so
+far: at least 1 − 1/e of what the best K frames would cover. Tokens are the patches of the
+snapshots, each at the place in the world that its middle pixel shows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import Config, MemoryConfig
+from pewm_jax.memory import cells
+from pewm_jax.types import Array, Frames, MapTokens
+
+MOST = 24 * 24
+"""Pixels of a frame, in an even grid, whose cells count as covered by it."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Snapshots:
+    """K snapshots of P patches that cover up to C cells each.
+
+    Attributes:
+        features_KPF: (K, P, F) patch features.
+        points_KP3: (K, P, 3) where patches stand in the world, metres.
+        valid_KP: (K, P) bool, False without depth; all False where a place is free.
+        cell_KC: (K, C) int32 cells covered, in any order and repeated; the number of cells where
+            there is none.
+        origin_3: (3,) lower corner of the grid, metres.
+        dropped: () int32, cells seen but shown by none of the snapshots kept (per insertion).
+    """
+
+    features_KPF: Array
+    points_KP3: Array
+    valid_KP: Array
+    cell_KC: Array
+    origin_3: Array
+    dropped: Array
+
+
+def patch_grid(config: Config) -> tuple[int, int]:
+    """Return rows and columns of patches of a snapshot: K snapshots fit into ``memory.tokens``."""
+    memory, clip = config.memory, config.clip
+    return cells.grid_of(clip.height, clip.width, memory.tokens // memory.snapshots)
+
+
+def empty(config: Config, centre_3: Array, channels: int) -> Snapshots:
+    """Return no snapshots; the cells they will cover are of a grid around a world position."""
+    count, memory = config.memory.snapshots, config.memory
+    patches = math.prod(patch_grid(config))
+    covers = math.prod(cells.grid_of(config.clip.height, config.clip.width, MOST))
+    return Snapshots(
+        jnp.zeros((count, patches, channels)),
+        jnp.zeros((count, patches, 3)),
+        jnp.zeros((count, patches), bool),
+        jnp.full((count, covers), math.prod(memory.cells), jnp.int32),
+        cells.origin(memory, centre_3),
+        dropped=jnp.zeros((), jnp.int32),
+    )
+
+
+def remember(
+    config: Config,
+    kept: Snapshots,
+    frames: Frames,
+    features_ThwF: Array,
+    valid_T: Array | None = None,
+) -> Snapshots:
+    """Choose anew among the snapshots kept so far and T frames.
+
+    Args:
+        config: the experiment.
+        kept: the snapshots so far; they win ties against new frames.
+        frames: T frames.
+        features_ThwF: (T, h, w, F) their patch features, pooled to the patches of a snapshot.
+        valid_T: (T,) bool; False frames are ignored.
+    """
+    memory, shape = config.memory, features_ThwF.shape
+    rows, columns = patch_grid(config)
+    points, _, valid = cells.sample(frames, rows, columns, valid_T)
+    pooled = jax.image.resize(features_ThwF, (shape[0], rows, columns, shape[-1]), "linear")
+    pooled = pooled.reshape(shape[0], rows * columns, shape[-1])
+    looked, _, measured = cells.sample(frames, *cells.grid_of(*frames.depth_THW.shape[1:], MOST))
+    if valid_T is not None:
+        measured = measured & valid_T[:, None]
+    nowhere = math.prod(memory.cells)
+    cell = jnp.where(measured, cells.keys(memory, kept.origin_3, looked), nowhere)
+
+    everything = Snapshots(
+        jnp.concatenate([kept.features_KPF, jnp.where(valid[..., None], pooled, 0)]),
+        jnp.concatenate([kept.points_KP3, jnp.where(valid[..., None], points, 0)]),
+        jnp.concatenate([kept.valid_KP, valid]),
+        jnp.concatenate([kept.cell_KC, cell]),
+        kept.origin_3,
+        kept.dropped,
+    )
+    chosen_K, gain_K, missed = greedy_cover(everything.cell_KC, memory.snapshots, nowhere)
+    useful = gain_K > 0
+    return Snapshots(
+        jnp.where(useful[:, None, None], everything.features_KPF[chosen_K], 0),
+        jnp.where(useful[:, None, None], everything.points_KP3[chosen_K], 0),
+        useful[:, None] & everything.valid_KP[chosen_K],
+        jnp.where(useful[:, None], everything.cell_KC[chosen_K], nowhere),
+        kept.origin_3,
+        dropped=kept.dropped + missed,
+    )
+
+
+def greedy_cover(cell_XC: Array, count: int, nowhere: int) -> tuple[Array, Array, Array]:
+    """Choose sets one by one, each time the one that covers most cells not yet covered.
+
+    Args:
+        cell_XC: (X, C) the cells of each of X sets, in any order and repeated.
+        count: how many to choose.
+        nowhere: a number that stands for no cell.
+
+    Returns:
+        ``(chosen, gain, missed)``: (count,) indices of the sets in the order of choice (ties go to
+        the lower index); (count,) cells that each one added, 0 where nothing was left to cover and
+        the index means nothing; () cells that stay uncovered.
+    """
+    sets = cell_XC.shape[0]
+    flat = cell_XC.reshape(-1)
+    order = jnp.argsort(flat)
+    in_order = flat[order]
+    first = jnp.concatenate([jnp.ones((1,), bool), in_order[1:] != in_order[:-1]])
+    number = jnp.zeros_like(flat).at[order].set(jnp.cumsum(first, dtype=jnp.int32) - 1)
+    column = jnp.where(cell_XC < nowhere, number.reshape(cell_XC.shape), flat.shape[0])
+    covers_XU = jnp.zeros((sets, flat.shape[0]), bool)
+    covers_XU = covers_XU.at[jnp.arange(sets)[:, None], column].set(True, mode="drop")
+
+    def choose(left_U: Array, _) -> tuple[Array, tuple[Array, Array]]:
+        gain_X = (covers_XU & left_U).sum(-1, dtype=jnp.int32)
+        best = jnp.argmax(gain_X)
+        return left_U & ~covers_XU[best], (best, gain_X[best])
+
+    left_U, (chosen, gain) = jax.lax.scan(choose, covers_XU.any(0), length=count)
+    return chosen, gain, left_U.sum(dtype=jnp.int32)
+
+
+def to_points(kept: Snapshots) -> tuple[Array, Array, Array]:
+    """Return all patches as ``(points_world_V3, features_VF, valid_V)``."""
+    channels = kept.features_KPF.shape[-1]
+    return (
+        kept.points_KP3.reshape(-1, 3),
+        kept.features_KPF.reshape(-1, channels),
+        kept.valid_KP.reshape(-1),
+    )
+
+
+def tokens(config: MemoryConfig, kept: Snapshots) -> MapTokens:
+    """Return all patches of all snapshots, then masked tokens up to ``memory.tokens``."""
+    parts = to_points(kept)
+    missing = config.tokens - parts[2].shape[0]
+    points, features, valid = (
+        jnp.pad(part, [(0, missing)] + [(0, 0)] * (part.ndim - 1)) for part in parts
+    )
+    return MapTokens(features, points, valid)

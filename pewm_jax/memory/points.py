@@ -1,0 +1,138 @@
+"""A point cloud: where something stands and its colour, without features.
+
+The rival "point cloud" of the paper's ablation. Thinned as point clouds usually are: of all points
+that fell into a cell of the grid one is kept, at their mean position and with their mean colour.
+Kept sorted by cell, so that an insertion is one sort and one segmented sum.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import MemoryConfig
+from pewm_jax.memory import cells
+from pewm_jax.types import Array, Camera, Frames, MapTokens
+
+MOST = 64 * 64
+"""Pixels of a frame that are looked at, at most, in an even grid."""
+CHANNELS = 4
+"""Colour in [−1, 1], and 1 for being there."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PointCloud:
+    """A thinned point cloud with static capacity V.
+
+    Attributes:
+        cell_V: (V,) int32 cells in increasing order; free slots, last, hold the number of cells.
+        sums_V7: (V, 7) count of points, sum of their offsets from ``origin_3``, of their colours.
+        origin_3: (3,) lower corner of the grid, metres.
+        occupied: () int32, points in use.
+        dropped: () int32, cells seen but not kept because the capacity was full (per insertion).
+        outside: () int32, points that fell outside the grid.
+    """
+
+    cell_V: Array
+    sums_V7: Array
+    origin_3: Array
+    occupied: Array
+    dropped: Array
+    outside: Array
+
+
+def empty(config: MemoryConfig, centre_3: Array) -> PointCloud:
+    """Return a cloud without points, its grid centred on a world position."""
+    zero = jnp.zeros((), jnp.int32)
+    return PointCloud(
+        jnp.full((config.capacity,), math.prod(config.cells), jnp.int32),
+        jnp.zeros((config.capacity, 7)),
+        cells.origin(config, centre_3),
+        occupied=zero,
+        dropped=zero,
+        outside=zero,
+    )
+
+
+def insert(
+    config: MemoryConfig, cloud: PointCloud, points_P3: Array, rgb_PC: Array, valid_P: Array
+) -> PointCloud:
+    """Insert coloured points; new cells beyond the capacity are counted, lower cells stay.
+
+    Args:
+        config: cell size, extent, capacity.
+        cloud: the points so far.
+        points_P3: (P, 3) world points, metres.
+        rgb_PC: (P, 3) colours in [−1, 1].
+        valid_P: (P,) bool; False points are ignored.
+    """
+    nowhere, capacity = math.prod(config.cells), cloud.cell_V.shape[0]
+    cell_P = cells.keys(config, cloud.origin_3, points_P3)
+    outside = (valid_P & (cell_P == nowhere)).sum(dtype=jnp.int32)
+    counted = valid_P & (cell_P < nowhere)
+    offset = jnp.where(counted[:, None], points_P3 - cloud.origin_3, 0)
+    colour = jnp.where(counted[:, None], rgb_PC, 0)
+    rows = jnp.concatenate([counted[:, None].astype(jnp.float32), offset, colour], -1)
+
+    cell = jnp.concatenate([cloud.cell_V, jnp.where(counted, cell_P, nowhere)])
+    order = jnp.argsort(cell, stable=True)
+    cell, old = cell[order], order < capacity
+    first = jnp.concatenate([jnp.ones((1,), bool), cell[1:] != cell[:-1]]) & (cell < nowhere)
+    # Stable: of equal cells the one already in the cloud stands first.
+    known, new = first & old, first & ~old
+    room = capacity - cloud.occupied
+    kept = known | (new & (jnp.cumsum(new) <= room))
+    slot = jnp.where(kept, jnp.cumsum(kept) - 1, capacity)
+    # Every row goes where the first row of its cell goes.
+    leader = jax.lax.cummax(jnp.where(first, jnp.arange(cell.shape[0]), 0))
+    target = jnp.where(cell < nowhere, slot[leader], capacity)
+    sums = jnp.concatenate([cloud.sums_V7, rows])[order]
+    return PointCloud(
+        jnp.full((capacity,), nowhere, jnp.int32).at[slot].set(cell, mode="drop"),
+        jnp.zeros((capacity, 7)).at[target].add(sums, mode="drop", indices_are_sorted=False),
+        cloud.origin_3,
+        occupied=kept.sum(dtype=jnp.int32),
+        dropped=cloud.dropped + (new & ~kept).sum(dtype=jnp.int32),
+        outside=cloud.outside + outside,
+    )
+
+
+def remember(
+    config: MemoryConfig, cloud: PointCloud, frames: Frames, valid_T: Array | None = None
+) -> PointCloud:
+    """Insert the pixels of posed RGB-D frames, colours in [−1, 1]."""
+    rows, columns = cells.grid_of(*frames.depth_THW.shape[1:], MOST)
+    points, rgb, valid = cells.sample(frames, rows, columns, valid_T)
+    return insert(config, cloud, points.reshape(-1, 3), rgb.reshape(-1, 3), valid.reshape(-1))
+
+
+def to_points(cloud: PointCloud, channels: int) -> tuple[Array, Array, Array]:
+    """Return all slots as ``(points_world_V3, features_VF, valid_V)``.
+
+    Features are the colour and a 1 for being there, then zeros up to ``channels``; free slots are
+    0 altogether.
+
+    Raises:
+        ValueError: fewer than four channels.
+    """
+    if channels < CHANNELS:
+        raise ValueError(f"a coloured point needs {CHANNELS} channels, got {channels}.")
+    valid = cloud.sums_V7[:, 0] > 0
+    mean = cloud.sums_V7[:, 1:] / jnp.where(valid, cloud.sums_V7[:, 0], 1)[:, None]
+    points = jnp.where(valid[:, None], cloud.origin_3 + mean[:, :3], 0)
+    there = valid[:, None].astype(jnp.float32)
+    padding = jnp.zeros((valid.shape[0], channels - CHANNELS))
+    return points, jnp.concatenate([mean[:, 3:], there, padding], -1), valid
+
+
+def tokens(
+    config: MemoryConfig, cloud: PointCloud, camera: Camera, size: tuple[int, int], channels: int
+) -> MapTokens:
+    """Choose the points that condition one clip: in view first, nearest first."""
+    points, features, valid = to_points(cloud, channels)
+    order = cells.in_view_first(points, valid, camera, size, config.tokens)
+    return MapTokens(features[order], points[order], valid[order])
