@@ -14,6 +14,7 @@ from pewm_jax.config.experiment import Config
 from pewm_jax.config.files import from_dict, load, save, to_dict
 from pewm_jax.config.memory import MemoryConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
+from pewm_jax.config.vae import VAEConfig
 
 __all__ = [
     "SMALLEST",
@@ -31,6 +32,7 @@ __all__ = [
     "StageConfig",
     "TrainConfig",
     "UserError",
+    "VAEConfig",
     "from_dict",
     "load",
     "save",

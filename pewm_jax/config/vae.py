@@ -1,0 +1,140 @@
+"""The video autoencoder in CogVideoX's form."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from pewm_jax.config.errors import ConfigError, require, require_positive
+
+
+@dataclasses.dataclass(frozen=True)
+class VAEConfig:
+    """The video autoencoder in CogVideoX's form: causal 3D convolutions, encoded in chunks.
+
+    The defaults are the published sizes; ``VAEConfig.published`` names the variants.
+    """
+
+    in_channels: int = 3
+    """Channels of a frame that goes in."""
+    out_channels: int = 3
+    """Channels of a frame that comes out."""
+    latent_channels: int = 16
+    """Channels of a latent."""
+    widths: tuple[int, ...] = (128, 256, 256, 512)
+    """Channels of each level, from pixels inwards; each level but the last halves height and
+    width."""
+    resnets: int = 3
+    """Residual blocks per level of the encoder; the decoder has one more."""
+    groups: int = 32
+    """Groups of the group norms; divides every width."""
+    eps: float = 1e-6
+    """Added to the variance in the encoder's residual blocks."""
+    temporal: int = 4
+    """Frames per latent: 1, 2, 4 or 8."""
+    sample_height: int = 480
+    """Height that the weights were trained for; half of it is the height of a tile."""
+    sample_width: int = 720
+    """Width that the weights were trained for; half of it is the width of a tile."""
+    scaling_factor: float = 1.15258426
+    """Latents times this have unit variance: the diffusion model's input. Applied by the codec,
+    not by ``encode`` and ``decode``."""
+    invert_scale_latents: bool = False
+    """Whether a conditioning image's latents are divided by the factor, not multiplied: the
+    published 1.5-5B-I2V."""
+    tiling: bool = False
+    """Work in overlapping tiles of space when a frame is larger than a tile: less memory, and a
+    slightly different result."""
+    tile_height: int = 0
+    """Height of a tile in pixels; 0 is half of ``sample_height``."""
+    tile_width: int = 0
+    """Width of a tile in pixels; 0 is half of ``sample_width``."""
+    tile_overlap_height: float = 1 / 6
+    """Share of a tile's height that overlaps with the next."""
+    tile_overlap_width: float = 1 / 5
+    """Share of a tile's width that overlaps with the next."""
+    convolution: Literal["auto", "taps", "volume"] = "auto"
+    """`volume`: 3D convolutions; `taps`: the same as sums of 2D convolutions over time, faster on
+    XLA's CPU backend; `auto`: `taps` on CPU and `volume` elsewhere."""
+
+    @property
+    def spatial(self) -> int:
+        """Pixels per latent cell, each way."""
+        return 2 ** (len(self.widths) - 1)
+
+    @property
+    def tile_pixels(self) -> tuple[int, int]:
+        """Height and width of a tile in pixels."""
+        return (
+            self.tile_height or self.sample_height // 2,
+            self.tile_width or self.sample_width // 2,
+        )
+
+    def __post_init__(self):
+        """Validate."""
+        require(len(self.widths) > 0, "vae.widths is empty: name at least one level's channels.")
+        sizes = ("in_channels", "out_channels", "latent_channels", "resnets", "groups")
+        require_positive(self, "vae", *sizes, "sample_height", "sample_width")
+        for width in self.widths:
+            require(
+                width >= 1 and width % self.groups == 0,
+                f"vae.widths holds {width}, which vae.groups {self.groups} does not divide: use "
+                "multiples of the groups.",
+            )
+        require(self.eps > 0, f"vae.eps is {self.eps}: use a small positive number, as 1e-6.")
+        require(
+            self.temporal in {1, 2, 4, 8},
+            f"vae.temporal is {self.temporal}: use 1, 2, 4 or 8 (published weights have 4).",
+        )
+        require(
+            self.temporal <= self.spatial,
+            f"vae.temporal {self.temporal} needs as many halvings as vae.widths has steps between "
+            f"levels ({len(self.widths) - 1}): add levels or lower vae.temporal.",
+        )
+        require(
+            self.scaling_factor > 0,
+            f"vae.scaling_factor is {self.scaling_factor}: use the checkpoint's positive factor "
+            "(1.15258426 for 2b, 0.7 for the others).",
+        )
+        self._validate_tiles()
+
+    def _validate_tiles(self):
+        """Refuse tiles that hold no latent, or that never advance."""
+        shares = (self.tile_overlap_height, self.tile_overlap_width)
+        for name, pixels, share in zip(("height", "width"), self.tile_pixels, shares, strict=True):
+            require(
+                0 <= share < 1,
+                f"vae.tile_overlap_{name} is {share}: use a share of the tile from 0 to below 1.",
+            )
+            require(
+                not self.tiling or int(pixels // self.spatial * (1 - share)) >= 1,
+                f"tiles of {pixels} pixels with vae.tile_overlap_{name} {share:.3g} advance by no "
+                f"latent: use a larger vae.tile_{name} or less overlap.",
+            )
+
+    @classmethod
+    def published(cls, variant: str) -> VAEConfig:
+        """Return the autoencoder of a published CogVideoX.
+
+        Args:
+            variant: ``2b``, ``5b``, ``5b-I2V``, ``1.5-5B`` or ``1.5-5B-I2V``.
+
+        Raises:
+            ConfigError: another name.
+        """
+        if variant not in _SCALES:
+            raise ConfigError(
+                f"no CogVideoX is called {variant!r}; choose one of {', '.join(_SCALES)}."
+            )
+        scale, inverted = _SCALES[variant]
+        return cls(scaling_factor=scale, invert_scale_latents=inverted)
+
+
+_SCALES = {
+    "2b": (1.15258426, False),
+    "5b": (0.7, False),
+    "5b-I2V": (0.7, False),
+    "1.5-5B": (0.7, False),
+    "1.5-5B-I2V": (0.7, True),
+}
+"""What tells the published autoencoders apart: scaling factor, and whether images invert it."""
