@@ -8,7 +8,7 @@ from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
 from pewm_jax.config.codec import CodecConfig
 from pewm_jax.config.diffusion import DiffusionConfig
 from pewm_jax.config.dinov2 import DINOv2Config
-from pewm_jax.config.dit import DiTConfig
+from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.files import from_dict, load, save, to_dict
@@ -17,6 +17,7 @@ from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainC
 from pewm_jax.config.vae import VAEConfig
 
 __all__ = [
+    "PUBLISHED",
     "SMALLEST",
     "ActionConfig",
     "ClipConfig",
@@ -35,6 +36,7 @@ __all__ = [
     "VAEConfig",
     "from_dict",
     "load",
+    "published",
     "save",
     "to_dict",
 ]

@@ -3,30 +3,63 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
-from pewm_jax.config.errors import require, require_positive
+from pewm_jax.config.errors import ConfigError, require, require_positive
+
+Positions = Literal["rope_integer", "rope_crop", "rope_learned", "sincos"]
+"""How a video token says where it is; see ``DiTConfig.positions``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DiTConfig:
-    """The diffusion transformer in CogVideoX's form."""
+    """The diffusion transformer in CogVideoX's form; ``published`` gives CogVideoX's own."""
 
     layers: int = 4
     """Transformer blocks."""
     heads: int = 6
     """Attention heads."""
     head_dim: int = 32
-    """Width of a head; a multiple of 16 (the rotary embedding splits it 1/4, 3/8, 3/8)."""
+    """Width of a head; a multiple of 16 (the rotary embedding splits it 1/4, 3/8, 3/8). With
+    positions `sincos` heads × head_dim is what must be a multiple of 16."""
     patch: int = 2
     """Latent cells per token, each way."""
+    patch_t: int = 1
+    """Latent frames per token: 2 in CogVideoX 1.5, else 1."""
+    in_channels: int = 0
+    """Latent channels that go in; 0 for what the codec and the conditioning need."""
+    out_channels: int = 0
+    """Latent channels that come out; 0 for what the codec needs."""
     text_length: int = 4
     """Text tokens; with no prompt they are zeros, so that the text path learns a constant."""
     text_dim: int = 32
     """Channels of a text token."""
     time_dim: int = 192
     """Width of the time embedding."""
+    ofs_dim: int = 0
+    """Width of the second scalar's embedding (1.5-5B-I2V: 512, equal to time_dim); 0 for none."""
     mlp_ratio: int = 4
     """Feed-forward width over model width."""
+    positions: Positions = "rope_integer"
+    """`rope_integer`: rotary, positions 0, 1, 2 … (CogVideoX 1.5). `rope_crop`: rotary, the token
+    grid stretched over the sample size's (5b). `rope_learned`: that and a learned table, for the
+    sample size alone (5b-I2V). `sincos`: a fixed sinusoid added to the tokens (2b)."""
+    sample_height: int = 0
+    """Latent rows that the network was trained for; 0 where positions do not ask (rope_integer:
+    a bound when not 0)."""
+    sample_width: int = 0
+    """Latent columns that the network was trained for; like sample_height."""
+    sample_frames: int = 0
+    """Video frames (not latent frames) that the network was trained for; rope_learned asks."""
+    temporal: int = 4
+    """Video frames per latent frame after the first; only reads sample_frames."""
+    spatial_interpolation: float = 1.875
+    """Divisor of the rows and columns in `sincos`."""
+    temporal_interpolation: float = 1.0
+    """Divisor of the latent frames in `sincos`."""
+    attention: Literal["auto", "xla", "cudnn"] = "auto"
+    """Who computes attention: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `xla` runs
+    anywhere, `auto` takes cudnn where it works."""
     remat: bool = False
     """Recompute activations in the backward pass: less memory, about a third more time."""
 
@@ -35,12 +68,107 @@ class DiTConfig:
         """Model width D."""
         return self.heads * self.head_dim
 
+    @property
+    def sample_latents(self) -> int:
+        """Latent frames of ``sample_frames`` video frames."""
+        return (self.sample_frames - 1) // self.temporal + 1
+
     def __post_init__(self):
         """Validate."""
-        require_positive(self, "dit", "layers", "heads", "head_dim", "patch")
+        require_positive(self, "dit", "layers", "heads", "head_dim", "patch", "patch_t")
         require_positive(self, "dit", "text_length", "text_dim", "time_dim", "mlp_ratio")
+        require_positive(self, "dit", "temporal")
+        for name in ("in_channels", "out_channels", "ofs_dim"):
+            value = getattr(self, name)
+            require(value >= 0, f"dit.{name} is {value}: use 0 or more.")
+        rotary = self.positions != "sincos"
         require(
-            self.head_dim % 16 == 0,
+            not rotary or self.head_dim % 16 == 0,
             f"dit.head_dim is {self.head_dim}: use a multiple of 16 (16, 32, 48, 64), the rotary "
             "embedding splits a head into time, height and width parts.",
         )
+        require(
+            self.width % 16 == 0,
+            f"dit.heads × head_dim is {self.width}: use a multiple of 16, the sinusoid of "
+            "positions splits it into time, height and width parts.",
+        )
+        require(
+            self.ofs_dim in (0, self.time_dim),
+            f"dit.ofs_dim is {self.ofs_dim}: its embedding is added to the time embedding, so use "
+            f"dit.time_dim ({self.time_dim}), or 0 for none.",
+        )
+        for name in ("spatial_interpolation", "temporal_interpolation"):
+            value = getattr(self, name)
+            require(value > 0, f"dit.{name} is {value}: use a number above 0.")
+        self._require_sample()
+
+    def _require_sample(self) -> None:
+        """Validate the sizes that some kinds of positions need."""
+        asked = {"rope_crop": 2, "rope_learned": 3}.get(self.positions, 0)
+        names = ("sample_height", "sample_width", "sample_frames")
+        for index, name in enumerate(names):
+            value = getattr(self, name)
+            require(value >= 0, f"dit.{name} is {value}: use 0 or more.")
+            require(
+                index >= asked or value > 0,
+                f"dit.{name} is 0: positions {self.positions} need the size that the network was "
+                "trained for (CogVideoX: 60 × 90 latents of 49 frames).",
+            )
+        learned = self.positions == "rope_learned"
+        require(
+            not learned or (self.sample_height % self.patch == self.sample_width % self.patch == 0),
+            f"dit.sample_height × sample_width {self.sample_height}×{self.sample_width}: learned "
+            f"positions need multiples of dit.patch ({self.patch}).",
+        )
+        require(
+            self.patch_t == 1 or self.positions == "rope_integer",
+            f"dit.patch_t is {self.patch_t}: more than 1 goes with positions rope_integer "
+            f"(CogVideoX 1.5), not with {self.positions}.",
+        )
+
+
+PUBLISHED = ("2b", "5b", "5b-I2V", "1.5-5B", "1.5-5B-I2V")
+"""The published CogVideoX networks, as ``published`` names them."""
+
+
+def published(name: str) -> DiTConfig:
+    """Return the configuration of a published CogVideoX network.
+
+    Args:
+        name: one of ``PUBLISHED``.
+
+    Raises:
+        ConfigError: there is no such network.
+    """
+    common = DiTConfig(
+        layers=42,
+        heads=48,
+        head_dim=64,
+        in_channels=16,
+        out_channels=16,
+        text_length=226,
+        text_dim=4096,
+        time_dim=512,
+        positions="rope_crop",
+        sample_height=60,
+        sample_width=90,
+        sample_frames=49,
+    )
+    newer = {
+        "patch_t": 2,
+        "text_length": 224,
+        "positions": "rope_integer",
+        "sample_height": 300,
+        "sample_width": 300,
+        "sample_frames": 81,
+    }
+    differences = {
+        "2b": {"layers": 30, "heads": 30, "positions": "sincos"},
+        "5b": {},
+        "5b-I2V": {"in_channels": 32, "positions": "rope_learned"},
+        "1.5-5B": newer,
+        "1.5-5B-I2V": {**newer, "in_channels": 32, "ofs_dim": 512},
+    }
+    if name not in differences:
+        raise ConfigError(f"There is no CogVideoX {name!r}; choose one of {', '.join(PUBLISHED)}.")
+    return dataclasses.replace(common, **differences[name])

@@ -1,12 +1,13 @@
-"""The diffusion transformer, in CogVideoX's form.
+"""The diffusion transformer, equal to CogVideoX's.
 
 Text and video tokens attend jointly; each kind has its own adaptive-layernorm modulation from the
 time embedding ("expert" adaptive layernorm) around one shared layernorm; queries and keys are
 normalised per head; a 3D rotary embedding turns the video tokens. The blocks are scanned, so
-compile time does not grow with depth. Reference: ``CogVideoXTransformer3DModel`` of diffusers.
+compile time does not grow with depth. Reference: ``CogVideoXTransformer3DModel`` of diffusers;
+``pewm_jax.config.published`` has the settings of its five published networks.
 
 Parameters: ``patch_embed, text_embed, time_embed, blocks (stacked over layers), norm_final,
-norm_out, proj_out``.
+norm_out, modulate_out, proj_out``, and ``positions`` or ``ofs_embed`` where a variant has them.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import DiTConfig
-from pewm_jax.models import layers
+from pewm_jax.config import DiTConfig, UserError
+from pewm_jax.models import layers, positions
 from pewm_jax.types import Array, Params
 
 BlockExpert = Callable[[Any, Array, Array], Array]
 """``expert(layer_params, video_BND, time_BE) -> video_BND``, run after a block."""
+
+OFS = 2.0
+"""The second scalar that 1.5-5B-I2V is always given."""
 
 
 def open_gates(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
@@ -38,14 +42,18 @@ def open_gates(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float3
 
 
 class LayerNormZero(nn.Module):
-    """Expert adaptive layernorm: one shared norm, separate modulation of video and text."""
+    """Expert adaptive layernorm: one shared norm, separate modulation of text and video."""
 
     @nn.compact
-    def __call__(
-        self, video_BND: Array, text_BLD: Array, time_BE: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Return normalised video, normalised text, video gate (B, D), text gate (B, D)."""
-        width, dtype = video_BND.shape[-1], video_BND.dtype
+    def __call__(self, tokens_BND: Array, time_BE: Array, length: int) -> tuple[Array, Array]:
+        """Return normalised and modulated tokens, and the gate (B, N, D) of each token.
+
+        Args:
+            tokens_BND: (B, L + N, D) text tokens, then video tokens.
+            time_BE: (B, E) time embedding.
+            length: L, the number of text tokens.
+        """
+        width, dtype = tokens_BND.shape[-1], tokens_BND.dtype
         linear = nn.Dense(
             6 * width,
             dtype=dtype,
@@ -53,16 +61,11 @@ class LayerNormZero(nn.Module):
             bias_init=open_gates,
             name="linear",
         )
-        modulation = linear(nn.silu(time_BE))
-        shift, scale, gate, text_shift, text_scale, text_gate = jnp.split(modulation, 6, -1)
-        both = layers.layer_norm(jnp.concatenate([text_BLD, video_BND], 1), "norm")
-        text, video = jnp.split(both, [text_BLD.shape[1]], 1)
-        return (
-            layers.modulate(video, shift, scale),
-            layers.modulate(text, text_shift, text_scale),
-            gate,
-            text_gate,
-        )
+        video, text = jnp.split(linear(nn.silu(time_BE))[:, None], 2, -1)
+        is_text = (jnp.arange(tokens_BND.shape[1]) < length)[:, None]
+        shift, scale, gate = jnp.split(jnp.where(is_text, text, video), 3, -1)
+        normed = layers.layer_norm(tokens_BND, "norm")
+        return normed * (1 + scale) + shift, gate
 
 
 class Block(nn.Module):
@@ -72,41 +75,30 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(
-        self, video_BND: Array, text_BLD: Array, time_BE: Array, angles_NR: Array
-    ) -> tuple[Array, Array]:
-        """Return the updated video and text tokens.
+        self, tokens_BND: Array, time_BE: Array, angles_NR: Array | None, length: int
+    ) -> Array:
+        """Return the updated tokens.
 
         Args:
-            video_BND: (B, N, D) video tokens.
-            text_BLD: (B, L, D) text tokens.
+            tokens_BND: (B, L + N, D) text tokens, then video tokens.
             time_BE: (B, E) time embedding.
-            angles_NR: (N, head_dim/2) rotary angles of the video tokens.
+            angles_NR: (L + N, head_dim/2) rotary angles, or None.
+            length: L, the number of text tokens.
         """
-        heads, dtype = self.config.heads, video_BND.dtype
-        length, width = text_BLD.shape[1], self.config.width
+        heads, width, dtype = self.config.heads, self.config.width, tokens_BND.dtype
 
-        video, text, gate, text_gate = LayerNormZero(name="norm1")(video_BND, text_BLD, time_BE)
-        both = jnp.concatenate([text, video], 1)
+        normed, gate = LayerNormZero(name="norm1")(tokens_BND, time_BE, length)
         q, k, v = (
-            layers.split_heads(layers.dense(width, dtype, f"to_{n}")(both), heads) for n in "qkv"
+            layers.split_heads(layers.dense(width, dtype, f"to_{n}")(normed), heads) for n in "qkv"
         )
         q, k = (layers.layer_norm(x, f"norm_{n}", 1e-6) for x, n in ((q, "q"), (k, "k")))
-        q, k = (
-            jnp.concatenate([x[:, :, :length], layers.rotate(x[:, :, length:], angles_NR)], 2)
-            for x in (q, k)
-        )
+        if angles_NR is not None:
+            q, k = layers.rotate(q, angles_NR), layers.rotate(k, angles_NR)
         mixed = layers.merge_heads(layers.attention(q, k, v))
-        mixed = layers.dense(width, dtype, "to_out")(mixed)
-        video_BND += gate[:, None] * mixed[:, length:]
-        text_BLD += text_gate[:, None] * mixed[:, :length]
+        tokens_BND += gate * layers.dense(width, dtype, "to_out")(mixed)
 
-        video, text, gate, text_gate = LayerNormZero(name="norm2")(video_BND, text_BLD, time_BE)
-        both = layers.FeedForward(self.config.mlp_ratio, name="ff")(
-            jnp.concatenate([text, video], 1)
-        )
-        video_BND += gate[:, None] * both[:, length:]
-        text_BLD += text_gate[:, None] * both[:, :length]
-        return video_BND, text_BLD
+        normed, gate = LayerNormZero(name="norm2")(tokens_BND, time_BE, length)
+        return tokens_BND + gate * layers.FeedForward(self.config.mlp_ratio, name="ff")(normed)
 
 
 class Ends(nn.Module):
@@ -118,66 +110,105 @@ class Ends(nn.Module):
 
     def setup(self):
         """Name the submodules."""
-        width, patch = self.config.width, self.config.patch
-        self.patch_embed = layers.dense(width, self.dtype, "patch_embed")
-        self.text_embed = layers.dense(width, self.dtype, "text_embed")
-        self.time_embed = layers.TimeEmbedding(width, self.config.time_dim, self.dtype)
+        config, dtype = self.config, self.dtype
+        self.patch_embed = layers.dense(config.width, dtype, "patch_embed")
+        self.text_embed = layers.dense(config.width, dtype, "text_embed")
+        self.time_embed = layers.TimeEmbedding(config.width, config.time_dim, dtype)
+        if config.ofs_dim:
+            self.ofs_embed = layers.TimeEmbedding(config.ofs_dim, config.ofs_dim, dtype)
+        if config.positions == "rope_learned":
+            tokens = config.text_length + positions.sample_tokens(config)
+            normal = nn.initializers.normal(0.02)
+            self.positions = self.param("positions", normal, (tokens, config.width))
         self.norm_final = nn.LayerNorm(epsilon=1e-5, dtype=jnp.float32)
         self.norm_out = nn.LayerNorm(epsilon=1e-5, dtype=jnp.float32)
-        self.modulate_out = layers.dense(2 * width, self.dtype, "modulate_out", zero=True)
-        self.proj_out = layers.dense(
-            patch * patch * self.out_channels, self.dtype, "proj_out", zero=True
-        )
+        self.modulate_out = layers.dense(2 * config.width, dtype, "modulate_out", zero=True)
+        cells = config.patch_t * config.patch**2
+        self.proj_out = layers.dense(cells * self.out_channels, dtype, "proj_out", zero=True)
 
-    def embed(self, patches_BNC: Array, text_BLC: Array, timesteps_B: Array):
-        """Return video tokens, text tokens and the time embedding."""
-        return (
-            self.patch_embed(patches_BNC),
-            self.text_embed(text_BLC),
-            self.time_embed(timesteps_B),
-        )
+    def embed(self, patches_BNC: Array, text_BLC: Array, timesteps_B: Array, ofs_B: Array):
+        """Return text and video tokens (B, L + N, D) and the time embedding (B, E)."""
+        tokens = jnp.concatenate([self.text_embed(text_BLC), self.patch_embed(patches_BNC)], 1)
+        time = self.time_embed(timesteps_B)
+        if self.config.ofs_dim:
+            time += self.ofs_embed(ofs_B)
+        if self.config.positions == "rope_learned":
+            tokens += self.positions.astype(self.dtype)
+        return tokens, time
 
     def project(self, video_BND: Array, time_BE: Array) -> Array:
-        """Return output patches (B, N, p·p·C)."""
+        """Return output patches (B, N, C·p_t·p·p)."""
         shift, scale = jnp.split(self.modulate_out(nn.silu(time_BE)), 2, -1)
         video = self.norm_out(self.norm_final(video_BND)).astype(self.dtype)
         return self.proj_out(layers.modulate(video, shift, scale))
 
-    def __call__(self, patches_BNC: Array, text_BLC: Array, timesteps_B: Array) -> Array:
+    def __call__(
+        self, patches_BNC: Array, text_BLC: Array, timesteps_B: Array, ofs_B: Array
+    ) -> Array:
         """Touch every parameter once (for initialisation)."""
-        video, _, time = self.embed(patches_BNC, text_BLC, timesteps_B)
-        return self.project(video, time)
+        tokens, time = self.embed(patches_BNC, text_BLC, timesteps_B, ofs_B)
+        return self.project(tokens, time)
 
 
-def patchify(latents_BthwC: Array, patch: int) -> Array:
-    """(B, t, h, w, C) → (B, t·h/p·w/p, C·p·p), channels before the patch's rows and columns."""
+def patchify(latents_BthwC: Array, patch: int, patch_t: int = 1) -> Array:
+    """(B, t, h, w, C) → (B, t/p_t·h/p·w/p, C·p_t·p·p), channels before the patch's cells."""
     batch, frames, height, width, channels = latents_BthwC.shape
     grid = latents_BthwC.reshape(
-        batch, frames, height // patch, patch, width // patch, patch, channels
+        batch,
+        frames // patch_t,
+        patch_t,
+        height // patch,
+        patch,
+        width // patch,
+        patch,
+        channels,
     )
-    return grid.transpose(0, 1, 2, 4, 6, 3, 5).reshape(batch, -1, channels * patch * patch)
+    cells = channels * patch_t * patch * patch
+    return grid.transpose(0, 1, 3, 5, 7, 2, 4, 6).reshape(batch, -1, cells)
 
 
-def unpatchify(tokens_BNC: Array, frames: int, height: int, width: int, patch: int) -> Array:
+def unpatchify(
+    tokens_BNC: Array, frames: int, height: int, width: int, patch: int, patch_t: int = 1
+) -> Array:
     """Invert ``patchify`` to (B, frames, height, width, C); sizes are the latents'."""
     batch = tokens_BNC.shape[0]
-    grid = tokens_BNC.reshape(batch, frames, height // patch, width // patch, -1, patch, patch)
-    return grid.transpose(0, 1, 2, 5, 3, 6, 4).reshape(batch, frames, height, width, -1)
+    grid = tokens_BNC.reshape(
+        batch,
+        frames // patch_t,
+        height // patch,
+        width // patch,
+        -1,
+        patch_t,
+        patch,
+        patch,
+    )
+    return grid.transpose(0, 1, 5, 2, 6, 3, 7, 4).reshape(batch, frames, height, width, -1)
 
 
-def init(config: DiTConfig, key: Array, in_channels: int, out_channels: int) -> Params:
-    """Initialise: float32, output layer at zero, blocks stacked over layers."""
+def init(config: DiTConfig, key: Array) -> Params:
+    """Initialise: float32, output layer at zero, blocks stacked over layers.
+
+    Raises:
+        UserError: ``in_channels`` or ``out_channels`` is 0 (left to the world model to fill).
+    """
+    if not (config.in_channels and config.out_channels):
+        raise UserError(
+            "dit.in_channels and dit.out_channels are 0, which leaves them to the world model: "
+            "set both to build the transformer alone (CogVideoX: 16 and 16)."
+        )
     ends_key, blocks_key = jax.random.split(key)
-    time = jnp.zeros((1, config.time_dim))
-    ends = Ends(config, out_channels, jnp.dtype(jnp.float32)).init(
+    cells = config.patch_t * config.patch**2
+    length = config.text_length
+    video = positions.sample_tokens(config) if config.positions == "rope_learned" else 1
+    ends = Ends(config, config.out_channels, jnp.dtype(jnp.float32)).init(
         ends_key,
-        jnp.zeros((1, 1, in_channels * config.patch**2)),
-        jnp.zeros((1, config.text_length, config.text_dim)),
+        jnp.zeros((1, video, config.in_channels * cells)),
+        jnp.zeros((1, length, config.text_dim)),
+        jnp.zeros((1,)),
         jnp.zeros((1,)),
     )["params"]
-    token = jnp.zeros((1, 1, config.width))
-    angles = jnp.zeros((1, config.head_dim // 2))
-    blocks = jax.vmap(lambda k: Block(config).init(k, token, token, time, angles)["params"])(
+    token, time = jnp.zeros((1, 1, config.width)), jnp.zeros((1, config.time_dim))
+    blocks = jax.vmap(lambda k: Block(config).init(k, token, time, None, 0)["params"])(
         jax.random.split(blocks_key, config.layers)
     )
     return {**ends, "blocks": blocks}
@@ -187,8 +218,9 @@ def apply(
     config: DiTConfig,
     params: Params,
     latents_BthwC: Array,
-    text_BLC: Array,
+    text_BLD: Array,
     timesteps_B: Array,
+    ofs_B: Array | None = None,
     *,
     expert: BlockExpert | None = None,
     expert_params: Any = None,
@@ -198,41 +230,76 @@ def apply(
     Args:
         config: the transformer.
         params: its parameters.
-        latents_BthwC: (B, t, h, w, C) input latents; h and w are multiples of the patch. Their
-            dtype is the dtype of the computation.
-        text_BLC: (B, L, text_dim) text tokens.
-        timesteps_B: (B,) diffusion times, 0 … train_steps − 1.
+        latents_BthwC: (B, t, h, w, C) input latents; h and w are multiples of the patch, t of
+            ``patch_t``. Their dtype is the dtype of the computation.
+        text_BLD: (B, L, text_dim) text tokens.
+        timesteps_B: (B,) diffusion times, 0 … train_steps − 1, or one for all.
+        ofs_B: (B,) second scalar of 1.5-5B-I2V; None is the 2.0 it was trained with.
         expert: run after every block on the video tokens (the memory block).
         expert_params: the experts' parameters, stacked over layers.
 
     Returns:
-        (B, t, h, w, C_out) prediction; C_out is the output layer's.
+        (B, t, h, w, C_out) prediction in the latents' dtype; C_out is the output layer's.
+
+    Raises:
+        UserError: sizes that this network cannot take, when traced.
     """
-    dtype = latents_BthwC.dtype
-    _, frames, height, width, _ = latents_BthwC.shape
-    patch = config.patch
-    out_channels = params["proj_out"]["bias"].shape[0] // patch**2
+    grid = positions.token_grid(config, latents_BthwC.shape)
+    _require_inputs(config, params, latents_BthwC, text_BLD, ofs_B)
+    dtype, patch, patch_t = latents_BthwC.dtype, config.patch, config.patch_t
+    batch, frames, height, width, _ = latents_BthwC.shape
+    length = text_BLD.shape[1]
+    out_channels = params["proj_out"]["bias"].shape[0] // (patch_t * patch**2)
     ends = Ends(config, out_channels, dtype)
     ends_params = {"params": {k: v for k, v in params.items() if k != "blocks"}}
     embedded: Any = ends.apply(
         ends_params,
-        patchify(latents_BthwC, patch),
-        text_BLC.astype(dtype),
-        timesteps_B,
+        patchify(latents_BthwC, patch, patch_t),
+        text_BLD.astype(dtype),
+        jnp.broadcast_to(jnp.asarray(timesteps_B), (batch,)),
+        jnp.broadcast_to(jnp.asarray(OFS if ofs_B is None else ofs_B), (batch,)),
         method="embed",
     )
-    video, text, time = embedded
-    angles = jnp.asarray(
-        layers.rope_angles(frames, height // patch, width // patch, config.head_dim)
-    )
+    tokens, time = embedded
+    if config.positions == "sincos":
+        tokens = tokens.at[:, length:].add(positions.sincos_table(config, grid).astype(dtype))
+    angles = positions.joint_angles(config, grid, length)
 
-    def body(carry, layer):
-        video, text = Block(config).apply({"params": layer[0]}, *carry, time, angles)
+    def body(tokens: Array, layer: tuple[Params, Any]) -> tuple[Array, None]:
+        tokens = Block(config).apply({"params": layer[0]}, tokens, time, angles, length)
         if expert is not None:
-            video = expert(layer[1], video, time)
-        return (video, text), None
+            text, video = jnp.split(tokens, [length], 1)
+            tokens = jnp.concatenate([text, expert(layer[1], video, time)], 1)
+        return tokens, None
 
     body = jax.checkpoint(body) if config.remat else body
-    (video, _), _ = jax.lax.scan(body, (video, text), (params["blocks"], expert_params))
-    patches: Array = ends.apply(ends_params, video, time, method="project")
-    return unpatchify(patches, frames, height, width, patch)
+    tokens, _ = jax.lax.scan(body, tokens, (params["blocks"], expert_params))
+    patches: Array = ends.apply(ends_params, tokens[:, length:], time, method="project")
+    return unpatchify(patches, frames, height, width, patch, patch_t)
+
+
+def _require_inputs(
+    config: DiTConfig, params: Params, latents: Array, text: Array, ofs: Array | None
+) -> None:
+    """Refuse inputs that do not fit the parameters."""
+    takes = params["patch_embed"]["kernel"].shape[0] // (config.patch_t * config.patch**2)
+    if latents.shape[-1] != takes:
+        raise UserError(
+            f"The latents have {latents.shape[-1]} channels and this network takes {takes}: an "
+            "image-to-video network takes 32 (noisy latents, then the image's), a text-to-video "
+            "network 16; channels are the last axis."
+        )
+    if text.ndim != 3 or text.shape[0] != latents.shape[0] or text.shape[2] != config.text_dim:
+        raise UserError(
+            f"The text has shape {tuple(text.shape)}: give (batch {latents.shape[0]}, tokens, "
+            f"{config.text_dim} channels)."
+        )
+    if config.positions == "rope_learned" and text.shape[1] != config.text_length:
+        raise UserError(
+            f"The text has {text.shape[1]} tokens: this network's learned positions are for "
+            f"{config.text_length}; pad the prompt to that."
+        )
+    if ofs is not None and not config.ofs_dim:
+        raise UserError(
+            "ofs_B was given to a network without an ofs embedding; only 1.5-5B-I2V has one."
+        )

@@ -73,21 +73,6 @@ def rotate_halves(x: Array, angles: Array) -> Array:
     return jnp.concatenate([a * cos - b * sin, b * cos + a * sin], -1).astype(x.dtype)
 
 
-def rope_angles(frames: int, height: int, width: int, head_dim: int) -> np.ndarray:
-    """Return (t·h·w, head_dim/2) rotary angles of a token grid, theta 1e4.
-
-    A head is split 1/4 time, 3/8 height, 3/8 width (``get_3d_rotary_pos_embed`` of diffusers,
-    integer positions).
-    """
-    parts = (head_dim // 4, head_dim // 8 * 3, head_dim // 8 * 3)
-    grid = np.meshgrid(np.arange(frames), np.arange(height), np.arange(width), indexing="ij")
-    angles = []
-    for positions, channels in zip(grid, parts, strict=True):
-        frequency = 1e4 ** (-np.arange(0, channels, 2) / channels)
-        angles.append(positions.reshape(-1, 1) * frequency)
-    return np.concatenate(angles, -1).astype(np.float32)
-
-
 def attention(q_BKND: Array, k_BKMD: Array, v_BKMD: Array) -> Array:
     """Scaled dot-product attention with the softmax in float32: (B, K, N, d)."""
     logits = jnp.einsum("bknd,bkmd->bknm", q_BKND, k_BKMD, preferred_element_type=jnp.float32)

@@ -3,24 +3,26 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.models import dit, layers
+from pewm_jax.config import PUBLISHED, ConfigError, DiTConfig, UserError, published
+from pewm_jax.models import dit, layers, positions
 from tests.helpers import randomise, tiny_config
 
-CONFIG = tiny_config().dit
+CONFIG = dataclasses.replace(tiny_config().dit, in_channels=5, out_channels=7)
 
 
-def inputs(channels=5, shape=(3, 4, 6), seed=0):
+def inputs(config=CONFIG, shape=(3, 4, 6), seed=0):
     rng = np.random.default_rng(seed)
-    latents = jnp.asarray(rng.normal(size=(2, *shape, channels)), jnp.float32)
-    text = jnp.asarray(rng.normal(size=(2, CONFIG.text_length, CONFIG.text_dim)), jnp.float32)
+    latents = jnp.asarray(rng.normal(size=(2, *shape, config.in_channels)), jnp.float32)
+    text = jnp.asarray(rng.normal(size=(2, config.text_length, config.text_dim)), jnp.float32)
     return latents, text, jnp.array([10, 900])
 
 
 def random_params(config=CONFIG):
-    return randomise(dit.init(config, jax.random.key(0), 5, 7))
+    return randomise(dit.init(config, jax.random.key(0)))
 
 
 @settings(max_examples=15, deadline=None)
@@ -29,17 +31,18 @@ def random_params(config=CONFIG):
     h=st.integers(1, 3),
     w=st.integers(1, 3),
     p=st.integers(1, 3),
+    p_t=st.integers(1, 3),
     c=st.integers(1, 3),
 )
-def test_unpatchify_inverts_patchify(t, h, w, p, c):
-    latents = np.random.default_rng(0).normal(size=(2, t, h * p, w * p, c))
-    tokens = dit.patchify(latents, p)
-    assert tokens.shape == (2, t * h * w, c * p * p)
-    np.testing.assert_array_equal(dit.unpatchify(tokens, t, h * p, w * p, p), latents)
+def test_unpatchify_inverts_patchify(t, h, w, p, p_t, c):
+    latents = np.random.default_rng(0).normal(size=(2, t * p_t, h * p, w * p, c))
+    tokens = dit.patchify(latents, p, p_t)
+    assert tokens.shape == (2, t * h * w, c * p_t * p * p)
+    np.testing.assert_array_equal(dit.unpatchify(tokens, t * p_t, h * p, w * p, p, p_t), latents)
 
 
 def test_a_fresh_network_predicts_zero():
-    params = dit.init(CONFIG, jax.random.key(0), 5, 7)
+    params = dit.init(CONFIG, jax.random.key(0))
     out = dit.apply(CONFIG, params, *inputs())
     assert out.shape == (2, 3, 4, 6, 7)
     np.testing.assert_array_equal(out, 0)
@@ -75,19 +78,40 @@ def test_scan_and_remat_equal_a_plain_loop():
 
     ends = dit.Ends(CONFIG, 7, jnp.dtype("float32"))
     rest = {"params": {k: v for k, v in params.items() if k != "blocks"}}
-    video, words, time = ends.apply(rest, dit.patchify(latents, 2), text, times, method="embed")
-    angles = layers.rope_angles(3, 2, 3, CONFIG.head_dim)
+    patches = dit.patchify(latents, 2)
+    tokens, time = ends.apply(rest, patches, text, times, times, method="embed")
+    length = CONFIG.text_length
+    angles = positions.joint_angles(CONFIG, (3, 2, 3), length)
     for i in range(CONFIG.layers):
         layer = jax.tree.map(lambda x, i=i: x[i], params["blocks"])
-        video, words = dit.Block(CONFIG).apply({"params": layer}, video, words, time, angles)
-    out = dit.unpatchify(ends.apply(rest, video, time, method="project"), 3, 4, 6, 2)
-    np.testing.assert_allclose(out, scanned, atol=1e-5)
+        tokens = dit.Block(CONFIG).apply({"params": layer}, tokens, time, angles, length)
+    out = ends.apply(rest, tokens[:, length:], time, method="project")
+    np.testing.assert_allclose(dit.unpatchify(out, 3, 4, 6, 2), scanned, atol=1e-5)
+
+
+def test_an_expert_reads_and_writes_the_video_tokens_alone():
+    params = random_params()
+    given = inputs()
+    plain = dit.apply(CONFIG, params, *given)
+    gates = jnp.zeros(CONFIG.layers)
+
+    def expert(gate, video, time):
+        assert video.shape == (2, 18, CONFIG.width)
+        return video + gate * time.mean()
+
+    def run(gates):
+        return dit.apply(CONFIG, params, *given, expert=expert, expert_params=gates)
+
+    np.testing.assert_array_equal(run(gates), plain)
+    slope = jax.grad(lambda g: run(g).std())(gates)
+    assert np.all(np.abs(slope) > 0), "every layer's expert is asked"
 
 
 def test_rotary_embedding_makes_attention_relative():
     rng = np.random.default_rng(0)
     q, k = rng.normal(size=(2, 32)).astype(np.float32)
-    angles = layers.rope_angles(4, 5, 6, 32).reshape(4, 5, 6, 16)
+    angles = positions.rope_angles(np.arange(4), np.arange(5), np.arange(6), 32)
+    angles = angles.reshape(4, 5, 6, 16)
 
     def product(a, b):
         return float(layers.rotate(q, angles[a]) @ layers.rotate(k, angles[b]))
@@ -95,3 +119,91 @@ def test_rotary_embedding_makes_attention_relative():
     here = product((0, 1, 2), (2, 2, 3))
     np.testing.assert_allclose(product((1, 3, 4), (3, 4, 5)), here, rtol=1e-4)
     assert abs(here - product((0, 1, 2), (1, 2, 3))) > 1e-4
+
+
+def refused(config, shape, **changes):
+    """The sentence with which abstract inputs of this shape are refused."""
+    text = jnp.zeros(changes.pop("text", (1, config.text_length, config.text_dim)))
+    params = jax.eval_shape(lambda: dit.init(config, jax.random.key(0)))
+    with pytest.raises(UserError) as caught:
+        jax.eval_shape(
+            lambda p: dit.apply(config, p, jnp.zeros((1, *shape)), text, jnp.zeros(1), **changes),
+            params,
+        )
+    sentence = str(caught.value)
+    assert "\n" not in sentence
+    assert sentence.endswith(".")
+    return sentence
+
+
+def small(name):
+    """A published network with its sizes divided, everything else as published."""
+    config = published(name)
+    sample = {"sample_height": 4, "sample_width": 6, "sample_frames": 9}
+    return dataclasses.replace(
+        config, layers=1, heads=1, head_dim=16, text_dim=8, text_length=3, **sample
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "says"),
+    [
+        ("5b", (2, 4, 5, 16), "multiples of 2"),
+        ("5b", (2, 4, 6), "give (batch, t, h, w, channels)"),
+        ("5b", (0, 4, 6, 16), "no size may be 0"),
+        ("5b", (3, 4, 6, 32), "32 channels and this network takes 16"),
+        ("5b-I2V", (3, 4, 6, 16), "16 channels and this network takes 32"),
+        ("5b-I2V", (3, 6, 6, 32), "a table for 3×4×6 latents"),
+        ("5b-I2V", (2, 4, 6, 32), "a table for 3×4×6 latents"),
+        ("1.5-5B", (3, 4, 6, 16), "repeat the first latent frame 1 times"),
+        ("1.5-5B", (2, 4, 8, 16), "larger than the 4×6"),
+    ],
+)
+def test_illegal_latents_are_refused_in_a_sentence(name, shape, says):
+    assert says in refused(small(name), shape)
+
+
+def test_text_and_ofs_that_do_not_fit_are_refused():
+    assert "8 channels" in refused(small("5b"), (1, 4, 6, 16), text=(1, 3, 9))
+    assert "pad the prompt" in refused(small("5b-I2V"), (3, 4, 6, 32), text=(1, 4, 8))
+    assert "1.5-5B-I2V" in refused(small("5b"), (1, 4, 6, 16), ofs_B=jnp.ones(1))
+
+
+def test_the_second_scalar_is_two_unless_given():
+    config = dataclasses.replace(small("1.5-5B-I2V"), time_dim=16, ofs_dim=16)
+    params, given = random_params(config), inputs(config, (2, 4, 6))
+    run = jax.jit(lambda ofs: dit.apply(config, params, *given, ofs))
+    base = dit.apply(config, params, *given)
+    np.testing.assert_allclose(run(jnp.full(2, 2.0)), base, rtol=1e-4, atol=1e-4)
+    assert np.abs(run(jnp.array([2.0, 1.0])) - base).max(axis=(1, 2, 3, 4)).tolist()[1] > 1e-3
+
+
+def test_channels_left_open_need_a_world_model():
+    with pytest.raises(UserError, match="set both"):
+        dit.init(DiTConfig(), jax.random.key(0))
+
+
+def test_published_networks_have_the_sizes_of_their_names():
+    billions = {"2b": 1.7, "5b": 5.6, "5b-I2V": 5.6, "1.5-5B": 5.6, "1.5-5B-I2V": 5.6}
+    for name in PUBLISHED:
+        shapes = jax.eval_shape(lambda n=name: dit.init(published(n), jax.random.key(0)))
+        count = sum(x.size for x in jax.tree.leaves(shapes))
+        assert abs(count / 1e9 - billions[name]) < 0.1, (name, count)
+    with pytest.raises(ConfigError, match="choose one of 2b"):
+        published("3b")
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"positions": "rope_crop"}, "sample_height is 0"),
+        ({"patch_t": 2, "positions": "sincos"}, "patch_t is 2"),
+        ({"ofs_dim": 7}, "ofs_dim is 7"),
+        ({"positions": "sincos", "head_dim": 12, "heads": 1}, "heads × head_dim is 12"),
+        ({"spatial_interpolation": 0.0}, "above 0"),
+        ({"in_channels": -1}, "0 or more"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(changes, says):
+    with pytest.raises(ConfigError, match=says):
+        DiTConfig(**changes)

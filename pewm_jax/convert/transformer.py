@@ -1,0 +1,220 @@
+"""CogVideoX's transformer: its settings, and the names and layouts of its tensors.
+
+Reference: ``CogVideoXTransformer3DModel`` of diffusers, ``transformer/config.json`` and
+``transformer/*.safetensors`` of a CogVideoX folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from pewm_jax.config import DiTConfig, UserError
+from pewm_jax.convert.mapping import LINEAR, SAME, Entry, Turn
+
+CLASS = "CogVideoXTransformer3DModel"
+"""The class that the json names."""
+
+DEFAULTS: dict[str, Any] = {
+    "num_attention_heads": 30,
+    "attention_head_dim": 64,
+    "in_channels": 16,
+    "out_channels": 16,
+    "time_embed_dim": 512,
+    "ofs_embed_dim": None,
+    "text_embed_dim": 4096,
+    "num_layers": 30,
+    "sample_width": 90,
+    "sample_height": 60,
+    "sample_frames": 49,
+    "patch_size": 2,
+    "patch_size_t": None,
+    "temporal_compression_ratio": 4,
+    "max_text_seq_length": 226,
+    "spatial_interpolation_scale": 1.875,
+    "temporal_interpolation_scale": 1.0,
+    "use_rotary_positional_embeddings": False,
+    "use_learned_positional_embeddings": False,
+    "patch_bias": True,
+}
+"""Settings that differ between networks, and what an absent one means."""
+FIXED: dict[str, Any] = {
+    "flip_sin_to_cos": True,
+    "freq_shift": 0,
+    "attention_bias": True,
+    "activation_fn": "gelu-approximate",
+    "timestep_activation_fn": "silu",
+    "norm_elementwise_affine": True,
+    "norm_eps": 1e-5,
+}
+"""Settings that are alike in every published network; other values are not supported."""
+IGNORED = ("dropout",)
+"""Settings that do not touch inference."""
+
+
+def config_from_diffusers(values: dict[str, Any]) -> DiTConfig:
+    """Read the settings of ``transformer/config.json``.
+
+    Args:
+        values: the json's keys and values; those that start with an underscore are diffusers'
+            own notes.
+
+    Raises:
+        UserError: a key that is unknown, or a value that is not supported, by its name.
+    """
+    kind = values.get("_class_name", CLASS)
+    if kind != CLASS:
+        raise UserError(f"The transformer is a {kind}; only {CLASS} can be read.")
+    for key, value in values.items():
+        if key in FIXED and value != FIXED[key]:
+            raise UserError(f"The transformer's {key} is {value!r}; only {FIXED[key]!r} is known.")
+        if not (key.startswith("_") or key in DEFAULTS or key in FIXED or key in IGNORED):
+            raise UserError(f"The transformer's setting {key} ({value!r}) is unknown.")
+    given = {**DEFAULTS, **{k: v for k, v in values.items() if k in DEFAULTS}}
+    for key, value in given.items():
+        optional = DEFAULTS[key] is None and value is None
+        like = int if DEFAULTS[key] is None else type(DEFAULTS[key])
+        kinds = (int, float) if like is float else (like,)
+        if not optional and (type(value) not in kinds):
+            raise UserError(f"The transformer's {key} is {value!r}; it must be {_a(like)}.")
+    return DiTConfig(
+        layers=given["num_layers"],
+        heads=given["num_attention_heads"],
+        head_dim=given["attention_head_dim"],
+        patch=given["patch_size"],
+        patch_t=given["patch_size_t"] or 1,
+        in_channels=given["in_channels"],
+        out_channels=given["out_channels"],
+        text_length=given["max_text_seq_length"],
+        text_dim=given["text_embed_dim"],
+        time_dim=given["time_embed_dim"],
+        ofs_dim=given["ofs_embed_dim"] or 0,
+        positions=_positions(given),
+        sample_height=given["sample_height"],
+        sample_width=given["sample_width"],
+        sample_frames=given["sample_frames"],
+        temporal=given["temporal_compression_ratio"],
+        spatial_interpolation=float(given["spatial_interpolation_scale"]),
+        temporal_interpolation=float(given["temporal_interpolation_scale"]),
+    )
+
+
+def _a(kind: type) -> str:
+    return {int: "a whole number", float: "a number", bool: "true or false"}[kind]
+
+
+def _positions(given: dict[str, Any]) -> Any:
+    rotary = given["use_rotary_positional_embeddings"]
+    learned = given["use_learned_positional_embeddings"]
+    newer = given["patch_size_t"] is not None
+    if newer and (learned or not rotary):
+        raise UserError(
+            "The transformer has patch_size_t with "
+            + ("use_learned_positional_embeddings true" if learned else "no rotary positions")
+            + "; CogVideoX 1.5 has rotary positions alone, and only that is known."
+        )
+    if learned and not rotary:
+        raise UserError(
+            "The transformer's use_learned_positional_embeddings is true with "
+            "use_rotary_positional_embeddings false; only both together are known."
+        )
+    if not newer and not given["patch_bias"]:
+        raise UserError(
+            "The transformer's patch_bias is False with no patch_size_t; only True is known."
+        )
+    if newer:
+        return "rope_integer"
+    if learned:
+        return "rope_learned"
+    return "rope_crop" if rotary else "sincos"
+
+
+def config_to_diffusers(config: DiTConfig) -> dict[str, Any]:
+    """Write the settings of ``transformer/config.json``, the inverse of reading them.
+
+    Raises:
+        UserError: a setting that CogVideoX does not have.
+    """
+    if config.mlp_ratio != 4:
+        raise UserError(f"dit.mlp_ratio is {config.mlp_ratio}; CogVideoX has 4 and nothing else.")
+    newer = config.positions == "rope_integer"
+    return {
+        "_class_name": CLASS,
+        **FIXED,
+        "dropout": 0.0,
+        "num_layers": config.layers,
+        "num_attention_heads": config.heads,
+        "attention_head_dim": config.head_dim,
+        "patch_size": config.patch,
+        "patch_size_t": config.patch_t if newer else None,
+        "patch_bias": not newer,
+        "in_channels": config.in_channels,
+        "out_channels": config.out_channels,
+        "max_text_seq_length": config.text_length,
+        "text_embed_dim": config.text_dim,
+        "time_embed_dim": config.time_dim,
+        "ofs_embed_dim": config.ofs_dim or None,
+        "sample_height": config.sample_height or 300,
+        "sample_width": config.sample_width or 300,
+        "sample_frames": config.sample_frames or 81,
+        "temporal_compression_ratio": config.temporal,
+        "spatial_interpolation_scale": config.spatial_interpolation,
+        "temporal_interpolation_scale": config.temporal_interpolation,
+        "use_rotary_positional_embeddings": config.positions != "sincos",
+        "use_learned_positional_embeddings": config.positions == "rope_learned",
+    }
+
+
+def entries(config: DiTConfig) -> list[Entry]:
+    """List every tensor of the reference with the leaf of ours that holds it."""
+    return [*_ends(config), *(e for i in range(config.layers) for e in _block(i))]
+
+
+def _linear(theirs: str, ours: str, layer: int | None = None) -> Iterator[Entry]:
+    yield Entry(f"{theirs}.weight", f"{ours}/kernel", LINEAR, layer)
+    yield Entry(f"{theirs}.bias", f"{ours}/bias", SAME, layer)
+
+
+def _norm(theirs: str, ours: str, layer: int | None = None) -> Iterator[Entry]:
+    yield Entry(f"{theirs}.weight", f"{ours}/scale", SAME, layer)
+    yield Entry(f"{theirs}.bias", f"{ours}/bias", SAME, layer)
+
+
+def _ends(config: DiTConfig) -> Iterator[Entry]:
+    turn = LINEAR if config.positions == "rope_integer" else _patches(config.patch)
+    yield Entry("patch_embed.proj.weight", "patch_embed/kernel", turn)
+    yield Entry("patch_embed.proj.bias", "patch_embed/bias")
+    yield from _linear("patch_embed.text_proj", "text_embed")
+    if config.positions == "rope_learned":
+        table = Turn(lambda x: x[0], lambda x: x[None])
+        yield Entry("patch_embed.pos_embedding", "positions", table)
+    for part in ("linear_1", "linear_2"):
+        yield from _linear(f"time_embedding.{part}", f"time_embed/{part}")
+        if config.ofs_dim:
+            yield from _linear(f"ofs_embedding.{part}", f"ofs_embed/{part}")
+    yield from _norm("norm_final", "norm_final")
+    yield from _norm("norm_out.norm", "norm_out")
+    yield from _linear("norm_out.linear", "modulate_out")
+    yield from _linear("proj_out", "proj_out")
+
+
+def _patches(patch: int) -> Turn:
+    """Turn a convolution whose stride is its size into the linear layer on patches that it is."""
+    return Turn(
+        lambda x: x.reshape(x.shape[0], -1).T,
+        lambda x: x.T.reshape(x.shape[1], -1, patch, patch),
+    )
+
+
+def _block(layer: int) -> Iterator[Entry]:
+    there, here = f"transformer_blocks.{layer}", "blocks"
+    for norm in ("norm1", "norm2"):
+        yield from _linear(f"{there}.{norm}.linear", f"{here}/{norm}/linear", layer)
+        yield from _norm(f"{there}.{norm}.norm", f"{here}/{norm}/norm", layer)
+    for part in ("q", "k", "v"):
+        yield from _linear(f"{there}.attn1.to_{part}", f"{here}/to_{part}", layer)
+    for part in ("q", "k"):
+        yield from _norm(f"{there}.attn1.norm_{part}", f"{here}/norm_{part}", layer)
+    yield from _linear(f"{there}.attn1.to_out.0", f"{here}/to_out", layer)
+    yield from _linear(f"{there}.ff.net.0.proj", f"{here}/ff/up", layer)
+    yield from _linear(f"{there}.ff.net.2", f"{here}/ff/down", layer)

@@ -1,0 +1,159 @@
+"""Where a video token is: rotary angles, fixed sinusoids and a learned table.
+
+All of it is computed on the host while tracing, from the configuration and the token grid.
+Reference: ``get_3d_rotary_pos_embed``, ``get_resize_crop_region_for_grid``,
+``get_3d_sincos_pos_embed`` and ``CogVideoXPatchEmbed`` of diffusers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pewm_jax.config import DiTConfig, UserError
+
+Grid = tuple[int, int, int]
+"""Tokens along time, height and width."""
+
+
+def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
+    """Return the token grid of latents, or refuse sizes that the network cannot take.
+
+    Args:
+        config: the transformer.
+        shape: (B, t, h, w, C) of the latents.
+
+    Raises:
+        UserError: in one sentence, for every illegal size.
+    """
+    if len(shape) != 5:
+        raise UserError(f"The latents have shape {tuple(shape)}: give (batch, t, h, w, channels).")
+    frames, height, width = shape[1:4]
+    patch, patch_t = config.patch, config.patch_t
+    if min(shape[:4]) < 1:
+        raise UserError(f"The latents have shape {tuple(shape)}: no size may be 0.")
+    if height % patch or width % patch:
+        raise UserError(
+            f"Latents of {height}×{width} do not split into {patch}×{patch} patches: use a "
+            f"height and width that are multiples of {patch} (in pixels, times the VAE's 8)."
+        )
+    if frames % patch_t:
+        raise UserError(
+            f"{frames} latent frames do not split into patches of {patch_t}: repeat the first "
+            f"latent frame {-frames % patch_t} times in front, as CogVideoX 1.5's pipelines do "
+            "(and drop as many from the result), or choose another number of frames."
+        )
+    rows, columns = config.sample_height, config.sample_width
+    if config.positions == "rope_learned":
+        sample = (config.sample_latents, rows, columns)
+        if (frames, height, width) != sample:
+            raise UserError(
+                f"This network's learned positions are a table for {_times(sample)} latents, "
+                f"not {_times((frames, height, width))}: use that size, or a network without "
+                "learned positions (5b, 1.5-5B-I2V)."
+            )
+    bounded = config.positions == "rope_integer" and rows > 0 and columns > 0
+    if bounded and (height // patch > rows // patch or width // patch > columns // patch):
+        raise UserError(
+            f"Latents of {height}×{width} are larger than the {rows}×{columns} that this "
+            "network's positions go to: use a smaller video."
+        )
+    return frames // patch_t, height // patch, width // patch
+
+
+def sample_tokens(config: DiTConfig) -> int:
+    """Return the number of video tokens at the sample size."""
+    rows, columns = config.sample_height // config.patch, config.sample_width // config.patch
+    return config.sample_latents // config.patch_t * rows * columns
+
+
+def _times(sizes: tuple[int, ...]) -> str:
+    return "×".join(map(str, sizes))
+
+
+def crop_region(grid: tuple[int, int], base: tuple[int, int]) -> tuple[tuple[int, int], ...]:
+    """Return (top, left), (bottom, right): the grid fitted into the middle of the base grid.
+
+    Args:
+        grid: (rows, columns) of tokens.
+        base: (rows, columns) of the grid that the network was trained for.
+    """
+    rows, columns = grid
+    base_rows, base_columns = base
+    if rows / columns > base_rows / base_columns:
+        size = base_rows, round(base_rows / rows * columns)
+    else:
+        size = round(base_columns / columns * rows), base_columns
+    top, left = (round((b - s) / 2) for b, s in zip(base, size, strict=True))
+    return (top, left), (top + size[0], left + size[1])
+
+
+def rope_places(config: DiTConfig, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rotary positions along time, height and width."""
+    if config.positions == "rope_integer":
+        frames, rows, columns = (np.arange(n) for n in grid)
+        return frames, rows, columns
+    base = config.sample_height // config.patch, config.sample_width // config.patch
+    start, stop = crop_region(grid[1:], base)
+    rows, columns = (
+        np.linspace(first, last * (n - 1) / n, n)
+        for first, last, n in zip(start, stop, grid[1:], strict=True)
+    )
+    return np.arange(grid[0]), rows, columns
+
+
+def rope_angles(
+    frames: np.ndarray, rows: np.ndarray, columns: np.ndarray, head_dim: int
+) -> np.ndarray:
+    """Return (t·h·w, head_dim/2) rotary angles, theta 1e4.
+
+    A head is split 1/4 time, 3/8 height, 3/8 width.
+
+    Args:
+        frames: (t,) positions in time.
+        rows: (h,) positions down the picture.
+        columns: (w,) positions across the picture.
+        head_dim: channels of a head.
+    """
+    parts = (head_dim // 4, head_dim // 8 * 3, head_dim // 8 * 3)
+    grid = np.meshgrid(frames, rows, columns, indexing="ij")
+    angles = []
+    for positions, channels in zip(grid, parts, strict=True):
+        frequency = 1e4 ** (-np.arange(0, channels, 2) / channels)
+        angles.append(positions.reshape(-1, 1) * frequency)
+    return np.concatenate(angles, -1).astype(np.float32)
+
+
+def joint_angles(config: DiTConfig, grid: Grid, length: int) -> np.ndarray | None:
+    """Return (length + t·h·w, head_dim/2) angles of text (0: not turned) and video tokens.
+
+    None where the network turns nothing.
+    """
+    if config.positions == "sincos":
+        return None
+    angles = rope_angles(*rope_places(config, grid), config.head_dim)
+    return np.concatenate([np.zeros((length, angles.shape[1]), np.float32), angles])
+
+
+def sincos_table(config: DiTConfig, grid: Grid) -> np.ndarray:
+    """Return (t·h·w, D): 1/4 of the channels say the time, 3/8 the column, 3/8 the row."""
+    frames, rows, columns = (np.arange(n) for n in grid)
+    places = (
+        frames / config.temporal_interpolation,
+        columns / config.spatial_interpolation,
+        rows / config.spatial_interpolation,
+    )
+    channels = (config.width // 4, config.width // 8 * 3, config.width // 8 * 3)
+    along_t, along_w, along_h = (_wave(p, c) for p, c in zip(places, channels, strict=True))
+    table = np.empty((*grid, config.width), np.float32)
+    first, second = channels[0], channels[0] + channels[1]
+    table[..., :first] = along_t[:, None, None]
+    table[..., first:second] = along_w
+    table[..., second:] = along_h[:, None]
+    return table.reshape(-1, config.width)
+
+
+def _wave(places: np.ndarray, channels: int) -> np.ndarray:
+    """Return (n, channels): sines, then cosines."""
+    half = channels // 2
+    angle = places[:, None] * 1e4 ** (-np.arange(half) / half)
+    return np.concatenate([np.sin(angle), np.cos(angle)], -1)
