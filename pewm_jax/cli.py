@@ -110,6 +110,35 @@ def parse(
         raise ConfigError(_sentence(told.getvalue(), prog)) from None
 
 
+def parse_command(kind: type[T], argv: Sequence[str], prog: str) -> T:
+    """Read the flags of one command of several, such as ``-m pewm_jax.data collect``.
+
+    Args:
+        kind: the frozen dataclass to read; fields without a default must be given.
+        argv: the arguments after the command's name.
+        prog: the command, for the help text.
+
+    Raises:
+        ConfigError: what is wrong with them, in one sentence.
+    """
+    nothing: T = tyro.MISSING_NONPROP  # type: ignore[assignment]
+    try:
+        return parse(kind, argv, default=nothing, prog=prog)
+    except ConfigError as error:
+        raise ConfigError(_first_sentence(str(error), kind.__name__, prog)) from None
+
+
+def _first_sentence(message: str, kind: str, prog: str) -> str:
+    """Keep the statement of the parser's message: no rules, no repeated help."""
+    parts = [part.strip() for part in re.split(r"-{5,}", message)]
+    text = next((part for part in parts if part.strip(".")), message)
+    text = text.removeprefix(f"Error parsing {kind}: ").removeprefix(f"{kind}: ")
+    if text.startswith("Missing from"):
+        text = f"{text}; `python {prog} --help` explains"
+    text = text.removesuffix(" .")
+    return text if text.endswith(".") else f"{text}."
+
+
 def overlay(default: T, path: Path) -> T:
     """Lay the settings in a JSON file, nested like the configuration, over a default.
 

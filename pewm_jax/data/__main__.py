@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
 from typing import TypeVar
 
-import tyro
-
 from pewm_jax import cli
-from pewm_jax.config import ConfigError, UserError
+from pewm_jax.config import UserError
 from pewm_jax.data.collect import collect
 from pewm_jax.data.importer import ImportConfig, import_recording
 from pewm_jax.data.recording import CollectConfig
@@ -60,24 +57,8 @@ def _main(argv: Sequence[str]) -> int:
 
 
 def _parse(kind: type[T], command: str, flags: Sequence[str]) -> T:
-    """Read the flags of one command, or say in one sentence what is wrong with them."""
-    nothing: T = tyro.MISSING_NONPROP  # type: ignore[assignment]
-    prog = f"-m pewm_jax.data {command}"
-    try:
-        return cli.parse(kind, flags, default=nothing, prog=prog)
-    except ConfigError as error:
-        raise ConfigError(_first_sentence(str(error), kind.__name__, prog)) from None
-
-
-def _first_sentence(message: str, kind: str, prog: str) -> str:
-    """Keep the statement of the parser's message: no rules, no repeated help."""
-    parts = [part.strip() for part in re.split(r"-{5,}", message)]
-    text = next((part for part in parts if part.strip(".")), message)
-    text = text.removeprefix(f"Error parsing {kind}: ").removeprefix(f"{kind}: ")
-    if text.startswith("Missing from"):
-        text = f"{text}; `python {prog} --help` explains"
-    text = text.removesuffix(" .")
-    return text if text.endswith(".") else f"{text}."
+    """Read the flags of one command."""
+    return cli.parse_command(kind, flags, f"-m pewm_jax.data {command}")
 
 
 if __name__ == "__main__":
