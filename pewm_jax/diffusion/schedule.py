@@ -75,8 +75,8 @@ def x0_weight(config: DiffusionConfig, timesteps_B: Array) -> Array:
 def timesteps(config: DiffusionConfig) -> np.ndarray:
     """Return (sample_steps,) int32 visited levels, descending (Lin et al. 2023, Table 2).
 
-    Trailing spacing begins at the last training level. It is always as many levels as asked;
-    stepping through a range of floats, as the reference does, adds one for 62 of 1000 counts.
+    Trailing spacing begins at the last training level. It is always as many levels as asked; the
+    reference's range of floats has one more, a level of −1, for 62 of 1000 counts.
     """
     count, total = config.sample_steps, config.train_steps
     if config.spacing == "linspace":
@@ -84,7 +84,7 @@ def timesteps(config: DiffusionConfig) -> np.ndarray:
     elif config.spacing == "leading":
         levels = np.arange(count)[::-1] * (total // count) + config.steps_offset
     else:
-        levels = np.round(total - total / count * np.arange(count)) - 1
+        levels = np.round(np.arange(total, 0, -total / count)[:count]) - 1
     return levels.astype(np.int32)
 
 

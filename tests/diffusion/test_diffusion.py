@@ -158,8 +158,8 @@ def test_guidance_interpolates_between_with_and_without_map():
     tokens = objective.clip_tokens(config, clip)
     noise = jax.random.normal(key, (2, 3, 4, 6, 256))
 
-    def run(guidance, tokens):
-        diffusion = dataclasses.replace(config.diffusion, guidance=guidance, sample_steps=1)
+    def run(guidance, tokens, **more):
+        diffusion = dataclasses.replace(config.diffusion, guidance=guidance, sample_steps=1, **more)
         return sampler.sample(
             dataclasses.replace(config, diffusion=diffusion), params, conditioning, tokens, noise
         )
@@ -168,3 +168,94 @@ def test_guidance_interpolates_between_with_and_without_map():
     np.testing.assert_allclose(run(0.0, tokens), without, atol=1e-5)
     np.testing.assert_allclose(run(3.0, tokens), without + 3 * (with_map - without), atol=1e-3)
     assert np.abs(with_map - without).max() > 1e-4
+    settings = DiffusionConfig(sample_steps=1, guidance=3.0, dynamic_guidance=True)
+    (weight,) = schedule.guidance(settings)
+    assert 1 <= weight <= 4
+    swung = run(3.0, tokens, dynamic_guidance=True)
+    np.testing.assert_allclose(swung, without + weight * (with_map - without), atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["ddim", "dpm"])
+@pytest.mark.parametrize("target", ["x0", "v", "eps"])
+def test_the_sampler_finds_the_mean_of_a_gaussian_whatever_the_network_predicts(kind, target):
+    """For data N(m, s²) the best prediction is known: both samplers end in that distribution."""
+    config = DiffusionConfig(
+        target=target, sampler=kind, sample_steps=200, zero_terminal_snr=target != "eps"
+    )
+    mean, spread = 0.7, 0.2
+    alphas = jnp.asarray(schedule.alphas_cumprod(config), jnp.float32)
+
+    def denoise(x, times):
+        a = alphas[times][:, None]
+        gain = jnp.sqrt(a) * spread**2 / (a * spread**2 + 1 - a)
+        x0 = mean + gain * (x - jnp.sqrt(a) * mean)
+        noise = (x - jnp.sqrt(a) * x0) / jnp.sqrt(1 - a)
+        asked = {"x0": x0, "eps": noise, "v": jnp.sqrt(a) * noise - jnp.sqrt(1 - a) * x0}[target]
+        return schedule.to_x0(config, asked, x, times)
+
+    start, key = jax.random.normal(jax.random.key(0), (1, 4000)), jax.random.key(1)
+    if kind == "ddim":
+        out = sampler.ddim(config, denoise, start)
+    else:
+        out = sampler.dpm(config, denoise, start, key)
+    assert abs(float(out.mean()) - mean) < 0.03
+    assert abs(float(out.std()) - spread) < 0.03
+
+
+def test_dpm_draws_its_noise_from_the_key_or_takes_it():
+    config = DiffusionConfig(sample_steps=4)
+    start, key = jax.random.normal(jax.random.key(0), (2, 3)), jax.random.key(1)
+    steps = jnp.stack([jax.random.normal(jax.random.fold_in(key, k), (2, 3)) for k in range(4)])
+
+    def denoise(x, _times):
+        return jnp.tanh(x)
+
+    by_key = sampler.dpm(config, denoise, start, key)
+    given = sampler.dpm(config, denoise, start, step_noise=steps)
+    np.testing.assert_allclose(by_key, given, atol=1e-6)
+    assert np.abs(by_key - sampler.dpm(config, denoise, start, jax.random.key(2))).max() > 1e-3
+    path = sampler.dpm(config, denoise, start, key, every_step=True)
+    assert path.shape == (4, 2, 3)
+    np.testing.assert_allclose(path[-1], by_key, atol=1e-6)
+
+
+@pytest.mark.parametrize("more", [{}, {"key": jax.random.key(0), "step_noise": np.zeros((4, 2))}])
+def test_dpm_needs_a_key_or_noise(more):
+    with pytest.raises(ValueError, match="give it a key"):
+        sampler.dpm(DiffusionConfig(sample_steps=4), lambda x, _t: x, jnp.zeros((2,)), **more)
+    with pytest.raises(ValueError, match=r"it needs \(4, 2\)"):
+        sampler.dpm(
+            DiffusionConfig(sample_steps=4),
+            lambda x, _t: x,
+            jnp.zeros((2,)),
+            step_noise=np.zeros((3, 2)),
+        )
+
+
+def test_a_fixed_stride_differs_only_where_the_steps_do_not_divide():
+    def path(steps, stride):
+        config = DiffusionConfig(sample_steps=steps, stride=stride)
+        return sampler.ddim(config, lambda x, _t: jnp.tanh(x), jnp.ones((1, 2)))
+
+    np.testing.assert_array_equal(path(10, "next"), path(10, "fixed"))
+    assert np.abs(path(7, "next") - path(7, "fixed")).max() > 1e-4
+
+
+def test_the_world_model_samples_by_dpm_with_its_own_noise():
+    config = tiny_config(diffusion=DiffusionConfig(sampler="dpm", sample_steps=2))
+    clip, key = make_clip(config, batch=1), jax.random.key(0)
+    params = randomise(world_model.init(config, key, memory=False))
+    frames = objective.as_signal(clip.frames)
+    camera = jax.tree.map(jnp.asarray, frames.camera)
+    first = (frames.rgb_THWC[:, 0], frames.depth_THW[:, 0])
+    conditioning = world_model.condition(config, *first, camera)
+    noise = jax.random.normal(key, (1, 3, 4, 6, 256))
+    draw = [
+        sampler.sample(config, params, conditioning, None, noise, jax.random.key(k))
+        for k in (0, 0, 1)
+    ]
+    np.testing.assert_array_equal(draw[0], draw[1])
+    assert np.isfinite(draw[0]).all()
+    assert np.abs(draw[0] - draw[2]).max() > 1e-3
+    with pytest.raises(ValueError, match="give it a key"):
+        sampler.sample(config, params, conditioning, None, noise)
