@@ -25,7 +25,7 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.diffusion import objective, sampler
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import features as image_features
-from pewm_jax.memory import voxel_map
+from pewm_jax.memory import memories
 from pewm_jax.models import codec, world_model
 from pewm_jax.types import Array, Camera, Frames, Params, WorldState
 
@@ -57,7 +57,7 @@ def start(config: Config, params: Params, frames: Frames) -> WorldState:
 
     Args:
         config: the experiment.
-        params: parameters of the image encoder; the weight-free encoders need none.
+        params: the world model's parameters; those of the image encoder are used, if it has any.
         frames: S ≥ 1 frames (S, H, W, …), uint8 or float colours; all go into the map, the last
             one is the present.
 
@@ -67,7 +67,6 @@ def start(config: Config, params: Params, frames: Frames) -> WorldState:
     Raises:
         UserError: the frames' shapes do not agree with each other or with the configuration.
     """
-    del params
     count = frames.depth_THW.shape[0] if frames.depth_THW.ndim else 0
     expected = (count, config.clip.height, config.clip.width)
     if count < 1 or frames.rgb_THWC.shape != (*expected, 3) or frames.depth_THW.shape != expected:
@@ -83,8 +82,8 @@ def start(config: Config, params: Params, frames: Frames) -> WorldState:
             f"{intrinsics.shape}; give ({count}, 4, 4) and ({count}, 4)."
         )
     frames = jax.tree.map(jnp.asarray, objective.as_signal(frames))
-    voxels = objective.remember(config, frames, jnp.ones((count,), bool))
-    return WorldState(jax.tree.map(lambda x: x[-1:], frames), voxels)
+    memory_after = objective.remember(config, params, frames, jnp.ones((count,), bool))
+    return WorldState(jax.tree.map(lambda x: x[-1:], frames), memory_after)
 
 
 def imagine_clip(
@@ -114,10 +113,10 @@ def imagine_clip(
     intrinsics = jnp.broadcast_to(frame.camera.intrinsics_4, (poses.shape[0], 4))
     camera = Camera(intrinsics, poses)
     batched = jax.tree.map(lambda x: x[None], camera)
-    conditioning = world_model.condition(config, frame.rgb_THWC, frame.depth_THW, batched)
+    conditioning = world_model.condition(config, params, frame.rgb_THWC, frame.depth_THW, batched)
     tokens = None
     if memory and "memory" in params:
-        tokens = jax.tree.map(lambda x: x[None], objective.recall(config, state.map, camera))
+        tokens = jax.tree.map(lambda x: x[None], memories.tokens(config, state.map, camera))
     shape = (1, *codec.latent_shape(config), codec.latent_channels(config))
     latents = sampler.sample(
         config,
@@ -127,12 +126,12 @@ def imagine_clip(
         jax.random.normal(key, shape),
         jax.random.fold_in(key, 1),
     )
-    rgb, depth = codec.decode_rgbd(config, latents)
+    rgb, depth = codec.decode_rgbd(config, params, latents)
     future = Camera(intrinsics[1:], poses[1:])
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
-    features = image_features.encode(config.memory, frames.rgb_THWC)
-    voxels = voxel_map.insert_frames(config.memory, state.map, frames, features)
-    return WorldState(jax.tree.map(lambda x: x[-1:], frames), voxels), frames
+    features = image_features.encode(config.memory, params.get("encoder", {}), frames.rgb_THWC)
+    memory_after = memories.remember(config, state.map, frames, features)
+    return WorldState(jax.tree.map(lambda x: x[-1:], frames), memory_after), frames
 
 
 def rollout(

@@ -51,7 +51,7 @@ def test_discrete_and_continuous_actions_agree(params):
 def test_imagined_frames_enter_the_map_exactly_as_observed_ones(params):
     state = a_state(params)
     after, frames = roll(CONFIG, params, state, ACTIONS[:8], jax.random.key(1))
-    features = image_features.encode(CONFIG.memory, frames.rgb_THWC)
+    features = image_features.encode(CONFIG.memory, {}, frames.rgb_THWC)
     expected = voxel_map.insert_frames(CONFIG.memory, state.map, frames, features)
     for name in ("slot_of_cell", "features_VF", "occupied"):
         np.testing.assert_array_equal(getattr(after.map, name), getattr(expected, name))

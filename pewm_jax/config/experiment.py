@@ -49,16 +49,39 @@ class Config:
             f"clip.frames {self.clip.frames} − 1 is not a multiple of codec.temporal "
             f"{self.codec.temporal}.",
         )
-        per_latent = self.codec.temporal
         require(
-            self.memory.positions == "sinusoid" or self.memory.heads >= per_latent,
-            f"memory.heads is {self.memory.heads}: with projective positions head k looks through "
-            f"camera k mod {per_latent} (codec.temporal) of a latent frame; use at least "
-            f"{per_latent} heads, or memory.positions sinusoid.",
+            self.codec.kind == "pixel" or (self.clip.frames - 1) // self.codec.temporal % 2 == 0,
+            f"clip.frames {self.clip.frames}: the VAE decodes an even number of latent frames "
+            "without its first-frame rule (2 latent frames become 8 frames, not 5); use 8k + 1 "
+            "frames (9, 17, 25, …).",
         )
+        cameras = self.codec.temporal * self.dit.patch_t
+        require(
+            self.memory.positions == "sinusoid" or self.memory.heads >= cameras,
+            f"memory.heads is {self.memory.heads}: with projective positions head k looks through "
+            f"camera k mod {cameras} (codec.temporal × dit.patch_t) of a token's frames; use at "
+            f"least {cameras} heads, or memory.positions sinusoid.",
+        )
+        self._require_channels()
         patch = self.memory.encoder_patch
         require(
-            self.clip.height % patch == 0 and self.clip.width % patch == 0,
+            self.memory.encoder != "patch_colours"
+            or self.clip.height % patch == 0 and self.clip.width % patch == 0,
             f"memory.encoder_patch {patch} does not divide the clip "
             f"{self.clip.height}×{self.clip.width}.",
         )
+
+    def _require_channels(self) -> None:
+        """Refuse channels of the denoiser that are not those of codec and camera."""
+        codec = self.codec
+        if codec.kind == "vae":
+            latent = 2 * codec.vae.latent_channels
+        else:
+            latent = 4 * codec.temporal * codec.spatial**2
+        wanted = {"in_channels": 2 * latent + 6 * codec.temporal, "out_channels": latent}
+        for name, value in wanted.items():
+            require(
+                getattr(self.dit, name) in (0, value),
+                f"dit.{name} is {getattr(self.dit, name)}: codec and camera need {value}; leave it "
+                "at 0 to have it follow them.",
+            )

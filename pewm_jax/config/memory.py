@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
+from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.errors import require, require_positive
 
 
@@ -34,10 +35,16 @@ class MemoryConfig:
     """Where a `sinusoid` counts positions from: the clip's first camera, or the world's origin."""
     snapshots: int = 8
     """Frames that the memory `images` keeps; together they have at most `tokens` patches."""
-    encoder: Literal["patch_colours"] = "patch_colours"
-    """Image features kept in the map; `patch_colours` has no weights."""
+    encoder: Literal["patch_colours", "dinov2"] = "patch_colours"
+    """Image features kept in the map: `patch_colours` has no weights, `dinov2` (the paper's) takes
+    them from a converted checkpoint."""
     encoder_patch: int = 2
-    """Pixels per feature patch, each way."""
+    """Pixels per patch of `patch_colours`, each way."""
+    encoder_size: int = 518
+    """Side of the square picture that `dinov2` is shown, pixels; a multiple of its patch. 518
+    gives 37 × 37 features."""
+    dinov2: DINOv2Config = DINOv2Config()
+    """The network of `dinov2`."""
     heads: int = 6
     """Heads of the memory attention."""
     head_dim: int = 32
@@ -49,13 +56,18 @@ class MemoryConfig:
         """Validate."""
         require(all(size > 0 for size in self.cell_m), "memory.cell_m must be positive.")
         require(all(count > 0 for count in self.cells), "memory.cells must be positive.")
-        require_positive(self, "memory", "capacity", "tokens", "looks", "encoder_patch")
-        require_positive(self, "memory", "snapshots")
+        require_positive(self, "memory", "capacity", "tokens", "looks", "snapshots")
+        require_positive(self, "memory", "encoder_patch", "encoder_size")
         require_positive(self, "memory", "heads", "head_dim", "mlp_ratio")
         require(
             self.tokens <= self.capacity,
             f"memory.tokens {self.tokens} exceeds memory.capacity {self.capacity}: a clip cannot "
             "attend to more cells than the map holds; raise capacity or lower tokens.",
+        )
+        require(
+            self.encoder_size % self.dinov2.patch == 0,
+            f"memory.encoder_size is {self.encoder_size}: use a multiple of memory.dinov2.patch "
+            f"{self.dinov2.patch}, 518 for the paper's 37 × 37 features.",
         )
         require(
             self.kind != "images" or self.snapshots <= self.tokens,

@@ -62,6 +62,9 @@ class TrainConfig:
 
     run: str = "runs/demo"
     """Folder of this run: checkpoints, logs, pictures, report."""
+    start: str = ""
+    """Folder that stage 1 starts from, made by `python -m pewm_jax.convert import … --rgbd
+    --camera` or an earlier run; empty starts from random weights."""
     stage1: StageConfig = StageConfig()
     """The backbone learns without memory: domain, camera control, RGB-D."""
     stage2: StageConfig = StageConfig()
@@ -102,10 +105,10 @@ class TrainConfig:
             f"train.preview_every is {self.preview_every}: use 0 (no pictures) or more steps.",
         )
         require(
-            self.stage1.steps > 0 or self.stage2.steps == 0,
+            bool(self.start) or self.stage1.steps > 0 or self.stage2.steps == 0,
             f"train.stage1.steps is 0 and train.stage2.steps is {self.stage2.steps}: stage 2 "
             "freezes the backbone, whose output starts at zero, so nothing would be learnt; give "
-            "train.stage1.steps at least 1.",
+            "train.stage1.steps at least 1, or name trained weights by train.start.",
         )
 
 

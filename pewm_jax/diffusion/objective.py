@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from pewm_jax.config import Config
 from pewm_jax.diffusion import schedule
 from pewm_jax.memory import features as image_features
-from pewm_jax.memory import voxel_map
+from pewm_jax.memory import memories
 from pewm_jax.models import codec, world_model
 from pewm_jax.types import Array, Clip, Frames, MapTokens, Params
 
@@ -18,29 +18,33 @@ def as_signal(frames: Frames) -> Frames:
     return Frames(codec.signal_from_rgb(frames.rgb_THWC), frames.depth_THW, frames.camera)
 
 
-def remember(config: Config, context: Frames, valid_S: Array) -> voxel_map.VoxelMap:
-    """Build the map of one world from its context frames (unbatched, colours in [−1, 1]).
+def remember(
+    config: Config, params: Params, context: Frames, valid_S: Array
+) -> memories.Memory:
+    """Build the memory of one world from its context frames.
 
     The grid is centred on the last valid context frame's camera.
+
+    Args:
+        config: the experiment.
+        params: the world model's parameters; those of the image encoder are used.
+        context: S frames of one world, colours in [−1, 1].
+        valid_S: (S,) bool, False frames are ignored.
     """
     last = jnp.argmax(jnp.where(valid_S, jnp.arange(valid_S.shape[0]), -1))
     centre = context.camera.world_from_camera[last, :3, 3]
-    voxels = voxel_map.empty(config.memory, centre, world_model.feature_channels(config))
-    features = image_features.encode(config.memory, context.rgb_THWC)
-    return voxel_map.insert_frames(config.memory, voxels, context, features, valid_S)
+    memory = memories.empty(config, centre)
+    weights = params.get("encoder", {})
+    features = image_features.encode(config.memory, weights, context.rgb_THWC)
+    return memories.remember(config, memory, context, features, valid_S)
 
 
-def recall(config: Config, voxels: voxel_map.VoxelMap, camera) -> MapTokens:
-    """Return the tokens of one world's map for one clip's cameras (T,)."""
-    size = (config.clip.height, config.clip.width)
-    return voxel_map.tokens(config.memory, voxels, camera, size)
-
-
-def clip_tokens(config: Config, clip: Clip) -> MapTokens:
-    """Build every clip's map from its context and return its tokens, leading axis B."""
+def clip_tokens(config: Config, params: Params, clip: Clip) -> MapTokens:
+    """Build every clip's memory from its context and return its tokens, leading axis B."""
 
     def one(context: Frames, valid_S: Array, camera) -> MapTokens:
-        return recall(config, remember(config, as_signal(context), valid_S), camera)
+        memory = remember(config, params, as_signal(context), valid_S)
+        return memories.tokens(config, memory, camera)
 
     return jax.vmap(one)(clip.context, clip.context_valid_S, clip.frames.camera)
 
@@ -62,7 +66,7 @@ def loss(
         everything with valid depth; for target v or ε the plain squared error of the target.
     """
     frames = as_signal(clip.frames)
-    x0 = codec.encode_rgbd(config, frames.rgb_THWC, frames.depth_THW)
+    x0 = codec.encode_rgbd(config, params, frames.rgb_THWC, frames.depth_THW)
     batch = x0.shape[0]
     time_key, noise_key, level_key, image_key = jax.random.split(key, 4)
     diffusion = config.diffusion
@@ -76,15 +80,17 @@ def loss(
     )
     first = frames.rgb_THWC[:, 0]
     first = first + level * jax.random.normal(image_key, first.shape)
-    conditioning = world_model.condition(config, first, frames.depth_THW[:, 0], frames.camera)
-    tokens = clip_tokens(config, clip) if memory else None
+    conditioning = world_model.condition(
+        config, params, first, frames.depth_THW[:, 0], frames.camera
+    )
+    tokens = clip_tokens(config, params, clip) if memory else None
     prediction = world_model.apply(config, params, x_t, conditioning, timesteps, tokens)
 
     error = (prediction - schedule.target(diffusion, x0, noise, timesteps)) ** 2
     if diffusion.target == "x0":
         error = error * schedule.x0_weight(diffusion, timesteps)[:, None, None, None, None]
-    measured = codec.encode(config.codec, (frames.depth_THW > 0).astype(jnp.float32)[..., None])
     split = codec.rgb_channels(config)
+    measured = jnp.broadcast_to(codec.measured(config, frames.depth_THW), error[..., split:].shape)
     rgb = error[..., :split].mean()
     depth = (error[..., split:] * measured).sum() / jnp.maximum(measured.sum(), 1)
     channels = error.shape[-1]

@@ -1,9 +1,8 @@
 """Pixels ↔ latents behind one interface, and metric depth ↔ [−1, 1].
 
-The pixel codec has no parameters and is exactly invertible: space-to-depth of s × s pixels and a
-temporal fold of q frames, with CogVideoX's frame rule (q·k + 1 frames → k + 1 latent frames; the
-first frame is alone in its latent, repeated q times). Colour and depth are encoded separately and
-concatenated, as the paper does with the VAE.
+Two codecs: ``pixel`` (no parameters) for small models, ``vae`` (CogVideoX's) for large ones. Both
+keep the frame rule q·k + 1 frames → k + 1 latent frames. Colour and depth are encoded separately
+and concatenated, as the paper does with the VAE, which sees depth as a grey picture.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import ClipConfig, CodecConfig, Config
-from pewm_jax.geometry.plucker import fold_frames
-from pewm_jax.types import Array
+from pewm_jax.models import pixel_codec, vae
+from pewm_jax.types import Array, Params
 
 
 def latent_shape(config: Config) -> tuple[int, int, int]:
@@ -25,49 +24,46 @@ def latent_shape(config: Config) -> tuple[int, int, int]:
     return frames, clip.height // codec.spatial, clip.width // codec.spatial
 
 
-def encode(config: CodecConfig, video_BTHWC: Array) -> Array:
+def init(config: CodecConfig, key: Array) -> Params:
+    """Return random parameters of the codec; the pixel codec has none."""
+    return vae.init(config.vae, key) if config.kind == "vae" else {}
+
+
+def encode(
+    config: CodecConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
+) -> Array:
     """Encode a video.
 
     Args:
         config: the codec.
-        video_BTHWC: (B, q·k + 1, H, W, C) float.
+        params: its parameters, empty for the pixel codec.
+        video_BTHWC: (B, q·k + 1, H, W, C) float in [−1, 1]; C is 3 for the VAE.
+        condition: whether the latents are what the denoiser is conditioned on. CogVideoX-1.5's
+            image-to-video model divides these by the scaling factor instead of multiplying.
 
     Returns:
-        (B, k + 1, H/s, W/s, q·s·s·C) latents.
+        (B, k + 1, H/s, W/s, C') latents: of the VAE the mean, scaled; of the pixel codec
+        C' = q·s·s·C.
 
     Raises:
-        ValueError: the frame count is not q·k + 1, or s does not divide the image.
+        ValueError: the video's size cannot be encoded.
     """
-    batch, frames, height, width, channels = video_BTHWC.shape
-    s, q = config.spatial, config.temporal
-    if (frames - 1) % q or height % s or width % s:
-        raise ValueError(
-            f"a video of {frames}×{height}×{width} cannot be folded: the codec needs {q}k + 1 "
-            f"frames and multiples of {s} pixels."
-        )
-    folded = jax.vmap(lambda video: fold_frames(video, q))(video_BTHWC)
-    grid = folded.reshape(batch, -1, q, height // s, s, width // s, s, channels)
-    grid = grid.transpose(0, 1, 3, 5, 2, 4, 6, 7)
-    return grid.reshape(*grid.shape[:4], q * s * s * channels)
+    if config.kind == "pixel":
+        return pixel_codec.encode(config, video_BTHWC)
+    mean, _ = vae.encode(config.vae, params, video_BTHWC)
+    return mean * _scale(config, condition=condition)
 
 
-def decode(config: CodecConfig, latents_BthwC: Array) -> Array:
-    """Invert ``encode``; the q copies of the first frame are averaged.
+def decode(config: CodecConfig, params: Params, latents_BthwC: Array) -> Array:
+    """Return the (B, q·k + 1, h·s, w·s, C) video of latents; the inverse of ``encode``."""
+    if config.kind == "pixel":
+        return pixel_codec.decode(config, latents_BthwC)
+    return vae.decode(config.vae, params, latents_BthwC / config.vae.scaling_factor)
 
-    Args:
-        config: the codec.
-        latents_BthwC: (B, k + 1, h, w, q·s·s·C).
 
-    Returns:
-        (B, q·k + 1, h·s, w·s, C) video.
-    """
-    batch, latent_frames, h, w, width = latents_BthwC.shape
-    s, q = config.spatial, config.temporal
-    grid = latents_BthwC.reshape(batch, latent_frames, h, w, q, s, s, width // (q * s * s))
-    grid = grid.transpose(0, 1, 4, 2, 5, 3, 6, 7)
-    video = grid.reshape(batch, latent_frames, q, h * s, w * s, -1)
-    rest = video[:, 1:].reshape(batch, -1, *video.shape[3:])
-    return jnp.concatenate([video[:, :1].mean(2), rest], 1)
+def _scale(config: CodecConfig, *, condition: bool) -> float:
+    factor = config.vae.scaling_factor
+    return 1 / factor if condition and config.vae.invert_scale_latents else factor
 
 
 def signal_from_depth(config: ClipConfig, depth: Array) -> Array:
@@ -100,26 +96,68 @@ def rgb_from_signal(signal: Array) -> Array:
     return jnp.round(jnp.clip((signal + 1) * 127.5, 0, 255)).astype(jnp.uint8)
 
 
-def encode_rgbd(config: Config, rgb_BTHWC: Array, depth_BTHW: Array) -> Array:
-    """Encode colour in [−1, 1] and metric depth separately and concatenate the channels."""
-    rgb = encode(config.codec, rgb_BTHWC)
-    depth = encode(config.codec, signal_from_depth(config.clip, depth_BTHW)[..., None])
-    return jnp.concatenate([rgb, depth], -1)
+def encode_rgbd(
+    config: Config,
+    params: Params,
+    rgb_BTHWC: Array,
+    depth_BTHW: Array,
+    *,
+    condition: bool = False,
+) -> Array:
+    """Encode colour in [−1, 1] and metric depth separately and concatenate the channels.
+
+    Args:
+        config: the experiment.
+        params: the world model's parameters; those of the codec are under ``codec``.
+        rgb_BTHWC: (B, T, H, W, 3).
+        depth_BTHW: (B, T, H, W) metres.
+        condition: see ``encode``.
+    """
+    signal = signal_from_depth(config.clip, depth_BTHW)[..., None]
+    weights = params.get("codec", {})
+    if config.codec.kind == "pixel":
+        parts = [encode(config.codec, weights, x) for x in (rgb_BTHWC, signal)]
+    else:
+        dtype = jnp.dtype(config.train.dtype)
+        grey = jnp.broadcast_to(signal, rgb_BTHWC.shape)
+        both = jnp.concatenate([rgb_BTHWC, grey]).astype(dtype)
+        latents = encode(config.codec, weights, both, condition=condition)
+        parts = jnp.split(latents.astype(jnp.float32), 2)
+    return jnp.concatenate(parts, -1)
 
 
-def decode_rgbd(config: Config, latents_BthwC: Array) -> tuple[Array, Array]:
+def decode_rgbd(config: Config, params: Params, latents_BthwC: Array) -> tuple[Array, Array]:
     """Invert ``encode_rgbd``: colour in [−1, 1] (B, T, H, W, 3) and metric depth (B, T, H, W)."""
-    split = rgb_channels(config)
-    rgb = decode(config.codec, latents_BthwC[..., :split])
-    depth = decode(config.codec, latents_BthwC[..., split:])[..., 0]
-    return jnp.clip(rgb, -1, 1), depth_from_signal(config.clip, depth)
+    parts = jnp.split(latents_BthwC, [rgb_channels(config)], -1)
+    weights = params.get("codec", {})
+    if config.codec.kind == "pixel":
+        rgb, signal = (decode(config.codec, weights, part) for part in parts)
+    else:
+        both = jnp.concatenate(parts).astype(jnp.dtype(config.train.dtype))
+        video = decode(config.codec, weights, both).astype(jnp.float32)
+        rgb, signal = jnp.split(video, 2)
+    return jnp.clip(rgb, -1, 1), depth_from_signal(config.clip, signal.mean(-1))
+
+
+def measured(config: Config, depth_BTHW: Array) -> Array:
+    """Return what share of each depth latent was measured, to weigh its error with.
+
+    Shape (B, t, h, w, C) that broadcasts with the depth channels of ``encode_rgbd``. A channel of
+    the pixel codec is one pixel (0 or 1); a latent of the VAE counts by the share of its pixels.
+    """
+    share = pixel_codec.encode(config.codec, (depth_BTHW > 0).astype(jnp.float32)[..., None])
+    return share if config.codec.kind == "pixel" else share.mean(-1, keepdims=True)
 
 
 def rgb_channels(config: Config) -> int:
     """Latent channels of the colour part."""
+    if config.codec.kind == "vae":
+        return config.codec.vae.latent_channels
     return 3 * config.codec.temporal * config.codec.spatial**2
 
 
 def latent_channels(config: Config) -> int:
     """Latent channels of colour and depth together."""
+    if config.codec.kind == "vae":
+        return 2 * config.codec.vae.latent_channels
     return 4 * config.codec.temporal * config.codec.spatial**2

@@ -37,7 +37,10 @@ NEAREST_M = 0.05
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sightings:
-    """Map tokens as seen through the cameras of every latent frame (q cameras each).
+    """Map tokens as seen through the cameras of every token's frames.
+
+    A token covers t = 1 latent frame of q cameras, or ``dit.patch_t`` latent frames and as many
+    times the cameras; below, t and q count tokens in time and cameras of a token.
 
     Attributes:
         index_tqJ: (B, t, q, J) int32, which of the M map tokens are looked at.
@@ -52,6 +55,16 @@ class Sightings:
     place_tqJ3: Array
     visible_tqJ: Array
     query_angles_nR: Array
+
+
+def group_latents(cameras_tqX: Array, patch_t: int) -> Array:
+    """Join the cameras of ``patch_t`` latent frames: (t, q, …) → (⌈t/p⌉, p·q, …).
+
+    As the denoiser pads, the first latent frame is repeated at the front where t is no multiple.
+    """
+    missing = -cameras_tqX.shape[0] % patch_t
+    padded = jnp.concatenate([cameras_tqX[:1]] * missing + [cameras_tqX])
+    return padded.reshape(-1, patch_t * padded.shape[1], *padded.shape[2:])
 
 
 def frequencies(head_dim: int, grid: int) -> np.ndarray:
@@ -115,7 +128,7 @@ def sightings(config: Config, camera: Camera, points_M3: Array, valid_M: Array) 
     log_z = jnp.log(jnp.where(visible, z, 1.0))
     place = jnp.concatenate([2 * uv / size - 1, log_z[..., None]], -1)
 
-    fold = jax.vmap(lambda x: fold_frames(x, codec.temporal))
+    fold = jax.vmap(lambda x: group_latents(fold_frames(x, codec.temporal), config.dit.patch_t))
     v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
     centres = np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)
     return Sightings(

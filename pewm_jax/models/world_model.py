@@ -2,8 +2,11 @@
 
 Input channels, in order: noisy colour and depth latents, clean latents of the observed first
 frame (zero for later latent frames), camera (Plücker) channels. After every transformer block a
-memory block reads the map. Parameters: ``{"backbone": dit, "memory": {camera, tokens, blocks}}``;
-without the ``memory`` entry, or without map tokens, it is the stage-1 model.
+memory block reads the map.
+
+Parameters: ``backbone`` (the DiT), ``memory`` (camera, tokens, blocks), and where the configuration
+asks for them the frozen ``codec`` (the VAE), ``encoder`` (DINOv2) and ``text`` (the prompt's
+embedding). Without the ``memory`` entry, or without map tokens, it is the stage-1 model.
 """
 
 from __future__ import annotations
@@ -15,9 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import Config, ConfigError, DiTConfig
+from pewm_jax.config import Config, DiTConfig
 from pewm_jax.geometry.plucker import camera_latents
-from pewm_jax.models import codec, dit, layers
+from pewm_jax.models import codec, dinov2, dit, layers
 from pewm_jax.models.memory_block import MemoryBlock
 from pewm_jax.models.memory_geometry import Sightings, sightings, sinusoid_3d
 from pewm_jax.types import Array, Camera, MapTokens, Params
@@ -43,7 +46,8 @@ class Conditioning:
 
 def feature_channels(config: Config) -> int:
     """Return the number of features F of a map cell."""
-    return {"patch_colours": 6}[config.memory.encoder]
+    memory = config.memory
+    return memory.dinov2.width if memory.encoder == "dinov2" else 6
 
 
 def camera_channels(config: Config) -> int:
@@ -57,34 +61,31 @@ def in_channels(config: Config) -> int:
 
 
 def backbone(config: Config) -> DiTConfig:
-    """Return the transformer's settings with its channels filled in.
-
-    Raises:
-        ConfigError: channels were set and are not what codec and conditioning need.
-    """
-    needed = {"in_channels": in_channels(config), "out_channels": codec.latent_channels(config)}
-    for name, channels in needed.items():
-        value = getattr(config.dit, name)
-        if value not in (0, channels):
-            raise ConfigError(
-                f"dit.{name} is {value} and codec and conditioning need {channels}: set that, or "
-                "0 to have it filled in."
-            )
-    return dataclasses.replace(config.dit, **needed)
+    """Return the transformer's settings with its channels filled in."""
+    return dataclasses.replace(
+        config.dit,
+        in_channels=in_channels(config),
+        out_channels=codec.latent_channels(config),
+    )
 
 
-def condition(config: Config, rgb_BHWC: Array, depth_BHW: Array, camera: Camera) -> Conditioning:
+def condition(
+    config: Config, params: Params, rgb_BHWC: Array, depth_BHW: Array, camera: Camera
+) -> Conditioning:
     """Build the conditioning of a batch of clips.
 
     Args:
         config: the experiment.
+        params: the world model's parameters; codec and text are used.
         rgb_BHWC: (B, H, W, 3) the observed first frame, float in [−1, 1].
         depth_BHW: (B, H, W) its depth, metres.
         camera: (B, T) cameras of all frames of the clip, world frame.
     """
     batch = rgb_BHWC.shape[0]
     frames, h, w = codec.latent_shape(config)
-    first = codec.encode_rgbd(config, rgb_BHWC[:, None], depth_BHW[:, None])
+    first = codec.encode_rgbd(
+        config, params, rgb_BHWC[:, None], depth_BHW[:, None], condition=True
+    )
     padding = jnp.zeros((batch, frames - 1, h, w, first.shape[-1]), first.dtype)
     clip = config.clip
     rays = jax.vmap(
@@ -92,7 +93,9 @@ def condition(config: Config, rgb_BHWC: Array, depth_BHW: Array, camera: Camera)
             c, clip.height, clip.width, config.codec.spatial, config.codec.temporal
         )
     )(camera)
-    text = jnp.zeros((batch, config.dit.text_length, config.dit.text_dim))
+    prompt = jnp.zeros((config.dit.text_length, config.dit.text_dim))
+    prompt = jnp.asarray(params.get("text", {}).get("prompt_LC", prompt), jnp.float32)
+    text = jnp.broadcast_to(prompt, (batch, *prompt.shape))
     return Conditioning(jnp.concatenate([first, padding], 1), rays, camera, text)
 
 
@@ -116,9 +119,16 @@ def _token_channels(config: Config) -> int:
 def init(config: Config, key: Array, *, memory: bool = True) -> Params:
     """Initialise the backbone and, with ``memory``, the memory blocks (identity at the start)."""
     backbone_key, memory_key = jax.random.split(key)
+    frozen_key = jax.random.fold_in(key, 2)
     params: Params = {"backbone": dit.init(backbone(config), backbone_key)}
     if memory:
         params["memory"] = init_memory(config, memory_key)
+    if config.codec.kind == "vae":
+        params["codec"] = codec.init(config.codec, frozen_key)
+    if config.memory.encoder == "dinov2":
+        params["encoder"] = dinov2.init(config.memory.dinov2, jax.random.fold_in(frozen_key, 1))
+    if config.dit.prompt == "stored":
+        params["text"] = {"prompt_LC": jnp.zeros((config.dit.text_length, config.dit.text_dim))}
     return params
 
 
@@ -128,7 +138,7 @@ def init_memory(config: Config, key: Array) -> Params:
     camera_key, tokens_key, blocks_key = jax.random.split(key, 3)
     memory, width = config.memory, config.dit.width
     half = memory.head_dim // 2
-    q = config.codec.temporal
+    q = config.codec.temporal * config.dit.patch_t
     seen = None
     if memory.positions == "projective":
         seen = Sightings(
@@ -149,11 +159,9 @@ def init_memory(config: Config, key: Array) -> Params:
     blocks = jax.vmap(lambda k: MemoryBlock(config).init(k, *example)["params"])(
         jax.random.split(blocks_key, config.dit.layers)
     )
-    patch = config.dit.patch
+    rays = camera_channels(config) * config.dit.patch**2 * config.dit.patch_t
     return {
-        "camera": camera.init(camera_key, jnp.zeros((1, camera_channels(config) * patch**2)))[
-            "params"
-        ],
+        "camera": camera.init(camera_key, jnp.zeros((1, rays)))["params"],
         "tokens": tokens.init(tokens_key, jnp.zeros((1, _token_channels(config))))["params"],
         "blocks": blocks,
     }
@@ -181,13 +189,20 @@ def apply(
         (B, t, h, w, C) float32 prediction.
     """
     dtype = jnp.dtype(config.train.dtype)
+    missing = -noisy_BthwC.shape[1] % config.dit.patch_t
+
+    def whole(x_BthwC: Array) -> Array:
+        """Repeat the first latent frame until dit.patch_t divides their number (CogVideoX 1.5)."""
+        return jnp.concatenate([x_BthwC[:, :1]] * missing + [x_BthwC], 1).astype(dtype)
+
     noisy, first = (_seen(config, x) for x in (noisy_BthwC, conditioning.first_BthwC))
-    latents = jnp.concatenate([noisy, first, conditioning.rays_BthwC], -1).astype(dtype)
+    rays_BthwC = whole(conditioning.rays_BthwC)
+    latents = jnp.concatenate([whole(noisy), whole(first), rays_BthwC], -1)
     expert, expert_params = None, None
     if tokens is not None and "memory" in params:
         memory = params["memory"]
         camera_layer, token_layer = _memory_parts(config)
-        rays = dit.patchify(conditioning.rays_BthwC.astype(dtype), config.dit.patch)
+        rays = dit.patchify(rays_BthwC, config.dit.patch, config.dit.patch_t)
         camera = camera_layer.apply({"params": memory["camera"]}, rays)
         valid, seen = tokens.valid_M, None
         points, features = (
@@ -216,28 +231,19 @@ def apply(
         expert=expert,
         expert_params=expert_params,
     )
-    return _seen(config, out.astype(jnp.float32))
-
-
-def _seen(config: Config, latents_C: Array) -> Array:
-    """Blank the depth channels of latents where the denoiser works without depth.
-
-    They stay, so that both variants have the same parameters.
-    """
-    if config.memory.depth:
-        return latents_C
-    colour = np.arange(latents_C.shape[-1]) < codec.rgb_channels(config)
-    return jnp.where(colour, latents_C, 0)
+    return _seen(config, out[:, missing:].astype(jnp.float32))
 
 
 def flops_per_clip(config: Config, *, memory: bool) -> float:
     """Return the forward FLOPs (2 per multiply-add) of one clip's matrix products."""
     t, h, w = codec.latent_shape(config)
     patch = config.dit.patch
+    t = -(-t // config.dit.patch_t)
+    cell = patch**2 * config.dit.patch_t
     video = t * (h // patch) * (w // patch)
     tokens, width, ratio = video + config.dit.text_length, config.dit.width, config.dit.mlp_ratio
     block = tokens * width * width * (4 + 2 * ratio) + 2 * tokens * tokens * width
-    ends = video * width * patch**2 * (in_channels(config) + codec.latent_channels(config))
+    ends = video * width * cell * (in_channels(config) + codec.latent_channels(config))
     ends += config.dit.text_length * config.dit.text_dim * width
     total = config.dit.layers * block + ends
     if memory:
@@ -249,6 +255,6 @@ def flops_per_clip(config: Config, *, memory: bool) -> float:
         read += video * (inner + geometry) * width + 2 * m.tokens * inner * inner
         read += video * looks * (2 * inner + geometry)
         total += config.dit.layers * read
-        total += video * camera_channels(config) * patch**2 * width / 2
+        total += video * camera_channels(config) * cell * width / 2
         total += m.tokens * _token_channels(config) * inner
     return 2.0 * math.ceil(total)

@@ -7,6 +7,7 @@ checkpoints are written in the background, so the devices never wait for the hos
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from pathlib import Path
 import jax
 from jax.sharding import Mesh
 
+from pewm_jax import rollouts
 from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.training import runs, sharding, stages
@@ -57,6 +59,7 @@ def train(
         Interrupted: Ctrl-C or SIGTERM came; everything is saved.
     """
     planned = stages.planned(config)
+    _require_weights(config)
     mesh = sharding.make_mesh()
     for stage in planned:
         sharding.require_divisible(config, stage, mesh)
@@ -66,15 +69,45 @@ def train(
         if runs.is_finished(run, config):
             say(f"{run} is already trained: nothing to do.")
             return run
-        start: Params | None = None
+        start: Callable[[], Params | None] = functools.partial(_converted, config)
         for stage in planned:
-            start = _train_stage(
+            trained = _train_stage(
                 config, stage, mesh, run=run, start=start, preview=preview, stop=stop
             )
+            start = functools.partial(_same, trained)
             if stop.number is not None and stage is not planned[-1]:
                 raise stop.interrupted(stage.number, stage.settings(config).steps)
     say(f"Trained: {run / runs.WEIGHTS}")
     return run
+
+
+def _same(params: Params) -> Params:
+    return params
+
+
+def _require_weights(config: Config) -> None:
+    """Refuse networks that are not trained here and that no converted weights are named for."""
+    frozen = {
+        "codec.kind vae": config.codec.kind == "vae",
+        "memory.encoder dinov2": config.memory.encoder == "dinov2",
+    }
+    for setting, wanted in frozen.items():
+        if wanted and not config.train.start:
+            raise UserError(
+                f"{setting} needs weights that are not trained here: convert a checkpoint "
+                "(python -m pewm_jax.convert --help) and name its folder by train.start."
+            )
+
+
+def _converted(config: Config) -> Params | None:
+    """Return the weights that the first planned stage starts from, if any are named.
+
+    Memory blocks that the folder may hold are left out: stage 2 begins with fresh ones.
+    """
+    if not config.train.start:
+        return None
+    _, params = rollouts.load(config.train.start)
+    return {name: part for name, part in params.items() if name != "memory"}
 
 
 def _train_stage(
@@ -83,7 +116,7 @@ def _train_stage(
     mesh: Mesh,
     *,
     run: Path,
-    start: Params | None,
+    start: Callable[[], Params | None],
     preview: Preview | None,
     stop: Stop,
 ) -> Params:
@@ -103,7 +136,7 @@ def _train_stage(
 
             def state_to_start_from() -> TrainState:
                 if not done:
-                    return initial_state(config, stage, mesh, start)
+                    return initial_state(config, stage, mesh, start())
                 view.say(f"stage {stage.number}: going on after step {done}")
                 return checkpoints.restore(like)
 

@@ -8,6 +8,7 @@
               checkpoints/stage1/   by Orbax, see ``checkpoint``
               previews/             sample pictures
               weights.safetensors   what inference uses, written when a stage is finished
+              base.json             which converted checkpoint it started from, if any
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from pewm_jax.types import Params
 
 CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
+BASE = "base.json"
 
 FREE = (
     "evaluate",
@@ -105,6 +107,11 @@ def prepare(config: Config) -> Path:
     """Check the run's folder and write down its configuration; only within ``alone``."""
     run = check(config)
     configuration.save(config, run / CONFIG)
+    base = Path(config.train.start) / BASE
+    if config.train.start and base.is_file():
+        partial = run / (BASE + ".partial")
+        partial.write_bytes(base.read_bytes())
+        partial.replace(run / BASE)
     return run
 
 

@@ -45,17 +45,22 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
         config: the experiment.
         stage: the stage to begin.
         key: PRNG key of the fresh weights.
-        start: weights of the stage before; they replace the fresh ones on their paths. They must
-            be exactly the leaves that this stage freezes.
+        start: weights to begin with, in place of fresh ones: either exactly the leaves that this
+            stage freezes (the stage before has trained them), or all of its leaves (converted
+            weights).
 
     Raises:
-        TreeError: ``start`` has other paths or shapes than the frozen leaves.
+        TreeError: ``start`` has other paths or shapes.
     """
     params = world_model.init(config, key, memory=stage.memory)
     trained, frozen = tree.split(params, stage.trained)
     if start is not None:
-        tree.require_like(start, frozen, f"The weights that stage {stage.number} starts from")
-        params = tree.merge(trained, start)
+        everything = bool(tree.flatten(start).keys() & tree.flatten(trained).keys())
+        like = params if everything else frozen
+        tree.require_like(start, like, f"The weights that stage {stage.number} starts from")
+        start = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), start, like)
+        params = start if everything else tree.merge(trained, start)
+        trained = tree.select(params, stage.trained)
     return TrainState(
         params=params,
         ema=jax.tree.map(jnp.copy, trained),

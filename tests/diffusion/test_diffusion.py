@@ -135,11 +135,11 @@ def test_pixels_without_depth_do_not_train_depth():
 def test_invalid_context_frames_are_not_remembered():
     config = tiny_config()
     clip = make_clip(config)
-    tokens = objective.clip_tokens(config, clip)
+    tokens = objective.clip_tokens(config, {}, clip)
     changed = np.array(clip.context.rgb_THWC)
     changed[:, 0] = 255 - changed[:, 0]
     context = dataclasses.replace(clip.context, rgb_THWC=changed)
-    again = objective.clip_tokens(config, dataclasses.replace(clip, context=context))
+    again = objective.clip_tokens(config, {}, dataclasses.replace(clip, context=context))
     np.testing.assert_array_equal(tokens.features_MF, again.features_MF)
     assert tokens.valid_M.any()
 
@@ -151,11 +151,12 @@ def test_guidance_interpolates_between_with_and_without_map():
     frames = objective.as_signal(clip.frames)
     conditioning = world_model.condition(
         config,
+        params,
         frames.rgb_THWC[:, 0],
         frames.depth_THW[:, 0],
         jax.tree.map(jnp.asarray, frames.camera),
     )
-    tokens = objective.clip_tokens(config, clip)
+    tokens = objective.clip_tokens(config, params, clip)
     noise = jax.random.normal(key, (2, 3, 4, 6, 256))
 
     def run(guidance, tokens, **more):

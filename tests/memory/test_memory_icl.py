@@ -43,7 +43,7 @@ def build(episode, cell):
     frames = Frames(signal_from_rgb(seen.rgb_THWC), seen.depth_THW, seen.camera)
     centre = np.asarray(seen.camera.world_from_camera)[0, :3, 3]
     insert = jax.jit(voxel_map.insert_frames, static_argnums=0)
-    patches = features.encode(config, frames.rgb_THWC)
+    patches = features.encode(config, {}, frames.rgb_THWC)
     voxels = insert(config, voxel_map.empty(config, centre, 6), frames, patches)
     assert int(voxels.dropped) == 0
     assert int(voxels.outside) == 0

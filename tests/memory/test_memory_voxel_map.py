@@ -128,7 +128,7 @@ def test_every_point_of_a_frame_is_within_half_a_cell_of_its_centre():
     frames = Frames(rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW, frames.camera)
     voxels = voxel_map.empty(config, np.zeros(3), 6)
     voxels = voxel_map.insert_frames(
-        config, voxels, frames, features.encode(config, frames.rgb_THWC), np.array([True, False])
+        config, voxels, frames, features.encode(config, {}, frames.rgb_THWC), np.array([True, False])
     )
     points = np.asarray(
         cameras.unproject(
@@ -151,7 +151,7 @@ def test_pixels_without_depth_leave_no_trace():
     frames = random_frames(rng, 1)
     blank = Frames(rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW * 0, frames.camera)
     voxels = voxel_map.empty(config, np.zeros(3), 6)
-    patches = features.encode(config, blank.rgb_THWC)
+    patches = features.encode(config, {}, blank.rgb_THWC)
     voxels = voxel_map.insert_frames(config, voxels, blank, patches)
     assert int(voxels.occupied) == 0
 
@@ -197,7 +197,7 @@ def test_patch_colours_keep_both_ends_of_the_range():
     config = tiny_config().memory
     rgb = np.full((1, 4, 4, 3), 0.5, np.float32)
     rgb[:, :, 2:] = -1.0
-    patches = np.asarray(features.encode(config, rgb))
+    patches = np.asarray(features.encode(config, {}, rgb))
     assert patches.shape == (1, 2, 2, 6)
     np.testing.assert_allclose(patches[0, 0, 0], [0.5] * 3 + [-0.5] * 3, atol=1e-6)
     both = np.maximum(patches[0, 0, 0], patches[0, 0, 1])

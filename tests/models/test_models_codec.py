@@ -19,22 +19,22 @@ from tests.helpers import tiny_config
 def test_decode_inverts_encode(k, h, w, s, c):
     config = CodecConfig(spatial=s)
     video = np.random.default_rng(k).normal(size=(2, 4 * k + 1, h * s, w * s, c))
-    latents = codec.encode(config, video.astype(np.float32))
+    latents = codec.encode(config, {}, video.astype(np.float32))
     assert latents.shape == (2, k + 1, h, w, 4 * s * s * c)
-    np.testing.assert_allclose(codec.decode(config, latents), video, atol=1e-6)
+    np.testing.assert_allclose(codec.decode(config, {}, latents), video, atol=1e-6)
 
 
 def test_a_latent_frame_holds_only_its_own_frames():
     config = CodecConfig()
     video = np.zeros((1, 9, 8, 8, 1), np.float32)
     video[:, 5] = 1
-    changed = np.abs(np.asarray(codec.encode(config, video))).sum((0, 2, 3, 4)) > 0
+    changed = np.abs(np.asarray(codec.encode(config, {}, video))).sum((0, 2, 3, 4)) > 0
     np.testing.assert_array_equal(changed, [False, False, True])
 
 
 def test_a_frame_count_that_cannot_be_folded_is_refused():
     with pytest.raises(ValueError, match="4k \\+ 1"):
-        codec.encode(CodecConfig(), np.zeros((1, 8, 8, 8, 3), np.float32))
+        codec.encode(CodecConfig(), {}, np.zeros((1, 8, 8, 8, 3), np.float32))
 
 
 @pytest.mark.parametrize("scale", ["linear", "log"])
@@ -59,10 +59,10 @@ def test_rgbd_is_encoded_separately_and_concatenated():
     rng = np.random.default_rng(0)
     rgb = rng.uniform(-1, 1, (1, 9, 16, 24, 3)).astype(np.float32)
     depth = rng.uniform(0.2, 8, (1, 9, 16, 24)).astype(np.float32)
-    latents = codec.encode_rgbd(config, rgb, depth)
-    other = codec.encode_rgbd(config, rgb, depth * 0.5)
+    latents = codec.encode_rgbd(config, {}, rgb, depth)
+    other = codec.encode_rgbd(config, {}, rgb, depth * 0.5)
     split = codec.rgb_channels(config)
     np.testing.assert_array_equal(latents[..., :split], other[..., :split])
-    rgb_back, depth_back = codec.decode_rgbd(config, latents)
+    rgb_back, depth_back = codec.decode_rgbd(config, {}, latents)
     np.testing.assert_allclose(rgb_back, rgb, atol=1e-6)
     np.testing.assert_allclose(depth_back, depth, rtol=1e-4)

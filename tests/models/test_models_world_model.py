@@ -20,6 +20,7 @@ def setup(positions="projective", seed=0):
     camera = jax.tree.map(lambda x: jnp.asarray(np.stack([x, x[::-1]])), camera)
     conditioning = world_model.condition(
         config,
+        {},
         jnp.asarray(rng.uniform(-1, 1, (2, 16, 24, 3)), jnp.float32),
         jnp.asarray(rng.uniform(0.5, 4, (2, 16, 24)), jnp.float32),
         camera,

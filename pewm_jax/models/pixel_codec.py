@@ -1,0 +1,59 @@
+"""The pixel codec: no parameters, exactly invertible.
+
+Space-to-depth of s × s pixels and a temporal fold of q frames, with CogVideoX's frame rule (q·k + 1
+frames → k + 1 latent frames; the first frame is alone in its latent, repeated q times).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import CodecConfig
+from pewm_jax.geometry.plucker import fold_frames
+from pewm_jax.types import Array
+
+
+def encode(config: CodecConfig, video_BTHWC: Array) -> Array:
+    """Encode a video.
+
+    Args:
+        config: the codec.
+        video_BTHWC: (B, q·k + 1, H, W, C) float.
+
+    Returns:
+        (B, k + 1, H/s, W/s, q·s·s·C) latents.
+
+    Raises:
+        ValueError: the frame count is not q·k + 1, or s does not divide the image.
+    """
+    batch, frames, height, width, channels = video_BTHWC.shape
+    s, q = config.spatial, config.temporal
+    if (frames - 1) % q or height % s or width % s:
+        raise ValueError(
+            f"a video of {frames}×{height}×{width} cannot be folded: the codec needs {q}k + 1 "
+            f"frames and multiples of {s} pixels."
+        )
+    folded = jax.vmap(lambda video: fold_frames(video, q))(video_BTHWC)
+    grid = folded.reshape(batch, -1, q, height // s, s, width // s, s, channels)
+    grid = grid.transpose(0, 1, 3, 5, 2, 4, 6, 7)
+    return grid.reshape(*grid.shape[:4], q * s * s * channels)
+
+
+def decode(config: CodecConfig, latents_BthwC: Array) -> Array:
+    """Invert ``encode``; the q copies of the first frame are averaged.
+
+    Args:
+        config: the codec.
+        latents_BthwC: (B, k + 1, h, w, q·s·s·C).
+
+    Returns:
+        (B, q·k + 1, h·s, w·s, C) video.
+    """
+    batch, latent_frames, h, w, width = latents_BthwC.shape
+    s, q = config.spatial, config.temporal
+    grid = latents_BthwC.reshape(batch, latent_frames, h, w, q, s, s, width // (q * s * s))
+    grid = grid.transpose(0, 1, 4, 2, 5, 3, 6, 7)
+    video = grid.reshape(batch, latent_frames, q, h * s, w * s, -1)
+    rest = video[:, 1:].reshape(batch, -1, *video.shape[3:])
+    return jnp.concatenate([video[:, :1].mean(2), rest], 1)
