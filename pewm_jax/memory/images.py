@@ -87,7 +87,9 @@ def remember(
     points, _, valid = cells.sample(frames, rows, columns, valid_T)
     pooled = jax.image.resize(features_ThwF, (shape[0], rows, columns, shape[-1]), "linear")
     pooled = pooled.reshape(shape[0], rows * columns, shape[-1])
-    looked, _, measured = cells.sample(frames, *cells.grid_of(*frames.depth_THW.shape[1:], MOST))
+    looked, _, measured = cells.sample(
+        frames, *cells.grid_of(frames.depth_THW.shape[1], frames.depth_THW.shape[2], MOST)
+    )
     if valid_T is not None:
         measured = measured & valid_T[:, None]
     nowhere = math.prod(memory.cells)

@@ -105,7 +105,7 @@ def remember(
     config: MemoryConfig, cloud: PointCloud, frames: Frames, valid_T: Array | None = None
 ) -> PointCloud:
     """Insert the pixels of posed RGB-D frames, colours in [−1, 1]."""
-    rows, columns = cells.grid_of(*frames.depth_THW.shape[1:], MOST)
+    rows, columns = cells.grid_of(frames.depth_THW.shape[1], frames.depth_THW.shape[2], MOST)
     points, rgb, valid = cells.sample(frames, rows, columns, valid_T)
     return insert(config, cloud, points.reshape(-1, 3), rgb.reshape(-1, 3), valid.reshape(-1))
 
