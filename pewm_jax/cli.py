@@ -122,6 +122,8 @@ def parse_command(kind: type[T], argv: Sequence[str], prog: str) -> T:
         ConfigError: what is wrong with them, in one sentence.
     """
     nothing: T = tyro.MISSING_NONPROP  # type: ignore[assignment]
+    if _take_config_file(argv, kind)[0] is not None:
+        raise ConfigError(f"--config is not a setting; `python {prog} --help` lists them all.")
     try:
         return parse(kind, argv, default=nothing, prog=prog)
     except ConfigError as error:

@@ -74,15 +74,19 @@ def save(path: Path, params: Params, words: Mapping[str, str] | None = None) -> 
     """
     leaves = tree.flatten(params)
     like = {name: jax.ShapeDtypeStruct(np.shape(x), _dtype(x)) for name, x in leaves.items()}
-    header = {_WORDS: json.dumps(dict(words or {}), sort_keys=True)}
-    write(path, like, leaves.items(), header)
+    write(path, like, leaves.items(), header(words or {}))
+
+
+def header(words: Mapping[str, str]) -> dict[str, str]:
+    """Return the header of ``write`` that ``metadata`` reads the words of."""
+    return {_WORDS: json.dumps(dict(words), sort_keys=True)}
 
 
 def write(
     path: Path,
     like: Mapping[str, Array | jax.ShapeDtypeStruct],
     tensors: Iterable[tuple[str, Array]],
-    header: Mapping[str, str],
+    words: Mapping[str, str],
 ) -> None:
     """Write a safetensors file tensor by tensor, aside and then renamed.
 
@@ -90,13 +94,13 @@ def write(
         path: the file; its folder is made.
         like: name → anything with the tensor's shape and dtype.
         tensors: the tensors, in any order, each once.
-        header: words for the file's header.
+        words: the file's header, words by name.
 
     Raises:
         ValueError: the tensors are not those announced.
     """
     order = sorted(like, key=lambda name: (-like[name].dtype.itemsize, name))
-    table: dict[str, object] = {"__metadata__": dict(header)}
+    table: dict[str, object] = {"__metadata__": dict(words)}
     end = 0
     for name in order:
         dtype = np.dtype(like[name].dtype)
@@ -142,19 +146,24 @@ def aside(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
-def load(path: Path) -> Params:
+def load(path: Path, part: str = "") -> Params:
     """Read parameters written by ``save``.
 
     Args:
         path: a safetensors file.
+        part: read only this branch of the tree, such as ``backbone``; by default all of it.
 
     Returns:
         Nested dictionaries of NumPy arrays.
 
     Raises:
-        UserError: the file is absent or damaged.
+        UserError: the file is absent or damaged, or holds no such branch.
     """
-    return tree.unflatten({name: read_at(path, place) for name, place in places(path).items()})
+    prefix = f"{part}/" if part else ""
+    found = {n.removeprefix(prefix): p for n, p in places(path).items() if n.startswith(prefix)}
+    if part and not found:
+        raise UserError(f"{path} holds no {part}; give weights that have it.")
+    return tree.unflatten({name: read_at(path, place) for name, place in found.items()})
 
 
 def places(path: Path) -> dict[str, Place]:

@@ -114,21 +114,28 @@ def read(
         UserError: names or shapes do not fit, a damaged file, or a value too large for float16.
     """
     require(entries, source, like)
-    target = None if dtype is None else _dtype(dtype)
-    by_path: dict[str, list[Entry]] = defaultdict(list)
-    for entry in entries:
-        by_path[entry.path].append(entry)
-    leaves: dict[str, np.ndarray] = {}
-    for path, leaf in tree.flatten(like).items():
-        stored = {source.dtype(entry.theirs) for entry in by_path[path]}
-        kind = target or (stored.pop() if len(stored) == 1 else np.dtype(np.float32))
-        leaves[path] = np.empty(leaf.shape, kind)
+    announced = leaf_specs(entries, source, like, dtype)
+    leaves = {path: np.empty(spec.shape, spec.dtype) for path, spec in announced.items()}
     for entry in entries:
         tensor = source.read(entry.theirs)
         place = leaves[entry.path] if entry.layer is None else leaves[entry.path][entry.layer]
         _cast(entry.turn.ours(tensor), place, f"{source.where}: {entry.theirs}")
         told(tensor.nbytes)
     return tree.unflatten(leaves)
+
+
+def leaf_specs(
+    entries: Sequence[Entry], source: Source, like: Params, dtype: str | None = None
+) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return the shape and dtype of every leaf that ``read`` will give, by path."""
+    stored: dict[str, set[np.dtype]] = defaultdict(set)
+    for entry in entries:
+        stored[entry.path].add(source.dtype(entry.theirs))
+    target = None if dtype is None else _dtype(dtype)
+    return {
+        path: jax.ShapeDtypeStruct(leaf.shape, target or _common(stored[path]))
+        for path, leaf in tree.flatten(like).items()
+    }
 
 
 def write(
@@ -166,6 +173,11 @@ def specs(
         )
         for entry in entries
     }
+
+
+def _common(dtypes: set[np.dtype]) -> np.dtype:
+    """Return the dtype that holds values of all of them."""
+    return next(iter(dtypes)) if len(dtypes) == 1 else np.dtype(np.float32)
 
 
 def _dtype(name: str) -> np.dtype:

@@ -6,11 +6,8 @@ asked for, so that nothing holds more than one of them.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import importlib
 import json
-import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,10 +17,6 @@ import numpy as np
 from pewm_jax import tree, weights
 from pewm_jax.config import UserError
 from pewm_jax.types import Array
-
-
-BASE = "base.json"
-"""File beside converted weights that says what they were made from."""
 
 
 class Source(Protocol):
@@ -232,46 +225,6 @@ def component(folder: Path, name: str) -> Path:
     raise UserError(
         f"{folder} has no folder {name}/ and no config.json; give a diffusers pipeline's folder."
     )
-
-
-@contextlib.contextmanager
-def new_folder(dst: Path) -> Iterator[Path]:
-    """Make a folder aside and rename it when it is complete; nothing stays of a failure.
-
-    Raises:
-        UserError: ``dst`` exists.
-    """
-    if dst.exists() or dst.is_symlink():
-        raise UserError(f"{dst} exists already; name a new folder or remove that one.")
-    partial = dst.with_name(f".{dst.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a command that was killed
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        partial.rename(dst)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-
-
-def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Write a JSON table as diffusers does: sorted keys."""
-    path.write_text(json.dumps(values, indent=2, sort_keys=True) + "\n", encoding="utf-8")
-
-
-def convert_extra(name: str) -> Any:
-    """Import a library of the optional dependencies.
-
-    Raises:
-        UserError: it is not installed.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise UserError(
-            f"{name} is needed for this and cannot be imported ({error}); run "
-            "pip install 'pewm-jax[convert]'."
-        ) from None
 
 
 def _plainest(paths: Iterable[Path] | Iterator[Path]) -> Path | None:

@@ -1,0 +1,251 @@
+"""CogVideoX checkpoints in the layout of diffusers: read, import, and load what was imported.
+
+A pipeline's folder has ``transformer/``, ``vae/`` and ``scheduler/``, each with its JSON settings
+and safetensors, one file or shards. An imported folder has the same parts in our layout::
+
+    DST/transformer/config.json   weights.safetensors
+        vae/config.json           weights.safetensors
+        scheduler/config.json
+        text/weights.safetensors  the prompts, encoded (where there is a text encoder)
+        base.json                 the three original settings, licence, prompts
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax import config as configuration
+from pewm_jax import weights
+from pewm_jax.config import DiffusionConfig, DiTConfig, UserError, VAEConfig
+from pewm_jax.convert import assemble, base, files, output, scheduler, transformer, vae
+from pewm_jax.convert.mapping import Entry
+from pewm_jax.data.progress import Meter
+from pewm_jax.models import dit as dit_model
+from pewm_jax.models import vae as vae_model
+from pewm_jax.types import Array, Params
+
+WEIGHTS = "weights.safetensors"
+CONFIG = "config.json"
+MEGABYTE = 1 << 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    """A network that can be converted.
+
+    Attributes:
+        folder: its folder in a pipeline, theirs and ours.
+        theirs: its class in diffusers.
+        ours: our configuration's class.
+        converter: ``config_from_diffusers``, ``config_to_diffusers`` and ``entries``.
+        init: ``(config, key) -> params``.
+    """
+
+    folder: str
+    theirs: str
+    ours: type
+    converter: ModuleType
+    init: Callable[[Any, Array], Params]
+
+    def entries(self, config: Any) -> Sequence[Entry]:
+        """Return the converter's table."""
+        return self.converter.entries(config)
+
+    def like(self, config: Any) -> Params:
+        """Return the abstract parameters, nothing allocated."""
+        return jax.eval_shape(lambda key: self.init(config, key), jax.random.key(0))
+
+    def config(self, values: dict[str, Any], where: str) -> Any:
+        """Read the settings of diffusers.
+
+        Raises:
+            UserError: a setting is unknown or unsupported.
+        """
+        try:
+            return self.converter.config_from_diffusers(values)
+        except UserError as error:
+            raise UserError(f"{where}: {error}") from None
+
+
+TRANSFORMER = Network(
+    "transformer", "CogVideoXTransformer3DModel", DiTConfig, transformer, dit_model.init
+)
+VAE = Network("vae", "AutoencoderKLCogVideoX", VAEConfig, vae, vae_model.init)
+
+
+def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[DiTConfig, Params]:
+    """Read the diffusion transformer of a CogVideoX checkpoint.
+
+    Args:
+        folder: a diffusers pipeline's folder, or the transformer's folder in it.
+        dtype: of the parameters, ``float32``, ``bfloat16`` or ``float16``; by default the
+            stored one.
+
+    Returns:
+        ``(config, params)`` for ``pewm_jax.models.dit.apply``, NumPy arrays.
+
+    Raises:
+        UserError: a tensor that is missing, left over or of another shape, a damaged file, a
+            class or setting that is not known.
+    """
+    return _read(TRANSFORMER, Path(folder), dtype)
+
+
+def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[VAEConfig, Params]:
+    """Read the VAE of a CogVideoX checkpoint; see ``read_transformer``.
+
+    Returns:
+        ``(config, params)`` for ``pewm_jax.models.vae.encode`` and ``decode``.
+    """
+    return _read(VAE, Path(folder), dtype)
+
+
+def read_scheduler(folder: str | Path) -> DiffusionConfig:
+    """Read the scheduler of a CogVideoX checkpoint: settings only, it has no weights.
+
+    Args:
+        folder: a diffusers pipeline's folder, or the scheduler's folder in it.
+
+    Raises:
+        UserError: a class or setting that is not known.
+    """
+    return scheduler.config_from_diffusers(scheduler_settings(Path(folder)))
+
+
+def settings(network: Network, folder: Path) -> dict[str, Any]:
+    """Read a network's settings as diffusers wrote them."""
+    return files.read_config(files.component(folder, network.folder) / CONFIG, [network.theirs])
+
+
+def scheduler_settings(folder: Path) -> dict[str, Any]:
+    """Read the scheduler's settings as diffusers wrote them."""
+    path = files.component(folder, "scheduler") / "scheduler_config.json"
+    return files.read_config(path, sorted(scheduler.CLASSES))
+
+
+def _read(network: Network, folder: Path, dtype: str | None) -> tuple[Any, Params]:
+    inside = files.component(folder, network.folder)
+    config = network.config(settings(network, folder), str(inside / CONFIG))
+    entries, source = network.entries(config), files.open_folder(inside)
+    total = sum(place.size for _, place in source.places.values())
+    with Meter(f"read {network.folder}", total // MEGABYTE, "MiB") as meter:
+        told = _Told(meter)
+        return config, assemble.read(entries, source, network.like(config), dtype, told.bytes)
+
+
+def stored_specs(
+    network: Network, folder: Path, dtype: str | None
+) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return shape and dtype of every leaf that reading a network will give, by path."""
+    config = network.config(settings(network, folder), network.folder)
+    source = files.open_folder(files.component(folder, network.folder))
+    entries, like = network.entries(config), network.like(config)
+    assemble.require(entries, source, like)
+    return assemble.leaf_specs(entries, source, like, dtype)
+
+
+class _Told:
+    """Tells a meter of bytes in whole megabytes."""
+
+    def __init__(self, meter: Meter):
+        self._meter, self._bytes = meter, 0
+
+    def bytes(self, count: int) -> None:
+        before, self._bytes = self._bytes, self._bytes + count
+        self._meter.advance(self._bytes // MEGABYTE - before // MEGABYTE)
+
+
+def load_transformer(folder: str | Path) -> tuple[DiTConfig, Params]:
+    """Load the transformer of an imported folder.
+
+    Raises:
+        UserError: it is absent or damaged.
+    """
+    return _load(TRANSFORMER, Path(folder))
+
+
+def load_vae(folder: str | Path) -> tuple[VAEConfig, Params]:
+    """Load the VAE of an imported folder; see ``load_transformer``."""
+    return _load(VAE, Path(folder))
+
+
+def load_scheduler(folder: str | Path) -> DiffusionConfig:
+    """Load the scheduler of an imported folder."""
+    return configuration.load(Path(folder) / "scheduler" / CONFIG, DiffusionConfig)
+
+
+def _load(network: Network, folder: Path) -> tuple[Any, Params]:
+    inside = folder / network.folder
+    config = configuration.load(inside / CONFIG, network.ours)
+    params = weights.load(inside / WEIGHTS)
+    weights.check(params, network.like(config), str(inside / WEIGHTS))
+    return config, params
+
+
+def write_network(config: Any, params: Params, folder: Path) -> None:
+    """Write one network in our layout."""
+    folder.mkdir(parents=True)
+    configuration.save(config, folder / CONFIG)
+    weights.save(folder / WEIGHTS, params)
+
+
+def write_diffusers(
+    network: Network,
+    values: dict[str, Any],
+    params: Params,
+    folder: Path,
+    dtype: str | None = None,
+) -> None:
+    """Write one network as diffusers' ``from_pretrained`` reads it.
+
+    Args:
+        network: which.
+        values: its settings in diffusers' words.
+        params: our parameters.
+        folder: to make.
+        dtype: of the tensors; by default that of the parameters.
+    """
+    folder.mkdir(parents=True)
+    output.write_json(folder / CONFIG, values)
+    entries = network.entries(network.config(values, "base.json"))
+    specs = assemble.specs(entries, params, dtype)
+    path = folder / "diffusion_pytorch_model.safetensors"
+    with Meter(f"write {network.folder}", len(specs), "tensors") as meter:
+
+        def tensors():
+            for pair in assemble.write(entries, params, dtype):
+                yield pair
+                meter.advance(1)
+
+        weights.write(path, specs, tensors(), {"format": "pt"})
+
+
+def import_pipeline(
+    src: Path, dst: Path, dtype: str | None, prompts: dict[str, np.ndarray], record: dict[str, Any]
+) -> None:
+    """Write an imported folder, one network at a time.
+
+    Args:
+        src: a diffusers pipeline's folder.
+        dst: the folder to make, not there yet.
+        dtype: of the weights; by default the stored one.
+        prompts: their tokens (L, text_dim) by prompt; empty without a text encoder.
+        record: what ``base.json`` shall hold.
+    """
+    with output.new_folder(dst) as folder:
+        for network in (TRANSFORMER, VAE):
+            write_network(*_read(network, src, dtype), folder / network.folder)
+        (folder / "scheduler").mkdir()
+        configuration.save(read_scheduler(src), folder / "scheduler" / CONFIG)
+        if prompts:
+            stacked = np.stack(list(prompts.values()))
+            kind = np.dtype(jax.numpy.dtype(dtype or "float32"))
+            weights.save(folder / "text" / WEIGHTS, {"prompts_PLC": stacked.astype(kind)})
+        base.save(folder, record)

@@ -1,0 +1,181 @@
+"""The flags of ``python -m pewm_jax.convert`` and what each command does with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+from pewm_jax import cli
+from pewm_jax.config import Config, ConfigError, UserError
+from pewm_jax.convert import base, cogvideox, diffusers_folder, dinov2, output, text, world
+from pewm_jax.convert.cogvideox import TRANSFORMER, VAE
+
+Dtype = Literal["float32", "bfloat16", "float16"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportCogVideoX:
+    """Import a CogVideoX checkpoint in the layout of diffusers.
+
+    With --rgbd --camera the patch embedding and the output layer are widened for a world model:
+    depth, the observed frame and the camera come in, depth comes out; --memory adds the blocks
+    that read the map. The result is a folder that `pewm_jax.load` and `train.py --train.start`
+    read; until it is trained, the colours it makes are those of the original. Without these flags
+    the networks are only brought into our layout.
+    """
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """The pipeline's folder: transformer/, vae/, scheduler/ and, if prompts are to be encoded,
+    text_encoder/ and tokenizer/."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to make."""
+    dtype: Dtype | None = None
+    """Store weights in this precision; by default as they are."""
+    prompt: tuple[str, ...] = ("",)
+    """Prompts to encode and store, by default the empty one; a world model takes one."""
+    rgbd: bool = False
+    """Widen for depth; goes with --camera."""
+    camera: bool = False
+    """Widen for the camera; goes with --rgbd."""
+    memory: bool = False
+    """Add memory blocks, which change nothing until they are trained."""
+    frames: int | None = None
+    """Frames of the world model's clips: 8k + 1; by default 9, or the size of learned positions."""
+    height: int | None = None
+    """Height of its images in pixels; by default 512, or the size of learned positions."""
+    width: int | None = None
+    """Width of its images in pixels; by default 512, or the size of learned positions."""
+    config: Path | None = None
+    """JSON file of other settings of the world model, such as {"memory": {"tokens": 1024}}."""
+    seed: int = 0
+    """Seed of the memory blocks' random weights."""
+
+    def __post_init__(self):
+        """Validate."""
+        if self.rgbd != self.camera:
+            given, lacking = ("rgbd", "camera") if self.rgbd else ("camera", "rgbd")
+            raise ConfigError(
+                f"--{given} was given without --{lacking}: a world model takes both depth and "
+                f"camera; add --{lacking}."
+            )
+        if not self.prompt:
+            raise ConfigError('--prompt was given no prompt; the empty one is --prompt "".')
+        if self.rgbd:
+            if len(set(self.prompt)) > 1:
+                raise ConfigError(
+                    f"--prompt names {len(self.prompt)} prompts: a world model takes one."
+                )
+            return
+        if self.memory:
+            raise ConfigError("--memory was given without --rgbd --camera; add them.")
+        for name in ("frames", "height", "width", "config"):
+            if getattr(self, name) is not None:
+                raise ConfigError(f"--{name} is of a world model; add --rgbd --camera.")
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportDINOv2:
+    """Import DINOv2, the image encoder behind the map."""
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """A folder of transformers (config.json, model.safetensors), or the original repository's
+    state dict (.pth or .safetensors)."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to make."""
+    dtype: Dtype | None = None
+    """Store weights in this precision; by default as they are."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportDiffusers:
+    """Write a folder that the from_pretrained of diffusers loads.
+
+    Of a world model the video model inside is written: memory blocks and the channels of depth
+    and camera stay behind. Text encoder and tokenizer are not written; take the original ones.
+    """
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """An imported folder, a widened one, or a training run that started from one."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to make."""
+    dtype: Dtype | None = None
+    """Store weights in this precision; by default as they are."""
+    base: Path | None = None
+    """Folder with base.json; by default SRC, or the folder that the training started from."""
+
+
+def import_cogvideox(options: ImportCogVideoX) -> None:
+    """Run ``import cogvideox``."""
+    src, dst = options.src, options.dst
+    output.refuse_existing(dst)
+    if not src.is_dir():
+        raise UserError(f"{src} is not a folder; give a diffusers pipeline's folder.")
+    settings = {part.folder: cogvideox.settings(part, src) for part in (TRANSFORMER, VAE)}
+    settings["scheduler"] = cogvideox.scheduler_settings(src)
+    dit = TRANSFORMER.config(settings["transformer"], str(src / "transformer/config.json"))
+    vae = VAE.config(settings["vae"], str(src / "vae/config.json"))
+    diffusion = cogvideox.read_scheduler(src)
+    for network in (TRANSFORMER, VAE):  # what is wrong with the files is said before hours of work
+        cogvideox.stored_specs(network, src, options.dtype)
+    config = None
+    if options.rgbd:
+        size = (options.frames, options.height, options.width)
+        config = world.config_of(dit, vae, diffusion, size, _stored_dtype(options))
+        config = cli.overlay(config, options.config) if options.config else config
+    prompts = text.encode(src, options.prompt, dit.text_length, dit.text_dim)
+    record = base.describe(src, settings, list(prompts), options.dtype)
+    if config is None:
+        cogvideox.import_pipeline(src, dst, options.dtype, prompts, record)
+    else:
+        _import_world(options, config, prompts, record)
+    print(f"{dst}: {_said(options, prompts)}; licence of the original: {record['licence']}")
+
+
+def _import_world(
+    options: ImportCogVideoX, config: Config, prompts: dict[str, np.ndarray], record: dict
+) -> None:
+    prompt = next(iter(prompts.values()), None)
+    config = dataclasses.replace(
+        config,
+        dit=dataclasses.replace(config.dit, prompt="zeros" if prompt is None else "stored"),
+    )
+    world.import_world(
+        options.src,
+        options.dst,
+        config,
+        prompt,
+        record,
+        memory=options.memory,
+        dtype=options.dtype,
+        seed=options.seed,
+    )
+
+
+def _stored_dtype(options: ImportCogVideoX) -> str:
+    """Return the dtype that the transformer's weights will have."""
+    specs = cogvideox.stored_specs(TRANSFORMER, options.src, options.dtype)
+    return specs["proj_out/kernel"].dtype.name
+
+
+def _said(options: ImportCogVideoX, prompts: dict[str, np.ndarray]) -> str:
+    what = "CogVideoX in our layout"
+    if options.rgbd:
+        what = "a world model" + " with memory blocks" * options.memory
+    if not prompts:
+        return f"{what}, no prompt (there is no text_encoder/)"
+    return f"{what}, {len(prompts)} prompt{'s' * (len(prompts) > 1)} encoded"
+
+
+def import_dinov2(options: ImportDINOv2) -> None:
+    """Run ``import dinov2``."""
+    dinov2.convert(options.src, options.dst, options.dtype)
+
+
+def export_diffusers(options: ExportDiffusers) -> None:
+    """Run ``export diffusers``."""
+    diffusers_folder.export(options.src, options.dst, options.base, options.dtype)
+    print(f"{options.dst}: transformer/, vae/, scheduler/ for diffusers' from_pretrained")

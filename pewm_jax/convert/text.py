@@ -1,0 +1,90 @@
+"""Prompts through CogVideoX's text encoder, once, at conversion: T5 is not run afterwards.
+
+As the reference pipeline does: padded with the pad token to the text length, cut there, and no
+mask given, neither to the encoder nor to the transformer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pewm_jax import tree
+from pewm_jax.config import UserError
+from pewm_jax.convert import files, output
+
+
+def encode(src: Path, prompts: Sequence[str], length: int, width: int) -> dict[str, np.ndarray]:
+    """Encode prompts with the ``text_encoder/`` and ``tokenizer/`` of a pipeline's folder.
+
+    Args:
+        src: the pipeline's folder.
+        prompts: the prompts; the empty one is a prompt too.
+        length: text tokens L of the transformer, 226 or 224.
+        width: channels of a text token.
+
+    Returns:
+        The tokens (L, width) in float32 by prompt; empty where the folder has no text encoder.
+
+    Raises:
+        UserError: only one of the two folders, a file that cannot be used, another width, or the
+            libraries are not installed.
+    """
+    encoder, words = src / "text_encoder", src / "tokenizer"
+    there = [folder.is_dir() for folder in (encoder, words)]
+    if not any(there):
+        return {}
+    if not all(there):
+        lone, other = (encoder, words) if there[0] else (words, encoder)
+        raise UserError(f"{lone} is there and {other} is not; copy both, or neither of them.")
+    values = files.read_config(encoder / "config.json", ["t5"], "model_type")
+    if values.get("d_model") != width:
+        raise UserError(
+            f"{encoder}/config.json says d_model {values.get('d_model')} and the transformer takes "
+            f"text of {width} channels; they are not of the same pipeline."
+        )
+    files.open_folder(encoder)  # complete and whole, or a sentence
+    return _encode(encoder, words, prompts, length)
+
+
+def _encode(
+    encoder: Path, words: Path, prompts: Sequence[str], length: int
+) -> dict[str, np.ndarray]:
+    torch, transformers = output.convert_extra("torch"), output.convert_extra("transformers")
+    try:
+        tokenizer = transformers.AutoTokenizer.from_pretrained(words, local_files_only=True)
+    except (OSError, ValueError, KeyError, TypeError, ImportError, AttributeError) as error:
+        raise UserError(f"{words} cannot be read as a tokenizer ({_first(error)}).") from None
+    try:
+        model, report = transformers.T5EncoderModel.from_pretrained(
+            encoder, local_files_only=True, dtype="auto", output_loading_info=True
+        )
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise UserError(f"{encoder} cannot be read as a T5 encoder ({_first(error)}).") from None
+    wrong = {*report["missing_keys"], *report["unexpected_keys"]}
+    if wrong:
+        raise UserError(
+            f"{encoder} does not hold a T5 encoder: missing or of no use are "
+            f"{tree.listing(map(str, wrong))}."
+        )
+    out: dict[str, np.ndarray] = {}
+    with torch.inference_mode():
+        for prompt in prompts:
+            ids = tokenizer(
+                prompt,
+                padding="max_length",
+                max_length=length,
+                truncation=True,
+                add_special_tokens=True,
+                return_tensors="pt",
+            ).input_ids
+            out[prompt] = model.eval()(ids)[0][0].float().numpy()
+    return out
+
+
+def _first(error: Exception) -> str:
+    """Return the first sentence of a library's message."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0].rstrip(".:")

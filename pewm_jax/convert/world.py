@@ -1,0 +1,136 @@
+"""A CogVideoX checkpoint as a world model that ``pewm_jax.load`` reads, before any training.
+
+The folder is written part by part, so that no more than one network is in memory at a time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax import config as configuration
+from pewm_jax import tree, weights
+from pewm_jax.config import (
+    ClipConfig,
+    CodecConfig,
+    Config,
+    DiffusionConfig,
+    DiTConfig,
+    TrainConfig,
+    VAEConfig,
+)
+from pewm_jax.convert import base, cogvideox, output, widen
+from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS
+from pewm_jax.models import world_model
+from pewm_jax.types import Array, Params
+
+
+def config_of(
+    dit: DiTConfig,
+    vae: VAEConfig,
+    diffusion: DiffusionConfig,
+    size: tuple[int | None, int | None, int | None],
+    dtype: str | None,
+) -> Config:
+    """Return the settings of the world model around a video model.
+
+    Args:
+        dit: the video model's transformer.
+        vae: its VAE.
+        diffusion: its scheduler.
+        size: frames, height and width of a clip; None for the paper's 9 × 512 × 512, or, where
+            positions are learned for one size, for that size.
+        dtype: of the weights: 16 bits are computed in bfloat16.
+
+    Raises:
+        ConfigError: a size that the network cannot take.
+    """
+    usual = (9, 512, 512)
+    if dit.positions == "rope_learned":
+        scale = vae.spatial
+        usual = (dit.sample_frames, dit.sample_height * scale, dit.sample_width * scale)
+    frames, height, width = (
+        value if given is None else given for given, value in zip(size, usual, strict=True)
+    )
+    return Config(
+        clip=ClipConfig(frames=frames, height=height, width=width),
+        codec=CodecConfig(kind="vae", spatial=vae.spatial, temporal=vae.temporal, vae=vae),
+        dit=dataclasses.replace(dit, in_channels=0, out_channels=0),
+        diffusion=diffusion,
+        train=TrainConfig(dtype="float32" if dtype in (None, "float32") else "bfloat16"),
+    )
+
+
+def import_world(
+    src: Path,
+    dst: Path,
+    config: Config,
+    prompt_LC: np.ndarray | None,
+    record: dict[str, Any],
+    *,
+    memory: bool,
+    dtype: str | None = None,
+    seed: int = 0,
+) -> None:
+    """Write the folder: ``config.json``, ``weights.safetensors``, ``base.json``.
+
+    Args:
+        src: a diffusers pipeline's folder.
+        dst: the folder to make.
+        config: the world model, from ``config_of``.
+        prompt_LC: (L, text_dim) tokens of the prompt, None without a text encoder.
+        record: what ``base.json`` shall hold.
+        memory: add memory blocks.
+        dtype: of the weights; by default the stored one, and float32 for memory blocks.
+        seed: of the memory blocks.
+    """
+    old = TRANSFORMER.config(record["transformer"], base.BASE)
+    channels = world_model.camera_channels(config)
+    plan = widen.plan(old, config.codec.vae.latent_channels, channels)
+    key = jax.random.key(seed)
+    new_dtype = np.dtype(jax.numpy.dtype(dtype or "float32"))
+
+    def backbone() -> Params:
+        return widen.widen(plan, cogvideox.read_transformer(src, dtype)[1])
+
+    def blocks() -> Params:
+        params = jax.jit(lambda k: world_model.init_memory(config, k))(key)
+        return jax.tree.map(lambda x: np.asarray(x).astype(new_dtype), params)
+
+    parts: dict[str, tuple[dict[str, jax.ShapeDtypeStruct], Callable[[], Params]]] = {}
+    wide = tree.flatten(TRANSFORMER.like(plan.new))
+    stored = cogvideox.stored_specs(TRANSFORMER, src, dtype)
+    parts["backbone"] = (
+        {p: jax.ShapeDtypeStruct(wide[p].shape, spec.dtype) for p, spec in stored.items()},
+        backbone,
+    )
+    if memory:
+        like = jax.eval_shape(lambda k: world_model.init_memory(config, k), key)
+        flat = tree.flatten(like)
+        parts["memory"] = (
+            {p: jax.ShapeDtypeStruct(leaf.shape, new_dtype) for p, leaf in flat.items()},
+            blocks,
+        )
+    parts["codec"] = (
+        cogvideox.stored_specs(VAE, src, dtype),
+        lambda: cogvideox.read_vae(src, dtype)[1],
+    )
+    if prompt_LC is not None:
+        tokens: Array = prompt_LC.astype(new_dtype)
+        like = jax.ShapeDtypeStruct(tokens.shape, tokens.dtype)
+        parts["text"] = ({"prompt_LC": like}, lambda: {"prompt_LC": tokens})
+
+    def tensors() -> Iterator[tuple[str, Array]]:
+        for part, (_, make) in parts.items():
+            yield from tree.flatten({part: make()}).items()
+
+    specs = {f"{part}/{p}": spec for part, (like, _) in parts.items() for p, spec in like.items()}
+    with output.new_folder(dst) as folder:
+        weights.write(folder / WEIGHTS, specs, tensors(), weights.header({"stage": "0"}))
+        configuration.save(config, folder / CONFIG)
+        base.save(folder, record)
