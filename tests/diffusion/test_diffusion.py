@@ -249,7 +249,7 @@ def test_the_world_model_samples_by_dpm_with_its_own_noise():
     frames = objective.as_signal(clip.frames)
     camera = jax.tree.map(jnp.asarray, frames.camera)
     first = (frames.rgb_THWC[:, 0], frames.depth_THW[:, 0])
-    conditioning = world_model.condition(config, *first, camera)
+    conditioning = world_model.condition(config, params, *first, camera)
     noise = jax.random.normal(key, (1, 3, 4, 6, 256))
     draw = [
         sampler.sample(config, params, conditioning, None, noise, jax.random.key(k))
