@@ -1,0 +1,205 @@
+"""Image features of a whole data set, computed once and kept: for encoders dearer than a read.
+
+A cache is a folder per split with one safetensors file per episode, ``features_ThwF``, and
+``cache.json``, written last: which encoder weights, which preprocessing and which data it holds,
+each by a hash or its settings. Whoever opens it says what he would compute himself; where that
+differs the cache is stale, and refused. ``feature_build`` fills it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from pewm_jax import config as configuration
+from pewm_jax import tree, weights
+from pewm_jax.config import MemoryConfig, UserError
+from pewm_jax.data.dataset import Manifest, read_manifest
+from pewm_jax.data.episodes import Episode
+from pewm_jax.models import dinov2
+from pewm_jax.types import Params
+
+MANIFEST = "cache.json"
+UNFINISHED = "caching.json"
+"""Lies in a cache while it is being filled, and says with what."""
+TENSOR = "features_ThwF"
+VERSION = 1
+Dtype = Literal["float16", "bfloat16", "float32"]
+
+
+@dataclasses.dataclass(frozen=True)
+class FeatureCache:
+    """An opened cache of one split; see ``open_cache`` and ``features``.
+
+    Attributes:
+        path: its folder.
+        made_of: the fingerprint of encoder, preprocessing and data.
+        files: episode name → (file name, frames).
+    """
+
+    path: Path
+    made_of: Mapping[str, Any]
+    files: Mapping[str, tuple[str, int]]
+
+
+def fingerprint(config: MemoryConfig, params: Params, data: Manifest) -> dict[str, Any]:
+    """Return what features depend on: encoder, weights, preprocessing, data.
+
+    Weights count by their float32 values, whatever dtype they are stored in; data by the hashes of
+    the split's shards.
+
+    Args:
+        config: names the encoder and how pictures are shown to it.
+        params: the encoder's parameters, empty where it has none.
+        data: the split's manifest.
+    """
+    if config.encoder == "dinov2":
+        network: dict[str, Any] = configuration.to_dict(config.dinov2)
+        preprocessing: dict[str, Any] = {
+            "size": config.encoder_size,
+            "resize": "bicubic, antialiased",
+            "mean": list(dinov2.MEAN_3),
+            "std": list(dinov2.STD_3),
+        }
+    else:
+        network, preprocessing = {}, {"patch": config.encoder_patch}
+    digest = hashlib.sha256()
+    for path, leaf in sorted(tree.flatten(params).items()):
+        values = np.ascontiguousarray(jax.device_get(leaf), np.float32)
+        digest.update(f"{path} {values.shape}".encode())
+        digest.update(values.data)
+    shards = "\n".join(shard.sha256 for shard in data.shards)
+    return {
+        "encoder": config.encoder,
+        "network": network,
+        "weights": digest.hexdigest(),
+        "preprocessing": preprocessing,
+        "data": hashlib.sha256(shards.encode()).hexdigest(),
+    }
+
+
+def open_cache(path: Path, config: MemoryConfig, params: Params, data: Path) -> FeatureCache:
+    """Open a finished cache, if it holds what this encoder makes of this data.
+
+    Args:
+        path: the cache of one split.
+        config: names the encoder and how pictures are shown to it.
+        params: the encoder's parameters, empty where it has none.
+        data: the split that it should belong to.
+
+    Raises:
+        UserError: it is absent, unfinished, damaged, or stale: of other weights, other
+            preprocessing or other data.
+    """
+    cache = read(path)
+    refuse_stale(path, cache.made_of, fingerprint(config, params, read_manifest(data)))
+    return cache
+
+
+def features(
+    cache: FeatureCache, episode: Episode | str, frame_indices: Sequence[int] | np.ndarray
+) -> np.ndarray:
+    """Return the features of some frames, read from disk and nothing else of the episode.
+
+    Args:
+        cache: from ``open_cache``.
+        episode: an episode of its data, or the name of one.
+        frame_indices: (T,) frame numbers, in any order.
+
+    Returns:
+        (T, h, w, F) in the stored dtype.
+
+    Raises:
+        UserError: the cache has no such episode or frame, or its file is damaged.
+    """
+    name = episode if isinstance(episode, str) else episode.name
+    if name not in cache.files:
+        raise UserError(f"{cache.path} has no features of episode {name}; make it again.")
+    file, frames = cache.files[name]
+    chosen = np.asarray(frame_indices, np.int64)
+    if chosen.size and not (chosen.min() >= 0 and chosen.max() < frames):
+        raise UserError(
+            f"{cache.path} has {frames} frames of episode {name}, not frames {chosen.min()} to "
+            f"{chosen.max()}."
+        )
+    place = _place(cache.path / file)
+    stored = np.memmap(cache.path / file, np.uint8, "r", place.begin, (place.size,))
+    return stored.view(place.dtype).reshape(place.shape)[chosen]
+
+
+def refuse_stale(path: Path, have: Mapping[str, Any], want: Mapping[str, Any]) -> None:
+    """Refuse what was made of something else, and say of what.
+
+    Raises:
+        UserError: two fingerprints differ.
+    """
+    again = "make it again with `python -m pewm_jax.memory cache` in a new folder"
+    for key in ("encoder", "network", "preprocessing"):
+        old, new = have.get(key), want[key]
+        if old != new:
+            if isinstance(old, dict) and isinstance(new, dict):
+                names = sorted(n for n in old.keys() | new.keys() if old.get(n) != new.get(n))
+                old, new = ({n: d.get(n) for n in names} for d in (old, new))
+            words = {"network": "another network", "encoder": "another encoder"}
+            raise UserError(
+                f"{path} is stale: it was made with {words.get(key, f'other {key}')} ({old}, now "
+                f"{new}); {again}."
+            )
+    for key, what in (("weights", "other encoder weights"), ("data", "other data")):
+        if have.get(key) != want[key]:
+            raise UserError(
+                f"{path} is stale: it was made with {what} (hash {str(have.get(key))[:12]}, now "
+                f"{want[key][:12]}); {again}."
+            )
+
+
+def read(path: Path) -> FeatureCache:
+    """Open a finished cache, stale or not.
+
+    Raises:
+        UserError: it is absent, unfinished, damaged or of another version.
+    """
+    if not (path / MANIFEST).is_file():
+        begun = (path / UNFINISHED).is_file()
+        hint = "is not finished: the command that makes it goes on" if begun else "is no cache"
+        raise UserError(
+            f"{path} {hint}; make it with `python -m pewm_jax.memory cache DATA {path}`."
+        )
+    value = read_json(path / MANIFEST)
+    try:
+        version, made_of = value["version"], value["made_of"]
+        files = {name: (str(file), int(frames)) for name, (file, frames) in value["files"].items()}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"{path / MANIFEST} does not parse ({error!r}); make it again.") from None
+    if version != VERSION:
+        raise UserError(f"{path} has format version {version}, this is {VERSION}; make it again.")
+    return FeatureCache(path, made_of, files)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON table.
+
+    Raises:
+        UserError: it is none.
+    """
+    try:
+        value = json.loads(path.read_text("utf-8"))
+    except ValueError as error:
+        raise UserError(f"{path} is not valid JSON ({error}); make the cache again.") from None
+    if not isinstance(value, dict):
+        raise UserError(f"{path} holds no table; make the cache again.")
+    return value
+
+
+def _place(path: Path) -> weights.Place:
+    places = weights.places(path)
+    if TENSOR not in places:
+        raise UserError(f"{path} holds no {TENSOR}; make the cache again.")
+    return places[TENSOR]
