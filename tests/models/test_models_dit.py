@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.config import PUBLISHED, ConfigError, DiTConfig, UserError, published
-from pewm_jax.models import dit, layers, positions
+from pewm_jax.models import dit, layers, positions, world_model
 from tests.helpers import randomise, tiny_config
+from tests.models.test_models_world_model import setup as world
 
 CONFIG = dataclasses.replace(tiny_config().dit, in_channels=5, out_channels=7)
 
@@ -22,7 +23,11 @@ def inputs(config=CONFIG, shape=(3, 4, 6), seed=0):
 
 
 def random_params(config=CONFIG):
-    return randomise(dit.init(config, jax.random.key(0)))
+    shapes = jax.eval_shape(lambda: dit.init(config, jax.random.key(0)))
+    return randomise(jax.tree.map(lambda x: jnp.zeros(x.shape), shapes))
+
+
+run = jax.jit(dit.apply, static_argnums=0, static_argnames="expert")
 
 
 @settings(max_examples=15, deadline=None)
@@ -42,8 +47,8 @@ def test_unpatchify_inverts_patchify(t, h, w, p, p_t, c):
 
 
 def test_a_fresh_network_predicts_zero():
-    params = dit.init(CONFIG, jax.random.key(0))
-    out = dit.apply(CONFIG, params, *inputs())
+    params = jax.jit(dit.init, static_argnums=0)(CONFIG, jax.random.key(0))
+    out = run(CONFIG, params, *inputs())
     assert out.shape == (2, 3, 4, 6, 7)
     np.testing.assert_array_equal(out, 0)
 
@@ -51,31 +56,27 @@ def test_a_fresh_network_predicts_zero():
 def test_samples_of_a_batch_do_not_see_each_other():
     latents, text, times = inputs()
     params = random_params()
-    both = dit.apply(CONFIG, params, latents, text, times)
-    alone = dit.apply(CONFIG, params, latents[1:], text[1:], times[1:])
-    np.testing.assert_allclose(both[1:], alone, atol=1e-5)
+    both = run(CONFIG, params, latents, text, times)
+    other = run(CONFIG, params, latents.at[0].add(1), text.at[0].add(1), times.at[0].add(9))
+    np.testing.assert_array_equal(both[1], other[1])
+    assert np.abs(both[0] - other[0]).max() > 1e-3
 
 
 def test_everything_given_matters():
     params = random_params()
     latents, text, times = inputs()
-    base = dit.apply(CONFIG, params, latents, text, times)
+    base = run(CONFIG, params, latents, text, times)
     for changed in (
         (latents.at[:, 0, 0, 0, 0].add(1), text, times),
         (latents, text.at[:, 0, 0].add(1), times),
         (latents, text, times + 50),
     ):
-        out = dit.apply(CONFIG, params, *changed)
+        out = run(CONFIG, params, *changed)
         assert np.abs(out - base)[:, -1, -1, -1].max() > 1e-6, "the far corner must hear of it"
 
 
-def test_scan_and_remat_equal_a_plain_loop():
-    params = random_params()
-    latents, text, times = inputs()
-    scanned = dit.apply(CONFIG, params, latents, text, times)
-    remat = dataclasses.replace(CONFIG, remat=True)
-    np.testing.assert_allclose(dit.apply(remat, params, latents, text, times), scanned, atol=1e-5)
-
+def plain_loop(params, latents, text, times):
+    """The same network without scan."""
     ends = dit.Ends(CONFIG, 7, jnp.dtype("float32"))
     rest = {"params": {k: v for k, v in params.items() if k != "blocks"}}
     patches = dit.patchify(latents, 2)
@@ -86,25 +87,66 @@ def test_scan_and_remat_equal_a_plain_loop():
         layer = jax.tree.map(lambda x, i=i: x[i], params["blocks"])
         tokens = dit.Block(CONFIG).apply({"params": layer}, tokens, time, angles, length)
     out = ends.apply(rest, tokens[:, length:], time, method="project")
-    np.testing.assert_allclose(dit.unpatchify(out, 3, 4, 6, 2), scanned, atol=1e-5)
+    return dit.unpatchify(out, 3, 4, 6, 2)
+
+
+def test_scan_and_remat_equal_a_plain_loop():
+    params, given = random_params(), inputs()
+    looped = jax.jit(plain_loop)(params, *given)
+    np.testing.assert_allclose(run(CONFIG, params, *given), looped, atol=1e-5)
+    remat = dataclasses.replace(CONFIG, remat=True)
+    np.testing.assert_allclose(run(remat, params, *given), looped, atol=1e-5)
+
+
+def add_gate(gate, video, time):
+    """An expert whose parameter is a number."""
+    assert video.shape == (2, 18, CONFIG.width)
+    return video + gate * time.mean()
 
 
 def test_an_expert_reads_and_writes_the_video_tokens_alone():
-    params = random_params()
-    given = inputs()
-    plain = dit.apply(CONFIG, params, *given)
-    gates = jnp.zeros(CONFIG.layers)
+    params, given = random_params(), inputs()
+    plain = run(CONFIG, params, *given)
 
-    def expert(gate, video, time):
-        assert video.shape == (2, 18, CONFIG.width)
-        return video + gate * time.mean()
+    @jax.jit
+    def value_and_slope(gates):
+        def out(gates):
+            return dit.apply(CONFIG, params, *given, expert=add_gate, expert_params=gates)
 
-    def run(gates):
-        return dit.apply(CONFIG, params, *given, expert=expert, expert_params=gates)
+        return out(gates), jax.grad(lambda g: out(g).std())(gates)
 
-    np.testing.assert_array_equal(run(gates), plain)
-    slope = jax.grad(lambda g: run(g).std())(gates)
+    closed, slope = value_and_slope(jnp.zeros(CONFIG.layers))
+    np.testing.assert_allclose(closed, plain, atol=1e-6)
     assert np.all(np.abs(slope) > 0), "every layer's expert is asked"
+
+
+def test_with_closed_memory_gates_stage_2_is_stage_1_and_feels_no_map():
+    config, conditioning, tokens, noisy, times = world("sinusoid")
+    params = randomise(world_model.init(config, jax.random.key(0)))
+    stage1 = {"backbone": params["backbone"]}
+    linear = params["memory"]["blocks"]["linear"]
+    closed = jax.tree.map(jnp.zeros_like, linear)
+
+    def out(linear, features):
+        blocks = {**params["memory"]["blocks"], "linear": linear}
+        memory = {**params["memory"], "blocks": blocks}
+        seen = dataclasses.replace(tokens, features_MF=features)
+        both = {**stage1, "memory": memory}
+        return world_model.apply(config, both, noisy, conditioning, times, seen)
+
+    @jax.jit
+    def compare(linear):
+        plain = world_model.apply(config, stage1, noisy, conditioning, times)
+        slope = jax.grad(lambda *a: out(*a).std(), (0, 1))(linear, tokens.features_MF)
+        return plain, out(linear, tokens.features_MF), slope
+
+    plain, same, (gates, features) = compare(closed)
+    np.testing.assert_allclose(same, plain, rtol=1e-5, atol=1e-6)
+    assert not np.asarray(features).any(), "nothing of the map comes through"
+    assert np.asarray(gates["bias"]).any(), "and the gates can open"
+    _, other, (_, features) = compare(linear)
+    assert np.abs(other - plain).max() > 1e-3
+    assert np.asarray(features).any()
 
 
 def test_rotary_embedding_makes_attention_relative():
@@ -172,10 +214,11 @@ def test_text_and_ofs_that_do_not_fit_are_refused():
 def test_the_second_scalar_is_two_unless_given():
     config = dataclasses.replace(small("1.5-5B-I2V"), time_dim=16, ofs_dim=16)
     params, given = random_params(config), inputs(config, (2, 4, 6))
-    run = jax.jit(lambda ofs: dit.apply(config, params, *given, ofs))
-    base = dit.apply(config, params, *given)
-    np.testing.assert_allclose(run(jnp.full(2, 2.0)), base, rtol=1e-4, atol=1e-4)
-    assert np.abs(run(jnp.array([2.0, 1.0])) - base).max(axis=(1, 2, 3, 4)).tolist()[1] > 1e-3
+    two = run(config, params, *given, jnp.full(2, 2.0))
+    np.testing.assert_allclose(run(config, params, *given), two, rtol=1e-4, atol=1e-4)
+    one = run(config, params, *given, jnp.array([2.0, 1.0]))
+    moved = np.abs(one - two).max(axis=(1, 2, 3, 4))
+    assert moved[0] == 0 < moved[1]
 
 
 def test_channels_left_open_need_a_world_model():
