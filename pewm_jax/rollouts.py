@@ -82,8 +82,8 @@ def start(config: Config, params: Params, frames: Frames) -> WorldState:
             f"{intrinsics.shape}; give ({count}, 4, 4) and ({count}, 4)."
         )
     frames = jax.tree.map(jnp.asarray, objective.as_signal(frames))
-    memory_after = objective.remember(config, params, frames, jnp.ones((count,), bool))
-    return WorldState(jax.tree.map(lambda x: x[-1:], frames), memory_after)
+    remembered = objective.remember(config, params, frames, jnp.ones((count,), bool))
+    return WorldState(jax.tree.map(lambda x: x[-1:], frames), remembered)
 
 
 def imagine_clip(
@@ -106,7 +106,8 @@ def imagine_clip(
         memory: False ignores the map (it is still updated).
 
     Returns:
-        The next state and T − 1 frames, colours float in [−1, 1].
+        The next state and T − 1 frames, colours float in [−1, 1]. A denoiser that works without
+        depth (``memory.depth``) imagines none: 0 everywhere, which no map keeps.
     """
     frame = state.frame
     poses = action_geometry.integrate(frame.camera.world_from_camera[0], actions_T3)
@@ -127,11 +128,12 @@ def imagine_clip(
         jax.random.fold_in(key, 1),
     )
     rgb, depth = codec.decode_rgbd(config, params, latents)
+    depth = depth if config.memory.depth else jnp.zeros_like(depth)
     future = Camera(intrinsics[1:], poses[1:])
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
     features = image_features.encode(config.memory, params.get("encoder", {}), frames.rgb_THWC)
-    memory_after = memories.remember(config, state.map, frames, features)
-    return WorldState(jax.tree.map(lambda x: x[-1:], frames), memory_after), frames
+    remembered = memories.remember(config, state.map, frames, features)
+    return WorldState(jax.tree.map(lambda x: x[-1:], frames), remembered), frames
 
 
 def rollout(

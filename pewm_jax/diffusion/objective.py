@@ -18,9 +18,7 @@ def as_signal(frames: Frames) -> Frames:
     return Frames(codec.signal_from_rgb(frames.rgb_THWC), frames.depth_THW, frames.camera)
 
 
-def remember(
-    config: Config, params: Params, context: Frames, valid_S: Array
-) -> memories.Memory:
+def remember(config: Config, params: Params, context: Frames, valid_S: Array) -> memories.Memory:
     """Build the memory of one world from its context frames.
 
     The grid is centred on the last valid context frame's camera.
@@ -64,6 +62,7 @@ def loss(
     Returns:
         ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of x0, averaged over
         everything with valid depth; for target v or ε the plain squared error of the target.
+        Where the denoiser works without depth (``memory.depth``), colour alone counts.
     """
     frames = as_signal(clip.frames)
     x0 = codec.encode_rgbd(config, params, frames.rgb_THWC, frames.depth_THW)
@@ -93,6 +92,8 @@ def loss(
     measured = jnp.broadcast_to(codec.measured(config, frames.depth_THW), error[..., split:].shape)
     rgb = error[..., :split].mean()
     depth = (error[..., split:] * measured).sum() / jnp.maximum(measured.sum(), 1)
+    if not config.memory.depth:
+        return rgb, {"loss_rgb": rgb, "loss_depth": depth}
     channels = error.shape[-1]
     total = (rgb * split + depth * (channels - split)) / channels
     return total, {"loss_rgb": rgb, "loss_depth": depth}

@@ -83,9 +83,7 @@ def condition(
     """
     batch = rgb_BHWC.shape[0]
     frames, h, w = codec.latent_shape(config)
-    first = codec.encode_rgbd(
-        config, params, rgb_BHWC[:, None], depth_BHW[:, None], condition=True
-    )
+    first = codec.encode_rgbd(config, params, rgb_BHWC[:, None], depth_BHW[:, None], condition=True)
     padding = jnp.zeros((batch, frames - 1, h, w, first.shape[-1]), first.dtype)
     clip = config.clip
     rays = jax.vmap(
@@ -232,6 +230,17 @@ def apply(
         expert_params=expert_params,
     )
     return _seen(config, out[:, missing:].astype(jnp.float32))
+
+
+def _seen(config: Config, latents_C: Array) -> Array:
+    """Blank the depth channels of latents where the denoiser works without depth.
+
+    They stay, so that both variants have the same parameters.
+    """
+    if config.memory.depth:
+        return latents_C
+    colour = np.arange(latents_C.shape[-1]) < codec.rgb_channels(config)
+    return jnp.where(colour, latents_C, 0)
 
 
 def flops_per_clip(config: Config, *, memory: bool) -> float:
