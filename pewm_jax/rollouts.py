@@ -37,7 +37,7 @@ def load(path: str | Path) -> tuple[Config, Params]:
         path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``.
 
     Returns:
-        ``(config, params)``; the averaged weights that inference uses, float32.
+        ``(config, params)``; the averaged weights that inference uses, in the dtype of the file.
 
     Raises:
         UserError: something is absent or damaged, or the weights do not fit the configuration.

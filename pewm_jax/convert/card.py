@@ -1,0 +1,179 @@
+"""The card of exported weights: what they are, what they saw, how good they are, whose base."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax.config import Config, UserError
+from pewm_jax.data.dataset import read_manifest
+from pewm_jax.evaluation.page import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, number
+from pewm_jax.types import Params
+
+TRAINED_ON = "train"
+"""The split that training reads."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """What a card is written from.
+
+    Attributes:
+        name: its heading.
+        version: of this library.
+        config: the run's settings.
+        params: its weights.
+        stage: number of the last finished stage, "0" for converted weights before any training.
+        step: steps of that stage.
+        base: what ``base.json`` says of the checkpoint the run started from, if it did.
+        metrics: what the report of these weights says, if there is one.
+    """
+
+    name: str
+    version: str
+    config: Config
+    params: Params
+    stage: str | None
+    step: str | None
+    base: Mapping[str, Any] | None
+    metrics: Mapping[str, Any] | None
+
+
+def write(facts: Facts) -> str:
+    """Return the card in Markdown."""
+    sections = [
+        f"# {facts.name}",
+        _what(facts),
+        _use(facts),
+        _data(facts.config),
+        _training(facts),
+        _scores(facts.metrics),
+        _licence(facts),
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def _what(facts: Facts) -> str:
+    config, clip = facts.config, facts.config.clip
+    counts = {
+        part: sum(np.size(leaf) for leaf in jax.tree.leaves(tree))
+        for part, tree in facts.params.items()
+    }
+    rows = [f"| {part} | {count / 1e6:.2f} |" for part, count in counts.items()]
+    memory = f"a memory of kind `{config.memory.kind}`"
+    if "memory" not in facts.params:
+        memory = "no memory (only its first stage is trained)"
+    size = f"{clip.frames} frames of {clip.width} × {clip.height} pixels"
+    table = "\n".join(["| part | million parameters |", "|---|---:|", *rows])
+    return (
+        "A persistent embodied world model: given posed RGB-D frames and an agent's actions, it "
+        f"imagines what the agent will see, colour and depth, in clips of {size}, with {memory}, "
+        f"image features `{config.memory.encoder}` and codec `{config.codec.kind}`."
+        f"\n\n{table}\n\n"
+        "Weights are the moving average of training where it trained and the unchanged base "
+        f"elsewhere, rounded to bfloat16; they compute in {config.train.dtype}. Written by "
+        f"pewm_jax {facts.version}."
+    )
+
+
+def _use(facts: Facts) -> str:
+    clip, actions = facts.config.clip, facts.config.actions
+    length = clip.frames - 1
+    return f"""## Use
+
+```python
+import jax
+import pewm_jax
+
+config, params = pewm_jax.load("{facts.name}")
+state = pewm_jax.start(config, params, frames)  # pewm_jax.Frames, {clip.height} × {clip.width}
+state, imagined = pewm_jax.rollout(config, params, state, [0] * {length}, jax.random.key(0))
+```
+
+Actions: 0 forward {actions.step_m:g} m, 1 left and 2 right {actions.turn_deg:g}°, or floats
+(dx, dy, dyaw); {length} a clip. Sampling: {facts.config.diffusion.sampler}, \
+{facts.config.diffusion.sample_steps} steps."""
+
+
+def _data(config: Config) -> str:
+    name = Path(config.data.path).name
+    try:
+        manifest = read_manifest(Path(config.data.path) / TRAINED_ON, check_files=False)
+    except UserError:
+        size = "which is not there any more to be counted"
+    else:
+        made = manifest.settings.get("made_by")
+        how = f", made by `{made}`" if made else ""
+        size = f"split `{TRAINED_ON}`: {manifest.records} episodes, {manifest.frames} frames{how}"
+    return (
+        f"## Data\n\n`{name}`, {size}. Clips take every {config.data.stride_min} to "
+        f"{config.data.stride_max} actions a frame, with up to {config.data.context} earlier "
+        "frames as context."
+    )
+
+
+def _training(facts: Facts) -> str:
+    train = facts.config.train
+    head = "## Training\n\n"
+    if facts.stage == "0":
+        return head + "None: these are converted weights, before any training."
+    rows = ["| stage | steps | batch | learning rate | what learns |", "|---|---:|---:|---:|---|"]
+    for number_, stage, what in (
+        ("1", train.stage1, "the backbone"),
+        ("2", train.stage2, "the memory blocks"),
+    ):
+        if stage.steps == 0:
+            done = "–"
+        elif number_ == facts.stage and facts.step is not None:
+            done = facts.step
+        else:
+            done = str(stage.steps) if number_ < (facts.stage or "") else f"0 of {stage.steps}"
+        rows.append(f"| {number_} | {done} | {stage.batch} | {stage.learning_rate:g} | {what} |")
+    tail = f"\n\nMoving average {train.ema:g}, seed {train.seed}, target {{}}.".format(
+        facts.config.diffusion.target
+    )
+    return head + "\n".join(rows) + tail
+
+
+def _scores(metrics: Mapping[str, Any] | None) -> str:
+    head = "## Scores\n\n"
+    if metrics is None:
+        return head + "None: these weights have no report; `python evaluate.py RUN` makes one."
+    protocol = metrics["protocol"]
+    rows = [
+        "| pixels | method | " + " | ".join(name for name, _ in METRIC_NAMES.values()) + " |",
+        "|---|---|" + "---:|" * len(METRIC_NAMES),
+    ]
+    for mask, where in MASK_NAMES.items():
+        for method, label in METHOD_NAMES.items():
+            scores = metrics["results"][method][mask]
+            cells = [number(scores[m], digits) for m, (_, digits) in METRIC_NAMES.items()]
+            rows.append(f"| {where} | {label} | " + " | ".join(cells) + " |")
+    new = {True: "none of which", False: "some of which", None: "of which it is not known which"}
+    said = (
+        f"\n\nMeasured before rounding: {protocol['clips']} clips in {protocol['scenes']} scenes, "
+        f"{new[protocol['held_out']]} it was trained in, seeds "
+        f"{', '.join(map(str, protocol['seeds']))}, {protocol['sampling_steps']} sampling steps, "
+        f"protocol {protocol['fingerprint'][:12]}."
+    )
+    return head + "\n".join(rows) + said
+
+
+def _licence(facts: Facts) -> str:
+    head = "## Licence\n\n"
+    if facts.base is None:
+        return head + (
+            "Trained from random weights: whoever trained them chooses a licence, and answers for "
+            "the data."
+        )
+    name = facts.base.get("name", "a converted checkpoint")
+    said = facts.base.get("licence", "not stated")
+    return head + (
+        f"Made from `{name}`, whose licence is: {said}. It binds what is made from it, these "
+        "weights included."
+    )

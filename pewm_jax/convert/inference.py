@@ -1,0 +1,125 @@
+"""A training run → a folder for inference: averaged weights in bfloat16, settings, and a card.
+
+::
+
+    DST/config.json           the run's settings
+        weights.safetensors   every leaf of the run's weights, floats rounded to bfloat16
+        base.json             where the run has one: the checkpoint it was made from
+        README.md             the card
+
+``pewm_jax.load(DST)`` returns the leaves as they are stored, bfloat16, which halves the memory;
+the networks compute in ``train.dtype`` all the same, because every layer casts its weights to it.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax import __version__, rollouts, tree, weights
+from pewm_jax import config as configuration
+from pewm_jax.config import Config, UserError
+from pewm_jax.convert import card, files, output
+from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.evaluation.report import METRICS
+from pewm_jax.training import runs
+from pewm_jax.types import Params
+
+CARD = "README.md"
+REPORT = Path("report") / METRICS
+
+
+def export(run: Path, dst: Path, *, say: Callable[[str], Any] = print) -> Path:
+    """Write what inference needs of a training run into a new folder.
+
+    The run's weights file already holds the moving average where the run trained and the frozen
+    weights elsewhere. The folder is written aside and renamed when it is complete.
+
+    Args:
+        run: a run folder made by ``train.py`` (or a converted checkpoint in the same form).
+        dst: the folder to make.
+        say: told what happens.
+
+    Returns:
+        ``dst``.
+
+    Raises:
+        UserError: ``dst`` exists; or the run is absent, damaged, or has no weights yet.
+    """
+    if not run.is_dir():
+        raise UserError(f"{run} is not a folder; name a run made by train.py.")
+    with output.new_folder(dst) as folder:
+        say(f"reading {run} …")
+        config, params = rollouts.load(run)
+        origin = _base(run, config)
+        words = weights.metadata(run / runs.WEIGHTS)
+        facts = card.Facts(
+            name=dst.name,
+            version=__version__,
+            config=config,
+            params=params,
+            stage=words.get("stage"),
+            step=words.get("step"),
+            base=files.read_json(origin) if origin else None,
+            metrics=_metrics(run),
+        )
+        total = sum(np.size(leaf) for leaf in jax.tree.leaves(params))
+        say(f"writing {total / 1e6:.1f} million parameters in bfloat16 …")
+        _write(folder / runs.WEIGHTS, params, {**words, "dtype": "bfloat16"})
+        configuration.save(config, folder / runs.CONFIG)
+        if origin:
+            shutil.copyfile(origin, folder / runs.BASE)
+        (folder / CARD).write_text(card.write(facts), encoding="utf-8")
+    say(f"{dst} is ready: pewm_jax.load({str(dst)!r})")
+    return dst
+
+
+def narrow(leaf: Any) -> np.ndarray:
+    """Return an array with floats rounded to bfloat16; everything else as it is."""
+    array = np.asarray(leaf)
+    return array.astype(jnp.bfloat16) if jnp.issubdtype(array.dtype, jnp.floating) else array
+
+
+def _write(path: Path, params: Params, words: Mapping[str, str]) -> None:
+    """Write the weights leaf by leaf, so that no second copy of them is held."""
+    leaves = tree.flatten(params)
+    like = {
+        name: jax.ShapeDtypeStruct(
+            np.shape(leaf),
+            jnp.bfloat16 if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf.dtype,
+        )
+        for name, leaf in leaves.items()
+    }
+
+    def narrowed() -> Iterator[tuple[str, np.ndarray]]:
+        for name, leaf in leaves.items():
+            yield name, narrow(leaf)
+
+    weights.write(path, like, narrowed(), weights.header(words))
+
+
+def _base(run: Path, config: Config) -> Path | None:
+    """Return the ``base.json`` of the run, or of the folder it started from, if there is one."""
+    places = [run, *([Path(config.train.start)] if config.train.start else [])]
+    found = [place / runs.BASE for place in places if (place / runs.BASE).is_file()]
+    return found[0] if found else None
+
+
+def _metrics(run: Path) -> dict[str, Any] | None:
+    """Return the metrics of the run's report, if there is one and it is of these weights."""
+    path = run / REPORT
+    if not path.is_file():
+        return None
+    try:
+        found = json.loads(path.read_text("utf-8"))
+        scored = found["protocol"]["weights_sha256"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return found if scored == file_hash(run / runs.WEIGHTS) else None

@@ -1,0 +1,127 @@
+"""A run goes in, a folder that `pewm_jax.load` reads and that describes itself comes out."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pewm_jax
+from pewm_jax import config as configuration
+from pewm_jax import tree, weights
+from pewm_jax.config import ClipConfig, DiffusionConfig, UserError
+from pewm_jax.convert import inference
+from pewm_jax.evaluation.page import MASK_NAMES, METHOD_NAMES, METRIC_NAMES
+from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.models import world_model
+from pewm_jax.training import runs, stages
+from tests.helpers import random_frames, tiny_config
+
+CONFIG = tiny_config(
+    clip=ClipConfig(frames=5, height=16, width=16), diffusion=DiffusionConfig(sample_steps=1)
+)
+METRICS = {
+    "protocol": {
+        "clips": 4,
+        "scenes": 2,
+        "seeds": [0, 1],
+        "sampling_steps": 3,
+        "held_out": True,
+        "fingerprint": "f" * 64,
+    },
+    "results": {
+        method: {
+            mask: {name: {"mean": 12.25, "stderr": None, "n": 4} for name in METRIC_NAMES}
+            for mask in MASK_NAMES
+        }
+        for method in METHOD_NAMES
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def params():
+    like = jax.eval_shape(lambda key: world_model.init(CONFIG, key), jax.random.key(0))
+    rng = np.random.default_rng(0)
+    return jax.tree.map(lambda x: rng.normal(0, 0.2, x.shape).astype(np.float32), like)
+
+
+@pytest.fixture
+def run(params, tmp_path):
+    folder = tmp_path / "runs" / "mine"
+    folder.mkdir(parents=True)
+    configuration.save(CONFIG, folder / runs.CONFIG)
+    runs.publish(folder, stages.STAGES[1], 7, params)
+    return folder
+
+
+def export(run, dst):
+    said = []
+    assert inference.export(run, dst, say=said.append) == dst
+    assert any(str(dst) in line for line in said)
+    return (dst / "README.md").read_text(encoding="utf-8")
+
+
+def test_every_leaf_is_there_in_bfloat16_and_the_world_rolls_on(run, params, tmp_path):
+    card = export(run, tmp_path / "small")
+    config, small = pewm_jax.load(tmp_path / "small")
+    assert config == CONFIG
+    have, want = tree.flatten(small), tree.flatten(params)
+    assert have.keys() == want.keys()
+    for name, leaf in have.items():
+        assert leaf.dtype == jnp.bfloat16, name
+        np.testing.assert_array_equal(leaf, want[name].astype(jnp.bfloat16), name)
+    half = (run / runs.WEIGHTS).stat().st_size * 0.55
+    assert (tmp_path / "small" / runs.WEIGHTS).stat().st_size < half
+    words = weights.metadata(tmp_path / "small" / runs.WEIGHTS)
+    assert words == {"stage": "2", "step": "7", "dtype": "bfloat16"}
+    assert "| 2 | 7 |" in card
+    assert "a memory of kind `voxel`" in card
+
+    frames = random_frames(np.random.default_rng(0), 2, 16, 16)
+    state = pewm_jax.start(config, small, frames)
+    rollout = jax.jit(pewm_jax.rollout, static_argnums=0)
+    after, got = rollout(config, small, state, jnp.zeros((4,), int), jax.random.key(1))
+    assert [x.dtype for x in jax.tree.leaves(after)] == [x.dtype for x in jax.tree.leaves(state)]
+    assert got.rgb_THWC.dtype == jnp.float32
+    assert np.isfinite(got.rgb_THWC).all()
+    assert np.isfinite(got.depth_THW).all()
+
+
+def test_the_card_tells_base_licence_data_and_scores(run, tmp_path):
+    card = export(run, tmp_path / "plain")
+    assert "have no report" in card
+    assert "chooses a licence" in card
+    assert not (tmp_path / "plain" / runs.BASE).exists()
+
+    record = {"name": "CogVideoX-5b", "licence": "cogvideox (https://example.org)"}
+    (run / runs.BASE).write_text(json.dumps(record))
+    (run / "report").mkdir()
+    metrics = json.loads(json.dumps(METRICS))
+    metrics["protocol"]["weights_sha256"] = file_hash(run / runs.WEIGHTS)
+    (run / "report" / "metrics.json").write_text(json.dumps(metrics))
+    card = export(run, tmp_path / "full")
+    assert "Made from `CogVideoX-5b`, whose licence is: cogvideox (https://example.org)." in card
+    assert json.loads((tmp_path / "full" / runs.BASE).read_text()) == record
+    assert "| seen before | with its map | 12.25 |" in card
+    assert "4 clips in 2 scenes, none of which" in card
+
+    metrics["protocol"]["weights_sha256"] = "of other weights"
+    (run / "report" / "metrics.json").write_text(json.dumps(metrics))
+    assert "have no report" in export(run, tmp_path / "stale")
+
+
+def test_what_cannot_be_exported_is_refused_and_leaves_nothing(run, tmp_path):
+    dst = tmp_path / "there"
+    dst.mkdir()
+    cases = [(run, dst, "exists already"), (tmp_path / "none", tmp_path / "x", "not a folder")]
+    (run / runs.WEIGHTS).rename(run / "away")
+    cases.append((run, tmp_path / "x", "does not exist"))
+    for source, target, sentence in cases:
+        with pytest.raises(UserError, match=sentence):
+            inference.export(source, target, say=lambda _: None)
+    (run / runs.WEIGHTS).write_bytes((run / "away").read_bytes()[:-5])
+    with pytest.raises(UserError, match="cut short"):
+        inference.export(run, tmp_path / "x", say=lambda _: None)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["runs", "there"]
