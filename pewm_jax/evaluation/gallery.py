@@ -23,7 +23,7 @@ from pewm_jax.evaluation.scoring import LongRollouts
 from pewm_jax.evaluation.seen import seen_masks
 from pewm_jax.evaluation.video import encode_h264, side_by_side
 from pewm_jax.geometry.actions import heading
-from pewm_jax.memory.features import colours
+from pewm_jax.memory import memories
 from pewm_jax.types import Frames
 
 ABOVE_CAMERA_M = 0.4
@@ -150,7 +150,7 @@ def _above(config: Config, long: LongRollouts, index: int, item: _Shown) -> np.n
     for when in ("first", "last"):
         valid = kept[f"{when}_valid"][index] & (kept[f"{when}_points"][index][:, 2] < ceiling)
         points = kept[f"{when}_points"][index][valid]
-        shades = np.asarray(colours(kept[f"{when}_features"][index][valid]))
+        shades = memories.colours(config, kept[f"{when}_features"][index][valid])
         clouds.append((points, as_bytes(shades)))
     bounds = map_bounds(*[points for points, _ in clouds], poses[:, :3, 3])
     panels = []

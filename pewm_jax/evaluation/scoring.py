@@ -17,8 +17,8 @@ from pewm_jax.evaluation.imagine import METHODS, Imagination, aloud, copy_last
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, stack
 from pewm_jax.evaluation.seen import seen_masks_batch
-from pewm_jax.memory.voxel_map import to_points
-from pewm_jax.types import Frames, VoxelMap
+from pewm_jax.memory import memories
+from pewm_jax.types import Frames
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,9 +228,9 @@ def roll_long(
     return LongRollouts(Scored(choices, sums), chain, shown, kept_all)
 
 
-def _map_points(config: Config, maps: VoxelMap, shown: int, when: str) -> dict[str, np.ndarray]:
+def _map_points(config: Config, maps: Any, shown: int, when: str) -> dict[str, np.ndarray]:
     some = jax.tree.map(lambda leaf: leaf[:shown], maps)
-    points, features, valid = jax.vmap(lambda one: to_points(config.memory, one))(some)
+    points, features, valid = jax.vmap(lambda one: memories.to_points(config, one))(some)
     return {
         f"{when}_points": np.asarray(points),
         f"{when}_features": np.asarray(features),

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-import jax.numpy as jnp
+import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.memory import features as image_features
@@ -133,8 +133,9 @@ def to_points(config: Config, memory: Memory) -> tuple[Array, Array, Array]:
             return blank.points_world_M3, blank.features_MF, blank.valid_M
 
 
-def colours(config: Config, features_VF: Array) -> Array:
-    """Return (V, 3) colours in [−1, 1] by which remembered features are drawn."""
-    if config.memory.kind == "points":
-        return jnp.asarray(features_VF)[..., :3]
-    return image_features.colours(features_VF)
+def colours(config: Config, features_VF: Array) -> np.ndarray:
+    """Return (V, 3) colours in [−1, 1] to draw remembered places with."""
+    values = np.asarray(features_VF)
+    if config.memory.kind == "points" or not len(values):
+        return values[..., :3]
+    return image_features.colours(values)
