@@ -34,6 +34,8 @@ class DiTConfig:
     """Text tokens; with no prompt they are zeros, so that the text path learns a constant."""
     text_dim: int = 32
     """Channels of a text token."""
+    prompt: Literal["zeros", "stored"] = "zeros"
+    """The text tokens: `zeros`, or a prompt's embedding `stored` with converted weights."""
     time_dim: int = 192
     """Width of the time embedding."""
     ofs_dim: int = 0

@@ -66,7 +66,7 @@ class Config:
         patch = self.memory.encoder_patch
         require(
             self.memory.encoder != "patch_colours"
-            or self.clip.height % patch == 0 and self.clip.width % patch == 0,
+            or (self.clip.height % patch == 0 and self.clip.width % patch == 0),
             f"memory.encoder_patch {patch} does not divide the clip "
             f"{self.clip.height}×{self.clip.width}.",
         )

@@ -20,8 +20,8 @@ FLOATING = 0.05
 """A point floats when it is this much nearer than what the other frame sees."""
 MOST_FLOATING = 0.08
 """Largest share of floating points, averaged over pairs of frames of one kind, in images of
-``LIMIT_SIDE`` pixels and more. Smaller ones are mostly edges: right data has up to 3 % at 32 pixels,
-7 % at 24 and 17 % at 16, so the limit grows as the side shrinks."""
+``LIMIT_SIDE`` pixels and more. Smaller ones are mostly edges: right data has up to 3 % at 32
+pixels, 7 % at 24 and 17 % at 16, so the limit grows as the side shrinks."""
 LIMIT_SIDE = 40
 STRIDES = (1, 3, 6, 12)
 PAIRS = 6

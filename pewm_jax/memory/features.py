@@ -1,8 +1,9 @@
 """Image features that the map keeps, by one of two encoders.
 
-``dinov2`` is the paper's: patch tokens of a frozen DINOv2. ``patch_colours`` is small and has no weights: the mean colour c of each patch and its negative.
-The map keeps the maximum over all views, so a cell holds the largest value of each channel and,
-through −c, the smallest one too; their middle is the cell's colour.
+``dinov2`` is the paper's: patch tokens of a frozen DINOv2. ``patch_colours`` is small and has no
+weights: the mean colour c of each patch and its negative. The map keeps the maximum over all
+views, so a cell holds the largest value of each channel and, through −c, the smallest one too;
+their middle is the cell's colour.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import numpy as np
 from pewm_jax.config import MemoryConfig
 from pewm_jax.models import dinov2
 from pewm_jax.types import Array, Params
-
 
 COLOURS = 6
 """Channels of ``patch_colours``."""

@@ -58,8 +58,8 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
         everything = bool(tree.flatten(start).keys() & tree.flatten(trained).keys())
         like = params if everything else frozen
         tree.require_like(start, like, f"The weights that stage {stage.number} starts from")
-        start = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), start, like)
-        params = start if everything else tree.merge(trained, start)
+        given: Params = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), start, like)
+        params = given if everything else tree.merge(trained, given)
         trained = tree.select(params, stage.trained)
     return TrainState(
         params=params,
