@@ -12,7 +12,7 @@ import json
 import math
 import os
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -64,17 +64,23 @@ class Place:
         return math.prod(self.shape) * self.dtype.itemsize
 
 
-def save(path: Path, params: Params, words: Mapping[str, str] | None = None) -> None:
+def save(
+    path: Path,
+    params: Params,
+    words: Mapping[str, str] | None = None,
+    told: Callable[[int], None] = lambda _: None,
+) -> None:
     """Write parameters to ``path``, aside and then renamed.
 
     Args:
         path: the file to write, by custom ``weights.safetensors``; its folder is made.
         params: nested dictionaries of arrays, on any device.
         words: a few facts about them, kept in the file's header.
+        told: called with the bytes written after every leaf.
     """
     leaves = tree.flatten(params)
     like = {name: jax.ShapeDtypeStruct(np.shape(x), _dtype(x)) for name, x in leaves.items()}
-    write(path, like, leaves.items(), header(words or {}))
+    write(path, like, leaves.items(), header(words or {}), told)
 
 
 def header(words: Mapping[str, str]) -> dict[str, str]:
@@ -87,6 +93,7 @@ def write(
     like: Mapping[str, Array | jax.ShapeDtypeStruct],
     tensors: Iterable[tuple[str, Array]],
     words: Mapping[str, str],
+    told: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Write a safetensors file tensor by tensor, aside and then renamed.
 
@@ -95,6 +102,7 @@ def write(
         like: name → anything with the tensor's shape and dtype.
         tensors: the tensors, in any order, each once.
         words: the file's header, words by name.
+        told: called with the bytes written after every tensor.
 
     Raises:
         ValueError: the tensors are not those announced.
@@ -126,8 +134,14 @@ def write(
             offset: int = table[name]["data_offsets"][0]  # type: ignore[index]
             file.seek(start + offset)
             file.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+            told(array.nbytes)
         if left:
             raise ValueError(f"{tree.listing(left)} were announced and not given.")
+
+
+def size(like: Mapping[str, Array | jax.ShapeDtypeStruct]) -> int:
+    """Return the bytes that tensors take, of anything with shape and dtype by name."""
+    return sum(math.prod(x.shape) * np.dtype(x.dtype).itemsize for x in like.values())
 
 
 @contextlib.contextmanager

@@ -22,18 +22,16 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax import weights
+from pewm_jax import tree, weights
 from pewm_jax.config import DiffusionConfig, DiTConfig, UserError, VAEConfig
 from pewm_jax.convert import assemble, base, files, output, scheduler, transformer, vae
 from pewm_jax.convert.mapping import Entry
-from pewm_jax.data.progress import Meter
 from pewm_jax.models import dit as dit_model
 from pewm_jax.models import vae as vae_model
 from pewm_jax.types import Array, Params
 
 WEIGHTS = "weights.safetensors"
 CONFIG = "config.json"
-MEGABYTE = 1 << 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,9 +133,8 @@ def _read(network: Network, folder: Path, dtype: str | None) -> tuple[Any, Param
     config = network.config(settings(network, folder), str(inside / CONFIG))
     entries, source = network.entries(config), files.open_folder(inside)
     total = sum(place.size for _, place in source.places.values())
-    with Meter(f"read {network.folder}", total // MEGABYTE, "MiB") as meter:
-        told = _Told(meter)
-        return config, assemble.read(entries, source, network.like(config), dtype, told.bytes)
+    with output.megabytes(f"read {network.folder}", total) as told:
+        return config, assemble.read(entries, source, network.like(config), dtype, told)
 
 
 def stored_specs(
@@ -149,17 +146,6 @@ def stored_specs(
     entries, like = network.entries(config), network.like(config)
     assemble.require(entries, source, like)
     return assemble.leaf_specs(entries, source, like, dtype)
-
-
-class _Told:
-    """Tells a meter of bytes in whole megabytes."""
-
-    def __init__(self, meter: Meter):
-        self._meter, self._bytes = meter, 0
-
-    def bytes(self, count: int) -> None:
-        before, self._bytes = self._bytes, self._bytes + count
-        self._meter.advance(self._bytes // MEGABYTE - before // MEGABYTE)
 
 
 def load_transformer(folder: str | Path) -> tuple[DiTConfig, Params]:
@@ -193,7 +179,8 @@ def write_network(config: Any, params: Params, folder: Path) -> None:
     """Write one network in our layout."""
     folder.mkdir(parents=True)
     configuration.save(config, folder / CONFIG)
-    weights.save(folder / WEIGHTS, params)
+    with output.megabytes(f"write {folder.name}", weights.size(tree.flatten(params))) as told:
+        weights.save(folder / WEIGHTS, params, told=told)
 
 
 def write_diffusers(
@@ -217,14 +204,9 @@ def write_diffusers(
     entries = network.entries(network.config(values, "base.json"))
     specs = assemble.specs(entries, params, dtype)
     path = folder / "diffusion_pytorch_model.safetensors"
-    with Meter(f"write {network.folder}", len(specs), "tensors") as meter:
-
-        def tensors():
-            for pair in assemble.write(entries, params, dtype):
-                yield pair
-                meter.advance(1)
-
-        weights.write(path, specs, tensors(), {"format": "pt"})
+    tensors = assemble.write(entries, params, dtype)
+    with output.megabytes(f"write {network.folder}", weights.size(specs)) as told:
+        weights.write(path, specs, tensors, {"format": "pt"}, told)
 
 
 def import_pipeline(

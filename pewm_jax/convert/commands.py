@@ -126,6 +126,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
         size = (options.frames, options.height, options.width)
         config = world.config_of(dit, vae, diffusion, size, _stored_dtype(options))
         config = cli.overlay(config, options.config) if options.config else config
+        world.require_size(config)
     prompts = text.encode(src, options.prompt, dit.text_length, dit.text_dim)
     record = base.describe(src, settings, list(prompts), options.dtype)
     if config is None:

@@ -6,11 +6,14 @@ import contextlib
 import importlib
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from pewm_jax.config import UserError
+from pewm_jax.data.progress import Meter
+
+_MEGABYTE = 1 << 20
 
 
 def refuse_existing(dst: Path) -> None:
@@ -40,6 +43,20 @@ def new_folder(dst: Path) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
+
+
+@contextlib.contextmanager
+def megabytes(label: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show progress over so many bytes; yields what is to be called with the bytes done."""
+    done = 0
+    with Meter(label, -(-total // _MEGABYTE), "MiB") as meter:
+
+        def told(count: int) -> None:
+            nonlocal done
+            before, done = done, done + count
+            meter.advance(done // _MEGABYTE - before // _MEGABYTE)
+
+        yield told
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:

@@ -21,12 +21,14 @@ from pewm_jax.config import (
     Config,
     DiffusionConfig,
     DiTConfig,
+    MemoryConfig,
     TrainConfig,
+    UserError,
     VAEConfig,
 )
 from pewm_jax.convert import base, cogvideox, output, widen
 from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS
-from pewm_jax.models import world_model
+from pewm_jax.models import codec, positions, world_model
 from pewm_jax.types import Array, Params
 
 
@@ -38,6 +40,8 @@ def config_of(
     dtype: str | None,
 ) -> Config:
     """Return the settings of the world model around a video model.
+
+    Its memory blocks attend with as many heads, as wide, as the transformer.
 
     Args:
         dit: the video model's transformer.
@@ -61,9 +65,27 @@ def config_of(
         clip=ClipConfig(frames=frames, height=height, width=width),
         codec=CodecConfig(kind="vae", spatial=vae.spatial, temporal=vae.temporal, vae=vae),
         dit=dataclasses.replace(dit, in_channels=0, out_channels=0),
+        memory=MemoryConfig(
+            heads=max(dit.heads, vae.temporal * dit.patch_t), head_dim=dit.head_dim
+        ),
         diffusion=diffusion,
         train=TrainConfig(dtype="float32" if dtype in (None, "float32") else "bfloat16"),
     )
+
+
+def require_size(config: Config) -> None:
+    """Insist that the transformer's positions can be given to a clip.
+
+    Raises:
+        UserError: they are learned for another size, or do not go so far.
+    """
+    frames, height, width = codec.latent_shape(config)
+    frames += -frames % config.dit.patch_t
+    clip = config.clip
+    try:
+        positions.token_grid(config.dit, (1, frames, height, width, 1))
+    except UserError as error:
+        raise UserError(f"A clip of {clip.frames}×{clip.height}×{clip.width}: {error}") from None
 
 
 def import_world(
@@ -99,8 +121,7 @@ def import_world(
         return widen.widen(plan, cogvideox.read_transformer(src, dtype)[1])
 
     def blocks() -> Params:
-        params = jax.jit(lambda k: world_model.init_memory(config, k))(key)
-        return jax.tree.map(lambda x: np.asarray(x).astype(new_dtype), params)
+        return jax.jit(lambda k: world_model.init_memory(config, k))(key)
 
     parts: dict[str, tuple[dict[str, jax.ShapeDtypeStruct], Callable[[], Params]]] = {}
     wide = tree.flatten(TRANSFORMER.like(plan.new))
@@ -125,12 +146,16 @@ def import_world(
         like = jax.ShapeDtypeStruct(tokens.shape, tokens.dtype)
         parts["text"] = ({"prompt_LC": like}, lambda: {"prompt_LC": tokens})
 
+    specs = {f"{part}/{p}": spec for part, (like, _) in parts.items() for p, spec in like.items()}
+
     def tensors() -> Iterator[tuple[str, Array]]:
         for part, (_, make) in parts.items():
-            yield from tree.flatten({part: make()}).items()
+            for path, leaf in tree.flatten({part: make()}).items():
+                yield path, np.asarray(leaf).astype(specs[path].dtype, copy=False)
 
-    specs = {f"{part}/{p}": spec for part, (like, _) in parts.items() for p, spec in like.items()}
     with output.new_folder(dst) as folder:
-        weights.write(folder / WEIGHTS, specs, tensors(), weights.header({"stage": "0"}))
+        path, words = folder / WEIGHTS, weights.header({"stage": "0"})
+        with output.megabytes(f"write {dst.name}", weights.size(specs)) as told:
+            weights.write(path, specs, tensors(), words, told)
         configuration.save(config, folder / CONFIG)
         base.save(folder, record)
