@@ -85,8 +85,8 @@ class VoxelMap:
     """A sparse voxel feature map with static capacity (see ``pewm_jax.memory.voxel_map``).
 
     Attributes:
-        slot_of_cell: (cells,) int32, the slot that holds a cell, −1 where unobserved.
-        cell_of_slot_V: (V,) int32, the cell a slot holds, −1 where the slot is free.
+        cell_of_slot_V: (V,) int32, the cells held, in increasing order; free slots, last, hold the
+            number of cells of the grid.
         features_VF: (V, F) float, per-cell maximum, −inf where the slot is free.
         origin_3: (3,) float32, world position of the grid's lower corner, metres.
         occupied: () int32, number of slots in use.
@@ -94,7 +94,6 @@ class VoxelMap:
         outside: () int32, points that fell outside the grid's extent.
     """
 
-    slot_of_cell: Array
     cell_of_slot_V: Array
     features_VF: Array
     origin_3: Array
@@ -126,8 +125,9 @@ class WorldState:
 
     Attributes:
         frame: the last frame, T = 1, rgb float32 in [−1, 1].
-        map: everything seen or imagined so far.
+        map: everything seen or imagined so far: a ``VoxelMap``, or another of
+            ``pewm_jax.memory.memories`` by ``memory.kind``.
     """
 
     frame: Frames
-    map: VoxelMap
+    map: Any

@@ -53,7 +53,7 @@ def test_imagined_frames_enter_the_map_exactly_as_observed_ones(params):
     after, frames = roll(CONFIG, params, state, ACTIONS[:8], jax.random.key(1))
     features = image_features.encode(CONFIG.memory, {}, frames.rgb_THWC)
     expected = voxel_map.insert_frames(CONFIG.memory, state.map, frames, features)
-    for name in ("slot_of_cell", "features_VF", "occupied"):
+    for name in ("cell_of_slot_V", "features_VF", "occupied"):
         np.testing.assert_array_equal(getattr(after.map, name), getattr(expected, name))
     assert int(after.map.occupied) > int(state.map.occupied)
 

@@ -1,27 +1,36 @@
-"""The 3D voxel feature map: a jitted scatter-max with occupancy.
+"""The 3D voxel feature map: scatter-max with occupancy, exact, sparse and of static capacity.
 
-A pytree of static capacity: features are kept for *occupied* cells only; the grid itself is one
-integer per cell. Cells start at −inf and not at 0, so that negative features survive and an
-unobserved cell is not a cell with feature 0. A cell's feature is the maximum over all points that
-ever fell into it, so neither order nor repetition of points matters. Cells that do not fit are
-counted in ``dropped``, points beyond the extent in ``outside``; which cells stay is deterministic
-(earlier insertions first, within one insertion by cell index).
+A cell's feature is the maximum over all points that ever fell into it, so neither order nor
+batching nor repetition of points matters: while the capacity holds, maps of the same points are
+equal bit for bit. Cells start at −inf and not at 0, so that negative features survive and an
+unobserved cell is not a cell with feature 0. Memory is kept for *occupied* cells only; the grid's
+extent costs nothing (``voxel_cells``).
+
+Nothing is lost silently: cells that do not fit are counted in ``dropped``, once per insertion that
+saw them, points beyond the extent in ``outside``. Which cells stay is deterministic: those of
+earlier insertions, and within one insertion those of the lowest numbers.
+
+All functions are pure and work under jit (``config`` is static), vmap, donation of the map, and
+with the batch of a vmapped map sharded over devices.
 """
 
 from __future__ import annotations
 
-import math
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from pewm_jax.config import MemoryConfig
-from pewm_jax.geometry.cameras import project, unproject
+from pewm_jax.memory import cells, voxel_cells, voxel_frames
 from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 
 
-def empty(config: MemoryConfig, centre_3: Array, channels: int) -> VoxelMap:
+def empty(
+    config: MemoryConfig, centre_3: Array, channels: int, dtype: DTypeLike = jnp.float32
+) -> VoxelMap:
     """Return a map that has seen nothing.
 
     Args:
@@ -29,36 +38,21 @@ def empty(config: MemoryConfig, centre_3: Array, channels: int) -> VoxelMap:
         centre_3: (3,) world position the grid is centred on, metres; the grid's corner is
             snapped to whole cells so that maps of one world share their cells.
         channels: features F per cell.
+        dtype: of the features, float32 or bfloat16.
     """
-    cell = np.asarray(config.cell_m, np.float32)
-    half = np.asarray(config.cells, np.float32) * cell / 2
-    origin = jnp.round((jnp.asarray(centre_3) - half) / cell) * cell
-    cells = math.prod(config.cells)
     zero = jnp.zeros((), jnp.int32)
     return VoxelMap(
-        slot_of_cell=jnp.full((cells,), -1, jnp.int32),
-        cell_of_slot_V=jnp.full((config.capacity,), -1, jnp.int32),
-        features_VF=jnp.full((config.capacity, channels), -jnp.inf, jnp.float32),
-        origin_3=origin.astype(jnp.float32),
+        cell_of_slot_V=jnp.full((config.capacity,), voxel_cells.nowhere(config), jnp.int32),
+        features_VF=jnp.full((config.capacity, channels), -jnp.inf, dtype),
+        origin_3=cells.origin(config, centre_3),
         occupied=zero,
         dropped=zero,
         outside=zero,
     )
 
 
-def cell_index(config: MemoryConfig, origin_3: Array, points_P3: Array) -> Array:
-    """Return (P,) the linear cell index of each point, or the number of cells if outside."""
-    cells = math.prod(config.cells)
-    place = jnp.floor((points_P3 - origin_3) / np.asarray(config.cell_m, np.float32))
-    limit = np.asarray(config.cells, np.float32)
-    inside = jnp.all((place >= 0) & (place < limit), -1)
-    x, y, z = (jnp.where(inside, place[..., i], 0).astype(jnp.int32) for i in range(3))
-    _, ny, nz = config.cells
-    return jnp.where(inside, (x * ny + y) * nz + z, cells)
-
-
 def cell_centres(config: MemoryConfig, origin_3: Array, cell_V: Array) -> Array:
-    """Return (V, 3) world centres of linear cell indices."""
+    """Return (V, 3) world centres of cell numbers (see ``cells.keys``)."""
     _, ny, nz = config.cells
     grid = jnp.stack([cell_V // (ny * nz), cell_V // nz % ny, cell_V % nz], -1)
     return origin_3 + (grid + 0.5) * np.asarray(config.cell_m, np.float32)
@@ -72,38 +66,31 @@ def insert(
     Args:
         config: cell size, extent, capacity.
         voxels: the map.
-        points_P3: (P, 3) world points, metres.
-        features_PF: (P, F) their features.
+        points_P3: (P, 3) world points, metres; what is not a number is outside.
+        features_PF: (P, F) their features, rounded to the map's dtype.
         valid_P: (P,) bool; False points are ignored.
 
     Returns:
         The map after the insertion.
     """
-    cells, capacity = voxels.slot_of_cell.shape[0], voxels.cell_of_slot_V.shape[0]
-    finite = jnp.isfinite(points_P3).all(-1)
-    cell = cell_index(config, voxels.origin_3, jnp.where(finite[:, None], points_P3, jnp.inf))
-    outside = (valid_P & (cell == cells)).sum(dtype=jnp.int32)
-    cell = jnp.where(valid_P, cell, cells)
+    none, size = voxel_cells.nowhere(config), len(points_P3)
+    if size == 0:
+        return voxels
+    valid_P = jnp.asarray(valid_P)
+    seen = cells.keys(config, voxels.origin_3, jnp.asarray(points_P3))
+    beyond = (valid_P & (seen == none)).sum(dtype=jnp.int32)
+    seen = jnp.where(valid_P, seen, none)
+    cell_V, dropped = voxel_cells.admit(voxels.cell_of_slot_V, seen, none)
+    features_PF = jnp.asarray(features_PF)
 
-    touched = jnp.zeros((cells,), bool).at[cell].set(True, mode="drop")
-    new = touched & (voxels.slot_of_cell < 0)
-    slot = voxels.occupied + jnp.cumsum(new, dtype=jnp.int32) - 1
-    kept = new & (slot < capacity)
-    slot_of_cell = jnp.where(kept, slot, voxels.slot_of_cell)
-    cell_of_slot = voxels.cell_of_slot_V.at[jnp.where(kept, slot, capacity)].set(
-        jnp.arange(cells, dtype=jnp.int32), mode="drop"
-    )
-    target = slot_of_cell.at[cell].get(mode="fill", fill_value=-1)
-    target = jnp.where(target < 0, capacity, target)
-    return VoxelMap(
-        slot_of_cell=slot_of_cell,
-        cell_of_slot_V=cell_of_slot,
-        features_VF=voxels.features_VF.at[target].max(features_PF, mode="drop"),
-        origin_3=voxels.origin_3,
-        occupied=voxels.occupied + kept.sum(dtype=jnp.int32),
-        dropped=voxels.dropped + (new & ~kept).sum(dtype=jnp.int32),
-        outside=voxels.outside + outside,
-    )
+    def read(start: Array, block: int) -> tuple[Array, Array]:
+        cell, rows = (jax.lax.dynamic_slice_in_dim(x, start, block) for x in (seen, features_PF))
+        slot, found = voxel_cells.find(cell_V, cell)
+        return jnp.where(found & (cell < none), slot, cell_V.shape[0]), rows
+
+    rows = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, none)
+    rows = voxel_cells.maximum_over_blocks(rows, jnp.asarray(size, jnp.int32), size, read)
+    return renewed(config, voxels, cell_V, rows, dropped, beyond)
 
 
 def insert_frames(
@@ -113,47 +100,75 @@ def insert_frames(
     features_ThwF: Array,
     valid_T: Array | None = None,
 ) -> VoxelMap:
-    """Insert posed depth frames: upsample their features, unproject every pixel, scatter-max.
+    """Insert posed depth frames: upsampling, unprojection and maximum in one pass.
+
+    The same as upsampling the features to all pixels and inserting every pixel's point, up to
+    rounding of the interpolation; the upsampled features never exist (see ``voxel_frames``).
 
     Args:
         config: cell size, extent, capacity.
         voxels: the map.
         frames: T frames, of which depth and cameras are used; pixels without depth are ignored.
-        features_ThwF: (T, h, w, F) features of a grid of patches that covers each frame; they
-            are upsampled bilinearly, patch centres at half-integers.
+        features_ThwF: (T, h, w, F) features of a grid of patches that covers each frame, float32
+            or bfloat16; they are upsampled bilinearly in float32, patch centres at half-integers.
         valid_T: (T,) bool, False frames are ignored.
     """
-    shape = (*frames.depth_THW.shape, features_ThwF.shape[-1])
-    features = jax.image.resize(features_ThwF, shape, "bilinear")
-    points = unproject(frames.depth_THW, frames.camera)
-    valid = frames.depth_THW > 0
+    none, depth_THW = voxel_cells.nowhere(config), jnp.asarray(frames.depth_THW)
+    camera = jax.tree.map(jnp.asarray, frames.camera)
+    seen = voxel_frames.pixel_cells(config, voxels.origin_3, depth_THW, camera)
+    valid = depth_THW > 0
     if valid_T is not None:
-        valid = valid & valid_T[:, None, None]
-    return insert(
-        config,
-        voxels,
-        points.reshape(-1, 3),
-        features.reshape(-1, features.shape[-1]),
-        valid.reshape(-1),
+        valid = valid & jnp.asarray(valid_T)[:, None, None]
+    beyond = (valid & (seen == none)).sum(dtype=jnp.int32)
+    seen = jnp.where(valid, seen, none)
+    cell_V, rows, dropped = voxel_frames.insert(
+        config, voxels.cell_of_slot_V, voxels.features_VF, seen, jnp.asarray(features_ThwF)
     )
+    return renewed(config, voxels, cell_V, rows, dropped, beyond)
+
+
+def merge(config: MemoryConfig, a: VoxelMap, b: VoxelMap) -> VoxelMap:
+    """Return the union of two maps of one world: the maximum where both have a cell.
+
+    While the capacity holds, inserting into a and then into b's points gives the same as merging.
+    Counts of dropped cells and outside points are added up.
+
+    Args:
+        config: cell size, extent, capacity of both.
+        a: a map; its grid is kept, and its cells have precedence where the capacity is full.
+        b: a map, its grid at the same place or shifted by whole cells; its cells beyond a's grid
+            are counted as outside, once per cell.
+    """
+    points, features, valid = to_points(config, b)
+    both = insert(config, a, points, features, valid)
+    return dataclasses.replace(
+        both, dropped=both.dropped + b.dropped, outside=both.outside + b.outside
+    )
+
+
+def count(voxels: VoxelMap) -> Array:
+    """Return () int32, the number of occupied cells."""
+    return voxels.occupied
 
 
 def to_points(config: MemoryConfig, voxels: VoxelMap) -> tuple[Array, Array, Array]:
     """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0."""
-    valid = voxels.cell_of_slot_V >= 0
-    points = cell_centres(config, voxels.origin_3, jnp.maximum(voxels.cell_of_slot_V, 0))
-    features = jnp.where(valid[:, None], voxels.features_VF, 0.0)
-    return points, features, valid
+    valid = voxels.cell_of_slot_V < voxel_cells.nowhere(config)
+    points = cell_centres(config, voxels.origin_3, jnp.where(valid, voxels.cell_of_slot_V, 0))
+    features = jnp.where(valid[:, None], voxels.features_VF, 0)
+    return jnp.where(valid[:, None], points, 0), features, valid
 
 
 def tokens(
     config: MemoryConfig, voxels: VoxelMap, camera: Camera, size: tuple[int, int]
 ) -> MapTokens:
-    """Choose the M cells that condition one clip.
+    """Choose the M = ``memory.tokens`` cells that condition one clip.
 
     Cells inside the view of any of the clip's cameras come first, nearest first (by the smallest
     depth at which a camera sees them); then the others by distance to the nearest camera. Ties
-    go to the lower slot. Fewer than M occupied cells leave masked tokens.
+    go to the lower cell number. Fewer than M occupied cells leave masked tokens. Positions are
+    those of the world; ``models.memory_geometry`` turns them into what attention needs, in the
+    clip's first camera or not (``memory.positions``, ``memory.frame``).
 
     Args:
         config: gives M.
@@ -162,14 +177,24 @@ def tokens(
         size: image height and width in pixels.
     """
     points, features, valid = to_points(config, voxels)
-    uv, z = project(points[None], camera)
-    limit = np.array([size[1], size[0]], np.float32)
-    seen = jnp.all((uv >= 0) & (uv <= limit), -1) & (z > 0)
-    depth = jnp.where(seen, z, jnp.inf).min(0)
-    centres = camera.world_from_camera[:, None, :3, 3]
-    distance = jnp.linalg.norm(points[None] - centres, axis=-1).min(0)
-    far = 1e4
-    score = jnp.where(jnp.isfinite(depth), depth, far + distance)
-    score = jnp.where(valid, score, jnp.inf)
-    _, order = jax.lax.top_k(-score, config.tokens)
+    order = cells.in_view_first(points, valid, camera, size, config.tokens)
     return MapTokens(features[order], points[order], valid[order])
+
+
+def renewed(
+    config: MemoryConfig,
+    voxels: VoxelMap,
+    cell_V: Array,
+    features_VF: Array,
+    dropped: Array | int = 0,
+    outside: Array | int = 0,
+) -> VoxelMap:
+    """Return a map with other cells and features, its counts of losses increased."""
+    return dataclasses.replace(
+        voxels,
+        cell_of_slot_V=cell_V,
+        features_VF=features_VF,
+        occupied=(cell_V < voxel_cells.nowhere(config)).sum(dtype=jnp.int32),
+        dropped=voxels.dropped + dropped,
+        outside=voxels.outside + outside,
+    )
