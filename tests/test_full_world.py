@@ -1,0 +1,178 @@
+"""A world with everything in it that a converted checkpoint brings: VAE, DINOv2, a prompt."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax import config as configs
+from pewm_jax import rollouts, tree, weights
+from pewm_jax.config import (
+    CodecConfig,
+    ConfigError,
+    DataConfig,
+    DiffusionConfig,
+    DINOv2Config,
+    DiTConfig,
+    MemoryConfig,
+    StageConfig,
+    TrainConfig,
+    UserError,
+    VAEConfig,
+)
+from pewm_jax.data import loader
+from pewm_jax.diffusion import objective
+from pewm_jax.memory import features
+from pewm_jax.models import codec, world_model
+from pewm_jax.training import loop
+from pewm_jax.types import Clip
+from tests.helpers import random_frames, randomise, tiny_config
+
+VAE = VAEConfig(widths=(8, 8, 8), resnets=1, groups=4, latent_channels=4, sample_height=16)
+STAGE = StageConfig(steps=2, batch=2, warmup=1)
+
+
+def full_config(**sections):
+    memory = MemoryConfig(
+        cell_m=(0.5, 0.5, 0.5),
+        cells=(16, 16, 8),
+        capacity=256,
+        tokens=16,
+        heads=8,
+        head_dim=8,
+        encoder="dinov2",
+        encoder_size=28,
+        dinov2=DINOv2Config(layers=1, heads=2, width=16, pretrained_size=28),
+    )
+    dit = DiTConfig(
+        layers=1,
+        heads=2,
+        head_dim=16,
+        patch_t=2,
+        text_length=3,
+        text_dim=8,
+        time_dim=16,
+        prompt="stored",
+    )
+    return tiny_config(
+        **{
+            "codec": CodecConfig(kind="vae", spatial=4, temporal=4, vae=VAE),
+            "dit": dit,
+            "memory": memory,
+            "diffusion": DiffusionConfig(sample_steps=2, target="v"),
+            **sections,
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def world():
+    config = full_config()
+    params = jax.jit(lambda key: world_model.init(config, key))(jax.random.key(0))
+    return config, randomise(params, scale=0.1)
+
+
+def clips(config, split="train", *, seed, batch, start_step=0):
+    """Random clips in place of a data set."""
+    assert split == "train"
+    while True:
+        rng = np.random.default_rng([seed, start_step])
+        drawn = [
+            Clip(random_frames(rng, config.clip.frames), random_frames(rng, 2), np.ones(2, bool))
+            for _ in range(batch)
+        ]
+        yield jax.tree.map(lambda *x: np.stack(x), *drawn)
+        start_step += 1
+
+
+def test_it_has_every_part_and_rolls_out(world):
+    config, params = world
+    assert set(params) == {"backbone", "memory", "codec", "encoder", "text"}
+    state = rollouts.start(config, params, random_frames(np.random.default_rng(0), 2))
+    assert state.map.features_VF.shape[-1] == config.memory.dinov2.width
+    roll = jax.jit(rollouts.rollout, static_argnums=0)
+    after, frames = roll(config, params, state, jnp.zeros(8, jnp.int32), jax.random.key(0))
+    assert frames.rgb_THWC.shape == (8, 16, 24, 3)
+    assert np.isfinite(frames.rgb_THWC).all()
+    assert np.isfinite(frames.depth_THW).all()
+    assert int(after.map.occupied) >= int(state.map.occupied) > 0
+
+
+def test_text_and_encoder_matter_and_depth_goes_through_the_vae(world):
+    config, params = world
+    frames = random_frames(np.random.default_rng(1), 9)
+    batch = jax.tree.map(lambda x: x[None], objective.as_signal(frames))
+    said = world_model.condition(
+        config, params, batch.rgb_THWC[:, 0], batch.depth_THW[:, 0], batch.camera
+    )
+    np.testing.assert_array_equal(said.text_BLC[0], params["text"]["prompt_LC"])
+    latents = codec.encode_rgbd(config, params, batch.rgb_THWC, batch.depth_THW)
+    assert latents.shape == (1, 3, 4, 6, 8)
+    grey = codec.signal_from_depth(config.clip, batch.depth_THW)[..., None].repeat(3, -1)
+    alone = codec.encode(config.codec, params["codec"], grey)
+    np.testing.assert_allclose(latents[..., 4:], alone, atol=1e-5)
+    rgb, depth = codec.decode_rgbd(config, params, latents)
+    assert rgb.shape == (1, 9, 16, 24, 3)
+    assert depth.shape == (1, 9, 16, 24)
+    one = features.encode(config.memory, params["encoder"], frames.rgb_THWC / 127.5 - 1)
+    assert one.shape == (9, 2, 2, 16)
+
+
+def test_only_an_inverting_vae_divides_the_image_latents_by_its_factor(world):
+    config, params = world
+    image = np.random.default_rng(2).uniform(-1, 1, (1, 1, 16, 24, 3)).astype(np.float32)
+    for inverts, power in ((False, 0), (True, 2)):
+        vae = dataclasses.replace(VAE, invert_scale_latents=inverts)
+        settings = dataclasses.replace(config.codec, vae=vae)
+        plain = codec.encode(settings, params["codec"], image)
+        shown = codec.encode(settings, params["codec"], image, condition=True)
+        np.testing.assert_allclose(shown * VAE.scaling_factor**power, plain, rtol=1e-5, atol=1e-6)
+
+
+def test_unmeasured_depth_weighs_nothing(world):
+    config, _ = world
+    depth = np.ones((1, 9, 16, 24), np.float32)
+    depth[:, 1:5, :4, :4] = 0
+    depth[:, 5:, :4, :2] = 0
+    share = np.asarray(codec.measured(config, depth))
+    assert share.shape == (1, 3, 4, 6, 1)
+    assert share[0, 1, 0, 0, 0] == 0
+    assert share[0, 2, 0, 0, 0] == 0.5
+    assert (share == 1).sum() == share.size - 2
+
+
+def test_frames_that_decode_to_another_number_are_refused():
+    clip = dataclasses.replace(full_config().clip, frames=13)
+    with pytest.raises(ConfigError, match="8k \\+ 1"):
+        full_config(clip=clip)
+    with pytest.raises(ConfigError, match="codec.spatial 4"):
+        full_config(codec=CodecConfig(kind="vae", spatial=8, vae=VAE))
+
+
+def test_training_needs_converted_weights_and_leaves_them_alone(world, tmp_path, monkeypatch):
+    monkeypatch.setattr(loader, "clips", clips)
+    config, params = world
+    train = TrainConfig(run=str(tmp_path / "run"), stage1=STAGE, stage2=STAGE, preview_every=0)
+    config = dataclasses.replace(config, train=train, data=DataConfig(context=2))
+    with pytest.raises(UserError, match="train.start"):
+        loop.train(config)
+
+    start = tmp_path / "converted"
+    start.mkdir()
+    configs.save(config, start / "config.json")
+    weights.save(start / "weights.safetensors", params)
+    (start / "base.json").write_text("{}")
+    config = dataclasses.replace(config, train=dataclasses.replace(train, start=str(start)))
+    run = loop.train(config, say=lambda _: None)
+
+    _, trained = rollouts.load(run)
+    before, after = tree.flatten(params), tree.flatten(trained)
+    assert before.keys() == after.keys()
+    for path in before:
+        same = np.array_equal(before[path], after[path])
+        assert same == path.startswith(("codec/", "encoder/", "text/")), path
+    far = max(np.abs(after[p] - before[p]).max() for p in before if p.startswith("backbone"))
+    assert far < 0.1, "stage 1 did not start from the converted weights"
+    assert (run / "base.json").read_text() == "{}"
