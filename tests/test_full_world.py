@@ -145,9 +145,9 @@ def test_unmeasured_depth_weighs_nothing(world):
 
 def test_frames_that_decode_to_another_number_are_refused():
     clip = dataclasses.replace(full_config().clip, frames=13)
-    with pytest.raises(ConfigError, match="8k \\+ 1"):
+    with pytest.raises(ConfigError, match=r"8k \+ 1"):
         full_config(clip=clip)
-    with pytest.raises(ConfigError, match="codec.spatial 4"):
+    with pytest.raises(ConfigError, match=r"codec\.spatial 4"):
         full_config(codec=CodecConfig(kind="vae", spatial=8, vae=VAE))
 
 
@@ -156,7 +156,7 @@ def test_training_needs_converted_weights_and_leaves_them_alone(world, tmp_path,
     config, params = world
     train = TrainConfig(run=str(tmp_path / "run"), stage1=STAGE, stage2=STAGE, preview_every=0)
     config = dataclasses.replace(config, train=train, data=DataConfig(context=2))
-    with pytest.raises(UserError, match="train.start"):
+    with pytest.raises(UserError, match=r"train\.start"):
         loop.train(config)
 
     start = tmp_path / "converted"
