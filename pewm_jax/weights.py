@@ -135,6 +135,7 @@ def write(
             file.seek(start + offset)
             file.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
             told(array.nbytes)
+            del tensor, array  # before the next one is made
         if left:
             raise ValueError(f"{tree.listing(left)} were announced and not given.")
 

@@ -20,7 +20,9 @@ from pewm_jax.convert.mapping import Entry
 from pewm_jax.types import Array, Params
 
 FLOATS = ("float32", "bfloat16", "float16")
-"""The dtypes weights may be stored in, by name."""
+"""The dtypes weights can be converted to, by name."""
+STORED = (*FLOATS, "float64")
+"""The dtypes weights may come in; a table that a network has computed can be float64."""
 
 
 def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...]]:
@@ -80,10 +82,10 @@ def require(entries: Sequence[Entry], source: Source, like: Params) -> None:
             f"{source.where} holds tensors of other shapes than its config.json says: "
             f"{tree.listing(wrong)}; are they of the same network?"
         )
-    other = [f"{n} {source.dtype(n)}" for n in want if source.dtype(n).name not in FLOATS]
+    other = [f"{n} {source.dtype(n)}" for n in want if source.dtype(n).name not in STORED]
     if other:
         raise UserError(
-            f"{source.where} holds {tree.listing(other)}: weights of {', '.join(FLOATS)} can be "
+            f"{source.where} holds {tree.listing(other)}: weights of {', '.join(STORED)} can be "
             "read; save it in one of these."
         )
 
@@ -121,6 +123,7 @@ def read(
         place = leaves[entry.path] if entry.layer is None else leaves[entry.path][entry.layer]
         _cast(entry.turn.ours(tensor), place, f"{source.where}: {entry.theirs}")
         told(tensor.nbytes)
+        del tensor  # before the next one is read
     return tree.unflatten(leaves)
 
 
@@ -157,9 +160,11 @@ def write(
     for entry in entries:
         leaf = leaves[entry.path]
         tensor = np.asarray(jax.device_get(leaf if entry.layer is None else leaf[entry.layer]))
-        out = np.empty(tensor.shape, tensor.dtype if dtype is None else _dtype(dtype))
-        _cast(tensor, out, entry.path)
-        yield entry.theirs, np.ascontiguousarray(entry.turn.theirs(out))
+        if dtype is not None and tensor.dtype != _dtype(dtype):
+            out = np.empty(tensor.shape, _dtype(dtype))
+            _cast(tensor, out, entry.path)
+            tensor = out
+        yield entry.theirs, np.ascontiguousarray(entry.turn.theirs(tensor))
 
 
 def specs(
@@ -177,7 +182,9 @@ def specs(
 
 def _common(dtypes: set[np.dtype]) -> np.dtype:
     """Return the dtype that holds values of all of them."""
-    return next(iter(dtypes)) if len(dtypes) == 1 else np.dtype(np.float32)
+    if len(dtypes) == 1:
+        return next(iter(dtypes))
+    return max(np.dtype(np.float32), *dtypes, key=lambda dtype: dtype.itemsize)
 
 
 def _dtype(name: str) -> np.dtype:

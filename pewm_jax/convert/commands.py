@@ -95,7 +95,8 @@ class ExportDiffusers:
     """Write a folder that the from_pretrained of diffusers loads.
 
     Of a world model the video model inside is written: memory blocks and the channels of depth
-    and camera stay behind. Text encoder and tokenizer are not written; take the original ones.
+    and camera stay behind. Text encoder and tokenizer are copied from the original pipeline, or
+    left out.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -106,6 +107,9 @@ class ExportDiffusers:
     """Store weights in this precision; by default as they are."""
     base: Path | None = None
     """Folder with base.json; by default SRC, or the folder that the training started from."""
+    original: Path | None = None
+    """The original pipeline's folder: its text_encoder/ and tokenizer/ are copied, so that the
+    whole pipeline loads. Without them it loads with text_encoder=None, tokenizer=None."""
 
 
 def import_cogvideox(options: ImportCogVideoX) -> None:
@@ -178,5 +182,5 @@ def import_dinov2(options: ImportDINOv2) -> None:
 
 def export_diffusers(options: ExportDiffusers) -> None:
     """Run ``export diffusers``."""
-    diffusers_folder.export(options.src, options.dst, options.base, options.dtype)
+    diffusers_folder.export(options.src, options.dst, options.base, options.dtype, options.original)
     print(f"{options.dst}: transformer/, vae/, scheduler/ for diffusers' from_pretrained")

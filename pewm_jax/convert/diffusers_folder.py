@@ -7,6 +7,7 @@ memory blocks and the channels of depth and camera stay behind.
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,17 @@ from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS, Networ
 from pewm_jax.models import world_model
 from pewm_jax.types import Params
 
-_TEXT = {"text_encoder": [None, None], "tokenizer": [None, None]}
+_TEXT = ("text_encoder", "tokenizer")
+"""Parts that are not converted, only copied."""
 
 
-def export(src: Path, dst: Path, base_folder: Path | None = None, dtype: str | None = None) -> None:
+def export(
+    src: Path,
+    dst: Path,
+    base_folder: Path | None = None,
+    dtype: str | None = None,
+    original: Path | None = None,
+) -> None:
     """Write a diffusers folder: ``transformer/``, ``vae/``, ``scheduler/``, ``model_index.json``.
 
     Args:
@@ -30,6 +38,7 @@ def export(src: Path, dst: Path, base_folder: Path | None = None, dtype: str | N
         base_folder: the folder with ``base.json``, by default ``src`` or, of a training run, the
             folder it started from.
         dtype: of the tensors; by default that of our weights.
+        original: the original pipeline's folder, to copy text encoder and tokenizer from.
 
     Raises:
         UserError: ``dst`` exists, ``base.json`` is absent, or the weights do not fit it.
@@ -38,6 +47,9 @@ def export(src: Path, dst: Path, base_folder: Path | None = None, dtype: str | N
         raise UserError(f"{src} is not a folder; give an imported folder or a training run.")
     output.refuse_existing(dst)
     record = base.load(base_folder or _origin(src))
+    absent = [name for name in _TEXT if original and not (original / name).is_dir()]
+    if absent:
+        raise UserError(f"{original} has no folder {absent[0]}/; give the original pipeline's.")
     imported = (src / "transformer").is_dir()
     with output.new_folder(dst) as folder:
         for network in (TRANSFORMER, VAE):
@@ -47,7 +59,10 @@ def export(src: Path, dst: Path, base_folder: Path | None = None, dtype: str | N
             del params
         (folder / "scheduler").mkdir()
         output.write_json(folder / "scheduler" / "scheduler_config.json", record["scheduler"])
-        output.write_json(folder / "model_index.json", _index(record))
+        output.write_json(folder / "model_index.json", _index(record, text=original is not None))
+        if original:
+            for name in _TEXT:
+                shutil.copytree(original / name, folder / name)
 
 
 def _origin(src: Path) -> Path:
@@ -86,8 +101,8 @@ def _run(src: Path, network: Network, record: dict[str, Any]) -> Params:
     return params
 
 
-def _index(record: dict[str, Any]) -> dict[str, Any]:
-    """Return ``model_index.json``; text encoder and tokenizer are not ours to write."""
+def _index(record: dict[str, Any], *, text: bool) -> dict[str, Any]:
+    """Return ``model_index.json``, with or without text encoder and tokenizer."""
     image = record["transformer"].get("in_channels", 16) != record["transformer"].get(
         "out_channels", 16
     )
@@ -96,8 +111,8 @@ def _index(record: dict[str, Any]) -> dict[str, Any]:
         "_diffusers_version": record["transformer"].get("_diffusers_version", "0.36.0"),
     }
     return {
-        **given,
-        **_TEXT,
+        **{name: [None, None] for name in _TEXT},
+        **{name: value for name, value in given.items() if text or name not in _TEXT},
         "scheduler": ["diffusers", record["scheduler"]["_class_name"]],
         "transformer": ["diffusers", TRANSFORMER.theirs],
         "vae": ["diffusers", VAE.theirs],

@@ -1,0 +1,277 @@
+"""A CogVideoX checkpoint comes in, is widened, and goes out again, tensor for tensor."""
+
+import dataclasses
+import json
+import tracemalloc
+
+import convert_pipelines as pipelines
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from diffusers import (
+    AutoencoderKLCogVideoX,
+    CogVideoXDPMScheduler,
+    CogVideoXImageToVideoPipeline,
+    CogVideoXTransformer3DModel,
+)
+from transformers import AutoTokenizer, T5EncoderModel
+
+import pewm_jax
+from pewm_jax import config as configuration
+from pewm_jax import weights
+from pewm_jax.convert import assemble, base, cogvideox, files, mapping, widen, world
+from pewm_jax.convert.__main__ import main
+from pewm_jax.models import dit, world_model
+from pewm_jax.types import Camera, MapTokens
+
+WORLD = ["--rgbd", "--camera", "--memory", "--frames", "9", "--height", "32", "--width", "32"]
+
+
+def run(*argv):
+    assert main([str(word) for word in argv]) == 0
+
+
+def bits(module):
+    return {k: v.contiguous().view(-1).view(torch.uint8) for k, v in module.state_dict().items()}
+
+
+def require_equal(module, other):
+    mine, theirs = bits(module), bits(other)
+    assert mine.keys() == theirs.keys()
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+    assert module.dtype == other.dtype
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    """An image-to-video pipeline in shards, with a text encoder and a card."""
+    folder = pipelines.save(tmp_path_factory.mktemp("i2v"), "5b-I2V", shard="40KB", sampler="dpm")
+    (folder / "README.md").write_text("---\nlicense: other\nlicense_name: tiny\n---\n# Tiny")
+    return pipelines.save_text(folder)
+
+
+@pytest.fixture(scope="module")
+def imported(images, tmp_path_factory):
+    dst = tmp_path_factory.mktemp("imported") / "dst"
+    run("import", "cogvideox", images, dst, "--prompt", "a room", "")
+    return dst
+
+
+@pytest.fixture(scope="module")
+def widened(images, tmp_path_factory):
+    dst = tmp_path_factory.mktemp("widened") / "dst"
+    run("import", "cogvideox", images, dst, *WORLD, "--prompt", "a room with a chair")
+    return dst
+
+
+@pytest.mark.parametrize(
+    ("variant", "dtype", "shard"),
+    [
+        ("2b", torch.float16, "10GB"),
+        ("5b", torch.bfloat16, "40KB"),
+        ("1.5-5B-I2V", torch.float32, "40KB"),
+    ],
+)
+def test_there_and_back_is_bit_for_bit_the_same(tmp_path, variant, dtype, shard):
+    src = pipelines.save(tmp_path / "src", variant, dtype, shard)
+    run("import", "cogvideox", src, tmp_path / "ours")
+    run("export", "diffusers", tmp_path / "ours", tmp_path / "back")
+    for kind, part in (
+        (CogVideoXTransformer3DModel, "transformer"),
+        (AutoencoderKLCogVideoX, "vae"),
+    ):
+        before, after = (
+            kind.from_pretrained(folder / part, torch_dtype=dtype)
+            for folder in (src, tmp_path / "back")
+        )
+        require_equal(after, before)
+        assert dict(after.config) == {**before.config, "_name_or_path": after.config._name_or_path}
+    assert (tmp_path / "back/scheduler/scheduler_config.json").read_text().split() == (
+        src / "scheduler/scheduler_config.json"
+    ).read_text().split()
+
+
+def test_the_exported_folder_is_a_pipeline(imported, images, tmp_path):
+    without, whole = tmp_path / "without", tmp_path / "whole"
+    run("export", "diffusers", imported, without)
+    run("export", "diffusers", imported, whole, "--original", images)
+    absent = {"text_encoder": None, "tokenizer": None}
+    for folder, given in ((without, absent), (whole, {})):
+        pipeline = CogVideoXImageToVideoPipeline.from_pretrained(folder, **given)
+        require_equal(pipeline.transformer, pipelines.dit("5b-I2V"))
+        require_equal(pipeline.vae, pipelines.vae())
+        assert isinstance(pipeline.scheduler, CogVideoXDPMScheduler)
+        assert (pipeline.text_encoder is None) == bool(given)
+
+
+def test_the_entry_points_read_what_the_commands_store(imported, images):
+    for read, load in (
+        (cogvideox.read_transformer, cogvideox.load_transformer),
+        (cogvideox.read_vae, cogvideox.load_vae),
+    ):
+        (config, params), (stored_config, stored) = read(images), load(imported)
+        assert config == stored_config
+        jax.tree.map(np.testing.assert_array_equal, params, stored)
+    assert cogvideox.read_transformer(images / "transformer")[0].positions == "rope_learned"
+    assert cogvideox.read_scheduler(images) == cogvideox.load_scheduler(imported)
+    assert cogvideox.read_scheduler(images / "scheduler").sampler == "dpm"
+    half = cogvideox.read_vae(images / "vae", "float16")[1]
+    assert {leaf.dtype.name for leaf in jax.tree.leaves(half)} == {"float16"}
+
+
+def test_the_record_says_where_it_came_from(imported, images):
+    record = base.load(imported)
+    assert record["licence"] == "tiny"
+    assert record["prompts"] == ["a room", ""]
+    for part in ("transformer", "vae"):
+        assert record[part] == json.loads((images / part / "config.json").read_text())
+
+
+def test_prompts_are_encoded_as_the_pipeline_does(imported, images, widened):
+    tokenizer = AutoTokenizer.from_pretrained(images / "tokenizer")
+    encoder = T5EncoderModel.from_pretrained(images / "text_encoder")
+
+    def reference(prompt):
+        ids = tokenizer(
+            prompt, padding="max_length", max_length=6, truncation=True, return_tensors="pt"
+        )
+        with torch.no_grad():
+            return encoder(ids.input_ids)[0][0].numpy()
+
+    stored = weights.load(imported / "text" / cogvideox.WEIGHTS)["prompts_PLC"]
+    for prompt, tokens in zip(("a room", ""), stored, strict=True):
+        np.testing.assert_allclose(tokens, reference(prompt), atol=1e-6)
+    config, params = pewm_jax.load(widened)
+    assert config.dit.prompt == "stored"
+    expected = reference("a room with a chair")
+    np.testing.assert_allclose(params["text"]["prompt_LC"], expected, atol=1e-6)
+    assert not np.allclose(expected, stored[0])
+
+
+def inputs(config, plan):
+    """Random inputs of a world model, and what the video model inside is given of them."""
+    rng = np.random.default_rng(0)
+
+    def normal(*shape):
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    frames, height, width = world.codec.latent_shape(config)
+    noisy, first = (normal(2, frames, height, width, plan.new.out_channels) for _ in range(2))
+    rays = normal(2, frames, height, width, world_model.camera_channels(config))
+    pose = jnp.broadcast_to(jnp.eye(4), (2, config.clip.frames, 4, 4))
+    camera = Camera(jnp.full((2, config.clip.frames, 4), 16.0), pose)
+    text_BLC = normal(2, config.dit.text_length, config.dit.text_dim)
+    conditioning = world_model.Conditioning(first, rays, camera, text_BLC)
+    points = normal(2, 24, 3) + jnp.array([0.0, 0.0, 3.0])
+    features = 9 * normal(2, 24, world_model.feature_channels(config))
+    tokens = MapTokens(features, points, jnp.ones((2, 24), bool))
+    split = plan.old.out_channels
+    video = noisy[..., :split]
+    if plan.old.in_channels > split:
+        video = jnp.concatenate([video, first[..., :split]], -1)
+    video = jnp.concatenate([video[:, :1]] * (-frames % config.dit.patch_t) + [video], 1)
+    return noisy, conditioning, tokens, video
+
+
+@pytest.mark.parametrize(
+    ("variant", "kind"),
+    [("2b", "projective"), ("5b-I2V", "sinusoid"), ("1.5-5B-I2V", "projective")],
+)
+def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
+    network = cogvideox.TRANSFORMER
+    source = {k: v.numpy() for k, v in pipelines.dit(variant).state_dict().items()}
+    old = network.config(dict(pipelines.dit(variant).config), variant)
+    params = assemble.read(
+        network.entries(old), files.Arrays(source, variant), network.like(old), "float32"
+    )
+    vae = cogvideox.VAE.config(dict(pipelines.vae().config), "vae")
+    config = world.config_of(
+        old, vae, cogvideox.scheduler.config_from_diffusers(
+            {"_class_name": "CogVideoXDDIMScheduler", **pipelines.SCHEDULER}
+        ), (9, 32, 32), "float32",
+    )  # fmt: skip
+    config = dataclasses.replace(config, memory=dataclasses.replace(config.memory, positions=kind))
+    plan = widen.plan(old, 4, world_model.camera_channels(config))
+    wide = {
+        "backbone": widen.widen(plan, params),
+        "memory": jax.jit(lambda: world_model.init_memory(config, jax.random.key(0)))(),
+    }
+    noisy, conditioning, tokens, video = inputs(config, plan)
+    times = jnp.array([999, 40])
+    apply = jax.jit(world_model.apply, static_argnums=0)
+    got = apply(config, wide, noisy, conditioning, times, tokens)[..., : old.out_channels]
+    want = jax.jit(dit.apply, static_argnums=0)(old, params, video, conditioning.text_BLC, times)
+    want = want[:, -got.shape[1] :]
+    assert np.abs(want).max() > 0.1
+    assert np.abs(got - want).max() <= 1e-6 * np.abs(want).max()
+
+    narrow = widen.narrow(plan, wide["backbone"])
+    jax.tree.map(np.testing.assert_array_equal, narrow, params)
+
+
+def test_the_video_model_in_a_training_run_is_exported(widened, tmp_path):
+    """All that a run changed goes back, the new channels and the memory blocks apart."""
+    config, params = pewm_jax.load(widened)
+    trained = {
+        **params,
+        "backbone": jax.tree.map(lambda x: (x + 0.5).astype(x.dtype), params["backbone"]),
+    }
+    (tmp_path / "run").mkdir()
+    started = dataclasses.replace(config.train, start=str(widened))
+    configuration.save(dataclasses.replace(config, train=started), tmp_path / "run/config.json")
+    weights.save(tmp_path / "run/weights.safetensors", trained)
+    run("export", "diffusers", tmp_path / "run", tmp_path / "back", "--dtype", "bfloat16")
+    moved = pipelines.dit("5b-I2V")
+    with torch.no_grad():
+        for tensor in moved.state_dict().values():
+            tensor.add_(0.5)
+    got = CogVideoXTransformer3DModel.from_pretrained(
+        tmp_path / "back/transformer", torch_dtype=torch.bfloat16
+    )
+    require_equal(got, moved.to(torch.bfloat16))
+    vae = AutoencoderKLCogVideoX.from_pretrained(tmp_path / "back/vae", torch_dtype=torch.bfloat16)
+    require_equal(vae, pipelines.vae().to(torch.bfloat16))
+
+    run("export", "diffusers", widened, tmp_path / "at_once")
+    plain = CogVideoXTransformer3DModel.from_pretrained(tmp_path / "at_once/transformer")
+    require_equal(plain, pipelines.dit("5b-I2V"))
+
+
+def test_settings_of_the_world_model_can_be_given(images, tmp_path):
+    settings = tmp_path / "settings.json"
+    settings.write_text('{"memory": {"tokens": 32, "heads": 4, "head_dim": 8}}')
+    dst = tmp_path / "dst"
+    run("import", "cogvideox", images, dst, *WORLD, "--config", settings, "--dtype", "bfloat16")
+    config, params = pewm_jax.load(dst)
+    assert (config.memory.tokens, config.clip.height) == (32, 32)
+    assert config.train.dtype == "bfloat16"
+    assert {leaf.dtype.name for leaf in jax.tree.leaves(params)} == {"bfloat16"}
+    assert config.diffusion.target == "v"
+
+
+def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
+    """Measured on 24 layers of 1 MiB in 24 shards; a second copy would be 24 MiB more."""
+    layer, layers = (512, 512), 24
+    entries = [mapping.Entry(f"l.{i}", "w", mapping.LINEAR, i) for i in range(layers)]
+    spec = {f"l.{i}": jax.ShapeDtypeStruct(layer, np.float32) for i in range(layers)}
+    for i, name in enumerate(spec):
+        one = {name: spec[name]}
+        pairs = [(name, np.full(layer, i, np.float32))]
+        weights.write(tmp_path / f"m-{i}.safetensors", one, pairs, {})
+    table = {"weight_map": {name: f"m-{i}.safetensors" for i, name in enumerate(spec)}}
+    (tmp_path / "m.safetensors.index.json").write_text(json.dumps(table))
+    like = {"w": jax.ShapeDtypeStruct((layers, *layer), np.float32)}
+    for dtype, each in (("float32", 1 << 20), ("bfloat16", 1 << 19)):
+        tracemalloc.start()
+        params = assemble.read(entries, files.open_folder(tmp_path), like, dtype)
+        weights.save(tmp_path / "out" / "w.safetensors", params)
+        specs = assemble.specs(entries, params)
+        weights.write(tmp_path / "back", specs, assemble.write(entries, params), {})
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert layers * each < peak < layers * each + 2.5 * (1 << 20)
+        saved = weights.load(tmp_path / "out" / "w.safetensors")
+        np.testing.assert_array_equal(saved["w"][:, 0, 0], np.arange(layers))
+        del params, saved
