@@ -19,7 +19,14 @@ def config() -> Config:
     return Config(
         clip=ClipConfig(frames=5, height=16, width=16),
         dit=DiTConfig(layers=2, heads=2, head_dim=16, text_length=1, text_dim=8, time_dim=16),
-        memory=MemoryConfig(cells=(32, 32, 8), capacity=256, tokens=16, heads=4, head_dim=8),
+        memory=MemoryConfig(
+            cell_m=(0.25, 0.25, 0.25),
+            cells=(32, 32, 8),
+            capacity=256,
+            tokens=16,
+            heads=4,
+            head_dim=8,
+        ),
         diffusion=DiffusionConfig(sample_steps=2),
         data=DataConfig(path="data/tiny", stride_max=2, context=4),
         train=TrainConfig(

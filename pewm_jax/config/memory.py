@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Literal
 
 from pewm_jax.config.dinov2 import DINOv2Config
@@ -18,10 +19,11 @@ class MemoryConfig:
     snapshots), `map2d` (a feature map seen from above), `points` (coloured points, no features)."""
     depth: bool = True
     """Whether the denoiser sees and makes depth; without it only observed frames are remembered."""
-    cell_m: tuple[float, float, float] = (0.25, 0.25, 0.25)
-    """Size of a map cell along x, y, z (z is up), metres. The paper: 0.25 0.25 1.0."""
+    cell_m: tuple[float, float, float] = (0.25, 0.25, 1.0)
+    """Size of a map cell along x, y, z (z is up), metres; the default is the paper's."""
     cells: tuple[int, int, int] = (128, 128, 16)
-    """Cells of the grid along x, y, z; the extent in metres is cells × cell size."""
+    """Cells of the grid along x, y, z; the extent in metres is cells × cell size, and costs
+    nothing."""
     capacity: int = 4096
     """Occupied cells a map can hold; what does not fit is counted."""
     tokens: int = 512
@@ -56,6 +58,11 @@ class MemoryConfig:
         """Validate."""
         require(all(size > 0 for size in self.cell_m), "memory.cell_m must be positive.")
         require(all(count > 0 for count in self.cells), "memory.cells must be positive.")
+        require(
+            math.prod(self.cells) < 2**31,
+            f"memory.cells {self.cells} make {math.prod(self.cells)} cells, more than the 2³¹ that "
+            "can be numbered; take fewer or larger cells.",
+        )
         require_positive(self, "memory", "capacity", "tokens", "looks", "snapshots")
         require_positive(self, "memory", "encoder_patch", "encoder_size")
         require_positive(self, "memory", "heads", "head_dim", "mlp_ratio")

@@ -31,7 +31,14 @@ def tiny(tmp, **evaluate):
     return Config(
         clip=ClipConfig(frames=5, height=SIZE, width=SIZE),
         dit=DiTConfig(layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16),
-        memory=MemoryConfig(cells=(32, 32, 8), capacity=256, tokens=16, heads=4, head_dim=8),
+        memory=MemoryConfig(
+            cell_m=(0.25, 0.25, 0.25),
+            cells=(32, 32, 8),
+            capacity=256,
+            tokens=16,
+            heads=4,
+            head_dim=8,
+        ),
         diffusion=DiffusionConfig(sample_steps=2),
         data=DataConfig(path=str(tmp / "data"), context=6),
         train=TrainConfig(run=str(tmp / "run")),
