@@ -1,7 +1,8 @@
-"""Adam with warm-up, clipping and decoupled weight decay, for the trained leaves alone.
+"""Adam with warm-up, clipping and decoupled weight decay, masked to what a stage trains.
 
-The optimizer only ever sees the trained subtree: frozen leaves have no moments, no gradient is
-computed for them, and their norm does not enter the clipping.
+``optax.partition`` sends every leaf to one of two transformations by the stage's labels: to Adam,
+with the clipping inside, or to zero. So frozen leaves have no moments and their gradients do not
+enter the norm that is clipped. (``optax.masked`` alone would pass raw gradients through to them.)
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import optax
 
 from pewm_jax import tree
 from pewm_jax.config import Config, StageConfig
-from pewm_jax.training.stages import Stage
+from pewm_jax.training.stages import FREEZE, TRAIN, Stage
 from pewm_jax.types import Params
 
 DECAYED = (
@@ -39,14 +40,18 @@ def schedule(settings: StageConfig) -> optax.Schedule:
 
 
 def make(config: Config, stage: Stage) -> optax.GradientTransformation:
-    """Build the optimizer of a stage; ``init`` and ``update`` take the trained subtree."""
+    """Build the optimizer of a stage.
+
+    ``init`` and ``update`` take all of the stage's parameters; the updates of frozen leaves are 0.
+    """
 
     def decayed(trained: Params) -> Params:
         return tree.assign(DECAYED, trained, "weight-decay mask")
 
-    return optax.chain(
+    adam = optax.chain(
         optax.clip_by_global_norm(config.train.clip_norm),
         optax.scale_by_adam(),
         optax.add_decayed_weights(config.train.weight_decay, mask=decayed),
         optax.scale_by_learning_rate(schedule(stage.settings(config))),
     )
+    return optax.partition({TRAIN: adam, FREEZE: optax.set_to_zero()}, stage.labels)

@@ -1,4 +1,4 @@
-"""What is trained when: the paper's two stages as a table.
+"""What is trained when: the paper's two stages as a table of rules over parameter paths.
 
 Stage 1 fine-tunes the backbone, without any memory, to the domain, to camera control and to
 RGB-D. Stage 2 adds the memory blocks, which start as the identity, and trains nothing else.
@@ -7,9 +7,13 @@ RGB-D. Stage 2 adds the memory blocks, which start as the identity, and trains n
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
+from pewm_jax import tree
 from pewm_jax.config import Config, ConfigError, StageConfig
 from pewm_jax.models import world_model
+
+TRAIN, FREEZE = "train", "freeze"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,12 +23,26 @@ class Stage:
     Attributes:
         number: 1 or 2.
         memory: whether the memory blocks exist and read the map.
-        trained: patterns over parameter paths (see ``pewm_jax.tree``); all else is frozen.
+        rules: (pattern, ``TRAIN`` or ``FREEZE``) over parameter paths, the first match wins (see
+            ``pewm_jax.tree``); a leaf that none matches is an error.
     """
 
     number: int
     memory: bool
-    trained: tuple[str, ...]
+    rules: tuple[tuple[str, str], ...]
+
+    @property
+    def trained(self) -> tuple[str, ...]:
+        """Return the patterns of what is trained."""
+        return tuple(pattern for pattern, label in self.rules if label == TRAIN)
+
+    def labels(self, params: Any) -> Any:
+        """Return a tree of ``TRAIN`` and ``FREEZE``, the mask that the optimizer works by.
+
+        Raises:
+            TreeError: leaves that no rule matches.
+        """
+        return tree.assign(self.rules, params, f"rules of {self.name}")
 
     @property
     def name(self) -> str:
@@ -37,8 +55,16 @@ class Stage:
 
 
 STAGES = (
-    Stage(number=1, memory=False, trained=(r"backbone/.*",)),
-    Stage(number=2, memory=True, trained=(r"memory/.*",)),
+    Stage(
+        number=1,
+        memory=False,
+        rules=((r"backbone/.*", TRAIN), (r"(codec|encoder|text)/.*", FREEZE)),
+    ),
+    Stage(
+        number=2,
+        memory=True,
+        rules=((r"memory/.*", TRAIN), (r"(backbone|codec|encoder|text)/.*", FREEZE)),
+    ),
 )
 
 

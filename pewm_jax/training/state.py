@@ -28,7 +28,7 @@ class TrainState:
     Attributes:
         params: all parameters of the stage, trained and frozen, float32.
         ema: exponential moving average of the trained parameters only.
-        opt_state: optimizer state of the trained parameters only.
+        opt_state: optimizer state; moments of the trained parameters only.
         step: () int32, steps done; also the position in the data.
     """
 
@@ -64,7 +64,7 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
     return TrainState(
         params=params,
         ema=jax.tree.map(jnp.copy, trained),
-        opt_state=optimizer.make(config, stage).init(trained),
+        opt_state=optimizer.make(config, stage).init(params),
         step=jnp.zeros((), jnp.int32),
     )
 

@@ -1,7 +1,8 @@
 """One step of training: a pure function, and the one place where it is compiled.
 
-Only the trained subtree is differentiated, so frozen leaves pass through bit-identical and the
-compiler never computes the gradients of frozen weights.
+Only the trained subtree is differentiated and updated: frozen leaves pass through bit-identical,
+and no gradient of frozen weights is ever computed; the optimizer's mask (``stages``, ``optimizer``)
+gets zeros in their place.
 """
 
 from __future__ import annotations
@@ -50,8 +51,12 @@ def train_step(
         return objective.loss(config, params, clip, step_key, memory=stage.memory)
 
     (loss, measured), gradients = jax.value_and_grad(loss_of, has_aux=True)(trained)
-    updates, opt_state = optimizer.make(config, stage).update(gradients, state.opt_state, trained)
-    trained = cast("Params", optax.apply_updates(trained, updates))
+    still = jax.tree.map(jnp.zeros_like, frozen)
+    updates, opt_state = optimizer.make(config, stage).update(
+        tree.merge(gradients, still), state.opt_state, state.params
+    )
+    moved = tree.select(cast("Params", updates), stage.trained)
+    trained = cast("Params", optax.apply_updates(trained, moved))
     metrics = {
         **measured,
         "loss": loss,

@@ -54,6 +54,20 @@ def test_gradients_beyond_the_norm_are_scaled_down_together():
         np.testing.assert_allclose(left, right, rtol=1e-4)
 
 
+def test_frozen_leaves_have_no_moments_no_update_and_no_say_in_the_clipping():
+    params = {"backbone": {"kernel": jnp.ones((2, 2))}, "memory": {"kernel": jnp.ones((3, 3))}}
+    adam = optimizer.make(fakes.config(clip_norm=1.0), stages.STAGES[1])
+    state = adam.init(params)
+    assert {leaf.shape for leaf in jax.tree.leaves(state)} == {(), (3, 3)}
+    quiet = jax.tree.map(lambda leaf: 0.1 * leaf, params)
+    loud = {**quiet, "backbone": {"kernel": jnp.full((2, 2), 1e6)}}
+    for gradients in (quiet, loud):
+        updates, after = adam.update(gradients, state, params)
+        np.testing.assert_array_equal(updates["backbone"]["kernel"], 0)
+        moments = sorted(float(leaf.max()) for leaf in jax.tree.leaves(after) if leaf.ndim)
+        np.testing.assert_allclose(moments, [0.001 * 0.01, 0.1 * 0.1], rtol=1e-5)
+
+
 def test_nothing_to_train_is_refused_and_empty_stages_are_skipped():
     with pytest.raises(ConfigError, match="both 0"):
         stages.planned(fakes.config(stage1=0, stage2=0))

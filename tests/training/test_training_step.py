@@ -123,7 +123,7 @@ def test_freezing_the_backbone_makes_the_step_of_the_real_model_cheaper():
     def flops(stage):
         return step.lower_step(config, stage, mesh, clip).cost_analysis()["flops"]
 
-    everything = dataclasses.replace(TWO, trained=(r".*",))
+    everything = dataclasses.replace(TWO, rules=((r".*", stages.TRAIN),))
     assert flops(TWO) < 0.85 * flops(everything)
 
 
@@ -131,6 +131,12 @@ def test_the_stages_cover_the_parameters_of_the_real_model():
     make = functools.partial(world_model.init, configs.load("tiny"), memory=True)
     params = jax.eval_shape(make, jax.random.key(0))
     assert set(tree.select(params, TWO.trained)) == {"memory"}
+    labels = tree.flatten(TWO.labels(params))
+    assert {p for p, label in labels.items() if label == stages.TRAIN} == {
+        p for p in labels if p.startswith("memory/")
+    }
+    with pytest.raises(tree.TreeError, match="rules of stage2 matches stranger"):
+        TWO.labels({**params, "stranger": 0})
     assert set(tree.exclude(params, TWO.trained)) == {"backbone"}
     assert (
         tree.mismatches(tree.select(params, ONE.trained), tree.exclude(params, TWO.trained)) == []
