@@ -1,0 +1,185 @@
+"""What of a world model runs on its own: functions of flat named arrays, and their lowering."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax import rollouts, tree
+from pewm_jax.config import Config, UserError
+from pewm_jax.memory import memories
+from pewm_jax.models import codec, world_model
+from pewm_jax.types import Array, Camera, Frames, Params
+
+Arrays: TypeAlias = dict[str, Array]
+"""Name → array, or anything with a shape and a dtype."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """One function to be exported.
+
+    Attributes:
+        meaning: a line on what it does.
+        function: ``(weights, inputs) -> outputs``, all flat named arrays.
+        inputs: the inputs' shapes and dtypes.
+    """
+
+    meaning: str
+    function: Callable[[Arrays, Arrays], Arrays]
+    inputs: Arrays
+
+
+def rollout_programs(config: Config, params: Params, frames: int, clips: int) -> dict[str, Program]:
+    """Return ``start`` and ``rollout`` (see ``pewm_jax.rollouts``) on flat arrays.
+
+    Args:
+        config: the experiment.
+        params: its weights; only their paths and shapes matter.
+        frames: observed frames that a world begins with.
+        clips: clips that one call imagines.
+    """
+    clip = config.clip
+    size = (frames, clip.height, clip.width)
+    observed = Frames(
+        jax.ShapeDtypeStruct((*size, 3), jnp.uint8),
+        jax.ShapeDtypeStruct(size, jnp.float32),
+        _camera(frames),
+    )
+    state = jax.eval_shape(lambda p, f: rollouts.start(config, p, f), params, observed)
+
+    def start(weights: Arrays, inputs: Arrays) -> Arrays:
+        (given,) = _pack({"frames": observed}, inputs)
+        return _name(state=rollouts.start(config, tree.unflatten(weights), given))
+
+    def rollout(weights: Arrays, inputs: Arrays) -> Arrays:
+        (given,) = _pack({"state": state}, inputs)
+        key = jax.random.wrap_key_data(inputs["key"], impl="threefry2x32")
+        world = tree.unflatten(weights)
+        after, imagined = rollouts.rollout(config, world, given, inputs["actions"], key)
+        return _name(state=after, imagined=imagined)
+
+    moves = jax.ShapeDtypeStruct((clips * (clip.frames - 1), 3), jnp.float32)
+    key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+    return {
+        "start": Program(
+            "begins a world from posed RGB-D frames, the last of which is the present one",
+            start,
+            _name(frames=observed),
+        ),
+        "rollout": Program(
+            "imagines what follows: actions are (dx, dy, dyaw) in metres forward, metres left "
+            "and radians to the left; colours come out in [-1, 1], depth in metres",
+            rollout,
+            {**_name(state=state), "actions": moves, "key": key},
+        ),
+    }
+
+
+def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
+    """Return one evaluation of the denoiser (``world_model.apply``) on flat arrays.
+
+    Args:
+        config: the experiment.
+        params: its weights; only their paths and shapes matter.
+        batch: clips at once.
+    """
+    clip = config.clip
+
+    def like(shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((batch, *shape), dtype)
+
+    camera = jax.tree.map(lambda x: like(x.shape), _camera(clip.frames))
+    first = like((clip.height, clip.width, 3)), like((clip.height, clip.width))
+    told = jax.eval_shape(
+        lambda p, rgb, depth, c: world_model.condition(config, p, rgb, depth, c),
+        params,
+        *first,
+        camera,
+    )
+    parts = {"conditioning": told}
+    if "memory" in params:
+
+        def read(c: Camera) -> Any:
+            return memories.tokens(config, memories.empty(config, jnp.zeros(3)), c)
+
+        parts["tokens"] = jax.eval_shape(jax.vmap(read), camera)
+    noisy = like((*codec.latent_shape(config), codec.latent_channels(config)))
+
+    def denoise(weights: Arrays, inputs: Arrays) -> Arrays:
+        given = _pack(parts, inputs)
+        tokens = given[1] if len(given) > 1 else None
+        noisy, times = inputs["noisy_BthwC"], inputs["timesteps_B"]
+        world = tree.unflatten(weights)
+        out = world_model.apply(config, world, noisy, given[0], times, tokens)
+        return {"prediction_BthwC": out}
+
+    target = config.diffusion.target
+    return Program(
+        f"one evaluation of the denoiser: the prediction is {target} at levels 0 to "
+        f"{config.diffusion.train_steps - 1}",
+        denoise,
+        {"noisy_BthwC": noisy, "timesteps_B": like((), jnp.int32), **_name(**parts)},
+    )
+
+
+def lower(program: Program, weights: Arrays, platforms: Sequence[str]) -> jax.export.Exported:
+    """Lower a program for every platform for which that is possible.
+
+    Args:
+        program: what to lower.
+        weights: its weights, flat.
+        platforms: where it shall run.
+
+    Raises:
+        UserError: it cannot be lowered for any.
+    """
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype), weights)
+    function = jax.jit(program.function)
+
+    def attempt(names: Sequence[str]) -> jax.export.Exported:
+        return jax.export.export(function, platforms=names)(like, program.inputs)
+
+    def possible(name: str) -> bool:
+        try:
+            attempt([name])
+        except (NotImplementedError, ValueError):
+            return False
+        return True
+
+    try:
+        return attempt(platforms)
+    except (NotImplementedError, ValueError) as error:
+        names = [name for name in platforms if possible(name)]
+        if not names:
+            raise UserError(
+                f"This model cannot be lowered for {', '.join(platforms)} "
+                f"({str(error).splitlines()[0]}); name other platforms."
+            ) from None
+        return attempt(names)
+
+
+def _camera(count: int) -> Camera:
+    return Camera(
+        jax.ShapeDtypeStruct((count, 4), jnp.float32),
+        jax.ShapeDtypeStruct((count, 4, 4), jnp.float32),
+    )
+
+
+def _name(**parts: Any) -> Arrays:
+    """Flatten pytrees into named arrays: ``frames/camera/intrinsics_4``."""
+    return tree.flatten(parts)
+
+
+def _pack(parts: dict[str, Any], arrays: Arrays) -> list[Any]:
+    """Build pytrees like the given ones from named arrays, the inverse of ``_name``."""
+    return [
+        jax.tree.unflatten(jax.tree.structure(like), [arrays[n] for n in _name(**{part: like})])
+        for part, like in parts.items()
+    ]

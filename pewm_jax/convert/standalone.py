@@ -1,0 +1,133 @@
+"""Run an exported world model without any model code.
+
+It takes ``pip install jax numpy safetensors flatbuffers``::
+
+    python run.py                                   # made-up frames: shows that it runs
+    python run.py --inputs mine.npz --out out.npz   # arrays by the names in signature.json
+
+From Python::
+
+    import run
+
+    model = run.Model(".")
+    values = model({"frames/rgb_THWC": …, …, "actions": …, "key": run.key(0)})
+
+Programs are called in the order of signature.json; what one returns, the next may take. To go on
+from where a rollout ended, call ``model.programs["rollout"]`` with the returned ``state/…``.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import jax
+import jax.export
+import numpy as np
+from safetensors.flax import load_file
+
+
+class Model:
+    """The programs of a folder, each compiled when it is first called.
+
+    Attributes:
+        signature: the content of signature.json.
+        weights: name → array.
+        programs: name → function from named arrays to named arrays.
+    """
+
+    def __init__(self, folder: str | Path):
+        folder = Path(folder)
+        self.signature = json.loads((folder / "signature.json").read_text("utf-8"))
+        self.weights = load_file(folder / self.signature["weights"])
+        self.programs = {
+            name: self._program(folder / entry["file"], entry)
+            for name, entry in self.signature["programs"].items()
+        }
+
+    def __call__(self, values):
+        """Call every program in order; returns all that they returned."""
+        returned = {}
+        for program in self.programs.values():
+            returned.update(program({**values, **returned}))
+        return returned
+
+    def _program(self, file, entry):
+        call = jax.jit(jax.export.deserialize(bytearray(file.read_bytes())).call)
+
+        def program(values):
+            inputs = {}
+            for item in entry["inputs"]:
+                name, shape = item["name"], tuple(item["shape"])
+                if name not in values:
+                    raise SystemExit(f"error: {name} {shape} {item['dtype']} is not given.")
+                inputs[name] = np.asarray(values[name], item["dtype"])
+                if inputs[name].shape != shape:
+                    got = inputs[name].shape
+                    raise SystemExit(f"error: {name} has the shape {got}; it must be {shape}.")
+            return call(self.weights, inputs)
+
+        return program
+
+
+def key(seed):
+    """Return the key of a seed: the randomness of sampling."""
+    return np.array([0, seed], np.uint32)
+
+
+def example(signature, seed=0):
+    """Make up inputs: noise for pictures, walls two metres away, a camera at the origin."""
+    rng = np.random.default_rng(seed)
+    values, returned = {}, set()
+    for entry in signature["programs"].values():
+        for item in entry["inputs"]:
+            if item["name"] not in returned:
+                values[item["name"]] = _made_up(rng, item)
+        returned |= {item["name"] for item in entry["outputs"]}
+    return values
+
+
+def _made_up(rng, item):
+    name, shape, dtype = item["name"].split("/")[-1], tuple(item["shape"]), item["dtype"]
+    level = [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1], [0, 0, 0, 1]]
+    known = {"key": key(0), "intrinsics_4": [8, 8, 8, 8], "world_from_camera": level}
+    if name in known:
+        made = np.broadcast_to(known[name], shape)
+    elif name == "depth_THW":
+        made = rng.uniform(1.5, 2.5, shape)
+    elif dtype == "bool":
+        made = np.ones(shape)
+    elif np.issubdtype(dtype, np.integer):
+        made = rng.integers(0, 256, shape)
+    else:
+        made = rng.normal(size=shape) * (0.1 if name == "actions" else 1.0)
+    return np.array(made, dtype)
+
+
+def main():
+    """Run the programs on given or made-up inputs."""
+    parser = argparse.ArgumentParser(description="Run an exported world model.")
+    parser.add_argument("--inputs", help="npz file of inputs, by the names in signature.json")
+    parser.add_argument("--out", help="npz file to write what the programs return")
+    given = parser.parse_args()
+    model = Model(Path(__file__).parent)
+    for name, entry in model.signature["programs"].items():
+        print(f"{name}: {entry['meaning']}")
+        for way in ("inputs", "outputs"):
+            for item in entry[way]:
+                print(f"  {way[:-1]:<7} {item['name']} {item['dtype']} {tuple(item['shape'])}")
+    values = dict(np.load(given.inputs)) if given.inputs else example(model.signature)
+    began = time.perf_counter()
+    returned = {name: np.asarray(value) for name, value in model(values).items()}
+    print(f"ran in {time.perf_counter() - began:.1f} s, compiling included, {jax.devices()[0]}")
+    for name, value in returned.items():
+        if np.issubdtype(value.dtype, np.floating) and value.size:
+            print(f"  {name}: {value.min():.4g} to {value.max():.4g}")
+    if given.out:
+        with Path(given.out).open("wb") as file:
+            np.savez(file, allow_pickle=False, **returned)
+        print(f"wrote {given.out}")
+
+
+if __name__ == "__main__":
+    main()

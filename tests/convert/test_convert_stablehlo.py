@@ -1,0 +1,163 @@
+"""Exported programs run in a process that has no model code, and do what the library does."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pewm_jax
+from pewm_jax import config as configuration
+from pewm_jax import tree
+from pewm_jax.config import ClipConfig, DiffusionConfig, MemoryConfig, UserError
+from pewm_jax.convert import programs, stablehlo
+from pewm_jax.models import world_model
+from pewm_jax.training import runs, stages
+from tests.helpers import random_frames, tiny_config
+
+CONFIG = tiny_config(
+    clip=ClipConfig(frames=5, height=16, width=16),
+    memory=MemoryConfig(
+        cells=(16, 16, 8), capacity=128, tokens=8, encoder_patch=2, heads=4, head_dim=8
+    ),
+    diffusion=DiffusionConfig(sample_steps=1, sampler="dpm"),
+)
+ALONE = (
+    "import runpy, sys; sys.modules.update(pewm_jax=None, flax=None); "
+    "runpy.run_path(sys.argv[0], run_name='__main__')"
+)
+
+serialises = pytest.mark.skipif(
+    importlib.util.find_spec("flatbuffers") is None, reason="flatbuffers is not installed"
+)
+
+
+@pytest.fixture(scope="module")
+def params():
+    like = jax.eval_shape(lambda key: world_model.init(CONFIG, key), jax.random.key(0))
+    rng = np.random.default_rng(0)
+    return jax.tree.map(lambda x: rng.normal(0, 0.2, x.shape).astype(np.float32), like)
+
+
+@pytest.fixture(scope="module")
+def run(params, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "mine"
+    folder.mkdir()
+    configuration.save(CONFIG, folder / runs.CONFIG)
+    runs.publish(folder, stages.STAGES[1], 7, params)
+    return folder
+
+
+def alone(folder, *flags):
+    """Run a folder's run.py where neither this library nor flax can be imported."""
+    code = f"import sys; sys.argv = sys.argv[1:]; {ALONE}"
+    return subprocess.run(
+        [sys.executable, "-c", code, str(folder / "run.py"), *map(str, flags)],
+        cwd=folder.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@serialises
+def test_a_rollout_runs_without_the_library_and_equals_it(run, params, tmp_path):
+    dst, said = tmp_path / "program", []
+    stablehlo.export(run, dst, clips=2, frames=3, check=False, say=said.append)
+    assert not any("left out" in line for line in said)
+    signature = json.loads((dst / "signature.json").read_text())
+    for entry in signature["programs"].values():
+        assert entry["platforms"] == ["cpu", "cuda", "tpu"]
+    assert signature["discrete_actions"]["forward"] == [CONFIG.actions.step_m, 0.0, 0.0]
+
+    frames = random_frames(np.random.default_rng(0), 3, 16, 16)
+    moves = np.random.default_rng(1).normal(0, 0.1, (8, 3)).astype(np.float32)
+    inputs = {**tree.flatten({"frames": frames}), "actions": moves, "key": np.uint32([0, 5])}
+    np.savez(tmp_path / "in.npz", **inputs)
+    done = alone(dst, "--inputs", tmp_path / "in.npz", "--out", tmp_path / "out.npz")
+    assert done.returncode == 0, done.stderr
+    got = dict(np.load(tmp_path / "out.npz"))
+
+    start = jax.jit(pewm_jax.start, static_argnums=0)
+    rollout = jax.jit(pewm_jax.rollout, static_argnums=0)
+    state = start(CONFIG, params, frames)
+    after, imagined = rollout(CONFIG, params, state, moves, jax.random.key(5))
+    want = tree.flatten({"state": after, "imagined": imagined})
+    assert got.keys() == want.keys()
+    for name, value in want.items():
+        assert stablehlo.difference(got[name], np.asarray(value)) <= 1e-3, name
+    for entry in signature["programs"]["rollout"]["outputs"]:
+        assert got[entry["name"]].shape == tuple(entry["shape"])
+        assert got[entry["name"]].dtype == entry["dtype"]
+
+    refused = alone(dst, "--inputs", tmp_path / "out.npz")
+    assert "frames/rgb_THWC (3, 16, 16, 3) uint8 is not given" in refused.stderr
+    with pytest.raises(UserError, match="exists already"):
+        stablehlo.export(run, dst, say=said.append)
+
+
+@serialises
+def test_a_denoise_step_is_checked_in_a_fresh_process(run, params, tmp_path):
+    said = []
+    stablehlo.export(run, tmp_path / "step", what="denoise", platforms=["cpu"], say=said.append)
+    assert any("largest difference" in line for line in said)
+    program = programs.denoise_program(CONFIG, params)
+    assert {"noisy_BthwC", "timesteps_B", "tokens/valid_M"} <= program.inputs.keys()
+    bare = programs.denoise_program(CONFIG, {"backbone": params["backbone"]})
+    assert not any(name.startswith("tokens") for name in bare.inputs)
+
+    other = jax.tree.map(lambda x: x * 1.5, params)
+    with pytest.raises(UserError, match="differ from the library by"):
+        stablehlo.verify(tmp_path / "step", {"denoise": program}, other, 1e-3)
+    (tmp_path / "step" / "denoise.jaxexport").write_bytes(b"nothing")
+    with pytest.raises(UserError, match="do not run in a fresh process"):
+        stablehlo.verify(tmp_path / "step", {"denoise": program}, params, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"clips": 0}, "clips is 0: use at least 1"),
+        ({"frames": 0}, "frames is 0: use at least 1"),
+        ({"platforms": ["rocket"]}, "no platform rocket; there is cpu, cuda, tpu"),
+        ({"platforms": []}, "no platform given"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_and_leaves_nothing(run, tmp_path, options, sentence):
+    with pytest.raises(UserError, match=sentence):
+        stablehlo.export(run, tmp_path / "x", **options, say=lambda _: None)
+    with pytest.raises(UserError, match="not a folder"):
+        stablehlo.export(tmp_path / "none", tmp_path / "x", say=lambda _: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_platforms_that_a_program_cannot_be_lowered_for_are_left_out():
+    def only_cpu(weights, inputs):
+        del weights
+        return {"y": jax.lax.platform_dependent(inputs["x"], cpu=jnp.sin)}
+
+    shape = {"x": jax.ShapeDtypeStruct((2,), jnp.float32)}
+    program = programs.Program("", only_cpu, shape)
+    assert programs.lower(program, {}, ["cpu", "tpu"]).platforms == ("cpu",)
+    with pytest.raises(UserError, match="cannot be lowered for tpu"):
+        programs.lower(program, {}, ["tpu"])
+
+
+@pytest.mark.parametrize(
+    ("got", "want", "difference"),
+    [
+        ([1.0, 2.0], [1.0, 2.0], 0.0),
+        ([1.0, 2.1], [1.0, 2.0], 0.05),
+        ([1.0, -np.inf], [1.0, -np.inf], 0.0),
+        ([1.0, 2.0], [1.0, -np.inf], np.inf),
+        ([1.0], [1.0, 1.0], np.inf),
+        ([np.nan, 1.0], [1.0, 1.0], np.nan),
+    ],
+)
+def test_differences_are_of_the_largest_value_and_infinities_must_agree(got, want, difference):
+    found = stablehlo.difference(np.array(got), np.array(want))
+    np.testing.assert_allclose(found, difference)
