@@ -156,11 +156,11 @@ def require_like(tree: Any, like: Any, what: str) -> None:
         raise TreeError(f"{what} does not fit this configuration: {listing(wrong)}.")
 
 
-def listing(items: Iterable[str]) -> str:
+def listing(items: Iterable[str], most: int = _LISTED) -> str:
     """Join a few items for a message and count the others."""
     items = sorted(items)
-    more = len(items) - _LISTED
-    return ", ".join(items[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+    more = len(items) - most
+    return ", ".join(items[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def _path(keys: Any) -> str:

@@ -24,6 +24,9 @@ FLOATS = ("float32", "bfloat16", "float16")
 STORED = (*FLOATS, "float64")
 """The dtypes weights may come in; a table that a network has computed can be float64."""
 
+_LISTED = 200
+"""Names in a message: those who wrote the file need all of them."""
+
 
 def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...]]:
     """Return the foreign names and shapes that the entries ask for, nothing allocated.
@@ -66,8 +69,10 @@ def require(entries: Sequence[Entry], source: Source, like: Params) -> None:
     have = set(source.names())
     missing, unused = want.keys() - have, have - want.keys()
     if missing or unused:
-        parts = [f"lacks {len(missing)} tensors ({tree.listing(missing)})"] * bool(missing)
-        parts += [f"has {len(unused)} tensors of no use ({tree.listing(unused)})"] * bool(unused)
+        parts = [f"lacks {len(missing)} tensors ({tree.listing(missing, _LISTED)})"] * bool(missing)
+        parts += [f"has {len(unused)} tensors of no use ({tree.listing(unused, _LISTED)})"] * bool(
+            unused
+        )
         raise UserError(
             f"{source.where} does not fit its config.json: it {' and '.join(parts)}; are they of "
             "the same network?"
