@@ -176,7 +176,7 @@ def difference(got: np.ndarray, want: np.ndarray) -> float:
 
 def _serialize(exported: jax.export.Exported) -> bytes:
     try:
-        return exported.serialize()
+        return bytes(exported.serialize())
     except ImportError:
         raise UserError(
             "jax.export cannot write programs without flatbuffers; run pip install flatbuffers."
