@@ -19,7 +19,7 @@ import numpy as np
 from pewm_jax import config as configuration
 from pewm_jax import weights
 from pewm_jax.config import DINOv2Config, UserError
-from pewm_jax.models import layers
+from pewm_jax.models import blocked_attention, layers
 from pewm_jax.types import Array, Params
 
 MEAN_3 = (0.485, 0.456, 0.406)
@@ -43,7 +43,7 @@ class Block(nn.Module):
             layers.split_heads(layers.dense(width, dtype, f"to_{n}")(normed), config.heads)
             for n in "qkv"
         )
-        mixed = layers.merge_heads(layers.attention(q, k, v))
+        mixed = layers.merge_heads(blocked_attention.attention(q, k, v))
         mixed = layers.dense(width, dtype, "to_out")(mixed)
         x_BND += mixed * self._scale("scale1", dtype)
         normed = _norm(config, "norm2")(x_BND).astype(dtype)

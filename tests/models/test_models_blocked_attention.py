@@ -1,0 +1,52 @@
+"""Attention in pieces is attention, whatever the number of pieces."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax.models import blocked_attention, layers
+
+
+def inputs(batch=2, heads=3, queries=13, keys=11, channels=8):
+    rng = np.random.default_rng(0)
+    shapes = [(batch, heads, n, channels) for n in (queries, keys, keys)]
+    return [jnp.asarray(rng.normal(0, 2, shape), jnp.float32) for shape in shapes]
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 5, 13])
+def test_pieces_make_the_whole(blocks):
+    q, k, v = inputs()
+    want = layers.attention(q, k, v)
+    got = blocked_attention.in_pieces(q, k, v, blocks)
+    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
+
+
+def test_large_logits_do_not_overflow():
+    q, k, v = inputs()
+    got = blocked_attention.in_pieces(q * 1e3, k * 1e3, v, 2)
+    np.testing.assert_allclose(got, layers.attention(q * 1e3, k * 1e3, v), rtol=1e-3, atol=1e-3)
+    assert np.isfinite(got).all()
+
+
+def test_what_does_not_fit_is_cut_on_a_cpu_and_only_there(monkeypatch):
+    q, k, v = inputs()
+    monkeypatch.setattr(blocked_attention, "LOGITS", 100)
+
+    def loops(platform):
+        traced = jax.jit(lambda *x: blocked_attention.attention(*x)).trace(q, k, v)
+        return traced.lower(lowering_platforms=(platform,)).as_text().count("stablehlo.while")
+
+    assert loops("cpu") == 2
+    assert loops("cuda") == 0
+    want = layers.attention(q, k, v)
+    np.testing.assert_allclose(
+        jax.jit(lambda *x: blocked_attention.attention(*x))(q, k, v), want, rtol=1e-5, atol=1e-6
+    )
+    worlds = jax.vmap(blocked_attention.attention)(*(jnp.stack([x, x[::-1]]) for x in (q, k, v)))
+    np.testing.assert_allclose(worlds, jnp.stack([want, want[::-1]]), rtol=1e-5, atol=1e-6)
+
+
+def test_few_tokens_are_not_cut():
+    text = jax.jit(lambda *x: blocked_attention.attention(*x)).lower(*inputs()).as_text()
+    assert "stablehlo.while" not in text
