@@ -16,12 +16,20 @@ commands:
                      --rgbd --camera [--memory] a world model to train from
   import dinov2      DINOv2 (transformers or the original state dict) → the map's image encoder
   export diffusers   our CogVideoX weights, fine-tuned or not → a folder for from_pretrained
+  export inference   a training run → averaged weights in bfloat16, settings and a card
+  export stablehlo   a training run → programs that run without this library
+  export inference   a training run → averaged weights in bfloat16, settings and a card
+  export stablehlo   a world model → programs that run without this library
 
 Each has --help. DST is made whole or not at all."""
 COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "import cogvideox": (commands.ImportCogVideoX, commands.import_cogvideox),
     "import dinov2": (commands.ImportDINOv2, commands.import_dinov2),
     "export diffusers": (commands.ExportDiffusers, commands.export_diffusers),
+    "export inference": (commands.ExportInference, commands.export_inference),
+    "export stablehlo": (commands.ExportStableHLO, commands.export_stablehlo),
+    "export inference": (commands.ExportInference, commands.export_inference),
+    "export stablehlo": (commands.ExportStableHLO, commands.export_stablehlo),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,7 +12,17 @@ import tyro
 
 from pewm_jax import cli
 from pewm_jax.config import Config, ConfigError, UserError
-from pewm_jax.convert import base, cogvideox, diffusers_folder, dinov2, output, text, world
+from pewm_jax.convert import (
+    base,
+    cogvideox,
+    diffusers_folder,
+    dinov2,
+    inference,
+    output,
+    stablehlo,
+    text,
+    world,
+)
 from pewm_jax.convert.cogvideox import TRANSFORMER, VAE
 
 Dtype = Literal["float32", "bfloat16", "float16"]
@@ -112,6 +123,82 @@ class ExportDiffusers:
     whole pipeline loads. Without them it loads with text_encoder=None, tokenizer=None."""
 
 
+@dataclasses.dataclass(frozen=True)
+class ExportInference:
+    """Write what inference needs of a training run: averaged weights in bfloat16, settings, a card.
+
+    The folder is read by `pewm_jax.load`; the card says what it is, what it was trained on and how
+    long, and the licence of the weights that the training started from.
+    """
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """A run's folder, made by train.py."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to make."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportStableHLO:
+    """Write the world model as programs that need jax and NumPy, and none of this library's code.
+
+    They are checked by running them in a fresh process.
+    """
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """A folder that `pewm_jax.load` reads: a run's, or that of `export inference`."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to make."""
+    what: Literal["rollout", "denoise"] = "rollout"
+    """`rollout`: begin a world and imagine clips; `denoise`: one step of the denoiser."""
+    clips: int = 1
+    """Clips that one call of the rollout imagines."""
+    frames: int | None = None
+    """Observed frames that a world begins with; by default data.context."""
+    platforms: tuple[str, ...] = stablehlo.PLATFORMS
+    """Where the programs shall run."""
+    check: bool = True
+    """Run the programs on the CPU afterwards and compare; for a large model this takes long."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportInference:
+    """Write what inference needs of a training run: averaged weights in bfloat16, settings, a card.
+
+    `pewm_jax.load` reads the folder; README.md in it is the card, with data, steps, scores and the
+    licence of the base.
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder made by train.py."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to make."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportStableHLO:
+    """Write a run as programs that need jax but none of this library, by `jax.export`.
+
+    Weights lie beside them in safetensors, signature.json names what goes in and out, and run.py
+    shows how to call them.
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder made by train.py, or better one made by `export inference`: half the size."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to make."""
+    what: Literal["rollout", "denoise"] = "rollout"
+    """`rollout`: begin a world from frames, and imagine clips. `denoise`: one evaluation of the
+    denoiser."""
+    clips: int = 1
+    """Clips that one call of the rollout imagines."""
+    frames: int | None = None
+    """Observed frames that a world begins with; by default the run's data.context."""
+    platforms: tuple[Literal["cpu", "cuda", "tpu"], ...] = ("cpu", "cuda", "tpu")
+    """Where the programs shall run."""
+    check: bool = True
+    """Run them on the CPU in a fresh process and compare; --no-check for large models."""
+
+
 def import_cogvideox(options: ImportCogVideoX) -> None:
     """Run ``import cogvideox``."""
     src, dst = options.src, options.dst
@@ -184,3 +271,33 @@ def export_diffusers(options: ExportDiffusers) -> None:
     """Run ``export diffusers``."""
     diffusers_folder.export(options.src, options.dst, options.base, options.dtype, options.original)
     print(f"{options.dst}: transformer/, vae/, scheduler/ for diffusers' from_pretrained")
+
+
+def export_inference(options: ExportInference) -> None:
+    """Run ``export inference``."""
+    inference.export(options.src, options.dst)
+
+
+def export_stablehlo(options: ExportStableHLO) -> None:
+    """Run ``export stablehlo``."""
+    stablehlo.export(
+        options.src,
+        options.dst,
+        what=options.what,
+        clips=options.clips,
+        frames=options.frames,
+        platforms=options.platforms,
+        check=options.check,
+    )
+
+
+def export_inference(options: ExportInference) -> None:
+    """Run ``export inference``."""
+    inference = importlib.import_module("pewm_jax.convert.inference")  # --help needs no networks
+    inference.export(options.run, options.dst)
+
+
+def export_stablehlo(options: ExportStableHLO) -> None:
+    """Run ``export stablehlo``."""
+    stablehlo = importlib.import_module("pewm_jax.convert.stablehlo")
+    stablehlo.export(**vars(options))
