@@ -28,8 +28,6 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "export diffusers": (commands.ExportDiffusers, commands.export_diffusers),
     "export inference": (commands.ExportInference, commands.export_inference),
     "export stablehlo": (commands.ExportStableHLO, commands.export_stablehlo),
-    "export inference": (commands.ExportInference, commands.export_inference),
-    "export stablehlo": (commands.ExportStableHLO, commands.export_stablehlo),
 }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -160,45 +159,6 @@ class ExportStableHLO:
     """Run the programs on the CPU afterwards and compare; for a large model this takes long."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ExportInference:
-    """Write what inference needs of a training run: averaged weights in bfloat16, settings, a card.
-
-    `pewm_jax.load` reads the folder; README.md in it is the card, with data, steps, scores and the
-    licence of the base.
-    """
-
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder made by train.py."""
-    dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ExportStableHLO:
-    """Write a run as programs that need jax but none of this library, by `jax.export`.
-
-    Weights lie beside them in safetensors, signature.json names what goes in and out, and run.py
-    shows how to call them.
-    """
-
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder made by train.py, or better one made by `export inference`: half the size."""
-    dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
-    what: Literal["rollout", "denoise"] = "rollout"
-    """`rollout`: begin a world from frames, and imagine clips. `denoise`: one evaluation of the
-    denoiser."""
-    clips: int = 1
-    """Clips that one call of the rollout imagines."""
-    frames: int | None = None
-    """Observed frames that a world begins with; by default the run's data.context."""
-    platforms: tuple[Literal["cpu", "cuda", "tpu"], ...] = ("cpu", "cuda", "tpu")
-    """Where the programs shall run."""
-    check: bool = True
-    """Run them on the CPU in a fresh process and compare; --no-check for large models."""
-
-
 def import_cogvideox(options: ImportCogVideoX) -> None:
     """Run ``import cogvideox``."""
     src, dst = options.src, options.dst
@@ -289,15 +249,3 @@ def export_stablehlo(options: ExportStableHLO) -> None:
         platforms=options.platforms,
         check=options.check,
     )
-
-
-def export_inference(options: ExportInference) -> None:
-    """Run ``export inference``."""
-    inference = importlib.import_module("pewm_jax.convert.inference")  # --help needs no networks
-    inference.export(options.run, options.dst)
-
-
-def export_stablehlo(options: ExportStableHLO) -> None:
-    """Run ``export stablehlo``."""
-    stablehlo = importlib.import_module("pewm_jax.convert.stablehlo")
-    stablehlo.export(**vars(options))
