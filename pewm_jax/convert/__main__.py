@@ -17,8 +17,6 @@ commands:
   import dinov2      DINOv2 (transformers or the original state dict) → the map's image encoder
   export diffusers   our CogVideoX weights, fine-tuned or not → a folder for from_pretrained
   export inference   a training run → averaged weights in bfloat16, settings and a card
-  export stablehlo   a training run → programs that run without this library
-  export inference   a training run → averaged weights in bfloat16, settings and a card
   export stablehlo   a world model → programs that run without this library
 
 Each has --help. DST is made whole or not at all."""
