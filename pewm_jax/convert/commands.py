@@ -10,7 +10,14 @@ import numpy as np
 import tyro
 
 from pewm_jax import cli
-from pewm_jax.config import Config, ConfigError, UserError
+from pewm_jax.config import (
+    Config,
+    ConfigError,
+    DiffusionConfig,
+    DiTConfig,
+    UserError,
+    VAEConfig,
+)
 from pewm_jax.convert import (
     base,
     cogvideox,
@@ -23,6 +30,8 @@ from pewm_jax.convert import (
     world,
 )
 from pewm_jax.convert.cogvideox import TRANSFORMER, VAE
+from pewm_jax.models import dinov2 as dinov2_model
+from pewm_jax.types import Params
 
 Dtype = Literal["float32", "bfloat16", "float16"]
 
@@ -59,6 +68,8 @@ class ImportCogVideoX:
     """Height of its images in pixels; by default 512, or the size of learned positions."""
     width: int | None = None
     """Width of its images in pixels; by default 512, or the size of learned positions."""
+    encoder: Path | None = None
+    """Folder of `import dinov2`: the image encoder behind the map; by default patches' colours."""
     config: Path | None = None
     """JSON file of other settings of the world model, such as {"memory": {"tokens": 1024}}."""
     seed: int = 0
@@ -82,7 +93,7 @@ class ImportCogVideoX:
             return
         if self.memory:
             raise ConfigError("--memory was given without --rgbd --camera; add them.")
-        for name in ("frames", "height", "width", "config"):
+        for name in ("frames", "height", "width", "encoder", "config"):
             if getattr(self, name) is not None:
                 raise ConfigError(f"--{name} is of a world model; add --rgbd --camera.")
 
@@ -172,39 +183,51 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
     diffusion = cogvideox.read_scheduler(src)
     for network in (TRANSFORMER, VAE):  # what is wrong with the files is said before hours of work
         cogvideox.stored_specs(network, src, options.dtype)
-    config = None
-    if options.rgbd:
-        size = (options.frames, options.height, options.width)
-        config = world.config_of(dit, vae, diffusion, size, _stored_dtype(options))
-        config = cli.overlay(config, options.config) if options.config else config
-        world.require_size(config)
+    config, encoder = _world(options, dit, vae, diffusion) if options.rgbd else (None, None)
     prompts = text.encode(src, options.prompt, dit.text_length, dit.text_dim)
     record = base.describe(src, settings, list(prompts), options.dtype)
     if config is None:
         cogvideox.import_pipeline(src, dst, options.dtype, prompts, record)
     else:
-        _import_world(options, config, prompts, record)
+        prompt = next(iter(prompts.values()), None)
+        told: Literal["zeros", "stored"] = "zeros" if prompt is None else "stored"
+        config = dataclasses.replace(config, dit=dataclasses.replace(config.dit, prompt=told))
+        world.import_world(
+            src,
+            dst,
+            config,
+            prompt,
+            record,
+            memory=options.memory,
+            encoder=encoder,
+            dtype=options.dtype,
+            seed=options.seed,
+        )
     print(f"{dst}: {_said(options, prompts)}; licence of the original: {record['licence']}")
 
 
-def _import_world(
-    options: ImportCogVideoX, config: Config, prompts: dict[str, np.ndarray], record: dict
-) -> None:
-    prompt = next(iter(prompts.values()), None)
-    config = dataclasses.replace(
-        config,
-        dit=dataclasses.replace(config.dit, prompt="zeros" if prompt is None else "stored"),
-    )
-    world.import_world(
-        options.src,
-        options.dst,
-        config,
-        prompt,
-        record,
-        memory=options.memory,
-        dtype=options.dtype,
-        seed=options.seed,
-    )
+def _world(
+    options: ImportCogVideoX, dit: DiTConfig, vae: VAEConfig, diffusion: DiffusionConfig
+) -> tuple[Config, Params | None]:
+    """Return the settings of the world model, and its image encoder if it has one.
+
+    Raises:
+        UserError: settings that cannot work, or an encoder that is asked for and not given.
+    """
+    size = (options.frames, options.height, options.width)
+    config = world.config_of(dit, vae, diffusion, size, _stored_dtype(options))
+    config = cli.overlay(config, options.config) if options.config else config
+    world.require_size(config)
+    if options.encoder:
+        network, params = dinov2_model.load(options.encoder)
+        memory = dataclasses.replace(config.memory, encoder="dinov2", dinov2=network)
+        return dataclasses.replace(config, memory=memory), params
+    if config.memory.encoder == "dinov2":
+        raise UserError(
+            "memory.encoder dinov2 needs its weights; name the folder of `import dinov2` with "
+            "--encoder."
+        )
+    return config, None
 
 
 def _stored_dtype(options: ImportCogVideoX) -> str:

@@ -6,6 +6,7 @@ The folder is written part by part, so that no more than one network is in memor
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,10 @@ def require_size(config: Config) -> None:
         raise UserError(f"A clip of {clip.frames}×{clip.height}×{clip.width}: {error}") from None
 
 
+def _same(params: Params) -> Params:
+    return params
+
+
 def import_world(
     src: Path,
     dst: Path,
@@ -96,6 +101,7 @@ def import_world(
     record: dict[str, Any],
     *,
     memory: bool,
+    encoder: Params | None = None,
     dtype: str | None = None,
     seed: int = 0,
 ) -> None:
@@ -108,6 +114,7 @@ def import_world(
         prompt_LC: (L, text_dim) tokens of the prompt, None without a text encoder.
         record: what ``base.json`` shall hold.
         memory: add memory blocks.
+        encoder: parameters of the map's image encoder, if the settings name one that has any.
         dtype: of the weights; by default the stored one, and float32 for memory blocks.
         seed: of the memory blocks.
     """
@@ -141,10 +148,15 @@ def import_world(
         cogvideox.stored_specs(VAE, src, dtype),
         lambda: cogvideox.read_vae(src, dtype)[1],
     )
+    given: dict[str, Params] = {}
+    if encoder is not None:
+        given["encoder"] = encoder
     if prompt_LC is not None:
-        tokens: Array = prompt_LC.astype(new_dtype)
-        like = jax.ShapeDtypeStruct(tokens.shape, tokens.dtype)
-        parts["text"] = ({"prompt_LC": like}, lambda: {"prompt_LC": tokens})
+        given["text"] = {"prompt_LC": prompt_LC}
+    for name, params in given.items():
+        flat = tree.flatten(params)
+        specs = {p: jax.ShapeDtypeStruct(leaf.shape, new_dtype) for p, leaf in flat.items()}
+        parts[name] = (specs, functools.partial(_same, params))
 
     specs = {f"{part}/{p}": spec for part, (like, _) in parts.items() for p, spec in like.items()}
 
