@@ -1,0 +1,186 @@
+"""What a voxel map is and does, all but editing and files (see ``voxel_map``)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+
+from pewm_jax.config import MemoryConfig
+from pewm_jax.memory import cells, voxel_cells, voxel_frames
+from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
+
+
+def empty(
+    config: MemoryConfig, centre_3: Array, channels: int, dtype: DTypeLike = jnp.float32
+) -> VoxelMap:
+    """Return a map that has seen nothing.
+
+    Args:
+        config: cell size, extent, capacity.
+        centre_3: (3,) world position the grid is centred on, metres; the grid's corner is
+            snapped to whole cells so that maps of one world share their cells.
+        channels: features F per cell.
+        dtype: of the features, float32 or bfloat16.
+    """
+    zero = jnp.zeros((), jnp.int32)
+    return VoxelMap(
+        cell_of_slot_V=jnp.full((config.capacity,), voxel_cells.nowhere(config), jnp.int32),
+        features_VF=jnp.full((config.capacity, channels), -jnp.inf, dtype),
+        origin_3=cells.origin(config, centre_3),
+        occupied=zero,
+        dropped=zero,
+        outside=zero,
+    )
+
+
+def cell_centres(config: MemoryConfig, origin_3: Array, cell_V: Array) -> Array:
+    """Return (V, 3) world centres of cell numbers (see ``cells.keys``)."""
+    _, ny, nz = config.cells
+    grid = jnp.stack([cell_V // (ny * nz), cell_V // nz % ny, cell_V % nz], -1)
+    return origin_3 + (grid + 0.5) * np.asarray(config.cell_m, np.float32)
+
+
+def insert(
+    config: MemoryConfig, voxels: VoxelMap, points_P3: Array, features_PF: Array, valid_P: Array
+) -> VoxelMap:
+    """Insert points by scatter-max.
+
+    Args:
+        config: cell size, extent, capacity.
+        voxels: the map.
+        points_P3: (P, 3) world points, metres; what is not a number is outside.
+        features_PF: (P, F) their features, rounded to the map's dtype.
+        valid_P: (P,) bool; False points are ignored.
+
+    Returns:
+        The map after the insertion.
+    """
+    none, size = voxel_cells.nowhere(config), len(points_P3)
+    if size == 0:
+        return voxels
+    valid_P = jnp.asarray(valid_P)
+    seen = cells.keys(config, voxels.origin_3, jnp.asarray(points_P3))
+    beyond = (valid_P & (seen == none)).sum(dtype=jnp.int32)
+    seen = jnp.where(valid_P, seen, none)
+    cell_V, dropped = voxel_cells.admit(voxels.cell_of_slot_V, seen, none)
+    features_PF = jnp.asarray(features_PF)
+
+    def read(start: Array, block: int) -> tuple[Array, Array]:
+        cell, rows = (jax.lax.dynamic_slice_in_dim(x, start, block) for x in (seen, features_PF))
+        slot, found = voxel_cells.find(cell_V, cell)
+        return jnp.where(found & (cell < none), slot, cell_V.shape[0]), rows
+
+    rows = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, none)
+    rows = voxel_cells.maximum_over_blocks(rows, jnp.asarray(size, jnp.int32), size, read)
+    return renewed(config, voxels, cell_V, rows, dropped, beyond)
+
+
+def insert_frames(
+    config: MemoryConfig,
+    voxels: VoxelMap,
+    frames: Frames,
+    features_ThwF: Array,
+    valid_T: Array | None = None,
+) -> VoxelMap:
+    """Insert posed depth frames: upsampling, unprojection and maximum in one pass.
+
+    The same as upsampling the features to all pixels and inserting every pixel's point, up to
+    rounding of the interpolation; the upsampled features never exist (see ``voxel_frames``).
+
+    Args:
+        config: cell size, extent, capacity.
+        voxels: the map.
+        frames: T frames, of which depth and cameras are used; pixels without depth are ignored.
+        features_ThwF: (T, h, w, F) features of a grid of patches that covers each frame, float32
+            or bfloat16; they are upsampled bilinearly in float32, patch centres at half-integers.
+        valid_T: (T,) bool, False frames are ignored.
+    """
+    none, depth_THW = voxel_cells.nowhere(config), jnp.asarray(frames.depth_THW)
+    camera = jax.tree.map(jnp.asarray, frames.camera)
+    seen = voxel_frames.pixel_cells(config, voxels.origin_3, depth_THW, camera)
+    valid = depth_THW > 0
+    if valid_T is not None:
+        valid = valid & jnp.asarray(valid_T)[:, None, None]
+    beyond = (valid & (seen == none)).sum(dtype=jnp.int32)
+    seen = jnp.where(valid, seen, none)
+    cell_V, rows, dropped = voxel_frames.insert(
+        config, voxels.cell_of_slot_V, voxels.features_VF, seen, jnp.asarray(features_ThwF)
+    )
+    return renewed(config, voxels, cell_V, rows, dropped, beyond)
+
+
+def merge(config: MemoryConfig, a: VoxelMap, b: VoxelMap) -> VoxelMap:
+    """Return the union of two maps of one world: the maximum where both have a cell.
+
+    While the capacity holds, inserting into a and then into b's points gives the same as merging.
+    Counts of dropped cells and outside points are added up.
+
+    Args:
+        config: cell size, extent, capacity of both.
+        a: a map; its grid is kept, and its cells have precedence where the capacity is full.
+        b: a map, its grid at the same place or shifted by whole cells; its cells beyond a's grid
+            are counted as outside, once per cell.
+    """
+    points, features, valid = to_points(config, b)
+    both = insert(config, a, points, features, valid)
+    return dataclasses.replace(
+        both, dropped=both.dropped + b.dropped, outside=both.outside + b.outside
+    )
+
+
+def count(voxels: VoxelMap) -> Array:
+    """Return () int32, the number of occupied cells."""
+    return voxels.occupied
+
+
+def to_points(config: MemoryConfig, voxels: VoxelMap) -> tuple[Array, Array, Array]:
+    """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0."""
+    valid = voxels.cell_of_slot_V < voxel_cells.nowhere(config)
+    points = cell_centres(config, voxels.origin_3, jnp.where(valid, voxels.cell_of_slot_V, 0))
+    features = jnp.where(valid[:, None], voxels.features_VF, 0)
+    return jnp.where(valid[:, None], points, 0), features, valid
+
+
+def tokens(
+    config: MemoryConfig, voxels: VoxelMap, camera: Camera, size: tuple[int, int]
+) -> MapTokens:
+    """Choose the M = ``memory.tokens`` cells that condition one clip.
+
+    Cells inside the view of any of the clip's cameras come first, nearest first (by the smallest
+    depth at which a camera sees them); then the others by distance to the nearest camera. Ties
+    go to the lower cell number. Fewer than M occupied cells leave masked tokens. Positions are
+    those of the world; ``models.memory_geometry`` turns them into what attention needs, in the
+    clip's first camera or not (``memory.positions``, ``memory.frame``).
+
+    Args:
+        config: gives M.
+        voxels: the map.
+        camera: (T,) cameras of the clip.
+        size: image height and width in pixels.
+    """
+    points, features, valid = to_points(config, voxels)
+    order = cells.in_view_first(points, valid, camera, size, config.tokens)
+    return MapTokens(features[order], points[order], valid[order])
+
+
+def renewed(
+    config: MemoryConfig,
+    voxels: VoxelMap,
+    cell_V: Array,
+    features_VF: Array,
+    dropped: Array | int = 0,
+    outside: Array | int = 0,
+) -> VoxelMap:
+    """Return a map with other cells and features, its counts of losses increased."""
+    return dataclasses.replace(
+        voxels,
+        cell_of_slot_V=cell_V,
+        features_VF=features_VF,
+        occupied=(cell_V < voxel_cells.nowhere(config)).sum(dtype=jnp.int32),
+        dropped=voxels.dropped + dropped,
+        outside=voxels.outside + outside,
+    )
