@@ -1,5 +1,7 @@
 """Attention in pieces is attention, whatever the number of pieces."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,19 +36,19 @@ def test_what_does_not_fit_is_cut_on_a_cpu_and_only_there(monkeypatch):
     monkeypatch.setattr(blocked_attention, "LOGITS", 100)
 
     def loops(platform):
-        traced = jax.jit(lambda *x: blocked_attention.attention(*x)).trace(q, k, v)
+        traced = jax.jit(functools.partial(blocked_attention.attention)).trace(q, k, v)
         return traced.lower(lowering_platforms=(platform,)).as_text().count("stablehlo.while")
 
     assert loops("cpu") == 2
     assert loops("cuda") == 0
     want = layers.attention(q, k, v)
     np.testing.assert_allclose(
-        jax.jit(lambda *x: blocked_attention.attention(*x))(q, k, v), want, rtol=1e-5, atol=1e-6
+        jax.jit(functools.partial(blocked_attention.attention))(q, k, v), want, rtol=1e-5, atol=1e-6
     )
     worlds = jax.vmap(blocked_attention.attention)(*(jnp.stack([x, x[::-1]]) for x in (q, k, v)))
     np.testing.assert_allclose(worlds, jnp.stack([want, want[::-1]]), rtol=1e-5, atol=1e-6)
 
 
 def test_few_tokens_are_not_cut():
-    text = jax.jit(lambda *x: blocked_attention.attention(*x)).lower(*inputs()).as_text()
+    text = jax.jit(functools.partial(blocked_attention.attention)).lower(*inputs()).as_text()
     assert "stablehlo.while" not in text
