@@ -166,6 +166,8 @@ def _scores(metrics: Mapping[str, Any] | None) -> str:
 
 def _licence(facts: Facts) -> str:
     head = "## Licence\n\n"
+    if "encoder" in facts.params:
+        head += "The image encoder is a converted DINOv2: its weights keep their own licence.\n\n"
     if facts.base is None:
         return head + (
             "Trained from random weights: whoever trained them chooses a licence, and answers for "

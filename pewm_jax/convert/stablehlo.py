@@ -10,12 +10,14 @@
         run.py, README.md     how to call them, with jax and three small packages
 
 Weights are arguments and not constants: the programs stay small, two of them share one file of
-weights, and weights trained further fit the same programs. State, frames and cameras travel as
+weights, and weights trained further fit the same programs. Attention is lowered in its plain form,
+which runs anywhere; cuDNN's is of one platform, and its calls are not promised to stay. State, frames and cameras travel as
 flat named arrays, so that no class of ours is needed on the other side.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -82,6 +84,7 @@ def export(
     with output.new_folder(dst) as folder:
         say(f"reading {run} …")
         config, params = rollouts.load(run)
+        config = dataclasses.replace(config, dit=dataclasses.replace(config.dit, attention="xla"))
         if what == "rollout":
             programs = rollout_programs(config, params, frames or config.data.context, clips)
         else:
