@@ -72,11 +72,14 @@ class Clip:
         frames: T frames; frame 0 is observed, the others are to be generated.
         context: S earlier frames of the same episode, from which the memory is built.
         context_valid_S: (..., S) bool, False where the episode had no more earlier frames.
+        context_features_ShwF: (..., S, h, w, F) the image encoder's features of the context, where
+            they were computed beforehand (``pewm_jax.memory.feature_cache``), else None.
     """
 
     frames: Frames
     context: Frames
     context_valid_S: Array
+    context_features_ShwF: Array | None = None
 
 
 @_pytree

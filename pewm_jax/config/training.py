@@ -20,6 +20,9 @@ class DataConfig:
     """Largest number of actions between two frames of a clip."""
     context: int = 24
     """Earlier frames of the same episode given to the memory."""
+    features: str = ""
+    """Folder of image features made by `python -m pewm_jax.memory cache` of `data.path`; empty
+    computes them at every step."""
     workers: int = 0
     """Threads that read and decode ahead of training; 0 means one."""
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.types import Camera, Clip, Frames
+
+ReadFeatures: TypeAlias = Callable[[Episode, np.ndarray], np.ndarray]
+"""``read(episode, frames_S) -> features_ShwF``: features computed beforehand."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +86,7 @@ def choose_context(start: int, slots: int, rng: np.random.Generator | None = Non
     return np.append(earlier, start)
 
 
-def cut(episode: Episode, choice: Choice, slots: int) -> Clip:
+def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | None = None) -> Clip:
     """Decode the chosen frames, each once.
 
     Args:
@@ -90,6 +94,8 @@ def cut(episode: Episode, choice: Choice, slots: int) -> Clip:
         choice: which frames.
         slots: S; slots without a frame are black, have no depth and the camera of the clip's
             first frame, and are marked invalid.
+        features: reads the context's features, if they are kept; slots without a frame have the
+            features of the clip's first frame.
 
     Returns:
         A NumPy clip without batch axis: rgb uint8, depth float32 metres.
@@ -105,7 +111,8 @@ def cut(episode: Episode, choice: Choice, slots: int) -> Clip:
     context = _take(frames, fill)
     context.rgb_THWC[~valid] = 0
     context.depth_THW[~valid] = 0
-    return Clip(_take(frames, place[:count]), context, valid)
+    found = None if features is None else features(episode, wanted[fill])
+    return Clip(_take(frames, place[:count]), context, valid, found)
 
 
 def clip_at(
@@ -147,10 +154,13 @@ def stack(clips: Sequence[Clip]) -> Clip:
             ),
         )
 
+    features = [clip.context_features_ShwF for clip in clips]
+    features = [feature for feature in features if feature is not None]
     return Clip(
         frames([clip.frames for clip in clips]),
         frames([clip.context for clip in clips]),
         np.stack([clip.context_valid_S for clip in clips]),
+        np.stack(features) if features else None,
     )
 
 

@@ -13,28 +13,32 @@ import grain
 import numpy as np
 
 from pewm_jax.config import Config, ConfigError, UserError
-from pewm_jax.data.clips import choose, cut, stack
+from pewm_jax.data.clips import ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
 from pewm_jax.types import Clip
 
 BATCHES_AHEAD = 2
 """Batches decoded before they are asked for; with the one in use, what the loader holds."""
+EPOCHS = 2**31
+"""Times that the episodes are gone through: without end, and countable in batches of one."""
 
 
 class _CutClip(grain.transforms.RandomMap):
     """Episode → clip."""
 
-    def __init__(self, config: Config):
-        self.config = config
+    def __init__(self, config: Config, features: ReadFeatures | None):
+        self.config, self.features = config, features
 
     def random_map(self, element: Episode, rng: np.random.Generator) -> Clip:
         _check_size(self.config, element)
         choice = choose(self.config, element.length, rng, f"episode {element.name}")
-        return cut(element, choice, self.config.data.context)
+        return cut(element, choice, self.config.data.context, self.features)
 
 
-def dataset(config: Config, split: str, seed: int, batch: int) -> grain.MapDataset:
+def dataset(
+    config: Config, split: str, seed: int, batch: int, features: ReadFeatures | None = None
+) -> grain.MapDataset:
     """Return the endless dataset whose element k is batch k.
 
     Raises:
@@ -47,12 +51,18 @@ def dataset(config: Config, split: str, seed: int, batch: int) -> grain.MapDatas
     _check_size(config, first)
     _check_actions(config, first)
     choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
-    clips = grain.MapDataset.source(source).seed(seed).shuffle().repeat()
-    return clips.random_map(_CutClip(config)).batch(batch, batch_fn=stack)
+    clips = grain.MapDataset.source(source).seed(seed).shuffle().repeat(EPOCHS)
+    return clips.random_map(_CutClip(config, features)).batch(batch, batch_fn=stack)
 
 
 def clips(
-    config: Config, split: str = "train", *, seed: int, batch: int, start_step: int = 0
+    config: Config,
+    split: str = "train",
+    *,
+    seed: int,
+    batch: int,
+    start_step: int = 0,
+    features: ReadFeatures | None = None,
 ) -> Iterator[Clip]:
     """Iterate over batches of clips for ever.
 
@@ -64,6 +74,7 @@ def clips(
         batch: clips per batch.
         start_step: number of the first batch; going on from step k gives what an iterator that
             started at 0 gives from its k-th batch on.
+        features: reads the context's features, if they are kept.
 
     Returns:
         NumPy clips with a leading B: rgb uint8, depth float32 in metres.
@@ -71,7 +82,7 @@ def clips(
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit.
     """
-    batches = dataset(config, split, seed, batch).slice(slice(start_step, None))
+    batches = dataset(config, split, seed, batch, features).slice(slice(start_step, None))
     threads = max(1, config.data.workers)
     return iter(batches.to_iter_dataset(grain.ReadOptions(threads, BATCHES_AHEAD + threads - 1)))
 

@@ -18,7 +18,13 @@ def as_signal(frames: Frames) -> Frames:
     return Frames(codec.signal_from_rgb(frames.rgb_THWC), frames.depth_THW, frames.camera)
 
 
-def remember(config: Config, params: Params, context: Frames, valid_S: Array) -> memories.Memory:
+def remember(
+    config: Config,
+    params: Params,
+    context: Frames,
+    valid_S: Array,
+    features_ShwF: Array | None = None,
+) -> memories.Memory:
     """Build the memory of one world from its context frames.
 
     The grid is centred on the last valid context frame's camera.
@@ -28,23 +34,29 @@ def remember(config: Config, params: Params, context: Frames, valid_S: Array) ->
         params: the world model's parameters; those of the image encoder are used.
         context: S frames of one world, colours in [−1, 1].
         valid_S: (S,) bool, False frames are ignored.
+        features_ShwF: (S, h, w, F) what the encoder makes of the context, if it is known already.
     """
     last = jnp.argmax(jnp.where(valid_S, jnp.arange(valid_S.shape[0]), -1))
     centre = context.camera.world_from_camera[last, :3, 3]
     memory = memories.empty(config, centre)
-    weights = params.get("encoder", {})
-    features = image_features.encode(config.memory, weights, context.rgb_THWC)
+    if features_ShwF is None:
+        weights = params.get("encoder", {})
+        features = image_features.encode(config.memory, weights, context.rgb_THWC)
+    else:
+        features = features_ShwF.astype(jnp.float32)
     return memories.remember(config, memory, context, features, valid_S)
 
 
 def clip_tokens(config: Config, params: Params, clip: Clip) -> MapTokens:
     """Build every clip's memory from its context and return its tokens, leading axis B."""
 
-    def one(context: Frames, valid_S: Array, camera) -> MapTokens:
-        memory = remember(config, params, as_signal(context), valid_S)
+    def one(context: Frames, valid_S: Array, features: Array | None, camera) -> MapTokens:
+        memory = remember(config, params, as_signal(context), valid_S, features)
         return memories.tokens(config, memory, camera)
 
-    return jax.vmap(one)(clip.context, clip.context_valid_S, clip.frames.camera)
+    return jax.vmap(one)(
+        clip.context, clip.context_valid_S, clip.context_features_ShwF, clip.frames.camera
+    )
 
 
 def loss(

@@ -99,8 +99,17 @@ def open_cache(path: Path, config: MemoryConfig, params: Params, data: Path) -> 
             preprocessing or other data.
     """
     cache = read(path)
-    refuse_stale(path, cache.made_of, fingerprint(config, params, read_manifest(data)))
+    require_fresh(cache, config, params, data)
     return cache
+
+
+def require_fresh(cache: FeatureCache, config: MemoryConfig, params: Params, data: Path) -> None:
+    """Refuse a cache of other weights, other preprocessing or other data; see ``open_cache``.
+
+    Raises:
+        UserError: it is stale; the message says in what.
+    """
+    refuse_stale(cache.path, cache.made_of, fingerprint(config, params, read_manifest(data)))
 
 
 def features(

@@ -41,7 +41,7 @@ def encode(config: MemoryConfig, params: Params, rgb_THWC: Array) -> Array:
         rgb_THWC: (T, H, W, 3) float in [−1, 1].
     """
     if config.encoder == "dinov2":
-        images = dinov2.preprocess(rgb_THWC, (config.encoder_size, config.encoder_size))
+        images = dinov2.preprocess(rgb_THWC, config.encoder_size, config.dinov2.patch)
         return dinov2.apply(config.dinov2, params, images)
     return patch_colours(rgb_THWC, config.encoder_patch)
 

@@ -19,6 +19,7 @@ from jax.sharding import Mesh
 from pewm_jax import rollouts
 from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
+from pewm_jax.memory import feature_cache
 from pewm_jax.training import runs, sharding, stages
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.feed import Feed
@@ -148,6 +149,13 @@ def _train_stage(
         return params
 
 
+def _features(config: Config, stage: Stage) -> feature_cache.FeatureCache | None:
+    """Open the features that are kept, where the stage needs any; not compared with weights yet."""
+    if not (config.data.features and stage.memory):
+        return None
+    return feature_cache.read(Path(config.data.features) / "train")
+
+
 @dataclasses.dataclass
 class _Worker:
     """Turns one stage's state from its first to its last step."""
@@ -170,17 +178,23 @@ class _Worker:
     def run(self, make_state: Callable[[], TrainState], done: int) -> TrainState:
         """Do the steps after ``done``, once the first batch is there; returns the last state."""
         config, settings = self.config, self.settings
+        cache = _features(config, self.stage)
         batches = loader.clips(
             config,
             "train",
             seed=config.train.seed + self.stage.number,
             batch=settings.batch,
             start_step=done,
+            features=cache and functools.partial(feature_cache.features, cache),
         )
         key = jax.device_put(stage_key(config, self.stage), sharding.replicated(self.mesh))
         with Feed(iter(batches), sharding.of_batch(self.mesh)) as feed:
             clip = next(feed)
             state, step_fn = self._compile(make_state, clip)
+            if cache is not None:
+                weights = state.params.get("encoder", {})
+                where = Path(config.data.path) / "train"
+                feature_cache.require_fresh(cache, config.memory, weights, where)
             self.pace = Pace(time.monotonic())
             pending: tuple[int, Metrics] | None = None
             for step in range(done + 1, settings.steps + 1):

@@ -54,8 +54,9 @@ def clip(config: Config, batch: int, seed: int) -> Clip:
     return Clip(frames(config.clip.frames), frames(context), np.ones((batch, context), bool))
 
 
-def clips(config, split="train", *, seed, batch, start_step=0):
+def clips(config, split="train", *, seed, batch, start_step=0, features=None):
     assert split == "train"
+    assert features is None
     step = start_step
     while True:
         yield clip(config, batch, 1000 * seed + step)
