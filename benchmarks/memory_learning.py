@@ -198,7 +198,7 @@ def runs(options: argparse.Namespace) -> Iterator[tuple[Variant, int, Result]]:
                 print(f"{label}: {result['psnr']['seen']:.2f} dB, kept", flush=True)
                 yield variant, seed, result
                 continue
-            began = time.monotonic()
+            began = time.process_time()
             batches = batches or held_out(config)
             first = variant == BEFORE
             start = None if first else weights.load(backbone)
@@ -206,9 +206,9 @@ def runs(options: argparse.Namespace) -> Iterator[tuple[Variant, int, Result]]:
             if first:
                 weights.save(backbone, params)
             found = score(config, params, batches, memory=not first)
-            seconds = round(time.monotonic() - began, 1)
+            seconds = round(time.process_time() - began, 1)
             found |= {"fingerprint": name, "parameters": count, "seconds": seconds}
-            print(f"{label}: {found['psnr']['seen']:.2f} dB in {seconds:.0f} s", flush=True)
+            print(f"{label}: {found['psnr']['seen']:.2f} dB in {seconds:.0f} s of processor time", flush=True)
             yield variant, seed, keep(path, found)
 
 
@@ -326,7 +326,7 @@ def main() -> None:
     caption = (
         f"{options.seeds} seeds, {results[BEFORE][0]['clips']} clips of held-out houses, "
         f"{options.steps1} + {options.steps2} steps of {options.batch} clips of {options.frames} "
-        f"frames, {options.context} remembered; {minutes:.0f} min"
+        f"frames, {options.context} remembered; {minutes:.0f} min of processor time"
     )
     picture = pictures.save_png(options.out / f"{NAME}.png", plot(rows, caption))
     keep(options.out / f"{NAME}.json", {"rows": rows, "caption": caption})
