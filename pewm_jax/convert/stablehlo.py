@@ -12,7 +12,7 @@
 Weights are arguments and not constants: the programs stay small, two of them share one file of
 weights, and weights trained further fit the same programs. Attention is lowered in its plain form,
 which runs anywhere; cuDNN's is of one platform, and its calls are not promised to stay. State,
-frames and cameras travel as flat named arrays, so that no class of ours is needed on the other side.
+frames and cameras travel as flat named arrays, so that no class of ours is needed.
 """
 
 from __future__ import annotations

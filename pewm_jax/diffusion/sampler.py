@@ -146,16 +146,17 @@ def _follow(
     def step(carry, inputs):
         x, earlier = carry
         row, k = inputs
-        x0 = denoise(x, jnp.full((x.shape[0],), row.timestep), row.guidance)
+        x0 = denoise(x, jnp.full((x.shape[0],), row.timestep), row.guidance).astype(jnp.float32)
         if fresh is None:
             x = row.keep * x + row.add * x0
         else:
             ahead = (1 + row.mix) * x0 - row.mix * earlier
             x = row.keep * x + row.add * ahead + row.spread * fresh(k)
             earlier = x0
+        x = x.astype(start.dtype)
         return (x, earlier), x if every_step else None
 
-    first = (start, None if fresh is None else jnp.zeros_like(start))
+    first = (start, None if fresh is None else jnp.zeros(start.shape, jnp.float32))
     inputs = (jax.tree.map(jnp.asarray, rows), np.arange(rows.timestep.shape[0]))
     (sample, _), path = jax.lax.scan(step, first, inputs)
     return path if every_step else sample

@@ -233,6 +233,15 @@ def test_dpm_needs_a_key_or_noise(more):
         )
 
 
+def test_the_sample_has_the_precision_of_the_noise():
+    config, start = DiffusionConfig(sample_steps=4), jnp.ones((1, 2), jnp.bfloat16)
+    for out in (
+        sampler.ddim(config, lambda x, _t: jnp.tanh(x), start),
+        sampler.dpm(config, lambda x, _t: jnp.tanh(x), start, jax.random.key(0)),
+    ):
+        assert out.dtype == jnp.bfloat16
+
+
 def test_a_fixed_stride_differs_only_where_the_steps_do_not_divide():
     def path(steps, stride):
         config = DiffusionConfig(sample_steps=steps, stride=stride)
