@@ -5,6 +5,7 @@ RUN ?= runs/demo
 DATA ?= data/demo
 PRESET ?= demo
 COLLECT ?= --size 48
+BENCH ?= render cogvideox memory dinov2
 
 .PHONY: help demo test lint format bench clean
 
@@ -50,8 +51,8 @@ format: .venv/installed-dev
 	@.venv/bin/ruff format .
 	@.venv/bin/ruff check --fix .
 
-bench: .venv/installed
-	@for file in benchmarks/*.py; do echo "== $$file"; $(PY) $$file || exit 1; done
+bench: .venv/installed-dev
+	@for name in $(BENCH); do echo "== $$name"; $(PY) benchmarks/$$name.py || exit 1; done
 
 clean:
 	rm -rf .venv
