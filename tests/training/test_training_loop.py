@@ -161,7 +161,7 @@ def test_a_folder_in_which_nothing_was_trained_yet_takes_the_new_configuration(
 def test_a_loss_that_is_not_finite_stops_at_its_step_and_the_checkpoint_before_is_kept(
     fake_model, tmp_path, monkeypatch
 ):
-    def poisoned(config, split="train", *, seed, batch, start_step=0):
+    def poisoned(config, split="train", *, seed, batch, start_step=0, features=None):
         for number, clip in enumerate(
             fakes.clips(config, split, seed=seed, batch=batch, start_step=start_step),
             start_step + 1,
