@@ -1,14 +1,18 @@
-"""Attention in pieces whose logits stay in a processor's cache.
+"""Attention without a table of all its logits: in pieces on a CPU, cuDNN's kernel on a GPU.
 
-With a thousand tokens and more the logits of all heads are hundreds of megabytes, and a CPU spends
-its time moving them. One head and a block of queries at a time is the same arithmetic, three times
-as fast there (1,370 tokens, 6 heads of 64). Accelerators have kernels of their own, for which the
-pieces would only be a loop: they get the whole.
+With a thousand tokens and more the logits of all heads are hundreds of megabytes. A CPU then spends
+its time moving them: one head and a block of queries at a time is the same arithmetic, three times
+as fast there (1,370 tokens, 6 heads of 64). And for gradients a table per layer would have to be
+kept: here only the logarithm of each query's normaliser is, and the backward pass computes a
+piece's weights again from it (as FlashAttention does, Dao et al. 2022), which is also faster than
+reading them back. Other platforms get the same formula without the loops.
 """
 
 from __future__ import annotations
 
 import math
+from functools import partial
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,48 +23,161 @@ from pewm_jax.types import Array
 LOGITS = 2**20
 """Logits held at once on a CPU: 4 MB in float32."""
 
+Implementation = Literal["auto", "xla", "cudnn"]
 
-def attention(q_BKND: Array, k_BKMD: Array, v_BKMD: Array) -> Array:
+
+def attention(
+    q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implementation = "auto"
+) -> Array:
     """Scaled dot-product attention (B, K, N, d), in pieces where the platform is a CPU.
 
     The batch is never cut, so that it can be spread over devices.
+
+    Args:
+        q_BKND: queries.
+        k_BKMD: keys.
+        v_BKMD: values.
+        implementation: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `xla` runs anywhere,
+            `auto` takes cudnn where it works.
     """
     batch, heads, queries, _ = q_BKND.shape
-    if batch * heads * queries * k_BKMD.shape[2] <= LOGITS:
+    sixteen = q_BKND.dtype in (jnp.bfloat16, jnp.float16)
+    if implementation == "auto":
+        flash = sixteen and jax.default_backend() == "gpu"
+        implementation = "cudnn" if flash else "xla"
+    if implementation == "cudnn":
+        q, k, v = (x.swapaxes(1, 2) for x in (q_BKND, k_BKMD, v_BKMD))
+        return jax.nn.dot_product_attention(q, k, v, implementation="cudnn").swapaxes(1, 2)
+    logits = batch * queries * k_BKMD.shape[2]
+    if heads * logits <= LOGITS:
         return layers.attention(q_BKND, k_BKMD, v_BKMD)
-    blocks = math.ceil(batch * queries * k_BKMD.shape[2] / LOGITS)
+    return _attention(q_BKND, k_BKMD, v_BKMD, min(math.ceil(logits / LOGITS), queries))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _attention(q: Array, k: Array, v: Array, blocks: int) -> Array:
+    return _forward(q, k, v, blocks)[0]
+
+
+def _forward(q: Array, k: Array, v: Array, blocks: int) -> tuple[Array, tuple[Array, ...]]:
+    out, normaliser = jax.lax.platform_dependent(
+        q, k, v, cpu=partial(_pieces_forward, blocks=blocks), default=_piece_forward
+    )
+    return out, (q, k, v, out, normaliser)
+
+
+def _backward(blocks: int, saved: tuple[Array, ...], grad: Array) -> Any:
+    q, k, v, out, normaliser = saved
+    shared = (grad.astype(jnp.float32) * out.astype(jnp.float32)).sum(-1, keepdims=True)
     return jax.lax.platform_dependent(
-        q_BKND,
-        k_BKMD,
-        v_BKMD,
-        cpu=lambda q, k, v: in_pieces(q, k, v, min(blocks, queries)),
-        default=layers.attention,
+        q,
+        k,
+        v,
+        normaliser,
+        shared,
+        grad,
+        cpu=partial(_pieces_backward, blocks=blocks),
+        default=_piece_backward,
     )
 
 
-def in_pieces(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, blocks: int) -> Array:
-    """Attention one head and one of ``blocks`` blocks of queries at a time, softmax in float32."""
-    batch, heads, queries, channels = q_BKND.shape
+_attention.defvjp(_forward, _backward)
+
+
+def _logits(q: Array, k: Array) -> Array:
+    return _dot("...nd,...md->...nm", q * q.shape[-1] ** -0.5, k)
+
+
+def _dot(equation: str, *operands: Array) -> Array:
+    return jnp.einsum(equation, *operands, preferred_element_type=jnp.float32)
+
+
+def _piece_forward(q: Array, k: Array, v: Array) -> tuple[Array, Array]:
+    """Return attention (..., n, d) and each query's log normaliser (..., n, 1), float32."""
+    logits = _logits(q, k)
+    top = logits.max(-1, keepdims=True)
+    weights = jnp.exp(logits - top)
+    total = weights.sum(-1, keepdims=True)
+    mixed = _dot("...nm,...md->...nd", weights.astype(v.dtype), v)
+    return (mixed / total).astype(v.dtype), top + jnp.log(total)
+
+
+def _piece_backward(
+    q: Array, k: Array, v: Array, normaliser: Array, shared: Array, grad: Array
+) -> tuple[Array, Array, Array]:
+    """Return the gradients of q, k and v; ``shared`` is (grad · output) of each query.
+
+    Those of k and v are computed transposed: a CPU transposes the few channels of q much faster
+    than the many weights.
+    """
+    weights = jnp.exp(_logits(q, k) - normaliser)
+    slope = weights * (_dot("...nd,...md->...nm", grad, v) - shared)
+    slope, weights = slope.astype(q.dtype), weights.astype(q.dtype)
+    scale = q.shape[-1] ** -0.5
+    return (
+        (_dot("...nm,...md->...nd", slope, k) * scale).astype(q.dtype),
+        (_dot("...nd,...nm->...dm", q, slope).swapaxes(-1, -2) * scale).astype(k.dtype),
+        _dot("...nd,...nm->...dm", grad, weights).swapaxes(-1, -2).astype(v.dtype),
+    )
+
+
+def _cut(x_BKNC: Array, blocks: int) -> Array:
+    """(B, K, N, C) → (K, blocks, B, n, C); padding is zero, for which all gradients are zero."""
+    batch, heads, queries, channels = x_BKNC.shape
     size = -(-queries // blocks)
-    q_BKND = q_BKND * channels**-0.5
-    padded = jnp.pad(q_BKND, ((0, 0), (0, 0), (0, blocks * size - queries), (0, 0)))
-    q_KnBsD = padded.reshape(batch, heads, blocks, size, channels).transpose(1, 2, 0, 3, 4)
+    padded = jnp.pad(x_BKNC, ((0, 0), (0, 0), (0, blocks * size - queries), (0, 0)))
+    return padded.reshape(batch, heads, blocks, size, channels).transpose(1, 2, 0, 3, 4)
 
-    def block(q_BsD: Array, k_BMD: Array, v_BMD: Array) -> Array:
-        logits = jnp.einsum("bnd,bmd->bnm", q_BsD, k_BMD, preferred_element_type=jnp.float32)
-        weights = jnp.exp(logits - logits.max(-1, keepdims=True))
-        mixed = jnp.einsum(
-            "bnm,bmd->bnd",
-            weights.astype(v_BMD.dtype),
-            v_BMD,
-            preferred_element_type=jnp.float32,
-        )
-        return (mixed / weights.sum(-1, keepdims=True)).astype(v_BMD.dtype)
 
-    def head(inputs: tuple[Array, Array, Array]) -> Array:
+def _join(x_KnBsC: Array, queries: int) -> Array:
+    """Invert ``_cut``."""
+    heads, blocks, batch, size, channels = x_KnBsC.shape
+    whole = x_KnBsC.transpose(2, 0, 1, 3, 4).reshape(batch, heads, blocks * size, channels)
+    return whole[:, :, :queries]
+
+
+def _pieces_forward(q: Array, k: Array, v: Array, *, blocks: int) -> tuple[Array, Array]:
+    """Do ``_piece_forward`` for one head and one of ``blocks`` blocks of queries at a time."""
+
+    def head(inputs: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         q_nBsD, k_BMD, v_BMD = inputs
-        return jax.lax.map(lambda q_BsD: block(q_BsD, k_BMD, v_BMD), q_nBsD)
+        return jax.lax.map(lambda q_BsD: _piece_forward(q_BsD, k_BMD, v_BMD), q_nBsD)
 
-    mixed = jax.lax.map(head, (q_KnBsD, *(x.transpose(1, 0, 2, 3) for x in (k_BKMD, v_BKMD))))
-    mixed = mixed.transpose(2, 0, 1, 3, 4).reshape(batch, heads, blocks * size, channels)
-    return mixed[:, :, :queries]
+    out, normaliser = jax.lax.map(head, (_cut(q, blocks), k.swapaxes(0, 1), v.swapaxes(0, 1)))
+    return _join(out, q.shape[2]), _join(normaliser, q.shape[2])
+
+
+def _pieces_backward(
+    q: Array,
+    k: Array,
+    v: Array,
+    normaliser: Array,
+    shared: Array,
+    grad: Array,
+    *,
+    blocks: int,
+) -> tuple[Array, Array, Array]:
+    """Do ``_piece_backward`` one head and one block of queries at a time."""
+
+    def head(inputs: tuple[tuple[Array, ...], Array, Array]) -> tuple[Array, Array, Array]:
+        (q_nBsD, *rest), k_BMD, v_BMD = inputs
+
+        def block(sums: tuple[Array, Array], parts: tuple[Array, ...]) -> Any:
+            dq, dk, dv = _piece_backward(parts[0], k_BMD, v_BMD, *parts[1:])
+            return (sums[0] + dk, sums[1] + dv), dq
+
+        if blocks == 1:
+            dq, dk, dv = _piece_backward(q_nBsD[0], k_BMD, v_BMD, *(x[0] for x in rest))
+            return dq[None], dk, dv
+        zeros = jnp.zeros(k_BMD.shape, jnp.float32), jnp.zeros(v_BMD.shape, jnp.float32)
+        (dk, dv), dq = jax.lax.scan(block, zeros, (q_nBsD, *rest))
+        return dq, dk.astype(k.dtype), dv.astype(v.dtype)
+
+    cut = tuple(_cut(x, blocks) for x in (q, normaliser, shared, grad))
+    dq, dk, dv = jax.lax.map(head, (cut, k.swapaxes(0, 1), v.swapaxes(0, 1)))
+    return _join(dq, q.shape[2]), dk.swapaxes(0, 1), dv.swapaxes(0, 1)
+
+
+def in_pieces(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, blocks: int) -> Array:
+    """Attention one head and one of ``blocks`` blocks of queries at a time, on any platform."""
+    return _pieces_forward(q_BKND, k_BKMD, v_BKMD, blocks=blocks)[0]

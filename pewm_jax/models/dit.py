@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import DiTConfig, UserError
-from pewm_jax.models import layers, positions
+from pewm_jax.models import blocked_attention, layers, positions
 from pewm_jax.types import Array, Params
 
 BlockExpert = Callable[[Any, Array, Array], Array]
@@ -28,6 +28,11 @@ BlockExpert = Callable[[Any, Array, Array], Array]
 
 OFS = 2.0
 """The second scalar that 1.5-5B-I2V is always given."""
+
+
+KEEP = jax.checkpoint_policies.dots_saveable
+"""What a block keeps for its backward pass: matrix products. Norms, modulation, rotation and gelu
+are cheaper to compute again than to stack over layers and read back."""
 
 
 def open_gates(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
@@ -85,8 +90,17 @@ class Block(nn.Module):
             angles_NR: (L + N, head_dim/2) rotary angles, or None.
             length: L, the number of text tokens.
         """
-        heads, width, dtype = self.config.heads, self.config.width, tokens_BND.dtype
+        before: Any = nn.remat(Block.before, policy=KEEP, prevent_cse=False, static_argnums=(4,))
+        after: Any = nn.remat(Block.after, policy=KEEP, prevent_cse=False, static_argnums=(5,))
+        q, k, v, gate = before(self, tokens_BND, time_BE, angles_NR, length)
+        mixed = blocked_attention.attention(q, k, v, self.config.attention)
+        return after(self, tokens_BND, time_BE, mixed, gate, length)
 
+    def before(
+        self, tokens_BND: Array, time_BE: Array, angles_NR: Array | None, length: int
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return queries, keys and values (B, K, N, d), and the gate of what they will find."""
+        heads, width, dtype = self.config.heads, self.config.width, tokens_BND.dtype
         normed, gate = LayerNormZero(name="norm1")(tokens_BND, time_BE, length)
         q, k, v = (
             layers.split_heads(layers.dense(width, dtype, f"to_{n}")(normed), heads) for n in "qkv"
@@ -94,9 +108,15 @@ class Block(nn.Module):
         q, k = (layers.layer_norm(x, f"norm_{n}", 1e-6) for x, n in ((q, "q"), (k, "k")))
         if angles_NR is not None:
             q, k = layers.rotate(q, angles_NR), layers.rotate(k, angles_NR)
-        mixed = layers.merge_heads(layers.attention(q, k, v))
-        tokens_BND += gate * layers.dense(width, dtype, "to_out")(mixed)
+        return q, k, v, gate
 
+    def after(
+        self, tokens_BND: Array, time_BE: Array, mixed_BKND: Array, gate: Array, length: int
+    ) -> Array:
+        """Return the tokens with what attention found, and the feed-forward network's."""
+        width, dtype = self.config.width, tokens_BND.dtype
+        mixed = layers.merge_heads(mixed_BKND)
+        tokens_BND += gate * layers.dense(width, dtype, "to_out")(mixed)
         normed, gate = LayerNormZero(name="norm2")(tokens_BND, time_BE, length)
         return tokens_BND + gate * layers.FeedForward(self.config.mlp_ratio, name="ff")(normed)
 

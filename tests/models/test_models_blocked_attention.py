@@ -52,3 +52,35 @@ def test_what_does_not_fit_is_cut_on_a_cpu_and_only_there(monkeypatch):
 def test_few_tokens_are_not_cut():
     text = jax.jit(functools.partial(blocked_attention.attention)).lower(*inputs()).as_text()
     assert "stablehlo.while" not in text
+
+
+@pytest.mark.parametrize("logits", [300, 100])
+def test_gradients_are_those_of_the_whole(monkeypatch, logits):
+    q, k, v = inputs()
+    monkeypatch.setattr(blocked_attention, "LOGITS", logits)
+    weight = jnp.asarray(np.random.default_rng(1).normal(size=v.shape[:2] + q.shape[2:]))
+
+    def slopes(attend):
+        return jax.jit(jax.grad(lambda *x: (attend(*x) * weight).sum(), (0, 1, 2)))(q, k, v)
+
+    for got, want in zip(
+        slopes(blocked_attention.attention), slopes(layers.attention), strict=True
+    ):
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
+
+
+def test_elsewhere_the_same_formula_runs_without_loops():
+    q, k, v = inputs()
+    cut = {"blocks": 2}
+    whole = blocked_attention._piece_forward(q, k, v)
+    for got, want in zip(blocked_attention._pieces_forward(q, k, v, **cut), whole, strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
+    grad = v[:, :, :1] + q
+    shared = (grad * whole[0]).sum(-1, keepdims=True)
+    given = (q, k, v, whole[1], shared, grad)
+    for got, want in zip(
+        blocked_attention._pieces_backward(*given, **cut),
+        blocked_attention._piece_backward(*given),
+        strict=True,
+    ):
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
