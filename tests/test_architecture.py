@@ -30,7 +30,8 @@ HOMES = {
     "orbax": {"training/checkpoint"},
     "embreex": {"data"},
     "trimesh": {"data"},
-    "torch": set(),
+    "torch": {"convert"},
+    "transformers": {"convert"},
     "diffusers": set(),
     "pickle": set(),
 }
