@@ -1,6 +1,7 @@
 """Every command and the example of README.md are run, in a small copy of the user's folder."""
 
 import dataclasses
+import importlib.util
 import json
 import os
 import re
@@ -26,6 +27,14 @@ STEPS = 3
 SMALLER = {
     "python -m pewm_jax.data collect ": COLLECT,
     "python train.py demo": ["--config", "small.json"],
+    "python train.py demo --config world/config.json": shlex.split(
+        "--train.stage1.steps 1 --train.stage1.batch 2 --train.stage2.steps 0 "
+        "--train.preview_every 0"
+    ),
+    "python -m pewm_jax.convert import cogvideox CogVideoX-2b world": shlex.split(
+        "--height 48 --width 48 --config small_memory.json"
+    ),
+    "python -m pewm_jax.convert export stablehlo": ["--what", "denoise", "--no_check"],
     "python evaluate.py runs/": shlex.split(
         "--clips 2 --seeds 0 1 --videos 1 --video_clips 1 --batch 2"
     ),
@@ -51,9 +60,8 @@ def smaller(command):
     arguments = shlex.split(command)[1:]
     if "--help" in arguments:
         return arguments
-    return arguments + [
-        flag for start, flags in SMALLER.items() if command.startswith(start) for flag in flags
-    ]
+    start = max((start for start in SMALLER if command.startswith(start)), key=len, default=None)
+    return arguments + SMALLER.get(start, [])
 
 
 def run(arguments, cwd):
@@ -103,7 +111,23 @@ def folder(tmp_path_factory):
     if ICL.is_dir():
         (path / "recordings" / "livingroom").symlink_to(ICL)
     (path / "small.json").write_text(json.dumps(small_settings()))
+    save_checkpoints(path)
     return path
+
+
+def save_checkpoints(path):
+    """Write a tiny CogVideoX and a tiny DINOv2, as diffusers and transformers do."""
+    from transformers import Dinov2Config, Dinov2Model
+
+    from tests.convert import convert_pipelines
+
+    convert_pipelines.save(path / "CogVideoX-2b", "2b", shard="60KB")
+    network = Dinov2Config(
+        hidden_size=16, num_hidden_layers=1, num_attention_heads=2, image_size=28
+    )
+    Dinov2Model(network).save_pretrained(path / "dinov2-small")
+    memory = {"tokens": 32, "looks": 16, "capacity": 256, "encoder_size": 28, "cells": [16, 16, 4]}
+    (path / "small_memory.json").write_text(json.dumps({"memory": memory}))
 
 
 def test_the_commands_and_then_the_example_work_as_written(folder):
@@ -114,9 +138,12 @@ def test_the_commands_and_then_the_example_work_as_written(folder):
     for command in python:
         if "recordings/livingroom" in command and not ICL.is_dir():
             continue
+        if "export stablehlo" in command and importlib.util.find_spec("flatbuffers") is None:
+            continue
         run([sys.executable, *smaller(command)], folder)
     assert (folder / "runs/demo/report/index.html").stat().st_size > 10_000
     assert (folder / "episode.png").is_file()
+    assert (folder / "CogVideoX-mine/transformer/config.json").is_file()
 
     (example,) = blocks("python")
     assert len([line for line in example.splitlines() if line.strip()]) <= 15
@@ -181,6 +208,8 @@ def test_commands_inside_of_sentences_are_run_too_and_smaller():
     longer = smaller("python train.py demo --train.stage2.steps 2000 --train.run runs/longer")
     assert longer[:4] == ["train.py", "demo", "--train.stage2.steps", str(STEPS)]
     assert longer[4:] == ["--train.run", "runs/longer", "--config", "small.json"]
+    world = smaller("python train.py demo --config world/config.json")
+    assert "small.json" not in world
     assert smaller("python train.py demo --help") == ["train.py", "demo", "--help"]
 
 
