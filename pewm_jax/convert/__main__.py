@@ -45,8 +45,25 @@ def _main(argv: Sequence[str]) -> int:
         return 0 if len(argv) > 1 else 2
     command = f"{verb} {cli.choose(argv[1], below, f'command {verb}')}"
     kind, run = COMMANDS[command]
-    run(cli.parse_command(kind, argv[2:], f"-m pewm_jax.convert {command}"))
+    flags = _gather(argv[2:], "--prompt")
+    run(cli.parse_command(kind, flags, f"-m pewm_jax.convert {command}"))
     return 0
+
+
+def _gather(flags: Sequence[str], name: str) -> list[str]:
+    """Let a flag of many values be given many times: ``--p a --p b`` becomes ``--p a b``."""
+    values: list[str] = []
+    rest: list[str] = []
+    into = rest
+    for flag in flags:
+        if flag == name or flag.startswith(f"{name}="):
+            into = values
+            values += [flag.removeprefix(f"{name}=")] if flag != name else []
+            continue
+        into = rest if flag.startswith("--") else into
+        into.append(flag)
+    given = any(flag.split("=")[0] == name for flag in flags)
+    return [*rest, name, *values] if given else rest
 
 
 if __name__ == "__main__":

@@ -30,6 +30,11 @@ from pewm_jax.models import dit as dit_model
 from pewm_jax.models import vae as vae_model
 from pewm_jax.types import Array, Params
 
+PIPELINES = (
+    "CogVideoXPipeline",
+    "CogVideoXImageToVideoPipeline",
+    "CogVideoXVideoToVideoPipeline",
+)
 WEIGHTS = "weights.safetensors"
 CONFIG = "config.json"
 
@@ -115,6 +120,26 @@ def read_scheduler(folder: str | Path) -> DiffusionConfig:
         UserError: a class or setting that is not known.
     """
     return scheduler.config_from_diffusers(scheduler_settings(Path(folder)))
+
+
+def require_pipeline(src: Path) -> None:
+    """Insist that a folder holds a CogVideoX pipeline, and no weights that would not be read.
+
+    Raises:
+        UserError: another pipeline, or weights beside those of its parts (such as a LoRA).
+    """
+    if not src.is_dir():
+        raise UserError(f"{src} is not a folder; give a diffusers pipeline's folder.")
+    if (src / "model_index.json").is_file():
+        files.read_config(src / "model_index.json", PIPELINES)
+    known = (TRANSFORMER.folder, VAE.folder, "text_encoder")
+    found = [*src.glob("*.safetensors"), *src.glob("*/*.safetensors")]
+    unused = [str(path.relative_to(src)) for path in found if path.parent.name not in known]
+    if unused:
+        raise UserError(
+            f"{src} holds weights that are of no use here: {tree.listing(unused)}; merge a LoRA "
+            "into the transformer first, and move away the rest."
+        )
 
 
 def settings(network: Network, folder: Path) -> dict[str, Any]:

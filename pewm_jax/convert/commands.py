@@ -174,8 +174,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
     """Run ``import cogvideox``."""
     src, dst = options.src, options.dst
     output.refuse_existing(dst)
-    if not src.is_dir():
-        raise UserError(f"{src} is not a folder; give a diffusers pipeline's folder.")
+    cogvideox.require_pipeline(src)
     settings = {part.folder: cogvideox.settings(part, src) for part in (TRANSFORMER, VAE)}
     settings["scheduler"] = cogvideox.scheduler_settings(src)
     dit = TRANSFORMER.config(settings["transformer"], str(src / "transformer/config.json"))

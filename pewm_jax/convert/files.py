@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -114,24 +114,37 @@ def open_folder(folder: Path) -> Files:
     """
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder; give the folder that holds the weights.")
-    index = _plainest(folder.glob("*.safetensors.index*.json"))
-    if index is not None:
-        return _open_shards(folder, index)
-    files = sorted(folder.glob("*.safetensors"))
-    single = _plainest(files)
-    if single is None:
-        pickled = [p.name for p in sorted(folder.glob("*.bin")) + sorted(folder.glob("*.pt*"))]
-        instead = f"only {tree.listing(pickled)}, which can run code when loaded" * bool(pickled)
+    indices = list(folder.glob("*.safetensors.index*.json"))
+    files = list(folder.glob("*.safetensors"))
+    whole = [path for path in files if "-of-" not in path.name]
+    candidates = sorted([*indices, *whole], key=lambda path: (_precision(path), path in whole))
+    if not candidates:
+        raise _without_weights(folder, files)
+    chosen = candidates[0]
+    source = _open_shards(folder, chosen) if chosen in indices else open_file(chosen)
+    used = {path for path, _ in source.places.values()}
+    beside = [p.name for p in files if p not in used and _precision(p) == _precision(chosen)]
+    if beside:
         raise UserError(
-            f"{folder} holds no safetensors file{', ' * bool(pickled)}{instead}; save the network "
-            "there with save_pretrained(…, safe_serialization=True)."
+            f"{folder} holds {tree.listing(beside)} besides what {chosen.name} stands for; move "
+            "away what is not of this network."
         )
-    if "-of-" in single.name:
-        raise UserError(
-            f"{folder} holds shards such as {single.name} but no *.safetensors.index.json that "
-            "lists them; copy the index there too."
+    return source
+
+
+def _without_weights(folder: Path, shards: Sequence[Path]) -> UserError:
+    """Return what to say of a folder without an index or a whole file."""
+    if shards:
+        return UserError(
+            f"{folder} holds shards such as {min(shards).name} but no *.safetensors.index.json "
+            "that lists them; copy the index there too."
         )
-    return open_file(single)
+    pickled = [p.name for p in sorted(folder.glob("*.bin")) + sorted(folder.glob("*.pt*"))]
+    instead = f", only {tree.listing(pickled)}, which can run code when loaded" * bool(pickled)
+    return UserError(
+        f"{folder} holds no safetensors file{instead}; save the network there with "
+        "save_pretrained(…, safe_serialization=True)."
+    )
 
 
 def open_file(path: Path) -> Files:
@@ -227,6 +240,11 @@ def component(folder: Path, name: str) -> Path:
     )
 
 
-def _plainest(paths: Iterable[Path] | Iterator[Path]) -> Path | None:
-    """Return the file with the fewest words in its name: the one of no special precision."""
-    return min(sorted(paths), key=lambda path: path.name.count("."), default=None)
+def _precision(path: Path) -> str:
+    """Return the word of a file that tells one of several precisions, or nothing.
+
+    It is ``fp16`` in ``model.fp16.safetensors``, ``model.fp16-00001-of-00002.safetensors`` and
+    ``model.safetensors.index.fp16.json``.
+    """
+    words = path.name.split("-00", 1)[0].split(".")[1:]
+    return ".".join(word for word in words if word not in {"safetensors", "index", "json"})

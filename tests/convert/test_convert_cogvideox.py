@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from diffusers import (
     AutoencoderKLCogVideoX,
@@ -55,7 +56,7 @@ def images(tmp_path_factory):
 @pytest.fixture(scope="module")
 def imported(images, tmp_path_factory):
     dst = tmp_path_factory.mktemp("imported") / "dst"
-    run("import", "cogvideox", images, dst, "--prompt", "a room", "")
+    run("import", "cogvideox", images, dst, "--prompt", "a room", "--prompt=")
     return dst
 
 
@@ -119,6 +120,19 @@ def test_the_entry_points_read_what_the_commands_store(imported, images):
     assert cogvideox.read_scheduler(images / "scheduler").sampler == "dpm"
     half = cogvideox.read_vae(images / "vae", "float16")[1]
     assert {leaf.dtype.name for leaf in jax.tree.leaves(half)} == {"float16"}
+
+
+def test_of_several_precisions_the_plain_one_is_read(images, tmp_path):
+    tensors = dict(pipelines.vae().state_dict())
+    (tmp_path / "vae").mkdir()
+    (tmp_path / "vae/config.json").write_text((images / "vae/config.json").read_text())
+    for name, dtype in (("", torch.float32), (".fp16", torch.float16)):
+        path = tmp_path / f"vae/diffusion_pytorch_model{name}.safetensors"
+        safetensors.torch.save_file({k: v.to(dtype) for k, v in tensors.items()}, path)
+    kinds = [{x.dtype.name for x in jax.tree.leaves(cogvideox.read_vae(tmp_path)[1])}]
+    (tmp_path / "vae/diffusion_pytorch_model.safetensors").unlink()
+    kinds += [{x.dtype.name for x in jax.tree.leaves(cogvideox.read_vae(tmp_path)[1])}]
+    assert kinds == [{"float32"}, {"float16"}]
 
 
 def test_the_record_says_where_it_came_from(imported, images):

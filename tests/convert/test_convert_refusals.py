@@ -97,6 +97,14 @@ def index_leads_away(src):
     edit(path, weight_map={**table, "proj_out.bias": "../vae/config.json"})
 
 
+def orphan_shard(src):
+    shutil.copy(first_shard(src / "vae"), src / f"vae/{WEIGHTS}-00099-of-00099.safetensors")
+
+
+def adapter(src):
+    shutil.copy(first_shard(src / "vae"), src / "pytorch_lora_weights.safetensors")
+
+
 def extra_tensor(src):
     """A tensor that shard and index both have and the network has not."""
     path = src / "transformer" / INDEX
@@ -160,6 +168,9 @@ FAULTS = {
     "empty index": (empty_index, "has no table weight_map"),
     "index names a tensor that is not there": (index_of_other_tensors, "lacks proj_out.other"),
     "index leads out of its folder": (index_leads_away, "../vae/config.json"),
+    "a shard too many": (orphan_shard, "00099-of-00099.safetensors besides what"),
+    "an adapter": (adapter, "of no use here: pytorch_lora_weights.safetensors"),
+    "another pipeline": (class_of("", "model_index.json", "WanPipeline"), "'WanPipeline'"),
     "a tensor too many": (extra_tensor, "1 tensors of no use (lora.down)"),
     "tensors too few": (deeper, "lacks 24 tensors (transformer_blocks.2.attn1.norm_k.bias"),
     "another shape": (wider, "patch_embed.text_proj.weight (32, 12) instead of (32, 16)"),

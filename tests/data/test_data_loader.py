@@ -77,6 +77,13 @@ def test_an_epoch_visits_every_episode_once(folder):
     assert len(set(orders)) > 1  # and not always in the same order
 
 
+def test_batches_of_one_are_clips_of_the_same_order(folder):
+    ones = loader.dataset(config(folder), "train", seed=3, batch=1).slice(slice(5, None))
+    pairs = loader.dataset(config(folder), "train", seed=3, batch=2)
+    for k in (0, 1):
+        np.testing.assert_array_equal(ones[1 + k].frames.rgb_THWC[0], pairs[3].frames.rgb_THWC[k])
+
+
 def test_the_last_valid_context_frame_is_the_first_of_the_clip(folder):
     batch = next(loader.clips(config(folder), seed=0, batch=16))
     for i, valid in enumerate(batch.context_valid_S):
