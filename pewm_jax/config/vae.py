@@ -53,9 +53,10 @@ class VAEConfig:
     """Share of a tile's height that overlaps with the next."""
     tile_overlap_width: float = 1 / 5
     """Share of a tile's width that overlaps with the next."""
-    convolution: Literal["auto", "taps", "volume"] = "auto"
+    convolution: Literal["auto", "taps", "volume", "winograd"] = "auto"
     """`volume`: 3D convolutions; `taps`: the same as sums of 2D convolutions over time, faster on
-    XLA's CPU backend; `auto`: `taps` on CPU and `volume` elsewhere."""
+    XLA's CPU backend; `winograd`: half as many of those; `auto`: on CPU `winograd` in float32 and
+    `taps` in fewer bits, elsewhere `volume`."""
 
     @property
     def spatial(self) -> int:

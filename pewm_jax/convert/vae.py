@@ -129,24 +129,23 @@ def _theirs(path: str) -> str:
 
 def _coerce(key: str, value: Any) -> Any:
     """Check one of their settings against the kind of our field's default; lists become tuples."""
-    default = getattr(VAEConfig(), _FIELDS[key])
+    default: Any = getattr(VAEConfig(), _FIELDS[key])
+    turn: Any
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if isinstance(default, bool):
-        fits = isinstance(value, bool)
+        fits, turn = isinstance(value, bool), bool
     elif isinstance(default, tuple):
-        fits = isinstance(value, (list, tuple)) and all(type(x) is int for x in value)
-        value = tuple(value) if fits else value
+        fits = isinstance(value, (list, tuple)) and all(type(item) is int for item in value)
+        turn = tuple
     elif isinstance(default, int):
-        fits = number and value == int(value)
-        value = int(value) if fits else value
+        fits, turn = number and value == int(value), int
     else:
-        fits = number
-        value = float(value) if fits else value
+        fits, turn = number, float
     if not fits:
         raise UserError(
             f"the VAE's config.json has {key} = {value!r}, where a value like {default!r} belongs."
         )
-    return value
+    return turn(value)
 
 
 def _require(key: str, value: Any, fits: bool, allowed: Any) -> None:

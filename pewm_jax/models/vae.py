@@ -4,7 +4,9 @@ Four frames and 8 × 8 pixels become one latent; the first frame is alone in its
 encoded in chunks of 8 frames, the first also taking what is left over, and decoded in chunks of 2
 latents, the first taking 3 of an odd number. Every convolution hands its last two frames to the
 next chunk; the group norms see one chunk at a time. So the chunks are part of the result, and also
-what bounds the memory. Chunks of equal shape share one compiled body (``lax.scan``).
+what bounds the memory. Chunks of equal shape share one compiled body: inside ``jit`` they are
+scanned; called as they are, ``encode`` and ``decode`` call a compiled function per chunk, so that
+videos of every length share two.
 
 How many frames? 8N + 1 frames ↔ 2N + 1 latents ↔ 8N + 1 frames. An *even* number of latents has no
 first-frame rule: 2 latents decode to 8 frames, not 5. ``frames_of`` and ``latents_of`` count.
@@ -22,6 +24,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from pewm_jax.config import UserError, VAEConfig
 from pewm_jax.models import vae_layers as layers
@@ -134,7 +137,6 @@ def decode(
     return _decode(config, params, latents_BthwC)
 
 
-@partial(jax.jit, static_argnums=0)
 def _encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
     def whole(video: Array) -> Array:
         step = partial(_encode_chunk, config, params["encoder"])
@@ -145,7 +147,6 @@ def _encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Arra
     return mean, jnp.clip(logvar, *LOGVAR_RANGE)
 
 
-@partial(jax.jit, static_argnums=0)
 def _decode(config: VAEConfig, params: Params, latents_BthwC: Array) -> Array:
     def whole(latents: Array) -> Array:
         step = partial(_decode_chunk, config, params["decoder"])
@@ -162,6 +163,12 @@ def _in_chunks(
     more = max(frames // size, 1) - 1
     split = frames - more * size
     first, past = step(x_BTHWC[:, :split], {})
+    if not isinstance(x_BTHWC, Tracer):
+        outs = [first]
+        for start in range(split, frames, size):
+            out, past = step(x_BTHWC[:, start : start + size], past)
+            outs.append(out)
+        return jnp.concatenate(outs, 1)
     if not more:
         return first
     rest = x_BTHWC[:, split:].reshape(batch, more, size, *x_BTHWC.shape[2:])
@@ -175,6 +182,7 @@ def _in_chunks(
     return jnp.concatenate([first, outs], 1)
 
 
+@partial(jax.jit, static_argnums=0)
 def _encode_chunk(
     config: VAEConfig, params: Params, x_BTHWC: Array, past: Params
 ) -> tuple[Array, Params]:
@@ -192,6 +200,7 @@ def _encode_chunk(
     return x, new
 
 
+@partial(jax.jit, static_argnums=0)
 def _decode_chunk(
     config: VAEConfig, params: Params, latents_BthwC: Array, past: Params
 ) -> tuple[Array, Params]:

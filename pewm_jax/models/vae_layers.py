@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import VAEConfig
-from pewm_jax.models.vae_convolution import convolve, convolve_2d
+from pewm_jax.models.vae_convolution import convolve, convolve_2d, convolve_doubled
 from pewm_jax.types import Array, Params
 
 EPS = 1e-6
@@ -162,8 +162,7 @@ def upsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
     Of an odd number of frames the first is not repeated. (Repeating frames before or after a
     convolution of single frames is the same; after is less work.)
     """
-    x = jnp.repeat(jnp.repeat(x_BTHWC, 2, axis=2), 2, axis=3)
-    x = convolve_2d(params, x, stride=1, padding=((1, 1), (1, 1)))
+    x = convolve_doubled(params, x_BTHWC)
     frames = x.shape[1]
     if not in_time or frames == 1:
         return x

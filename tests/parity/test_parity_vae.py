@@ -1,0 +1,165 @@
+"""The autoencoder equals diffusers' AutoencoderKLCogVideoX, chunk by chunk and tile by tile."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from diffusers import AutoencoderKLCogVideoX
+
+from pewm_jax import tree
+from pewm_jax.config import UserError, VAEConfig
+from pewm_jax.convert import vae as converter
+from pewm_jax.models import vae
+
+SHRUNKEN = {
+    "block_out_channels": (8, 12, 12, 16),
+    "norm_num_groups": 4,
+    "latent_channels": 4,
+    "layers_per_block": 1,
+    "sample_height": 96,
+    "sample_width": 160,
+}
+TOLERANCE = 1e-4
+
+
+@pytest.fixture(scope="module")
+def reference():
+    """A small reference with every tensor drawn at random, norms and biases included."""
+    network = AutoencoderKLCogVideoX(**SHRUNKEN).eval().requires_grad_(False)
+    generator = torch.Generator().manual_seed(0)
+    for path, tensor in network.named_parameters():
+        if tensor.ndim == 1:
+            one = "norm" in path and path.endswith("weight")
+            tensor.copy_(one + 0.4 * torch.randn(tensor.shape, generator=generator))
+    return network
+
+
+@pytest.fixture(scope="module")
+def ours(reference):
+    config = converter.config_from_diffusers(dict(reference.config))
+    tensors = {name: tensor.numpy() for name, tensor in reference.state_dict().items()}
+    leaves = {
+        entry.path: jnp.asarray(entry.turn.ours(tensors.pop(entry.theirs)))
+        for entry in converter.entries(config)
+    }
+    assert not tensors
+    return config, tree.unflatten(leaves)
+
+
+def draw(*shape, seed=0):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed)).clamp(-1, 1)
+
+
+def last(tensor):
+    """Channels last, as ours."""
+    return tensor.float().permute(0, 2, 3, 4, 1).numpy()
+
+
+def distance(x, wanted):
+    x = np.asarray(x, np.float32)
+    assert x.shape == wanted.shape
+    return np.abs(x - wanted).max() / np.abs(wanted).max()
+
+
+def compare(reference, ours, video):
+    """Return how far our mean, variance and decoded video are from the reference's."""
+    config, params = ours
+    posterior = reference.encode(video).latent_dist
+    decoded = reference.decode(posterior.mean).sample
+    mean, logvar = vae.encode(config, params, jnp.asarray(last(video)))
+    video = vae.decode(config, params, jnp.asarray(last(posterior.mean)))
+    return (
+        distance(mean, last(posterior.mean)),
+        distance(logvar, last(posterior.logvar)),
+        distance(video, last(decoded)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("frames", "height", "width"),
+    [(1, 24, 40), (5, 24, 8), (8, 24, 8), (9, 27, 13), *((t, 24, 8) for t in (9, 17, 33, 49))],
+)
+def test_it_encodes_and_decodes_as_the_reference(reference, ours, frames, height, width):
+    video = draw(2, 3, frames, height, width)
+    assert max(compare(reference, ours, video)) < TOLERANCE
+
+
+@pytest.mark.parametrize("form", ["taps", "volume"])
+def test_every_form_of_the_convolution_is_the_same(reference, ours, form):
+    config, params = ours
+    ours = dataclasses.replace(config, convolution=form), params
+    assert max(compare(reference, ours, draw(1, 3, 9, 16, 8))) < TOLERANCE
+
+
+def test_inside_jit_the_chunks_are_scanned(reference, ours):
+    config, params = ours
+    latents = draw(2, 4, 5, 3, 1)
+    scanned = dataclasses.replace(config, convolution="volume")
+    decode = jax.jit(lambda x: vae.decode(scanned, params, x))
+    video = decode(jnp.asarray(last(latents)))
+    assert distance(video, last(reference.decode(latents).sample)) < TOLERANCE
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_an_even_number_of_latents_has_no_first_frame_rule(reference, ours, count, caplog):
+    config, params = ours
+    latents = draw(2, 4, count, 3, 1)
+    video = vae.decode(config, params, jnp.asarray(last(latents)))
+    assert video.shape[1] == 4 * count == vae.frames_of(config, count)
+    assert distance(video, last(reference.decode(latents).sample)) < TOLERANCE
+    assert f"{count} latents decode to {4 * count} frames" in caplog.text
+    with pytest.raises(UserError, match="odd number of latents"):
+        vae.decode(config, params, jnp.asarray(last(latents)), frames=4 * count - 3)
+
+
+@pytest.mark.parametrize(("height", "width"), [(40, 144), (88, 64)])
+def test_tiles_are_cut_and_blended_as_in_the_reference(reference, ours, height, width):
+    config, params = ours
+    tiled = dataclasses.replace(config, tiling=True, convolution="volume"), params
+    reference.enable_tiling()
+    try:
+        assert max(compare(reference, tiled, draw(1, 3, 1, height, width))) < TOLERANCE
+    finally:
+        reference.disable_tiling()
+
+
+def test_bfloat16_is_as_near_to_float32_as_the_references(reference, ours):
+    config, params = ours
+    video = draw(2, 3, 9, 24, 8, seed=1)
+    posterior = reference.encode(video).latent_dist
+    exact = [last(posterior.parameters), last(reference.decode(posterior.mean).sample)]
+    half = reference.to(torch.bfloat16)
+    try:
+        theirs = [
+            last(half.encode(video.bfloat16()).latent_dist.parameters),
+            last(half.decode(posterior.mean.bfloat16()).sample),
+        ]
+    finally:
+        reference.to(torch.float32)
+    moments = vae.encode(config, params, jnp.asarray(last(video), jnp.bfloat16))
+    decoded = vae.decode(config, params, jnp.asarray(last(posterior.mean), jnp.bfloat16))
+    assert decoded.dtype == jnp.bfloat16
+    for x, y, z in zip([np.concatenate(moments, -1), decoded], theirs, exact, strict=True):
+        assert distance(x, z) < 1.5 * distance(y, z)
+        assert np.square(np.asarray(x, np.float32) - z).sum() < 1.5**2 * np.square(y - z).sum()
+
+
+@pytest.mark.parametrize("variant", ["2b", "5b", "5b-I2V", "1.5-5B", "1.5-5B-I2V"])
+def test_names_and_shapes_of_the_published_size_fit_without_a_weight(variant):
+    config = VAEConfig.published(variant)
+    with torch.device("meta"):
+        network = AutoencoderKLCogVideoX.from_config(converter.config_to_diffusers(config))
+    wanted = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+    like = tree.flatten(jax.eval_shape(lambda key: vae.init(config, key), jax.random.key(0)))
+    entries = converter.entries(config)
+    nothing = np.zeros((), np.float32)
+    have = {
+        e.theirs: e.turn.theirs(np.broadcast_to(nothing, like[e.path].shape)).shape for e in entries
+    }
+    assert have == wanted
+    assert {e.path for e in entries} == like.keys()
+    assert len(entries) == len(like)
+    assert converter.config_from_diffusers(dict(network.config)) == config
