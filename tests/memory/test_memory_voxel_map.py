@@ -4,6 +4,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +15,8 @@ from tests.helpers import random_frames, tiny_config
 
 CONFIG = dataclasses.replace(tiny_config().memory, cell_m=(0.5, 0.25, 1.0), cells=(6, 8, 3))
 insert = jax.jit(voxel_map.insert, static_argnums=0)
+insert_frames = jax.jit(voxel_map.insert_frames, static_argnums=0)
+merge = jax.jit(voxel_map.merge, static_argnums=0)
 SEEDS = st.integers(0, 100_000)
 
 
@@ -31,6 +34,18 @@ def cells_of(config, voxels):
     """The map as a plain dictionary: cell → features."""
     cells, values = np.asarray(voxels.cell_of_slot_V), np.asarray(voxels.features_VF)
     return {int(c): values[i] for i, c in enumerate(cells) if c < math.prod(config.cells)}
+
+
+def identical(a, b):
+    """Equal bit for bit, layout and counts included."""
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def inside(points):
+    half = np.array(CONFIG.cells) * CONFIG.cell_m / 2
+    low = np.round(-half / CONFIG.cell_m) * CONFIG.cell_m
+    place = (points - low) / CONFIG.cell_m
+    return ((place >= 0) & (place < CONFIG.cells)).all(-1)
 
 
 def same(a, b):
@@ -72,15 +87,73 @@ def test_a_cell_is_the_maximum_of_its_points(seed):
 @given(seed=SEEDS)
 def test_order_repetition_and_batching_do_not_matter(seed):
     points, values, valid = random_points(seed)
-    once = cells_of(CONFIG, insert(CONFIG, fresh(), points, values, valid))
+    once = insert(CONFIG, fresh(), points, values, valid)
     order = np.random.default_rng(seed).permutation(len(points))
-    shuffled = insert(CONFIG, fresh(), points[order], values[order], valid[order])
-    same(once, cells_of(CONFIG, shuffled))
+    identical(once, insert(CONFIG, fresh(), points[order], values[order], valid[order]))
     half = len(points) // 2
     parts = fresh()
     for part in (slice(half, None), slice(None, half), slice(half, None)):
         parts = insert(CONFIG, parts, points[part], values[part], valid[part])
-    same(once, cells_of(CONFIG, parts))
+    repeated = (valid[half:] & ~inside(points[half:])).sum()
+    assert int(parts.outside) == int(once.outside) + repeated, "points outside count every time"
+    identical(once, dataclasses.replace(parts, outside=once.outside))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=SEEDS)
+def test_inserting_after_one_another_is_merging(seed):
+    a, b = random_points(seed), random_points(seed + 1)
+    maps = [insert(CONFIG, fresh(), *part) for part in (a, b)]
+    after = insert(CONFIG, maps[0], *b)
+    identical(merge(CONFIG, *maps), after)
+    identical(merge(CONFIG, *maps[::-1]), after)
+
+
+def test_merging_keeps_the_first_map_whole_and_counts_what_does_not_fit():
+    config = dataclasses.replace(CONFIG, capacity=30, tokens=5)
+    a, b = (insert(config, fresh(config), *random_points(s, 300)) for s in (0, 1))
+    both = merge(config, a, b)
+    assert int(a.dropped) > 0, "the first map is full"
+    np.testing.assert_array_equal(both.cell_of_slot_V, a.cell_of_slot_V)
+    new = set(np.asarray(b.cell_of_slot_V)) - set(np.asarray(a.cell_of_slot_V))
+    assert int(both.dropped) == int(a.dropped) + int(b.dropped) + len(new)
+
+
+def test_merging_grids_shifted_by_whole_cells():
+    points, values, valid = random_points(5)
+    shifted = voxel_map.empty(CONFIG, np.array([0.5, -0.25, 0.0], np.float32), 4)
+    other = insert(CONFIG, shifted, points, values, valid)
+    merged = merge(CONFIG, fresh(), other)
+    here = insert(
+        CONFIG, fresh(), points, values, valid & inside(points + np.array([-0.5, 0.25, 0]))
+    )
+    np.testing.assert_array_equal(merged.cell_of_slot_V, here.cell_of_slot_V)
+    np.testing.assert_array_equal(merged.features_VF, here.features_VF)
+    assert int(merged.outside) > int(other.outside), "cells beyond the first grid are counted"
+
+
+def test_what_was_there_stays_when_the_capacity_is_full():
+    config = dataclasses.replace(CONFIG, capacity=8, tokens=5)
+    points, values, valid = random_points(0, 40)
+    high, low = points[:, 0] > 0, points[:, 0] <= 0
+    first = insert(config, fresh(config), points, values, valid & high)
+    again = insert(config, first, points, values, valid & low)
+    assert int(first.dropped) == 0
+    assert 0 < int(first.occupied) < int(again.occupied) == 8
+    assert set(np.asarray(first.cell_of_slot_V)) - set(np.asarray(again.cell_of_slot_V)) <= {144}
+    everything, _ = reference(config, points, values, valid)
+    assert int(again.dropped) == len(everything) - 8
+
+
+@pytest.mark.parametrize("given_as", [jnp.float32, jnp.bfloat16])
+def test_a_map_of_bfloat16_holds_the_rounded_maxima(given_as):
+    points, values, valid = random_points(2)
+    values = jnp.asarray(values, given_as)
+    half = insert(
+        CONFIG, voxel_map.empty(CONFIG, np.zeros(3), 4, jnp.bfloat16), points, values, valid
+    )
+    full = insert(CONFIG, fresh(), points, values, valid)
+    np.testing.assert_array_equal(half.features_VF, full.features_VF.astype(jnp.bfloat16))
 
 
 def test_negative_features_survive_and_zero_is_not_empty():
@@ -113,7 +186,7 @@ def test_points_that_are_not_numbers_are_outside():
 def test_batched_maps_equal_single_ones():
     sets = [random_points(s) for s in range(3)]
     stacked = [np.stack(x) for x in zip(*sets, strict=True)]
-    many = jax.vmap(lambda p, f, v: voxel_map.insert(CONFIG, fresh(), p, f, v))(*stacked)
+    many = jax.jit(jax.vmap(lambda p, f, v: voxel_map.insert(CONFIG, fresh(), p, f, v)))(*stacked)
     for i, one in enumerate(sets):
         same(
             cells_of(CONFIG, jax.tree.map(lambda x, i=i: x[i], many)),
@@ -127,7 +200,7 @@ def test_every_point_of_a_frame_is_within_half_a_cell_of_its_centre():
     frames = random_frames(rng, 2)
     frames = Frames(rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW, frames.camera)
     voxels = voxel_map.empty(config, np.zeros(3), 6)
-    voxels = voxel_map.insert_frames(
+    voxels = insert_frames(
         config,
         voxels,
         frames,
@@ -156,7 +229,7 @@ def test_pixels_without_depth_leave_no_trace():
     blank = Frames(rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW * 0, frames.camera)
     voxels = voxel_map.empty(config, np.zeros(3), 6)
     patches = features.encode(config, {}, blank.rgb_THWC)
-    voxels = voxel_map.insert_frames(config, voxels, blank, patches)
+    voxels = insert_frames(config, voxels, blank, patches)
     assert int(voxels.occupied) == 0
 
 
