@@ -158,10 +158,9 @@ def main() -> None:
         return
     rows = all_rows(args.turns, args.frames, args.size)
     where = machine("jax", "torch", "diffusers")
-    text = (
-        f"## CogVideoX's autoencoder, float32\n\nPublished widths, warm, median of {args.turns} turns; torch with "
-        f"2 threads; goal: at most {GOAL} of its time. {where}.\n\n{table(HEADER, rows)}"
-    )
+    words = f"Published widths, warm, median of {args.turns} turns; torch with 2 threads; "
+    goal = f"goal: at most {GOAL} of its time. {where}."
+    text = f"## CogVideoX's autoencoder, float32\n\n{words}{goal}\n\n{table(HEADER, rows)}"
     print(text)
     if args.record:
         record(NAME, text)
