@@ -54,7 +54,8 @@ def megabytes(label: str, total: int) -> Iterator[Callable[[int], None]]:
         def told(count: int) -> None:
             nonlocal done
             before, done = done, done + count
-            meter.advance(done // _MEGABYTE - before // _MEGABYTE)
+            if whole := done // _MEGABYTE - before // _MEGABYTE:
+                meter.advance(whole)
 
         yield told
 
