@@ -81,6 +81,11 @@ def _encode(
                 return_tensors="pt",
             ).input_ids
             out[prompt] = model.eval()(ids)[0][0].float().numpy()
+            if not np.isfinite(out[prompt]).all():
+                raise UserError(
+                    f"{encoder} in {model.dtype} overflows on the prompt {prompt!r}; save it in "
+                    "bfloat16 or float32."
+                )
     return out
 
 

@@ -39,6 +39,8 @@ _FIXED: dict[str, tuple[Any, ...]] = {
     "force_upcast": (True, False),
 }
 """Settings that change nothing here, and the values that may stand there; the first is written."""
+_FORMER = frozenset(["sample_size"])
+"""Settings of the reference's first release, which it does not have any more."""
 _BLOCKS = {
     "down_block_types": "CogVideoXDownBlock3D",
     "up_block_types": "CogVideoXUpBlock3D",
@@ -62,7 +64,7 @@ def config_from_diffusers(values: dict[str, Any]) -> VAEConfig:
         raise UserError(f"the VAE's config.json describes a {kind!r}; only {CLASS} can be read.")
     fields: dict[str, Any] = {}
     for key, value in values.items():
-        if key.startswith("_"):
+        if key.startswith("_") or key in _FORMER:
             continue
         if key in _FIELDS:
             fields[_FIELDS[key]] = _coerce(key, value)
