@@ -195,10 +195,11 @@ def places(path: Path) -> dict[str, Place]:
         try:
             dtype, (begin, end) = _DTYPES[entry["dtype"]], entry["data_offsets"]
             found[name] = Place(tuple(entry["shape"]), dtype, start + begin)
+            length = end - begin
         except (KeyError, TypeError, ValueError):
             raise _damaged(path, f"its entry of {name} cannot be read: {entry}") from None
-        if end - begin != found[name].size:
-            raise _damaged(path, f"{name} takes {end - begin} bytes, not {found[name].size}")
+        if length != found[name].size:
+            raise _damaged(path, f"{name} takes {length} bytes, not {found[name].size}")
         spans.append((begin, end))
     end = 0
     for begin, until in sorted(spans):

@@ -60,3 +60,38 @@ def test_equal_weights_are_equal_files(tmp_path):
         weights.save(tmp_path / name, PARAMS, words)
     weights.save(tmp_path / "c", dict(reversed(PARAMS.items())), dict(reversed(words.items())))
     assert len({(tmp_path / name).read_bytes() for name in "abc"}) == 1
+
+
+def test_one_branch_can_be_read_alone(tmp_path):
+    weights.save(tmp_path / "w", PARAMS)
+    assert list(weights.load(tmp_path / "w", "memory")) == ["gate"]
+    with pytest.raises(UserError, match="holds no codec"):
+        weights.load(tmp_path / "w", "codec")
+
+
+def test_tensors_that_were_not_announced_leave_no_file(tmp_path):
+    one = np.ones(3, np.float32)
+    for tensors in ([("b", one)], [("a", one[:2])], [("a", one), ("a", one)], []):
+        with pytest.raises(ValueError, match="announced"):
+            weights.write(tmp_path / "w", {"a": one}, tensors, {})
+        assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        b"[]",
+        b'{"a": 3}',
+        b'{"a": {"dtype": "F8", "shape": [1], "data_offsets": [0, 4]}}',
+        b'{"a": {"dtype": "F32", "shape": [2], "data_offsets": [0, 4]}}',
+        b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [4, 8]}}',
+        b'{"a": {"dtype": "F32", "shape": [-1], "data_offsets": [4, 0]}}',
+        b'{"a": {"dtype": "F32", "shape": ["1"], "data_offsets": [0, 4]}}',
+        b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": ["0", 4]}}',
+        b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, "4"]}}',
+    ],
+)
+def test_a_header_that_does_not_hold_together_is_refused(tmp_path, table):
+    (tmp_path / "w").write_bytes(len(table).to_bytes(8, "little") + table + b"1234")
+    with pytest.raises(UserError, match="is damaged"):
+        weights.load(tmp_path / "w")
