@@ -53,7 +53,6 @@ def convolve(config: VAEConfig, params: Params, padded_BTHWC: Array) -> Array:
             (1, 1, 1),
             ((0, 0), *SAME),
             dimension_numbers=("NDHWC", "DHWIO", "NDHWC"),
-            preferred_element_type=jnp.float32,
         )
     elif how == "winograd" and (frames - 2) * height * width >= WORTHWHILE:
         out = _winograd(padded_BTHWC, kernel)
@@ -111,23 +110,27 @@ def form(config: VAEConfig, dtype: jnp.dtype) -> str:
     return "winograd" if dtype == jnp.float32 else "taps"
 
 
-def _frames(x_BTHWC: Array, kernel: Array, stride: int, padding: Sequence) -> Array:
-    """2D convolution of every frame, in float32 at least."""
+def _frames(
+    x_BTHWC: Array, kernel: Array, stride: int, padding: Sequence, out: jnp.dtype | None = None
+) -> Array:
+    """2D convolution of every frame, returned in x's dtype or in ``out``."""
     batch, frames = x_BTHWC.shape[:2]
-    out = jax.lax.conv_general_dilated(
+    y = jax.lax.conv_general_dilated(
         x_BTHWC.reshape(batch * frames, *x_BTHWC.shape[2:]),
         kernel,
         (stride, stride),
         padding,
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        preferred_element_type=jnp.float32,
+        preferred_element_type=out,
     )
-    return out.reshape(batch, frames, *out.shape[1:])
+    return y.reshape(batch, frames, *y.shape[1:])
 
 
 def _taps(padded_BTHWC: Array, kernel: Array) -> Array:
-    frames = padded_BTHWC.shape[1] - 2
-    return sum(_frames(padded_BTHWC[:, k : k + frames], kernel[k], 1, SAME) for k in range(3))
+    """Sum of three convolutions, in float32."""
+    frames, wide = padded_BTHWC.shape[1] - 2, jnp.dtype(jnp.float32)
+    inputs = [padded_BTHWC[:, k : k + frames] for k in range(3)]
+    return sum(_frames(x, kernel[k], 1, SAME, wide) for k, x in enumerate(inputs))
 
 
 def _winograd(padded_BTHWC: Array, kernel: Array) -> Array:
@@ -156,12 +159,12 @@ def _split(frames: int) -> list[tuple[int, int]]:
 def _tiles(padded_BTHWC: Array, kernel: Array, size: int) -> Array:
     """Tiles of ``size`` output frames by size + 2 convolutions each."""
     batch, frames, height, width, _ = padded_BTHWC.shape
-    count = (frames - 2) // size
+    count, wide = (frames - 2) // size, jnp.dtype(jnp.float32)
     out_of, weigh, into = minimal_filter(size)
     inputs = [padded_BTHWC[:, i : i + size * (count - 1) + 1 : size] for i in range(size + 2)]
     weighed = jnp.einsum("aj,jhwcd->ahwcd", np.float32(weigh), kernel)
     products = [
-        _frames(_combine(row, inputs), weighed[a].astype(padded_BTHWC.dtype), 1, SAME)
+        _frames(_combine(row, inputs), weighed[a].astype(padded_BTHWC.dtype), 1, SAME, wide)
         for a, row in enumerate(into)
     ]
     out = jnp.stack([_combine(row, products) for row in out_of], 2)

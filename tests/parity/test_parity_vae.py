@@ -46,7 +46,8 @@ def ours(reference):
         for entry in converter.entries(config)
     }
     assert not tensors
-    return config, tree.unflatten(leaves)
+    # The form that compiles fastest; the others are compared below.
+    return dataclasses.replace(config, convolution="volume"), tree.unflatten(leaves)
 
 
 def draw(*shape, seed=0):
@@ -87,18 +88,17 @@ def test_it_encodes_and_decodes_as_the_reference(reference, ours, frames, height
     assert max(compare(reference, ours, video)) < TOLERANCE
 
 
-@pytest.mark.parametrize("form", ["taps", "volume"])
+@pytest.mark.parametrize("form", ["taps", "winograd"])
 def test_every_form_of_the_convolution_is_the_same(reference, ours, form):
     config, params = ours
     ours = dataclasses.replace(config, convolution=form), params
-    assert max(compare(reference, ours, draw(1, 3, 9, 16, 8))) < TOLERANCE
+    assert max(compare(reference, ours, draw(1, 3, 9, 24, 8))) < TOLERANCE
 
 
 def test_inside_jit_the_chunks_are_scanned(reference, ours):
     config, params = ours
     latents = draw(2, 4, 5, 3, 1)
-    scanned = dataclasses.replace(config, convolution="volume")
-    decode = jax.jit(lambda x: vae.decode(scanned, params, x))
+    decode = jax.jit(lambda x: vae.decode(config, params, x))
     video = decode(jnp.asarray(last(latents)))
     assert distance(video, last(reference.decode(latents).sample)) < TOLERANCE
 
@@ -118,7 +118,7 @@ def test_an_even_number_of_latents_has_no_first_frame_rule(reference, ours, coun
 @pytest.mark.parametrize(("height", "width"), [(40, 144), (88, 64)])
 def test_tiles_are_cut_and_blended_as_in_the_reference(reference, ours, height, width):
     config, params = ours
-    tiled = dataclasses.replace(config, tiling=True, convolution="volume"), params
+    tiled = dataclasses.replace(config, tiling=True), params
     reference.enable_tiling()
     try:
         assert max(compare(reference, tiled, draw(1, 3, 1, height, width))) < TOLERANCE
@@ -127,7 +127,7 @@ def test_tiles_are_cut_and_blended_as_in_the_reference(reference, ours, height, 
 
 
 def test_bfloat16_is_as_near_to_float32_as_the_references(reference, ours):
-    config, params = ours
+    config, params = dataclasses.replace(ours[0], convolution="auto"), ours[1]
     video = draw(2, 3, 9, 24, 8, seed=1)
     posterior = reference.encode(video).latent_dist
     exact = [last(posterior.parameters), last(reference.decode(posterior.mean).sample)]
