@@ -48,8 +48,9 @@ def same_weights() -> tuple[dict, Dinov2Model]:
         image_size=CONFIG.pretrained_size,
     )
     network = Dinov2Model(settings).eval()
+    known = network.state_dict().keys()
     tensors = {
-        in_memory(name): torch.tensor(tensor)
+        name if name in known else in_memory(name): torch.tensor(tensor)
         for name, tensor in assemble.write(entries(CONFIG), params)
     }
     missing, unexpected = network.load_state_dict(tensors, strict=False)
@@ -58,7 +59,7 @@ def same_weights() -> tuple[dict, Dinov2Model]:
 
 
 def in_memory(name: str) -> str:
-    """Return how the network calls, while it runs, what its files call ``name``."""
+    """Return how the network calls in memory (transformers 5) what its files call ``name``."""
     name = re.sub(r"attention\.attention\.(\w)\w+", r"attention.\1_proj", name)
     return name.replace("attention.output.dense", "attention.o_proj")
 

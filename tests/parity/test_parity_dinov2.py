@@ -58,10 +58,28 @@ def randomise(network, seed=0):
     return network
 
 
+def saved_words(tensors):
+    """The tensors as transformers names them in files; in memory its version 5 has other names."""
+    words = {"q_proj": "attention.query", "k_proj": "attention.key", "v_proj": "attention.value"}
+    words |= {"o_proj": "output.dense", "down_proj": "weights_out", "gate_proj": "weights_in"}
+    saved = {}
+    for name, tensor in tensors.items():
+        if ".up_proj." in name:
+            continue
+        parts = [tensor]
+        if ".gate_proj." in name:
+            parts.append(tensors[name.replace("gate_proj", "up_proj")])
+        renamed = name
+        for ours, theirs in words.items():
+            renamed = renamed.replace(f".{ours}.", f".{theirs}.")
+        saved[renamed] = torch.cat(parts) if len(parts) > 1 else tensor
+    return saved
+
+
 def original_words(network):
     """The same tensors as the original repository names and fuses them."""
     theirs = {}
-    saved = network.state_dict()
+    saved = saved_words(network.state_dict())
     layers = network.config.num_hidden_layers
     embeddings = "embeddings."
     theirs["cls_token"] = saved[embeddings + "cls_token"]
@@ -74,16 +92,16 @@ def original_words(network):
         theirs[f"norm.{end}"] = saved[f"layernorm.{end}"]
         for layer in range(layers):
             ours, block = f"encoder.layer.{layer}.", f"blocks.{layer}."
-            qkv = [saved[f"{ours}attention.{n}_proj.{end}"] for n in "qkv"]
+            three = ("query", "key", "value")
+            qkv = [saved[f"{ours}attention.attention.{n}.{end}"] for n in three]
             theirs[f"{block}attn.qkv.{end}"] = torch.cat(qkv)
-            theirs[f"{block}attn.proj.{end}"] = saved[f"{ours}attention.o_proj.{end}"]
+            theirs[f"{block}attn.proj.{end}"] = saved[f"{ours}attention.output.dense.{end}"]
             for n in "12":
                 theirs[f"{block}norm{n}.{end}"] = saved[f"{ours}norm{n}.{end}"]
                 theirs[f"{block}ls{n}.gamma"] = saved[f"{ours}layer_scale{n}.lambda1"]
             if network.config.use_swiglu_ffn:
-                gate, up = (saved[f"{ours}mlp.{n}_proj.{end}"] for n in ("gate", "up"))
-                theirs[f"{block}mlp.w12.{end}"] = torch.cat([gate, up])
-                theirs[f"{block}mlp.w3.{end}"] = saved[f"{ours}mlp.down_proj.{end}"]
+                theirs[f"{block}mlp.w12.{end}"] = saved[f"{ours}mlp.weights_in.{end}"]
+                theirs[f"{block}mlp.w3.{end}"] = saved[f"{ours}mlp.weights_out.{end}"]
             else:
                 for n in "12":
                     theirs[f"{block}mlp.fc{n}.{end}"] = saved[f"{ours}mlp.fc{n}.{end}"]
