@@ -48,6 +48,7 @@ def test_every_preset_goes_to_json_and_back(name, tmp_path):
         ),
         (lambda: MemoryConfig(head_dim=6), "multiple of 8"),
         (lambda: MemoryConfig(cell_m=(0.1, 0.0, 1.0)), "positive"),
+        (lambda: MemoryConfig(cells=(4096, 4096, 256)), "numbered"),
         (lambda: DiffusionConfig(sample_steps=0), "use 1 to"),
         (lambda: DiffusionConfig(beta_start=0.5), "start < end"),
         (lambda: DataConfig(stride_min=3, stride_max=2), "min ≤ max"),
