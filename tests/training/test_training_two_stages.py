@@ -1,0 +1,103 @@
+"""The two stages on the real model: what is trained, what is kept, what freezing saves."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+import configs
+from pewm_jax import tree
+from pewm_jax.config import DiTConfig
+from pewm_jax.models import world_model
+from pewm_jax.training import sharding, stages, step
+from pewm_jax.types import Clip
+from tests.helpers import random_frames, randomise
+
+TWO = stages.STAGES[1]
+EVERYTHING = dataclasses.replace(TWO, rules=((r".*", stages.TRAIN),))
+
+
+def small():
+    """A backbone that is large beside its memory blocks, as CogVideoX beside the paper's."""
+    config = configs.load("tiny")
+    wide = DiTConfig(layers=1, heads=16, head_dim=32, text_length=1, text_dim=8, time_dim=16)
+    return dataclasses.replace(
+        config, dit=wide, memory=dataclasses.replace(config.memory, mlp_ratio=1)
+    )
+
+
+CONFIG = small()
+CLIP = jax.tree.map(
+    lambda x: np.stack([x, x]),
+    Clip(
+        random_frames(np.random.default_rng(0), CONFIG.clip.frames, 16, 16),
+        random_frames(np.random.default_rng(1), CONFIG.data.context, 16, 16),
+        np.ones(CONFIG.data.context, bool),
+    ),
+)
+
+
+def one_device():
+    return sharding.make_mesh(jax.devices()[:1])
+
+
+def parameters(config):
+    return jax.eval_shape(functools.partial(world_model.init, config), jax.random.key(0))
+
+
+def compiled(stage):
+    lowered = step.lower_step(CONFIG, stage, one_device(), CLIP)
+    return lowered.compile()
+
+
+@pytest.fixture(scope="module")
+def stage_2():
+    return compiled(TWO)
+
+
+def test_a_step_of_stage_2_costs_at_most_three_quarters_of_training_everything(stage_2):
+    """The same shape, and both compiled; a scanned body counts once in both."""
+    everything = compiled(EVERYTHING)
+    assert stage_2.cost_analysis()["flops"] <= 0.75 * everything.cost_analysis()["flops"]
+
+
+def test_frozen_leaves_stay_bit_identical_and_only_trained_ones_have_moments(stage_2):
+    start = randomise(world_model.init(CONFIG, jax.random.key(1), memory=False))
+    now = step.initial_state(CONFIG, TWO, one_device(), start)
+    before = jax.tree.map(np.array, now)
+    clip = jax.device_put(CLIP, sharding.of_batch(one_device()))
+    key = step.stage_key(CONFIG, TWO)
+    for _ in range(3):
+        now, _ = stage_2(now, clip, key)
+    after, start = tree.flatten(now.params), tree.flatten(before.params)
+    moved = {path for path in after if np.asarray(after[path]).tobytes() != start[path].tobytes()}
+    assert moved
+    assert all(path.startswith("memory/") for path in moved)
+    assert any("/attention/to_v/" in path for path in moved)
+    trained = tree.flatten(tree.select(before.params, TWO.trained))
+    moments = tree.flatten(now.opt_state)
+    for name in ("mu", "nu"):
+        assert {path.split(f"/{name}/")[1] for path in moments if f"/{name}/" in path} == set(
+            trained
+        )
+    assert all("backbone/" not in path for path in moments)
+
+
+@pytest.mark.parametrize("stage", stages.STAGES, ids=lambda stage: stage.name)
+def test_every_leaf_has_a_rule_and_one_without_fails(stage):
+    params = parameters(CONFIG)
+    if not stage.memory:
+        params = tree.exclude(params, (r"memory/.*",))
+    labels = tree.flatten(stage.labels(params))
+    trained, frozen = tree.split(params, stage.trained)
+    train = {path for path, label in labels.items() if label == stages.TRAIN}
+    assert tree.flatten(trained).keys() == train
+    assert tree.flatten(frozen).keys() == labels.keys() - train
+    with pytest.raises(tree.TreeError, match="matches memroy/gate"):
+        stage.labels({**params, "memroy": {"gate": 0}})
+    fewer = dataclasses.replace(stage, rules=stage.rules[:1])
+    if frozen:
+        with pytest.raises(tree.TreeError, match="matches backbone/"):
+            fewer.labels(params)
