@@ -81,7 +81,7 @@ def compare(ours: Callable, theirs: Callable, turns: int) -> tuple[list[float], 
     return list(np.median(times[:, :, 0], 0)), wall, cpu
 
 
-def vae_rows(turns: int = 5, frames: int = 9, size: int = 64) -> list[tuple[str, ...]]:
+def vae_rows(turns: int = 5, frames: int = 9, size: int = 96) -> list[tuple[str, ...]]:
     """Compare encoding and decoding; return the rows under ``HEADER`` but for its last column."""
     return [row[:5] for row in all_rows(turns, frames, size)]
 
@@ -136,7 +136,7 @@ def main() -> None:
     """Print the table; with ``--record``, keep it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=9, help="frames, 8N + 1")
-    parser.add_argument("--size", type=int, default=64, help="height and width in pixels")
+    parser.add_argument("--size", type=int, default=96, help="height and width in pixels")
     parser.add_argument("--turns", type=int, default=5, help="timed turns of each")
     parser.add_argument("--memory", action="store_true", help="print the memory of decoding")
     parser.add_argument(

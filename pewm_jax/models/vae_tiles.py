@@ -7,6 +7,7 @@ tile. Tiles of equal shape share one compiled body and run one after another. Re
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 import jax
@@ -15,6 +16,8 @@ import numpy as np
 
 from pewm_jax.config import VAEConfig
 from pewm_jax.types import Array
+
+_log = logging.getLogger(__name__)
 
 
 def in_tiles(
@@ -29,7 +32,8 @@ def in_tiles(
         shrink: whether ``whole`` encodes (pixels in, latents out) or decodes.
 
     Returns:
-        What ``whole`` would return, up to the tiles' borders.
+        What ``whole`` would return, up to the tiles' borders. (Where tiles overlap by no whole
+        number of latents the reference returns another size; so does this, and says so.)
     """
     pixels = config.tile_pixels
     latents = tuple(size // config.spatial for size in pixels)
@@ -54,7 +58,17 @@ def in_tiles(
                 tiles[i, j] = _fade(tiles[i, j - 1], tiles[i, j], blend[1], axis=3)
             row.append(tiles[i, j][:, :, : keep[0], : keep[1]])
         rows.append(jnp.concatenate(row, 3))
-    return jnp.concatenate(rows, 2)
+    joined = jnp.concatenate(rows, 2)
+    side = config.spatial
+    wanted = tuple(n // side if shrink else n * side for n in size)
+    if joined.shape[2:4] != wanted:
+        _log.warning(
+            "tiles of %d×%d pixels that overlap by shares of %.3g and %.3g do not join on whole "
+            "latents: the result is %d×%d, not %d×%d; choose tiles whose overlap is a whole number "
+            "of %d pixels, as 240×360 with 1/6 and 1/5.",
+            *(*pixels, *overlap, *joined.shape[2:4], *wanted, side),
+        )
+    return joined
 
 
 def _run(

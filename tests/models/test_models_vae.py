@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pewm_jax.config import ConfigError, UserError, VAEConfig
 from pewm_jax.convert import vae as converter
-from pewm_jax.models import vae, vae_convolution, vae_layers
+from pewm_jax.models import vae, vae_convolution, vae_layers, vae_tiles
 from tests.helpers import randomise
 
 TINY = VAEConfig(
@@ -78,6 +78,15 @@ def test_surprising_sizes_are_told(params, caplog):
     assert mean.shape == (1, 2, 2, 2, 2)
     assert "5 frames become 2 latents" in caplog.text
     assert "9×8 pixels is no multiple of 4: it will decode to 8×8" in caplog.text
+
+
+def test_tiles_that_do_not_join_are_told(caplog):
+    config = dataclasses.replace(TINY, tiling=True, tile_height=12, tile_overlap_height=0.5)
+    for height, told in ((24, True), (12, False)):
+        caplog.clear()
+        x = jnp.zeros((1, 1, height, 8, 3))
+        vae_tiles.in_tiles(lambda x: x[:, :, ::4, ::4], x, config, shrink=True)
+        assert ("do not join" in caplog.text) == told
 
 
 @pytest.mark.parametrize(
