@@ -17,6 +17,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
+from pewm_jax.config import UserError
 from pewm_jax.models import layers
 from pewm_jax.types import Array
 
@@ -39,19 +40,40 @@ def attention(
         v_BKMD: values.
         implementation: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `xla` runs anywhere,
             `auto` takes cudnn where it works.
+
+    Raises:
+        UserError: cudnn is asked for where it does not work.
     """
     batch, heads, queries, _ = q_BKND.shape
-    sixteen = q_BKND.dtype in (jnp.bfloat16, jnp.float16)
-    if implementation == "auto":
-        flash = sixteen and jax.default_backend() == "gpu"
-        implementation = "cudnn" if flash else "xla"
-    if implementation == "cudnn":
+    works = has_flash() and fits_flash(q_BKND)
+    if implementation == "cudnn" and not works:
+        raise UserError(
+            f"attention cudnn needs an NVIDIA GPU (Ampere or newer), 16 bits and heads of at most "
+            f"128 channels, a multiple of 8; here are {jax.default_backend()}, {q_BKND.dtype} and "
+            f"{q_BKND.shape[-1]}: choose auto or xla."
+        )
+    if works and implementation != "xla":
         q, k, v = (x.swapaxes(1, 2) for x in (q_BKND, k_BKMD, v_BKMD))
         return jax.nn.dot_product_attention(q, k, v, implementation="cudnn").swapaxes(1, 2)
     logits = batch * queries * k_BKMD.shape[2]
     if heads * logits <= LOGITS:
         return layers.attention(q_BKND, k_BKMD, v_BKMD)
     return _attention(q_BKND, k_BKMD, v_BKMD, min(math.ceil(logits / LOGITS), queries))
+
+
+def has_flash() -> bool:
+    """Whether what computes is an NVIDIA GPU with cuDNN's flash attention."""
+    if jax.default_backend() != "gpu":
+        return False
+    capability = str(getattr(jax.local_devices()[0], "compute_capability", ""))
+    return capability.partition(".")[0].isdigit() and float(capability) >= 8
+
+
+def fits_flash(q_BKND: Array) -> bool:
+    """Whether cuDNN's flash attention takes heads like these."""
+    channels = q_BKND.shape[-1]
+    sixteen = q_BKND.dtype in (jnp.bfloat16, jnp.float16)
+    return sixteen and channels <= 128 and channels % 8 == 0
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))

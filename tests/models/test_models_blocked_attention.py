@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pewm_jax.config import UserError
 from pewm_jax.models import blocked_attention, layers
 
 
@@ -84,3 +85,22 @@ def test_elsewhere_the_same_formula_runs_without_loops():
         strict=True,
     ):
         np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
+
+
+def test_flash_attention_is_refused_where_there_is_none_and_taken_where_there_is(monkeypatch):
+    q, k, v = inputs()
+    with pytest.raises(UserError, match="cpu, float32 and 8: choose auto or xla"):
+        blocked_attention.attention(q, k, v, "cudnn")
+    asked = []
+
+    def flash(q, k, v, implementation):
+        asked.append((q.shape, implementation))
+        return q + v[:, :1] * k[:, :1]
+
+    monkeypatch.setattr(blocked_attention, "has_flash", lambda: True)
+    monkeypatch.setattr(jax.nn, "dot_product_attention", flash)
+    half = [x.astype(jnp.bfloat16) for x in (q, k, v)]
+    assert blocked_attention.attention(*half).shape == q.shape
+    blocked_attention.attention(*half, "xla")
+    blocked_attention.attention(q, k, v)
+    assert asked == [((2, 13, 3, 8), "cudnn")], "16 bits alone, batch and tokens in front of heads"
