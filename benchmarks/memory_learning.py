@@ -208,7 +208,8 @@ def runs(options: argparse.Namespace) -> Iterator[tuple[Variant, int, Result]]:
             found = score(config, params, batches, memory=not first)
             seconds = round(time.process_time() - began, 1)
             found |= {"fingerprint": name, "parameters": count, "seconds": seconds}
-            print(f"{label}: {found['psnr']['seen']:.2f} dB in {seconds:.0f} s of processor time", flush=True)
+            took = f"{seconds:.0f} s of processor time"
+            print(f"{label}: {found['psnr']['seen']:.2f} dB in {took}", flush=True)
             yield variant, seed, keep(path, found)
 
 
