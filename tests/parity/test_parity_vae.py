@@ -81,17 +81,16 @@ def compare(reference, ours, video):
 
 @pytest.mark.parametrize(
     ("frames", "height", "width"),
-    [(1, 24, 40), (5, 24, 8), (8, 24, 8), (9, 27, 13), *((t, 24, 8) for t in (9, 17, 33, 49))],
+    [(1, 27, 37), *((t, 24, 8) for t in (5, 9, 17, 33, 49))],
 )
 def test_it_encodes_and_decodes_as_the_reference(reference, ours, frames, height, width):
     video = draw(2, 3, frames, height, width)
     assert max(compare(reference, ours, video)) < TOLERANCE
 
 
-@pytest.mark.parametrize("form", ["taps", "winograd"])
-def test_every_form_of_the_convolution_is_the_same(reference, ours, form):
+def test_the_minimal_filtering_is_the_same(reference, ours):
     config, params = ours
-    ours = dataclasses.replace(config, convolution=form), params
+    ours = dataclasses.replace(config, convolution="winograd"), params
     assert max(compare(reference, ours, draw(1, 3, 9, 24, 8))) < TOLERANCE
 
 
@@ -115,15 +114,18 @@ def test_an_even_number_of_latents_has_no_first_frame_rule(reference, ours, coun
         vae.decode(config, params, jnp.asarray(last(latents)), frames=4 * count - 3)
 
 
-@pytest.mark.parametrize(("height", "width"), [(40, 144), (88, 64)])
-def test_tiles_are_cut_and_blended_as_in_the_reference(reference, ours, height, width):
+def test_tiles_are_cut_and_blended_as_in_the_reference(reference, ours):
     config, params = ours
-    tiled = dataclasses.replace(config, tiling=True), params
+    config = dataclasses.replace(config, tiling=True)
+    high, wide = draw(1, 3, 1, 88, 64), draw(1, 4, 1, 5, 18)
     reference.enable_tiling()
     try:
-        assert max(compare(reference, tiled, draw(1, 3, 1, height, width))) < TOLERANCE
+        mean = last(reference.encode(high).latent_dist.mean)
+        decoded = last(reference.decode(wide).sample)
     finally:
         reference.disable_tiling()
+    assert distance(vae.encode(config, params, jnp.asarray(last(high)))[0], mean) < TOLERANCE
+    assert distance(vae.decode(config, params, jnp.asarray(last(wide))), decoded) < TOLERANCE
 
 
 def test_bfloat16_is_as_near_to_float32_as_the_references(reference, ours):
