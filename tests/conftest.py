@@ -1,6 +1,7 @@
 """Compile fast rather than well: tests are never timed, and compiling is most of what they do."""
 
 import os
+import signal
 
 os.environ["XLA_FLAGS"] = " ".join(
     [
@@ -9,3 +10,15 @@ os.environ["XLA_FLAGS"] = " ".join(
         "--xla_llvm_disable_expensive_passes=true",
     ]
 ).strip()
+
+# A shell that starts the tests in the background tells them to ignore Ctrl-C, and so would every
+# program that they start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+SLOW = ("test_readme.py", "test_train_cli.py", "test_evaluation_report.py")
+"""Files of long programs: begun first, so that no worker is left alone with one at the end."""
+
+
+def pytest_collection_modifyitems(items):
+    """Order the files for workers that take one file at a time."""
+    items.sort(key=lambda item: SLOW.index(item.path.name) if item.path.name in SLOW else len(SLOW))
