@@ -44,8 +44,9 @@ class DiTConfig:
     """Feed-forward width over model width."""
     positions: Positions = "rope_integer"
     """`rope_integer`: rotary, positions 0, 1, 2 … (CogVideoX 1.5). `rope_crop`: rotary, the token
-    grid stretched over the sample size's (5b). `rope_learned`: that and a learned table, for the
-    sample size alone (5b-I2V). `sincos`: a fixed sinusoid added to the tokens (2b)."""
+    grid stretched over the sample size's (5b). `rope_learned`: that and a learned table (5b-I2V),
+    for the sample size alone; other numbers of frames get the sinusoid in its place. `sincos`: a
+    fixed sinusoid added to the tokens (2b)."""
     sample_height: int = 0
     """Latent rows that the network was trained for; 0 where positions do not ask (rope_integer:
     a bound when not 0)."""

@@ -152,8 +152,6 @@ class Ends(nn.Module):
         time = self.time_embed(timesteps_B)
         if self.config.ofs_dim:
             time += self.ofs_embed(ofs_B)
-        if self.config.positions == "rope_learned":
-            tokens += self.positions.astype(self.dtype)
         return tokens, time
 
     def project(self, video_BND: Array, time_BE: Array) -> Array:
@@ -281,7 +279,9 @@ def apply(
         method="embed",
     )
     tokens, time = embedded
-    if config.positions == "sincos":
+    if positions.takes_learned(config, grid):
+        tokens += params["positions"].astype(dtype)
+    elif config.positions in {"sincos", "rope_learned"}:
         tokens = tokens.at[:, length:].add(positions.sincos_table(config, grid).astype(dtype))
     angles = positions.joint_angles(config, grid, length)
 

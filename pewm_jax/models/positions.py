@@ -7,12 +7,16 @@ Reference: ``get_3d_rotary_pos_embed``, ``get_resize_crop_region_for_grid``,
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from pewm_jax.config import DiTConfig, UserError
 
 Grid = tuple[int, int, int]
 """Tokens along time, height and width."""
+
+_log = logging.getLogger(__name__)
 
 
 def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
@@ -43,14 +47,12 @@ def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
             "(and drop as many from the result), or choose another number of frames."
         )
     rows, columns = config.sample_height, config.sample_width
-    if config.positions == "rope_learned":
-        sample = (config.sample_latents, rows, columns)
-        if (frames, height, width) != sample:
-            raise UserError(
-                f"This network's learned positions are a table for {_times(sample)} latents, "
-                f"not {_times((frames, height, width))}: use that size, or a network without "
-                "learned positions (5b, 1.5-5B-I2V)."
-            )
+    if config.positions == "rope_learned" and (height, width) != (rows, columns):
+        raise UserError(
+            f"This network's learned positions are a table for latents of {rows}×{columns}, "
+            f"not {height}×{width}: use that size, or a network without learned positions "
+            "(5b, 1.5-5B-I2V)."
+        )
     bounded = config.positions == "rope_integer" and rows > 0 and columns > 0
     if bounded and (height // patch > rows // patch or width // patch > columns // patch):
         raise UserError(
@@ -66,8 +68,22 @@ def sample_tokens(config: DiTConfig) -> int:
     return config.sample_latents // config.patch_t * rows * columns
 
 
-def _times(sizes: tuple[int, ...]) -> str:
-    return "×".join(map(str, sizes))
+def takes_learned(config: DiTConfig, grid: Grid) -> bool:
+    """Tell whether a token grid is given the learned table; if it is of other frames, say so.
+
+    The table is for one number of frames; as in the reference, any other gets the fixed sinusoid in
+    its place.
+    """
+    if config.positions != "rope_learned":
+        return False
+    frames = config.temporal * (grid[0] - 1) + 1
+    if frames != config.sample_frames:
+        _log.warning(
+            "this network's learned positions are for %d frames, not %d: as in the reference the "
+            "fixed sinusoid takes their place, and it was not trained with that.",
+            *(config.sample_frames, frames),
+        )
+    return frames == config.sample_frames
 
 
 def crop_region(grid: tuple[int, int], base: tuple[int, int]) -> tuple[tuple[int, int], ...]:

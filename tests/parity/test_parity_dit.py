@@ -26,11 +26,12 @@ OLDER = {"sample_height": 8, "sample_width": 12, "sample_frames": 9}
 SHAPES = {
     "2b": [(3, 6, 10)],
     "5b": [(3, 6, 10), (1, 10, 6)],
-    "5b-I2V": [(3, 8, 12)],
+    "5b-I2V": [(3, 8, 12), (2, 8, 12)],
     "1.5-5B": [(4, 10, 6)],
     "1.5-5B-I2V": [(2, 6, 10)],
 }
-"""Latents: an odd number of tokens each way, wider and taller than the sample."""
+"""Latents: an odd number of tokens each way, wider and taller than the sample. Learned positions
+are for one size; with other numbers of frames the reference puts the sinusoid in their place."""
 
 run = jax.jit(dit.apply, static_argnums=0)
 
