@@ -66,8 +66,9 @@ class TrainConfig:
     run: str = "runs/demo"
     """Folder of this run: checkpoints, logs, pictures, report."""
     start: str = ""
-    """Folder that stage 1 starts from, made by `python -m pewm_jax.convert import … --rgbd
-    --camera` or an earlier run; empty starts from random weights."""
+    """Folder that training starts from, made by `python -m pewm_jax.convert import … --rgbd
+    --camera` or an earlier run; empty starts from random weights. Its memory blocks go on learning
+    if stage 1 has no steps; else they are left out, and stage 2 begins with fresh ones."""
     stage1: StageConfig = StageConfig()
     """The backbone learns without memory: domain, camera control, RGB-D."""
     stage2: StageConfig = StageConfig()

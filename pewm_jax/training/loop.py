@@ -70,7 +70,7 @@ def train(
         if runs.is_finished(run, config):
             say(f"{run} is already trained: nothing to do.")
             return run
-        start: Callable[[], Params | None] = functools.partial(_converted, config)
+        start: Callable[[], Params | None] = functools.partial(_named, config, planned[0], say)
         for stage in planned:
             trained = _train_stage(
                 config, stage, mesh, run=run, start=start, preview=preview, stop=stop
@@ -100,15 +100,19 @@ def _require_weights(config: Config) -> None:
             )
 
 
-def _converted(config: Config) -> Params | None:
+def _named(config: Config, stage: Stage, say: Callable[[str], None]) -> Params | None:
     """Return the weights that the first planned stage starts from, if any are named.
 
-    Memory blocks that the folder may hold are left out: stage 2 begins with fresh ones.
+    Memory blocks that the folder may hold go on learning in stage 2. Before stage 1 they are left
+    out, since they were fitted to another backbone, and said to be.
     """
     if not config.train.start:
         return None
     _, params = rollouts.load(config.train.start)
-    return {name: part for name, part in params.items() if name != "memory"}
+    if "memory" in params and not stage.memory:
+        say(f"{config.train.start}: its memory blocks are left out; stage 2 begins with fresh ones")
+        params = {name: part for name, part in params.items() if name != "memory"}
+    return params
 
 
 def _train_stage(

@@ -113,6 +113,18 @@ def test_stage_2_starts_from_the_average_of_stage_1_and_leaves_it(fake_model, tm
         assert leaf.tobytes() == after_two["backbone"][name].tobytes()
 
 
+@pytest.mark.parametrize("stage1", [0, 3])
+def test_memory_blocks_of_the_start_go_on_in_stage_2_alone(undisturbed, tmp_path, stage1):
+    config = fakes.config(tmp_path / "on", stage1=stage1, stage2=3, start=str(undisturbed))
+    config = fakes.with_stage(config, "stage2", learning_rate=1e-9)
+    said = train(config)
+    kept = weights.load(undisturbed / "weights.safetensors")["memory"]
+    now = weights.load(tmp_path / "on" / "weights.safetensors")["memory"]
+    near = all(np.allclose(now[name], kept[name], atol=1e-6) for name in kept)
+    assert near == (stage1 == 0)
+    assert any("memory blocks are left out" in line for line in said) == (stage1 > 0)
+
+
 def test_a_finished_run_says_so_and_does_nothing(undisturbed, monkeypatch):
     monkeypatch.setattr(loader, "clips", None)
     before = file_bytes(undisturbed)
