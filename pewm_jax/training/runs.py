@@ -32,6 +32,7 @@ BASE = "base.json"
 
 FREE = (
     "evaluate",
+    "data.features",
     "data.workers",
     "diffusion.sample_steps",
     "diffusion.sampler",
@@ -47,25 +48,27 @@ FREE = (
     "train.log_every",
     "train.preview_every",
 )
-"""Settings that may change between one start of a run and the next: none alters what is learnt."""
+"""Settings that may change between one start of a run and the next: none alters what is learnt.
+
+(Of kept features the path is free: whatever it names is checked by its hashes when it is opened.)
+"""
 
 
 def identity(config: Config) -> dict[str, Any]:
     """Return the settings that make a run what it is, flat: ``{"train.seed": 0, …}``."""
     flat = _flatten(json.loads(json.dumps(configuration.to_dict(config))))
-    return {
-        name: value
-        for name, value in flat.items()
-        if not any(name == free or name.startswith(free + ".") for free in FREE)
-    }
+    return {name: value for name, value in flat.items() if not _is_free(name)}
 
 
 def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
-    """List the settings in which two identities differ, with both values."""
+    """List the settings in which two identities differ, with both values.
+
+    What is free does not count, also where an older identity still holds it.
+    """
     return [
         f"{name} {there.get(name)} there, {here.get(name)} here"
         for name in sorted(there.keys() | here.keys())
-        if there.get(name) != here.get(name)
+        if there.get(name) != here.get(name) and not _is_free(name)
     ]
 
 
@@ -145,6 +148,10 @@ def alone(run: Path) -> Iterator[None]:
                 f"Another process is training in {run}: wait for it, or use another --train.run."
             ) from None
         yield
+
+
+def _is_free(name: str) -> bool:
+    return any(name == free or name.startswith(free + ".") for free in FREE)
 
 
 def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:

@@ -7,11 +7,11 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import ClipConfig, UserError
+from pewm_jax.config import ClipConfig, ConfigError, UserError
 from pewm_jax.data import loader
 from pewm_jax.diffusion import objective
 from pewm_jax.memory import feature_build, feature_cache
-from pewm_jax.training import loop, stages
+from pewm_jax.training import loop, runs, stages
 from tests.data import data_world
 from tests.helpers import tiny_config
 
@@ -72,6 +72,18 @@ def test_training_on_stale_features_is_refused(config, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "initial_state", fake_state)
     with pytest.raises(UserError, match=r"stale: it was made with other preprocessing"):
         loop.train(stale, say=lambda _: None)
+
+
+def test_a_run_goes_on_with_features_that_were_moved(config, tmp_path):
+    train = dataclasses.replace(config.train, run=str(tmp_path / "run"))
+    begun = dataclasses.replace(config, train=train)
+    (runs.prepare(begun) / runs.WEIGHTS).touch()
+    moved = dataclasses.replace(begun, data=dataclasses.replace(begun.data, features="elsewhere"))
+    runs.check(moved)
+    assert not runs.differences({**runs.identity(begun), "data.features": ""}, runs.identity(moved))
+    other = dataclasses.replace(moved, data=dataclasses.replace(moved.data, context=7))
+    with pytest.raises(ConfigError, match=r"data\.context 6 there, 7 here"):
+        runs.check(other)
 
 
 def fake_state(*_):
