@@ -149,6 +149,8 @@ def test_frames_that_decode_to_another_number_are_refused():
         full_config(clip=clip)
     with pytest.raises(ConfigError, match=r"codec\.spatial 4"):
         full_config(codec=CodecConfig(kind="vae", spatial=8, vae=VAE))
+    with pytest.raises(UserError, match=r"2 latents decode to 8 frames.*5 frames were expected"):
+        codec.decode(full_config().codec, {}, jnp.zeros((1, 2, 4, 6, 4)))
 
 
 def test_training_needs_converted_weights_and_leaves_them_alone(world, tmp_path, monkeypatch):

@@ -54,10 +54,23 @@ def encode(
 
 
 def decode(config: CodecConfig, params: Params, latents_BthwC: Array) -> Array:
-    """Return the (B, q·k + 1, h·s, w·s, C) video of latents; the inverse of ``encode``."""
+    """Decode latents, the inverse of ``encode``.
+
+    Args:
+        config: the codec.
+        params: its parameters, empty for the pixel codec.
+        latents_BthwC: (B, k + 1, h, w, C') latents; for the VAE k is even.
+
+    Returns:
+        (B, q·k + 1, h·s, w·s, C) video.
+
+    Raises:
+        UserError: latents that the VAE decodes to another number of frames.
+    """
     if config.kind == "pixel":
         return pixel_codec.decode(config, latents_BthwC)
-    return vae.decode(config.vae, params, latents_BthwC / config.vae.scaling_factor)
+    frames = config.temporal * (latents_BthwC.shape[1] - 1) + 1
+    return vae.decode(config.vae, params, latents_BthwC / config.vae.scaling_factor, frames=frames)
 
 
 def _scale(config: CodecConfig, *, condition: bool) -> float:

@@ -4,9 +4,10 @@ Four frames and 8 × 8 pixels become one latent; the first frame is alone in its
 encoded in chunks of 8 frames, the first also taking what is left over, and decoded in chunks of 2
 latents, the first taking 3 of an odd number. Every convolution hands its last two frames to the
 next chunk; the group norms see one chunk at a time. So the chunks are part of the result, and also
-what bounds the memory. Chunks of equal shape share one compiled body: inside ``jit`` they are
-scanned; called as they are, ``encode`` and ``decode`` call a compiled function per chunk, so that
-videos of every length share two.
+what bounds the memory. A latent depends on no later frame but through those norms' statistics,
+which reach to the end of its chunk. Chunks of equal shape share one compiled body: inside ``jit``
+they are scanned; called as they are, ``encode`` and ``decode`` call a compiled function per chunk,
+so that videos of every length share two.
 
 How many frames? 8N + 1 frames ↔ 2N + 1 latents ↔ 8N + 1 frames. An *even* number of latents has no
 first-frame rule: 2 latents decode to 8 frames, not 5. ``frames_of`` and ``latents_of`` count.
