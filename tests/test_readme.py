@@ -34,6 +34,7 @@ SMALLER = {
     "python -m pewm_jax.convert import cogvideox CogVideoX-2b world": shlex.split(
         "--height 48 --width 48 --config small_memory.json"
     ),
+    "python -m pewm_jax.memory cache": ["--size", "28"],
     "python -m pewm_jax.convert export stablehlo": ["--what", "denoise", "--no_check"],
     "python evaluate.py runs/": shlex.split(
         "--clips 2 --seeds 0 1 --videos 1 --video_clips 1 --batch 2"
