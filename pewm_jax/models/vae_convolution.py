@@ -80,7 +80,7 @@ def convolve_doubled(params: Params, x_BTHWC: Array) -> Array:
     Returns:
         (B, T, 2H, 2W, D).
     """
-    dtype, kernel = x_BTHWC.dtype, params["kernel"]
+    dtype, kernel = x_BTHWC.dtype, params["kernel"].astype(jnp.float32)  # sums need its bits
     batch, frames, height, width, _ = x_BTHWC.shape
     rows = []
     for first in (kernel[0], kernel[1] + kernel[2]), (kernel[0] + kernel[1], kernel[2]):
@@ -139,7 +139,8 @@ def _winograd(padded_BTHWC: Array, kernel: Array) -> Array:
     for size, count in _split(padded_BTHWC.shape[1] - 2):
         end = start + size * count
         if size == 1:
-            parts.append(_taps(padded_BTHWC[:, start : end + 2], kernel))
+            taps = kernel.astype(padded_BTHWC.dtype)
+            parts.append(_taps(padded_BTHWC[:, start : end + 2], taps))
         else:
             parts.append(_tiles(padded_BTHWC[:, start : end + 2], kernel, size))
         start = end

@@ -60,6 +60,21 @@ def test_statistics_reach_to_the_end_of_the_chunk_and_no_further(params):
     np.testing.assert_array_equal(seen[0], np.arange(17) < 9)
 
 
+@pytest.mark.parametrize("frames", [1, 9])
+def test_weights_stored_in_fewer_bits_are_computed_with_in_full(params, frames):
+    half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), params)
+    full = jax.tree.map(lambda x: x.astype(jnp.float32), half)
+    config = dataclasses.replace(TINY, convolution="winograd")
+    x = video(frames, 16, 16)
+    pairs = []
+    for weights in (half, full):
+        mean, _ = vae.encode(config, weights, x)
+        pairs.append((mean, vae.decode(config, weights, x[:, : mean.shape[1], ::4, ::4, :2])))
+    for got, wanted in zip(*pairs, strict=True):
+        assert got.dtype == jnp.float32
+        np.testing.assert_allclose(got, wanted, atol=1e-5 * np.abs(wanted).max())
+
+
 @given(latents=st.integers(1, 60))
 def test_odd_counts_of_latents_come_back_and_even_ones_do_not(latents):
     frames = vae.frames_of(TINY, latents)
