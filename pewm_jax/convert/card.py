@@ -50,7 +50,7 @@ def write(facts: Facts) -> str:
         f"# {facts.name}",
         _what(facts),
         _use(facts),
-        _data(facts.config),
+        _data(facts),
         _training(facts),
         _scores(facts.metrics),
         _licence(facts),
@@ -100,7 +100,10 @@ Actions: 0 forward {actions.step_m:g} m, 1 left and 2 right {actions.turn_deg:g}
 {facts.config.diffusion.sample_steps} steps."""
 
 
-def _data(config: Config) -> str:
+def _data(facts: Facts) -> str:
+    config = facts.config
+    if facts.stage == "0":
+        return "## Data\n\nNone here: see what the original was trained on."
     name = Path(config.data.path).name
     try:
         manifest = read_manifest(Path(config.data.path) / TRAINED_ON, check_files=False)

@@ -112,6 +112,14 @@ def test_the_card_tells_base_licence_data_and_scores(run, tmp_path):
     assert "have no report" in export(run, tmp_path / "stale")
 
 
+def test_converted_weights_have_neither_data_nor_training(run, params, tmp_path):
+    weights.save(run / runs.WEIGHTS, params, {"stage": "0"})
+    card = export(run, tmp_path / "converted")
+    assert "None: these are converted weights" in card
+    assert "see what the original was trained on" in card
+    assert "`demo`" not in card
+
+
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(run, tmp_path):
     dst = tmp_path / "there"
     dst.mkdir()
