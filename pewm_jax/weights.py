@@ -185,7 +185,7 @@ def places(path: Path) -> dict[str, Place]:
     """Return where each tensor of a safetensors file lies, having read its header only.
 
     Raises:
-        UserError: the file is absent, truncated or damaged.
+        UserError: the file is absent, truncated or damaged, or of a dtype that is not known.
     """
     table, start = _header(path)
     table.pop("__metadata__", None)
@@ -197,6 +197,12 @@ def places(path: Path) -> dict[str, Place]:
             found[name] = Place(tuple(entry["shape"]), dtype, start + begin)
             length = end - begin
         except (KeyError, TypeError, ValueError):
+            kind = entry.get("dtype") if isinstance(entry, dict) else None
+            if isinstance(kind, str) and kind not in _DTYPES:
+                raise UserError(
+                    f"{path} holds {name} in {kind}, which cannot be read here; save it in "
+                    "float32, bfloat16 or float16."
+                ) from None
             raise _damaged(path, f"its entry of {name} cannot be read: {entry}") from None
         if length != found[name].size:
             raise _damaged(path, f"{name} takes {length} bytes, not {found[name].size}")

@@ -82,7 +82,7 @@ def test_tensors_that_were_not_announced_leave_no_file(tmp_path):
     [
         b"[]",
         b'{"a": 3}',
-        b'{"a": {"dtype": "F8", "shape": [1], "data_offsets": [0, 4]}}',
+        b'{"a": {"dtype": 8, "shape": [1], "data_offsets": [0, 4]}}',
         b'{"a": {"dtype": "F32", "shape": [2], "data_offsets": [0, 4]}}',
         b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [4, 8]}}',
         b'{"a": {"dtype": "F32", "shape": [-1], "data_offsets": [4, 0]}}',
@@ -94,4 +94,11 @@ def test_tensors_that_were_not_announced_leave_no_file(tmp_path):
 def test_a_header_that_does_not_hold_together_is_refused(tmp_path, table):
     (tmp_path / "w").write_bytes(len(table).to_bytes(8, "little") + table + b"1234")
     with pytest.raises(UserError, match="is damaged"):
+        weights.load(tmp_path / "w")
+
+
+def test_a_dtype_that_is_not_known_is_named(tmp_path):
+    table = b'{"a": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}}'
+    (tmp_path / "w").write_bytes(len(table).to_bytes(8, "little") + table + b"1234")
+    with pytest.raises(UserError, match="holds a in F8_E4M3, which cannot be read here"):
         weights.load(tmp_path / "w")
