@@ -125,13 +125,31 @@ def apply(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
     first = jnp.broadcast_to(first, (images.shape[0], *first.shape))
     tokens = jnp.concatenate([first, tokens], 1)
 
-    def body(x_BND: Array, layer: Params) -> tuple[Any, None]:
-        return Block(config).apply({"params": layer}, x_BND), None
-
-    tokens, _ = jax.lax.scan(body, tokens, params["blocks"])
+    tokens = _blocks(config, params["blocks"], tokens)
     kept = tokens[:, 1 + config.registers :]
     normed: Array = _norm(config).apply({"params": params["norm"]}, kept)
     return normed.reshape(-1, height, width, config.width).astype(dtype)
+
+
+def _blocks(config: DINOv2Config, blocks: Params, tokens_BND: Array) -> Array:
+    """Run all layers; on a CPU that is the only device image by image.
+
+    What one image needs stays in a processor's cache: four at 518² take a seventh less time than
+    together. Over several devices the batch may be spread, and must not be cut.
+    """
+
+    def body(x_BND: Array, layer: Params) -> tuple[Any, None]:
+        return Block(config).apply({"params": layer}, x_BND), None
+
+    def together(tokens_BND: Array) -> Array:
+        return jax.lax.scan(body, tokens_BND, blocks)[0]
+
+    def one_by_one(tokens_BND: Array) -> Array:
+        return jax.lax.map(lambda x_ND: together(x_ND[None])[0], tokens_BND)
+
+    if jax.device_count() > 1 or len(tokens_BND) == 1:
+        return together(tokens_BND)
+    return jax.lax.platform_dependent(tokens_BND, cpu=one_by_one, default=together)
 
 
 def load(folder: Path) -> tuple[DINOv2Config, Params]:

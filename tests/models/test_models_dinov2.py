@@ -99,3 +99,17 @@ def test_eight_devices_share_a_batch_of_frames_and_compute_what_one_does():
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "8 devices, equal"
+
+
+def test_a_lone_processor_takes_image_by_image_and_computes_what_all_together_give(
+    params, monkeypatch
+):
+    batch, found = images(9, 28, 28), {}
+    for devices in (1, 2):
+        monkeypatch.setattr(jax, "device_count", lambda n=devices: n)
+        program = jax.jit(lambda p, x: dinov2.apply(TINY, p, x)).lower(params, batch).compile()
+        costs = program.cost_analysis() or {}
+        found[devices] = program(params, batch), costs["flops"]
+    np.testing.assert_allclose(found[1][0], found[2][0], rtol=1e-4, atol=1e-5)
+    one_image = found[2][1] / 9
+    assert found[1][1] < 7 * one_image, "a loop's body is counted once"
