@@ -53,7 +53,8 @@ TIMES = jnp.array([5, 700])
 
 @functools.cache
 def weights(positions):
-    return randomise(world_model.init(config_of(positions=positions), jax.random.key(0)))
+    init = jax.jit(world_model.init, static_argnums=0)
+    return randomise(init(config_of(positions=positions), jax.random.key(0)))
 
 
 def predict(positions, tokens, conditioning=None, **changes):
@@ -108,10 +109,11 @@ def test_the_block_is_equation_2():
     valid = np.arange(7) < np.array([[4], [7]])
     arrays = [jnp.asarray(x, jnp.float32) for x in (video, time, camera, memory)]
     block = MemoryBlock(config)
-    fresh = block.init(jax.random.key(0), *arrays, valid, None)
-    np.testing.assert_array_equal(block.apply(fresh, *arrays, valid, None), arrays[0])
+    fresh = jax.jit(block.init, static_argnums=6)(jax.random.key(0), *arrays, valid, None)
+    run = jax.jit(block.apply, static_argnums=6)
+    np.testing.assert_array_equal(run(fresh, *arrays, valid, None), arrays[0])
     params = randomise(fresh)
-    found = block.apply(params, *arrays, valid, None)
+    found = run(params, *arrays, valid, None)
     in_double = jax.tree.map(lambda x: np.asarray(x, np.float64), params["params"])
     expected = equation_2(in_double, video, time, camera, memory, valid, count)
     np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
@@ -284,10 +286,11 @@ def test_without_depth_training_weighs_colour_alone_and_rollouts_add_nothing_to_
         lambda p: objective.loss(config, p, batch, jax.random.key(0), memory=False)
     )(params)
     assert total == parts["loss_rgb"]
-    state = rollouts.start(config, params, frames)
+    state = jax.jit(rollouts.start, static_argnums=0)(config, params, frames)
     roll = jax.jit(rollouts.rollout, static_argnums=0)
     after, made = roll(config, params, state, jnp.zeros(8, jnp.int32), jax.random.key(0))
     np.testing.assert_array_equal(made.depth_THW, 0)
     for a, b in zip(jax.tree.leaves(after.map), jax.tree.leaves(state.map), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert np.asarray(objective.clip_tokens(config, params, batch).valid_M).any()
+    tokens = jax.jit(objective.clip_tokens, static_argnums=0)(config, params, batch)
+    assert np.asarray(tokens.valid_M).any()
