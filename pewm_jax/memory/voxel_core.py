@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import MemoryConfig, UserError
 from pewm_jax.memory import cells, voxel_cells, voxel_frames
 from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 
@@ -58,16 +58,25 @@ def insert(
 
     Returns:
         The map after the insertion.
+
+    Raises:
+        UserError: points, features, validity and the map's channels do not fit together.
     """
+    points_P3, features_PF, valid_P = map(jnp.asarray, (points_P3, features_PF, valid_P))
     none, size = voxel_cells.nowhere(config), len(points_P3)
+    shapes = points_P3.shape, features_PF.shape, valid_P.shape
+    wanted = (size, 3), (size, voxels.features_VF.shape[-1]), (size,)
+    if shapes != wanted:
+        raise UserError(
+            "insert() got points, features and validity of shapes "
+            f"{', '.join(map(str, shapes))}; this map takes {', '.join(map(str, wanted))}."
+        )
     if size == 0:
         return voxels
-    valid_P = jnp.asarray(valid_P)
-    seen = cells.keys(config, voxels.origin_3, jnp.asarray(points_P3))
+    seen = cells.keys(config, voxels.origin_3, points_P3)
     beyond = (valid_P & (seen == none)).sum(dtype=jnp.int32)
     seen = jnp.where(valid_P, seen, none)
     cell_V, dropped = voxel_cells.admit(voxels.cell_of_slot_V, seen, none)
-    features_PF = jnp.asarray(features_PF)
 
     def read(start: Array, block: int) -> tuple[Array, Array]:
         cell, rows = (jax.lax.dynamic_slice_in_dim(x, start, block) for x in (seen, features_PF))
@@ -98,8 +107,18 @@ def insert_frames(
         features_ThwF: (T, h, w, F) features of a grid of patches that covers each frame, float32
             or bfloat16; they are upsampled bilinearly in float32, patch centres at half-integers.
         valid_T: (T,) bool, False frames are ignored.
+
+    Raises:
+        UserError: frames, features and the map's channels do not fit together.
     """
     none, depth_THW = voxel_cells.nowhere(config), jnp.asarray(frames.depth_THW)
+    count, channels = len(depth_THW), voxels.features_VF.shape[-1]
+    shape = jnp.shape(features_ThwF)
+    if len(shape) != 4 or (shape[0], shape[-1]) != (count, channels):
+        raise UserError(
+            f"insert_frames() got features of shape {shape} for {count} frames and a map of "
+            f"{channels} channels; give ({count}, rows, columns, {channels})."
+        )
     camera = jax.tree.map(jnp.asarray, frames.camera)
     seen = voxel_frames.pixel_cells(config, voxels.origin_3, depth_THW, camera)
     valid = depth_THW > 0

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pewm_jax.config import UserError
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import features, voxel_map
 from pewm_jax.types import Camera, Frames
@@ -181,6 +182,22 @@ def test_points_that_are_not_numbers_are_outside():
     voxels = insert(CONFIG, fresh(), points, np.ones((3, 4), np.float32), np.ones(3, bool))
     assert int(voxels.occupied) == 1
     assert int(voxels.outside) == 2
+
+
+def test_what_does_not_fit_together_is_refused():
+    points, values, valid = random_points(1)
+    for wrong in (
+        (points, values[:-1], valid),
+        (points, values[:, :3], valid),
+        (points, values, valid[:-1]),
+        (points[:, :2], values, valid),
+    ):
+        with pytest.raises(UserError, match=r"this map takes \(60, 3\), \(60, 4\), \(60,\)"):
+            voxel_map.insert(CONFIG, fresh(), *wrong)
+    frames = random_frames(np.random.default_rng(0), 2)
+    for shape in ((1, 8, 12, 4), (2, 8, 12, 5), (2, 8, 4)):
+        with pytest.raises(UserError, match=r"give \(2, rows, columns, 4\)"):
+            voxel_map.insert_frames(CONFIG, fresh(), frames, np.zeros(shape, np.float32))
 
 
 def test_batched_maps_equal_single_ones():
