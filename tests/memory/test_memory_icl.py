@@ -11,7 +11,7 @@ from pewm_jax.config import MemoryConfig
 from pewm_jax.data.__main__ import main
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry import cameras
-from pewm_jax.memory import features, voxel_map
+from pewm_jax.memory import cells, features, voxel_map
 from pewm_jax.models.codec import signal_from_rgb
 from pewm_jax.types import Camera, Frames
 
@@ -93,6 +93,25 @@ def test_the_map_explains_a_later_frame(episode, cell, bin_px, least):
     assert covered > 0.8, "the recording comes back to what it saw"
     assert share > least
     assert colour_error < 0.35, "colours lie in [-1, 1]"
+
+
+@pytest.mark.parametrize(("cell", "least", "most"), [(0.05, 0.9, 0.1), (0.25, 0.98, 0.45)])
+def test_a_later_frames_surfaces_lie_in_occupied_cells_and_nearer_or_farther_ones_do_not(
+    episode, cell, least, most
+):
+    """No tolerance but the cell itself; the control is the same depth off by 0.35 m."""
+    config, voxels = build(episode, cell)
+    occupied = np.asarray(voxels.cell_of_slot_V)
+    occupied = occupied[occupied < math.prod(config.cells)]
+    later = episode.frames([LATER])
+
+    def share(offset):
+        depth = np.where(later.depth_THW > 0, later.depth_THW + np.float32(offset), 0)
+        seen = cells.keys(config, voxels.origin_3, cameras.unproject(depth, later.camera))
+        return np.isin(np.asarray(seen)[later.depth_THW > 0], occupied).mean()
+
+    assert share(0) > least
+    assert max(share(-0.35), share(0.35)) < most
 
 
 def test_from_a_wrong_place_it_does_not(episode):
