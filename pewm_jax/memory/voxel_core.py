@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import DTypeLike
 
 from pewm_jax.config import MemoryConfig, UserError
@@ -143,7 +144,16 @@ def merge(config: MemoryConfig, a: VoxelMap, b: VoxelMap) -> VoxelMap:
         a: a map; its grid is kept, and its cells have precedence where the capacity is full.
         b: a map, its grid at the same place or shifted by whole cells; its cells beyond a's grid
             are counted as outside, once per cell.
+
+    Raises:
+        UserError: the grids are not shifted by whole cells (seen outside of jit only).
     """
+    shift_3 = (b.origin_3 - a.origin_3) / np.asarray(config.cell_m, np.float32)
+    if not isinstance(shift_3, Tracer) and not np.allclose(shift_3, np.round(shift_3), atol=1e-2):
+        raise UserError(
+            f"merge() got grids shifted by {np.asarray(shift_3)} cells; only whole cells can be "
+            "merged."
+        )
     points, features, valid = to_points(config, b)
     both = insert(config, a, points, features, valid)
     return dataclasses.replace(

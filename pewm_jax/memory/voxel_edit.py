@@ -73,11 +73,13 @@ def paste(
         beyond the extent as outside.
 
     Raises:
-        UserError: the transform is not 4×4.
+        UserError: the transform is not a rigid 4×4.
     """
     transform = jnp.eye(4) if transform is None else jnp.asarray(transform, jnp.float32)
     if transform.shape != (4, 4):
         raise UserError(f"paste() got a transform of shape {transform.shape}; give a rigid 4×4.")
+    if not isinstance(transform, Tracer) and not _is_rigid(np.asarray(transform)):
+        raise UserError("paste() got a transform that is not rigid; give a rotation and a shift.")
     none, back = voxel_cells.nowhere(config), invert_rigid(transform)
 
     def source(cell: Array) -> tuple[Array, Array]:
@@ -115,10 +117,16 @@ def move(config: MemoryConfig, voxels: VoxelMap, box_23: Array, transform: Array
         transform: (4, 4) rigid, from where things are to where they shall be, metres.
 
     Raises:
-        UserError: the box is not a box, or the transform not 4×4.
+        UserError: the box is not a box, or the transform not a rigid 4×4.
     """
     piece = copy(config, voxels, box_23)
     return paste(config, erase(config, voxels, box_23), piece, transform)
+
+
+def _is_rigid(transform: np.ndarray) -> bool:
+    turn = transform[:3, :3]
+    turns = np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0
+    return bool(turns and (transform[3] == (0, 0, 0, 1)).all() and np.isfinite(transform).all())
 
 
 def _within(config: MemoryConfig, voxels: VoxelMap, box_23: Array) -> Array:

@@ -148,6 +148,9 @@ def test_where_both_have_a_cell_the_maximum_counts():
         (lambda m: voxel_map.erase(CONFIG, m, np.zeros(6)), r"shape \(2, 3\)"),
         (lambda m: voxel_map.copy(CONFIG, m, [[1, 0, 0], [0, 1, 1]]), "lower one first"),
         (lambda m: voxel_map.paste(CONFIG, m, m, jnp.eye(3)), "4×4"),
+        (lambda m: voxel_map.paste(CONFIG, m, m, np.diag([2, 2, 2, 1])), "not rigid"),
+        (lambda m: voxel_map.paste(CONFIG, m, m, np.diag([1, 1, -1, 1])), "not rigid"),
+        (lambda m: voxel_map.paste(CONFIG, m, m, np.full((4, 4), np.nan)), "not rigid"),
     ],
 )
 def test_what_is_no_box_and_no_transform_is_refused(act, sentence):

@@ -200,6 +200,12 @@ def test_what_does_not_fit_together_is_refused():
             voxel_map.insert_frames(CONFIG, fresh(), frames, np.zeros(shape, np.float32))
 
 
+def test_grids_that_are_not_shifted_by_whole_cells_are_not_merged():
+    moved = dataclasses.replace(fresh(), origin_3=fresh().origin_3 + np.float32(0.1))
+    with pytest.raises(UserError, match="only whole cells can be merged"):
+        voxel_map.merge(CONFIG, fresh(), moved)
+
+
 def test_batched_maps_equal_single_ones():
     sets = [random_points(s) for s in range(3)]
     stacked = [np.stack(x) for x in zip(*sets, strict=True)]
