@@ -1,6 +1,7 @@
 """What several test files share: a tiny world model, random weights, random posed frames."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from pewm_jax.config import (
     MemoryConfig,
 )
 from pewm_jax.geometry import cameras
+from pewm_jax.models import world_model
 from pewm_jax.types import Camera, Frames
 
 
@@ -37,6 +39,16 @@ def tiny_config(**sections) -> Config:
         diffusion=DiffusionConfig(sample_steps=3),
     )
     return dataclasses.replace(config, **sections)
+
+
+@functools.partial(jax.jit, static_argnums=0, static_argnames="memory")
+def _init(config, key, *, memory):
+    return world_model.init(config, key, memory=memory)
+
+
+def init_world(config, key=None, *, memory=True):
+    """Initialise as the library does, compiled: several times faster than step by step."""
+    return _init(config, jax.random.key(0) if key is None else key, memory=memory)
 
 
 def randomise(params, seed=0, scale=0.2):

@@ -10,9 +10,8 @@ from pewm_jax.config import UserError
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import features as image_features
 from pewm_jax.memory import voxel_map
-from pewm_jax.models import world_model
 from pewm_jax.types import Frames
-from tests.helpers import random_frames, randomise, tiny_config
+from tests.helpers import init_world, random_frames, randomise, tiny_config
 
 CONFIG = tiny_config()
 roll = jax.jit(rollouts.rollout, static_argnums=0, static_argnames="memory")
@@ -21,7 +20,7 @@ ACTIONS = jnp.asarray([0, 0, 1, 0, 2, 0, 0, 1] * 2)
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(world_model.init(CONFIG, jax.random.key(0)))
+    return randomise(init_world(CONFIG, jax.random.key(0)))
 
 
 def a_state(params, seed=0, count=3):

@@ -9,7 +9,7 @@ from pewm_jax.config import ConfigError, DiffusionConfig
 from pewm_jax.diffusion import objective, sampler, schedule
 from pewm_jax.models import world_model
 from pewm_jax.types import Clip
-from tests.helpers import random_frames, randomise, tiny_config
+from tests.helpers import init_world, random_frames, randomise, tiny_config
 
 
 def test_the_schedule_ends_in_pure_noise_and_falls():
@@ -109,7 +109,7 @@ def make_clip(config, seed=0, batch=2, context=3):
 def test_the_loss_is_finite_and_stage_1_ignores_the_memory(kind):
     config = tiny_config(diffusion=DiffusionConfig(target=kind))
     clip, key = make_clip(config), jax.random.key(0)
-    params = randomise(world_model.init(config, key))
+    params = randomise(init_world(config, key))
     other = dataclasses.replace(clip, context=jax.tree.map(np.zeros_like, clip.context))
     loss = jax.jit(objective.loss, static_argnums=0, static_argnames="memory")
     stage1 = [float(loss(config, params, c, key, memory=False)[0]) for c in (clip, other)]
@@ -122,7 +122,7 @@ def test_the_loss_is_finite_and_stage_1_ignores_the_memory(kind):
 def test_pixels_without_depth_do_not_train_depth():
     config = tiny_config()
     clip, key = make_clip(config), jax.random.key(0)
-    params = randomise(world_model.init(config, key, memory=False))
+    params = randomise(init_world(config, key, memory=False))
     blank = dataclasses.replace(
         clip, frames=dataclasses.replace(clip.frames, depth_THW=clip.frames.depth_THW * 0)
     )
@@ -147,7 +147,7 @@ def test_invalid_context_frames_are_not_remembered():
 def test_guidance_interpolates_between_with_and_without_map():
     config = tiny_config()
     clip, key = make_clip(config), jax.random.key(0)
-    params = randomise(world_model.init(config, key))
+    params = randomise(init_world(config, key))
     frames = objective.as_signal(clip.frames)
     conditioning = world_model.condition(
         config,
@@ -254,7 +254,7 @@ def test_a_fixed_stride_differs_only_where_the_steps_do_not_divide():
 def test_the_world_model_samples_by_dpm_with_its_own_noise():
     config = tiny_config(diffusion=DiffusionConfig(sampler="dpm", sample_steps=2))
     clip, key = make_clip(config, batch=1), jax.random.key(0)
-    params = randomise(world_model.init(config, key, memory=False))
+    params = randomise(init_world(config, key, memory=False))
     frames = objective.as_signal(clip.frames)
     camera = jax.tree.map(jnp.asarray, frames.camera)
     first = (frames.rgb_THWC[:, 0], frames.depth_THW[:, 0])

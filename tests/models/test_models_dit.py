@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pewm_jax.config import PUBLISHED, ConfigError, DiTConfig, UserError, published
 from pewm_jax.models import dit, layers, positions, world_model
-from tests.helpers import randomise, tiny_config
+from tests.helpers import init_world, randomise, tiny_config
 from tests.models.test_models_world_model import setup as world
 
 CONFIG = dataclasses.replace(tiny_config().dit, in_channels=5, out_channels=7)
@@ -122,7 +122,7 @@ def test_an_expert_reads_and_writes_the_video_tokens_alone():
 
 def test_with_closed_memory_gates_stage_2_is_stage_1_and_feels_no_map():
     config, conditioning, tokens, noisy, times = world("sinusoid")
-    params = randomise(world_model.init(config, jax.random.key(0)))
+    params = randomise(init_world(config, jax.random.key(0)))
     stage1 = {"backbone": params["backbone"]}
     linear = params["memory"]["blocks"]["linear"]
     closed = jax.tree.map(jnp.zeros_like, linear)

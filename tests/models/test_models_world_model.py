@@ -7,7 +7,7 @@ import pytest
 
 from pewm_jax.models import codec, world_model
 from pewm_jax.types import Camera, MapTokens
-from tests.helpers import random_camera, randomise, rigid, tiny_config
+from tests.helpers import init_world, random_camera, randomise, rigid, tiny_config
 
 
 def setup(positions="projective", seed=0):
@@ -41,7 +41,7 @@ BOTH = pytest.mark.parametrize("positions", ["projective", "sinusoid"])
 @BOTH
 def test_fresh_memory_blocks_are_exactly_the_identity(positions):
     config, conditioning, tokens, noisy, times = setup(positions)
-    params = world_model.init(config, jax.random.key(0))
+    params = init_world(config)
     params["backbone"] = randomise(params["backbone"])
     stage1 = world_model.apply(config, params, noisy, conditioning, times)
     stage2 = world_model.apply(config, params, noisy, conditioning, times, tokens)
@@ -52,7 +52,7 @@ def test_fresh_memory_blocks_are_exactly_the_identity(positions):
 @BOTH
 def test_an_empty_map_contributes_nothing_and_has_finite_gradients(positions):
     config, conditioning, tokens, noisy, times = setup(positions)
-    params = randomise(world_model.init(config, jax.random.key(0)))
+    params = randomise(init_world(config, jax.random.key(0)))
     without = world_model.apply(config, params, noisy, conditioning, times)
     empty = dataclasses.replace(tokens, valid_M=jnp.zeros_like(tokens.valid_M))
     np.testing.assert_array_equal(
@@ -71,7 +71,7 @@ def test_an_empty_map_contributes_nothing_and_has_finite_gradients(positions):
 @BOTH
 def test_masked_tokens_contribute_nothing(positions):
     config, conditioning, tokens, noisy, times = setup(positions)
-    params = randomise(world_model.init(config, jax.random.key(0)))
+    params = randomise(init_world(config, jax.random.key(0)))
     base = world_model.apply(config, params, noisy, conditioning, times, tokens)
     other = dataclasses.replace(
         tokens,
@@ -89,7 +89,7 @@ def test_masked_tokens_contribute_nothing(positions):
 @BOTH
 def test_moving_cameras_and_map_together_changes_nothing(positions):
     config, conditioning, tokens, noisy, times = setup(positions)
-    params = randomise(world_model.init(config, jax.random.key(0)))
+    params = randomise(init_world(config, jax.random.key(0)))
     base = world_model.apply(config, params, noisy, conditioning, times, tokens)
     motion = rigid(np.random.default_rng(3))
     camera = conditioning.camera
@@ -106,7 +106,7 @@ def test_moving_cameras_and_map_together_changes_nothing(positions):
 
 def test_each_latent_frame_looks_through_its_own_cameras():
     config, conditioning, tokens, noisy, times = setup()
-    params = randomise(world_model.init(config, jax.random.key(0), memory=True))
+    params = randomise(init_world(config, jax.random.key(0), memory=True))
     # One memory layer and no attention between frames would be needed to read this off the
     # output, so ask the geometry: only latent frame 2 (frames 5 to 8) may change with frame 6.
     from pewm_jax.models.memory_geometry import sightings
@@ -144,7 +144,7 @@ def test_conditioning_channels_matter_and_only_the_first_latent_frame_is_clean()
     first = np.asarray(conditioning.first_BthwC)
     assert np.abs(first[:, 0]).max() > 0
     np.testing.assert_array_equal(first[:, 1:], 0)
-    params = randomise(world_model.init(config, jax.random.key(0), memory=False))
+    params = randomise(init_world(config, jax.random.key(0), memory=False))
     base = world_model.apply(config, params, noisy, conditioning, times)
     for field in ("first_BthwC", "rays_BthwC"):
         other = dataclasses.replace(conditioning, **{field: getattr(conditioning, field) * 0.5})

@@ -13,7 +13,7 @@ from pewm_jax.config import DiTConfig
 from pewm_jax.models import world_model
 from pewm_jax.training import sharding, stages, step
 from pewm_jax.types import Clip
-from tests.helpers import random_frames, randomise
+from tests.helpers import init_world, random_frames, randomise
 
 TWO = stages.STAGES[1]
 EVERYTHING = dataclasses.replace(TWO, rules=((r".*", stages.TRAIN),))
@@ -64,7 +64,7 @@ def test_a_step_of_stage_2_costs_at_most_three_quarters_of_training_everything(s
 
 
 def test_frozen_leaves_stay_bit_identical_and_only_trained_ones_have_moments(stage_2):
-    start = randomise(world_model.init(CONFIG, jax.random.key(1), memory=False))
+    start = randomise(init_world(CONFIG, jax.random.key(1), memory=False))
     now = step.initial_state(CONFIG, TWO, one_device(), start)
     before = jax.tree.map(np.array, now)
     clip = jax.device_put(CLIP, sharding.of_batch(one_device()))
