@@ -100,6 +100,7 @@ def test_metrics_hold_every_method_mask_and_metric(run):
     assert (protocol["held_out"], protocol["trained_scenes"]) == (True, [])
     assert protocol["clustered_by"] == "scene"
     assert protocol["sampling_steps"] == 2
+    assert (protocol["sampler"], protocol["memory"]) == ("ddim", "voxel")
     assert protocol["encoder"] == "patch_colours"
     assert configs.from_dict(configs.Config, protocol["config"]) == configs.load(
         run / "config.json"
