@@ -141,6 +141,53 @@ def _first_sentence(message: str, kind: str, prog: str) -> str:
     return text if text.endswith(".") else f"{text}."
 
 
+def take(kind: type[T], argv: Sequence[str]) -> tuple[T, list[str]]:
+    """Take the flags of a flat dataclass of bools, numbers and words out of the arguments.
+
+    Args:
+        kind: the frozen dataclass.
+        argv: the arguments.
+
+    Returns:
+        The flags that are its fields, and all other arguments.
+
+    Raises:
+        ConfigError: a flag without its value, or a value that is refused.
+    """
+    fields = {f"--{field.name}": field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    found: dict[str, Any] = {}
+    rest, queue = [], list(argv)
+    while queue:
+        flag, equals, value = queue.pop(0).partition("=")
+        if flag not in fields:
+            rest.append(flag + equals + value)
+            continue
+        field = fields[flag]
+        if isinstance(field.default, bool):
+            if equals:
+                raise ConfigError(f"{flag} takes no value: leave out {equals}{value}.")
+            found[field.name] = True
+            continue
+        if not equals:
+            if not queue:
+                raise ConfigError(f"{flag} needs a value: {field.metadata['help']}.")
+            value = queue.pop(0)
+        try:
+            found[field.name] = type(field.default)(value)
+        except ValueError:
+            raise ConfigError(f"{flag} needs a whole number, got {value!r}.") from None
+    return kind(**found), rest
+
+
+def list_flags(kind: type) -> str:
+    """Return one line for each field of a dataclass that ``take`` reads."""
+    lines = []
+    for field in dataclasses.fields(kind):
+        name = "" if isinstance(field.default, bool) else " " + type(field.default).__name__.upper()
+        lines.append(f"  --{field.name + name:<16} {field.metadata['help']}")
+    return "\n".join(lines)
+
+
 def overlay(default: T, path: Path) -> T:
     """Lay the settings in a JSON file, nested like the configuration, over a default.
 

@@ -46,7 +46,7 @@ def taken(monkeypatch, tmp_path):
     calls = []
     monkeypatch.setattr(preview, "make_preview", lambda config, run: ("preview", run))
     monkeypatch.setattr(
-        loop, "train", lambda config, *, preview=None: calls.append((config, preview))
+        loop, "train", lambda config, *, preview=None, profile=0: calls.append((config, preview))
     )
     return calls
 

@@ -12,11 +12,14 @@ from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.files import from_dict, load, save, to_dict
+from pewm_jax.config.launch import Launch
 from pewm_jax.config.memory import MemoryConfig
+from pewm_jax.config.mesh import AXES, MeshConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
 from pewm_jax.config.vae import VAEConfig
 
 __all__ = [
+    "AXES",
     "PUBLISHED",
     "SMALLEST",
     "ActionConfig",
@@ -29,7 +32,9 @@ __all__ = [
     "DiTConfig",
     "DiffusionConfig",
     "EvalConfig",
+    "Launch",
     "MemoryConfig",
+    "MeshConfig",
     "StageConfig",
     "TrainConfig",
     "UserError",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 
@@ -24,3 +25,12 @@ def require_positive(section: Any, where: str, *names: str) -> None:
     for name in names:
         value = getattr(section, name)
         require(value >= 1, f"{where}.{name} is {value}: use at least 1.")
+
+
+def is_pattern(text: str) -> bool:
+    """Tell whether a text is a regular expression."""
+    try:
+        re.compile(text)
+    except re.error:
+        return False
+    return True

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from pewm_jax.config.errors import require
+from pewm_jax.config.errors import is_pattern, require
+from pewm_jax.config.mesh import MeshConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +26,8 @@ class DataConfig:
     computes them at every step."""
     workers: int = 0
     """Threads that read and decode ahead of training; 0 means one."""
+    bad_records: int = 0
+    """Records that may fail to decode before training stops; each is named, and skipped."""
 
     def __post_init__(self):
         """Validate."""
@@ -35,6 +38,7 @@ class DataConfig:
         )
         require(self.context >= 1, "data.context must be at least 1 frame.")
         require(self.workers >= 0, f"data.workers is {self.workers}: use 0 or more threads.")
+        require(self.bad_records >= 0, f"data.bad_records is {self.bad_records}: use 0 or more.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,13 +88,27 @@ class TrainConfig:
     save_every: int = 100
     """Steps between checkpoints."""
     keep: int = 2
-    """Checkpoints kept."""
+    """Newest checkpoints kept."""
+    keep_every: int = 0
+    """Checkpoints at multiples of this many steps are kept for ever; 0 for none."""
     log_every: int = 10
     """Steps between log lines."""
     preview_every: int = 250
     """Steps between sample pictures; 0 for none."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Compute precision; master weights stay float32."""
+    """Compute precision; master weights of what trains stay float32, frozen weights are kept in
+    this precision."""
+    mesh: MeshConfig = MeshConfig()
+    """How devices are arranged; may change between one start of a run and the next."""
+    fresh: tuple[str, ...] = (r"memory/.*",)
+    """Paths (regular expressions) of leaves that the weights a stage starts from may lack; those
+    begin at random."""
+    on_nonfinite: Literal["stop", "skip"] = "stop"
+    """What a loss or gradient that is not finite does: `stop` the training, or `skip` that update
+    and count it."""
+    grace_s: float = 30.0
+    """Seconds after Ctrl-C or SIGTERM within which training has saved and left; 30 is what
+    Kubernetes and SLURM wait before they kill."""
 
     def __post_init__(self):
         """Validate."""
@@ -100,6 +118,10 @@ class TrainConfig:
             min(self.save_every, self.log_every, self.keep) >= 1,
             "train.save_every, train.log_every and train.keep must be at least 1.",
         )
+        require(self.keep_every >= 0, f"train.keep_every is {self.keep_every}: use 0 or more.")
+        require(self.grace_s > 0, f"train.grace_s is {self.grace_s}: use more than 0 seconds.")
+        for pattern in self.fresh:
+            require(is_pattern(pattern), f"train.fresh: {pattern!r} is no regular expression.")
         require(self.seed >= 0, f"train.seed is {self.seed}: use 0 or a positive number.")
         require(
             self.weight_decay >= 0, f"train.weight_decay is {self.weight_decay}: use 0 or more."

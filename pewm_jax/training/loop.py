@@ -41,7 +41,11 @@ Preview = Callable[[Params, int, int], Path]
 
 
 def train(
-    config: Config, *, preview: Preview | None = None, say: Callable[[str], None] = print
+    config: Config,
+    *,
+    preview: Preview | None = None,
+    profile: int = 0,
+    say: Callable[[str], None] = print,
 ) -> Path:
     """Train all planned stages, going on where an earlier start of the same run stopped.
 
@@ -49,6 +53,7 @@ def train(
         config: the experiment; ``config.train.run`` is the folder that is written.
         preview: makes sample pictures every ``config.train.preview_every`` steps and at the end
             of a stage.
+        profile: steps to trace.
         say: prints a line.
 
     Returns:
@@ -61,7 +66,7 @@ def train(
     """
     planned = stages.planned(config)
     _require_weights(config)
-    mesh = sharding.make_mesh()
+    mesh = sharding.make_mesh(arranged=config.train.mesh)
     for stage in planned:
         sharding.require_divisible(config, stage, mesh)
     run = runs.check(config)

@@ -7,6 +7,7 @@ parallelism): nothing else has to change, the compiler inserts the communication
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,11 +16,14 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax import tree
-from pewm_jax.config import Config, ConfigError
+from pewm_jax.config import AXES, Config, ConfigError, MeshConfig
 from pewm_jax.training.stages import Stage
 
-DATA = "data"
-"""The mesh axis along which batches are split."""
+BATCH = ("data", "fsdp")
+"""The mesh axes along which batches are split."""
+
+ALL_DATA = MeshConfig()
+"""All devices along ``data``."""
 
 STATE_RULES: tuple[tuple[str, P], ...] = (
     (r"step", P()),
@@ -28,10 +32,15 @@ STATE_RULES: tuple[tuple[str, P], ...] = (
 """Placement of each leaf of a ``TrainState`` by its path; every leaf must be matched."""
 
 
-def make_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """Make the mesh over the given devices, by default all there are."""
+def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_DATA) -> Mesh:
+    """Make the mesh over the given devices, by default all there are, all along ``data``.
+
+    Raises:
+        ConfigError: the devices cannot be arranged as asked.
+    """
     devices = jax.devices() if devices is None else devices
-    return jax.make_mesh((len(devices),), (DATA,), (AxisType.Auto,), devices=devices)
+    types = (AxisType.Auto,) * len(AXES)
+    return jax.make_mesh(arranged.shape(len(devices)), AXES, types, devices=devices)
 
 
 def of_state(mesh: Mesh, state: Any) -> Any:
@@ -44,7 +53,7 @@ def of_state(mesh: Mesh, state: Any) -> Any:
 
 def of_batch(mesh: Mesh) -> NamedSharding:
     """Return the sharding of every array of a batch: split along B."""
-    return NamedSharding(mesh, P(DATA))
+    return NamedSharding(mesh, P(BATCH))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
@@ -67,7 +76,7 @@ def require_divisible(config: Config, stage: Stage, mesh: Mesh) -> None:
     Raises:
         ConfigError: the batch is not a multiple of the number of devices.
     """
-    batch, devices = stage.settings(config).batch, mesh.shape[DATA]
+    batch, devices = stage.settings(config).batch, math.prod(mesh.shape[axis] for axis in BATCH)
     if batch % devices:
         raise ConfigError(
             f"train.{stage.name}.batch is {batch}, which {devices} devices cannot share evenly: "

@@ -1,0 +1,59 @@
+"""How a training is launched, apart from what it is: flags that no configuration file keeps."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from pewm_jax.config.errors import require
+
+
+def _flag(default: Any, text: str) -> Any:
+    return dataclasses.field(default=default, metadata={"help": text})
+
+
+@dataclasses.dataclass(frozen=True)
+class Launch:
+    """The flags of ``train.py`` beside the settings; their help texts are in the metadata.
+
+    Attributes:
+        distributed: join the other processes of the job.
+        coordinator: address of process 0, empty for what JAX finds out.
+        processes: how many there are, 0 for what JAX finds out.
+        process: the number of this one, −1 for what JAX finds out.
+        plan: compile for other hardware and say what it would take, in place of training.
+        devices: devices to plan for.
+        chip: kind of device to plan for.
+        profile: steps to trace.
+    """
+
+    distributed: bool = _flag(
+        False, "join the other processes of this job (SLURM, Kubernetes, TPU: found by JAX)"
+    )
+    coordinator: str = _flag("", "HOST:PORT of process 0, where JAX cannot find it out")
+    processes: int = _flag(0, "number of processes, where JAX cannot find it out")
+    process: int = _flag(-1, "number of this process, where JAX cannot find it out")
+    plan: bool = _flag(False, "do not train: compile the step and print what it would take")
+    devices: int = _flag(8, "with --plan: how many devices")
+    chip: str = _flag("h200", "with --plan: h100, h200, b200, v5p or v6e")
+    profile: int = _flag(0, "trace this many steps, for TensorBoard's profile and for Perfetto")
+
+    def __post_init__(self):
+        """Validate."""
+        require(self.devices >= 1, f"--devices is {self.devices}: use at least 1.")
+        require(self.profile >= 0, f"--profile is {self.profile}: use 0 or more steps.")
+        require(self.processes >= 0, f"--processes is {self.processes}: use 1 or more.")
+        given = bool(self.coordinator), self.processes > 0, self.process >= 0
+        require(
+            all(given) or not any(given),
+            "--coordinator, --processes and --process go together: give all three, or none and "
+            "let JAX find them out.",
+        )
+        require(
+            self.distributed or not any(given),
+            "--coordinator, --processes and --process need --distributed.",
+        )
+        require(
+            not given[2] or self.process < self.processes,
+            f"--process is {self.process}: number the {self.processes} processes from 0.",
+        )
