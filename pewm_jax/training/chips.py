@@ -1,0 +1,129 @@
+"""What kinds of devices can do, from their makers' data sheets.
+
+A device's utilisation (MFU) is counted against the peak given here, and a plan rests on it. All
+rates are per device and in one direction; peaks are of bfloat16 products with float32 sums, without
+the doubling that NVIDIA states for sparse matrices.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+from pewm_jax.config import ConfigError
+
+
+@dataclasses.dataclass(frozen=True)
+class Chip:
+    """One kind of device.
+
+    Attributes:
+        name: what ``--chip`` calls it.
+        device_kind: a regular expression for what JAX calls it, and for how people write it.
+        flops: peak FLOP/s in bfloat16, dense.
+        memory: bytes of device memory.
+        bandwidth: bytes/s of that memory.
+        island: devices that fast links join: a node of GPUs, a pod of TPUs.
+        link: bytes/s that a device sends within the island in a collective along one mesh axis.
+        network: bytes/s that a device sends beyond it.
+        source: where the figures stand.
+    """
+
+    name: str
+    device_kind: str
+    flops: float
+    memory: float
+    bandwidth: float
+    island: int
+    link: float
+    network: float
+    source: str
+
+
+CHIPS = (
+    Chip(
+        name="h100",
+        device_kind=r"(NVIDIA )?H100( 80GB HBM3| SXM5?)?",
+        flops=989.4e12,
+        memory=80e9,
+        bandwidth=3.35e12,
+        island=8,
+        link=450e9,
+        network=50e9,
+        source="NVIDIA H100 data sheet (SXM); DGX H100: 8 × 400 Gb/s",
+    ),
+    Chip(
+        name="h200",
+        device_kind=r"(NVIDIA )?H200( SXM5?)?",
+        flops=989.4e12,
+        memory=141e9,
+        bandwidth=4.8e12,
+        island=8,
+        link=450e9,
+        network=50e9,
+        source="NVIDIA H200 data sheet (SXM); DGX H200: 8 × 400 Gb/s",
+    ),
+    Chip(
+        name="b200",
+        device_kind=r"(NVIDIA )?B200",
+        flops=2250e12,
+        memory=180e9,
+        bandwidth=8e12,
+        island=8,
+        link=900e9,
+        network=50e9,
+        source="NVIDIA DGX B200 data sheet: an eighth of the system; 8 × 400 Gb/s",
+    ),
+    # A collective along one mesh axis runs over one axis of the torus, both ways round: two of the
+    # 6 (v5p) or 4 (v6e) links, which share the bandwidth stated for the chip, in two directions.
+    Chip(
+        name="v5p",
+        device_kind=r"TPU v5p?|v5p",
+        flops=459e12,
+        memory=95 * 2**30,
+        bandwidth=2765e9,
+        island=8960,
+        link=1200e9 / 2 / 3,
+        network=50e9 / 8,
+        source="Google Cloud, TPU v5p: 1200 GB/s over 6 links both ways, network 50 Gb/s a chip",
+    ),
+    Chip(
+        name="v6e",
+        device_kind=r"TPU v6( lite|e)|v6e|trillium",
+        flops=918e12,
+        memory=32e9,
+        bandwidth=1638e9,
+        island=256,
+        link=800e9 / 2 / 2,
+        network=100e9 / 8,
+        source="Google Cloud, TPU v6e: 800 GB/s over 4 links both ways, network 100 Gb/s a chip",
+    ),
+)
+"""All that are known."""
+
+
+def find(device_kind: str) -> Chip | None:
+    """Return the chip that JAX, or a person, calls so; None where it is not known.
+
+    Args:
+        device_kind: as ``jax.devices()[0].device_kind``: "NVIDIA H200", "TPU v6 lite"; or as in
+            "h200", "tpu-v5p".
+    """
+    plain = " ".join(re.split(r"[\s_-]+", device_kind.strip()))
+    for chip in CHIPS:
+        if re.fullmatch(chip.device_kind, plain, re.IGNORECASE):
+            return chip
+    return None
+
+
+def named(name: str) -> Chip:
+    """Return the chip that ``--chip`` names.
+
+    Raises:
+        ConfigError: it is not known.
+    """
+    chip = find(name)
+    if chip is None:
+        known = ", ".join(chip.name for chip in CHIPS)
+        raise ConfigError(f"--chip {name!r} is not known: choose one of {known}.")
+    return chip
