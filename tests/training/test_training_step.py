@@ -11,7 +11,7 @@ import training_fakes as fakes
 
 import configs
 from pewm_jax import tree
-from pewm_jax.config import ConfigError, DiTConfig
+from pewm_jax.config import AXES, ConfigError, DiTConfig
 from pewm_jax.models import world_model
 from pewm_jax.training import optimizer, sharding, stages, state, step
 
@@ -103,7 +103,7 @@ def test_weights_that_a_stage_cannot_start_from_are_refused(fake_model):
 
 
 def test_a_batch_that_devices_cannot_share_is_refused(fake_model):
-    mesh = jax.sharding.AbstractMesh((3,), ("data",))
+    mesh = jax.sharding.AbstractMesh((3, 1, 1, 1), AXES)
     with pytest.raises(ConfigError, match=r"stage1\.batch is 8, which 3 devices"):
         sharding.require_divisible(fakes.config(), ONE, mesh)
 
