@@ -7,6 +7,7 @@ and the data position is that number too, so a restored state goes on exactly as
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
 import jax
@@ -45,28 +46,55 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
         config: the experiment.
         stage: the stage to begin.
         key: PRNG key of the fresh weights.
-        start: weights to begin with, in place of fresh ones: either exactly the leaves that this
-            stage freezes (the stage before has trained them), or all of its leaves (converted
-            weights).
+        start: weights to begin with, in place of fresh ones; see ``require_start``.
 
     Raises:
         TreeError: ``start`` has other paths or shapes.
     """
     params = world_model.init(config, key, memory=stage.memory)
-    trained, frozen = tree.split(params, stage.trained)
     if start is not None:
-        everything = bool(tree.flatten(start).keys() & tree.flatten(trained).keys())
-        like = params if everything else frozen
-        tree.require_like(start, like, f"The weights that stage {stage.number} starts from")
-        given: Params = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), start, like)
-        params = given if everything else tree.merge(trained, given)
-        trained = tree.select(params, stage.trained)
+        require_start(config, stage, start, params)
+        given = tree.flatten(start)
+        params = tree.unflatten(
+            {
+                path: jnp.asarray(given[path], leaf.dtype) if path in given else leaf
+                for path, leaf in tree.flatten(params).items()
+            }
+        )
+    trained = tree.select(params, stage.trained)
     return TrainState(
         params=params,
         ema=jax.tree.map(jnp.copy, trained),
         opt_state=optimizer.make(config, stage).init(params),
         step=jnp.zeros((), jnp.int32),
     )
+
+
+def require_start(config: Config, stage: Stage, start: Any, like: Params) -> None:
+    """Insist that weights are those that a stage can start from.
+
+    Leaves may be absent where ``train.fresh`` says so, and begin at random then: the memory blocks
+    of stage 2, which the weights of stage 1 do not hold.
+
+    Args:
+        config: the experiment.
+        stage: the stage to begin.
+        start: the weights, or anything of their paths and shapes.
+        like: all parameters of the stage, or their shapes.
+
+    Raises:
+        TreeError: another leaf is absent, one is unexpected, or one has another shape; with the
+            list.
+    """
+    given = tree.flatten(start)
+    wanted = {
+        path: leaf
+        for path, leaf in tree.flatten(like).items()
+        if path in given or not any(re.fullmatch(rule, path) for rule in config.train.fresh)
+    }
+    allowed = ", ".join(config.train.fresh) or "none"
+    what = f"What stage {stage.number} starts from (train.fresh, what it may lack: {allowed})"
+    tree.require_like(given, wanted, what)
 
 
 def update_ema(ema: Params, trained: Params, step: Array, decay: float) -> Params:
