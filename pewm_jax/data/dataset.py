@@ -22,7 +22,7 @@ from grain import sources
 
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import Episode, read_episode
-from pewm_jax.data.layout import VERSION
+from pewm_jax.data.layout import VERSION, DamagedError
 
 MANIFEST = "dataset.json"
 UNFINISHED = "collecting.json"
@@ -258,6 +258,7 @@ class EpisodeSource(Sequence[Episode]):
 
     Raises:
         UserError: the split is absent, unfinished, or a shard was cut short.
+        DamagedError: (where an episode is opened) this record does not read.
     """
 
     def __init__(self, path: str | Path):
@@ -290,21 +291,30 @@ class EpisodeSource(Sequence[Episode]):
         if not -len(self) <= index < len(self):
             raise IndexError(f"episode {index} of {self.path}, which has {len(self)}")
         position = int(index) % len(self)
-        return read_episode(self._record(position), self.where(position))
+        record, where = self._record(position), self.where(position)
+        try:
+            return read_episode(record, where)
+        except UserError:
+            raise
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+            raise DamagedError(
+                f"{where}: the header and the bytes do not fit together ({error!r}); the record is "
+                "damaged, collect or import it again."
+            ) from None
 
     def _record(self, index: int) -> bytes:
         try:
             return self._records[index]
         except (RuntimeError, ValueError) as error:
-            raise UserError(
+            raise DamagedError(
                 f"{self.where(index)} does not read ({str(error).splitlines()[0]}); the shard is "
                 "damaged, delete it and make the split again."
             ) from None
 
-    def where(self, index: int) -> str:
+    def where(self, index: int, between: str = ", record ") -> str:
         """Return the place of an episode in words: file and record."""
         for shard in self.manifest.shards:
             if index < shard.records:
-                return f"{self.path / shard.file}, record {index}"
+                return f"{self.path / shard.file}{between}{index}"
             index -= shard.records
         return str(self.path)

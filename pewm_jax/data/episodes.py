@@ -18,6 +18,7 @@ from pewm_jax.data.layout import (
     CONVENTIONS,
     UNITS,
     VERSION,
+    DamagedError,
     check_span,
     pack_record,
     read_header,
@@ -102,7 +103,7 @@ class Episode:
             NumPy frames: rgb uint8, depth float32 in metres.
 
         Raises:
-            UserError: an image does not decode, naming the frame.
+            DamagedError: an image does not decode, naming the frame.
         """
         chosen = np.arange(self.length) if indices is None else np.asarray(indices, np.int64)
         rgb = np.empty((len(chosen), self.height, self.width, 3), np.uint8)
@@ -131,7 +132,7 @@ class Episode:
         image = decode_image(memoryview(self.record)[offset : offset + size], cv2.IMREAD_UNCHANGED)
         shape = (self.height, self.width, 3) if stream == "rgb" else (self.height, self.width)
         if image is None or image.shape != shape:
-            raise UserError(
+            raise DamagedError(
                 f"episode {self.name}, frame {index}, {stream}: the image does not decode to "
                 f"{self.width}×{self.height} pixels; the record is damaged, collect or import it "
                 "again."
@@ -200,7 +201,8 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
         where: name of the place in error messages.
 
     Raises:
-        UserError: damaged, of another version, or with counts that do not match.
+        UserError: of another version.
+        DamagedError: damaged, or with counts that do not match.
     """
     header = read_header(record, where)
     frames = header["frames"]
@@ -213,7 +215,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
     arrays: dict[str, np.ndarray | None] = dict.fromkeys(expected)
     for field, place in header["arrays"].items():
         if tuple(place["shape"]) != expected.get(field):
-            raise UserError(
+            raise DamagedError(
                 f"{where}, field {field}: shape {tuple(place['shape'])} for {frames} frames, "
                 f"expected {expected.get(field)}; the counts do not match, write it again."
             )
@@ -224,7 +226,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
     for stream in ("rgb", "depth", *header["streams"]):
         spans = header["streams"].get(stream, {"spans": []})["spans"]
         if len(spans) != frames:
-            raise UserError(
+            raise DamagedError(
                 f"{where}, field {stream}: {len(spans)} images for {frames} frames; the counts do "
                 "not match, write it again."
             )
@@ -232,7 +234,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
             check_span(record, spans[-1][0], spans[-1][1], where, stream)
     intrinsics, pose = arrays["intrinsics"], arrays["world_from_camera"]
     if intrinsics is None or pose is None:
-        raise UserError(f"{where} lacks intrinsics or world_from_camera; write it again.")
+        raise DamagedError(f"{where} lacks intrinsics or world_from_camera; write it again.")
     return Episode(
         name=header["name"],
         scene=header["scene"],

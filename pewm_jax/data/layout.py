@@ -51,6 +51,10 @@ UNITS = {
 }
 
 
+class DamagedError(UserError):
+    """A record whose bytes are not what was written: it can only be made again, or done without."""
+
+
 def pack_record(
     header: dict[str, Any], arrays: Mapping[str, np.ndarray], streams: Mapping[str, list[bytes]]
 ) -> bytes:
@@ -85,9 +89,13 @@ def _absolute(header: dict[str, Any], payload: int) -> dict[str, Any]:
 
 
 def check_span(record: bytes, offset: int, size: int, where: str, field: str) -> None:
-    """Refuse a record that ends before a field does."""
+    """Refuse a record that ends before a field does.
+
+    Raises:
+        DamagedError: it does.
+    """
     if offset + size > len(record):
-        raise UserError(
+        raise DamagedError(
             f"{where}, field {field}: the record ends after {len(record)} bytes but the field "
             f"reaches to {offset + size}; it is truncated, collect or import it again."
         )
@@ -97,10 +105,11 @@ def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
     """Parse the header of a record; spans become offsets from the start of the record.
 
     Raises:
-        UserError: not an episode, another format version, or a header that does not parse.
+        UserError: another format version.
+        DamagedError: not an episode, or a header that does not parse.
     """
     if len(record) < len(MAGIC) + 4 or record[: len(MAGIC)] != MAGIC:
-        raise UserError(
+        raise DamagedError(
             f"{where} is not a pewm episode (its first bytes differ); read a file made by "
             "`python -m pewm_jax.data collect` or `import`."
         )
@@ -112,7 +121,7 @@ def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
         if version == VERSION:
             header = _absolute({field: header[field] for field in FIELDS}, start + length)
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError):
-        raise UserError(
+        raise DamagedError(
             f"{where}: the episode's header does not parse; the record is damaged, collect or "
             "import it again."
         ) from None

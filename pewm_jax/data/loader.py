@@ -1,11 +1,14 @@
 """Batches of clips by Grain: batch k is a function of (seed, k), so a position is one integer.
 
 Every epoch visits every episode once, in an order drawn from the seed; a clip is drawn from the
-episode. Nothing but k is needed to go on where an interrupted training stopped.
+episode. Nothing but k is needed to go on where an interrupted training stopped. In the place of an
+episode that does not decode comes another, drawn from the same (seed, place): which one depends on
+what lies on disk alone.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,9 +16,11 @@ import grain
 import numpy as np
 
 from pewm_jax.config import Config, ConfigError, UserError
-from pewm_jax.data.clips import ReadFeatures, choose, cut, stack
+from pewm_jax.data.bad_records import BadRecords
+from pewm_jax.data.clips import Choice, ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
+from pewm_jax.data.layout import DamagedError
 from pewm_jax.types import Clip
 
 BATCHES_AHEAD = 2
@@ -24,20 +29,76 @@ EPOCHS = 2**31
 """Times that the episodes are gone through: without end, and countable in batches of one."""
 
 
-class _CutClip(grain.transforms.RandomMap):
-    """Episode → clip."""
+@dataclasses.dataclass(frozen=True)
+class _Drawn:
+    """A clip and where it comes from: the number of its record, its episode, its frames."""
 
-    def __init__(self, config: Config, features: ReadFeatures | None):
-        self.config, self.features = config, features
+    record: int
+    name: str
+    choice: Choice
+    clip: Clip
 
-    def random_map(self, element: Episode, rng: np.random.Generator) -> Clip:
-        _check_size(self.config, element)
-        choice = choose(self.config, element.length, rng, f"episode {element.name}")
-        return cut(element, choice, self.config.data.context, self.features)
+
+class _DrawClip(grain.transforms.RandomMap):
+    """Number of a record → a clip of its episode, or of another's where it does not decode."""
+
+    def __init__(
+        self,
+        config: Config,
+        source: EpisodeSource,
+        features: ReadFeatures | None,
+        bad: BadRecords,
+    ):
+        self.config, self.source, self.features, self.bad = config, source, features, bad
+
+    def random_map(self, element: int, rng: np.random.Generator) -> Clip:
+        return self.draw(element, rng).clip
+
+    def draw(self, record: int, rng: np.random.Generator) -> _Drawn:
+        """Draw a clip.
+
+        Raises:
+            UserError: the episode does not fit the configuration, more records do not decode than
+                are done without, or none does.
+        """
+        refused: set[int] = set()
+        while True:
+            try:
+                episode = self.source[record]
+                _check_size(self.config, episode)
+                choice = choose(self.config, episode.length, rng, f"episode {episode.name}")
+                clip = cut(episode, choice, self.config.data.context, self.features)
+            except DamagedError as error:
+                self.bad.add(_name(self.source, record), str(error))
+                refused.add(record)
+                if len(refused) == len(self.source):
+                    raise UserError(
+                        f"{self.source.path}: none of its {len(self.source)} records decodes; "
+                        "make the split again."
+                    ) from None
+                while record in refused:
+                    record = int(rng.integers(len(self.source)))
+                continue
+            return _Drawn(record, episode.name, choice, clip)
+
+
+class _DescribeClip(grain.transforms.RandomMap):
+    """Number of a record → the name of the clip that ``_DrawClip`` draws."""
+
+    def __init__(self, draw: _DrawClip):
+        self.draw = draw
+
+    def random_map(self, element: int, rng: np.random.Generator) -> str:
+        return _describe(self.draw.source, self.draw.draw(element, rng))
 
 
 def dataset(
-    config: Config, split: str, seed: int, batch: int, features: ReadFeatures | None = None
+    config: Config,
+    split: str,
+    seed: int,
+    batch: int,
+    features: ReadFeatures | None = None,
+    bad: BadRecords | None = None,
 ) -> grain.MapDataset:
     """Return the endless dataset whose element k is batch k.
 
@@ -47,12 +108,36 @@ def dataset(
         ConfigError: the episodes were collected with other steps or turns than ``actions`` says.
     """
     source = EpisodeSource(Path(config.data.path) / split)
-    first = source[0]
-    _check_size(config, first)
-    _check_actions(config, first)
-    choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
-    clips = grain.MapDataset.source(source).seed(seed).shuffle().repeat(EPOCHS)
-    return clips.random_map(_CutClip(config, features)).batch(batch, batch_fn=stack)
+    bad = BadRecords(config.data.bad_records) if bad is None else bad
+    _check_first(config, source, bad)
+    drawn = _order(source, seed).random_map(_DrawClip(config, source, features, bad))
+    return drawn.batch(batch, batch_fn=stack)
+
+
+def records(config: Config, split: str = "train", *, seed: int, batch: int, step: int) -> list[str]:
+    """Name what a batch was made of, found out again from its number.
+
+    Args:
+        config: as for ``clips``.
+        split: folder inside ``data.path``.
+        seed: as for ``clips``.
+        batch: clips per batch.
+        step: number of the batch, from 0: the one that a training's step ``step + 1`` learns from.
+
+    Returns:
+        B names such as ``train/shard-00000-of-00004.array_record record 12 (episode house-3/follow)
+        frames 3–11``; records that do not decode are passed over as ``clips`` does.
+    """
+    source = EpisodeSource(Path(config.data.path) / split)
+    named = _order(source, seed).random_map(
+        _DescribeClip(_DrawClip(config, source, None, BadRecords()))
+    )
+    return [str(named[index]) for index in range(step * batch, (step + 1) * batch)]
+
+
+def _order(source: EpisodeSource, seed: int) -> grain.MapDataset:
+    """Return the endless list of records in the order in which they are read."""
+    return grain.MapDataset.range(len(source)).seed(seed).shuffle().repeat(EPOCHS)
 
 
 def clips(
@@ -63,6 +148,7 @@ def clips(
     batch: int,
     start_step: int = 0,
     features: ReadFeatures | None = None,
+    bad: BadRecords | None = None,
 ) -> Iterator[Clip]:
     """Iterate over batches of clips for ever.
 
@@ -75,16 +161,53 @@ def clips(
         start_step: number of the first batch; going on from step k gives what an iterator that
             started at 0 gives from its k-th batch on.
         features: reads the context's features, if they are kept.
+        bad: counts and names the records that do not decode; by default ``data.bad_records`` are
+            skipped silently.
 
     Returns:
         NumPy clips with a leading B: rgb uint8, depth float32 in metres.
 
     Raises:
-        UserError: the split is absent, unfinished or damaged, or its episodes do not fit.
+        UserError: the split is absent, unfinished or damaged, or its episodes do not fit, or (where
+            the batch would have been) too many records do not decode.
     """
-    batches = dataset(config, split, seed, batch, features).slice(slice(start_step, None))
+    batches = dataset(config, split, seed, batch, features, bad).slice(slice(start_step, None))
     threads = max(1, config.data.workers)
     return iter(batches.to_iter_dataset(grain.ReadOptions(threads, BATCHES_AHEAD + threads - 1)))
+
+
+def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> None:
+    """Compare the first episode that decodes with the configuration, before anything is compiled.
+
+    Raises:
+        UserError: it does not fit, or none is left.
+    """
+    for record in range(len(source)):
+        try:
+            first = source[record]
+        except DamagedError as error:
+            bad.add(_name(source, record), str(error))
+            continue
+        _check_size(config, first)
+        _check_actions(config, first)
+        choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
+        return
+    raise UserError(f"{source.path}: none of its records can be read; make the split again.")
+
+
+def _name(source: EpisodeSource, record: int) -> str:
+    """Return the split, the shard's file and the record's number in it."""
+    return f"{source.path.name}/" + source.where(record, " record ").rpartition("/")[2]
+
+
+def _describe(source: EpisodeSource, drawn: _Drawn) -> str:
+    frames = drawn.choice.frames_T
+    stride = int(frames[1] - frames[0])
+    every = f" by {stride}" if stride > 1 else ""
+    return (
+        f"{_name(source, drawn.record)} (episode {drawn.name}) frames {frames[0]}–{frames[-1]}"
+        f"{every}"
+    )
 
 
 def _check_size(config: Config, episode: Episode) -> None:

@@ -1,0 +1,60 @@
+"""Records that fail to decode: each is named once, and so many are done without and no more."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from pewm_jax.config import UserError
+
+
+class BadRecords:
+    """What turned out not to decode; may be shared by threads and by several loaders.
+
+    Args:
+        budget: distinct records that may be skipped, ``data.bad_records``; None for any number.
+        say: told the name of each record that is skipped, once.
+    """
+
+    def __init__(self, budget: int | None = None, say: Callable[[str], Any] | None = None):
+        self._budget, self._say = budget, say
+        self._reasons: dict[str, str] = {}
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._reasons)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the records, in the order in which they were met."""
+        return tuple(self._reasons)
+
+    def add(self, record: str, reason: str) -> None:
+        """Note a record that does not decode.
+
+        Args:
+            record: its name.
+            reason: the sentence with which it was refused.
+
+        Raises:
+            UserError: that is more than are done without; the message names all of them.
+        """
+        with self._lock:
+            known = record in self._reasons
+            self._reasons.setdefault(record, reason)
+            if self._budget is not None and len(self) > self._budget:
+                raise UserError(self._too_many(reason))
+            if not known and self._say is not None:
+                allowed = "" if self._budget is None else f" of {self._budget} allowed"
+                self._say(f"bad record {len(self)}{allowed}, skipped: {record}: {reason}")
+
+    def _too_many(self, reason: str) -> str:
+        count = len(self)
+        if count == 1:
+            return f"{reason.rstrip('.')}, or train without it by --data.bad_records 1."
+        return (
+            f"{count} records do not decode and data.bad_records allows {self._budget}: "
+            f"{'; '.join(self._reasons)}. `python -m pewm_jax.data validate` finds all there are; "
+            "make their shards again, or allow more by --data.bad_records."
+        )
