@@ -1,52 +1,70 @@
-"""Checkpoints by Orbax: written in the background, whole or not at all.
+"""Checkpoints by Orbax: written in the background, whole or not at all, and checked when read.
 
-One folder per stage. Each checkpoint has three items: ``weights``, what inference uses, complete
+One folder per stage. Each checkpoint has four items: ``weights``, what inference uses, complete
 and loadable on its own; ``state``, what training needs besides (the trained parameters and the
-optimizer's moments; frozen leaves are already in ``weights``); ``position``, a few words of JSON.
-Arrays restore to any number of devices.
+optimizer's moments; frozen leaves are already in ``weights``); ``data``, the position in the data;
+``config``, the experiment. Arrays restore to any mesh, any number of devices and of processes.
+
+Orbax writes aside, ``shelf`` seals what it wrote with a manifest of checksums and names it; what
+was damaged since is found by that manifest, set aside, and the checkpoint before it is used.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
+import logging
+import time
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Self
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 
+from pewm_jax import config as configuration
 from pewm_jax import tree
 from pewm_jax.config import Config, UserError
-from pewm_jax.training import runs
+from pewm_jax.training import integrity, processes, runs, shelf
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import TrainState, inference_params
 from pewm_jax.types import Params
 
 FOLDER = "checkpoints"
+WEIGHTS, STATE, DATA, CONFIG = "weights", "state", "data", "config"
+
+_MOMENT_S, _SHARE = 1.0, 0.02
+"""How long ``settle`` waits: seconds, or a share of the time between two saves if that is more."""
 
 
 class Checkpoints:
     """The checkpoints of one stage of one run; a context manager that waits for writes.
 
+    A damaged newest one is set aside when this is made. Where several processes train together,
+    all of them make this and call its methods in the same order.
+
     Args:
         run: the run's folder.
         config: the experiment, remembered in each checkpoint.
         stage: the stage.
+        say: prints a line, about a damaged checkpoint say.
+
+    Raises:
+        UserError: there were checkpoints, and all are damaged.
     """
 
-    def __init__(self, run: Path, config: Config, stage: Stage):
+    def __init__(self, run: Path, config: Config, stage: Stage, say: Callable[[str], None] = print):
         self.folder = (run / FOLDER / stage.name).resolve()
         self.config = config
         self.stage = stage
-        self._manager = ocp.CheckpointManager(
-            self.folder,
-            item_names=("weights", "state", "position"),
-            options=ocp.CheckpointManagerOptions(
-                max_to_keep=config.train.keep, create=True, enable_async_checkpointing=True
-            ),
-        )
+        self._writer = ocp.AsyncCheckpointer(ocp.CompositeCheckpointHandler())
+        self._pool = concurrent.futures.ThreadPoolExecutor(1, "checkpoint")
+        self._finishing: concurrent.futures.Future[None] | None = None
+        self._began, self._interval, self._settled = time.monotonic(), 0.0, True
+        self._latest = _agreed(self.folder, say)
+        logging.getLogger("absl").addFilter(_is_not_raised_too)
 
     def __enter__(self) -> Self:
         return self
@@ -57,12 +75,19 @@ class Checkpoints:
         error: BaseException | None,
         trace: types.TracebackType | None,
     ) -> None:
-        with self._writing():
-            self._manager.close()
+        try:
+            self.wait()
+        except UserError:
+            if error is None:
+                raise
+        finally:
+            self._pool.shutdown()
+            self._writer.close()
+            logging.getLogger("absl").removeFilter(_is_not_raised_too)
 
     def latest(self) -> int | None:
-        """Return the step of the newest complete checkpoint, if there is any."""
-        return self._manager.latest_step()
+        """Return the step of the newest whole checkpoint, if there is any."""
+        return self._latest
 
     def save(self, state: TrainState) -> None:
         """Copy the state off the devices and write it in the background.
@@ -70,26 +95,59 @@ class Checkpoints:
         Raises:
             UserError: this checkpoint, or the one before in the background, cannot be written.
         """
+        self.wait()
         step = int(state.step)
-        if step == self.latest():
+        if step == self._latest:
             return
+        settings = self.stage.settings(self.config)
         position = {
             "stage": self.stage.number,
             "step": step,
-            "config": runs.identity(self.config),
+            "seed": self.config.train.seed + self.stage.number,
+            "batch": settings.batch,
+            "clips": step * settings.batch,
         }
         items = {
-            "weights": ocp.args.StandardSave(inference_params(self.stage, state)),
-            "state": ocp.args.StandardSave(_rest(self.stage, state)),
-            "position": ocp.args.JsonSave(position),
+            WEIGHTS: ocp.args.StandardSave(inference_params(self.stage, state)),
+            STATE: ocp.args.StandardSave(_rest(self.stage, state)),
+            DATA: ocp.args.JsonSave(position),
+            CONFIG: ocp.args.JsonSave(configuration.to_dict(self.config)),
         }
         with self._writing():
-            self._manager.save(step, args=ocp.args.Composite(**items))
+            self._writer.save(
+                shelf.writing(self.folder, step), args=ocp.args.Composite(**items), force=True
+            )
+        self._finishing = self._pool.submit(self._finish, step)
+        now = time.monotonic()
+        self._interval, self._began, self._settled = now - self._began, now, False
 
-    def wait(self) -> None:
-        """Block until everything is on disk; raises as ``save`` does."""
-        with self._writing():
-            self._manager.wait_until_finished()
+    def wait(self, seconds: float | None = None) -> None:
+        """Block until everything is on disk, or some seconds have passed.
+
+        Raises:
+            UserError: as ``save``.
+        """
+        if self._finishing is None:
+            return
+        concurrent.futures.wait([self._finishing], seconds)
+        if self._finishing.done():
+            finished, self._finishing = self._finishing, None
+            with self._writing():
+                finished.result()
+
+    def settle(self) -> None:
+        """Let a save become whole, within reason; called before each step is told of.
+
+        So no step is told of that lies more than one interval beyond the newest whole checkpoint,
+        and that is what a killed training loses at most. A save that is slow for its interval,
+        taking more than a fiftieth of it and more than a second, is not waited for any longer.
+
+        Raises:
+            UserError: as ``save``.
+        """
+        reasonable = max(_MOMENT_S, _SHARE * self._interval)
+        self.wait(0 if self._settled else reasonable)
+        self._settled = True
 
     def restore(self, like: TrainState) -> TrainState:
         """Read the newest checkpoint.
@@ -98,16 +156,15 @@ class Checkpoints:
             like: the abstract state; arrays come back with its shardings.
 
         Raises:
-            UserError: the checkpoint is of another configuration, or damaged.
+            UserError: there is none, it is of another configuration, or it cannot be read.
         """
-        step = self._require_step()
         items = {
-            "weights": ocp.args.StandardRestore(inference_params(self.stage, like)),
-            "state": ocp.args.StandardRestore(_rest(self.stage, like)),
+            WEIGHTS: ocp.args.StandardRestore(inference_params(self.stage, like)),
+            STATE: ocp.args.StandardRestore(_rest(self.stage, like)),
         }
-        read = self._read(step, items)
-        ema, frozen = tree.split(read["weights"], self.stage.trained)
-        rest = read["state"]
+        read = self._read(items)
+        ema, frozen = tree.split(read[WEIGHTS], self.stage.trained)
+        rest = read[STATE]
         return TrainState(
             params=tree.merge(rest["trained"], frozen),
             ema=ema,
@@ -117,8 +174,17 @@ class Checkpoints:
 
     def restore_weights(self, like: TrainState) -> Params:
         """Read only the inference weights of the newest checkpoint; see ``restore``."""
-        items = {"weights": ocp.args.StandardRestore(inference_params(self.stage, like))}
-        return self._read(self._require_step(), items)["weights"]
+        return self._read({WEIGHTS: ocp.args.StandardRestore(inference_params(self.stage, like))})[
+            WEIGHTS
+        ]
+
+    def _finish(self, step: int) -> None:
+        """Wait for the background, seal, name and count the checkpoint, and delete old ones."""
+        self._writer.wait_until_finished()
+        if processes.is_primary():
+            shelf.put(self.folder, step)
+            shelf.prune(self.folder, self.config.train.keep, self.config.train.keep_every)
+        self._latest = step
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
@@ -126,41 +192,97 @@ class Checkpoints:
         try:
             yield
         except (OSError, ValueError, RuntimeError) as error:
-            whole = [int(path.name) for path in self.folder.glob("[0-9]*") if path.name.isdigit()]
-            kept = f"that of step {max(whole)} is kept" if whole else "none was written before"
-            reason = " ".join(str(error).split())[:160]
+            if processes.is_primary():
+                shelf.clear(self.folder)
+            whole = self._latest
+            kept = "none was written before" if whole is None else f"that of step {whole} is kept"
             raise UserError(
-                f"A checkpoint in {self.folder} cannot be written ({reason}); {kept}: free space "
-                "or allow writing there, then run the same command again to go on."
+                f"A checkpoint in {self.folder} cannot be written ({_reason(error)}); {kept}: free "
+                "space or allow writing there, then run the same command again to go on."
             ) from None
 
-    def _require_step(self) -> int:
-        step = self.latest()
-        if step is None:
-            raise UserError(f"{self.folder} holds no complete checkpoint; train this stage first.")
-        return step
-
-    def _read(self, step: int, items: dict[str, Any]) -> Any:
-        """Read items of a checkpoint after making sure that it is of this configuration."""
-        folder = self.folder / str(step)
-        position = self._restore(step, {"position": ocp.args.JsonRestore()})["position"]
-        wrong = runs.differences(position["config"], runs.identity(self.config))
+    def _read(self, items: dict[str, Any]) -> Any:
+        """Read items of the newest checkpoint after making sure that it is of this experiment."""
+        self.wait()
+        if self._latest is None:
+            raise UserError(f"{self.folder} holds no whole checkpoint; train this stage first.")
+        folder = self.folder / str(self._latest)
+        there = configuration.from_dict(
+            Config, _restore(self._writer, folder, {CONFIG: ocp.args.JsonRestore()})[CONFIG]
+        )
+        wrong = runs.differences(runs.identity(there), runs.identity(self.config))
         if wrong:
             raise UserError(
                 f"{folder} is a checkpoint of another configuration ({runs.phrase(wrong)}): "
                 "give this one its own folder with --train.run, or put the settings back."
             )
-        return self._restore(step, items)
+        return _restore(self._writer, folder, items)
 
-    def _restore(self, step: int, items: dict[str, Any]) -> Any:
+
+def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[Config, Params]:
+    """Read what inference uses of a checkpoint, and nothing else of it.
+
+    Args:
+        folder: the checkpoint, such as ``runs/demo/checkpoints/stage1/200``.
+        like: called with the experiment and the stage's number for the shapes of the weights.
+
+    Returns:
+        The experiment and the weights, as NumPy arrays.
+
+    Raises:
+        UserError: what is read is damaged.
+    """
+    found = integrity.flaws(folder, (WEIGHTS, DATA, CONFIG))
+    if found:
+        raise UserError(
+            f"The checkpoint {folder} is damaged ({tree.listing(found, 2)}): copy it again, or "
+            "name another one."
+        )
+    with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as reader:
+        words = {DATA: ocp.args.JsonRestore(), CONFIG: ocp.args.JsonRestore()}
+        read = _restore(reader, folder, words)
+        config = configuration.from_dict(Config, read[CONFIG])
+        shapes = like(config, read[DATA]["stage"])
+        how = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), shapes)
+        arrays = {WEIGHTS: ocp.args.PyTreeRestore(shapes, restore_args=how)}
+        return config, _restore(reader, folder, arrays)[WEIGHTS]
+
+
+def _agreed(folder: Path, say: Callable[[str], None]) -> int | None:
+    """Let the first process tidy the folder; returns the step that all processes go on from."""
+    found: dict[str, Any] = {}
+    if processes.is_primary():
         try:
-            return self._manager.restore(step, args=ocp.args.Composite(**items))
-        except (ValueError, KeyError, TypeError, OSError) as error:
-            reason = " ".join(str(error).split())[:160]
-            raise UserError(
-                f"{self.folder / str(step)} cannot be read ({reason}): it is damaged; delete that "
-                "folder to go on from the checkpoint before it."
-            ) from None
+            folder.mkdir(parents=True, exist_ok=True)
+            shelf.clear(folder)
+            found = {"step": shelf.newest(folder, say)}
+        except UserError as error:
+            found = {"error": str(error)}
+        except OSError as error:
+            found = {"error": f"{folder} cannot be used ({_reason(error)}); allow access to it."}
+    found = processes.agree(found)
+    if "error" in found:
+        raise UserError(found["error"])
+    return found["step"]
+
+
+def _restore(reader: ocp.Checkpointer, folder: Path, items: dict[str, Any]) -> Any:
+    try:
+        return reader.restore(folder, args=ocp.args.Composite(**items))
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise UserError(
+            f"{folder} cannot be read ({_reason(error)}): another version of the library may have "
+            "written it; go on with that one, or train in another --train.run."
+        ) from None
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split())[:160]
+
+
+def _is_not_raised_too(record: logging.LogRecord) -> bool:
+    """Drop tracebacks of the background: ``Checkpoints.wait`` raises the same as a sentence."""
+    return record.exc_info is None
 
 
 def _rest(stage: Stage, state: TrainState) -> dict[str, Any]:

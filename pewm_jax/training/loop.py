@@ -78,7 +78,7 @@ def train(
         start: Callable[[], Params | None] = functools.partial(_named, config, planned[0], say)
         for stage in planned:
             trained = _train_stage(
-                config, stage, mesh, run=run, start=start, preview=preview, stop=stop
+                config, stage, mesh, run=run, start=start, preview=preview, stop=stop, say=say
             )
             start = functools.partial(_same, trained)
             if stop.number is not None and stage is not planned[-1]:
@@ -129,11 +129,12 @@ def _train_stage(
     start: Callable[[], Params | None],
     preview: Preview | None,
     stop: Stop,
+    say: Callable[[str], None],
 ) -> Params:
     """Train one stage, or find it done; returns its inference weights."""
     settings = stage.settings(config)
     like = abstract_state(config, stage, mesh)
-    with Checkpoints(run, config, stage) as checkpoints:
+    with Checkpoints(run, config, stage, say) as checkpoints:
         done = checkpoints.latest() or 0
         if done >= settings.steps:
             params = checkpoints.restore_weights(like)
@@ -236,6 +237,9 @@ class _Worker:
 
     def _report(self, step: int, metrics: Metrics) -> None:
         """Read a step's metrics, check, show and log them."""
+        began = time.monotonic()
+        self.checkpoints.settle()
+        self.pace.pause(time.monotonic() - began)
         values = {name: float(value) for name, value in jax.device_get(metrics).items()}
         if not (math.isfinite(values["loss"]) and math.isfinite(values["grad_norm"])):
             raise UserError(self._not_finite(step, values))
@@ -252,6 +256,7 @@ class _Worker:
             self.log.write(step, values)
 
     def _not_finite(self, step: int, values: dict[str, float]) -> str:
+        self.checkpoints.wait()
         saved = self.checkpoints.latest()
         kept = f"the checkpoint of step {saved} is intact" if saved else "nothing was saved yet"
         return (

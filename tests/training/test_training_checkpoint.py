@@ -67,30 +67,17 @@ def test_an_unfinished_checkpoint_is_not_there(fake_model, tmp_path):
     config = fakes.config()
     train(config, ONE, tmp_path, 2)
     folder = tmp_path / "checkpoints" / "stage1"
-    (folder / "2").rename(folder / "2.orbax-checkpoint-tmp")
+    (folder / "2").rename(folder / "2.writing")
     with Checkpoints(tmp_path, config, ONE) as checkpoints:
         assert checkpoints.latest() == 1
-
-
-@pytest.mark.parametrize("part", ["state", "weights", "position"])
-def test_a_damaged_checkpoint_is_refused_in_a_sentence(fake_model, tmp_path, part):
-    config = fakes.config()
-    mesh, _ = train(config, ONE, tmp_path, 1)
-    for path in (tmp_path / "checkpoints" / "stage1" / "1" / part).rglob("*"):
-        if path.is_file():
-            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with (
-        Checkpoints(tmp_path, config, ONE) as checkpoints,
-        pytest.raises(UserError, match=r"1 cannot be read .* delete that folder"),
-    ):
-        checkpoints.restore(step.abstract_state(config, ONE, mesh))
+    assert [path.name for path in folder.iterdir()] == ["1"]
 
 
 def test_without_a_checkpoint_there_is_a_sentence(fake_model, tmp_path):
     config = fakes.config()
     with (
         Checkpoints(tmp_path, config, ONE) as checkpoints,
-        pytest.raises(UserError, match="no complete checkpoint"),
+        pytest.raises(UserError, match="no whole checkpoint"),
     ):
         checkpoints.restore_weights(
             step.abstract_state(config, ONE, sharding.make_mesh(jax.devices()[:1]))
@@ -102,13 +89,14 @@ def test_a_full_disk_is_a_sentence_that_says_which_checkpoint_is_kept(
     fake_model, tmp_path, monkeypatch, where
 ):
     config = fakes.config()
-    train(config, ONE, tmp_path, 2)
-    state = step.initial_state(config, ONE, sharding.make_mesh(jax.devices()[:1]))
+    mesh, _ = train(config, ONE, tmp_path, 2)
+    state = step.initial_state(config, ONE, mesh)
 
     def full(*_args, **_options):
         raise OSError(28, "No space left on device")
 
     with Checkpoints(tmp_path, config, ONE) as checkpoints, monkeypatch.context() as patch:
-        patch.setattr(checkpoints._manager, where, full)
+        patch.setattr(checkpoints._writer, where, full)
         with pytest.raises(UserError, match=r"No space left .* that of step 2 is kept"):
-            checkpoints.save(state) if where == "save" else checkpoints.wait()
+            (checkpoints.save(state), checkpoints.wait())
+        assert checkpoints.latest() == 2
