@@ -109,7 +109,7 @@ def _memory_parts(config: Config) -> tuple[layers.nn.Dense, layers.nn.Dense]:
     return camera, tokens
 
 
-def _token_channels(config: Config) -> int:
+def token_channels(config: Config) -> int:
     positions = 60 if config.memory.positions == "sinusoid" else 0
     return feature_channels(config) + positions
 
@@ -160,7 +160,7 @@ def init_memory(config: Config, key: Array) -> Params:
     rays = camera_channels(config) * config.dit.patch**2 * config.dit.patch_t
     return {
         "camera": camera.init(camera_key, jnp.zeros((1, rays)))["params"],
-        "tokens": tokens.init(tokens_key, jnp.zeros((1, _token_channels(config))))["params"],
+        "tokens": tokens.init(tokens_key, jnp.zeros((1, token_channels(config))))["params"],
         "blocks": blocks,
     }
 
@@ -265,5 +265,5 @@ def flops_per_clip(config: Config, *, memory: bool) -> float:
         read += video * looks * (2 * inner + geometry)
         total += config.dit.layers * read
         total += video * camera_channels(config) * cell * width / 2
-        total += m.tokens * _token_channels(config) * inner
+        total += m.tokens * token_channels(config) * inner
     return 2.0 * math.ceil(total)

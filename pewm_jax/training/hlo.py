@@ -1,0 +1,262 @@
+"""What a compiled program does, counted from its text: FLOPs, and bytes between devices.
+
+XLA's own ``cost_analysis`` counts the body of a loop once; here a body counts as often as it runs.
+Only matrix products and convolutions are counted, 2 FLOPs per multiply-add, padding included. The
+program is what one device runs, so all figures are per device.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+KINDS = ("all-gather", "reduce-scatter", "all-reduce", "all-to-all", "collective-permute")
+"""The kinds of communication."""
+BITS = {"pred": 8, "s4": 4, "u4": 4, "bf16": 16, "c64": 64, "c128": 128}
+"""Bits of the types whose names do not end with them."""
+
+_COMPUTATION = re.compile(r"^(?:ENTRY )?%?([\w.$-]+) .*\{$")
+_NAME = re.compile(r"^\s+(?:ROOT )?%?([\w.$-]+) = ")
+_OPCODE = re.compile(r"\s*([\w-]+)\(")
+_ARRAY = re.compile(r"([a-z]+\d*(?:e\dm\d\w*)?)\[([\d,<=]*)\]")
+_CALLED = re.compile(r"\b(?:calls|to_apply|body)=%?([\w.$-]+)")
+_BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
+_EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
+_TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
+_LISTED = re.compile(r"replica_groups=\{(\{[\d,{} ]*\})\}")
+_COUNTED = re.compile(r"replica_groups=\[([\d,]+)\]<=\[([\d,]+)\](?:T\(([\d,]+)\))?")
+_PAIRS = re.compile(r"source_target_pairs=\{\{(\d+),(\d+)\}")
+_LABEL = re.compile(r'op_name="([^"]*)"')
+
+
+@dataclasses.dataclass(frozen=True)
+class Product:
+    """A matrix product or convolution.
+
+    Attributes:
+        label: where in the program it comes from, as JAX names it.
+        flops: all its runs together.
+    """
+
+    label: str
+    flops: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Collective:
+    """One communication between devices.
+
+    Attributes:
+        kind: one of ``KINDS``.
+        label: where in the program it comes from.
+        group: the devices of one of the groups that communicate, by their place in the mesh.
+        sent: bytes that a device sends in all its runs together, going round in a ring.
+    """
+
+    kind: str
+    label: str
+    group: tuple[int, ...]
+    sent: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """What one device does when a program runs once.
+
+    Attributes:
+        products: its matrix products and convolutions.
+        collectives: its communication.
+        unknown: labels of loops that hold products or communication and do not say how often they
+            run; they are counted as one run.
+    """
+
+    products: tuple[Product, ...]
+    collectives: tuple[Collective, ...]
+    unknown: tuple[str, ...]
+
+    @property
+    def flops(self) -> float:
+        """FLOPs of all products."""
+        return sum(product.flops for product in self.products)
+
+    def sent(self, kind: str) -> float:
+        """Return the bytes that a device sends in communication of one kind."""
+        return sum(one.sent for one in self.collectives if one.kind == kind)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Line:
+    """An instruction: its type, opcode, operands and the rest of its text."""
+
+    shape: str
+    opcode: str
+    operands: tuple[str, ...]
+    rest: str
+
+    @property
+    def label(self) -> str:
+        found = _LABEL.search(self.rest)
+        return found[1] if found else ""
+
+
+def read(text: str) -> Program:
+    """Count what a compiled program does.
+
+    Args:
+        text: ``compiled.as_text()``.
+    """
+    computations, entry = _split(text)
+    unknown: list[str] = []
+
+    @functools.cache
+    def walk(name: str) -> tuple[tuple[Product, ...], tuple[Collective, ...]]:
+        products: list[Product] = []
+        collectives: list[Collective] = []
+        lines = computations.get(name, {})
+        for line in lines.values():
+            if (flops := _flops(line, lines)) > 0:
+                products.append(Product(line.label, flops))
+            elif (one := _collective(line, lines)) is not None:
+                collectives.append(one)
+            for (some, others), trips in _inside(line, walk):
+                if trips == 0 and (some or others):
+                    unknown.append(line.label)
+                times = max(trips, 1)
+                products += [Product(p.label, p.flops * times) for p in some]
+                collectives += [dataclasses.replace(c, sent=c.sent * times) for c in others]
+        return tuple(products), tuple(collectives)
+
+    return Program(*walk(entry), tuple(unknown))
+
+
+def _inside(line: _Line, walk) -> Iterator[tuple]:
+    """Yield what an instruction runs, and how often: 0 where the program does not say."""
+    if line.opcode == "while":
+        trips = _TRIPS.search(line.rest)
+        body = _CALLED.search(line.rest)
+        if body:
+            yield walk(body[1]), int(trips[1]) if trips else 0
+    elif line.opcode == "conditional":
+        branches = _BRANCHES.search(line.rest)
+        names = re.findall(r"[\w.$-]+", branches[1]) if branches else _EITHER.findall(line.rest)
+        costs = [walk(name) for name in names]
+        if costs:
+            yield max(costs, key=lambda cost: sum(product.flops for product in cost[0])), 1
+    elif line.opcode in ("fusion", "call", "async-start"):
+        called = _CALLED.search(line.rest)
+        if called:
+            yield walk(called[1]), 1
+
+
+def _split(text: str) -> tuple[dict[str, dict[str, _Line]], str]:
+    """Split a program into its computations, and name the one it begins with."""
+    computations: dict[str, dict[str, _Line]] = {}
+    entry, lines = "", {}
+    for row in text.splitlines():
+        if row.endswith("{") and (found := _COMPUTATION.match(row)):
+            lines = computations.setdefault(found[1], {})
+            entry = found[1] if row.startswith("ENTRY") else entry
+        elif found := _NAME.match(row):
+            lines[found[1]] = _parse(row[found.end() :])
+    return computations, entry
+
+
+def _parse(text: str) -> _Line:
+    """Take an instruction apart: ``TYPE opcode(operands), attributes``."""
+    end = _close(text, 0) if text.startswith("(") else text.find(" ")
+    shape, text = text[:end], text[end:]
+    found = _OPCODE.match(text)
+    if found is None:
+        return _Line(shape, "", (), text)
+    close = _close(text, found.end() - 1)
+    inside = re.sub(r"/\*.*?\*/", "", text[found.end() : close - 1])
+    operands = tuple(part.strip().split(" ")[-1].lstrip("%") for part in inside.split(", "))
+    return _Line(shape, found[1], operands, text[close:])
+
+
+def _close(text: str, start: int) -> int:
+    """Return the place after the parenthesis that closes the one at ``start``."""
+    depth = 0
+    for place in range(start, len(text)):
+        depth += (text[place] == "(") - (text[place] == ")")
+        if depth == 0:
+            return place + 1
+    return len(text)
+
+
+def _dims(shape: str) -> tuple[int, ...]:
+    found = _ARRAY.search(shape)
+    return tuple(int(n) for n in found[2].split(",") if n) if found else ()
+
+
+def size(shape: str) -> float:
+    """Return the bytes of an array's or a tuple's type, such as ``(f32[2,3]{1,0}, s32[])``."""
+    total = 0.0
+    for kind, dims in _ARRAY.findall(shape):
+        digits = re.search(r"\d+", kind)
+        bits = BITS.get(kind, int(digits[0]) if digits else 0)
+        total += bits / 8 * math.prod(int(n) for n in dims.split(",") if n)
+    return total
+
+
+def _numbers(line: _Line, name: str) -> list[int]:
+    found = re.search(name + r"=\{([\d,]*)\}", line.rest)
+    return [int(n) for n in found[1].split(",") if n] if found else []
+
+
+def _flops(line: _Line, lines: dict[str, _Line]) -> float:
+    """Return the FLOPs of one instruction by itself."""
+    matmul = line.opcode == "custom-call" and "matmul" in line.rest
+    if line.opcode not in ("dot", "convolution") and not matmul:
+        return 0.0
+    shapes = [_dims(lines[name].shape) for name in line.operands[:2]]
+    out = math.prod(_dims(line.shape))
+    if line.opcode == "dot":
+        summed = math.prod(shapes[0][axis] for axis in _numbers(line, "lhs_contracting_dims"))
+    elif matmul:
+        summed = shapes[0][-1]
+    else:
+        labels = re.search(r"dim_labels=\w+_(\w+)->", line.rest)
+        kernel = labels[1] if labels else "io"
+        summed = math.prod(n for n, axis in zip(shapes[1], kernel, strict=True) if axis != "o")
+    return 2.0 * out * summed
+
+
+def _collective(line: _Line, lines: dict[str, _Line]) -> Collective | None:
+    """Return the communication that an instruction is, if it is any."""
+    kind = line.opcode.removesuffix("-start")
+    if kind not in KINDS:
+        return None
+    group = _group(line)
+    taken = sum(size(lines[name].shape) for name in line.operands if name in lines)
+    count = len(group)
+    others = (count - 1) / max(count, 1)
+    sent = {
+        "all-gather": taken * (count - 1),
+        "reduce-scatter": taken * others,
+        "all-reduce": 2 * taken * others,
+        "all-to-all": taken * others,
+        "collective-permute": taken,
+    }[kind]
+    return Collective(kind, line.label, group, sent)
+
+
+def _group(line: _Line) -> tuple[int, ...]:
+    """Return the first group of devices that communicate."""
+    if counted := _COUNTED.search(line.rest):
+        shape, dims = ([int(n) for n in counted[k].split(",")] for k in (1, 2))
+        devices = np.arange(math.prod(dims)).reshape(dims)
+        if counted[3]:
+            devices = devices.transpose([int(n) for n in counted[3].split(",")])
+        return tuple(int(n) for n in devices.reshape(shape)[0])
+    if listed := _LISTED.search(line.rest):
+        first = listed[1].split("}")[0].strip("{ ")
+        return tuple(int(n) for n in first.split(",") if n.strip())
+    if pairs := _PAIRS.search(line.rest):
+        return int(pairs[1]), int(pairs[2])
+    return ()
