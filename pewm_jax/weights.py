@@ -1,13 +1,15 @@
 """Network weights as one safetensors file: flat ``a/b/c`` keys, nothing to execute on loading.
 
 Files are written and read tensor by tensor, so that no more than one tensor is held beside what
-the caller holds.
+the caller holds. In its header a file of ours has the SHA-256 of every tensor, and of the header
+itself, so that no bit can flip unnoticed; other people's files are read without.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import math
 import os
@@ -25,7 +27,11 @@ from pewm_jax.config import UserError
 from pewm_jax.types import Array, Params
 
 _WORDS = "pewm_jax"
-"""The one key in the file's header, so that equal weights are equal files: their hash is a name."""
+"""The key in the file's header for what we say of it, as one text: equal weights are equal files,
+and their hash is a name."""
+_TENSORS, _HEADER = "sha256", "header_sha256"
+"""The keys of the checksums: of each tensor, and of the header with zeros in place of this one."""
+_NONE = "0" * 64
 _DTYPES = {
     "BOOL": np.dtype(bool),
     "U8": np.dtype(np.uint8),
@@ -52,11 +58,13 @@ class Place:
         shape: its shape.
         dtype: its dtype.
         begin: its first byte in the file.
+        sha256: of its bytes, empty if the file does not say.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype
     begin: int
+    sha256: str = ""
 
     @property
     def size(self) -> int:
@@ -101,14 +109,18 @@ def write(
         path: the file; its folder is made.
         like: name → anything with the tensor's shape and dtype.
         tensors: the tensors, in any order, each once.
-        words: the file's header, words by name.
+        words: the file's header, words by name; checksums are added to those of ``header``.
         told: called with the bytes written after every tensor.
 
     Raises:
         ValueError: the tensors are not those announced.
     """
     order = sorted(like, key=lambda name: (-like[name].dtype.itemsize, name))
-    table: dict[str, object] = {"__metadata__": dict(words)}
+    said, ours = dict(words), _WORDS in words
+    table: dict[str, object] = {"__metadata__": said}
+    digests = dict.fromkeys(order, _NONE)
+    if ours:
+        said |= {_TENSORS: json.dumps(digests), _HEADER: _NONE}
     end = 0
     for name in order:
         dtype = np.dtype(like[name].dtype)
@@ -118,8 +130,7 @@ def write(
             "shape": list(like[name].shape),
             "data_offsets": [begin, end],
         }
-    text = json.dumps(table, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
+    text = _text(table)
     with aside(path) as file:
         file.write(struct.pack("<Q", len(text)) + text)
         start, left = file.tell(), set(order)
@@ -133,11 +144,25 @@ def write(
             left.remove(name)
             offset: int = table[name]["data_offsets"][0]  # type: ignore[index]
             file.seek(start + offset)
-            file.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+            raw = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+            file.write(raw)
+            if ours:
+                digests[name] = hashlib.sha256(raw).hexdigest()
             told(array.nbytes)
-            del tensor, array  # before the next one is made
+            del tensor, array, raw  # before the next one is made
         if left:
             raise ValueError(f"{tree.listing(left)} were announced and not given.")
+        if ours:
+            said[_TENSORS] = json.dumps(digests)
+            said[_HEADER] = hashlib.sha256(_text(table)).hexdigest()
+            file.seek(8)
+            file.write(_text(table))
+
+
+def _text(table: Mapping[str, object]) -> bytes:
+    """Return a header as it stands in the file, padded to whole words of 8 bytes."""
+    text = json.dumps(table, separators=(",", ":")).encode()
+    return text + b" " * (-len(text) % 8)
 
 
 def size(like: Mapping[str, Array | jax.ShapeDtypeStruct]) -> int:
@@ -188,13 +213,15 @@ def places(path: Path) -> dict[str, Place]:
         UserError: the file is absent, truncated or damaged, or of a dtype that is not known.
     """
     table, start = _header(path)
-    table.pop("__metadata__", None)
+    said = table.pop("__metadata__", None) or {}
+    digests = json.loads(said[_TENSORS]) if _HEADER in said else {}
     found: dict[str, Place] = {}
     spans = []
     for name, entry in table.items():
         try:
             dtype, (begin, end) = _DTYPES[entry["dtype"]], entry["data_offsets"]
-            found[name] = Place(tuple(entry["shape"]), dtype, start + begin)
+            shape = tuple(entry["shape"])
+            found[name] = Place(shape, dtype, start + begin, digests.get(name, ""))
             length = end - begin
         except (KeyError, TypeError, ValueError):
             kind = entry.get("dtype") if isinstance(entry, dict) else None
@@ -222,17 +249,30 @@ def read_at(path: Path, place: Place) -> np.ndarray:
     """Read one tensor into memory of its own.
 
     Raises:
-        UserError: the file is absent or ends too early.
+        UserError: the file is absent, ends too early, or holds other bytes than were written.
     """
     array = np.empty(math.prod(place.shape), place.dtype)
     try:
         with path.open("rb") as file:
             file.seek(place.begin)
-            if file.readinto(array.view(np.uint8).data) != place.size:  # type: ignore[attr-defined]
+            raw = array.view(np.uint8).data
+            if file.readinto(raw) != place.size:  # type: ignore[attr-defined]
                 raise _damaged(path, "it ends too early")
     except OSError as error:
         raise _damaged(path, str(error.strerror)) from None
+    if place.sha256 and hashlib.sha256(raw).hexdigest() != place.sha256:
+        raise _damaged(path, "a tensor holds other bytes than were written")
     return array.reshape(place.shape)
+
+
+def verify(path: Path) -> None:
+    """Read a whole file, tensor by tensor, and compare it with the checksums in its header.
+
+    Raises:
+        UserError: the file is absent or damaged.
+    """
+    for place in places(path).values():
+        read_at(path, place)
 
 
 def check(params: Params, like: Params, where: str) -> None:
@@ -277,7 +317,8 @@ def _header(path: Path) -> tuple[dict, int]:
             (length,) = struct.unpack("<Q", start)
             if length > size - 8:
                 raise _damaged(path, "it ends within its header")
-            table = json.loads(file.read(length))
+            text = file.read(length)
+            table = json.loads(text)
     except OSError as error:
         raise _damaged(path, str(error.strerror)) from None
     except (ValueError, RecursionError) as error:
@@ -286,6 +327,12 @@ def _header(path: Path) -> tuple[dict, int]:
         raise _damaged(path, "its header is not JSON") from None
     if not isinstance(table, dict):
         raise _damaged(path, "its header is not a table")
+    said = table.get("__metadata__") or {}
+    if _TENSORS in said or _HEADER in said:
+        digest = str(said.get(_HEADER))
+        blank = text.replace(digest.encode(), _NONE.encode())
+        if hashlib.sha256(blank).hexdigest() != digest:
+            raise _damaged(path, "its header is not what was written")
     return table, 8 + length
 
 

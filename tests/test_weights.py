@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from pewm_jax import weights
 from pewm_jax.config import UserError
@@ -45,6 +46,26 @@ def test_a_truncated_file_is_refused_in_a_sentence(tmp_path):
         for read in (weights.load, weights.metadata):
             with pytest.raises(UserError, match="is damaged"):
                 read(path)
+
+
+def test_a_flipped_bit_is_noticed_wherever_it_is(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    weights.save(path, PARAMS, {"stage": "1"})
+    whole = path.read_bytes()
+    weights.verify(path)
+    for place in range(len(whole)):
+        path.write_bytes(
+            whole[:place] + bytes([whole[place] ^ 1 << place % 8]) + whole[place + 1 :]
+        )
+        for read in (weights.load, weights.verify):
+            with pytest.raises(UserError, match=r"is damaged|holds .* which cannot be read"):
+                read(path)
+
+
+def test_other_peoples_files_have_no_checksums_and_are_read(tmp_path):
+    safetensors.numpy.save_file({"a": np.ones(3, np.float32)}, tmp_path / "w", {"format": "pt"})
+    assert weights.load(tmp_path / "w")["a"].tolist() == [1, 1, 1]
+    assert weights.metadata(tmp_path / "w") == {}
 
 
 def test_absent_or_unfitting_weights_are_refused(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from pewm_jax import weights
 from pewm_jax.config import MemoryConfig, UserError
 from pewm_jax.memory import voxel_map
 
@@ -52,6 +53,9 @@ def test_a_file_that_does_not_fit_is_refused(tmp_path):
     with pytest.raises(UserError, match="damaged"):
         voxel_map.load(CONFIG, path)
     path.write_bytes(whole.replace(b"voxel map 1", b"voxel map 7"))
+    with pytest.raises(UserError, match="damaged"):
+        voxel_map.load(CONFIG, path)
+    weights.save(path, {"cells": np.zeros(3)}, {"format": "voxel map 7"})
     with pytest.raises(UserError, match="not a voxel map"):
         voxel_map.load(CONFIG, path)
     with pytest.raises(UserError, match="one map"):
