@@ -49,13 +49,13 @@ def main(argv: Sequence[str]) -> int:
     if launch.plan:
         importlib.import_module("pewm_jax.training.plan").show(config, launch)
         return 0
-    importlib.import_module("pewm_jax.training.processes").start(launch)
-    loop = importlib.import_module("pewm_jax.training.loop")
-    pictures = importlib.import_module("pewm_jax.evaluation.preview")
-    run = loop.runs.check(config)
-    cli.cache_compilation(run.parent)
-    preview = pictures.make_preview(config, run) if config.train.preview_every else None
-    loop.train(config, preview=preview, profile=launch.profile)
+    with importlib.import_module("pewm_jax.training.processes").joined(launch):
+        loop = importlib.import_module("pewm_jax.training.loop")
+        pictures = importlib.import_module("pewm_jax.evaluation.preview")
+        run = loop.runs.check(config)
+        cli.cache_compilation(run.parent)
+        preview = pictures.make_preview(config, run) if config.train.preview_every else None
+        loop.train(config, preview=preview, profile=launch.profile)
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
 from pewm_jax.config.errors import require
@@ -21,6 +22,7 @@ class Launch:
         coordinator: address of process 0, empty for what JAX finds out.
         processes: how many there are, 0 for what JAX finds out.
         process: the number of this one, −1 for what JAX finds out.
+        patience: seconds to wait for the others.
         plan: compile for other hardware and say what it would take, in place of training.
         devices: devices to plan for.
         chip: kind of device to plan for.
@@ -33,6 +35,7 @@ class Launch:
     coordinator: str = _flag("", "HOST:PORT of process 0, where JAX cannot find it out")
     processes: int = _flag(0, "number of processes, where JAX cannot find it out")
     process: int = _flag(-1, "number of this process, where JAX cannot find it out")
+    patience: int = _flag(60, "with --distributed: seconds to wait until all processes are there")
     plan: bool = _flag(False, "do not train: compile the step and print what it would take")
     devices: int = _flag(8, "with --plan: how many devices")
     chip: str = _flag("h200", "with --plan: h100, h200, b200, v5p or v6e")
@@ -43,6 +46,11 @@ class Launch:
         require(self.devices >= 1, f"--devices is {self.devices}: use at least 1.")
         require(self.profile >= 0, f"--profile is {self.profile}: use 0 or more steps.")
         require(self.processes >= 0, f"--processes is {self.processes}: use 1 or more.")
+        require(self.patience >= 1, f"--patience is {self.patience}: use 1 second or more.")
+        require(
+            not self.coordinator or re.fullmatch(r".+:\d{1,5}", self.coordinator) is not None,
+            f"--coordinator is {self.coordinator}: give it as HOST:PORT, such as node-0:1234.",
+        )
         given = bool(self.coordinator), self.processes > 0, self.process >= 0
         require(
             all(given) or not any(given),

@@ -1,43 +1,109 @@
-"""The processes of one job: who writes, and how they agree."""
+"""The processes of one job: how they find one another, agree, and leave together.
+
+All of them run the same program in the same order. The first one writes what is written once; what
+must be the same everywhere is decided by ``agree`` and ``Votes``, never by each for itself.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
-from typing import Any
+import os
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any, NoReturn, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 
+from pewm_jax import cli
 from pewm_jax.config import Launch, UserError
+from pewm_jax.training import last_words
+
+HEARTBEAT_S = 20
+"""Seconds of silence after which a process counts as dead, and all others end."""
+_LEAVE_S = 60
+"""Seconds that a process which is done waits for the others to be done too."""
+_COMMUNICATION = ("gloo", "nccl", "unavailable", "deadline", "connect", "coordination", "socket")
+"""Words of the errors that JAX raises when another process is gone."""
+
+T = TypeVar("T")
+
+
+@contextlib.contextmanager
+def joined(launch: Launch) -> Iterator[None]:
+    """Be one of the processes of a job while this is entered, if the launch asks for it.
+
+    Inside, only the first process prints. An error ends this process at once with its sentence,
+    without waiting for the others, which notice within ``HEARTBEAT_S``.
+
+    Raises:
+        UserError: there is nothing to join.
+    """
+    if not launch.distributed:
+        yield
+        return
+    code: int | None = None
+    with last_words.one_sentence():
+        start(launch)
+        with _quiet_but_first():
+            try:
+                yield
+                wait("the end of the training")
+                jax.distributed.shutdown()
+            except BaseException as error:  # noqa: BLE001 - told, whatever it is
+                code = _tell(error)
+    if code is not None:
+        os._exit(code)  # else JAX waits for those that wait for this one
 
 
 def start(launch: Launch) -> None:
     """Join the other processes of the job, if the launch asks for it; before any device is used.
 
     Where the launch names no coordinator, JAX finds out from the environment (SLURM, Kubernetes,
-    Cloud TPU, Open MPI). Without ``--distributed`` nothing is tried.
+    Cloud TPU, Open MPI). Without ``--distributed`` nothing is tried. Where not all processes have
+    come within ``launch.patience`` seconds, this one says so and ends.
 
     Raises:
-        UserError: there is nothing to join.
+        UserError: there is nothing to join, or the coordinator's port is taken.
     """
     if not launch.distributed:
         return
-    given = {}
+    given: dict[str, Any] = {}
     if launch.coordinator:
         given = {
             "coordinator_address": launch.coordinator,
             "num_processes": launch.processes,
             "process_id": launch.process,
         }
+        if launch.process == 0:
+            _require_free(launch.coordinator)
+    # Told to stop, training saves and leaves by itself (``signals``): JAX shall not take SIGTERM.
+    jax.config.update("jax_enable_preemption_service", False)
+    late = threading.Timer(launch.patience, _give_up, (launch,))
+    late.daemon = True
+    late.start()
     try:
-        jax.distributed.initialize(**given)
+        jax.distributed.initialize(
+            **given,
+            initialization_timeout=launch.patience + 60,  # past our own, which says it better
+            heartbeat_timeout_seconds=HEARTBEAT_S,
+            shutdown_timeout_seconds=_LEAVE_S,
+        )
     except (ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:160]
         raise UserError(
             f"--distributed found no processes to join ({reason}): name them with --coordinator, "
             "--processes and --process, or train without --distributed."
         ) from None
+    finally:
+        late.cancel()
 
 
 def is_primary() -> bool:
@@ -63,3 +129,127 @@ def agree(value: Any) -> Any:
     size = multihost_utils.broadcast_one_to_all(np.asarray(len(text), np.int32))
     padded = np.frombuffer(text.ljust(int(size), b" "), np.uint8)
     return json.loads(bytes(multihost_utils.broadcast_one_to_all(padded)))
+
+
+def gather(tree: T) -> T:
+    """Bring arrays that are spread over processes to the first one; called by all.
+
+    Leaf by leaf, so no device holds more than one of them whole. What a process has whole anyway
+    stays as and where it is.
+
+    Returns:
+        In the first process the same tree with NumPy arrays, in the others one of empty arrays.
+    """
+    if jax.process_count() == 1:
+        return tree
+
+    def whole(leaf: Any) -> Any:
+        if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable:
+            if leaf.is_fully_replicated:
+                leaf = leaf.addressable_data(0)
+            else:
+                leaf = multihost_utils.process_allgather(leaf, tiled=True)
+        return np.asarray(leaf) if is_primary() else np.zeros(0)
+
+    return jax.tree.map(whole, tree)
+
+
+class Votes:
+    """What any process was told, known to all of them one vote later, without waiting.
+
+    Every process votes once after every step. A vote is a small computation over all devices,
+    queued behind the step; by the time of the next vote its result is there. So all processes
+    learn of a stop signal after the same step, whichever of them it came to.
+    """
+
+    def __init__(self) -> None:
+        self._last: jax.Array | None = None
+        if jax.process_count() == 1:
+            return
+        devices = np.asarray(jax.devices())
+        mesh = Mesh(devices, ("all",))
+        self._each = NamedSharding(mesh, P("all"))
+        self._largest = jax.jit(jnp.max, out_shardings=NamedSharding(mesh, P()))
+
+    def cast(self, number: int | None) -> int | None:
+        """Vote, and return what the vote before this came to.
+
+        Args:
+            number: the signal that came to this process, None without one.
+
+        Returns:
+            The largest number that any process gave, None where none gave any. Where there is but
+            one process, its own, now.
+        """
+        if jax.process_count() == 1:
+            return number
+        own = np.full(1, number or 0, np.int32)
+        everyone = jax.make_array_from_callback(
+            (jax.device_count(),), self._each, lambda _index: own
+        )
+        before, self._last = self._last, self._largest(everyone)
+        return None if before is None else (int(before) or None)
+
+
+def _require_free(coordinator: str) -> None:
+    """Refuse an address at which something else listens."""
+    port = int(coordinator.rpartition(":")[2])
+    try:
+        with socket.socket() as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind(("", port))
+            trial.listen()
+    except OSError as error:
+        raise UserError(
+            f"--coordinator {coordinator}: port {port} cannot be used here ({error.strerror}); "
+            "give all processes another one."
+        ) from None
+
+
+def _give_up(launch: Launch) -> NoReturn:
+    """Say that the processes have not met, and end; JAX itself would end with a stack trace."""
+    where = f" at {launch.coordinator}" if launch.coordinator else ""
+    who = f"process {launch.process} of {launch.processes}" if launch.coordinator else "this one"
+    sys.stderr.write(
+        f"error: The processes of this training have not met{where} within {launch.patience} s of "
+        f"waiting by {who}: start all of them, make sure that they can reach the first one there, "
+        "or wait longer with --patience.\n"
+    )
+    sys.stderr.flush()
+    os._exit(2)
+
+
+@contextlib.contextmanager
+def _quiet_but_first() -> Iterator[None]:
+    """Let only the first process print to standard output, and only from Python.
+
+    (The library that carries messages between CPUs prints there, too.)
+    """
+    sys.stdout.flush()
+    before, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 1)
+    with (
+        os.fdopen(nothing, "w") as silence,
+        os.fdopen(before, "w") as speech,
+        contextlib.redirect_stdout(speech if is_primary() else silence),
+    ):
+        try:
+            yield
+        finally:
+            speech.flush()
+            os.dup2(before, 1)
+
+
+def _tell(error: BaseException) -> int:
+    """Print an error as the command line does; returns the exit code."""
+    reason = str(error).lower()
+    if isinstance(error, jax.errors.JaxRuntimeError) and any(w in reason for w in _COMMUNICATION):
+        error = UserError(last_words.GONE)
+    if not isinstance(error, (UserError, OSError, KeyboardInterrupt)):
+        sys.excepthook(type(error), error, error.__traceback__)
+        return 1
+
+    def again(_: Any) -> None:
+        raise error
+
+    return cli.run(again, [])
