@@ -257,7 +257,7 @@ def test_training_real_episodes_stopped_by_ctrl_c_and_started_again(data, tmp_pa
     code, out, err = finish(start(*argv))
     assert (code, err) == (0, "")
     assert f"stage 1: going on after step {stopped}" in out
-    assert re.search(r"stage 1 200/200 loss .* samples/s · .* GFLOP/s", out)
+    assert re.search(r"stage 1 200/200 loss .* clips/s · .* GFLOP/s/device", out)
     assert out.splitlines()[-1] == f"Trained: {run / 'weights.safetensors'}"
     steps = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     seen = [(entry["stage"], entry["step"]) for entry in steps]

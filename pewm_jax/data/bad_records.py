@@ -18,7 +18,8 @@ class BadRecords:
     """
 
     def __init__(self, budget: int | None = None, say: Callable[[str], Any] | None = None):
-        self._budget, self._say = budget, say
+        self.say = say
+        self._budget = budget
         self._reasons: dict[str, str] = {}
         self._lock = threading.Lock()
 
@@ -45,9 +46,9 @@ class BadRecords:
             self._reasons.setdefault(record, reason)
             if self._budget is not None and len(self) > self._budget:
                 raise UserError(self._too_many(reason))
-            if not known and self._say is not None:
+            if not known and self.say is not None:
                 allowed = "" if self._budget is None else f" of {self._budget} allowed"
-                self._say(f"bad record {len(self)}{allowed}, skipped: {record}: {reason}")
+                self.say(f"bad record {len(self)}{allowed}, skipped: {record}: {reason}")
 
     def _too_many(self, reason: str) -> str:
         count = len(self)

@@ -1,9 +1,9 @@
-"""Sample pictures during training: the same few held-out clips, imagined anew each time."""
+"""Samples during training: the same few held-out clips, imagined anew each time, and measured."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,19 @@ import numpy as np
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.evaluation.images import psnr, unit_colours
 from pewm_jax.evaluation.imagine import Imagination, aloud
-from pewm_jax.evaluation.pictures import as_bytes, grid, save_png
+from pewm_jax.evaluation.pictures import as_bytes, farthest, grid, save_png
 from pewm_jax.evaluation.protocol import choose, load_clip, stack
-from pewm_jax.types import Params
+from pewm_jax.evaluation.video import encode_h264, side_by_side
+from pewm_jax.training.watch import Preview, Previewed
+from pewm_jax.types import Frames, Params
 
-SPLIT, CLIPS = "validation", 3
+SPLIT, CLIPS, SHOWN = "validation", 8, 3
+"""Where previews come from, how many clips are measured, and how many of them are shown."""
 
 
-def make_preview(
-    config: Config, run: Path, say: Callable[[str], Any] = aloud
-) -> Callable[[Params, int, int], Path] | None:
+def make_preview(config: Config, run: Path, say: Callable[[str], Any] = aloud) -> Preview | None:
     """Prepare previews for a training run, where its data can be previewed.
 
     A training needs no previews: without validation data, or where that cannot be replayed (too
@@ -29,13 +31,15 @@ def make_preview(
 
     Args:
         config: the experiment; clips come from ``data.path``/validation.
-        run: its folder; pictures go to ``previews/`` inside.
+        run: its folder; pictures and videos go to ``previews/`` inside.
         say: told why there are no previews.
 
     Returns:
-        ``preview(params, stage, step)``: imagines the clips with the current weights and writes
-        ``previews/stage2-000250.png`` with rows truth, with its map, empty map (stage 1: truth,
-        model). It is compiled once per stage. None where there is nothing to preview.
+        ``preview(params, stage, step)``: imagines the clips with the current weights, measures
+        their PSNR with its map and with an empty map (stage 1: of the model, which has none), and
+        writes ``previews/stage2-000250.png`` with rows truth, with its map, empty map and
+        ``previews/stage2-000250.mp4``, the same side by side. It is compiled once per stage. None
+        where there is nothing to preview.
     """
     quick = dataclasses.replace(config.evaluate, split=SPLIT, batch=CLIPS)
     config = dataclasses.replace(config, evaluate=quick)
@@ -51,22 +55,83 @@ def make_preview(
     seeds = np.stack([np.zeros(CLIPS, int), np.arange(CLIPS)], -1)
     models: dict[int, Imagination] = {}
 
-    def preview(params: Params, stage: int, step: int) -> Path:
+    def preview(params: Params, stage: int, step: int) -> Previewed:
         if stage not in models:
             models[stage] = Imagination(config, params, CLIPS, config.data.context)
         variants = {"model": False} if stage == 1 else {"with its map": True, "empty map": False}
-        made = {}
+        made: dict[str, Frames] = {}
         for name, memory in variants.items():
-            _, _, frames = models[stage].run(context, actions, seeds, memory=memory, params=params)
-            made[name] = as_bytes(frames.rgb_THWC)
-        rows = []
-        for index, (seen, true, _) in enumerate(clips):
-            present = seen.rgb_THWC[-1]
-            rows.append(("truth", [present, *true.rgb_THWC]))
-            rows += [(name, [present, *rgb[index]]) for name, rgb in made.items()]
-        count = len(clips[0][1].depth_THW)
-        columns = ["observed", *(f"{index + 1}" for index in range(count))]
-        picture = grid(rows, columns, title=f"stage {stage}, step {step}", cell=96)
-        return save_png(run / "previews" / f"stage{stage}-{step:06d}.png", picture)
+            _, _, made[name] = models[stage].run(
+                context, actions, seeds, memory=memory, params=params
+            )
+        name = f"stage{stage}-{step:06d}"
+        shown = clips[:SHOWN]
+        picture = _picture(shown, made, f"stage {stage}, step {step}")
+        return Previewed(
+            (
+                save_png(run / "previews" / f"{name}.png", picture),
+                _save_video(run / "previews" / f"{name}.mp4", shown, made, f"step {step}"),
+            ),
+            {name: _score(clips, frames) for name, frames in made.items()},
+        )
 
     return preview
+
+
+_Loaded = tuple[Frames, Frames, np.ndarray]
+"""Context, true frames and actions of a clip, as ``protocol.load_clip`` gives them."""
+
+
+def _score(clips: Sequence[_Loaded], frames: Frames) -> float:
+    """Return the mean PSNR, decibels, over frames and clips (B, N)."""
+    truth = np.stack([true.rgb_THWC for _, true, _ in clips])
+    difference = unit_colours(frames.rgb_THWC[: len(clips)]) - unit_colours(truth)
+    return float(psnr((difference**2).mean((2, 3, 4))).mean())
+
+
+def _picture(clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str) -> np.ndarray:
+    """Lay out the frames of every clip: a row of the truth, a row of each variant."""
+    rows = []
+    for index, (seen, true, _) in enumerate(clips):
+        present = seen.rgb_THWC[-1]
+        rows.append(("truth", [present, *true.rgb_THWC]))
+        rows += [
+            (name, [present, *as_bytes(frames.rgb_THWC[index])]) for name, frames in made.items()
+        ]
+    count = len(clips[0][1].depth_THW)
+    columns = ["observed", *(f"{index + 1}" for index in range(count))]
+    return grid(rows, columns, title=title, cell=96)
+
+
+def _save_video(
+    path: Path, clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str
+) -> Path:
+    """Write the clips one after the other, truth and variants side by side; aside, then renamed."""
+    pictures = []
+    for index, (seen, true, _) in enumerate(clips):
+        columns = [
+            (name, _with_present(seen, rgb), _with_present_depth(seen, depth))
+            for name, rgb, depth in (
+                ("truth", true.rgb_THWC, true.depth_THW),
+                *(
+                    (name, as_bytes(frames.rgb_THWC[index]), frames.depth_THW[index])
+                    for name, frames in made.items()
+                ),
+            )
+        ]
+        times = range(len(true.depth_THW) + 1)
+        where = f"{title}, clip {index + 1} of {len(clips)}"
+        footers = [f"{where}: {f'imagined {time}' if time else 'observed'}" for time in times]
+        pictures += side_by_side(columns, footers, far_m=farthest(true), cell=192)
+    aside = path.with_name(path.name + ".partial")
+    aside.write_bytes(encode_h264(pictures))
+    aside.replace(path)
+    return path
+
+
+def _with_present(seen: Frames, rgb_THWC: np.ndarray) -> np.ndarray:
+    return np.concatenate([seen.rgb_THWC[-1:], rgb_THWC])
+
+
+def _with_present_depth(seen: Frames, depth_THW: np.ndarray) -> np.ndarray:
+    return np.concatenate([seen.depth_THW[-1:], np.asarray(depth_THW, np.float32)])

@@ -162,8 +162,24 @@ def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
     return (
         f"loss {metrics['loss']:.4f} · lr {metrics['learning_rate']:.2e} · "
         f"grad {metrics['grad_norm']:.2f} · {duration(metrics['step_seconds'])}/step · "
-        f"{metrics['samples_per_second']:.1f} samples/s · "
-        f"{metrics['flops_per_second'] / 1e9:.1f} GFLOP/s · {duration(seconds_left)} left"
+        f"{metrics['clips_per_second']:.1f} clips/s · {_work(metrics)} · "
+        f"{_counts(metrics)}{duration(seconds_left)} left"
+    )
+
+
+def _work(metrics: Mapping[str, float]) -> str:
+    """Write how hard each device works, and what share of its peak that is where it is known."""
+    rate = metrics["tflops_per_second_per_device"]
+    words = f"{rate:.1f} TFLOP/s" if rate >= 1 else f"{rate * 1e3:.1f} GFLOP/s"
+    share = f" · MFU {metrics['mfu']:.1%}" if "mfu" in metrics else ""
+    return f"{words}/device{share}"
+
+
+def _counts(metrics: Mapping[str, float]) -> str:
+    """Write what went wrong so far, if anything did."""
+    names = {"skipped": "skipped", "bad_records": "bad records"}
+    return "".join(
+        f"{metrics[key]:.0f} {words} · " for key, words in names.items() if metrics.get(key)
     )
 
 

@@ -6,12 +6,12 @@ checkpoints are written in the background, so the devices never wait for the hos
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 import jax
 from jax.sharding import Mesh
@@ -19,11 +19,13 @@ from jax.sharding import Mesh
 from pewm_jax import rollouts
 from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
+from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.memory import feature_cache
 from pewm_jax.training import runs, sharding, stages
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.feed import Feed
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, duration
+from pewm_jax.training.profile import Profile
 from pewm_jax.training.signals import Stop
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import TrainState, inference_params
@@ -34,10 +36,8 @@ from pewm_jax.training.step import (
     initial_state,
     stage_key,
 )
+from pewm_jax.training.watch import Preview, Watch
 from pewm_jax.types import Clip, Params
-
-Preview = Callable[[Params, int, int], Path]
-"""Called with inference weights, stage number and step; writes a picture and returns its path."""
 
 
 def train(
@@ -53,7 +53,7 @@ def train(
         config: the experiment; ``config.train.run`` is the folder that is written.
         preview: makes sample pictures every ``config.train.preview_every`` steps and at the end
             of a stage.
-        profile: steps to trace.
+        profile: steps to trace in each stage, for ``profile/`` in the run's folder.
         say: prints a line.
 
     Returns:
@@ -62,7 +62,8 @@ def train(
     Raises:
         UserError: the folder is of another configuration or in use, the data do not fit, or the
             loss is not finite.
-        Interrupted: Ctrl-C or SIGTERM came; everything is saved.
+        Interrupted: Ctrl-C or SIGTERM came; everything is saved. (Where saving takes longer than
+            ``train.grace_s``, and at a second signal, the process ends itself.)
     """
     planned = stages.planned(config)
     _require_weights(config)
@@ -70,16 +71,18 @@ def train(
     for stage in planned:
         sharding.require_divisible(config, stage, mesh)
     run = runs.check(config)
-    with runs.alone(run), Stop() as stop:
+    bad = BadRecords(config.data.bad_records)
+    with runs.alone(run), Stop(config.train.grace_s) as stop:
         runs.prepare(config)
         if runs.is_finished(run, config):
             say(f"{run} is already trained: nothing to do.")
             return run
         start: Callable[[], Params | None] = functools.partial(_named, config, planned[0], say)
         for stage in planned:
-            trained = _train_stage(
-                config, stage, mesh, run=run, start=start, preview=preview, stop=stop, say=say
+            worker = _Worker(
+                config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, say=say
             )
+            trained = worker.train(start)
             start = functools.partial(_same, trained)
             if stop.number is not None and stage is not planned[-1]:
                 raise stop.interrupted(stage.number, stage.settings(config).steps)
@@ -120,45 +123,6 @@ def _named(config: Config, stage: Stage, say: Callable[[str], None]) -> Params |
     return params
 
 
-def _train_stage(
-    config: Config,
-    stage: Stage,
-    mesh: Mesh,
-    *,
-    run: Path,
-    start: Callable[[], Params | None],
-    preview: Preview | None,
-    stop: Stop,
-    say: Callable[[str], None],
-) -> Params:
-    """Train one stage, or find it done; returns its inference weights."""
-    settings = stage.settings(config)
-    like = abstract_state(config, stage, mesh)
-    with Checkpoints(run, config, stage, say) as checkpoints:
-        done = checkpoints.latest() or 0
-        if done >= settings.steps:
-            params = checkpoints.restore_weights(like)
-            runs.publish(run, stage, done, params)
-            return params
-        with (
-            LiveView(f"stage {stage.number}", settings.steps, done) as view,
-            MetricsLog(run, stage.number, done) as log,
-        ):
-
-            def state_to_start_from() -> TrainState:
-                if not done:
-                    return initial_state(config, stage, mesh, start())
-                view.say(f"stage {stage.number}: going on after step {done}")
-                return checkpoints.restore(like)
-
-            worker = _Worker(config, stage, mesh, stop, view, log, checkpoints, preview)
-            state = worker.run(state_to_start_from, done)
-        params = inference_params(stage, state)
-        checkpoints.wait()
-        runs.publish(run, stage, settings.steps, params)
-        return params
-
-
 def _features(config: Config, stage: Stage) -> feature_cache.FeatureCache | None:
     """Open the features that are kept, where the stage needs any; not compared with weights yet."""
     if not (config.data.features and stage.memory):
@@ -166,24 +130,72 @@ def _features(config: Config, stage: Stage) -> feature_cache.FeatureCache | None
     return feature_cache.read(Path(config.data.features) / "train")
 
 
-@dataclasses.dataclass
 class _Worker:
     """Turns one stage's state from its first to its last step."""
 
-    config: Config
-    stage: Stage
-    mesh: Mesh
-    stop: Stop
-    view: LiveView
-    log: MetricsLog
     checkpoints: Checkpoints
-    preview: Preview | None
-    pace: Pace = dataclasses.field(default_factory=lambda: Pace(time.monotonic()))
-    shown: bool = False
+    view: LiveView
+    watch: Watch
+
+    def __init__(
+        self,
+        config: Config,
+        stage: Stage,
+        mesh: Mesh,
+        run: Path,
+        stop: Stop,
+        *,
+        bad: BadRecords,
+        preview: Preview | None,
+        profile: int,
+        say: Callable[[str], None],
+    ):
+        self.config, self.stage, self.mesh, self.path = config, stage, mesh, run
+        self.stop, self.bad, self.preview, self.profile = stop, bad, preview, profile
+        self.say, self.shown = say, False
 
     @property
     def settings(self) -> StageConfig:
         return self.stage.settings(self.config)
+
+    def train(self, start: Callable[[], Params | None]) -> Params:
+        """Train the stage, or find it done; returns its inference weights."""
+        config, stage, run, steps = self.config, self.stage, self.path, self.settings.steps
+        like = abstract_state(config, stage, self.mesh)
+        with Checkpoints(run, config, stage, self.say) as self.checkpoints:
+            self.stop.at_once, self.stop.kept = True, self._kept
+            done = self.checkpoints.latest() or 0
+            if done >= steps:
+                params = self.checkpoints.restore_weights(like)
+                runs.publish(run, stage, done, params)
+                return params
+            with (
+                LiveView(f"stage {stage.number}", steps, done) as self.view,
+                MetricsLog(run, stage.number, done) as log,
+            ):
+                self.bad.say = self.view.say
+                self.watch = Watch(
+                    config,
+                    stage,
+                    run,
+                    done,
+                    devices=self.mesh.size,
+                    view=self.view,
+                    log=log,
+                    bad=self.bad,
+                )
+
+                def state_to_start_from() -> TrainState:
+                    if not done:
+                        return initial_state(config, stage, self.mesh, start())
+                    self.view.say(f"stage {stage.number}: going on after step {done}")
+                    return self.checkpoints.restore(like)
+
+                state = self.run(state_to_start_from, done)
+            params = inference_params(stage, state)
+            self.checkpoints.wait()
+            runs.publish(run, stage, steps, params)
+            return params
 
     def run(self, make_state: Callable[[], TrainState], done: int) -> TrainState:
         """Do the steps after ``done``, once the first batch is there; returns the last state."""
@@ -192,37 +204,52 @@ class _Worker:
         batches = loader.clips(
             config,
             "train",
-            seed=config.train.seed + self.stage.number,
+            seed=self.stage.data_seed(config),
             batch=settings.batch,
             start_step=done,
             features=cache and functools.partial(feature_cache.features, cache),
+            bad=self.bad,
         )
         key = jax.device_put(stage_key(config, self.stage), sharding.replicated(self.mesh))
-        with Feed(iter(batches), sharding.of_batch(self.mesh)) as feed:
+        traced = Profile(
+            self.path,
+            self.stage.name,
+            steps=self.profile,
+            first=done + 1,
+            last=settings.steps,
+            say=self.view.say,
+        )
+        with Feed(iter(batches), sharding.of_batch(self.mesh)) as feed, closing(traced):
             clip = next(feed)
             state, step_fn = self._compile(make_state, clip)
             if cache is not None:
                 weights = state.params.get("encoder", {})
                 where = Path(config.data.path) / "train"
                 feature_cache.require_fresh(cache, config.memory, weights, where)
-            self.pace = Pace(time.monotonic())
+            self.watch.pace = Pace(time.monotonic())
             pending: tuple[int, Metrics] | None = None
             for step in range(done + 1, settings.steps + 1):
-                state, metrics = step_fn(state, clip, key)
+                with traced.around(step):
+                    state, metrics = step_fn(state, clip, key)
+                self.stop.at_once = False
                 if pending is not None:
-                    self._report(*pending)
+                    self._tell(*pending)
                 pending = (step, metrics)
-                last = step == settings.steps
-                if last or step % config.train.save_every == 0 or self.stop.number is not None:
-                    self._report(*pending)
+                self.watch.pace.pause(traced.after(step, metrics))
+                last, told = step == settings.steps, self.stop.due(step) is not None
+                save = last or told or step % config.train.save_every == 0
+                show = self._wants_preview(step) and not told
+                if save or show:
+                    self._tell(step, metrics, state if show else None)
                     pending = None
+                if save:
                     self._save(state)
-                if self.preview is not None and self._wants_preview(step):
-                    self._show(state, step)
-                if self.stop.number is not None and not last:
-                    self._leave(step)
-                if not last:
-                    clip = next(feed)
+                if last:
+                    break
+                following = None if told else self.stop.unless_told(feed.__next__)
+                if following is None:
+                    self._leave(step, state, pending)
+                clip = following
         return state
 
     def _compile(self, make_state: Callable[[], TrainState], clip: Clip):
@@ -235,56 +262,62 @@ class _Worker:
         self.view.say(f"stage {self.stage.number}: compiled the training step in {took}")
         return state, step_fn
 
-    def _report(self, step: int, metrics: Metrics) -> None:
-        """Read a step's metrics, check, show and log them."""
-        began = time.monotonic()
-        self.checkpoints.settle()
-        self.pace.pause(time.monotonic() - began)
-        values = {name: float(value) for name, value in jax.device_get(metrics).items()}
-        if not (math.isfinite(values["loss"]) and math.isfinite(values["grad_norm"])):
-            raise UserError(self._not_finite(step, values))
-        seconds = self.pace.tick(time.monotonic())
-        values |= {
-            "step_seconds": seconds,
-            "samples_per_second": self.settings.batch / seconds,
-            "flops_per_second": self.settings.batch
-            * stages.flops_per_clip(self.config, self.stage)
-            / seconds,
-        }
-        self.view.update(step, values)
-        if step == 1 or step % self.config.train.log_every == 0 or step == self.settings.steps:
-            self.log.write(step, values)
-
-    def _not_finite(self, step: int, values: dict[str, float]) -> str:
-        self.checkpoints.wait()
-        saved = self.checkpoints.latest()
-        kept = f"the checkpoint of step {saved} is intact" if saved else "nothing was saved yet"
-        return (
-            f"Stage {self.stage.number} stopped at step {step}: loss {values['loss']} and gradient "
-            f"norm {values['grad_norm']} are not both finite ({kept}); train again in another "
-            f"--train.run with a lower --train.{self.stage.name}.learning_rate."
-        )
+    def _tell(self, step: int, metrics: Metrics, shown: TrainState | None = None) -> None:
+        """Read a step's metrics; check, show and log them, with samples of the state if given."""
+        with self._paused():
+            self.checkpoints.settle()
+        values = self.watch.read(step, metrics, self._kept_in_the_end)
+        samples = {} if shown is None else self._show(shown, step)
+        self.watch.write(step, values | samples, always=bool(samples))
 
     def _wants_preview(self, step: int) -> bool:
         every = self.config.train.preview_every
-        return every > 0 and (step % every == 0 or step == self.settings.steps)
+        due = every > 0 and (step % every == 0 or step == self.settings.steps)
+        return due and self.preview is not None
+
+    def _show(self, state: TrainState, step: int) -> dict[str, float]:
+        """Make samples, unless a signal breaks that off; returns how good they are."""
+        preview, number = self.preview, self.stage.number
+        assert preview is not None
+        if not self.shown:
+            self.view.say(f"stage {number}: compiling the sampler for pictures …")
+        self.shown = True
+        params = inference_params(self.stage, state)
+        with self._paused():
+            try:
+                made = self.stop.unless_told(lambda: preview(params, number, step))
+            except (jax.errors.JaxRuntimeError, UserError) as error:
+                reason = " ".join(str(error).split())[:160]
+                self.view.say(f"stage {number}: no sample pictures of step {step} ({reason})")
+                return {}
+        return {} if made is None else self.watch.told_by(made)
 
     def _save(self, state: TrainState) -> None:
-        began = time.monotonic()
-        self.checkpoints.save(state)
-        self.pace.pause(time.monotonic() - began)
+        with self._paused():
+            self.checkpoints.save(state)
 
-    def _show(self, state: TrainState, step: int) -> None:
-        if self.preview is None:
-            return
-        if not self.shown:
-            self.view.say(f"stage {self.stage.number}: compiling the sampler for pictures …")
-        self.shown = True
-        began = time.monotonic()
-        path = self.preview(inference_params(self.stage, state), self.stage.number, step)
-        self.pace.pause(time.monotonic() - began)
-        self.view.say(f"stage {self.stage.number}: sample picture {path}")
-
-    def _leave(self, step: int) -> None:
+    def _leave(self, step: int, state: TrainState, pending: tuple[int, Metrics] | None) -> NoReturn:
+        """Save what is not saved yet, and leave."""
+        if pending is not None:
+            self._tell(*pending)
+        self._save(state)
         self.checkpoints.wait()
         raise self.stop.interrupted(self.stage.number, step)
+
+    def _kept(self) -> str:
+        """Say what is safely on disk."""
+        step, number = self.checkpoints.latest(), self.stage.number
+        if step is not None:
+            return f"stage {number}'s checkpoint of step {step} is intact"
+        return "nothing was saved yet" if number == 1 else f"of stage {number} nothing is saved yet"
+
+    def _kept_in_the_end(self) -> str:
+        self.checkpoints.wait()
+        return self._kept()
+
+    @contextmanager
+    def _paused(self) -> Iterator[None]:
+        """Do not count what is done inside as time of the steps."""
+        began = time.monotonic()
+        yield
+        self.watch.pace.pause(time.monotonic() - began)

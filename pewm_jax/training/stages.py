@@ -53,6 +53,10 @@ class Stage:
         """Return this stage's settings."""
         return getattr(config.train, self.name)
 
+    def data_seed(self, config: Config) -> int:
+        """Return the seed of the order in which this stage reads the data."""
+        return config.train.seed + self.number
+
 
 STAGES = (
     Stage(

@@ -7,6 +7,7 @@ gets zeros in their place.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, cast
@@ -41,7 +42,9 @@ def train_step(
 
     Returns:
         The state after, and scalars: ``loss``, ``grad_norm`` (before clipping),
-        ``learning_rate``, and what the objective measures.
+        ``learning_rate``, and what the objective measures. Where ``train.on_nonfinite`` is
+        ``skip`` also ``skipped``: 1 where loss or gradient is not finite, and the state after is
+        the state before but for its ``step``.
     """
     trained, frozen = tree.split(state.params, stage.trained)
     step_key = jax.random.fold_in(key, state.step)
@@ -69,6 +72,11 @@ def train_step(
         opt_state=opt_state,
         step=state.step + 1,
     )
+    if config.train.on_nonfinite == "skip":
+        good = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
+        unmoved = dataclasses.replace(state, step=after.step)
+        after = jax.tree.map(functools.partial(_unless, good), after, unmoved)
+        metrics["skipped"] = ~good
     return after, jax.tree.map(jnp.asarray, metrics)
 
 
@@ -132,3 +140,8 @@ def compile_step(
 
 def _norm(gradients: Params) -> Array:
     return jnp.sqrt(sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(gradients)))
+
+
+def _unless(good: Array, new: Array, old: Array) -> Array:
+    """Choose the new leaf or the old; what was passed through is left alone."""
+    return new if new is old else jnp.where(good, new, old)

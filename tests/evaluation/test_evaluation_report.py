@@ -27,6 +27,7 @@ from pewm_jax.evaluation import imagine, preview, report
 from pewm_jax.evaluation.imagine import Imagination
 from pewm_jax.evaluation.page import introduction, number, verdict
 from pewm_jax.models import world_model
+from pewm_jax.types import Frames
 
 ROOT = Path(__file__).parents[2]
 
@@ -277,15 +278,49 @@ def test_previews_show_each_method(run, tmp_path, stage, rows, monkeypatch):
     if stage == 1:
         params = {"backbone": params["backbone"]}
     draw = preview.make_preview(config, tmp_path)
-    path = draw(params, stage, 250)
-    assert path == tmp_path / "previews" / f"stage{stage}-000250.png"
+    made = draw(params, stage, 250)
+    folder = tmp_path / "previews"
+    path, video = folder / f"stage{stage}-000250.png", folder / f"stage{stage}-000250.mp4"
+    assert made.files == (path, video)
     with Image.open(path) as picture:
         height = picture.height
     other = draw(jax.tree.map(lambda leaf: leaf * 0.5, params), stage, 500)
     assert len(set(map(id, compiled))) == 1
-    assert other.read_bytes() != path.read_bytes()
+    for one, two in zip(made.files, other.files, strict=True):
+        assert one.read_bytes() != two.read_bytes()
     per_row = 96 + 6
     assert (height - 34 - 24) // per_row == 2 * rows
+    with av.open(str(video)) as container:
+        (stream,) = container.streams.video
+        assert stream.codec_context.name == "h264"
+        frames = sum(1 for _ in container.decode(stream))
+        assert frames == 2 * config.clip.frames
+        assert stream.width == 8 + rows * (192 + 8)
+    names = {1: {"model"}, 2: {"with its map", "empty map"}}
+    assert set(made.psnr) == names[stage]
+    assert all(0 < value < 60 for value in made.psnr.values())
+
+
+def test_previews_measure_what_is_shown(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(preview, "CLIPS", 2)
+    config, true = configs.load(run / "config.json"), []
+    load = preview.load_clip
+    monkeypatch.setattr(preview, "load_clip", lambda *a: (true.append(load(*a)), true[-1])[1])
+    off = {False: 16, True: 0}  # levels of 255
+
+    def imagined(_model, _context, _actions, _seeds, *, memory, params):
+        frames = [clip[1] for clip in true]
+        rgb = np.stack([np.where(f.rgb_THWC > 99, f.rgb_THWC - off[memory], 99) for f in frames])
+        rgb = np.stack([f.rgb_THWC for f in frames]) if memory else rgb
+        return None, None, Frames(rgb, np.stack([f.depth_THW for f in frames]), None)
+
+    monkeypatch.setattr(Imagination, "run", imagined)
+    made = preview.make_preview(config, tmp_path)({}, 2, 3)
+    truth = np.stack([clip[1].rgb_THWC for clip in true]).astype(float)
+    wrong = np.where(truth > 99, truth - 16, 99)
+    errors = ((truth - wrong) ** 2).mean((2, 3, 4)) / 255**2
+    assert made.psnr["with its map"] == 100.0
+    assert made.psnr["empty map"] == pytest.approx((-10 * np.log10(errors)).mean(), abs=1e-3)
 
 
 def test_data_that_cannot_be_previewed_cost_one_line_and_not_the_training(tmp_path):

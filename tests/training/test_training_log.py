@@ -13,8 +13,8 @@ METRICS = {
     "learning_rate": 1e-3,
     "grad_norm": 1.0,
     "step_seconds": 0.25,
-    "samples_per_second": 32.0,
-    "flops_per_second": 2.5e9,
+    "clips_per_second": 32.0,
+    "tflops_per_second_per_device": 2.5e-3,
 }
 
 
@@ -47,7 +47,7 @@ def test_tensorboard_files_are_written_per_stage(tmp_path):
             out.write(1, METRICS)
     for stage in (1, 2):
         (events,) = (tmp_path / "tensorboard" / f"stage{stage}").glob("events.*")
-        assert b"samples_per_second" in events.read_bytes()
+        assert b"clips_per_second" in events.read_bytes()
 
 
 def view(total, done=0):
@@ -73,8 +73,17 @@ def test_without_a_terminal_there_is_a_line_now_and_then_and_one_at_the_end(monk
 
 def test_a_line_names_rate_flops_and_time_left():
     text = log.describe(METRICS, 90)
-    for part in ("0.5000", "1.00e-03", "250 ms/step", "32.0 samples/s", "2.5 GFLOP/s", "1 min 30"):
-        assert part in text
+    assert text == (
+        "loss 0.5000 · lr 1.00e-03 · grad 1.00 · 250 ms/step · 32.0 clips/s · 2.5 GFLOP/s/device · "
+        "1 min 30 s left"
+    )
+
+
+def test_a_line_names_utilisation_where_the_peak_is_known_and_what_went_wrong():
+    known = {"tflops_per_second_per_device": 412.34, "mfu": 0.4168}
+    text = log.describe(METRICS | known | {"skipped": 2.0, "bad_records": 0.0}, 90)
+    assert "412.3 TFLOP/s/device · MFU 41.7% · 2 skipped · 1 min 30 s left" in text
+    assert "1 bad records" in log.describe(METRICS | {"bad_records": 1.0}, 90)
 
 
 def test_on_a_terminal_there_is_a_bar():

@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,9 @@ from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data import loader
 from pewm_jax.training import loop, runs
 from pewm_jax.training.signals import Interrupted
+from pewm_jax.training.watch import Previewed
+
+PICTURE = Previewed((Path("picture.png"),))
 
 
 def train(config, **options):
@@ -42,7 +46,7 @@ class StopAt:
         self.seen.append((stage, step))
         if (stage, step) == self.when:
             os.kill(os.getpid(), self.number)
-        return "picture.png"
+        return PICTURE
 
 
 @pytest.fixture
@@ -173,7 +177,7 @@ def test_a_folder_in_which_nothing_was_trained_yet_takes_the_new_configuration(
 def test_a_loss_that_is_not_finite_stops_at_its_step_and_the_checkpoint_before_is_kept(
     fake_model, tmp_path, monkeypatch
 ):
-    def poisoned(config, split="train", *, seed, batch, start_step=0, features=None):
+    def poisoned(config, split="train", *, seed, batch, start_step=0, **_options):
         for number, clip in enumerate(
             fakes.clips(config, split, seed=seed, batch=batch, start_step=start_step),
             start_step + 1,
@@ -232,7 +236,7 @@ def test_nothing_is_compiled_unannounced(fake_model, tmp_path, monkeypatch):
 
     def preview(_params, _stage, step):
         told.append(f"preview {step}")
-        return "picture.png"
+        return PICTURE
 
     train(fakes.config(tmp_path, stage1=2, stage2=0, preview_every=1), preview=preview)
     told = [text for text in told if "compiled" not in text and "loss" not in text]
@@ -242,7 +246,7 @@ def test_nothing_is_compiled_unannounced(fake_model, tmp_path, monkeypatch):
         "compile_step",
         "stage 1: compiling the sampler for pictures …",
         "preview 1",
-        "stage 1: sample picture picture.png",
+        "stage 1: sample pictures picture.png",
         "preview 2",
-        "stage 1: sample picture picture.png",
+        "stage 1: sample pictures picture.png",
     ]

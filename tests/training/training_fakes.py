@@ -54,13 +54,17 @@ def clip(config: Config, batch: int, seed: int) -> Clip:
     return Clip(frames(config.clip.frames), frames(context), np.ones((batch, context), bool))
 
 
-def clips(config, split="train", *, seed, batch, start_step=0, features=None):
+def clips(config, split="train", *, seed, batch, start_step=0, features=None, **_options):
     assert split == "train"
     assert features is None
     step = start_step
     while True:
         yield clip(config, batch, 1000 * seed + step)
         step += 1
+
+
+def records(config, split="train", *, seed, batch, step):
+    return [f"record {1000 * seed + step}-{row}" for row in range(batch)]
 
 
 def init(config, key, *, memory=True):
@@ -89,3 +93,4 @@ def fake_model(monkeypatch):
     monkeypatch.setattr(world_model, "flops_per_clip", lambda config, *, memory: 2.0 + memory)
     monkeypatch.setattr(objective, "loss", loss)
     monkeypatch.setattr(loader, "clips", clips)
+    monkeypatch.setattr(loader, "records", records)
