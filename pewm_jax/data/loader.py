@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import grain
 import numpy as np
@@ -99,8 +100,9 @@ def dataset(
     batch: int,
     features: ReadFeatures | None = None,
     bad: BadRecords | None = None,
+    rows: slice | None = None,
 ) -> grain.MapDataset:
-    """Return the endless dataset whose element k is batch k.
+    """Return the endless dataset whose element k is batch k, or some rows of it.
 
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit the
@@ -111,7 +113,12 @@ def dataset(
     bad = BadRecords(config.data.bad_records) if bad is None else bad
     _check_first(config, source, bad)
     drawn = _order(source, seed).random_map(_DrawClip(config, source, features, bad))
-    return drawn.batch(batch, batch_fn=stack)
+    wanted = range(batch)[rows or slice(None)]
+
+    def read(number: int) -> Clip:
+        return stack([cast("Clip", drawn[number * batch + row]) for row in wanted])
+
+    return grain.MapDataset.range(len(drawn) // batch).map(read)
 
 
 def records(config: Config, split: str = "train", *, seed: int, batch: int, step: int) -> list[str]:
@@ -149,6 +156,7 @@ def clips(
     start_step: int = 0,
     features: ReadFeatures | None = None,
     bad: BadRecords | None = None,
+    rows: slice | None = None,
 ) -> Iterator[Clip]:
     """Iterate over batches of clips for ever.
 
@@ -163,15 +171,17 @@ def clips(
         features: reads the context's features, if they are kept.
         bad: counts and names the records that do not decode; by default ``data.bad_records`` are
             skipped silently.
+        rows: which of a batch's clips are read and returned, by default all: a process of several
+            reads its own. Each clip is the same whoever reads it.
 
     Returns:
-        NumPy clips with a leading B: rgb uint8, depth float32 in metres.
+        NumPy clips with a leading B (the number of rows): rgb uint8, depth float32 in metres.
 
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit, or (where
             the batch would have been) too many records do not decode.
     """
-    batches = dataset(config, split, seed, batch, features, bad).slice(slice(start_step, None))
+    batches = dataset(config, split, seed, batch, features, bad, rows)[start_step:]
     threads = max(1, config.data.workers)
     return iter(batches.to_iter_dataset(grain.ReadOptions(threads, BATCHES_AHEAD + threads - 1)))
 

@@ -1,4 +1,4 @@
-"""Batches ready on the devices before they are wanted."""
+"""Batches ready on the devices before they are wanted; each process brings its own rows."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Self
 
 import jax
+import numpy as np
 from jax.sharding import Sharding
 
 from pewm_jax.config import UserError
@@ -16,6 +17,44 @@ from pewm_jax.types import Clip
 
 AHEAD = 2
 _POLL_S = 0.2
+
+
+def rows_of(where: Sharding, batch: int) -> slice:
+    """Return the rows of a batch that this process's devices hold, as one slice.
+
+    Processes whose devices hold the same rows (they share a clip's tokens or heads) get the same
+    slice. Rows in between that are other processes' are included.
+
+    Args:
+        where: the placement of the batch.
+        batch: its size in all processes together.
+    """
+    parts = where.addressable_devices_indices_map((batch,)).values()
+    held = [index[0].indices(batch) for index in parts if index is not None]
+    return slice(min(start for start, _, _ in held), max(stop for _, stop, _ in held))
+
+
+def place(clip: Clip, where: Sharding, batch: int) -> Clip:
+    """Make a batch that is spread over all processes of the rows that each of them has.
+
+    Args:
+        clip: the rows of this process, as ``rows_of`` says.
+        where: the placement of every array.
+        batch: the size of the batch in all processes together.
+    """
+    if where.is_fully_addressable:
+        return jax.device_put(clip, where)
+    first = rows_of(where, batch).start
+
+    def spread(rows: np.ndarray) -> jax.Array:
+        def part(index: tuple[slice, ...] | None) -> np.ndarray:
+            assert index is not None
+            start, stop, _ = index[0].indices(batch)
+            return rows[start - first : stop - first]
+
+        return jax.make_array_from_callback((batch, *rows.shape[1:]), where, part)
+
+    return jax.tree.map(spread, clip)
 
 
 class Feed:
@@ -27,12 +66,20 @@ class Feed:
     Args:
         batches: the source; it is closed at the end when it has a ``close`` method.
         where: the placement of every array of a batch.
+        batch: clips per batch, of which the source has this process's rows; None where there is
+            but one process.
         ahead: batches kept ready.
     """
 
-    def __init__(self, batches: Iterator[Clip], where: Sharding, ahead: int = AHEAD):
+    def __init__(
+        self,
+        batches: Iterator[Clip],
+        where: Sharding,
+        batch: int | None = None,
+        ahead: int = AHEAD,
+    ):
         self._batches = batches
-        self._where = where
+        self._where, self._batch = where, batch
         self._ready: queue.Queue[Clip | BaseException] = queue.Queue(ahead)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._fill, name="feed", daemon=True)
@@ -63,7 +110,7 @@ class Feed:
     def _fill(self) -> None:
         try:
             for batch in self._batches:
-                if not self._put(jax.device_put(batch, self._where)):
+                if not self._put(self._placed(batch)):
                     break
             else:
                 self._put(UserError("The training data ended before the training did."))
@@ -73,6 +120,11 @@ class Feed:
             close = getattr(self._batches, "close", None)
             if close is not None:
                 close()
+
+    def _placed(self, clip: Clip) -> Clip:
+        if self._batch is None:
+            return jax.device_put(clip, self._where)
+        return place(clip, self._where, self._batch)
 
     def _put(self, item: Clip | BaseException) -> bool:
         """Wait for room; False when the training is over."""
