@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from pewm_jax.geometry.actions import integrate
     from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
     from pewm_jax.models.codec import rgb_from_signal
-    from pewm_jax.rollouts import load, rollout, start
+    from pewm_jax.rollouts import rollout, start
+    from pewm_jax.training.loading import load
     from pewm_jax.types import Camera, Clip, Frames, VoxelMap, WorldState
 
 __version__ = "0.1.0"
@@ -36,7 +37,7 @@ _HOME = {
     "WorldState": "types",
     "integrate": "geometry.actions",
     "intrinsics_from_fov": "geometry.cameras",
-    "load": "rollouts",
+    "load": "training.loading",
     "pose_from_yaw": "geometry.cameras",
     "rgb_from_signal": "models.codec",
     "rollout": "rollouts",

@@ -23,6 +23,7 @@ from typing import Any, Self
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from etils import epath
 
 from pewm_jax import config as configuration
 from pewm_jax import tree
@@ -32,8 +33,7 @@ from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import TrainState, inference_params
 from pewm_jax.types import Params
 
-FOLDER = "checkpoints"
-WEIGHTS, STATE, DATA, CONFIG = "weights", "state", "data", "config"
+WEIGHTS, STATE, DATA, CONFIG = shelf.WEIGHTS, "state", "data", "config"
 
 _MOMENT_S, _SHARE = 1.0, 0.02
 """How long ``settle`` waits: seconds, or a share of the time between two saves if that is more."""
@@ -56,7 +56,8 @@ class Checkpoints:
     """
 
     def __init__(self, run: Path, config: Config, stage: Stage, say: Callable[[str], None] = print):
-        self.folder = (run / FOLDER / stage.name).resolve()
+        self.run = run
+        self.folder = (run / shelf.FOLDER / stage.name).resolve()
         self.config = config
         self.stage = stage
         self._writer = ocp.AsyncCheckpointer(ocp.CompositeCheckpointHandler())
@@ -178,6 +179,24 @@ class Checkpoints:
             WEIGHTS
         ]
 
+    def publish(self, params: Params) -> None:
+        """Write the newest checkpoint's weights where ``pewm_jax.load`` finds them first.
+
+        Args:
+            params: those weights, where one process holds all of them. Of several the first reads
+                them from the checkpoint, into its own memory and not a device's.
+
+        Raises:
+            UserError: as ``save``.
+        """
+        self.wait()
+        step, alone = self._require_step(), jax.process_count() == 1
+        if processes.is_primary() and not runs.is_published(self.run, self.stage, step):
+            if not alone:
+                params = _read_arrays(self.folder / str(step), params)
+            runs.publish(self.run, self.stage, step, params)
+        processes.wait(f"published {self.stage.name}")
+
     def _finish(self, step: int) -> None:
         """Wait for the background, seal, name and count the checkpoint, and delete old ones."""
         self._writer.wait_until_finished()
@@ -201,22 +220,24 @@ class Checkpoints:
                 "space or allow writing there, then run the same command again to go on."
             ) from None
 
+    def _require_step(self) -> int:
+        if self._latest is None:
+            raise UserError(f"{self.folder} holds no whole checkpoint; train this stage first.")
+        return self._latest
+
     def _read(self, items: dict[str, Any]) -> Any:
         """Read items of the newest checkpoint after making sure that it is of this experiment."""
         self.wait()
-        if self._latest is None:
-            raise UserError(f"{self.folder} holds no whole checkpoint; train this stage first.")
-        folder = self.folder / str(self._latest)
-        there = configuration.from_dict(
-            Config, _restore(self._writer, folder, {CONFIG: ocp.args.JsonRestore()})[CONFIG]
-        )
-        wrong = runs.differences(runs.identity(there), runs.identity(self.config))
-        if wrong:
-            raise UserError(
-                f"{folder} is a checkpoint of another configuration ({runs.phrase(wrong)}): "
-                "give this one its own folder with --train.run, or put the settings back."
-            )
-        return _restore(self._writer, folder, items)
+        folder = self.folder / str(self._require_step())
+        with _reading(folder):
+            there = configuration.from_dict(Config, _read_words(folder / CONFIG))
+            wrong = runs.differences(runs.identity(there), runs.identity(self.config))
+            if wrong:
+                raise UserError(
+                    f"{folder} is a checkpoint of another configuration ({runs.phrase(wrong)}): "
+                    "give this one its own folder with --train.run, or put the settings back."
+                )
+            return self._writer.restore(folder, args=ocp.args.Composite(**items))
 
 
 def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[Config, Params]:
@@ -238,14 +259,23 @@ def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[C
             f"The checkpoint {folder} is damaged ({tree.listing(found, 2)}): copy it again, or "
             "name another one."
         )
-    with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as reader:
-        words = {DATA: ocp.args.JsonRestore(), CONFIG: ocp.args.JsonRestore()}
-        read = _restore(reader, folder, words)
-        config = configuration.from_dict(Config, read[CONFIG])
-        shapes = like(config, read[DATA]["stage"])
-        how = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), shapes)
-        arrays = {WEIGHTS: ocp.args.PyTreeRestore(shapes, restore_args=how)}
-        return config, _restore(reader, folder, arrays)[WEIGHTS]
+    with _reading(folder):
+        config = configuration.from_dict(Config, _read_words(folder / CONFIG))
+        position = _read_words(folder / DATA)
+    return config, _read_arrays(folder, like(config, position["stage"]))
+
+
+def _read_words(item: Path) -> dict[str, Any]:
+    return dict(ocp.JsonCheckpointHandler().restore(epath.Path(item)))
+
+
+def _read_arrays(folder: Path, like: Params) -> Params:
+    """Read the weights of a checkpoint into the memory of this process alone."""
+    how = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), like)
+    with _reading(folder):
+        return ocp.PyTreeCheckpointHandler().restore(
+            epath.Path(folder / WEIGHTS), args=ocp.args.PyTreeRestore(like, restore_args=how)
+        )
 
 
 def _agreed(folder: Path, say: Callable[[str], None]) -> int | None:
@@ -266,10 +296,14 @@ def _agreed(folder: Path, say: Callable[[str], None]) -> int | None:
     return found["step"]
 
 
-def _restore(reader: ocp.Checkpointer, folder: Path, items: dict[str, Any]) -> Any:
+@contextlib.contextmanager
+def _reading(folder: Path) -> Iterator[None]:
+    """Turn what goes wrong in reading a whole checkpoint into a sentence."""
     try:
-        return reader.restore(folder, args=ocp.args.Composite(**items))
+        yield
     except (ValueError, KeyError, TypeError, OSError) as error:
+        if isinstance(error, UserError):
+            raise
         raise UserError(
             f"{folder} cannot be read ({_reason(error)}): another version of the library may have "
             "written it; go on with that one, or train in another --train.run."

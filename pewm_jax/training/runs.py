@@ -125,18 +125,32 @@ def prepare(config: Config) -> Path:
 
 
 def is_finished(run: Path, config: Config) -> bool:
-    """Tell whether the last planned stage has left its weights."""
+    """Tell whether the last planned stage has left its weights, and they are whole."""
+    last = stages.planned(config)[-1]
+    return is_published(run, last, last.settings(config).steps)
+
+
+def is_published(run: Path, stage: stages.Stage, step: int) -> bool:
+    """Tell whether the run's file of weights is of this stage and step, and whole."""
     path = run / WEIGHTS
-    if not path.exists():
+    try:
+        if not path.exists() or weights.metadata(path) != _words(stage, step):
+            return False
+        weights.verify(path)
+    except UserError:
         return False
-    return weights.metadata(path).get("stage") == str(stages.planned(config)[-1].number)
+    return True
 
 
 def publish(run: Path, stage: stages.Stage, step: int, params: Params) -> Path:
     """Write the weights that ``pewm_jax.load`` reads; returns the file."""
     path = run / WEIGHTS
-    weights.save(path, params, {"stage": str(stage.number), "step": str(step)})
+    weights.save(path, params, _words(stage, step))
     return path
+
+
+def _words(stage: stages.Stage, step: int) -> dict[str, str]:
+    return {"stage": str(stage.number), "step": str(step)}
 
 
 @contextlib.contextmanager

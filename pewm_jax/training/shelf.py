@@ -20,6 +20,9 @@ from pewm_jax import tree
 from pewm_jax.config import UserError
 from pewm_jax.training import integrity
 
+FOLDER = "checkpoints"
+WEIGHTS = "weights"
+"""The item of a checkpoint that inference uses."""
 DAMAGED = "damaged"
 WRITING = ".writing"
 _REMOVED = ".removed"

@@ -1,0 +1,78 @@
+"""Weights to use, of whatever training has left: a finished run, one in mid-training, a checkpoint.
+
+Only what inference uses is read: a checkpoint's optimizer state may be gone or damaged.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import warnings
+from pathlib import Path
+
+import jax
+
+from pewm_jax import rollouts, weights
+from pewm_jax.config import Config, UserError
+from pewm_jax.models import world_model
+from pewm_jax.training import runs, shelf, stages
+from pewm_jax.types import Params
+
+
+def load(path: str | Path) -> tuple[Config, Params]:
+    """Load a world model.
+
+    Args:
+        path: a run folder made by ``train.py``, finished or not: the newest weights in it are
+            taken, those of its newest whole checkpoint while a stage is being trained. Or a
+            checkpoint's own folder, such as ``runs/demo/checkpoints/stage1/200``. Or a folder of
+            converted weights.
+
+    Returns:
+        ``(config, params)``; the averaged weights that inference uses, as NumPy arrays in the
+        dtype of the file.
+
+    Raises:
+        UserError: something is absent or damaged, or the weights do not fit the configuration.
+    """
+    folder = Path(path)
+    if (folder / shelf.WEIGHTS).is_dir():
+        return _read(folder)
+    newer = _checkpoints(folder)
+    if not newer:
+        return rollouts.load(folder)
+    for number, checkpoint in enumerate(newer):
+        try:
+            return _read(checkpoint)
+        except UserError as error:
+            if number == len(newer) - 1 and not (folder / runs.WEIGHTS).exists():
+                raise
+            warnings.warn(f"{error} The one before it is loaded.", stacklevel=2)
+    return rollouts.load(folder)
+
+
+def _checkpoints(run: Path) -> list[Path]:
+    """Return the checkpoints of a run that are newer than its file of weights, newest first."""
+    path = run / runs.WEIGHTS
+    words = weights.metadata(path) if path.exists() else {}
+    have = (int(words.get("stage", 0)), int(words.get("step", 0)))
+    found: dict[tuple[int, int], Path] = {}
+    for stage in stages.STAGES:
+        folder = run / shelf.FOLDER / stage.name
+        for step in shelf.steps(folder):
+            found[stage.number, step] = folder / str(step)
+    return [found[when] for when in sorted(found, reverse=True) if when > have]
+
+
+def _read(folder: Path) -> tuple[Config, Params]:
+    # Imported here and not above: Orbax takes a moment, and finished runs do without.
+    checkpoint = importlib.import_module("pewm_jax.training.checkpoint")
+    config, params = checkpoint.read_weights(folder, _shapes)
+    return config, params
+
+
+def _shapes(config: Config, number: int) -> Params:
+    """Return the shapes of all weights after some of the training of a stage."""
+    memory = next(stage.memory for stage in stages.STAGES if stage.number == number)
+    init = functools.partial(world_model.init, config, memory=memory)
+    return jax.eval_shape(init, jax.random.key(0))
