@@ -12,7 +12,7 @@ import os
 import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NoReturn, TypeVar
 
 import jax
@@ -129,6 +129,41 @@ def agree(value: Any) -> Any:
     size = multihost_utils.broadcast_one_to_all(np.asarray(len(text), np.int32))
     padded = np.frombuffer(text.ljust(int(size), b" "), np.uint8)
     return json.loads(bytes(multihost_utils.broadcast_one_to_all(padded)))
+
+
+def first(work: Callable[[], Any]) -> Any:
+    """Do what one process does for all: the first one does it, and all get its result.
+
+    Args:
+        work: returns something that JSON holds.
+
+    Raises:
+        UserError: what was raised in the first process, in all of them.
+    """
+    outcome: dict[str, Any] = {}
+    if is_primary():
+        try:
+            outcome = {"result": work()}
+        except (UserError, OSError) as error:
+            if jax.process_count() == 1:
+                raise
+            outcome = {"refused": str(error)}
+    outcome = agree(outcome)
+    if "refused" in outcome:
+        raise UserError(outcome["refused"])
+    return outcome["result"]
+
+
+@contextlib.contextmanager
+def entered_by_first(context: contextlib.AbstractContextManager[Any]) -> Iterator[None]:
+    """Let the first process enter a context for all of them; raises as ``first`` does."""
+    with contextlib.ExitStack() as held:
+
+        def enter() -> None:
+            held.enter_context(context)
+
+        first(enter)
+        yield
 
 
 def gather(tree: T) -> T:
