@@ -57,7 +57,7 @@ class Checkpoints:
 
     def __init__(self, run: Path, config: Config, stage: Stage, say: Callable[[str], None] = print):
         self.run = run
-        self.folder = (run / shelf.FOLDER / stage.name).resolve()
+        self.folder = shelf.of(run, stage.name).resolve()
         self.config = config
         self.stage = stage
         self._writer = ocp.AsyncCheckpointer(ocp.CompositeCheckpointHandler())

@@ -58,7 +58,7 @@ def _checkpoints(run: Path) -> list[Path]:
     have = (int(words.get("stage", 0)), int(words.get("step", 0)))
     found: dict[tuple[int, int], Path] = {}
     for stage in stages.STAGES:
-        folder = run / shelf.FOLDER / stage.name
+        folder = shelf.of(run, stage.name)
         for step in shelf.steps(folder):
             found[stage.number, step] = folder / str(step)
     return [found[when] for when in sorted(found, reverse=True) if when > have]

@@ -28,6 +28,11 @@ WRITING = ".writing"
 _REMOVED = ".removed"
 
 
+def of(run: Path, stage: str) -> Path:
+    """Return the folder of the checkpoints of a run's stage."""
+    return run / FOLDER / stage
+
+
 def steps(folder: Path) -> list[int]:
     """Return the numbers of the checkpoints that were once whole, in ascending order."""
     if not folder.is_dir():
