@@ -21,7 +21,7 @@ from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.memory import feature_cache
-from pewm_jax.training import runs, sharding, stages
+from pewm_jax.training import processes, runs, sharding, stages
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.feed import Feed
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, duration
@@ -72,7 +72,11 @@ def train(
         sharding.require_divisible(config, stage, mesh)
     run = runs.check(config)
     bad = BadRecords(config.data.bad_records)
-    with runs.alone(run), Stop(config.train.grace_s) as stop:
+    alone, agreed = jax.process_count() == 1, processes.Votes().cast
+    with (
+        runs.alone(run),
+        Stop(config.train.grace_s, agreed=agreed, alone=alone) as stop,
+    ):
         runs.prepare(config)
         if runs.is_finished(run, config):
             say(f"{run} is already trained: nothing to do.")
@@ -84,7 +88,7 @@ def train(
             )
             trained = worker.train(start)
             start = functools.partial(_same, trained)
-            if stop.number is not None and stage is not planned[-1]:
+            if stop.told and stage is not planned[-1]:
                 raise stop.interrupted(stage.number, stage.settings(config).steps)
     say(f"Trained: {run / runs.WEIGHTS}")
     return run
@@ -236,7 +240,7 @@ class _Worker:
                     self._tell(*pending)
                 pending = (step, metrics)
                 self.watch.pace.pause(traced.after(step, metrics))
-                last, told = step == settings.steps, self.stop.due(step) is not None
+                last, told = step == settings.steps, self.stop.due()
                 save = last or told or step % config.train.save_every == 0
                 show = self._wants_preview(step) and not told
                 if save or show:

@@ -48,10 +48,9 @@ class Stop:
 
     Args:
         grace_s: seconds after the first signal within which the process has left.
-        agreed: ``agreed(step, number)`` is called after every step with the signal that came here,
-            if any, and returns the one after which all processes of a job stop at this step.
-        alone: whether this process may break off what others do not wait for; False in a job of
-            several processes, which take all steps together.
+        agreed: called after every step with the signal that came to this process, if any; returns
+            the one at which all processes of the job stop after this step, if any.
+        alone: whether this is the only process; others would wait for what it breaks off.
 
     Attributes:
         number: the signal that came, None until one does.
@@ -65,14 +64,15 @@ class Stop:
         self,
         grace_s: float = 30.0,
         *,
-        agreed: Callable[[int, int | None], int | None] = lambda _step, number: number,
+        agreed: Callable[[int | None], int | None] = lambda number: number,
         alone: bool = True,
     ) -> None:
         self.number: int | None = None
         self.at_once = True
-        self.kept: Callable[[], str] = lambda: "nothing new was saved"
+        self.kept: Callable[[], str] = lambda: "nothing was saved yet"
         self._grace_s, self._agreed, self._alone = grace_s, agreed, alone
         self._breakable = False
+        self._told = False
         self._before: dict[int, object] = {}
         self._asked: float | None = None
         self._deadline: float | None = None
@@ -105,13 +105,17 @@ class Stop:
         os.close(self._read)
         os.close(self._write)
 
-    def due(self, step: int) -> int | None:
-        """Return the signal after which training stops at this step, if it does.
+    def due(self) -> bool:
+        """Tell whether training stops after this step; asked once a step by all processes."""
+        agreed = self._agreed(self.number)
+        if agreed is not None:
+            self.number, self._told = agreed, True
+        return self._told
 
-        Called once after every step, by every process of a job.
-        """
-        self.number = self._agreed(step, self.number)
-        return self.number
+    @property
+    def told(self) -> bool:
+        """Whether training stops, as far as is known without asking other processes."""
+        return self._told or (self._alone and self.number is not None)
 
     def unless_told(self, work: Callable[[], T]) -> T | None:
         """Do what a signal may break off; returns None where one came, before or meanwhile."""
@@ -161,7 +165,7 @@ class Stop:
                     self._ask(number)
                 elif time.monotonic() - self._asked > ONE_S:
                     self._leave(
-                        f"Left at once; {self.kept()}: the same command goes on from there."
+                        f"Left at once ({self.kept()}); the same command goes on from there."
                     )
 
     def _ask(self, number: int) -> None:
@@ -190,14 +194,12 @@ class Stop:
             self._grant()  # the first step was done just when the signal came
             return
         self._leave(
-            f"Left before saving was done, since the {self._grace_s:g} s of train.grace_s are "
-            f"over; {self.kept()}: the same command goes on from there."
+            f"Left before saving was done, for the {self._grace_s:g} s of train.grace_s are over "
+            f"({self.kept()}); the same command goes on from there."
         )
 
     def _nothing_new(self) -> str:
-        return (
-            f"Stopped with nothing new to save; {self.kept()}: the same command goes on from there."
-        )
+        return f"Stopped with nothing new to save ({self.kept()}); the same command goes on."
 
     def _leave(self, sentence: str) -> NoReturn:
         _tell(sentence)
