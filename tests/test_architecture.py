@@ -30,6 +30,7 @@ HOMES = {
     "orbax": {"training/checkpoint"},
     "embreex": {"data"},
     "trimesh": {"data"},
+    "ray": {"data/engines"},
     "torch": {"convert"},
     "transformers": {"convert"},
     "diffusers": set(),

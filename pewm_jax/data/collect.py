@@ -1,29 +1,20 @@
-"""Collect a dataset with several processes, so that nothing half-made is ever taken for whole.
+"""Collect a dataset with many workers, so that nothing half-made is ever taken for whole.
 
 The unit of work is a shard. A shard is written aside and renamed, ``dataset.json`` is written when
 all shards of a split are there: a collection that was killed goes on with the missing shards, and
-neither that nor the number of processes leaves a trace in the files.
+neither that nor who made the shards (see ``engines``) leaves a trace in the files.
 """
 
 from __future__ import annotations
 
-import concurrent.futures
 import contextlib
-import dataclasses
 import json
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import wait
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
-
 from pewm_jax.config import ConfigError, UserError
+from pewm_jax.data import engines
 from pewm_jax.data.dataset import (
     MANIFEST,
     UNFINISHED,
@@ -34,26 +25,12 @@ from pewm_jax.data.dataset import (
     read_manifest,
     write_json,
     write_manifest,
-    write_shard,
 )
+from pewm_jax.data.engines import Job
 from pewm_jax.data.progress import Meter
-from pewm_jax.data.recording import SPLITS, CollectConfig, dashed, make_episode, settings_of
+from pewm_jax.data.recording import SPLITS, CollectConfig, dashed, settings_of
 
 State = Literal["fresh", "resume", "complete"]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Job:
-    """One shard to make."""
-
-    config: CollectConfig
-    split: str
-    path: Path
-    indices: range
-
-    def run(self) -> Shard:
-        write_shard(self.path, (make_episode(self.config, self.split, i) for i in self.indices))
-        return describe_shard(self.path)
 
 
 def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
@@ -64,8 +41,8 @@ def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
         say: receives the lines to show.
 
     Raises:
-        UserError: a mesh that cannot be walked in, a dataset of other settings in the way, or a
-            worker process that died.
+        UserError: a mesh that cannot be walked in, a dataset of other settings in the way, a
+            worker process that died, or a cluster that cannot be reached.
     """
     for path in config.scene:
         if not path.is_file():
@@ -80,15 +57,19 @@ def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
         return
     if config.scene and len(config.scene) < len(wanted):
         say(f"fewer meshes ({len(config.scene)}) than splits: the splits share their scenes.")
-    jobs: dict[str, list[_Job]] = {split: _jobs(config, split) for split in todo}
+    engines.require(config)
+    jobs: dict[str, list[Job]] = {split: _jobs(config, split) for split in todo}
     done = {split: _prepare(config, split, states[split], jobs[split]) for split in todo}
     missing = [job for split in todo for job in jobs[split] if job.path.name not in done[split]]
     if any(done.values()):
         there = sum(len(shards) for shards in done.values())
         say(f"resuming: {there} files are there, {len(missing)} are missing.")
     frames = sum(len(job.indices) for job in missing) * config.frames
-    with Meter(f"collecting {config.out}", frames, "frames") as meter:
-        for job, shard in _run(missing, config.workers or os.cpu_count() or 1):
+    with (
+        Meter(f"collecting {config.out}", frames, "frames") as meter,
+        contextlib.closing(engines.run(missing, config, say)) as made,
+    ):
+        for job, shard in made:
             done[job.split][shard.file] = shard
             meter.advance(len(job.indices) * config.frames)
     for split in todo:
@@ -96,11 +77,11 @@ def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
     say(meter.summary())
 
 
-def _jobs(config: CollectConfig, split: str) -> list[_Job]:
+def _jobs(config: CollectConfig, split: str) -> list[Job]:
     episodes, per = config.episodes(split), config.shard_episodes
     count = -(-episodes // per)
     return [
-        _Job(
+        Job(
             config,
             split,
             config.out / split / f"shard-{i:05d}-of-{count:05d}.array_record",
@@ -146,7 +127,7 @@ def _read_settings(path: Path) -> Mapping[str, Any]:
         raise UserError(f"{path} does not parse; delete its folder and collect again.") from None
 
 
-def _prepare(config: CollectConfig, split: str, state: State, jobs: list[_Job]) -> dict[str, Shard]:
+def _prepare(config: CollectConfig, split: str, state: State, jobs: list[Job]) -> dict[str, Shard]:
     """Mark a split as unfinished, clear away what is not whole, and return what is."""
     folder = config.out / split
     folder.mkdir(parents=True, exist_ok=True)
@@ -170,7 +151,7 @@ def _prepare(config: CollectConfig, split: str, state: State, jobs: list[_Job]) 
     return whole
 
 
-def _whole(job: _Job) -> Shard | None:
+def _whole(job: Job) -> Shard | None:
     if not job.path.is_file():
         return None
     try:
@@ -184,60 +165,3 @@ def _publish(config: CollectConfig, split: str, shards: list[Shard]) -> None:
     frames = config.episodes(split) * config.frames
     write_manifest(folder, Manifest(split, tuple(shards), settings_of(config, split), frames))
     (folder / UNFINISHED).unlink(missing_ok=True)
-
-
-def _run(jobs: list[_Job], workers: int) -> Iterator[tuple[_Job, Shard]]:
-    """Make shards, in this process or in several, as they get ready."""
-    if min(workers, len(jobs)) <= 1:
-        for job in jobs:
-            yield job, job.run()
-        return
-    others = set(multiprocessing.active_children())
-    done = False
-    # Spawned, not forked: JAX has threads, and a fork of a process with threads may hang.
-    pool = concurrent.futures.ProcessPoolExecutor(
-        min(workers, len(jobs)), multiprocessing.get_context("spawn"), _start_worker
-    )
-    try:
-        with _deaf():  # workers are spawned here, and inherit it before any line of theirs runs
-            futures = {pool.submit(job.run): job for job in jobs}
-        for future in concurrent.futures.as_completed(futures):
-            yield futures[future], future.result()
-        done = True
-    except BrokenProcessPool:
-        raise UserError(
-            "a worker process died (killed, or out of memory); run the same command again to go "
-            "on, with fewer --workers if memory is short."
-        ) from None
-    finally:
-        if not done:  # what they are writing is marked as partial, and is made again
-            for worker in set(multiprocessing.active_children()) - others:
-                worker.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _deaf() -> Iterator[None]:
-    """Ignore Ctrl-C for a moment, here and for ever in the processes spawned meanwhile."""
-    if threading.current_thread() is not threading.main_thread():  # others cannot set signals
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
-
-
-def _start_worker() -> None:
-    """Prepare a worker: one thread, deaf to Ctrl-C (its parent ends it), gone with its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    cv2.setNumThreads(1)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-
-        def follow() -> None:
-            wait([parent.sentinel])
-            os._exit(1)
-
-        threading.Thread(target=follow, daemon=True).start()

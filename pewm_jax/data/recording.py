@@ -25,6 +25,8 @@ from pewm_jax.types import Camera
 SPLITS = ("train", "validation", "revisit")
 """Folders written; ``revisit`` holds the test scenes, walked out and back."""
 HOUSES_PER_SEED = 1_000_000
+_FREE = ("out", "workers", "engine", "address", "overwrite")
+"""Settings that do not show in the files."""
 HEADROOM_M = 0.1
 """Free room above the camera where the agent may stand, metres."""
 
@@ -72,6 +74,12 @@ class CollectConfig:
     """Seed of houses and trajectories."""
     workers: int = 0
     """Processes; 0 = as many as there are CPU cores. The result does not depend on it."""
+    engine: Literal["processes", "ray"] = "processes"
+    """Who makes the shards: `processes` of this machine, or a `ray` cluster (pip install
+    'pewm-jax[ray]'). The result does not depend on it."""
+    address: str = ""
+    """With `--engine ray`: HOST:PORT of the cluster, or `auto` on one of its machines; empty
+    starts one of this machine alone."""
     shard_episodes: int = 8
     """Episodes per file."""
     overwrite: bool = False
@@ -97,6 +105,14 @@ class CollectConfig:
             raise ConfigError(f"--hfov is {self.hfov}: use 1 up to below 180 degrees.")
         if self.frames < 2:
             raise ConfigError("--frames is 1: an episode needs at least 2 frames.")
+        self._check_address()
+
+    def _check_address(self) -> None:
+        if self.address and self.engine != "ray":
+            raise ConfigError(f"--address {self.address} needs --engine ray.")
+        port = self.address.rpartition(":")[2]
+        if self.address not in ("", "auto") and not port.isdecimal():
+            raise ConfigError(f"--address is {self.address!r}: use HOST:PORT or auto.")
 
     @property
     def actions(self) -> ActionConfig:
@@ -111,7 +127,7 @@ class CollectConfig:
 def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
     """Return what determines the bytes of a split, as plain values."""
     settings = dataclasses.asdict(config)
-    for name in ("out", "train", "validation", "test", "workers", "overwrite"):
+    for name in (*_FREE, "train", "validation", "test"):
         del settings[name]
     settings["scene"] = [f"{p.name} ({p.stat().st_size} bytes)" for p in config.scene]
     return {"made_by": "collect", "episodes": config.episodes(split), **settings}

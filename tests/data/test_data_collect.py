@@ -19,8 +19,9 @@ import pytest
 import trimesh
 
 from pewm_jax.config import ConfigError, UserError
+from pewm_jax.data import engines
 from pewm_jax.data.checks import check_episode
-from pewm_jax.data.collect import _run, collect
+from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import EpisodeSource, write_shard
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.recording import CollectConfig, house_seed, make_episode, scenes_of
@@ -182,9 +183,9 @@ def test_workers_are_born_deaf_to_an_interruption(monkeypatch):
     class Job:
         run = functools.partial(signal.getsignal, signal.SIGINT)
 
-    monkeypatch.setattr("pewm_jax.data.collect._start_worker", os.getpid)  # it comes too late
+    monkeypatch.setattr("pewm_jax.data.engines._start_worker", os.getpid)  # it comes too late
     before = signal.getsignal(signal.SIGINT)
-    heard = [handler for _, handler in _run([Job(), Job()], workers=2)]
+    heard = [handler for _, handler in engines.on_processes([Job(), Job()], workers=2)]
     assert heard == [signal.SIG_IGN] * 2
     assert signal.getsignal(signal.SIGINT) is before
 

@@ -1,0 +1,301 @@
+"""Who makes the shards: this process, several of this machine, or those of a Ray cluster.
+
+A shard is a pure function of the settings and its number, so that it does not show in the files
+who made them. Machines of a cluster send the bytes of a shard back and see no common folder.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import hashlib
+import importlib
+import importlib.metadata
+import multiprocessing
+import os
+import platform
+import signal
+import socket
+import tempfile
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from pewm_jax.config import UserError
+from pewm_jax.data.dataset import Shard, describe_shard, write_shard
+from pewm_jax.data.recording import CollectConfig, make_episode
+
+AHEAD = 2
+"""Shards given to a cluster for each of its processors: one that is made and one that waits."""
+CONNECT_S = 10.0
+"""How long a cluster may take to answer."""
+PATIENCE_S = 5.0
+"""How long the shards that are not wanted any more may take to be given up."""
+DIED = (
+    "a worker process died (killed, or out of memory); run the same command again to go on, with "
+    "fewer --workers if memory is short."
+)
+QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+"""Ray's own switches: no reports on its users, no warning about GPUs that nobody uses here."""
+LIBRARIES = ("numpy", "scipy", "trimesh", "embreex", "opencv-python-headless", "array_record")
+"""What the bytes of a shard depend on beside this library's own code."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One shard to make.
+
+    Attributes:
+        config: the settings of the collection.
+        split: name of the split.
+        path: the file to write.
+        indices: its episodes.
+    """
+
+    config: CollectConfig
+    split: str
+    path: Path
+    indices: range
+
+    def run(self) -> Shard:
+        """Write the file, aside and then renamed."""
+        write_shard(self.path, (make_episode(self.config, self.split, i) for i in self.indices))
+        return describe_shard(self.path)
+
+
+def run(
+    jobs: list[Job], config: CollectConfig, say: Callable[[str], None] = print
+) -> Generator[tuple[Job, Shard]]:
+    """Make shards with the engine that the settings name; yields them as they get ready.
+
+    Args:
+        jobs: the shards.
+        config: ``engine``, ``address`` and ``workers`` count.
+        say: receives the lines to show.
+
+    Raises:
+        UserError: a worker died, the cluster cannot be reached or cannot make the same shards,
+            or an episode cannot be made.
+    """
+    if config.engine == "ray":
+        return on_cluster(jobs, config, say)
+    return on_processes(jobs, config.workers or os.cpu_count() or 1)
+
+
+def on_processes(jobs: list[Job], workers: int) -> Generator[tuple[Job, Shard]]:
+    """Make shards in this process or in several of this machine."""
+    if min(workers, len(jobs)) <= 1:
+        for job in jobs:
+            yield job, job.run()
+        return
+    others = set(multiprocessing.active_children())
+    done = False
+    # Spawned, not forked: JAX has threads, and a fork of a process with threads may hang.
+    pool = concurrent.futures.ProcessPoolExecutor(
+        min(workers, len(jobs)), multiprocessing.get_context("spawn"), _start_worker
+    )
+    try:
+        with _deaf():  # workers are spawned here, and inherit it before any line of theirs runs
+            futures = {pool.submit(job.run): job for job in jobs}
+        for future in concurrent.futures.as_completed(futures):
+            yield futures[future], future.result()
+        done = True
+    except BrokenProcessPool:
+        raise UserError(DIED) from None
+    finally:
+        if not done:  # what they are writing is marked as partial, and is made again
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.terminate()
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _deaf() -> Iterator[None]:
+    """Ignore Ctrl-C for a moment, here and for ever in the processes spawned meanwhile."""
+    if threading.current_thread() is not threading.main_thread():  # others cannot set signals
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
+
+
+def _start_worker() -> None:
+    """Prepare a worker: one thread, deaf to Ctrl-C (its parent ends it), gone with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(1)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+
+        def follow() -> None:
+            wait([parent.sentinel])
+            os._exit(1)
+
+        threading.Thread(target=follow, daemon=True).start()
+
+
+def on_cluster(
+    jobs: list[Job], config: CollectConfig, say: Callable[[str], None] = print
+) -> Generator[tuple[Job, Shard]]:
+    """Make shards on the machines of a Ray cluster; arguments and errors as for ``run``.
+
+    Few shards are given out at a time, so that what comes back never fills the cluster's memory,
+    and always more than there are processors, so that a cluster that grows on demand does.
+    """
+    ray = _import_ray()
+    with _cluster(ray, config, say):
+        make = ray.remote(num_cpus=1)(make_bytes)
+        software = software_here()
+        waiting, going = list(reversed(jobs)), {}
+        try:
+            while waiting or going:
+                processors = int(ray.cluster_resources().get("CPU", 1))
+                while waiting and len(going) < (config.workers or AHEAD * max(processors, 1)):
+                    job = waiting.pop()
+                    going[make.remote(_reachable(job), software)] = job
+                ready, _ = ray.wait(list(going), num_returns=1)
+                job = going.pop(ready[0])
+                yield job, _place(job.path, *ray.get(ready[0]))
+        except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, UserError):
+                raise UserError(str(error.cause)) from None
+            raise
+        except ray.exceptions.RayError:
+            raise UserError(DIED) from None
+        finally:
+            for reference in going:
+                with contextlib.suppress(ray.exceptions.RayError):
+                    ray.cancel(reference)
+            if going:
+                ray.wait(list(going), num_returns=len(going), timeout=PATIENCE_S)
+
+
+def make_bytes(job: Job, software: Mapping[str, str]) -> tuple[Shard, bytes]:
+    """Make a shard on another machine: its description and the bytes of its file.
+
+    Args:
+        job: the shard; only the last part of its path counts.
+        software: what the machine that asks has, see ``software_here``.
+
+    Raises:
+        UserError: this machine has other software, or a mesh is not there.
+    """
+    here = software_here()
+    for name in software:
+        if here[name] != software[name]:
+            raise UserError(
+                f"{platform.node()} has {name} {here[name]}, the machine that asks has "
+                f"{software[name]}: install the same on every machine of the cluster, since the "
+                "shards could differ."
+            )
+    for path in job.config.scene:
+        if not path.is_file():
+            raise UserError(
+                f"{path} does not exist on {platform.node()}; put the meshes of --scene into the "
+                "same place on every machine of the cluster."
+            )
+    cv2.setNumThreads(1)
+    with tempfile.TemporaryDirectory(prefix="pewm-collect-") as folder:
+        shard = dataclasses.replace(job, path=Path(folder) / job.path.name)
+        return shard.run(), shard.path.read_bytes()
+
+
+def software_here() -> dict[str, str]:
+    """Return the versions that a shard's bytes depend on; of this library, a hash of its code."""
+    root = Path(__file__).parents[1]
+    code = hashlib.sha256()
+    for chapter in ("config", "geometry", "data"):
+        for path in sorted((root / chapter).glob("*.py")):
+            code.update(path.name.encode() + path.read_bytes())
+    versions = {name: importlib.metadata.version(name) for name in LIBRARIES}
+    return {"pewm_jax with hash": code.hexdigest()[:12], **versions}
+
+
+def require(config: CollectConfig) -> None:
+    """Make sure that the engine can be used, before anything is touched.
+
+    Raises:
+        UserError: Ray is not installed, or nothing answers at the address.
+    """
+    if config.engine != "ray":
+        return
+    _import_ray()
+    host, colon, port = config.address.rpartition("/")[2].rpartition(":")
+    if colon:  # Ray itself would wait for a quarter of an hour
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
+        except OSError as error:
+            raise UserError(_no_cluster(config, error.strerror or str(error))) from None
+
+
+def _import_ray() -> Any:
+    """Import Ray, which is heavy, wants to report on its users, and is not always there."""
+    for name, value in QUIET.items():
+        os.environ.setdefault(name, value)
+    try:
+        return importlib.import_module("ray")
+    except ImportError:
+        raise UserError(
+            "--engine ray needs Ray, which is not installed: pip install 'pewm-jax[ray]'."
+        ) from None
+
+
+def _no_cluster(config: CollectConfig, reason: str) -> str:
+    where = f"at --address {config.address}" if config.address else "on this machine"
+    return (
+        f"there is no Ray cluster {where} ({reason}); start one with `ray start --head` "
+        "(RAY_AUTH_MODE=token where it asks for one), or leave out --engine ray."
+    )
+
+
+@contextlib.contextmanager
+def _cluster(ray: Any, config: CollectConfig, say: Callable[[str], None]) -> Iterator[None]:
+    """Use the cluster that this process has joined, or join one, or start one of this machine."""
+    if ray.is_initialized():
+        yield
+        return
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if not config.address:
+        quiet |= {"num_cpus": config.workers or os.cpu_count() or 1, "include_dashboard": False}
+    try:
+        ray.init(address=config.address or "local", **quiet)
+    except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+        reason = " ".join(str(error).split()).partition(". ")[0]
+        raise UserError(_no_cluster(config, reason[:160])) from None
+    try:
+        machines = sum(node["Alive"] for node in ray.nodes())
+        processors = ray.cluster_resources().get("CPU", 0)
+        say(f"ray: {processors:.0f} processors of {machines} machine{'s'[: machines > 1]}.")
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _reachable(job: Job) -> Job:
+    """Return the job with meshes named by where they are for a process of any folder."""
+    scene = tuple(path.absolute() for path in job.config.scene)
+    return dataclasses.replace(job, config=dataclasses.replace(job.config, scene=scene))
+
+
+def _place(path: Path, made: Shard, content: bytes) -> Shard:
+    """Write a shard that came from elsewhere, aside and then renamed, and compare its hash."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        if hashlib.sha256(content).hexdigest() != made.sha256:
+            raise UserError(f"{path} arrived damaged; run the same command again to go on.")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return made

@@ -1,0 +1,183 @@
+"""Collecting on a Ray cluster: the very files of the local pool, the same words at its end."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pewm_jax.config import ConfigError, UserError
+from pewm_jax.data import engines
+from pewm_jax.data.__main__ import main
+from pewm_jax.data.collect import collect
+from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.engines import Job
+from pewm_jax.data.recording import CollectConfig
+
+ROOT = Path(__file__).parents[2]
+SMALL = {"train": 3, "validation": 0, "test": 1, "frames": 30, "size": 16, "shard_episodes": 1}
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two processors of this machine, with this module's functions known to the workers."""
+    ray = pytest.importorskip("ray", reason="collecting on a cluster needs pewm-jax[ray]")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in engines.QUIET.items():
+            patch.setenv(name, value)
+        ray.init(
+            address="local",
+            num_cpus=2,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level="ERROR",
+        )
+        yield ray
+        ray.shutdown()
+
+
+def fingerprints(folder):
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def jobs(out, count, **settings):
+    config = CollectConfig(out, **{**SMALL, "engine": "ray", **settings})
+    return [Job(config, "train", out / f"{k}.array_record", range(k, k + 1)) for k in range(count)]
+
+
+def test_a_cluster_makes_the_very_files_of_the_local_pool_and_only_those_that_miss(
+    cluster, tmp_path
+):
+    collect(CollectConfig(tmp_path / "pool", workers=1, **SMALL))
+    want = fingerprints(tmp_path / "pool")
+    there = CollectConfig(tmp_path / "ray", engine="ray", **SMALL)
+    collect(there)
+    assert fingerprints(there.out) == want
+
+    lost, kept = sorted(there.out.glob("train/*.array_record"))[:2]
+    lost.unlink()
+    made = kept.stat().st_mtime_ns
+    said = []
+    collect(there, said.append)
+    assert said[0] == "resuming: 2 files are there, 1 are missing."
+    assert fingerprints(there.out) == want
+    assert kept.stat().st_mtime_ns == made
+
+    collect(CollectConfig(there.out, **SMALL), said.append)
+    assert "nothing to do" in said[-1], "the engine is no setting of the files"
+
+
+@pytest.mark.parametrize(
+    ("broken", "says"),
+    [
+        (lambda job, software: os._exit(1), "a worker process died .*run the same command again"),
+        (
+            lambda job, software: engines.make_bytes(job, {**software, "numpy": "1.0"}),
+            "has numpy .*, the machine that asks has 1.0: install the same on every machine",
+        ),
+        (
+            lambda job, software: (engines.make_bytes(job, software)[0], b"other bytes"),
+            "arrived damaged; run the same command again",
+        ),
+    ],
+    ids=["died", "other software", "damaged"],
+)
+def test_what_goes_wrong_elsewhere_is_a_sentence_here(cluster, tmp_path, monkeypatch, broken, says):
+    monkeypatch.setattr(engines, "make_bytes", broken)
+    (job,) = jobs(tmp_path, 1)
+    with pytest.raises(UserError, match=says):
+        list(engines.run([job], job.config))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_meshes_are_named_where_they_are_missing(cluster, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (job,) = jobs(tmp_path, 1, scene=(Path("here.ply"),))
+    with pytest.raises(UserError, match=f"{tmp_path}/here.ply does not exist on .* every machine"):
+        list(engines.run([job], job.config))
+
+
+def test_the_rest_is_given_up_when_it_is_not_wanted_any_more(cluster, tmp_path, monkeypatch):
+    given_up = []
+    cancel = cluster.cancel
+    monkeypatch.setattr(cluster, "cancel", lambda ref: (given_up.append(ref), cancel(ref)))
+    many = jobs(tmp_path, 40)
+    made = engines.run(many, many[0].config)
+    next(made)
+    made.close()
+    assert len(given_up) == 2 * engines.AHEAD - 1
+    assert len(list(tmp_path.iterdir())) == 1
+    limit = time.monotonic() + 20
+    while cluster.available_resources().get("CPU") != 2 and time.monotonic() < limit:
+        time.sleep(0.05)
+    assert cluster.available_resources()["CPU"] == 2
+
+
+def test_ctrl_c_ends_the_cluster_that_was_started_and_the_pool_goes_on(tmp_path):
+    pytest.importorskip("ray", reason="collecting on a cluster needs pewm-jax[ray]")
+    options = {**SMALL, "train": 200, "test": 0}
+    flags = [f"--{k.replace('_', '-')}={v}" for k, v in options.items()]
+    flags += ["--engine=ray", "--workers=2"]
+    process = subprocess.Popen(
+        [sys.executable, "-W", "error", "-m", "pewm_jax.data", "collect", str(tmp_path), *flags],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"},
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    limit = time.monotonic() + 60
+    while not list(tmp_path.glob("train/*.array_record")) and time.monotonic() < limit:
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (
+        130,
+        "Interrupted; the same command goes on where it was.\n",
+    )
+    assert "ray: 2 processors of 1 machine.\n" in out
+    with pytest.raises(UserError, match="did not finish"):
+        EpisodeSource(tmp_path / "train")
+    there = len(list(tmp_path.glob("train/*.array_record")))
+    assert list(tmp_path.glob("train/*.partial")) == []
+
+    assert 1 <= there < 200
+
+
+def test_an_engine_that_cannot_be_used_is_refused_before_anything_is_touched(
+    tmp_path, monkeypatch, capsys
+):
+    flags = ["collect", str(tmp_path / "out"), "--engine", "ray"]
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert main(flags) == 2
+    assert "pip install 'pewm-jax[ray]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cluster_that_does_not_answer_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", object())
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+        flags = ["collect", str(tmp_path / "out"), "--engine", "ray", "--address", address]
+        assert main(flags) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"error: there is no Ray cluster at --address {address} (Connection refu")
+    assert err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_address_without_its_engine_or_port_is_refused():
+    with pytest.raises(ConfigError, match="needs --engine ray"):
+        CollectConfig(Path("x"), address="auto")
+    with pytest.raises(ConfigError, match="use HOST:PORT or auto"):
+        CollectConfig(Path("x"), engine="ray", address="machine")
