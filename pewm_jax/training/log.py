@@ -17,6 +17,8 @@ import tensorboardX
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from pewm_jax.training import processes
+
 LINE_EVERY_S = 10.0
 """Seconds between lines of the live view where the output is not a terminal."""
 
@@ -25,7 +27,7 @@ class MetricsLog:
     """Appends scalars to ``metrics.jsonl`` and to TensorBoard; a context manager.
 
     What a run logged beyond the step it is resumed from is dropped, so that every step stands
-    there once.
+    there once. Of several processes only the first writes.
 
     Args:
         run: the run's folder.
@@ -35,6 +37,9 @@ class MetricsLog:
 
     def __init__(self, run: Path, stage: int, step: int):
         self._stage = stage
+        self._writes = processes.is_primary()
+        if not self._writes:
+            return
         path = run / "metrics.jsonl"
         drop_after(path, stage, step)
         self._file = path.open("a")
@@ -51,11 +56,14 @@ class MetricsLog:
         error: BaseException | None,
         trace: types.TracebackType | None,
     ) -> None:
-        self._file.close()
-        self._events.close()
+        if self._writes:
+            self._file.close()
+            self._events.close()
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Log the scalars of one step."""
+        if not self._writes:
+            return
         line = {"stage": self._stage, "step": step, **metrics, "time": round(time.time(), 3)}
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()

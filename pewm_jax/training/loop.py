@@ -23,7 +23,7 @@ from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.memory import feature_cache
 from pewm_jax.training import processes, runs, sharding, stages
 from pewm_jax.training.checkpoint import Checkpoints
-from pewm_jax.training.feed import Feed
+from pewm_jax.training.feed import Feed, rows_of
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, duration
 from pewm_jax.training.profile import Profile
 from pewm_jax.training.signals import Stop
@@ -74,11 +74,11 @@ def train(
     bad = BadRecords(config.data.bad_records)
     alone, agreed = jax.process_count() == 1, processes.Votes().cast
     with (
-        runs.alone(run),
+        processes.entered_by_first(runs.alone(run)),
         Stop(config.train.grace_s, agreed=agreed, alone=alone) as stop,
     ):
-        runs.prepare(config)
-        if runs.is_finished(run, config):
+        processes.first(lambda: str(runs.prepare(config)))
+        if processes.first(lambda: runs.is_finished(run, config)):
             say(f"{run} is already trained: nothing to do.")
             return run
         start: Callable[[], Params | None] = functools.partial(_named, config, planned[0], say)
@@ -205,6 +205,7 @@ class _Worker:
         """Do the steps after ``done``, once the first batch is there; returns the last state."""
         config, settings = self.config, self.settings
         cache = _features(config, self.stage)
+        where = sharding.of_batch(self.mesh)
         batches = loader.clips(
             config,
             "train",
@@ -213,23 +214,26 @@ class _Worker:
             start_step=done,
             features=cache and functools.partial(feature_cache.features, cache),
             bad=self.bad,
+            rows=rows_of(where, settings.batch),
         )
         key = jax.device_put(stage_key(config, self.stage), sharding.replicated(self.mesh))
         traced = Profile(
             self.path,
             self.stage.name,
-            steps=self.profile,
+            steps=self.profile if processes.is_primary() else 0,
             first=done + 1,
             last=settings.steps,
             say=self.view.say,
         )
-        with Feed(iter(batches), sharding.of_batch(self.mesh)) as feed, closing(traced):
+        with Feed(iter(batches), where, settings.batch) as feed, closing(traced):
             clip = next(feed)
             state, step_fn = self._compile(make_state, clip)
             if cache is not None:
-                weights = state.params.get("encoder", {})
-                where = Path(config.data.path) / "train"
-                feature_cache.require_fresh(cache, config.memory, weights, where)
+                weights = processes.gather(state.params.get("encoder", {}))
+                split = Path(config.data.path) / "train"
+                processes.first(
+                    lambda: feature_cache.require_fresh(cache, config.memory, weights, split)
+                )
             self.watch.pace = Pace(time.monotonic())
             pending: tuple[int, Metrics] | None = None
             for step in range(done + 1, settings.steps + 1):
@@ -286,7 +290,9 @@ class _Worker:
         if not self.shown:
             self.view.say(f"stage {number}: compiling the sampler for pictures …")
         self.shown = True
-        params = inference_params(self.stage, state)
+        params = processes.gather(inference_params(self.stage, state))
+        if not processes.is_primary():
+            return {}
         with self._paused():
             try:
                 made = self.stop.unless_told(lambda: preview(params, number, step))

@@ -23,7 +23,7 @@ from typing import Any
 from pewm_jax import config as configuration
 from pewm_jax import weights
 from pewm_jax.config import Config, ConfigError, UserError
-from pewm_jax.training import stages
+from pewm_jax.training import processes, stages
 from pewm_jax.types import Params
 
 CONFIG = "config.json"
@@ -143,9 +143,11 @@ def is_published(run: Path, stage: stages.Stage, step: int) -> bool:
 
 
 def publish(run: Path, stage: stages.Stage, step: int, params: Params) -> Path:
-    """Write the weights that ``pewm_jax.load`` reads; returns the file."""
+    """Write the weights that ``pewm_jax.load`` reads; returns the file. Called by all processes."""
     path = run / WEIGHTS
-    weights.save(path, params, _words(stage, step))
+    params = processes.gather(params)
+    if processes.is_primary():
+        weights.save(path, params, _words(stage, step))
     return path
 
 
