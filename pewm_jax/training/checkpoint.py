@@ -64,7 +64,7 @@ class Checkpoints:
         self._pool = concurrent.futures.ThreadPoolExecutor(1, "checkpoint")
         self._finishing: concurrent.futures.Future[None] | None = None
         self._began, self._interval, self._settled = time.monotonic(), 0.0, True
-        self._latest = _agreed(self.folder, say)
+        self._latest: int | None = processes.first(lambda: _tidied(self.folder, say))
         logging.getLogger("absl").addFilter(_is_not_raised_too)
 
     def __enter__(self) -> Self:
@@ -191,11 +191,13 @@ class Checkpoints:
         """
         self.wait()
         step, alone = self._require_step(), jax.process_count() == 1
-        if processes.is_primary() and not runs.is_published(self.run, self.stage, step):
-            if not alone:
-                params = _read_arrays(self.folder / str(step), params)
-            runs.publish(self.run, self.stage, step, params)
-        processes.wait(f"published {self.stage.name}")
+
+        def write() -> None:
+            if not runs.is_published(self.run, self.stage, step):
+                whole = params if alone else _read_arrays(self.folder / str(step), params)
+                runs.publish(self.run, self.stage, step, whole)
+
+        processes.first(write)
 
     def _finish(self, step: int) -> None:
         """Wait for the background, seal, name and count the checkpoint, and delete old ones."""
@@ -278,22 +280,11 @@ def _read_arrays(folder: Path, like: Params) -> Params:
         )
 
 
-def _agreed(folder: Path, say: Callable[[str], None]) -> int | None:
-    """Let the first process tidy the folder; returns the step that all processes go on from."""
-    found: dict[str, Any] = {}
-    if processes.is_primary():
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            shelf.clear(folder)
-            found = {"step": shelf.newest(folder, say)}
-        except UserError as error:
-            found = {"error": str(error)}
-        except OSError as error:
-            found = {"error": f"{folder} cannot be used ({_reason(error)}); allow access to it."}
-    found = processes.agree(found)
-    if "error" in found:
-        raise UserError(found["error"])
-    return found["step"]
+def _tidied(folder: Path, say: Callable[[str], None]) -> int | None:
+    """Tidy the folder of a stage; returns the step of its newest whole checkpoint."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shelf.clear(folder)
+    return shelf.newest(folder, say)
 
 
 @contextlib.contextmanager

@@ -21,7 +21,7 @@ from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.memory import feature_cache
-from pewm_jax.training import processes, runs, sharding, stages
+from pewm_jax.training import processes, runs, sharding, shelf, stages
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.feed import Feed, rows_of
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, duration
@@ -82,7 +82,7 @@ def train(
             say(f"{run} is already trained: nothing to do.")
             return run
         start: Callable[[], Params | None] = functools.partial(_named, config, planned[0], say)
-        for stage in planned:
+        for stage in _left(run, planned):
             worker = _Worker(
                 config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, say=say
             )
@@ -96,6 +96,12 @@ def train(
 
 def _same(params: Params) -> Params:
     return params
+
+
+def _left(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    """Leave out stages that a later one has built on: its checkpoints hold what they gave."""
+    begun = [n for n, stage in enumerate(planned) if shelf.steps(shelf.of(run, stage.name))]
+    return planned[processes.agree(max(begun, default=0)) :]
 
 
 def _require_weights(config: Config) -> None:
@@ -171,7 +177,7 @@ class _Worker:
             done = self.checkpoints.latest() or 0
             if done >= steps:
                 params = self.checkpoints.restore_weights(like)
-                runs.publish(run, stage, done, params)
+                self.checkpoints.publish(params)
                 return params
             with (
                 LiveView(f"stage {stage.number}", steps, done) as self.view,
@@ -197,8 +203,7 @@ class _Worker:
 
                 state = self.run(state_to_start_from, done)
             params = inference_params(stage, state)
-            self.checkpoints.wait()
-            runs.publish(run, stage, steps, params)
+            self.checkpoints.publish(params)
             return params
 
     def run(self, make_state: Callable[[], TrainState], done: int) -> TrainState:
@@ -216,7 +221,8 @@ class _Worker:
             bad=self.bad,
             rows=rows_of(where, settings.batch),
         )
-        key = jax.device_put(stage_key(config, self.stage), sharding.replicated(self.mesh))
+        make_key = functools.partial(stage_key, config, self.stage)
+        key = jax.jit(make_key, out_shardings=sharding.replicated(self.mesh))()
         traced = Profile(
             self.path,
             self.stage.name,
