@@ -87,10 +87,15 @@ def loss(config, params, clip, key, *, memory):
     return error, {"loss_rgb": error}
 
 
+def install(patch):
+    """Put the small model and its clips in place of the real ones."""
+    patch.setattr(world_model, "init", init)
+    patch.setattr(world_model, "flops_per_clip", lambda config, *, memory: 2.0 + memory)
+    patch.setattr(objective, "loss", loss)
+    patch.setattr(loader, "clips", clips)
+    patch.setattr(loader, "records", records)
+
+
 @pytest.fixture
 def fake_model(monkeypatch):
-    monkeypatch.setattr(world_model, "init", init)
-    monkeypatch.setattr(world_model, "flops_per_clip", lambda config, *, memory: 2.0 + memory)
-    monkeypatch.setattr(objective, "loss", loss)
-    monkeypatch.setattr(loader, "clips", clips)
-    monkeypatch.setattr(loader, "records", records)
+    install(monkeypatch)
