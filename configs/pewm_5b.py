@@ -1,0 +1,9 @@
+"""The paper's method on CogVideoX-5b: 9 frames of 512×512, 2.8 billion parameters of memory."""
+
+from configs import pewm_2b
+from pewm_jax.config import Config
+
+
+def config() -> Config:
+    """Return the settings of ``pewm_2b`` with the larger backbone."""
+    return pewm_2b.config("5b")
