@@ -16,7 +16,7 @@ from pewm_jax.evaluation.imagine import Imagination, aloud
 from pewm_jax.evaluation.pictures import as_bytes, farthest, grid, save_png
 from pewm_jax.evaluation.protocol import choose, load_clip, stack
 from pewm_jax.evaluation.video import encode_h264, side_by_side
-from pewm_jax.training.watch import Preview, Previewed
+from pewm_jax.training.watch import IMAGINED, Preview, Previewed
 from pewm_jax.types import Frames, Params
 
 SPLIT, CLIPS, SHOWN = "validation", 8, 3
@@ -58,7 +58,7 @@ def make_preview(config: Config, run: Path, say: Callable[[str], Any] = aloud) -
     def preview(params: Params, stage: int, step: int) -> Previewed:
         if stage not in models:
             models[stage] = Imagination(config, params, CLIPS, config.data.context)
-        variants = {"model": False} if stage == 1 else {"with its map": True, "empty map": False}
+        variants = {"model": False} if stage == 1 else {"memory": True, "empty": False}
         made: dict[str, Frames] = {}
         for name, memory in variants.items():
             _, _, made[name] = models[stage].run(
@@ -96,7 +96,8 @@ def _picture(clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str) -
         present = seen.rgb_THWC[-1]
         rows.append(("truth", [present, *true.rgb_THWC]))
         rows += [
-            (name, [present, *as_bytes(frames.rgb_THWC[index])]) for name, frames in made.items()
+            (IMAGINED[name], [present, *as_bytes(frames.rgb_THWC[index])])
+            for name, frames in made.items()
         ]
     count = len(clips[0][1].depth_THW)
     columns = ["observed", *(f"{index + 1}" for index in range(count))]
@@ -114,7 +115,7 @@ def _save_video(
             for name, rgb, depth in (
                 ("truth", true.rgb_THWC, true.depth_THW),
                 *(
-                    (name, as_bytes(frames.rgb_THWC[index]), frames.depth_THW[index])
+                    (IMAGINED[name], as_bytes(frames.rgb_THWC[index]), frames.depth_THW[index])
                     for name, frames in made.items()
                 ),
             )

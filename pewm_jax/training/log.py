@@ -6,6 +6,7 @@ On a terminal the live view is a progress bar, elsewhere a line every ten second
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 import types
@@ -61,13 +62,15 @@ class MetricsLog:
             self._events.close()
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Log the scalars of one step."""
+        """Log the scalars of one step; what is not finite is null in JSON, which has no such."""
         if not self._writes:
             return
-        line = {"stage": self._stage, "step": step, **metrics, "time": round(time.time(), 3)}
+        finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
+        values = {name: finite.get(name) for name in metrics}
+        line = {"stage": self._stage, "step": step, **values, "time": round(time.time(), 3)}
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()
-        for name, value in metrics.items():
+        for name, value in finite.items():
             self._events.add_scalar(name, value, step)
         self._events.flush()
 

@@ -51,7 +51,7 @@ class Profile:
             return
         if step == self._steps[0]:
             self.folder.mkdir(parents=True, exist_ok=True)
-            jax.profiler.start_trace(self.folder, create_perfetto_trace=True)
+            jax.profiler.start_trace(self.folder)
             self._tracing = True
         with jax.profiler.StepTraceAnnotation("train", step_num=step):
             yield
@@ -71,9 +71,10 @@ class Profile:
             return
         self._tracing = False
         jax.profiler.stop_trace()
-        made = sorted(self.folder.rglob("perfetto_trace.json.gz"), key=lambda p: p.stat().st_mtime)
+        made = sorted(self.folder.rglob("*.trace.json.gz"), key=lambda p: p.stat().st_mtime)
         drop = f", or drop {made[-1]} on https://ui.perfetto.dev" if made else ""
+        stage = self._stage.replace("stage", "stage ")
         self._say(
-            f"{self._stage}: traced {len(self._steps)} steps; open them with "
+            f"{stage}: traced {len(self._steps)} steps; open them with "
             f"`tensorboard --logdir {self.folder}` (and the xprof plugin){drop}"
         )

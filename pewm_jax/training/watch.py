@@ -27,13 +27,17 @@ SKIPPED = "nonfinite.jsonl"
 """In the run's folder: a line for every update that was skipped."""
 
 
+IMAGINED = {"model": "model", "memory": "with its map", "empty": "empty map"}
+"""Who imagines: stage 1's model, stage 2's with its map, and the same weights with an empty one."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Previewed:
     """What a preview made.
 
     Attributes:
         files: pictures and videos.
-        psnr: name of what was imagined → decibels against what was recorded.
+        psnr: key of ``IMAGINED`` → decibels against what was recorded.
     """
 
     files: tuple[Path, ...]
@@ -116,11 +120,11 @@ class Watch:
 
     def told_by(self, made: Previewed) -> dict[str, float]:
         """Show what a preview made; returns its numbers for the log."""
-        scores = ", ".join(f"{name} {value:.1f} dB" for name, value in made.psnr.items())
+        scores = ", ".join(f"{IMAGINED[name]} {value:.1f} dB" for name, value in made.psnr.items())
         files = " and ".join(map(str, made.files))
         where = f"sample pictures {files}"
         self.view.say(f"stage {self.stage.number}: {f'{scores}; {where}' if scores else where}")
-        return {f"psnr_{name.replace(' ', '_')}": value for name, value in made.psnr.items()}
+        return {f"psnr_{name}": value for name, value in made.psnr.items()}
 
     def _not_finite(
         self, step: int, values: Mapping[str, float], skipped: bool, kept: Callable[[], str]

@@ -296,7 +296,7 @@ def test_previews_show_each_method(run, tmp_path, stage, rows, monkeypatch):
         frames = sum(1 for _ in container.decode(stream))
         assert frames == 2 * config.clip.frames
         assert stream.width == 8 + rows * (192 + 8)
-    names = {1: {"model"}, 2: {"with its map", "empty map"}}
+    names = {1: {"model"}, 2: {"memory", "empty"}}
     assert set(made.psnr) == names[stage]
     assert all(0 < value < 60 for value in made.psnr.values())
 
@@ -319,8 +319,8 @@ def test_previews_measure_what_is_shown(run, tmp_path, monkeypatch):
     truth = np.stack([clip[1].rgb_THWC for clip in true]).astype(float)
     wrong = np.where(truth > 99, truth - 16, 99)
     errors = ((truth - wrong) ** 2).mean((2, 3, 4)) / 255**2
-    assert made.psnr["with its map"] == 100.0
-    assert made.psnr["empty map"] == pytest.approx((-10 * np.log10(errors)).mean(), abs=1e-3)
+    assert made.psnr["memory"] == 100.0
+    assert made.psnr["empty"] == pytest.approx((-10 * np.log10(errors)).mean(), abs=1e-3)
 
 
 def test_data_that_cannot_be_previewed_cost_one_line_and_not_the_training(tmp_path):

@@ -41,6 +41,17 @@ def test_what_was_logged_beyond_the_restored_step_is_dropped(tmp_path):
     assert lines(path) == [(1, 1)]
 
 
+def test_a_line_is_json_whatever_the_values(tmp_path):
+    def refuse(name):
+        raise ValueError(name)
+
+    with log.MetricsLog(tmp_path, 1, 0) as out:
+        out.write(1, METRICS | {"loss": float("nan"), "grad_norm": float("inf")})
+    (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    entry = json.loads(line, parse_constant=refuse)
+    assert (entry["loss"], entry["grad_norm"], entry["learning_rate"]) == (None, None, 1e-3)
+
+
 def test_tensorboard_files_are_written_per_stage(tmp_path):
     for stage in (1, 2):
         with log.MetricsLog(tmp_path, stage, 0) as out:
