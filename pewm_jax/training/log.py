@@ -20,6 +20,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from pewm_jax.training import processes
 
+FLUSH_S = 10
+"""Seconds for which TensorBoard's events may wait to be written; lines of JSON never do."""
 LINE_EVERY_S = 10.0
 """Seconds between lines of the live view where the output is not a terminal."""
 
@@ -45,7 +47,9 @@ class MetricsLog:
         drop_after(path, stage, step)
         self._file = path.open("a")
         self._events = tensorboardX.SummaryWriter(
-            str(run / "tensorboard" / f"stage{stage}"), purge_step=step + 1 if step else None
+            str(run / "tensorboard" / f"stage{stage}"),
+            purge_step=step + 1 if step else None,
+            flush_secs=FLUSH_S,
         )
 
     def __enter__(self) -> Self:
@@ -72,7 +76,6 @@ class MetricsLog:
         self._file.flush()
         for name, value in finite.items():
             self._events.add_scalar(name, value, step)
-        self._events.flush()
 
 
 def drop_after(path: Path, stage: int, step: int) -> None:
@@ -137,6 +140,7 @@ class LiveView:
                 MofNCompleteColumn(),
                 TextColumn("{task.fields[words]}"),
                 console=self._console,
+                refresh_per_second=4,
             )
             self._task = self._bar.add_task(label, total=total, completed=done, words="")
 
