@@ -84,6 +84,8 @@ class Checkpoints:
         finally:
             self._pool.shutdown()
             self._writer.close()
+            if processes.is_primary():
+                shelf.clear(self.folder)  # of a write that failed
             logging.getLogger("absl").removeFilter(_is_not_raised_too)
 
     def latest(self) -> int | None:
@@ -213,8 +215,6 @@ class Checkpoints:
         try:
             yield
         except (OSError, ValueError, RuntimeError) as error:
-            if processes.is_primary():
-                shelf.clear(self.folder)
             whole = self._latest
             kept = "none was written before" if whole is None else f"that of step {whole} is kept"
             raise UserError(

@@ -166,6 +166,16 @@ def entered_by_first(context: contextlib.AbstractContextManager[Any]) -> Iterato
         yield
 
 
+def is_lost(error: BaseException) -> bool:
+    """Tell whether an error is about another process that is gone or cannot be reached."""
+    reason = str(error).lower()
+    return (
+        isinstance(error, jax.errors.JaxRuntimeError)
+        and jax.process_count() > 1
+        and any(word in reason for word in _COMMUNICATION)
+    )
+
+
 def gather(tree: T) -> T:
     """Bring arrays that are spread over processes to the first one; called by all.
 
@@ -277,8 +287,7 @@ def _quiet_but_first() -> Iterator[None]:
 
 def _tell(error: BaseException) -> int:
     """Print an error as the command line does; returns the exit code."""
-    reason = str(error).lower()
-    if isinstance(error, jax.errors.JaxRuntimeError) and any(w in reason for w in _COMMUNICATION):
+    if is_lost(error):
         error = UserError(last_words.GONE)
     if not isinstance(error, (UserError, OSError, KeyboardInterrupt)):
         sys.excepthook(type(error), error, error.__traceback__)

@@ -54,12 +54,13 @@ def clip(config: Config, batch: int, seed: int) -> Clip:
     return Clip(frames(config.clip.frames), frames(context), np.ones((batch, context), bool))
 
 
-def clips(config, split="train", *, seed, batch, start_step=0, features=None, **_options):
+def clips(config, split="train", *, seed, batch, start_step=0, features=None, rows=None, bad=None):
     assert split == "train"
     assert features is None
     step = start_step
     while True:
-        yield clip(config, batch, 1000 * seed + step)
+        whole = clip(config, batch, 1000 * seed + step)
+        yield jax.tree.map(lambda x: x[rows or slice(None)], whole)
         step += 1
 
 

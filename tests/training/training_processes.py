@@ -1,0 +1,161 @@
+"""Trainings of several real processes for ``test_training_processes``; run, it is train.py.
+
+By the environment, ``FAKE`` puts the small model of ``training_fakes`` in place of the real one,
+``PAUSE`` seconds are slept for every batch, ``TERM_AT`` sends the process SIGTERM when it reads
+that batch, and ``MEET`` has processes meet and do nothing else.
+"""
+
+import contextlib
+import importlib
+import itertools
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from pewm_jax import cli
+from pewm_jax.config import Launch
+from pewm_jax.training import processes
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+PATIENCE_S = 120
+
+
+class Job:
+    """Processes of one training, started together; killed at the end if they are still there.
+
+    Args:
+        argv: arguments of train.py, for all of them.
+        processes: how many; one is not distributed.
+        devices: simulated in each.
+        settings: the environment variables above.
+    """
+
+    def __init__(self, argv, processes=1, devices=1, settings=()):
+        flags = f"{QUICK} --xla_force_host_platform_device_count={devices}"
+        shared = {
+            **os.environ,
+            "PYTHONPATH": f"{ROOT}:{HERE}",
+            "JAX_PLATFORMS": "cpu",
+            "XLA_FLAGS": flags,
+        }
+        port = free_port()
+        self.running, self.written, self.files = [], [], contextlib.ExitStack()
+        for index in range(processes):
+            joining = ["--distributed", "--coordinator", f"localhost:{port}"]
+            joining += ["--processes", processes, "--process", index]
+            command = [sys.executable, __file__, *argv, *(joining if processes > 1 else ())]
+            files = [self.files.enter_context(tempfile.TemporaryFile()) for _ in range(2)]
+            self.written.append(files)
+            self.running.append(
+                subprocess.Popen(
+                    list(map(str, command)),
+                    stdout=files[0],
+                    stderr=files[1],
+                    env=shared | dict(settings),
+                )
+            )
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for process in self.running:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            process.wait()
+        self.files.close()
+
+    def end(self):
+        """Wait for all to end; returns their exit codes, outputs and errors."""
+        until = time.monotonic() + PATIENCE_S
+        codes = [process.wait(until - time.monotonic()) for process in self.running]
+        return codes, *([self.read(index, kind) for index in range(len(codes))] for kind in (0, 1))
+
+    def read(self, index, kind):
+        """Return what a process has written so far: 0 output, 1 errors."""
+        return Path(f"/proc/self/fd/{self.written[index][kind].fileno()}").read_text()
+
+
+def finish(argv, **options):
+    """Run a job that must succeed; returns what its processes printed."""
+    with Job(argv, **options) as job:
+        codes, outputs, errors = job.end()
+    assert codes == [0] * len(codes), errors
+    return outputs
+
+
+def free_port():
+    with socket.socket() as trial:
+        trial.bind(("", 0))
+        return trial.getsockname()[1]
+
+
+def metrics(run):
+    path = run / "metrics.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def losses(run):
+    """Return (stage, step) → loss, each once."""
+    lines = metrics(run)
+    found = {(line["stage"], line["step"]): line["loss"] for line in lines}
+    assert len(found) == len(lines)
+    return found
+
+
+def wait_for(ready, job):
+    """Wait until something is so, while all processes of a job are there."""
+    until = time.monotonic() + PATIENCE_S
+    while not ready():
+        assert time.monotonic() < until, [job.read(index, 1) for index in range(len(job.running))]
+        codes = [process.poll() for process in job.running]
+        assert codes == [None] * len(codes), [job.read(index, 1) for index in range(len(codes))]
+        time.sleep(0.05)
+
+
+def told_at(read, batch, pause=0.0):
+    """Return a loader of clips that sends this process SIGTERM when it reads a certain batch."""
+
+    def clips(*args, start_step=0, **options):
+        for step, clip in enumerate(read(*args, start_step=start_step, **options), start_step + 1):
+            if step == batch:
+                os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(pause)
+            yield clip
+
+    return clips
+
+
+def meet(argv):
+    """Do nothing but agree, again and again."""
+    launch, _ = cli.take(Launch, argv)
+    with processes.joined(launch):
+        for count in itertools.count():
+            processes.agree(count)
+            print(count, flush=True)
+            time.sleep(0.01)
+
+
+def main():
+    if "MEET" in os.environ:
+        return cli.run(meet)
+    loader = importlib.import_module("pewm_jax.data.loader")
+    if "FAKE" in os.environ:
+        patch = importlib.import_module("pytest").MonkeyPatch()
+        importlib.import_module("training_fakes").install(patch)
+    loader.clips = told_at(
+        loader.clips, int(os.environ.get("TERM_AT", "0")), float(os.environ.get("PAUSE", "0"))
+    )
+    return cli.run(importlib.import_module("train").main)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
