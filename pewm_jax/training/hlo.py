@@ -11,12 +11,14 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 KINDS = ("all-gather", "reduce-scatter", "all-reduce", "all-to-all", "collective-permute")
 """The kinds of communication."""
+THROUGH = ("bitcast", "copy", "convert", "transpose", "reshape")
+"""Operations behind which an array is still the same one."""
 BITS = {"pred": 8, "s4": 4, "u4": 4, "bf16": 16, "c64": 64, "c128": 128}
 """Bits of the types whose names do not end with them."""
 
@@ -30,6 +32,7 @@ _EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
 _TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
 _LISTED = re.compile(r"replica_groups=\{(\{[\d,{} ]*\})\}")
 _COUNTED = re.compile(r"replica_groups=\[([\d,]+)\]<=\[([\d,]+)\](?:T\(([\d,]+)\))?")
+_MESH = re.compile(r"replica_groups=mesh\[([^\]]*)\] ?\{([^}]*)\}")
 _PAIRS = re.compile(r"source_target_pairs=\{\{(\d+),(\d+)\}")
 _LABEL = re.compile(r'op_name="([^"]*)"')
 
@@ -111,7 +114,17 @@ def read(text: str) -> Program:
         text: ``compiled.as_text()``.
     """
     computations, entry = _split(text)
+    users = {name: _users(lines) for name, lines in computations.items()}
     unknown: list[str] = []
+
+    def sliced(where: str, name: str) -> bool:
+        """Whether of an array, in a computation, only slices are used."""
+        return bool(users[where].get(name)) and all(
+            _is_slice(line, name)
+            or (line.opcode in THROUGH and sliced(where, user))
+            or any(sliced(*place) for place in _parameters(line, name, computations))
+            for user, line in users[where][name]
+        )
 
     @functools.cache
     def walk(name: str) -> tuple[tuple[Product, ...], tuple[Collective, ...]]:
@@ -121,8 +134,8 @@ def read(text: str) -> Program:
         for line in lines.values():
             if (flops := _flops(line, lines)) > 0:
                 products.append(Product(line.label, flops))
-            elif (one := _collective(line, lines)) is not None:
-                collectives.append(one)
+            elif line.opcode.removesuffix("-start") in KINDS:
+                collectives += _collectives(line, lines, functools.partial(sliced, name))
             for (some, others), trips in _inside(line, walk):
                 if trips == 0 and (some or others):
                     unknown.append(line.label)
@@ -227,23 +240,61 @@ def _flops(line: _Line, lines: dict[str, _Line]) -> float:
     return 2.0 * out * summed
 
 
-def _collective(line: _Line, lines: dict[str, _Line]) -> Collective | None:
-    """Return the communication that an instruction is, if it is any."""
-    kind = line.opcode.removesuffix("-start")
-    if kind not in KINDS:
-        return None
-    group = _group(line)
-    taken = sum(size(lines[name].shape) for name in line.operands if name in lines)
-    count = len(group)
-    others = (count - 1) / max(count, 1)
-    sent = {
-        "all-gather": taken * (count - 1),
-        "reduce-scatter": taken * others,
-        "all-reduce": 2 * taken * others,
-        "all-to-all": taken * others,
-        "collective-permute": taken,
-    }[kind]
-    return Collective(kind, line.label, group, sent)
+def _collectives(
+    line: _Line, lines: dict[str, _Line], sliced: Callable[[str], bool]
+) -> Iterator[Collective]:
+    """Yield the communication that an instruction is: one for each array that it takes."""
+    kind, group = line.opcode.removesuffix("-start"), _group(line)
+    others = (len(group) - 1) / max(len(group), 1)
+    own = next((name for name, other in lines.items() if other is line), "")
+    for index, operand in enumerate(line.operands):
+        taken = size(lines[operand].shape) if operand in lines else 0.0
+        made = kind
+        if kind == "all-reduce" and sliced(_element(own, index, lines)):
+            made = "reduce-scatter"
+        sent = {
+            "all-gather": taken * (len(group) - 1),
+            "reduce-scatter": taken * others,
+            "all-reduce": 2 * taken * others,
+            "all-to-all": taken * others,
+            "collective-permute": taken,
+        }[made]
+        yield Collective(made, line.label, group, sent)
+
+
+def _element(name: str, index: int, lines: dict[str, _Line]) -> str:
+    """Return the name under which one of the results of an instruction goes on."""
+    for other, line in lines.items():
+        taken = line.opcode == "get-tuple-element" and line.operands == (name,)
+        if taken and re.search(rf"\bindex={index}\b", line.rest):
+            return other
+    return name
+
+
+def _users(lines: dict[str, _Line]) -> dict[str, list[tuple[str, _Line]]]:
+    """Return, for each name, the instructions that take it."""
+    found: dict[str, list[tuple[str, _Line]]] = {}
+    for name, line in lines.items():
+        for operand in set(line.operands):
+            found.setdefault(operand, []).append((name, line))
+    return found
+
+
+def _is_slice(line: _Line, name: str) -> bool:
+    return line.opcode == "dynamic-slice" and line.operands[0] == name
+
+
+def _parameters(
+    line: _Line, name: str, computations: dict[str, dict[str, _Line]]
+) -> Iterator[tuple[str, str]]:
+    """Yield where a fusion's or a call's operand goes on inside: (computation, name)."""
+    called = _CALLED.search(line.rest) if line.opcode in ("fusion", "call") else None
+    if called is None:
+        return
+    places = {str(k) for k, operand in enumerate(line.operands) if operand == name}
+    for inner, other in computations.get(called[1], {}).items():
+        if other.opcode == "parameter" and other.operands[0] in places:
+            yield called[1], inner
 
 
 def _group(line: _Line) -> tuple[int, ...]:
@@ -254,9 +305,26 @@ def _group(line: _Line) -> tuple[int, ...]:
         if counted[3]:
             devices = devices.transpose([int(n) for n in counted[3].split(",")])
         return tuple(int(n) for n in devices.reshape(shape)[0])
+    if mesh := _MESH.search(line.rest):
+        return _along(mesh[1], mesh[2])
     if listed := _LISTED.search(line.rest):
         first = listed[1].split("}")[0].strip("{ ")
         return tuple(int(n) for n in first.split(",") if n.strip())
     if pairs := _PAIRS.search(line.rest):
         return int(pairs[1]), int(pairs[2])
     return ()
+
+
+def _along(mesh: str, axes: str) -> tuple[int, ...]:
+    """Return the first group along axes, or parts of axes, of a mesh: ``'a'=4,'b'=2``, ``'a'``."""
+    sizes = {name: int(count) for name, count in re.findall(r"'([^']*)'=(\d+)", mesh)}
+    strides, stride = {}, 1
+    for name in reversed(sizes):
+        strides[name], stride = stride, stride * sizes[name]
+    group = np.zeros(1, int)
+    for name, before, count in re.findall(r"'([^']*)'(?::\((\d+)\)(\d+))?", axes):
+        steps = int(count) if count else sizes[name]
+        inner = sizes[name] // (int(before) * steps) if count else 1
+        places = np.arange(steps) * inner * strides[name]
+        group = (group[:, None] + places).ravel()
+    return tuple(int(n) for n in group)
