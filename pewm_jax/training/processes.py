@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import socket
 import sys
 import threading
@@ -168,11 +169,12 @@ def entered_by_first(context: contextlib.AbstractContextManager[Any]) -> Iterato
 
 def is_lost(error: BaseException) -> bool:
     """Tell whether an error is about another process that is gone or cannot be reached."""
-    reason = str(error).lower()
+    status, _, reason = str(error).partition(": ")
     return (
-        isinstance(error, jax.errors.JaxRuntimeError)
-        and jax.process_count() > 1
-        and any(word in reason for word in _COMMUNICATION)
+        jax.process_count() > 1
+        and isinstance(error, (RuntimeError, ValueError))  # JAX raises both
+        and re.fullmatch("[A-Z_]+", status) is not None
+        and any(word in f"{status} {reason}".lower() for word in _COMMUNICATION)
     )
 
 

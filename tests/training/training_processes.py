@@ -52,7 +52,8 @@ class Job:
             joining = ["--distributed", "--coordinator", f"localhost:{port}"]
             joining += ["--processes", processes, "--process", index]
             command = [sys.executable, __file__, *argv, *(joining if processes > 1 else ())]
-            files = [self.files.enter_context(tempfile.TemporaryFile()) for _ in range(2)]
+            kept = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115 - closed in the end
+            files = [self.files.enter_context(file) for file in kept]
             self.written.append(files)
             self.running.append(
                 subprocess.Popen(

@@ -1,0 +1,181 @@
+"""Several processes train as one: the same losses, one log, one decision, no one left waiting."""
+
+import signal
+import time
+
+import jax
+import numpy as np
+import pytest
+import training_processes as jobs
+
+import train
+from pewm_jax import cli
+from pewm_jax.config import Launch, UserError
+from pewm_jax.data import loader
+from pewm_jax.data.collect import collect
+from pewm_jax.data.recording import CollectConfig
+from pewm_jax.training import last_words, processes
+
+FAKE = {"FAKE": "1"}
+STAGES = ("--train.stage1.batch", 8, "--train.stage2.batch", 8, "--train.save_every", 5)
+HAND = Launch(distributed=True, coordinator="node-0:1234", processes=2, process=1)
+
+
+@pytest.fixture
+def joining(monkeypatch):
+    """What jax.distributed.initialize is called with."""
+    calls = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda **given: calls.append(given))
+    monkeypatch.setattr(jax.config, "update", lambda *setting: None)
+    return calls
+
+
+def test_without_the_flag_nothing_is_joined(joining):
+    with processes.joined(Launch()):
+        processes.start(Launch())
+    assert joining == []
+
+
+def test_processes_are_joined_by_hand_or_as_jax_finds_them(joining):
+    processes.start(HAND)
+    processes.start(Launch(distributed=True, patience=7))
+    by_hand, found = joining
+    assert by_hand["coordinator_address"] == "node-0:1234"
+    assert (by_hand["num_processes"], by_hand["process_id"]) == (2, 1)
+    assert not found.keys() & {"coordinator_address", "num_processes", "process_id"}
+    assert found["initialization_timeout"] > 7
+
+
+def test_nothing_to_join_is_said_in_a_sentence(capsys, monkeypatch):
+    def initialize(**_given):
+        raise ValueError("coordinator_address should be defined.")
+
+    monkeypatch.setattr(jax.distributed, "initialize", initialize)
+    monkeypatch.setattr(jax.config, "update", lambda *setting: None)
+    with pytest.raises(UserError, match="--distributed found no processes to join"):
+        processes.start(Launch(distributed=True))
+    assert cli.run(train.main, ["tiny", "--distributed", "--coordinator", "node-0"]) == 2
+    assert "HOST:PORT" in capsys.readouterr().err
+
+
+def test_a_port_in_use_is_refused(joining):
+    with jobs.socket.create_server(("", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(UserError, match=f"port {port} cannot be used"):
+            processes.start(Launch(True, f"localhost:{port}", 2, 0))
+    assert joining == []
+
+
+def test_one_process_agrees_with_itself():
+    assert processes.is_primary()
+    assert processes.agree({"a": [1, None]}) == {"a": [1, None]}
+    assert processes.first(lambda: "x") == "x"
+    votes = processes.Votes()
+    assert [votes.cast(None), votes.cast(15)] == [None, 15]
+    tree = {"a": np.arange(3)}
+    assert processes.gather(tree) is tree
+    with pytest.raises(OSError, match="full"):
+        processes.first(lambda: (_ for _ in ()).throw(OSError("full")))
+
+
+FATAL = b"F1121 09:46:42.762529    9648 client.h:80] Terminating process because"
+ERROR = b"E1121 09:46:42.762464 9648 coordination_service_agent.cc:289] Polled an error\n"
+
+
+@pytest.mark.parametrize("fatal", [FATAL + b"\n*** Check failure stack trace: ***\n", ERROR])
+def test_pages_of_a_dying_process_become_one_sentence(fatal):
+    told = [b"a warning\n", *fatal.splitlines(keepends=True), b"    @ 0x7fb895c40634\n"]
+    passed = list(last_words.filtered(iter(told)))
+    assert passed == [b"a warning\n", b"error: " + last_words.GONE.encode() + b"\n"]
+
+
+def test_nothing_follows_the_first_error():
+    said = [b"error: the disk is full\n", FATAL, b"error: another\n"]
+    assert list(last_words.filtered(iter(said))) == said[:1]
+    assert list(last_words.filtered(iter([b"E1121 x\n", b"y"]))) == [b"E1121 x\n", b"y"]
+
+
+def run_here(monkeypatch, argv, term_at=0):
+    """Run train.py in this process, with one device; returns its exit code."""
+    monkeypatch.setattr(cli, "cache_compilation", lambda folder: None)
+    monkeypatch.setattr(loader, "clips", jobs.told_at(loader.clips, term_at))
+    return cli.run(train.main, list(map(str, argv)))
+
+
+def test_two_processes_of_two_devices_compute_the_losses_of_one(tmp_path, monkeypatch):
+    data = tmp_path / "data"
+    collect(CollectConfig(out=data, train=2, validation=0, test=0, frames=24, size=16, workers=1))
+    argv = ["tiny", "--data.path", data, "--train.stage1.steps", 20, "--train.stage1.batch", 4]
+    argv += ["--train.stage2.steps", 0, "--dit.layers", 1]
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert run_here(monkeypatch, [*argv, "--train.run", one]) == 0
+    spoken, silent = jobs.finish(
+        [*argv, "--train.run", two, "--train.mesh.fsdp", 2], processes=2, devices=2
+    )
+    assert spoken.endswith(f"Trained: {two}/weights.safetensors\n")
+    assert silent == ""
+    expected, found = jobs.losses(one), jobs.losses(two)
+    assert list(found) == list(expected) == [(1, step) for step in range(1, 21)]
+    np.testing.assert_allclose(list(found.values()), list(expected.values()), rtol=1e-5)
+
+
+def test_a_run_goes_on_with_other_numbers_of_devices_and_processes(
+    fake_model, tmp_path, monkeypatch
+):
+    argv = ["tiny", *STAGES, "--train.stage1.steps", 14, "--train.stage2.steps", 6]
+    once, often = tmp_path / "once", tmp_path / "often"
+    assert run_here(monkeypatch, [*argv, "--train.run", once]) == 0
+    argv += ["--train.run", often]
+    with jobs.Job(argv, devices=8, settings=FAKE | {"TERM_AT": "6"}) as job:
+        codes, _, errors = job.end()
+    assert codes == [143], errors
+    on_eight = len(jobs.metrics(often))
+    assert run_here(monkeypatch, argv, term_at=11) == 143
+    on_one = len(jobs.metrics(often)) - on_eight
+    jobs.finish(argv, processes=4, settings=FAKE)
+    expected, found = jobs.losses(once), jobs.losses(often)
+    assert min(on_eight, on_one, len(found) - 6 - on_eight - on_one) > 0
+    assert list(found) == list(expected)
+    np.testing.assert_allclose(list(found.values()), list(expected.values()), rtol=1e-5)
+
+
+def test_a_signal_to_one_stops_all_after_the_same_step(tmp_path):
+    run = tmp_path / "run"
+    argv = ["tiny", *STAGES, "--train.stage1.steps", 10_000, "--train.run", run]
+    with jobs.Job(argv, processes=2, settings=FAKE | {"PAUSE": "0.02"}) as job:
+        jobs.wait_for(lambda: len(jobs.metrics(run)) > 6, job)
+        job.running[1].send_signal(signal.SIGTERM)
+        codes, _, errors = job.end()
+    assert codes == [143, 143], errors
+    done = len(jobs.metrics(run))
+    for told in errors:
+        assert told.endswith(
+            f"Stopped after step {done} of stage 1; everything is saved: the same command goes on "
+            "from there.\n"
+        )
+    assert (run / "checkpoints" / "stage1" / str(done)).is_dir()
+
+
+@pytest.mark.parametrize("killed", [0, 1])
+def test_when_one_is_killed_the_other_ends_with_one_sentence(killed):
+    with jobs.Job([], processes=2, settings={"MEET": ""}) as job:
+        jobs.wait_for(lambda: "10\n" in job.read(0, 0), job)
+        job.running[killed].kill()
+        began = time.monotonic()
+        codes, outputs, errors = job.end()
+    assert time.monotonic() - began < processes.HEARTBEAT_S + 40
+    assert codes[killed] == -signal.SIGKILL
+    assert codes[1 - killed] not in (0, 1)
+    assert errors[1 - killed] == f"error: {last_words.GONE}\n"
+    assert outputs[1] == ""
+
+
+@pytest.mark.parametrize("process", [0, 1])
+def test_processes_that_do_not_meet_say_so_in_time(process):
+    argv = ["--distributed", "--patience", 1, "--processes", 2, "--process", process]
+    argv += ["--coordinator", f"localhost:{jobs.free_port()}"]
+    with jobs.Job(argv, settings={"MEET": ""}) as job:
+        codes, _, errors = job.end()
+    assert codes == [2]
+    assert errors[0].startswith("error: The processes of this training have not met at localhost:")
+    assert errors[0].count("\n") == 1
