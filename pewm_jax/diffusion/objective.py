@@ -9,8 +9,8 @@ from pewm_jax.config import Config
 from pewm_jax.diffusion import schedule
 from pewm_jax.memory import features as image_features
 from pewm_jax.memory import memories
-from pewm_jax.models import codec, world_model
-from pewm_jax.types import Array, Clip, Frames, MapTokens, Params
+from pewm_jax.models import codec, placement, world_model
+from pewm_jax.types import Array, Camera, Clip, Frames, MapTokens, Params
 
 
 def as_signal(frames: Frames) -> Frames:
@@ -50,13 +50,29 @@ def remember(
 def clip_tokens(config: Config, params: Params, clip: Clip) -> MapTokens:
     """Build every clip's memory from its context and return its tokens, leading axis B."""
 
-    def one(context: Frames, valid_S: Array, features: Array | None, camera) -> MapTokens:
-        memory = remember(config, params, as_signal(context), valid_S, features)
+    def one(context: Frames, valid_S: Array, features: Array, camera: Camera) -> MapTokens:
+        memory = remember(config, {}, context, valid_S, features)
         return memories.tokens(config, memory, camera)
 
-    return jax.vmap(one)(
-        clip.context, clip.context_valid_S, clip.context_features_ShwF, clip.frames.camera
-    )
+    def some(weights: Params, clip: Clip) -> MapTokens:
+        features = clip.context_features_ShwF
+        if features is None:
+            features = _encode(config, weights, clip.context.rgb_THWC)
+        context = as_signal(clip.context)
+        return jax.vmap(one)(context, clip.context_valid_S, features, clip.frames.camera)
+
+    return placement.by_batch(some, params.get("encoder", {}), clip)
+
+
+def _encode(config: Config, weights: Params, rgb_BSHWC: Array) -> Array:
+    """Return the features of every clip's context; a large encoder sees clip by clip."""
+
+    def one(rgb_SHWC: Array) -> Array:
+        return image_features.encode(config.memory, weights, codec.signal_from_rgb(rgb_SHWC))
+
+    if config.memory.encoder == "patch_colours":
+        return jax.vmap(one)(rgb_BSHWC)
+    return jax.lax.map(one, rgb_BSHWC)
 
 
 def loss(

@@ -16,9 +16,10 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.models import layers
+from pewm_jax.models import layers, placement
 from pewm_jax.types import Array
 
 LOGITS = 2**20
@@ -28,11 +29,16 @@ Implementation = Literal["auto", "xla", "cudnn"]
 
 
 def attention(
-    q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implementation = "auto"
+    q_BKND: Array,
+    k_BKMD: Array,
+    v_BKMD: Array,
+    implementation: Implementation = "auto",
+    real_M: np.ndarray | None = None,
 ) -> Array:
     """Scaled dot-product attention (B, K, N, d), in pieces where the platform is a CPU.
 
-    The batch is never cut, so that it can be spread over devices.
+    Over several devices (``placement``) batch, heads and queries are split; each device has all
+    keys and values of its clips and heads, and computes alone.
 
     Args:
         q_BKND: queries.
@@ -40,10 +46,24 @@ def attention(
         v_BKMD: values.
         implementation: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `xla` runs anywhere,
             `auto` takes cudnn where it works.
+        real_M: where the keys stand that count; None where all do.
 
     Raises:
         UserError: cudnn is asked for where it does not work.
     """
+
+    def alone(q: Array, k: Array, v: Array) -> Array:
+        if real_M is not None:
+            k, v = k[:, :, real_M], v[:, :, real_M]
+        return _alone(q, k, v, implementation)
+
+    split: placement.Names = ("batch", "heads")
+    queries: placement.Names = (*split, "tokens")
+    return placement.local(alone, (queries, split, split), queries)(q_BKND, k_BKMD, v_BKMD)
+
+
+def _alone(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implementation) -> Array:
+    """Do ``attention`` on one device."""
     batch, heads, queries, _ = q_BKND.shape
     works = has_flash() and fits_flash(q_BKND)
     if implementation == "cudnn" and not works:

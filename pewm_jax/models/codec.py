@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from pewm_jax.config import ClipConfig, CodecConfig, Config
-from pewm_jax.models import pixel_codec, vae
+from pewm_jax.models import pixel_codec, placement, vae
 from pewm_jax.types import Array, Params
 
 
@@ -129,13 +131,23 @@ def encode_rgbd(
     weights = params.get("codec", {})
     if config.codec.kind == "pixel":
         parts = [encode(config.codec, weights, x) for x in (rgb_BTHWC, signal)]
-    else:
-        dtype = jnp.dtype(config.train.dtype)
-        grey = jnp.broadcast_to(signal, rgb_BTHWC.shape)
-        both = jnp.concatenate([rgb_BTHWC, grey]).astype(dtype)
+        return jnp.concatenate(parts, -1)
+
+    def together(weights: Params, rgb: Array, signal: Array) -> Array:
+        grey = jnp.broadcast_to(signal, rgb.shape)
+        both = jnp.concatenate([rgb, grey]).astype(jnp.dtype(config.train.dtype))
         latents = encode(config.codec, weights, both, condition=condition)
-        parts = jnp.split(latents.astype(jnp.float32), 2)
-    return jnp.concatenate(parts, -1)
+        return jnp.concatenate(jnp.split(latents.astype(jnp.float32), 2), -1)
+
+    def one_by_one(weights: Params, *videos: Array) -> Array:
+        """Encode clip by clip, so that memory does not grow with the batch."""
+        if len(videos[0]) == 1:
+            return together(weights, *videos)
+        one = jax.lax.map(lambda clip: together(weights, *(x[None] for x in clip)), videos)
+        return one[:, 0]
+
+    traced = isinstance(rgb_BTHWC, Tracer)
+    return placement.by_batch(one_by_one if traced else together, weights, rgb_BTHWC, signal)
 
 
 def decode_rgbd(config: Config, params: Params, latents_BthwC: Array) -> tuple[Array, Array]:

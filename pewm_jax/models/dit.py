@@ -20,7 +20,8 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import DiTConfig, UserError
-from pewm_jax.models import blocked_attention, layers, positions
+from pewm_jax.models import blocked_attention, layers, placement, positions
+from pewm_jax.models.token_layout import TokenLayout
 from pewm_jax.types import Array, Params
 
 BlockExpert = Callable[[Any, Array, Array], Array]
@@ -50,13 +51,15 @@ class LayerNormZero(nn.Module):
     """Expert adaptive layernorm: one shared norm, separate modulation of text and video."""
 
     @nn.compact
-    def __call__(self, tokens_BND: Array, time_BE: Array, length: int) -> tuple[Array, Array]:
+    def __call__(
+        self, tokens_BND: Array, time_BE: Array, layout: TokenLayout
+    ) -> tuple[Array, Array]:
         """Return normalised and modulated tokens, and the gate (B, N, D) of each token.
 
         Args:
-            tokens_BND: (B, L + N, D) text tokens, then video tokens.
+            tokens_BND: (B, L + N, D) text and video tokens.
             time_BE: (B, E) time embedding.
-            length: L, the number of text tokens.
+            layout: their order.
         """
         width, dtype = tokens_BND.shape[-1], tokens_BND.dtype
         linear = nn.Dense(
@@ -66,11 +69,12 @@ class LayerNormZero(nn.Module):
             bias_init=open_gates,
             name="linear",
         )
-        video, text = jnp.split(linear(nn.silu(time_BE))[:, None], 2, -1)
-        is_text = (jnp.arange(tokens_BND.shape[1]) < length)[:, None]
+        modulation = placement.constrain(linear(nn.silu(time_BE)), "batch")
+        video, text = jnp.split(modulation[:, None], 2, -1)
+        is_text = jnp.asarray(layout.is_text)
         shift, scale, gate = jnp.split(jnp.where(is_text, text, video), 3, -1)
         normed = layers.layer_norm(tokens_BND, "norm")
-        return normed * (1 + scale) + shift, gate
+        return placement.constrain(normed * (1 + scale) + shift, "batch", "tokens"), gate
 
 
 class Block(nn.Module):
@@ -80,44 +84,51 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(
-        self, tokens_BND: Array, time_BE: Array, angles_NR: Array | None, length: int
+        self, tokens_BND: Array, time_BE: Array, angles_NR: Array | None, layout: TokenLayout
     ) -> Array:
         """Return the updated tokens.
 
         Args:
-            tokens_BND: (B, L + N, D) text tokens, then video tokens.
+            tokens_BND: (B, L + N, D) text and video tokens.
             time_BE: (B, E) time embedding.
-            angles_NR: (L + N, head_dim/2) rotary angles, or None.
-            length: L, the number of text tokens.
+            angles_NR: (L + N, head_dim/2) rotary angles in the order of the tokens, or None.
+            layout: the order of the tokens.
         """
         before: Any = nn.remat(Block.before, policy=KEEP, prevent_cse=False, static_argnums=(4,))
         after: Any = nn.remat(Block.after, policy=KEEP, prevent_cse=False, static_argnums=(5,))
-        q, k, v, gate = before(self, tokens_BND, time_BE, angles_NR, length)
-        mixed = blocked_attention.attention(q, k, v, self.config.attention)
-        return after(self, tokens_BND, time_BE, mixed, gate, length)
+        q, k, v, gate = before(self, tokens_BND, time_BE, angles_NR, layout)
+        mixed = blocked_attention.attention(q, k, v, self.config.attention, layout.real)
+        return after(self, tokens_BND, time_BE, mixed, gate, layout)
 
     def before(
-        self, tokens_BND: Array, time_BE: Array, angles_NR: Array | None, length: int
+        self, tokens_BND: Array, time_BE: Array, angles_NR: Array | None, layout: TokenLayout
     ) -> tuple[Array, Array, Array, Array]:
         """Return queries, keys and values (B, K, N, d), and the gate of what they will find."""
         heads, width, dtype = self.config.heads, self.config.width, tokens_BND.dtype
-        normed, gate = LayerNormZero(name="norm1")(tokens_BND, time_BE, length)
+        normed, gate = LayerNormZero(name="norm1")(tokens_BND, time_BE, layout)
         q, k, v = (
             layers.split_heads(layers.dense(width, dtype, f"to_{n}")(normed), heads) for n in "qkv"
         )
+        q, k, v = (placement.constrain(x, "batch", "heads", "tokens") for x in (q, k, v))
         q, k = (layers.layer_norm(x, f"norm_{n}", 1e-6) for x, n in ((q, "q"), (k, "k")))
         if angles_NR is not None:
             q, k = layers.rotate(q, angles_NR), layers.rotate(k, angles_NR)
         return q, k, v, gate
 
     def after(
-        self, tokens_BND: Array, time_BE: Array, mixed_BKND: Array, gate: Array, length: int
+        self,
+        tokens_BND: Array,
+        time_BE: Array,
+        mixed_BKND: Array,
+        gate: Array,
+        layout: TokenLayout,
     ) -> Array:
         """Return the tokens with what attention found, and the feed-forward network's."""
         width, dtype = self.config.width, tokens_BND.dtype
         mixed = layers.merge_heads(mixed_BKND)
         tokens_BND += gate * layers.dense(width, dtype, "to_out")(mixed)
-        normed, gate = LayerNormZero(name="norm2")(tokens_BND, time_BE, length)
+        tokens_BND = placement.constrain(tokens_BND, "batch", "tokens")
+        normed, gate = LayerNormZero(name="norm2")(tokens_BND, time_BE, layout)
         return tokens_BND + gate * layers.FeedForward(self.config.mlp_ratio, name="ff")(normed)
 
 
@@ -148,7 +159,9 @@ class Ends(nn.Module):
 
     def embed(self, patches_BNC: Array, text_BLC: Array, timesteps_B: Array, ofs_B: Array):
         """Return text and video tokens (B, L + N, D) and the time embedding (B, E)."""
+        text_BLC, patches_BNC = (placement.constrain(x, "batch") for x in (text_BLC, patches_BNC))
         tokens = jnp.concatenate([self.text_embed(text_BLC), self.patch_embed(patches_BNC)], 1)
+        tokens = placement.constrain(tokens, "batch")
         time = self.time_embed(timesteps_B)
         if self.config.ofs_dim:
             time += self.ofs_embed(ofs_B)
@@ -156,7 +169,8 @@ class Ends(nn.Module):
 
     def project(self, video_BND: Array, time_BE: Array) -> Array:
         """Return output patches (B, N, C·p_t·p·p)."""
-        shift, scale = jnp.split(self.modulate_out(nn.silu(time_BE)), 2, -1)
+        modulation = placement.constrain(self.modulate_out(nn.silu(time_BE)), "batch")
+        shift, scale = jnp.split(modulation, 2, -1)
         video = self.norm_out(self.norm_final(video_BND)).astype(self.dtype)
         return self.proj_out(layers.modulate(video, shift, scale))
 
@@ -226,7 +240,8 @@ def init(config: DiTConfig, key: Array) -> Params:
         jnp.zeros((1,)),
     )["params"]
     token, time = jnp.zeros((1, 1, config.width)), jnp.zeros((1, config.time_dim))
-    blocks = jax.vmap(lambda k: Block(config).init(k, token, time, None, 0)["params"])(
+    alone = TokenLayout(parts=1, text=0, frames=1, patches=1)
+    blocks = jax.vmap(lambda k: Block(config).init(k, token, time, None, alone)["params"])(
         jax.random.split(blocks_key, config.layers)
     )
     return {**ends, "blocks": blocks}
@@ -253,7 +268,8 @@ def apply(
         text_BLD: (B, L, text_dim) text tokens.
         timesteps_B: (B,) diffusion times, 0 … train_steps − 1, or one for all.
         ofs_B: (B,) second scalar of 1.5-5B-I2V; None is the 2.0 it was trained with.
-        expert: run after every block on the video tokens (the memory block).
+        expert: run after every block on the video tokens (the memory block), in the order that
+            ``layout_of`` says.
         expert_params: the experts' parameters, stacked over layers.
 
     Returns:
@@ -269,7 +285,8 @@ def apply(
     length = text_BLD.shape[1]
     out_channels = params["proj_out"]["bias"].shape[0] // (patch_t * patch**2)
     ends = Ends(config, out_channels, dtype)
-    ends_params = {"params": {k: v for k, v in params.items() if k != "blocks"}}
+    ends_params = {k: v for k, v in params.items() if k != "blocks"}
+    ends_params = {"params": jax.tree.map(placement.constrain, ends_params)}
     embedded: Any = ends.apply(
         ends_params,
         patchify(latents_BthwC, patch, patch_t),
@@ -284,18 +301,28 @@ def apply(
     elif config.positions in {"sincos", "rope_learned"}:
         tokens = tokens.at[:, length:].add(positions.sincos_table(config, grid).astype(dtype))
     angles = positions.joint_angles(config, grid, length)
+    layout = layout_of(config, latents_BthwC.shape, length)
+    tokens = placement.constrain(layout.arrange(tokens), "batch", "tokens")
+    angles = None if angles is None else layout.arrange(angles[None])[0]
 
     def body(tokens: Array, layer: tuple[Params, Any]) -> tuple[Array, None]:
-        tokens = Block(config).apply({"params": layer[0]}, tokens, time, angles, length)
+        tokens = Block(config).apply({"params": layer[0]}, tokens, time, angles, layout)
         if expert is not None:
-            text, video = jnp.split(tokens, [length], 1)
-            tokens = jnp.concatenate([text, expert(layer[1], video, time)], 1)
-        return tokens, None
+            text, video = layout.split(tokens)
+            tokens = layout.join(text, expert(layer[1], video, time))
+        return placement.constrain(tokens, "batch", "tokens"), None
 
     body = jax.checkpoint(body) if config.remat else body
     tokens, _ = jax.lax.scan(body, tokens, (params["blocks"], expert_params))
-    patches: Array = ends.apply(ends_params, tokens[:, length:], time, method="project")
-    return unpatchify(patches, frames, height, width, patch, patch_t)
+    video = layout.split(tokens)[1]
+    patches: Array = ends.apply(ends_params, video, time, method="project")
+    return unpatchify(layout.gather(patches), frames, height, width, patch, patch_t)
+
+
+def layout_of(config: DiTConfig, shape: tuple[int, ...], length: int) -> TokenLayout:
+    """Return the order of the tokens of latents of a shape (B, t, h, w, C) and L text tokens."""
+    frames, rows, columns = positions.token_grid(config, shape)
+    return TokenLayout.here(length, frames, rows * columns)
 
 
 def _require_inputs(

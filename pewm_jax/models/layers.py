@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pewm_jax.models import placement
 from pewm_jax.types import Array
 
 zeros = nn.initializers.zeros_init()
@@ -102,6 +103,7 @@ class FeedForward(nn.Module):
         """(B, N, D) → (B, N, D)."""
         width = x_BND.shape[-1]
         hidden = dense(self.ratio * width, x_BND.dtype, "up")(x_BND)
+        hidden = placement.constrain(hidden, "batch", "tokens", "hidden")
         return dense(width, x_BND.dtype, "down")(nn.gelu(hidden, approximate=True))
 
 
@@ -118,5 +120,6 @@ class TimeEmbedding(nn.Module):
     def __call__(self, timesteps_B: Array) -> Array:
         """(B,) → (B, time_dim)."""
         wave = sinusoid(timesteps_B, self.width).astype(self.dtype)
-        hidden = dense(self.time_dim, self.dtype, "linear_1")(wave)
-        return dense(self.time_dim, self.dtype, "linear_2")(nn.silu(hidden))
+        hidden = dense(self.time_dim, self.dtype, "linear_1")(placement.constrain(wave, "batch"))
+        hidden = nn.silu(placement.constrain(hidden, "batch"))
+        return placement.constrain(dense(self.time_dim, self.dtype, "linear_2")(hidden), "batch")

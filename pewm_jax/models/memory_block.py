@@ -21,12 +21,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import Config
-from pewm_jax.models import layers
+from pewm_jax.models import layers, placement
 from pewm_jax.models.memory_geometry import Sightings, frequencies
 from pewm_jax.types import Array
 
 PEAK = 12.0
 """Logit by which a cell in the middle of the patch looked at stands out at the start."""
+
+QUERIES: placement.Names = ("batch", "heads", "tokens")
+KEYS: placement.Names = ("batch", "heads")
+VIEWS: placement.Names = ("batch", None, "heads")
+MIXED: placement.Names = ("batch", "tokens", "heads")
+"""How queries, keys, what cameras see and what is found are split over devices."""
 
 
 def masked_attention(logits: Array, mask: Array, sink_K: Array, values: Array) -> Array:
@@ -63,12 +69,16 @@ class SinusoidAttention(nn.Module):
         k = layers.split_heads(layers.dense(width, dtype, "to_k")(memory_BMD), self.heads)
         v = layers.split_heads(layers.dense(width, dtype, "to_v")(memory_BMD), self.heads)
         q, k = (layers.layer_norm(x, f"norm_{n}", 1e-6) for x, n in ((q, "q"), (k, "k")))
-        logits = jnp.einsum("bknd,bkmd->bknm", q, k, preferred_element_type=jnp.float32)
         sink = self.param("sink", layers.zeros, (self.heads,))
-        mixed = masked_attention(
-            logits / math.sqrt(self.head_dim), valid_BM[:, None, None], sink, v
-        )
-        return layers.merge_heads(mixed)
+        read = placement.local(_read_all, (QUERIES, KEYS, KEYS, ("batch",), ("heads",)), MIXED)
+        return read(q, k, v, valid_BM, sink)
+
+
+def _read_all(q: Array, k: Array, v: Array, valid_BM: Array, sink_K: Array) -> Array:
+    """Return what every query finds among all map tokens, (B, N, K·d); on one device."""
+    logits = jnp.einsum("bknd,bkmd->bknm", q, k, preferred_element_type=jnp.float32)
+    logits = logits / math.sqrt(q.shape[-1])
+    return layers.merge_heads(masked_attention(logits, valid_BM[:, None, None], sink_K, v))
 
 
 class ProjectiveAttention(nn.Module):
@@ -87,19 +97,12 @@ class ProjectiveAttention(nn.Module):
         size = math.sqrt(PEAK / math.sqrt(head_dim))
         return layers.rotate_halves(jnp.full(shape, size), angle.reshape(heads, -1))
 
-    def _look(self, x_BKMD: Array, index_BtKJ: Array) -> Array:
-        """Return (B, t, K, J, d): the tokens that each head's camera looks at."""
-        rows = jax.vmap(jax.vmap(lambda x, i: x[i]))(x_BKMD, index_BtKJ.swapaxes(1, 2))
-        return rows.swapaxes(1, 2)
-
     @nn.compact
     def __call__(self, video_BND: Array, memory_BMD: Array, seen: Sightings) -> Array:
         """Return (B, N, K·(d + 3)): attended features and mean place per head."""
         dtype, heads, head_dim = video_BND.dtype, self.heads, self.head_dim
-        batch, frames, cameras = seen.angles_tqJR.shape[:3]
         width = heads * head_dim
-        through = np.arange(heads) % cameras
-        log_z = seen.place_tqJ3[..., 2][:, :, through]
+        through = np.arange(heads) % seen.angles_tqJR.shape[2]
 
         q = layers.split_heads(layers.dense(width, dtype, "to_q")(video_BND), heads)
         k = layers.split_heads(layers.dense(width, dtype, "to_k")(memory_BMD), heads)
@@ -119,25 +122,59 @@ class ProjectiveAttention(nn.Module):
         nearer = self.param("nearer", nn.initializers.constant(2.0), (heads,))
         sink = self.param("sink", layers.zeros, (heads,))
 
-        q = norm(q, "norm_q") + q_constant[:, None].astype(dtype)
-        q = q.reshape(batch, heads, frames, -1, head_dim).transpose(0, 2, 1, 3, 4)
-        q = layers.rotate_halves(q, seen.query_angles_nR)
-        k, v = (self._look(x, seen.index_tqJ[:, :, through]) for x in (norm(k, "norm_k"), v))
-        k = k + k_constant[:, None].astype(dtype)
-        k = k + (log_z[..., None] * k_depth[:, None]).astype(dtype)
-        k = layers.rotate_halves(k, seen.angles_tqJR[:, :, through])
-
-        logits = jnp.einsum("btknd,btkmd->btknm", q, k, preferred_element_type=jnp.float32)
-        logits = logits / math.sqrt(head_dim) - (nearer[:, None] * log_z)[..., None, :]
-        place = seen.place_tqJ3[:, :, through].astype(dtype)
-        mixed = masked_attention(
-            logits,
-            seen.visible_tqJ[:, :, through, None],
-            sink,
-            jnp.concatenate([v, place], -1),
+        q, k = norm(q, "norm_q"), norm(k, "norm_k")
+        views = (seen.index_tqJ, seen.angles_tqJR, seen.place_tqJ3, seen.visible_tqJ)
+        views = tuple(x[:, :, through] for x in views)
+        born = (q_constant, k_constant, k_depth, nearer, sink)
+        read = placement.local(
+            _read_seen, (QUERIES, KEYS, KEYS, VIEWS, ("tokens",), ("heads",)), MIXED
         )
-        mixed = mixed.transpose(0, 1, 3, 2, 4)
-        return mixed.reshape(batch, video_BND.shape[1], -1)
+        return read(q, k, v, views, layout_angles(seen.query_angles_nR), born)
+
+
+def layout_angles(angles_nR: Array) -> Array:
+    """Fill up the angles of a frame's patches to a multiple of the parts that tokens come in."""
+    more = -len(angles_nR) % placement.parts("tokens")
+    return jnp.pad(angles_nR, ((0, more), (0, 0))) if more else angles_nR
+
+
+def _look(x_BKMD: Array, index_BtKJ: Array) -> Array:
+    """Return (B, t, K, J, d): the tokens that each head's camera looks at."""
+    rows = jax.vmap(jax.vmap(lambda x, i: x[i]))(x_BKMD, index_BtKJ.swapaxes(1, 2))
+    return rows.swapaxes(1, 2)
+
+
+def _read_seen(
+    q: Array, k: Array, v: Array, views: tuple[Array, ...], turns_nR: Array, born: tuple[Array, ...]
+) -> Array:
+    """Return what every query finds where its frame's cameras look; on one device.
+
+    Args:
+        q: (B, K, t·n, d) queries, normalised, without position.
+        k: (B, K, M, d) keys, normalised, without position.
+        v: (B, K, M, d) values.
+        views: index, angles, place and visibility of the J tokens that each head looks at in each
+            frame, (B, t, K, J, …).
+        turns_nR: (n, d/2) rotary angles of the n patches of a frame.
+        born: the parameters ``q_constant, k_constant, k_depth, nearer, sink``.
+    """
+    index, angles, place, visible = views
+    q_constant, k_constant, k_depth, nearer, sink = born
+    dtype, (batch, heads, _, head_dim) = q.dtype, q.shape
+    log_z = place[..., 2]
+    q = q + q_constant[:, None].astype(dtype)
+    q = q.reshape(batch, heads, index.shape[1], -1, head_dim).transpose(0, 2, 1, 3, 4)
+    q = layers.rotate_halves(q, turns_nR)
+    k, v = (_look(x, index) for x in (k, v))
+    k = k + k_constant[:, None].astype(dtype)
+    k = k + (log_z[..., None] * k_depth[:, None]).astype(dtype)
+    k = layers.rotate_halves(k, angles)
+
+    logits = jnp.einsum("btknd,btkmd->btknm", q, k, preferred_element_type=jnp.float32)
+    logits = logits / math.sqrt(head_dim) - (nearer[:, None] * log_z)[..., None, :]
+    values = jnp.concatenate([v, place.astype(dtype)], -1)
+    mixed = masked_attention(logits, visible[..., None, :], sink, values)
+    return mixed.transpose(0, 1, 3, 2, 4).reshape(batch, -1, heads * (head_dim + 3))
 
 
 class MemoryBlock(nn.Module):
@@ -169,13 +206,16 @@ class MemoryBlock(nn.Module):
         width, memory_width = video_BND.shape[-1], memory_BMD.shape[-1]
         sizes = [width, width, memory_width, memory_width, width]
         modulation = layers.dense(sum(sizes) + width, dtype, "linear", zero=True)(nn.silu(time_BE))
+        modulation = placement.constrain(modulation, "batch")
         shift, scale, m_shift, m_scale, m_gate, gate = jnp.split(
             modulation, np.cumsum(sizes).tolist(), -1
         )
         query = layers.dense(width, dtype, "with_camera")(
             jnp.concatenate([video_BND, camera_BNC], -1)
         )
+        query = placement.constrain(query, "batch", "tokens")
         query = layers.modulate(layers.layer_norm(query, "norm_video"), shift, scale)
+        query = placement.constrain(query, "batch", "tokens")
         keys = layers.modulate(layers.layer_norm(memory_BMD, "norm_memory"), m_shift, m_scale)
 
         if seen is None:
@@ -188,7 +228,7 @@ class MemoryBlock(nn.Module):
             mixed = attend(query, keys, seen)
         mixed = layers.dense(width, dtype, "to_out")(mixed)
 
-        out = video_BND + m_gate[:, None] * mixed
+        out = placement.constrain(video_BND + m_gate[:, None] * mixed, "batch", "tokens")
         forward = layers.FeedForward(memory.mlp_ratio, name="ff")(layers.layer_norm(out, "norm2"))
         out = out + gate[:, None] * forward
         if memory.kind == "none":

@@ -24,6 +24,7 @@ import numpy as np
 from pewm_jax.config import Config
 from pewm_jax.geometry.cameras import invert_rigid, project, transform_points
 from pewm_jax.geometry.plucker import fold_frames
+from pewm_jax.models import placement
 from pewm_jax.types import Array, Camera
 
 MARGIN = 0.25
@@ -107,10 +108,25 @@ def sightings(config: Config, camera: Camera, points_M3: Array, valid_M: Array) 
         points_M3: (B, M, 3) cell centres in the world.
         valid_M: (B, M) bool.
     """
+    clip = config.clip
+    patch = config.codec.spatial * config.dit.patch
+    rows, columns = clip.height // patch, clip.width // patch
+    v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
+    centres = np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)
+
+    def look(_: None, camera: Camera, points: Array, valid: Array) -> tuple[Array, ...]:
+        return _look(config, camera, points, valid)
+
+    looked = placement.by_batch(look, None, camera, points_M3, valid_M)
+    turns = _angles(jnp.asarray(centres), config.memory.head_dim, max(rows, columns))
+    return Sightings(*looked, query_angles_nR=turns)
+
+
+def _look(config: Config, camera: Camera, points_M3: Array, valid_M: Array) -> tuple[Array, ...]:
+    """Return the first four fields of ``Sightings``."""
     clip, codec = config.clip, config.codec
     patch = codec.spatial * config.dit.patch
-    rows, columns = clip.height // patch, clip.width // patch
-    head_dim, grid = config.memory.head_dim, max(rows, columns)
+    head_dim, grid = config.memory.head_dim, max(clip.height // patch, clip.width // patch)
     looks = min(config.memory.looks, points_M3.shape[1])
 
     uv, z = project(points_M3[:, None], camera)
@@ -129,15 +145,7 @@ def sightings(config: Config, camera: Camera, points_M3: Array, valid_M: Array) 
     place = jnp.concatenate([2 * uv / size - 1, log_z[..., None]], -1)
 
     fold = jax.vmap(lambda x: group_latents(fold_frames(x, codec.temporal), config.dit.patch_t))
-    v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
-    centres = np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)
-    return Sightings(
-        index_tqJ=fold(index),
-        angles_tqJR=_angles(fold(uv) / patch, head_dim, grid),
-        place_tqJ3=fold(place),
-        visible_tqJ=fold(visible),
-        query_angles_nR=_angles(jnp.asarray(centres), head_dim, grid),
-    )
+    return fold(index), _angles(fold(uv) / patch, head_dim, grid), fold(place), fold(visible)
 
 
 def sinusoid_3d(config: Config, camera: Camera, points_M3: Array) -> Array:

@@ -201,7 +201,8 @@ def apply(
         memory = params["memory"]
         camera_layer, token_layer = _memory_parts(config)
         rays = dit.patchify(rays_BthwC, config.dit.patch, config.dit.patch_t)
-        camera = camera_layer.apply({"params": memory["camera"]}, rays)
+        layout = dit.layout_of(config.dit, latents.shape, conditioning.text_BLC.shape[1])
+        camera = layout.spread(camera_layer.apply({"params": memory["camera"]}, rays))
         valid, seen = tokens.valid_M, None
         points, features = (
             jnp.where(valid[..., None], x, 0) for x in (tokens.points_world_M3, tokens.features_MF)

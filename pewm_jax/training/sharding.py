@@ -1,35 +1,77 @@
-"""Where arrays live: a mesh with one axis, and a table from paths to placements.
+"""Where the state lives: a mesh with four axes, and a table from paths to placements.
 
-Batches are split over the devices along B; parameters and optimizer state are copied to each. To
-shard them instead, add a rule above the last (``(r".*/kernel", P("data"))`` is fully sharded data
-parallelism): nothing else has to change, the compiler inserts the communication.
+``data`` holds copies of the weights, ``fsdp`` splits weights, optimizer and average (a layer's
+weights are gathered when it computes), ``tensor`` splits heads and feed-forward channels,
+``context`` splits tokens and no weights. Where activations live is said in ``models.placement``.
 """
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-from jax.sharding import AxisType, Mesh, NamedSharding
+import numpy as np
+from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax import tree
 from pewm_jax.config import AXES, Config, ConfigError, MeshConfig
+from pewm_jax.models.placement import BATCH
 from pewm_jax.training.stages import Stage
-
-BATCH = ("data", "fsdp")
-"""The mesh axes along which batches are split."""
+from pewm_jax.types import Params
 
 ALL_DATA = MeshConfig()
 """All devices along ``data``."""
 
-STATE_RULES: tuple[tuple[str, P], ...] = (
-    (r"step", P()),
-    (r"(params|ema|opt_state)/.*", P()),
+WHOLE = P()
+
+PARAMETERS: tuple[tuple[str, P], ...] = (
+    # The backbone: matrices into heads and hidden channels, and out of them.
+    (r"backbone/blocks/(to_[qkv]|ff/up|norm[12]/linear)/kernel", P("fsdp", "tensor")),
+    (r"backbone/blocks/(to_[qkv]|ff/up|norm[12]/linear)/bias", P("tensor")),
+    (r"backbone/blocks/(to_out|ff/down)/kernel", P("tensor", "fsdp")),
+    (r"backbone/blocks/(to_out|ff/down)/bias", WHOLE),
+    (r"backbone/blocks/(norm_[qk]|norm[12]/norm)/(scale|bias)", WHOLE),
+    (r"backbone/(patch_embed|text_embed)/kernel", P(None, "fsdp")),
+    (r"backbone/(time_embed|ofs_embed)/linear_[12]/kernel", P(None, "fsdp")),
+    (r"backbone/modulate_out/kernel", P("fsdp", "tensor")),
+    (r"backbone/modulate_out/bias", P("tensor")),
+    (r"backbone/proj_out/kernel", P("fsdp", None)),
+    (r"backbone/positions", P(None, "fsdp")),
+    (r"backbone/(patch_embed|text_embed|proj_out|(time|ofs)_embed/linear_[12])/bias", WHOLE),
+    (r"backbone/norm_(final|out)/(scale|bias)", WHOLE),
+    # The memory blocks.
+    (r"memory/blocks/(attention/to_[qkv]|ff/up|linear)/kernel", P("fsdp", "tensor")),
+    (r"memory/blocks/(attention/to_[qkv]|ff/up|linear)/bias", P("tensor")),
+    (r"memory/blocks/(to_out|ff/down)/kernel", P("tensor", "fsdp")),
+    (r"memory/blocks/with_camera/kernel", P(None, "fsdp")),
+    (r"memory/(camera|tokens)/kernel", P(None, "fsdp")),
+    (r"memory/blocks/attention/([qk]_constant|k_depth)", P("tensor", None)),
+    (r"memory/blocks/attention/(nearer|sink)", P("tensor")),
+    (r"memory/blocks/(to_out|ff/down|with_camera)/bias", WHOLE),
+    (r"memory/(camera|tokens)/bias", WHOLE),
+    (r"memory/blocks/(attention/norm_[qk]|norm_video|norm_memory|norm2)/(scale|bias)", WHOLE),
+    # Frozen networks: gathered when they compute, each device its own examples.
+    (r"(codec|encoder)/.*/kernel", P(None, "fsdp")),
+    (r"encoder/position_embed", P(None, "fsdp")),
+    (r"encoder/register_tokens", P(None, "fsdp")),
+    (r"encoder/blocks/scale[12]", WHOLE),
+    (r"encoder/cls_token", WHOLE),
+    (r"(codec|encoder)/.*/(scale|bias)", WHOLE),
+    (r"text/prompt_LC", P(None, "fsdp")),
 )
-"""Placement of each leaf of a ``TrainState`` by its path; every leaf must be matched."""
+"""Path of a parameter → the mesh axes of its *last* axes; those before them (stacked layers, taps
+of a convolution) are never split. The first match wins, and every parameter must be matched."""
+
+STATE_RULES: tuple[tuple[str, P], ...] = (
+    *((rf"(params|ema|opt_state/.+)/{path}", spec) for path, spec in PARAMETERS),
+    (r"opt_state/.*count", WHOLE),
+    (r"step", WHOLE),
+)
+"""The same for each leaf of a ``TrainState``: average and moments lie with their parameter."""
 
 
 def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_DATA) -> Mesh:
@@ -44,11 +86,64 @@ def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_D
 
 
 def of_state(mesh: Mesh, state: Any) -> Any:
-    """Return the shardings of a (possibly abstract) state, as a tree of its structure."""
-    specs = tree.assign(STATE_RULES, state, "sharding rules")
+    """Return the shardings of a (possibly abstract) state, as a tree of its structure.
+
+    An axis of the mesh that does not divide its axis of a leaf is left out for that leaf;
+    ``left_out`` lists these.
+
+    Raises:
+        TreeError: leaves that no rule matches.
+    """
     return jax.tree.map(
-        lambda spec: NamedSharding(mesh, spec), specs, is_leaf=lambda node: isinstance(node, P)
+        lambda leaf, spec: NamedSharding(mesh, _fitted(mesh, leaf, spec)[0]),
+        state,
+        _specs(state),
     )
+
+
+def constrain(params: Params) -> Params:
+    """Keep a tree of parameters, or of their gradients, where the table says; within a step."""
+    mesh = jax.sharding.get_abstract_mesh()
+    if mesh.empty or mesh.size == 1:
+        return params
+    specs = tree.assign(STATE_RULES, {"params": params}, "sharding rules")["params"]
+    return jax.tree.map(
+        lambda x, spec: jax.lax.with_sharding_constraint(x, _fitted(mesh, x, spec)[0]),
+        params,
+        specs,
+    )
+
+
+def left_out(mesh: Mesh, state: Any) -> dict[str, tuple[str, ...]]:
+    """Return the leaves that are not split as their rule says, and the mesh axes left out.
+
+    Args:
+        mesh: the devices.
+        state: a (possibly abstract) state.
+    """
+    leaves, specs = tree.flatten(state), tree.flatten(_specs(state))
+    missed = {path: _fitted(mesh, leaf, specs[path])[1] for path, leaf in leaves.items()}
+    return {path: axes for path, axes in missed.items() if axes}
+
+
+def _specs(state: Any) -> Any:
+    return tree.assign(STATE_RULES, state, "sharding rules")
+
+
+def _fitted(mesh: Mesh | AbstractMesh, leaf: Any, spec: P) -> tuple[P, tuple[str, ...]]:
+    """Align a spec to a leaf's last axes; returns it, and the mesh axes that do not divide them."""
+    shape = tuple(getattr(leaf, "shape", ()))
+    kept: list[str | None] = [None] * len(shape)
+    missed: list[str] = []
+    for place in range(1, len(spec) + 1):  # from the last axis forward
+        axis = spec[-place]
+        if axis is None:
+            continue
+        if place <= len(shape) and shape[-place] % mesh.shape[axis] == 0:
+            kept[-place] = axis
+        else:
+            missed.append(axis)
+    return P(*kept), tuple(missed)
 
 
 def of_batch(mesh: Mesh) -> NamedSharding:
@@ -70,11 +165,46 @@ def abstract(shapes: Any, shardings: Any) -> Any:
     )
 
 
+def place(values: Any, like: Any) -> Any:
+    """Put weights where they belong: leaf by leaf, and of each leaf only this process's parts.
+
+    Args:
+        values: nested dictionaries of arrays: NumPy arrays, also of files that are mapped and not
+            read yet (``weights.lazy``), or JAX arrays, which move between devices.
+        like: abstract arrays with shardings, for at least these paths.
+
+    Returns:
+        The same tree as JAX arrays, in the dtypes of ``like``.
+    """
+    given, wanted = tree.flatten(values), tree.flatten(like)
+    moved = {path: leaf for path, leaf in given.items() if isinstance(leaf, jax.Array)}
+    read = {
+        path: jax.make_array_from_callback(
+            leaf.shape, wanted[path].sharding, functools.partial(_part, leaf, wanted[path].dtype)
+        )
+        for path, leaf in given.items()
+        if path not in moved
+    }
+    if moved:
+        there = {path: wanted[path].sharding for path in moved}
+        cast = jax.jit(
+            lambda leaves: {path: x.astype(wanted[path].dtype) for path, x in leaves.items()},
+            out_shardings=there,
+        )
+        moved = cast(moved)
+    return tree.unflatten({path: moved.get(path, read.get(path)) for path in given})
+
+
+def _part(leaf: np.ndarray, dtype: np.dtype, index: tuple[slice, ...]) -> np.ndarray:
+    return np.asarray(leaf[index], dtype)
+
+
 def require_divisible(config: Config, stage: Stage, mesh: Mesh) -> None:
-    """Refuse a batch that cannot be split evenly.
+    """Refuse what cannot be split evenly.
 
     Raises:
-        ConfigError: the batch is not a multiple of the number of devices.
+        ConfigError: the batch is not a multiple of the devices that share it, or heads and hidden
+            channels are no multiple of those that share them.
     """
     batch, devices = stage.settings(config).batch, math.prod(mesh.shape[axis] for axis in BATCH)
     if batch % devices:
@@ -82,3 +212,13 @@ def require_divisible(config: Config, stage: Stage, mesh: Mesh) -> None:
             f"train.{stage.name}.batch is {batch}, which {devices} devices cannot share evenly: "
             f"use a multiple of {devices}."
         )
+    tensor = mesh.shape["tensor"]
+    heads: Mapping[str, int] = {"dit.heads": config.dit.heads}
+    if stage.memory:
+        heads = {**heads, "memory.heads": config.memory.heads}
+    for name, count in heads.items():
+        if count % tensor:
+            raise ConfigError(
+                f"train.mesh.tensor is {tensor}, which does not divide {name} ({count}): use a "
+                f"divisor of {count}."
+            )

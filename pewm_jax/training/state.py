@@ -27,7 +27,8 @@ class TrainState:
     """The state of one stage.
 
     Attributes:
-        params: all parameters of the stage, trained and frozen, float32.
+        params: all parameters of the stage: trained ones in float32, frozen ones in
+            ``train.dtype``, which is all that computing with them takes.
         ema: exponential moving average of the trained parameters only.
         opt_state: optimizer state; moments of the trained parameters only.
         step: () int32, steps done; also the position in the data.
@@ -61,7 +62,8 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
                 for path, leaf in tree.flatten(params).items()
             }
         )
-    trained = tree.select(params, stage.trained)
+    trained, frozen = tree.split(params, stage.trained)
+    params = tree.merge(trained, jax.tree.map(lambda x: x.astype(config.train.dtype), frozen))
     return TrainState(
         params=params,
         ema=jax.tree.map(jnp.copy, trained),

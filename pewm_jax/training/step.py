@@ -22,7 +22,7 @@ from pewm_jax.config import Config
 from pewm_jax.diffusion import objective
 from pewm_jax.training import optimizer, sharding
 from pewm_jax.training.stages import Stage
-from pewm_jax.training.state import TrainState, create, update_ema
+from pewm_jax.training.state import TrainState, create, require_start, update_ema
 from pewm_jax.types import Array, Clip, Params
 
 Metrics = dict[str, Array]
@@ -54,6 +54,7 @@ def train_step(
         return objective.loss(config, params, clip, step_key, memory=stage.memory)
 
     (loss, measured), gradients = jax.value_and_grad(loss_of, has_aux=True)(trained)
+    gradients = sharding.constrain(gradients)
     still = jax.tree.map(jnp.zeros_like, frozen)
     updates, opt_state = optimizer.make(config, stage).update(
         tree.merge(gradients, still), state.opt_state, state.params
@@ -94,10 +95,16 @@ def abstract_state(config: Config, stage: Stage, mesh: Mesh) -> Any:
 def initial_state(
     config: Config, stage: Stage, mesh: Mesh, start: Params | None = None
 ) -> TrainState:
-    """Create the state in its place on the devices; see ``state.create``."""
+    """Create the state in its place on the devices; see ``state.create``.
+
+    Nothing is whole anywhere in between: fresh weights are drawn where they belong, and of those
+    to start from each device is given its part.
+    """
+    like = abstract_state(config, stage, mesh)
+    shardings = jax.tree.map(lambda leaf: leaf.sharding, like)
     if start is not None:
-        start = jax.device_put(start, sharding.replicated(mesh))
-    shardings = jax.tree.map(lambda leaf: leaf.sharding, abstract_state(config, stage, mesh))
+        require_start(config, stage, start, like.params)
+        start = sharding.place(start, like.params)
     make = jax.jit(functools.partial(create, config, stage), out_shardings=shardings)
     return make(stage_key(config, stage), start)
 
@@ -117,7 +124,8 @@ def lower_step(config: Config, stage: Stage, mesh: Mesh, clip: Any) -> jax.stage
         donate_argnums=0,
     )
     abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
-    return step.lower(state, batch, abstract_key)
+    with jax.set_mesh(mesh):  # which ``models.placement`` asks for
+        return step.lower(state, batch, abstract_key)
 
 
 def compile_step(

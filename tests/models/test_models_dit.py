@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pewm_jax.config import PUBLISHED, ConfigError, DiTConfig, UserError, published
 from pewm_jax.models import dit, layers, positions, world_model
+from pewm_jax.models.token_layout import TokenLayout
 from tests.helpers import init_world, randomise, tiny_config
 from tests.models.test_models_world_model import setup as world
 
@@ -83,9 +84,10 @@ def plain_loop(params, latents, text, times):
     tokens, time = ends.apply(rest, patches, text, times, times, method="embed")
     length = CONFIG.text_length
     angles = positions.joint_angles(CONFIG, (3, 2, 3), length)
+    layout = TokenLayout(parts=1, text=length, frames=3, patches=6)
     for i in range(CONFIG.layers):
         layer = jax.tree.map(lambda x, i=i: x[i], params["blocks"])
-        tokens = dit.Block(CONFIG).apply({"params": layer}, tokens, time, angles, length)
+        tokens = dit.Block(CONFIG).apply({"params": layer}, tokens, time, angles, layout)
     out = ends.apply(rest, tokens[:, length:], time, method="project")
     return dit.unpatchify(out, 3, 4, 6, 2)
 

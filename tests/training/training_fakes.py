@@ -11,6 +11,7 @@ from pewm_jax.config import ClipConfig, Config, DataConfig, StageConfig, TrainCo
 from pewm_jax.data import loader
 from pewm_jax.diffusion import objective
 from pewm_jax.models import world_model
+from pewm_jax.training import sharding
 from pewm_jax.types import Camera, Clip, Frames
 
 SIZE = 16
@@ -95,6 +96,8 @@ def install(patch):
     patch.setattr(objective, "loss", loss)
     patch.setattr(loader, "clips", clips)
     patch.setattr(loader, "records", records)
+    fake = r"(params|ema|opt_state/.+)/(backbone|memory)/(kernel|bias|gate)"
+    patch.setattr(sharding, "STATE_RULES", ((fake, sharding.WHOLE), *sharding.STATE_RULES))
 
 
 @pytest.fixture
