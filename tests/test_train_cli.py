@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -278,6 +279,36 @@ def test_training_real_episodes_stopped_by_ctrl_c_and_started_again(data, tmp_pa
     assert code == 2
     assert err.count("\n") == 1
     assert "dit.layers 2 there, 1 here" in err
+
+
+def test_told_to_end_while_it_compiles_then_trained_without_a_record_that_is_damaged(
+    data, tmp_path
+):
+    shutil.copytree(data, tmp_path / "data")
+    shard = next((tmp_path / "data" / "train").glob("*.array_record"))
+    held = shard.read_bytes()
+    place = held.index(b"IDAT") + 20
+    shard.write_bytes(held[:place] + bytes([held[place] ^ 4]) + held[place + 1 :])
+    argv = ["tiny", "--data.path", tmp_path / "data", "--train.run", tmp_path / "runs" / "it"]
+    argv += ["--train.stage1.steps", "3", "--train.stage2.steps", "0", "--data.bad_records", "1"]
+    process = start(*argv, "--profile", "1")
+    assert process.stdout is not None
+    while "compiling the training step" not in process.stdout.readline():
+        assert process.poll() is None, process.communicate()
+    process.send_signal(signal.SIGTERM)
+    code, _, err = finish(process)
+    assert code == 143
+    assert err.strip() == (
+        "Stopped with nothing new to save (nothing was saved yet); the same command goes on."
+    )
+
+    code, out, err = finish(start(*argv, "--profile", "1"))
+    assert (code, err) == (0, "")
+    named = rf"bad record 1 of 1 allowed, skipped: train/{shard.name} record 0: "
+    assert len(re.findall(named, out)) == 1
+    assert re.search(r"^stage 1 3/3 loss .* · 1 bad records · ", out, re.MULTILINE)
+    assert re.search(r"^stage 1: traced 1 steps; open them with `tensorboard ", out, re.MULTILINE)
+    assert list((tmp_path / "runs" / "it" / "profile").rglob("*.xplane.pb"))
 
 
 def test_absent_data_are_a_sentence_and_the_run_can_be_started_again(tmp_path):
