@@ -30,11 +30,12 @@ from pewm_jax.models import codec, world_model
 from pewm_jax.types import Array, Camera, Frames, Params, WorldState
 
 
-def load(path: str | Path) -> tuple[Config, Params]:
+def load(path: str | Path, *, lazily: bool = False) -> tuple[Config, Params]:
     """Load a trained world model.
 
     Args:
         path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``.
+        lazily: map the file into memory, so that what is not looked at is not read.
 
     Returns:
         ``(config, params)``; the averaged weights that inference uses, in the dtype of the file.
@@ -44,7 +45,7 @@ def load(path: str | Path) -> tuple[Config, Params]:
     """
     folder = Path(path)
     config = configs.load(folder / "config.json")
-    params = weights.load(folder / "weights.safetensors")
+    params = (weights.lazy if lazily else weights.load)(folder / "weights.safetensors")
     expected = jax.eval_shape(
         lambda key: world_model.init(config, key, memory="memory" in params), jax.random.key(0)
     )

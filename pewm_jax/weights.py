@@ -206,6 +206,20 @@ def load(path: Path, part: str = "") -> Params:
     return tree.unflatten({name: read_at(path, place) for name, place in found.items()})
 
 
+def lazy(path: Path) -> Params:
+    """Map a file of weights into memory: of each tensor only what is looked at is read.
+
+    Like ``load`` otherwise, but checksums are not compared; ``verify`` does that.
+    """
+    found = places(path)
+    whole = np.memmap(path, np.uint8, "r")
+
+    def view(place: Place) -> np.ndarray:
+        return whole[place.begin : place.begin + place.size].view(place.dtype).reshape(place.shape)
+
+    return tree.unflatten({name: view(place) for name, place in found.items()})
+
+
 def places(path: Path) -> dict[str, Place]:
     """Return where each tensor of a safetensors file lies, having read its header only.
 

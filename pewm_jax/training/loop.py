@@ -16,7 +16,7 @@ from typing import NoReturn
 import jax
 from jax.sharding import Mesh
 
-from pewm_jax import rollouts
+from pewm_jax import rollouts, weights
 from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
@@ -126,11 +126,19 @@ def _named(config: Config, stage: Stage, say: Callable[[str], None]) -> Params |
     """
     if not config.train.start:
         return None
-    _, params = rollouts.load(config.train.start)
+    _, params = rollouts.load(config.train.start, lazily=True)
+    processes.first(lambda: weights.verify(Path(config.train.start) / runs.WEIGHTS))
     if "memory" in params and not stage.memory:
         say(f"{config.train.start}: its memory blocks are left out; stage 2 begins with fresh ones")
         params = {name: part for name, part in params.items() if name != "memory"}
     return params
+
+
+def _encoder(config: Config) -> Params:
+    """Return the image encoder's weights as they are given, to compare kept features with."""
+    if config.memory.encoder != "dinov2":
+        return {}
+    return rollouts.load(config.train.start, lazily=True)[1]["encoder"]
 
 
 def _features(config: Config, stage: Stage) -> feature_cache.FeatureCache | None:
@@ -235,10 +243,11 @@ class _Worker:
             clip = next(feed)
             state, step_fn = self._compile(make_state, clip)
             if cache is not None:
-                weights = processes.gather(state.params.get("encoder", {}))
                 split = Path(config.data.path) / "train"
                 processes.first(
-                    lambda: feature_cache.require_fresh(cache, config.memory, weights, split)
+                    lambda: feature_cache.require_fresh(
+                        cache, config.memory, _encoder(config), split
+                    )
                 )
             self.watch.pace = Pace(time.monotonic())
             pending: tuple[int, Metrics] | None = None
