@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
-import logging
 import time
 import types
 from collections.abc import Callable, Iterator
@@ -29,6 +28,7 @@ from pewm_jax import config as configuration
 from pewm_jax import tree
 from pewm_jax.config import Config, UserError
 from pewm_jax.training import integrity, processes, runs, shelf
+from pewm_jax.training.background import Quiet
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import TrainState, inference_params
 from pewm_jax.types import Params
@@ -65,7 +65,7 @@ class Checkpoints:
         self._finishing: concurrent.futures.Future[None] | None = None
         self._began, self._interval, self._settled = time.monotonic(), 0.0, True
         self._latest: int | None = processes.first(lambda: _tidied(self.folder, say))
-        logging.getLogger("absl").addFilter(_is_not_raised_too)
+        self._quiet, self._failed = Quiet(), False
 
     def __enter__(self) -> Self:
         return self
@@ -77,16 +77,20 @@ class Checkpoints:
         trace: types.TracebackType | None,
     ) -> None:
         try:
-            self.wait()
+            with self._writing():
+                try:
+                    self.wait()
+                finally:
+                    self._pool.shutdown()
+                    self._writer.close()
         except UserError:
             if error is None:
                 raise
         finally:
-            self._pool.shutdown()
-            self._writer.close()
             if processes.is_primary():
                 shelf.clear(self.folder)  # of a write that failed
-            logging.getLogger("absl").removeFilter(_is_not_raised_too)
+            if not self._failed:  # else some threads have not said all yet
+                self._quiet.end()
 
     def latest(self) -> int | None:
         """Return the step of the newest whole checkpoint, if there is any."""
@@ -215,6 +219,9 @@ class Checkpoints:
         try:
             yield
         except (OSError, ValueError, RuntimeError) as error:
+            if isinstance(error, UserError):
+                raise
+            self._failed = True
             whole = self._latest
             kept = "none was written before" if whole is None else f"that of step {whole} is kept"
             raise UserError(
@@ -302,12 +309,8 @@ def _reading(folder: Path) -> Iterator[None]:
 
 
 def _reason(error: BaseException) -> str:
-    return " ".join(str(error).split())[:160]
-
-
-def _is_not_raised_too(record: logging.LogRecord) -> bool:
-    """Drop tracebacks of the background: ``Checkpoints.wait`` raises the same as a sentence."""
-    return record.exc_info is None
+    said = getattr(error, "strerror", None) or str(error)
+    return " ".join(said.split())[:160]
 
 
 def _rest(stage: Stage, state: TrainState) -> dict[str, Any]:

@@ -5,6 +5,7 @@ On a terminal the live view is a progress bar, elsewhere a line every ten second
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import sys
@@ -61,9 +62,14 @@ class MetricsLog:
         error: BaseException | None,
         trace: types.TracebackType | None,
     ) -> None:
-        if self._writes:
-            self._file.close()
-            self._events.close()
+        if not self._writes:
+            return
+        # What went wrong before says more than that a full disk does not take the last lines.
+        with contextlib.nullcontext() if error is None else contextlib.suppress(OSError):
+            try:
+                self._file.close()
+            finally:
+                self._events.close()
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Log the scalars of one step; what is not finite is null in JSON, which has no such."""

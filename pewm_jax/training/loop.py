@@ -6,6 +6,7 @@ checkpoints are written in the background, so the devices never wait for the hos
 
 from __future__ import annotations
 
+import errno
 import functools
 import time
 from collections.abc import Callable, Iterator
@@ -38,6 +39,9 @@ from pewm_jax.training.step import (
 )
 from pewm_jax.training.watch import Preview, Watch
 from pewm_jax.types import Clip, Params
+
+_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+"""What is wrong where a disk cannot take more."""
 
 
 def train(
@@ -180,7 +184,7 @@ class _Worker:
         """Train the stage, or find it done; returns its inference weights."""
         config, stage, run, steps = self.config, self.stage, self.path, self.settings.steps
         like = abstract_state(config, stage, self.mesh)
-        with Checkpoints(run, config, stage, self.say) as self.checkpoints:
+        with Checkpoints(run, config, stage, self.say) as self.checkpoints, self._writing():
             self.stop.at_once, self.stop.kept = True, self._kept
             done = self.checkpoints.latest() or 0
             if done >= steps:
@@ -339,6 +343,20 @@ class _Worker:
     def _kept_in_the_end(self) -> str:
         self.checkpoints.wait()
         return self._kept()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Turn a disk that is full, or fails, into a sentence that says what is safe on it."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno not in _DISK:
+                raise
+            raise UserError(
+                f"{error.filename or self.path} cannot be written ({error.strerror}); "
+                f"{self._kept_in_the_end()}: free space there, then run the same command again to "
+                "go on."
+            ) from None
 
     @contextmanager
     def _paused(self) -> Iterator[None]:
