@@ -191,7 +191,7 @@ def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
 def _work(metrics: Mapping[str, float]) -> str:
     """Write how hard each device works, and what share of its peak that is where it is known."""
     rate = metrics["tflops_per_second_per_device"]
-    words = f"{rate:.1f} TFLOP/s" if rate >= 1 else f"{rate * 1e3:.1f} GFLOP/s"
+    words = f"{rate:.1f} TFLOP/s" if rate >= 1 else f"{rate * 1e3:.3g} GFLOP/s"
     share = f" · MFU {metrics['mfu']:.1%}" if "mfu" in metrics else ""
     return f"{words}/device{share}"
 
@@ -200,7 +200,7 @@ def _counts(metrics: Mapping[str, float]) -> str:
     """Write what went wrong so far, if anything did."""
     names = {"skipped": "skipped", "bad_records": "bad records"}
     return "".join(
-        f"{metrics[key]:.0f} {words} · " for key, words in names.items() if metrics.get(key)
+        f"{words} {metrics[key]:.0f} · " for key, words in names.items() if metrics.get(key)
     )
 
 

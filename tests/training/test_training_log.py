@@ -93,8 +93,8 @@ def test_a_line_names_rate_flops_and_time_left():
 def test_a_line_names_utilisation_where_the_peak_is_known_and_what_went_wrong():
     known = {"tflops_per_second_per_device": 412.34, "mfu": 0.4168}
     text = log.describe(METRICS | known | {"skipped": 2.0, "bad_records": 0.0}, 90)
-    assert "412.3 TFLOP/s/device · MFU 41.7% · 2 skipped · 1 min 30 s left" in text
-    assert "1 bad records" in log.describe(METRICS | {"bad_records": 1.0}, 90)
+    assert "412.3 TFLOP/s/device · MFU 41.7% · skipped 2 · 1 min 30 s left" in text
+    assert "bad records 1 ·" in log.describe(METRICS | {"bad_records": 1.0}, 90)
 
 
 def test_on_a_terminal_there_is_a_bar():
