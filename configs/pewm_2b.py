@@ -7,6 +7,7 @@ from pewm_jax.config import (
     CodecConfig,
     Config,
     DataConfig,
+    DiffusionConfig,
     EvalConfig,
     MemoryConfig,
     MeshConfig,
@@ -27,11 +28,11 @@ def config(variant: str = "2b") -> Config:
     the paper does not say is chosen: 512 cells per clip, 16 frames of context, and a memory block
     with 16 heads of 64 and a feed-forward network of twice the width, which makes 0.94 billion
     parameters on 2b ("nearly 1 B") and 2.8 on 5b; 256 clips per step, so that 8 devices, 64 and 256
-    share them evenly.
+    share them evenly; weights split over 8 devices, a node of GPUs, and copied beyond.
 
     Training needs ``train.start``: converted weights of CogVideoX, widened to depth and cameras,
-    with those of DINOv2 (``python -m pewm_jax.convert import … --rgbd --camera``, docs/convert.md).
-    ``--plan`` needs nothing.
+    with those of DINOv2 (``python -m pewm_jax.convert import cogvideox SRC DST --rgbd --camera
+    --encoder DINOV2``). ``--plan`` needs nothing.
 
     Args:
         variant: one of ``pewm_jax.config.PUBLISHED``.
@@ -54,6 +55,9 @@ def config(variant: str = "2b") -> Config:
             head_dim=64,
             mlp_ratio=2,
         ),
+        diffusion=DiffusionConfig(
+            target="v", snr_shift=3.0 if variant == "2b" else 1.0, sample_steps=50
+        ),
         data=DataConfig(path="data/pewm", context=16),
         train=TrainConfig(
             run=f"runs/pewm_{variant}",
@@ -64,7 +68,7 @@ def config(variant: str = "2b") -> Config:
             keep_every=5000,
             preview_every=1000,
             dtype="bfloat16",
-            mesh=MeshConfig(data=1, fsdp=8),
+            mesh=MeshConfig(fsdp=8),
         ),
         evaluate=EvalConfig(clips=256, batch=8),
     )

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from pewm_jax.config import Config
-from pewm_jax.models import blocked_attention, codec, world_model
+from pewm_jax.models import codec, world_model
 from pewm_jax.models.vae_layout import layout
 from pewm_jax.training.stages import Stage
 
+SPLIT = ("tensor", "context")
+"""The axes of the mesh that split a block."""
 PARTS = ("backbone", "memory", "codec", "encoder")
 """The networks of a step, as their parameters are named."""
 
@@ -31,6 +33,8 @@ class Product:
         macs: multiply-adds of one clip, forward, all layers together.
         backward: forward passes' worth of the gradients.
         again: forward passes' worth of what the backward pass computes again.
+        axes: the axes of the mesh, beside the batch's, over which it is split; devices along
+            others do the same work.
     """
 
     part: str
@@ -38,6 +42,7 @@ class Product:
     macs: float
     backward: float = 0.0
     again: float = 0.0
+    axes: tuple[str, ...] = ()
 
     @property
     def model(self) -> float:
@@ -133,6 +138,18 @@ def flops_per_clip(config: Config, stage: Stage) -> float:
     return math.fsum(product.model for product in products(config, stage))
 
 
+def flops_of_device(product: Product, mesh: Mapping[str, int], clips: float) -> float:
+    """Return the FLOPs that one device does for a product.
+
+    Args:
+        product: the product.
+        mesh: devices along each axis.
+        clips: clips of a step, of all devices.
+    """
+    ways = math.prod(mesh[axis] for axis in ("data", "fsdp", *product.axes))
+    return clips * product.hardware / ways
+
+
 def _backbone(config: Config, stage: Stage) -> Iterator[Product]:
     """Yield the transformer's products.
 
@@ -147,21 +164,20 @@ def _backbone(config: Config, stage: Stage) -> Iterator[Product]:
     both, one = 1.0 + trained, float(trained)
 
     per_token = (4 + 2 * dit.mlp_ratio) * width * width
-    yield Product("backbone", "linear", depth * s.joint * per_token, both, again)
+    yield Product("backbone", "linear", depth * s.joint * per_token, both, again, SPLIT)
     modulation = depth * 12 * width * time
-    yield Product("backbone", "linear", modulation, 2 * one, again)
-    clip_batch = max(stage.settings(config).batch, 1)
-    table = clip_batch * dit.heads * s.joint**2 <= blocked_attention.LOGITS
-    recomputed = again + (0.0 if table else 0.5)  # the logits, from their normaliser
-    yield Product("backbone", "attention", depth * 2 * s.joint**2 * width, 2.0, recomputed)
+    yield Product("backbone", "linear", modulation, 2 * one, again, ("tensor",))
+    recomputed = again + 0.5  # the logits, from their normaliser
+    attention = depth * 2 * s.joint**2 * width
+    yield Product("backbone", "attention", attention, 2.0, recomputed, SPLIT)
 
     ends_in = s.video * cell * world_model.in_channels(config) * width
     ends_in += s.text * dit.text_dim * width + (width + dit.ofs_dim) * time
     yield Product("backbone", "linear", ends_in, one)
     yield Product("backbone", "linear", time * time * (2 if dit.ofs_dim else 1), 2 * one)
-    yield Product("backbone", "linear", 2 * width * time, 2 * one)
+    yield Product("backbone", "linear", 2 * width * time, 2 * one, 0.0, ("tensor",))
     out = s.video * cell * codec.latent_channels(config) * width
-    yield Product("backbone", "linear", out, both)
+    yield Product("backbone", "linear", out, both, 0.0, ("context",))
 
 
 def _memory(config: Config) -> Iterator[Product]:
@@ -172,14 +188,16 @@ def _memory(config: Config) -> Iterator[Product]:
     projective = memory.positions == "projective"
     place = 3 * memory.heads if projective else 0
 
-    video = s.video * width * (width + width // 2 + inner + inner + place)
-    video += s.video * width * 2 * memory.mlp_ratio * width
-    keys = 2 * s.map * inner * inner
-    yield Product("memory", "linear", depth * (video + keys), 2.0, again)
+    camera = depth * s.video * width * (width + width // 2)
+    yield Product("memory", "linear", camera, 2.0, again, ("context",))
+    video = depth * s.video * width * (2 * inner + place + 2 * memory.mlp_ratio * width)
+    yield Product("memory", "linear", video, 2.0, again, SPLIT)
+    keys = depth * 2 * s.map * inner * inner
+    yield Product("memory", "linear", keys, 2.0, again, ("tensor",))
     modulation = depth * dit.time_dim * (4 * width + 2 * inner)
-    yield Product("memory", "linear", modulation, 1.0, again)
+    yield Product("memory", "linear", modulation, 1.0, again, ("tensor",))
     attention = depth * s.video * s.seen * (2 * inner + place)
-    yield Product("memory", "attention", attention, 2.0, again)
+    yield Product("memory", "attention", attention, 2.0, again, SPLIT)
     rays = world_model.camera_channels(config) * dit.patch**2 * dit.patch_t
     ends = s.video * rays * (width // 2) + s.map * world_model.token_channels(config) * inner
     yield Product("memory", "linear", ends, 1.0)

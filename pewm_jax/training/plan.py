@@ -1,0 +1,197 @@
+"""What a training would take on hardware that is not here: ``python train.py PRESET --plan``.
+
+The real step is compiled ahead of time for as many virtual CPU devices as are asked for, from
+shapes alone: no data is read, no weight is made, no folder written. The compiled program says what
+is done and sent; the sums on paper (``costs``, ``footprint``, ``predict``), which it confirms, say
+what that is on the chip.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax.config import Config, Launch, UserError
+from pewm_jax.models import world_model
+from pewm_jax.training import chips, hlo, plan_text, sharding, stages, step, suggest
+from pewm_jax.training.chips import Chip
+from pewm_jax.training.footprint import Arranged, Footprint, footprint
+from pewm_jax.training.stages import Stage
+from pewm_jax.training.suggest import Choice
+from pewm_jax.types import Camera, Clip, Frames
+
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+"""What is never run need not be fast: only the machine code differs, not what is planned."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Compiled:
+    """What the compiler says about one stage's step, per device.
+
+    Attributes:
+        program: its products and communication.
+        arguments: bytes of state and batch.
+        temporary: bytes that the step needs besides.
+        expected: the sum on paper for a CPU, which widens 16 bits to 32 and cuts attention in
+            pieces; to be compared with.
+        seconds: what compiling took.
+    """
+
+    program: hlo.Program
+    arguments: float
+    temporary: float
+    expected: Footprint
+    seconds: float
+
+    @property
+    def peak(self) -> float:
+        """All together."""
+        return self.arguments + self.temporary
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """One stage on one kind of device.
+
+    Attributes:
+        config: the experiment.
+        stage: the stage.
+        chip: the kind of device.
+        choice: the arrangement asked for, and what it takes by the sums on paper.
+        compiled: what the compiler says.
+        best: the best arrangements.
+    """
+
+    config: Config
+    stage: Stage
+    chip: Chip
+    choice: Choice
+    compiled: Compiled
+    best: tuple[Choice, ...]
+
+    @property
+    def peak(self) -> float:
+        """Bytes on a device that decide: by the sums, more where the compiler finds more."""
+        more = max(1.0, self.compiled.peak / self.compiled.expected.peak)
+        return self.choice.memory.peak * more
+
+    @property
+    def fits(self) -> bool:
+        """Whether the step fits, with a margin."""
+        return self.peak <= suggest.MARGIN * self.chip.memory
+
+
+def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> list[Plan]:
+    """Plan all stages that have steps, and print the plans.
+
+    Args:
+        config: the experiment.
+        launch: how many devices, and of what kind.
+        say: prints a line.
+
+    Raises:
+        ConfigError: the chip is not known, or the devices cannot be arranged or share a batch so.
+        UserError: devices were in use before and are too few.
+    """
+    chip = chips.named(launch.chip)
+    arranged = Arranged(*config.train.mesh.shape(launch.devices))
+    planned = stages.planned(config)
+    for stage in planned:
+        sharding.require_divisible(config, stage, _abstract(arranged))
+    devices = virtual(launch.devices)
+    plans = []
+    for stage in planned:
+        say(f"stage {stage.number}: compiling the real step for {launch.devices} devices …")
+        compiled = compile_stage(config, stage, devices)
+        say(f"stage {stage.number}: compiled in {compiled.seconds:.0f} s")
+        best = suggest.rank(config, stage, launch.devices, chip)[:3]
+        choice = suggest.weigh(config, stage, arranged, chip)
+        plans.append(Plan(config, stage, chip, choice, compiled, tuple(best)))
+        for line in plan_text.lines(plans[-1]):
+            say(line)
+    return plans
+
+
+def virtual(count: int) -> Sequence[Any]:
+    """Return so many CPU devices that there are not; before any device is used.
+
+    Raises:
+        UserError: devices are in use already, and too few.
+    """
+    try:
+        jax.config.update("jax_platforms", "cpu")
+        jax.config.update("jax_num_cpu_devices", count)
+    except RuntimeError:
+        pass  # in use already: they may be enough
+    devices = jax.devices("cpu")
+    if len(devices) < count:
+        raise UserError(
+            f"A plan for {count} devices needs a process of its own, in which JAX has not used its "
+            f"{len(devices)} yet: run `python train.py … --plan`."
+        )
+    return devices[:count]
+
+
+def compile_stage(config: Config, stage: Stage, devices: Sequence[Any]) -> Compiled:
+    """Compile a stage's real step from shapes alone, and read what it does."""
+    began = time.monotonic()
+    mesh = sharding.make_mesh(devices, config.train.mesh)
+    as_there = _as_on_chips(config)
+    lowered = step.lower_step(as_there, stage, mesh, abstract_clip(config, stage))
+    compiled = lowered.compile(compiler_options=QUICK)
+    memory, text = compiled.memory_analysis(), compiled.as_text()
+    if memory is None or text is None:
+        raise UserError("This JAX does not say what a compiled program needs; use 0.10 or newer.")
+    kept = memory.output_size_in_bytes - memory.alias_size_in_bytes
+    return Compiled(
+        program=hlo.read(text),
+        arguments=float(memory.argument_size_in_bytes),
+        temporary=float(memory.temp_size_in_bytes + kept),
+        expected=footprint(config, stage, Arranged.of(mesh), wide=4, flash=False),
+        seconds=time.monotonic() - began,
+    )
+
+
+def abstract_clip(config: Config, stage: Stage) -> Clip:
+    """Return the shapes and types of a batch, as the loader makes it, without reading any."""
+    batch, clip = stage.settings(config).batch, config.clip
+
+    def array(*shape: int, dtype: Any = np.float32) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((batch, *shape), dtype)
+
+    def frames(count: int) -> Frames:
+        return Frames(
+            array(count, clip.height, clip.width, 3, dtype=np.uint8),
+            array(count, clip.height, clip.width),
+            Camera(array(count, 4), array(count, 4, 4)),
+        )
+
+    context, features = config.data.context, None
+    if config.data.features and stage.memory:
+        memory = config.memory
+        rows = columns = memory.encoder_size // memory.dinov2.patch
+        if memory.encoder != "dinov2":
+            rows, columns = (n // memory.encoder_patch for n in (clip.height, clip.width))
+        channels = world_model.feature_channels(config)
+        features = array(context, rows, columns, channels, dtype=np.float16)
+    valid = array(context, dtype=np.bool_)
+    return Clip(frames(clip.frames), frames(context), valid, features)
+
+
+def _as_on_chips(config: Config) -> Config:
+    """Have the VAE's convolutions as accelerators run them, not in a CPU's form."""
+    codec = config.codec
+    if codec.vae.convolution != "auto":
+        return config
+    vae = dataclasses.replace(codec.vae, convolution="volume")
+    return dataclasses.replace(config, codec=dataclasses.replace(codec, vae=vae))
+
+
+def _abstract(arranged: Arranged) -> Any:
+    """Return a mesh without devices."""
+    return jax.sharding.AbstractMesh(tuple(arranged.sizes.values()), tuple(arranged.sizes))

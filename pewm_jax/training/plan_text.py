@@ -1,0 +1,92 @@
+"""A plan in words and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from pewm_jax.training import hlo, suggest
+from pewm_jax.training.log import duration
+from pewm_jax.training.suggest import Choice
+
+if TYPE_CHECKING:
+    from pewm_jax.training.plan import Plan
+
+MEMORY = (
+    ("weights that train, float32", "trained"),
+    ("frozen weights", "frozen"),
+    ("moving average", "average"),
+    ("Adam's moments", "moments"),
+    ("batch", "batch"),
+    ("gradients", "gradients"),
+    ("activations kept for the backward pass", "kept"),
+    ("one block's backward pass", "block"),
+    ("one block's weights, gathered", "gathered"),
+    ("or before all that: VAE and DINOv2", "encoders"),
+)
+"""What stands in which line of the table of memory."""
+
+
+def lines(plan: Plan) -> Iterator[str]:
+    """Yield the lines of a stage's plan."""
+    config, choice, compiled = plan.config, plan.choice, plan.compiled
+    chip, time = plan.chip, choice.time
+    clips = plan.stage.settings(config).batch
+    yield ""
+    yield (
+        f"Stage {plan.stage.number} on {choice.mesh.devices} × {chip.name}: {arranged(choice)}; "
+        f"{clips} clips a step, {clips / choice.mesh.batch:g} a device"
+    )
+    yield "  memory of a device"
+    for label, name in MEMORY:
+        yield f"    {label:<42}{size(getattr(choice.memory, name)):>10}"
+    yield f"    {'peak, by the formula':<42}{size(choice.memory.peak):>10}"
+    yield (
+        f"    the compiled CPU program: {size(compiled.arguments)} of state and batch + "
+        f"{size(compiled.temporary)} = {size(compiled.peak)}, where the formula for a CPU, which "
+        f"widens 16 bits to 32, has {size(compiled.expected.peak)}"
+    )
+    verdict = "fits" if plan.fits else "does not fit"
+    yield (
+        f"    {verdict}: {size(plan.peak)} of {size(chip.memory)} ({suggest.MARGIN:.0%} may be "
+        f"used); the formula decides, raised where the compiler found more than it"
+    )
+    yield "  work of a step"
+    yield f"    the model's own, all devices {time.model_flops / 1e12:>17.4g} TFLOP"
+    yield (
+        f"    done by a device, with what is recomputed {time.hardware_flops / 1e12:>4.4g} TFLOP "
+        f"(compiled program: {compiled.program.flops / 1e12:.4g})"
+    )
+    yield "  sent by a device in a step, by the formula (compiled program, in 32 bits)"
+    for kind in hlo.KINDS:
+        formula, counted = time.sent_of(kind), compiled.program.sent(kind)
+        if formula or counted:
+            yield f"    {kind:<42}{size(formula):>10} ({size(counted)})"
+    yield "  predicted"
+    yield (
+        f"    a step {duration(time.step_s)}: products {duration(time.products_s)}, element-wise "
+        f"{duration(time.streaming_s)}, waiting for other devices {duration(time.waiting_s)}"
+    )
+    yield (
+        f"    MFU {time.mfu:.1%}, {time.clips_per_s:.3g} clips/s, {time.tokens_per_s:,.0f} video "
+        "tokens/s"
+    )
+    yield "  arrangements that suit best, by the formula"
+    for best in plan.best:
+        fits = "fits" if best.fits else "does not fit"
+        yield (
+            f"    {duration(best.time.step_s)}/step, {size(best.memory.peak)}, {fits}: {best.flags}"
+        )
+
+
+def arranged(choice: Choice) -> str:
+    """Write an arrangement: ``data 8 × fsdp 8 × tensor 1 × context 1``."""
+    return " × ".join(f"{name} {count}" for name, count in choice.mesh.sizes.items())
+
+
+def size(count: float) -> str:
+    """Write bytes as people do."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= factor:
+            return f"{count / factor:.3g} {unit}"
+    return f"{count:.0f} B"

@@ -1,0 +1,164 @@
+"""How long a step takes on a chip, from its data sheet: FLOPs, bytes of memory, bytes sent.
+
+A prediction, not a measurement: what share of the peak each kind of work reaches is assumed
+(``REACHED``), and communication is taken to run behind the computation where nothing waits for it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from pewm_jax.config import AXES, Config
+from pewm_jax.training import costs
+from pewm_jax.training.chips import Chip
+from pewm_jax.training.footprint import FLOAT, Arranged, counts
+from pewm_jax.training.stages import Stage
+
+REACHED = {"linear": 0.65, "attention": 0.4, "convolution": 0.4}
+"""Shares of the peak that large products reach: assumed, from what is published of such kernels."""
+STREAMED = 0.8
+"""Share of the memory's bandwidth that element-wise work reaches; assumed."""
+PASSES = {"backbone": (16, 40), "memory": (14, 34)}
+"""Times that a block's tokens are read or written by element-wise work, forward and backward."""
+PASSES_CODEC = 70
+"""Times that the VAE's widest array is read or written while a clip is encoded."""
+OPTIMIZER = 10
+"""Times that each trained parameter's 4 bytes are read or written by clipping, Adam, average."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Prediction:
+    """What a step is expected to take.
+
+    Attributes:
+        products_s: seconds of matrix products and convolutions.
+        streaming_s: seconds of element-wise work.
+        sent: bytes that a device sends, by (kind, axis of the mesh).
+        waiting_s: seconds of communication that nothing runs beside.
+        step_s: seconds of a step.
+        model_flops: FLOPs of a step on all devices that the mathematics needs.
+        hardware_flops: FLOPs that one device does, with what is recomputed.
+        mfu: model FLOPs over what the devices could do in that time.
+        clips_per_s: clips per second.
+        tokens_per_s: video tokens per second.
+    """
+
+    products_s: float
+    streaming_s: float
+    sent: dict[tuple[str, str], float]
+    waiting_s: float
+    step_s: float
+    model_flops: float
+    hardware_flops: float
+    mfu: float
+    clips_per_s: float
+    tokens_per_s: float
+
+    def sent_of(self, kind: str) -> float:
+        """Return the bytes of one kind of communication."""
+        return sum(size for (one, _), size in self.sent.items() if one == kind)
+
+
+def predict(config: Config, stage: Stage, mesh: Arranged, chip: Chip) -> Prediction:
+    """Predict a stage's step on a chip."""
+    products = costs.products(config, stage)
+    clips = stage.settings(config).batch
+    work = {product: costs.flops_of_device(product, mesh.sizes, clips) for product in products}
+    peak = chip.flops if config.train.dtype == "bfloat16" else chip.flops / 2
+    products_s = sum(flops / (peak * REACHED[p.kind]) for p, flops in work.items())
+    streaming_s = _streamed(config, stage, mesh) / (chip.bandwidth * STREAMED)
+    sent = traffic(config, stage, mesh)
+    seconds = {key: size / _rate(mesh, key[1], chip) for key, size in sent.items()}
+    needed = sum(s for (_, axis), s in seconds.items() if axis in costs.SPLIT)
+    behind = sum(s for (_, axis), s in seconds.items() if axis not in costs.SPLIT)
+    busy = products_s + streaming_s
+    waiting_s = needed + max(0.0, behind - busy)
+    step_s = busy + waiting_s
+    model = clips * costs.flops_per_clip(config, stage)
+    return Prediction(
+        products_s=products_s,
+        streaming_s=streaming_s,
+        sent=sent,
+        waiting_s=waiting_s,
+        step_s=step_s,
+        model_flops=model,
+        hardware_flops=sum(work.values()),
+        mfu=model / (step_s * chip.flops * mesh.devices),
+        clips_per_s=clips / step_s,
+        tokens_per_s=clips * costs.sizes(config).video / step_s,
+    )
+
+
+def traffic(config: Config, stage: Stage, mesh: Arranged) -> dict[tuple[str, str], float]:
+    """Return the bytes that a device sends in a step, by kind and axis of the mesh.
+
+    Per step: a block's weights are gathered for the forward and again for the backward pass
+    (``fsdp``), gradients are added up and scattered; copies of the weights add up theirs
+    (``data``). Per block and pass: what its two, with memory four, last products give is added up
+    over ``tensor``; keys and values are gathered over ``context`` and their gradients scattered.
+    """
+    c, s, dit = counts(config, stage), costs.sizes(config), config.dit
+    wide = 2 if config.train.dtype == "bfloat16" else FLOAT
+    clips = stage.settings(config).batch / mesh.batch
+    parameters = (c.trained + c.frozen) / mesh.tensor * wide
+    learnt = c.trained / mesh.tensor * wide
+    tokens = clips * s.joint * s.width * wide / mesh.context
+    passes = 2 + dit.remat  # forward, backward, forward again
+    sums = (4 if stage.memory else 2) * dit.layers * passes
+    sent = {
+        ("all-gather", "fsdp"): (2 * parameters + c.encoders * wide) * _ring(mesh.fsdp),
+        ("reduce-scatter", "fsdp"): learnt * _ring(mesh.fsdp),
+        ("all-reduce", "data"): 2 * learnt / mesh.fsdp * _ring(mesh.data),
+        ("all-reduce", "tensor"): 2 * sums * tokens * _ring(mesh.tensor),
+        ("all-gather", "context"): (1 + dit.remat)
+        * dit.layers
+        * 2
+        * tokens
+        / mesh.tensor
+        * (mesh.context - 1),
+        ("reduce-scatter", "context"): dit.layers * 2 * tokens / mesh.tensor * (mesh.context - 1),
+        ("all-reduce", "context"): 2 * learnt / mesh.fsdp * _ring(mesh.context),
+    }
+    return {key: size for key, size in sent.items() if size > 0}
+
+
+def _ring(devices: int) -> float:
+    return (devices - 1) / devices
+
+
+def _rate(mesh: Arranged, axis: str, chip: Chip) -> float:
+    """Return the bytes/s at which a device sends along an axis of the mesh."""
+    places = np.arange(mesh.devices).reshape(tuple(mesh.sizes.values()))
+    group = np.moveaxis(places, AXES.index(axis), -1).reshape(-1, mesh.sizes[axis])[0]
+    return rate(tuple(group.tolist()), chip)
+
+
+def rate(group: tuple[int, ...], chip: Chip) -> float:
+    """Return the bytes/s at which each of a group of devices sends.
+
+    Within an island that is the fast link's. Beyond, all of the group's devices in an island bring
+    in together, each by its own way out, what each of them wants.
+    """
+    islands = {device // chip.island for device in group}
+    if len(islands) <= 1:
+        return chip.link
+    return min(chip.link, chip.network * math.ceil(len(group) / len(islands)))
+
+
+def _streamed(config: Config, stage: Stage, mesh: Arranged) -> float:
+    """Return the bytes that element-wise work reads and writes on one device."""
+    s, dit, clip = costs.sizes(config), config.dit, config.clip
+    wide = 2 if config.train.dtype == "bfloat16" else FLOAT
+    clips = stage.settings(config).batch / mesh.batch
+    tokens = clips * s.joint * s.width * wide / mesh.context
+    total = 0.0
+    for part in ("backbone", "memory") if stage.memory else ("backbone",):
+        forward, backward = PASSES[part]
+        total += dit.layers * tokens * (forward * (1 + dit.remat) + backward)
+    if config.codec.kind == "vae":
+        pixels = 2 * (clip.frames + 1) * clip.height * clip.width
+        total += PASSES_CODEC * clips * pixels * config.codec.vae.widths[0] * wide
+    return total + OPTIMIZER * FLOAT * counts(config, stage).trained / mesh.weights
