@@ -32,7 +32,10 @@ _EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
 _TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
 _LISTED = re.compile(r"replica_groups=\{(\{[\d,{} ]*\})\}")
 _COUNTED = re.compile(r"replica_groups=\[([\d,]+)\]<=\[([\d,]+)\](?:T\(([\d,]+)\))?")
-_MESH = re.compile(r"replica_groups=mesh\[([^\]]*)\] ?\{([^}]*)\}")
+_MESH = re.compile(
+    r"replica_groups=mesh\[([^\]]*)\](?:, device_ids=\(([^()]*(?:\([\d,]+\))?)\))? ?\{([^}]*)\}"
+)
+_ORDER = re.compile(r"\[([\d,]+)\](?:T\(([\d,]+)\))?")
 _PAIRS = re.compile(r"source_target_pairs=\{\{(\d+),(\d+)\}")
 _LABEL = re.compile(r'op_name="([^"]*)"')
 
@@ -306,7 +309,7 @@ def _group(line: _Line) -> tuple[int, ...]:
             devices = devices.transpose([int(n) for n in counted[3].split(",")])
         return tuple(int(n) for n in devices.reshape(shape)[0])
     if mesh := _MESH.search(line.rest):
-        return _along(mesh[1], mesh[2])
+        return _along(mesh[1], mesh[3], mesh[2] or "")
     if listed := _LISTED.search(line.rest):
         first = listed[1].split("}")[0].strip("{ ")
         return tuple(int(n) for n in first.split(",") if n.strip())
@@ -315,8 +318,14 @@ def _group(line: _Line) -> tuple[int, ...]:
     return ()
 
 
-def _along(mesh: str, axes: str) -> tuple[int, ...]:
-    """Return the first group along axes, or parts of axes, of a mesh: ``'a'=4,'b'=2``, ``'a'``."""
+def _along(mesh: str, axes: str, order: str) -> tuple[int, ...]:
+    """Return the first group along axes, or parts of axes, of a mesh.
+
+    Args:
+        mesh: sizes, as in ``'a'=4,'b'=2``.
+        axes: as in ``'a'``, or ``'a':(2)2`` for two of its parts after the first two.
+        order: of the devices, if not their own: ``[4,2]T(1,0)`` or ``0,2,4,6``.
+    """
     sizes = {name: int(count) for name, count in re.findall(r"'([^']*)'=(\d+)", mesh)}
     strides, stride = {}, 1
     for name in reversed(sizes):
@@ -327,4 +336,11 @@ def _along(mesh: str, axes: str) -> tuple[int, ...]:
         inner = sizes[name] // (int(before) * steps) if count else 1
         places = np.arange(steps) * inner * strides[name]
         group = (group[:, None] + places).ravel()
-    return tuple(int(n) for n in group)
+    devices = np.arange(stride)
+    if turned := _ORDER.fullmatch(order):
+        devices = devices.reshape([int(n) for n in turned[1].split(",")])
+        if turned[2]:
+            devices = devices.transpose([int(n) for n in turned[2].split(",")])
+    elif order:
+        devices = np.array([int(n) for n in order.split(",")])
+    return tuple(int(n) for n in devices.ravel()[group])
