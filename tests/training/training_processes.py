@@ -36,9 +36,10 @@ class Job:
         processes: how many; one is not distributed.
         devices: simulated in each.
         settings: the environment variables above.
+        slurm: whether the processes find one another by what SLURM tells its tasks.
     """
 
-    def __init__(self, argv, processes=1, devices=1, settings=()):
+    def __init__(self, argv, processes=1, devices=1, settings=(), slurm=False):
         flags = f"{QUICK} --xla_force_host_platform_device_count={devices}"
         shared = {
             **os.environ,
@@ -49,8 +50,11 @@ class Job:
         port = free_port()
         self.running, self.written, self.files = [], [], contextlib.ExitStack()
         for index in range(processes):
-            joining = ["--distributed", "--coordinator", f"localhost:{port}"]
-            joining += ["--processes", processes, "--process", index]
+            own, joining = dict(settings), ["--distributed"]
+            if slurm:
+                own |= task_of_slurm(port, processes, index)
+            else:
+                joining = by_hand(port, processes, index)
             command = [sys.executable, __file__, *argv, *(joining if processes > 1 else ())]
             kept = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115 - closed in the end
             files = [self.files.enter_context(file) for file in kept]
@@ -60,7 +64,7 @@ class Job:
                     list(map(str, command)),
                     stdout=files[0],
                     stderr=files[1],
-                    env=shared | dict(settings),
+                    env=shared | own,
                 )
             )
 
@@ -97,6 +101,28 @@ def free_port():
     with socket.socket() as trial:
         trial.bind(("", 0))
         return trial.getsockname()[1]
+
+
+def by_hand(port, processes, index):
+    """Return the flags of one process: for two of them those that the documentation gives."""
+    lines = (ROOT / "docs" / "distributed.md").read_text().splitlines()
+    command = "python train.py demo "
+    two = [line.removeprefix(command) for line in lines if line.startswith(command)]
+    assert len(two) == 2
+    flags = two[min(index, 1)] if processes == 2 else f"{two[0][:-1]}{index}"
+    return flags.replace("1234", str(port)).replace("processes 2", f"processes {processes}").split()
+
+
+def task_of_slurm(port, tasks, index):
+    """Return the variables that SLURM sets for a task, as far as JAX reads them."""
+    return {
+        "SLURM_JOB_ID": "1",
+        "SLURM_STEP_NODELIST": "localhost",
+        "SLURM_NTASKS": str(tasks),
+        "SLURM_PROCID": str(index),
+        "SLURM_LOCALID": str(index),
+        "JAX_COORDINATOR_PORT": str(port),
+    }
 
 
 def metrics(run):
