@@ -5,7 +5,7 @@ RUN ?= runs/demo
 DATA ?= data/demo
 PRESET ?= demo
 COLLECT ?= --size 48
-BENCH ?= render cogvideox memory dinov2
+BENCH ?= render cogvideox memory dinov2 training
 
 .PHONY: help demo test lint format bench clean
 

@@ -48,25 +48,32 @@ SMALL = ("--dit.heads", "4", "--dit.head_dim", "32", "--dit.layers", "4")
 def python(arguments: Sequence[Any], log: Path) -> subprocess.Popen[str]:
     """Start Python in the repository's root, telling what it prints to a file."""
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'benchmarks'}"}
-    return subprocess.Popen(
-        [sys.executable, *map(str, arguments)],
-        cwd=ROOT,
-        env=environment,
-        stdout=log.open("w"),
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
+    with log.open("w") as told:
+        return subprocess.Popen(
+            [sys.executable, *map(str, arguments)],
+            cwd=ROOT,
+            env=environment,
+            stdout=told,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
 
 
-def finish(process: subprocess.Popen[str], log: Path) -> None:
-    """Wait for a process.
+def finish(processes: Sequence[subprocess.Popen[str]], logs: Sequence[Path]) -> None:
+    """Wait for processes; when one fails, or this one is interrupted, none is left running.
 
     Raises:
-        UserError: it failed; its last lines are told.
+        UserError: one failed; its last lines are told.
     """
-    if process.wait() != 0:
-        lines = log.read_text().strip().splitlines()[-8:]
-        raise UserError("A part of the benchmark failed: " + " / ".join(lines))
+    try:
+        for process, log in zip(processes, logs, strict=True):
+            if process.wait() != 0:
+                lines = log.read_text().strip().splitlines()[-8:]
+                raise UserError("A part of the benchmark failed: " + " / ".join(lines))
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def part(folder: Path, **job: Any) -> tuple[Any, float]:
@@ -74,7 +81,7 @@ def part(folder: Path, **job: Any) -> tuple[Any, float]:
     job_file, out, log = (folder / f"part.{end}" for end in ("json", "out", "log"))
     job_file.write_text(json.dumps(job))
     called = time.time()
-    finish(python([ROOT / "benchmarks/training_parts.py", job_file, out], log), log)
+    finish([python([ROOT / "benchmarks/training_parts.py", job_file, out], log)], [log])
     return json.loads(out.read_text()), called
 
 
@@ -134,8 +141,7 @@ def measure_processes(folder: Path, data: Path, steps: int) -> dict[str, Any]:
         started = [
             python([*argv, *([*joining, k] if count else [])], log) for k, log in enumerate(logs)
         ]
-        for process, log in zip(started, logs, strict=True):
-            finish(process, log)
+        finish(started, logs)
         found[str(count)] = [training_parts.step_seconds(run, stage) for stage in (1, 2)]
     return found
 
@@ -255,9 +261,10 @@ def main(argv: Sequence[str]) -> None:
     ]
     with tempfile.TemporaryDirectory(prefix="pewm-benchmark-") as name:
         folder = Path(name)
-        data = gather(folder, config.clip.width, 32, 10)
         loop: dict[str, Any] = {}
+        data = folder
         if {"loop", "input"} & set(options.only):
+            data = gather(folder, config.clip.width, 32, 10)
             print(f"training {options.preset} for {options.steps} steps of each stage …")
             loop = measure_loop(folder, options.preset, data, options.steps)
         if "input" in options.only:
@@ -269,7 +276,7 @@ def main(argv: Sequence[str]) -> None:
         if "processes" in options.only:
             print("training on 1, 2 and 4 processes …")
             data = gather(folder, configs.load("tiny").clip.width, 8)
-            texts.append(report_processes(measure_processes(folder, data, 60)))
+            texts.append(report_processes(measure_processes(folder, data, 30)))
     text = "\n\n".join(texts)
     print(f"\n{text}")
     if options.record:
