@@ -16,7 +16,7 @@ from pewm_jax.evaluation.imagine import Imagination, aloud
 from pewm_jax.evaluation.pictures import as_bytes, farthest, grid, save_png
 from pewm_jax.evaluation.protocol import choose, load_clip, stack
 from pewm_jax.evaluation.video import encode_h264, side_by_side
-from pewm_jax.training.watch import IMAGINED, Preview, Previewed
+from pewm_jax.training.samples import IMAGINED, Preview, Previewed
 from pewm_jax.types import Frames, Params
 
 SPLIT, CLIPS, SHOWN = "validation", 8, 3

@@ -17,16 +17,16 @@ from typing import NoReturn
 import jax
 from jax.sharding import Mesh
 
-from pewm_jax import rollouts, weights
 from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.memory import feature_cache
-from pewm_jax.training import processes, runs, sharding, shelf, stages
+from pewm_jax.training import processes, runs, sharding, stages, starting
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.feed import Feed, rows_of
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, duration
 from pewm_jax.training.profile import Profile
+from pewm_jax.training.samples import Preview, Samples
 from pewm_jax.training.signals import Stop
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import TrainState, inference_params
@@ -37,7 +37,7 @@ from pewm_jax.training.step import (
     initial_state,
     stage_key,
 )
-from pewm_jax.training.watch import Preview, Watch
+from pewm_jax.training.watch import Watch
 from pewm_jax.types import Clip, Params
 
 _DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
@@ -70,7 +70,7 @@ def train(
             ``train.grace_s``, and at a second signal, the process ends itself.)
     """
     planned = stages.planned(config)
-    _require_weights(config)
+    starting.require_weights(config)
     mesh = sharding.make_mesh(arranged=config.train.mesh)
     for stage in planned:
         sharding.require_divisible(config, stage, mesh)
@@ -85,8 +85,10 @@ def train(
         if processes.first(lambda: runs.is_finished(run, config)):
             say(f"{run} is already trained: nothing to do.")
             return run
-        start: Callable[[], Params | None] = functools.partial(_named, config, planned[0], say)
-        for stage in _left(run, planned):
+        start: Callable[[], Params | None] = functools.partial(
+            starting.named, config, planned[0], say
+        )
+        for stage in starting.left(run, planned):
             worker = _Worker(
                 config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, say=say
             )
@@ -102,62 +104,13 @@ def _same(params: Params) -> Params:
     return params
 
 
-def _left(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
-    """Leave out stages that a later one has built on: its checkpoints hold what they gave."""
-    begun = [n for n, stage in enumerate(planned) if shelf.steps(shelf.of(run, stage.name))]
-    return planned[processes.agree(max(begun, default=0)) :]
-
-
-def _require_weights(config: Config) -> None:
-    """Refuse networks that are not trained here and that no converted weights are named for."""
-    frozen = {
-        "codec.kind vae": config.codec.kind == "vae",
-        "memory.encoder dinov2": config.memory.encoder == "dinov2",
-    }
-    for setting, wanted in frozen.items():
-        if wanted and not config.train.start:
-            raise UserError(
-                f"{setting} needs weights that are not trained here: convert a checkpoint "
-                "(python -m pewm_jax.convert --help) and name its folder by train.start."
-            )
-
-
-def _named(config: Config, stage: Stage, say: Callable[[str], None]) -> Params | None:
-    """Return the weights that the first planned stage starts from, if any are named.
-
-    Memory blocks that the folder may hold go on learning in stage 2. Before stage 1 they are left
-    out, since they were fitted to another backbone, and said to be.
-    """
-    if not config.train.start:
-        return None
-    _, params = rollouts.load(config.train.start, lazily=True)
-    processes.first(lambda: weights.verify(Path(config.train.start) / runs.WEIGHTS))
-    if "memory" in params and not stage.memory:
-        say(f"{config.train.start}: its memory blocks are left out; stage 2 begins with fresh ones")
-        params = {name: part for name, part in params.items() if name != "memory"}
-    return params
-
-
-def _encoder(config: Config) -> Params:
-    """Return the image encoder's weights as they are given, to compare kept features with."""
-    if config.memory.encoder != "dinov2":
-        return {}
-    return rollouts.load(config.train.start, lazily=True)[1]["encoder"]
-
-
-def _features(config: Config, stage: Stage) -> feature_cache.FeatureCache | None:
-    """Open the features that are kept, where the stage needs any; not compared with weights yet."""
-    if not (config.data.features and stage.memory):
-        return None
-    return feature_cache.read(Path(config.data.features) / "train")
-
-
 class _Worker:
     """Turns one stage's state from its first to its last step."""
 
     checkpoints: Checkpoints
     view: LiveView
     watch: Watch
+    samples: Samples
 
     def __init__(
         self,
@@ -174,7 +127,7 @@ class _Worker:
     ):
         self.config, self.stage, self.mesh, self.path = config, stage, mesh, run
         self.stop, self.bad, self.preview, self.profile = stop, bad, preview, profile
-        self.say, self.shown = say, False
+        self.say = say
 
     @property
     def settings(self) -> StageConfig:
@@ -206,6 +159,13 @@ class _Worker:
                     log=log,
                     bad=self.bad,
                 )
+                self.samples = Samples(
+                    config,
+                    stage,
+                    self.preview,
+                    say=self.view.say,
+                    unless_told=self.stop.unless_told,
+                )
 
                 def state_to_start_from() -> TrainState:
                     if not done:
@@ -221,7 +181,7 @@ class _Worker:
     def run(self, make_state: Callable[[], TrainState], done: int) -> TrainState:
         """Do the steps after ``done``, once the first batch is there; returns the last state."""
         config, settings = self.config, self.settings
-        cache = _features(config, self.stage)
+        cache = starting.features(config, self.stage)
         where = sharding.of_batch(self.mesh)
         batches = loader.clips(
             config,
@@ -250,7 +210,7 @@ class _Worker:
                 split = Path(config.data.path) / "train"
                 processes.first(
                     lambda: feature_cache.require_fresh(
-                        cache, config.memory, _encoder(config), split
+                        cache, config.memory, starting.encoder(config), split
                     )
                 )
             self.watch.pace = Pace(time.monotonic())
@@ -265,7 +225,7 @@ class _Worker:
                 self.watch.pace.pause(traced.after(step, metrics))
                 last, told = step == settings.steps, self.stop.due()
                 save = last or told or step % config.train.save_every == 0
-                show = self._wants_preview(step) and not told
+                show = self.samples.due(step) and not told
                 if save or show:
                     self._tell(step, metrics, state if show else None)
                     pending = None
@@ -294,32 +254,11 @@ class _Worker:
         with self._paused():
             self.checkpoints.settle()
         values = self.watch.read(step, metrics, self._kept_in_the_end)
-        samples = {} if shown is None else self._show(shown, step)
+        samples: dict[str, float] = {}
+        if shown is not None:
+            with self._paused():
+                samples = self.samples.make(inference_params(self.stage, shown), step)
         self.watch.write(step, values | samples, always=bool(samples))
-
-    def _wants_preview(self, step: int) -> bool:
-        every = self.config.train.preview_every
-        due = every > 0 and (step % every == 0 or step == self.settings.steps)
-        return due and self.preview is not None
-
-    def _show(self, state: TrainState, step: int) -> dict[str, float]:
-        """Make samples, unless a signal breaks that off; returns how good they are."""
-        preview, number = self.preview, self.stage.number
-        assert preview is not None
-        if not self.shown:
-            self.view.say(f"stage {number}: compiling the sampler for pictures …")
-        self.shown = True
-        params = processes.gather(inference_params(self.stage, state))
-        if not processes.is_primary():
-            return {}
-        with self._paused():
-            try:
-                made = self.stop.unless_told(lambda: preview(params, number, step))
-            except (jax.errors.JaxRuntimeError, UserError) as error:
-                reason = " ".join(str(error).split())[:160]
-                self.view.say(f"stage {number}: no sample pictures of step {step} ({reason})")
-                return {}
-        return {} if made is None else self.watch.told_by(made)
 
     def _save(self, state: TrainState) -> None:
         with self._paused():

@@ -5,7 +5,6 @@ Only the first process of a job writes and shows; all of them stop where trainin
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import time
@@ -21,31 +20,9 @@ from pewm_jax.training import chips, processes, stages
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, drop_after
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.step import Metrics
-from pewm_jax.types import Params
 
 SKIPPED = "nonfinite.jsonl"
 """In the run's folder: a line for every update that was skipped."""
-
-
-IMAGINED = {"model": "model", "memory": "with its map", "empty": "empty map"}
-"""Who imagines: stage 1's model, stage 2's with its map, and the same weights with an empty one."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Previewed:
-    """What a preview made.
-
-    Attributes:
-        files: pictures and videos.
-        psnr: key of ``IMAGINED`` → decibels against what was recorded.
-    """
-
-    files: tuple[Path, ...]
-    psnr: Mapping[str, float] = dataclasses.field(default_factory=dict)
-
-
-Preview = Callable[[Params, int, int], Previewed]
-"""Called with inference weights, stage number and step; writes samples and measures them."""
 
 
 class Watch:
@@ -117,14 +94,6 @@ class Watch:
         """Log a step where it is time for that, or ``always``."""
         if always or step in (1, self.settings.steps) or step % self.config.train.log_every == 0:
             self.log.write(step, values)
-
-    def told_by(self, made: Previewed) -> dict[str, float]:
-        """Show what a preview made; returns its numbers for the log."""
-        scores = ", ".join(f"{IMAGINED[name]} {value:.1f} dB" for name, value in made.psnr.items())
-        files = " and ".join(map(str, made.files))
-        where = f"sample pictures {files}"
-        self.view.say(f"stage {self.stage.number}: {f'{scores}; {where}' if scores else where}")
-        return {f"psnr_{name}": value for name, value in made.psnr.items()}
 
     def _not_finite(
         self, step: int, values: Mapping[str, float], skipped: bool, kept: Callable[[], str]

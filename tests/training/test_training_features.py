@@ -11,7 +11,7 @@ from pewm_jax.config import ClipConfig, ConfigError, UserError
 from pewm_jax.data import loader
 from pewm_jax.diffusion import objective
 from pewm_jax.memory import feature_build, feature_cache
-from pewm_jax.training import loop, runs, stages
+from pewm_jax.training import loop, runs, stages, starting
 from tests.data import data_world
 from tests.helpers import tiny_config
 
@@ -35,7 +35,7 @@ def batch(config, cache):
 
 
 def test_the_map_of_kept_features_is_the_map_of_computed_ones(config):
-    cache = loop._features(config, stages.STAGES[1])
+    cache = starting.features(config, stages.STAGES[1])
     kept, plain = batch(config, cache), batch(config, None)
     assert not kept.context_valid_S.all(), "the test should see slots without a frame"
     assert kept.context_features_ShwF.shape == (3, 6, 8, 12, 6)
@@ -50,12 +50,12 @@ def test_the_map_of_kept_features_is_the_map_of_computed_ones(config):
 
 
 def test_features_are_opened_only_where_a_map_is_built(config):
-    assert loop._features(config, stages.STAGES[0]) is None
+    assert starting.features(config, stages.STAGES[0]) is None
     none = dataclasses.replace(config, data=dataclasses.replace(config.data, features=""))
-    assert loop._features(none, stages.STAGES[1]) is None
+    assert starting.features(none, stages.STAGES[1]) is None
     absent = dataclasses.replace(config, data=dataclasses.replace(config.data, features="absent"))
     with pytest.raises(UserError, match=r"absent/train is no cache; make it with"):
-        loop._features(absent, stages.STAGES[1])
+        starting.features(absent, stages.STAGES[1])
 
 
 def test_training_on_stale_features_is_refused(config, tmp_path, monkeypatch):

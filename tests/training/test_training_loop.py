@@ -15,8 +15,8 @@ from pewm_jax import weights
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data import loader
 from pewm_jax.training import loop, runs
+from pewm_jax.training.samples import Previewed
 from pewm_jax.training.signals import Interrupted
-from pewm_jax.training.watch import Previewed
 
 PICTURE = Previewed((Path("picture.png"),))
 

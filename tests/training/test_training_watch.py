@@ -17,7 +17,7 @@ import training_fakes as fakes
 from pewm_jax import weights
 from pewm_jax.config import UserError
 from pewm_jax.data import loader
-from pewm_jax.training import chips, loop, step, watch
+from pewm_jax.training import chips, loop, samples, step, watch
 from pewm_jax.training.sharding import make_mesh
 from pewm_jax.training.signals import Interrupted
 from pewm_jax.training.stages import STAGES
@@ -115,7 +115,7 @@ def test_the_count_goes_on_right_after_a_kill(nan_at_5, tmp_path, last):
     def die(_params, stage, number):
         if (stage, number) == (1, last):
             raise RuntimeError("power cut")
-        return watch.Previewed(())
+        return samples.Previewed(())
 
     config = fakes.config(tmp_path / "whole", stage2=0, on_nonfinite="skip")
     train(config)
@@ -207,7 +207,7 @@ def test_what_a_preview_measures_stands_in_its_steps_line(fake_model, tmp_path, 
 
     def preview(_params, stage, number):
         psnr = {"model": 12.5} if stage == 1 else {"memory": 15.25, "empty": 13.0 + number}
-        return watch.Previewed((Path("a.png"), Path("a.mp4")), psnr)
+        return samples.Previewed((Path("a.png"), Path("a.mp4")), psnr)
 
     train(fakes.config(tmp_path, preview_every=4, log_every=5), preview=preview)
     entries = {(e["stage"], e["step"]): e for e in lines(tmp_path / "metrics.jsonl")}
