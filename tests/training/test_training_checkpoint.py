@@ -1,5 +1,7 @@
 """Checkpoints: exact, safe under donation, and never read half-written or for another run."""
 
+import threading
+
 import jax
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import training_fakes as fakes
 
 from pewm_jax import tree
 from pewm_jax.config import UserError
-from pewm_jax.training import sharding, stages, step
+from pewm_jax.training import checkpoint, sharding, shelf, stages, step
 from pewm_jax.training.checkpoint import Checkpoints
 
 ONE, TWO = stages.STAGES
@@ -71,6 +73,56 @@ def test_an_unfinished_checkpoint_is_not_there(fake_model, tmp_path):
     with Checkpoints(tmp_path, config, ONE) as checkpoints:
         assert checkpoints.latest() == 1
     assert [path.name for path in folder.iterdir()] == ["1"]
+
+
+def test_the_newest_and_every_so_many_th_are_kept(fake_model, tmp_path):
+    train(fakes.config(keep=2, keep_every=4), ONE, tmp_path, 11)
+    folder = tmp_path / "checkpoints" / "stage1"
+    assert {path.name for path in folder.iterdir()} == {"4", "8", "10", "11"}
+    for path in folder.iterdir():
+        assert {item.name for item in path.iterdir() if item.is_dir()} == {
+            "weights",
+            "state",
+            "data",
+            "config",
+        }
+
+
+def test_a_save_is_waited_for_within_reason_before_a_step_is_told_of(
+    fake_model, tmp_path, monkeypatch
+):
+    config = fakes.config()
+    mesh, _ = train(config, ONE, tmp_path, 1)
+    state = step.initial_state(config, ONE, mesh)
+    go_on, put = threading.Event(), shelf.put
+    monkeypatch.setattr(shelf, "put", lambda *args: (go_on.wait(), put(*args)))
+    monkeypatch.setattr(checkpoint, "_MOMENT_S", 0.01)
+    with Checkpoints(tmp_path, config, ONE) as checkpoints:
+        checkpoints.save(state)
+        checkpoints.settle()
+        assert checkpoints.latest() == 1
+        monkeypatch.setattr(checkpoint, "_MOMENT_S", 1e9)
+        checkpoints.settle()
+        assert checkpoints.latest() == 1, "what is slow is waited for once only"
+        go_on.set()
+        checkpoints.wait()
+        assert checkpoints.latest() == 0
+
+
+def test_what_fails_in_the_background_is_told_at_the_next_step(fake_model, tmp_path, monkeypatch):
+    config = fakes.config()
+    mesh, _ = train(config, ONE, tmp_path, 1)
+    state = step.initial_state(config, ONE, mesh)
+
+    def full(*_args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shelf, "put", full)
+    with Checkpoints(tmp_path, config, ONE) as checkpoints:
+        checkpoints.save(state)
+        with pytest.raises(UserError, match=r"\(No space left on device\); that of step 1 is kept"):
+            checkpoints.settle()
+    assert [path.name for path in (tmp_path / "checkpoints" / "stage1").iterdir()] == ["1"]
 
 
 def test_without_a_checkpoint_there_is_a_sentence(fake_model, tmp_path):

@@ -74,6 +74,15 @@ def test_the_state_of_the_optimizer_is_never_touched(run):
     same(pewm_jax.load(newest)[1], params)
 
 
+def test_weights_come_in_the_dtype_in_which_they_were_trained(fake_model, tmp_path):
+    config = fakes.config(tmp_path / "run", dtype="bfloat16", stage1=2, stage2=2)
+    train(config)
+    _, params = pewm_jax.load(tmp_path / "run" / "checkpoints" / "stage2" / "2")
+    assert {leaf.dtype.name for leaf in jax.tree.leaves(params["backbone"])} == {"bfloat16"}
+    assert {leaf.dtype.name for leaf in jax.tree.leaves(params["memory"])} == {"float32"}
+    same(params, pewm_jax.load(tmp_path / "run")[1])
+
+
 def test_a_finished_run_gives_its_file_of_weights_also_without_checkpoints(run):
     config = fakes.config(run, save_every=2, keep=3)
     train(config)
