@@ -1,8 +1,7 @@
 """Network weights as one safetensors file: flat ``a/b/c`` keys, nothing to execute on loading.
 
-Files are written and read tensor by tensor, so that no more than one tensor is held beside what
-the caller holds. In its header a file of ours has the SHA-256 of every tensor, and of the header
-itself, so that no bit can flip unnoticed; other people's files are read without.
+Files are written and read tensor by tensor, so that no more than one is held beside what the caller
+holds. The header of ours has the SHA-256 of every tensor and of itself: no bit flips unnoticed.
 """
 
 from __future__ import annotations
@@ -27,10 +26,9 @@ from pewm_jax.config import UserError
 from pewm_jax.types import Array, Params
 
 _WORDS = "pewm_jax"
-"""The key in the file's header for what we say of it, as one text: equal weights are equal files,
-and their hash is a name."""
+"""The header's key for what we say of a file, as one text: equal weights are equal files."""
 _TENSORS, _HEADER = "sha256", "header_sha256"
-"""The keys of the checksums: of each tensor, and of the header with zeros in place of this one."""
+"""The keys of checksums: of each tensor, and of the header with zeros in place of this one."""
 _NONE = "0" * 64
 _DTYPES = {
     "BOOL": np.dtype(bool),
@@ -146,8 +144,7 @@ def write(
             file.seek(start + offset)
             raw = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             file.write(raw)
-            if ours:
-                digests[name] = hashlib.sha256(raw).hexdigest()
+            digests[name] = hashlib.sha256(raw).hexdigest() if ours else ""
             told(array.nbytes)
             del tensor, array, raw  # before the next one is made
         if left:
@@ -160,7 +157,7 @@ def write(
 
 
 def _text(table: Mapping[str, object]) -> bytes:
-    """Return a header as it stands in the file, padded to whole words of 8 bytes."""
+    """Return a header as it stands in the file, padded to words of 8 bytes."""
     text = json.dumps(table, separators=(",", ":")).encode()
     return text + b" " * (-len(text) % 8)
 
@@ -234,8 +231,8 @@ def places(path: Path) -> dict[str, Place]:
     for name, entry in table.items():
         try:
             dtype, (begin, end) = _DTYPES[entry["dtype"]], entry["data_offsets"]
-            shape = tuple(entry["shape"])
-            found[name] = Place(shape, dtype, start + begin, digests.get(name, ""))
+            whole = digests.get(name, "")
+            found[name] = Place(tuple(entry["shape"]), dtype, start + begin, whole)
             length = end - begin
         except (KeyError, TypeError, ValueError):
             kind = entry.get("dtype") if isinstance(entry, dict) else None
@@ -344,8 +341,7 @@ def _header(path: Path) -> tuple[dict, int]:
     said = table.get("__metadata__") or {}
     if _TENSORS in said or _HEADER in said:
         digest = str(said.get(_HEADER))
-        blank = text.replace(digest.encode(), _NONE.encode())
-        if hashlib.sha256(blank).hexdigest() != digest:
+        if hashlib.sha256(text.replace(digest.encode(), _NONE.encode())).hexdigest() != digest:
             raise _damaged(path, "its header is not what was written")
     return table, 8 + length
 
