@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import functools
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -104,6 +105,11 @@ def _same(params: Params) -> Params:
     return params
 
 
+def _aside(line: str) -> None:
+    """Tell what only this process knows, where the first one shows what all of them know."""
+    print(line, file=sys.stderr, flush=True)
+
+
 class _Worker:
     """Turns one stage's state from its first to its last step."""
 
@@ -148,7 +154,7 @@ class _Worker:
                 LiveView(f"stage {stage.number}", steps, done) as self.view,
                 MetricsLog(run, stage.number, done) as log,
             ):
-                self.bad.say = self.view.say
+                self.bad.say = self.view.say if processes.is_primary() else _aside
                 self.watch = Watch(
                     config,
                     stage,
