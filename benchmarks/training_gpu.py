@@ -5,8 +5,8 @@ of context. The step is the real one (``train_step``: VAE, map, DINOv2, both net
 average) on random clips and weights. Every batch size is tried in a process of its own, so that its
 peak memory is its own, from one clip on to twice the last until the memory ends. Numbers are kept
 in ``--state``: after an interruption, or the ``--seconds`` of one command, run the same command
-again and it goes on. ``--record`` writes the section of RESULTS.md. ``--smoke`` runs a tiny step on a
-CPU.
+again and it goes on. ``--record`` writes the section of RESULTS.md. ``--smoke`` runs a tiny step on
+a CPU.
 
 MFU is the model's FLOPs (nothing recomputed counts) over the data sheet's rate in bf16.
 """
