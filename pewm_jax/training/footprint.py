@@ -18,8 +18,10 @@ from jax.sharding import Mesh
 from pewm_jax import tree
 from pewm_jax.config import Config
 from pewm_jax.models import blocked_attention, world_model
+from pewm_jax.training import sharding
 from pewm_jax.training.costs import encodes, sizes
 from pewm_jax.training.stages import Stage
+from pewm_jax.types import Params
 
 FLOAT = 4
 """Bytes of a float32: what trains, its moments, average and gradients, and logits."""
@@ -54,27 +56,49 @@ class Arranged:
         """Parts that the batch is split into."""
         return self.data * self.fsdp
 
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """Some parameters: how many, by the axes of the mesh that split them."""
+
+    split: tuple[tuple[tuple[str, ...], int], ...]
+
+    @classmethod
+    def of(cls, params: Params) -> Weights:
+        """Count parameters, abstract ones too, by the table of ``sharding``."""
+        specs = tree.flatten(tree.assign(sharding.PARAMETERS, params, "sharding rules"))
+        found: dict[tuple[str, ...], int] = {}
+        for path, leaf in tree.flatten(params).items():
+            axes = tuple(axis for axis in specs[path] if axis)
+            found[axes] = found.get(axes, 0) + leaf.size
+        return cls(tuple(found.items()))
+
     @property
-    def weights(self) -> int:
-        """Parts that weights are split into."""
-        return self.fsdp * self.tensor
+    def count(self) -> int:
+        """All of them."""
+        return sum(count for _, count in self.split)
+
+    def on(self, mesh: Arranged) -> float:
+        """How many a device has."""
+        sizes_ = mesh.sizes
+        return sum(count / math.prod(sizes_[axis] for axis in axes) for axes, count in self.split)
 
 
 @dataclasses.dataclass(frozen=True)
 class Counts:
-    """Numbers of parameters.
+    """The parameters of a stage.
 
     Attributes:
         trained: what the stage trains.
         frozen: backbone (in stage 2), text and whatever else stands still.
         encoders: the frozen VAE and DINOv2.
-        layer: one block, with its memory block.
-        trained_layer: what of it is trained.
+        layer: number in one block, with its memory block.
+        trained_layer: number of what of it is trained.
     """
 
-    trained: int
-    frozen: int
-    encoders: int
+    trained: Weights
+    frozen: Weights
+    encoders: Weights
     layer: int
     trained_layer: int
 
@@ -85,20 +109,24 @@ def counts(config: Config, stage: Stage) -> Counts:
     make = functools.partial(world_model.init, config, memory=stage.memory)
     params = jax.eval_shape(make, jax.random.key(0))
     trained, frozen = tree.split(params, stage.trained)
-    encoders = {name: frozen[name] for name in ("codec", "encoder") if name in frozen}
-    blocks = [params[name]["blocks"] for name in ("backbone", "memory") if name in params]
-    learning = params["memory" if stage.memory else "backbone"]["blocks"]
+    encoders = {name: frozen.pop(name) for name in ("codec", "encoder") if name in frozen}
+    blocks = {
+        name: {"blocks": params[name]["blocks"]}
+        for name in ("backbone", "memory")
+        if name in params
+    }
+    learning = blocks["memory" if stage.memory else "backbone"]
     return Counts(
-        trained=_count(trained),
-        frozen=_count(frozen) - _count(encoders),
-        encoders=_count(encoders),
+        trained=Weights.of(trained),
+        frozen=Weights.of(frozen),
+        encoders=Weights.of(encoders),
         layer=_count(blocks) // config.dit.layers,
         trained_layer=_count(learning) // config.dit.layers,
     )
 
 
-def _count(tree_: object) -> int:
-    return sum(leaf.size for leaf in jax.tree.leaves(tree_))
+def _count(params: Params) -> int:
+    return sum(leaf.size for leaf in jax.tree.leaves(params))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,12 +187,12 @@ def footprint(config: Config, stage: Stage, mesh: Arranged, *, wide: int, flash:
     c = counts(config, stage)
     clips = stage.settings(config).batch / mesh.batch
     frozen_wide = 2 if config.train.dtype == "bfloat16" else FLOAT
-    trained = FLOAT * c.trained / mesh.weights
-    widened = FLOAT * c.frozen / mesh.weights if wide > frozen_wide else 0.0
+    trained = FLOAT * c.trained.on(mesh)
+    widened = FLOAT * c.frozen.on(mesh) if wide > frozen_wide else 0.0
     kept, block = _activations(config, stage, mesh, clips, wide, flash=flash)
     return Footprint(
         trained=trained,
-        frozen=frozen_wide * (c.frozen / mesh.weights + c.encoders / mesh.fsdp),
+        frozen=frozen_wide * (c.frozen.on(mesh) + c.encoders.on(mesh)),
         average=trained,
         moments=2 * trained,
         batch=clips * clip_bytes(config, stage),
@@ -209,9 +237,9 @@ def _activations(
     logits = clips * dit.heads / mesh.tensor * s.joint**2 / mesh.context
     if flash:
         logits = 0.0
-    elif wide == FLOAT:  # a CPU: in pieces
-        logits = min(logits, blocked_attention.LOGITS)
-    shared = 4 * part * (mesh.context - 1)  # keys, values and their gradients, of all tokens
+    elif wide == FLOAT and logits > blocked_attention.LOGITS:  # a CPU: in pieces of a head
+        logits = min(clips * s.joint**2 / mesh.context, blocked_attention.LOGITS)
+    shared = 2 * part * (mesh.context - 1)  # keys and values of all tokens, or their gradients
     common = 4 * FLOAT * logits + shared
 
     kept = dit.layers * whole
@@ -242,4 +270,4 @@ def _encoders(config: Config, stage: Stage, clips: float, wide: int, mesh: Arran
         values = s.context * s.image * memory.dinov2.width
         held = max(held, FLOAT * (2 * logits + 12 * values))
     signal = 2 * clips * pixels * 3 * FLOAT
-    return held + signal + (counts(config, stage).encoders * wide if mesh.fsdp > 1 else 0)
+    return held + signal + (counts(config, stage).encoders.count * wide if mesh.fsdp > 1 else 0)

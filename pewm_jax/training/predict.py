@@ -103,13 +103,13 @@ def traffic(config: Config, stage: Stage, mesh: Arranged) -> dict[tuple[str, str
     c, s, dit = counts(config, stage), costs.sizes(config), config.dit
     wide = 2 if config.train.dtype == "bfloat16" else FLOAT
     clips = stage.settings(config).batch / mesh.batch
-    parameters = (c.trained + c.frozen) / mesh.tensor * wide
-    learnt = c.trained / mesh.tensor * wide
+    parameters = (c.trained.on(mesh) + c.frozen.on(mesh)) * mesh.fsdp * wide
+    learnt = c.trained.on(mesh) * mesh.fsdp * wide
     tokens = clips * s.joint * s.width * wide / mesh.context
     passes = 2 + dit.remat  # forward, backward, forward again
     sums = (4 if stage.memory else 2) * dit.layers * passes
     sent = {
-        ("all-gather", "fsdp"): (2 * parameters + c.encoders * wide) * _ring(mesh.fsdp),
+        ("all-gather", "fsdp"): (2 * parameters + c.encoders.count * wide) * _ring(mesh.fsdp),
         ("reduce-scatter", "fsdp"): learnt * _ring(mesh.fsdp),
         ("all-reduce", "data"): 2 * learnt / mesh.fsdp * _ring(mesh.data),
         ("all-reduce", "tensor"): 2 * sums * tokens * _ring(mesh.tensor),
@@ -161,4 +161,4 @@ def _streamed(config: Config, stage: Stage, mesh: Arranged) -> float:
     if config.codec.kind == "vae":
         pixels = 2 * (clip.frames + 1) * clip.height * clip.width
         total += PASSES_CODEC * clips * pixels * config.codec.vae.widths[0] * wide
-    return total + OPTIMIZER * FLOAT * counts(config, stage).trained / mesh.weights
+    return total + OPTIMIZER * FLOAT * counts(config, stage).trained.on(mesh)

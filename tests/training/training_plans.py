@@ -1,0 +1,124 @@
+"""Run on eight virtual devices by ``test_training_plan_sums``: compiles small steps that could run.
+
+Prints, for each, what the compiled program does and needs and what the sums on paper say, as JSON.
+"""
+
+import dataclasses
+import json
+import sys
+from typing import Literal
+
+from pewm_jax.config import (
+    ClipConfig,
+    CodecConfig,
+    Config,
+    DataConfig,
+    DINOv2Config,
+    DiTConfig,
+    MemoryConfig,
+    MeshConfig,
+    StageConfig,
+    TrainConfig,
+    VAEConfig,
+)
+from pewm_jax.training import costs, plan, stages
+from pewm_jax.training.footprint import Arranged
+
+ENCODERS = {
+    "codec": CodecConfig(
+        kind="vae",
+        spatial=8,
+        temporal=4,
+        vae=VAEConfig(widths=(16, 16, 32, 32), groups=16, resnets=1),
+    ),
+    "encoder": "dinov2",
+}
+FSDP = MeshConfig(fsdp=8)
+TENSOR = MeshConfig(fsdp=4, tensor=2)
+CONTEXT = MeshConfig(fsdp=2, context=4)
+
+VARIANTS = {
+    "stage 1": (1, {}),
+    "stage 1, deeper and narrower, kept": (
+        1,
+        {"layers": 4, "heads": 8, "batch": 16, "remat": False},
+    ),
+    "stage 2 with VAE and DINOv2": (2, {"size": 64, "batch": 4, **ENCODERS}),
+    "stage 1, fsdp 8": (1, {"mesh": FSDP, "batch": 16}),
+    "stage 2, fsdp 8, bfloat16": (2, {"mesh": FSDP, "batch": 16, "layers": 4, "dtype": "bfloat16"}),
+    "stage 2, tensor 2 × fsdp 4": (2, {"mesh": TENSOR, "batch": 16}),
+    "stage 1, context 4 × fsdp 2": (1, {"mesh": CONTEXT, "batch": 16, "heads": 8}),
+}
+"""Name → stage and what differs from the defaults of ``experiment``."""
+
+
+def experiment(
+    layers=2,
+    heads=16,
+    batch=8,
+    remat=True,
+    mlp=2,
+    tokens=64,
+    size=32,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+    mesh=None,
+    codec=None,
+    encoder: Literal["patch_colours", "dinov2"] = "patch_colours",
+):
+    """Return a small experiment."""
+    stage = StageConfig(batch=batch)
+    return Config(
+        clip=ClipConfig(frames=9, height=size, width=size),
+        codec=codec or CodecConfig(spatial=2),
+        dit=DiTConfig(
+            layers=layers, heads=heads, head_dim=32, text_length=16, text_dim=64, time_dim=64
+        ),
+        memory=MemoryConfig(
+            tokens=tokens,
+            heads=8,
+            head_dim=16,
+            mlp_ratio=mlp,
+            positions="sinusoid",
+            encoder=encoder,
+            encoder_size=56,
+            dinov2=DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56),
+        ),
+        data=DataConfig(context=2),
+        train=TrainConfig(stage1=stage, stage2=stage, dtype=dtype, mesh=mesh or MeshConfig()),
+    )
+
+
+def measure(number, settings, devices):
+    """Compile a variant; returns what was counted and what was expected."""
+    remat = settings.pop("remat", True)
+    config = experiment(**settings)
+    config = dataclasses.replace(config, dit=dataclasses.replace(config.dit, remat=remat))
+    stage = stages.STAGES[number - 1]
+    used = devices if "mesh" in settings else devices[:1]
+    compiled = plan.compile_stage(config, stage, used)
+    mesh = Arranged(*config.train.mesh.shape(len(used)))
+    clips = stage.settings(config).batch
+    done = [costs.flops_of_device(p, mesh.sizes, clips) for p in costs.products(config, stage)]
+    return {
+        "flops": compiled.program.flops,
+        "flops_expected": sum(done),
+        "unknown": compiled.program.unknown,
+        "state": compiled.arguments,
+        "state_expected": compiled.expected.state,
+        "peak": compiled.peak,
+        "peak_expected": compiled.expected.peak,
+    }
+
+
+def main(names):
+    devices = plan.virtual(8)
+    chosen = {name: VARIANTS[name] for name in names or VARIANTS}
+    measured = {
+        name: measure(number, dict(settings), devices)
+        for name, (number, settings) in chosen.items()
+    }
+    print(json.dumps(measured))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
