@@ -195,8 +195,8 @@ def place(values: Any, like: Any) -> Any:
     return tree.unflatten({path: moved.get(path, read.get(path)) for path in given})
 
 
-def _part(leaf: np.ndarray, dtype: np.dtype, index: tuple[slice, ...]) -> np.ndarray:
-    return np.asarray(leaf[index], dtype)
+def _part(leaf: np.ndarray, dtype: np.dtype, index: tuple[slice, ...] | None) -> np.ndarray:
+    return np.asarray(leaf[index or ...], dtype)
 
 
 def require_divisible(config: Config, stage: Stage, mesh: Mesh) -> None:
