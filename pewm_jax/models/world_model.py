@@ -12,7 +12,6 @@ embedding). Without the ``memory`` entry, or without map tokens, it is the stage
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +109,7 @@ def _memory_parts(config: Config) -> tuple[layers.nn.Dense, layers.nn.Dense]:
 
 
 def token_channels(config: Config) -> int:
+    """Return the channels of a map token: features and, with sinusoid positions, its place."""
     positions = 60 if config.memory.positions == "sinusoid" else 0
     return feature_channels(config) + positions
 
@@ -242,29 +242,3 @@ def _seen(config: Config, latents_C: Array) -> Array:
         return latents_C
     colour = np.arange(latents_C.shape[-1]) < codec.rgb_channels(config)
     return jnp.where(colour, latents_C, 0)
-
-
-def flops_per_clip(config: Config, *, memory: bool) -> float:
-    """Return the forward FLOPs (2 per multiply-add) of one clip's matrix products."""
-    t, h, w = codec.latent_shape(config)
-    patch = config.dit.patch
-    t = -(-t // config.dit.patch_t)
-    cell = patch**2 * config.dit.patch_t
-    video = t * (h // patch) * (w // patch)
-    tokens, width, ratio = video + config.dit.text_length, config.dit.width, config.dit.mlp_ratio
-    block = tokens * width * width * (4 + 2 * ratio) + 2 * tokens * tokens * width
-    ends = video * width * cell * (in_channels(config) + codec.latent_channels(config))
-    ends += config.dit.text_length * config.dit.text_dim * width
-    total = config.dit.layers * block + ends
-    if memory:
-        m = config.memory
-        projective = m.positions == "projective"
-        inner, looks = m.heads * m.head_dim, min(m.looks, m.tokens) if projective else m.tokens
-        geometry = 3 * m.heads if projective else 0
-        read = video * width * (1.5 * width + inner + 2 * m.mlp_ratio * width)
-        read += video * (inner + geometry) * width + 2 * m.tokens * inner * inner
-        read += video * looks * (2 * inner + geometry)
-        total += config.dit.layers * read
-        total += video * camera_channels(config) * cell * width / 2
-        total += m.tokens * token_channels(config) * inner
-    return 2.0 * math.ceil(total)

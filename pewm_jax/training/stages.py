@@ -11,7 +11,6 @@ from typing import Any
 
 from pewm_jax import tree
 from pewm_jax.config import Config, ConfigError, StageConfig
-from pewm_jax.models import world_model
 
 TRAIN, FREEZE = "train", "freeze"
 
@@ -85,15 +84,3 @@ def planned(config: Config) -> tuple[Stage, ...]:
             "give one of them steps."
         )
     return stages
-
-
-def flops_per_clip(config: Config, stage: Stage) -> float:
-    """Estimate the FLOPs that one clip costs in one step of training.
-
-    The forward pass and the gradients of activations run through the whole network (2 forward
-    passes' worth), the gradients of weights only through what is trained. Rematerialisation is
-    not counted: it is a cost of the implementation and not of the model.
-    """
-    whole = world_model.flops_per_clip(config, memory=stage.memory)
-    frozen = world_model.flops_per_clip(config, memory=False) if stage.memory else 0.0
-    return 2 * whole + (whole - frozen)

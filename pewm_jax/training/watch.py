@@ -16,7 +16,7 @@ import jax
 from pewm_jax.config import Config, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
-from pewm_jax.training import chips, processes, stages
+from pewm_jax.training import chips, costs, processes
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, drop_after
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.step import Metrics
@@ -56,7 +56,7 @@ class Watch:
         self.view, self.log, self.bad = view, log, bad
         self.pace = Pace(time.monotonic())
         self._devices, self._chip = devices, chips.find(jax.devices()[0].device_kind)
-        self._flops = self.settings.batch * stages.flops_per_clip(config, stage)
+        self._flops = self.settings.batch * costs.flops_per_clip(config, stage)
         self._skipped = self._skipped_before(done)
 
     def read(self, step: int, metrics: Metrics, kept: Callable[[], str]) -> dict[str, float]:

@@ -73,9 +73,3 @@ def test_nothing_to_train_is_refused_and_empty_stages_are_skipped():
         stages.planned(fakes.config(stage1=0, stage2=0))
     assert [s.number for s in stages.planned(fakes.config(stage2=0))] == [1]
     assert [s.number for s in stages.planned(fakes.config())] == [1, 2]
-
-
-def test_training_flops_count_weight_gradients_only_where_trained(fake_model):
-    first, second = (stages.flops_per_clip(fakes.config(), stage) for stage in stages.STAGES)
-    assert first == 3 * 2.0
-    assert second == 2 * 3.0 + 1.0

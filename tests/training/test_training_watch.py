@@ -17,7 +17,7 @@ import training_fakes as fakes
 from pewm_jax import weights
 from pewm_jax.config import UserError
 from pewm_jax.data import loader
-from pewm_jax.training import chips, loop, samples, step, watch
+from pewm_jax.training import chips, costs, loop, samples, step, watch
 from pewm_jax.training.sharding import make_mesh
 from pewm_jax.training.signals import Interrupted
 from pewm_jax.training.stages import STAGES
@@ -155,7 +155,7 @@ def test_utilisation_is_told_where_the_chip_is_known(fake_model, tmp_path, monke
         rate = entry["tflops_per_second_per_device"] * 1e12
         assert entry["mfu"] == pytest.approx(rate / chips.CHIPS[0].flops)
         per_step = rate * entry["step_seconds"] * jax.device_count()
-        assert per_step == pytest.approx(8 * loop.stages.flops_per_clip(fakes.config(), STAGES[0]))
+        assert per_step == pytest.approx(8 * costs.flops_per_clip(fakes.config(), STAGES[0]))
         assert entry["clips_per_second"] == pytest.approx(8 / entry["step_seconds"])
 
 
