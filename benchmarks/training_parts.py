@@ -149,7 +149,9 @@ def reading(config: Config, **settings: Any) -> Config:
     return dataclasses.replace(config, data=dataclasses.replace(config.data, **settings))
 
 
-def input_rates(config: Config, batch: int, batches: int, rounds: int) -> dict[str, list[float]]:
+def input_rates(
+    config: Config, batch: int, batches: int, rounds: int, processes: int = 2
+) -> dict[str, list[float]]:
     """Return seconds per batch of the loader and of torch's over the same records, in turns.
 
     Both draw and decode clips by the same code; what differs is who reads ahead: threads of Grain
@@ -166,10 +168,10 @@ def input_rates(config: Config, batch: int, batches: int, rounds: int) -> dict[s
         TorchClips(config),  # pyright: ignore[reportArgumentType]
         batch_size=batch,
         sampler=list(range(batch * (batches + 64))),
-        num_workers=2,
+        num_workers=processes,
         collate_fn=stack_clips,
-        multiprocessing_context="spawn",
-        persistent_workers=True,
+        multiprocessing_context="spawn" if processes else None,
+        persistent_workers=processes > 0,
     )
     makers = {"1 thread": lambda: ours(0), "2 threads": lambda: ours(2), "torch": peers.__iter__}
     seconds: dict[str, list[float]] = {name: [] for name in makers}

@@ -19,6 +19,7 @@ import signal
 import socket
 import tempfile
 import threading
+import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
@@ -33,6 +34,8 @@ from pewm_jax.data.recording import CollectConfig, make_episode
 
 AHEAD = 2
 """Shards given to a cluster for each of its processors: one that is made and one that waits."""
+RETRIES = 3
+"""Times that a shard is made again, by another worker, when its worker or machine is lost."""
 CONNECT_S = 10.0
 """How long a cluster may take to answer."""
 PATIENCE_S = 5.0
@@ -151,8 +154,8 @@ def on_cluster(
     and always more than there are processors, so that a cluster that grows on demand does.
     """
     ray = _import_ray()
-    with _cluster(ray, config, say):
-        make = ray.remote(num_cpus=1)(make_bytes)
+    with cluster(ray, config, say):
+        make = ray.remote(num_cpus=1, max_retries=RETRIES)(make_bytes)
         software = software_here()
         waiting, going = list(reversed(jobs)), {}
         try:
@@ -257,8 +260,17 @@ def _no_cluster(config: CollectConfig, reason: str) -> str:
 
 
 @contextlib.contextmanager
-def _cluster(ray: Any, config: CollectConfig, say: Callable[[str], None]) -> Iterator[None]:
-    """Use the cluster that this process has joined, or join one, or start one of this machine."""
+def cluster(ray: Any, config: CollectConfig, say: Callable[[str], None]) -> Iterator[None]:
+    """Use the cluster that this process has joined, or join one, or start one of this machine.
+
+    Args:
+        ray: the module.
+        config: ``address`` and ``workers`` count.
+        say: receives the line to show.
+
+    Raises:
+        UserError: there is no cluster.
+    """
     if ray.is_initialized():
         yield
         return
@@ -266,7 +278,10 @@ def _cluster(ray: Any, config: CollectConfig, say: Callable[[str], None]) -> Ite
     if not config.address:
         quiet |= {"num_cpus": config.workers or os.cpu_count() or 1, "include_dashboard": False}
     try:
-        ray.init(address=config.address or "local", **quiet)
+        with warnings.catch_warnings():
+            # Ray starts programs of its own, which is safe also where JAX has threads.
+            warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
+            ray.init(address=config.address or "local", **quiet)
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         reason = " ".join(str(error).split()).partition(". ")[0]
         raise UserError(_no_cluster(config, reason[:160])) from None

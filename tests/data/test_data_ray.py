@@ -27,20 +27,14 @@ SMALL = {"train": 3, "validation": 0, "test": 1, "frames": 30, "size": 16, "shar
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Two processors of this machine, with this module's functions known to the workers."""
+    """One processor of this machine."""
     ray = pytest.importorskip("ray", reason="collecting on a cluster needs pewm-jax[ray]")
+    config = CollectConfig(Path("x"), engine="ray", workers=1)
     with pytest.MonkeyPatch.context() as patch:
         for name, value in engines.QUIET.items():
             patch.setenv(name, value)
-        ray.init(
-            address="local",
-            num_cpus=2,
-            include_dashboard=False,
-            log_to_driver=False,
-            logging_level="ERROR",
-        )
-        yield ray
-        ray.shutdown()
+        with engines.cluster(ray, config, lambda _: None):
+            yield ray
 
 
 def fingerprints(folder):
@@ -92,6 +86,7 @@ def test_a_cluster_makes_the_very_files_of_the_local_pool_and_only_those_that_mi
 )
 def test_what_goes_wrong_elsewhere_is_a_sentence_here(cluster, tmp_path, monkeypatch, broken, says):
     monkeypatch.setattr(engines, "make_bytes", broken)
+    monkeypatch.setattr(engines, "RETRIES", 0)
     (job,) = jobs(tmp_path, 1)
     with pytest.raises(UserError, match=says):
         list(engines.run([job], job.config))
@@ -113,12 +108,12 @@ def test_the_rest_is_given_up_when_it_is_not_wanted_any_more(cluster, tmp_path, 
     made = engines.run(many, many[0].config)
     next(made)
     made.close()
-    assert len(given_up) == 2 * engines.AHEAD - 1
+    assert len(given_up) == engines.AHEAD - 1
     assert len(list(tmp_path.iterdir())) == 1
     limit = time.monotonic() + 20
-    while cluster.available_resources().get("CPU") != 2 and time.monotonic() < limit:
+    while cluster.available_resources().get("CPU") != 1 and time.monotonic() < limit:
         time.sleep(0.05)
-    assert cluster.available_resources()["CPU"] == 2
+    assert cluster.available_resources()["CPU"] == 1
 
 
 def test_ctrl_c_ends_the_cluster_that_was_started_and_the_pool_goes_on(tmp_path):

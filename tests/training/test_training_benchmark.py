@@ -82,7 +82,7 @@ def test_what_saving_and_logging_take_is_told_from_the_steps(parts):
 def test_both_loaders_read_the_same_records(parts, tmp_path):
     collect(CollectConfig(tmp_path, train=2, validation=0, test=0, frames=24, size=16, workers=1))
     config = parts.reading(fakes.config(), path=str(tmp_path), context=4)
-    found = parts.input_rates(config, batch=2, batches=2, rounds=1)
+    found = parts.input_rates(config, batch=2, batches=2, rounds=1, processes=0)
     assert set(found) == {"1 thread", "2 threads", "torch"}
     assert all(seconds > 0 for (seconds,) in found.values())
 
