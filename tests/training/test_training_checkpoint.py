@@ -1,5 +1,6 @@
 """Checkpoints: exact, safe under donation, and never read half-written or for another run."""
 
+import dataclasses
 import threading
 
 import jax
@@ -107,6 +108,9 @@ def test_a_save_is_waited_for_within_reason_before_a_step_is_told_of(
         go_on.set()
         checkpoints.wait()
         assert checkpoints.latest() == 0
+        checkpoints.save(dataclasses.replace(state, step=state.step + 5))
+        checkpoints.settle()
+        assert checkpoints.latest() == 5
 
 
 def test_what_fails_in_the_background_is_told_at_the_next_step(fake_model, tmp_path, monkeypatch):
