@@ -35,7 +35,7 @@ from pewm_jax.types import Params
 
 WEIGHTS, STATE, DATA, CONFIG = shelf.WEIGHTS, "state", "data", "config"
 
-_MOMENT_S, _SHARE = 1.0, 0.02
+_MOMENT_S, _SHARE = 2.0, 0.02
 """How long ``settle`` waits: seconds, or a share of the time between two saves if that is more."""
 
 
@@ -147,7 +147,7 @@ class Checkpoints:
 
         So no step is told of that lies more than one interval beyond the newest whole checkpoint,
         and that is what a killed training loses at most. A save that is slow for its interval,
-        taking more than a fiftieth of it and more than a second, is not waited for any longer.
+        taking more than a fiftieth of it and more than two seconds, is not waited for any longer.
 
         Raises:
             UserError: as ``save``.

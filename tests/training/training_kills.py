@@ -19,7 +19,7 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax.data import loader
-from pewm_jax.training import loop, shelf
+from pewm_jax.training import checkpoint, loop, shelf
 
 EVERY, STEPS = 3, 27
 
@@ -113,6 +113,7 @@ def main(folder, kills, seed):
         fakes.install(patch)
         patch.setattr(loader, "clips", clips)
         patch.setattr(loader, "records", records)
+        patch.setattr(checkpoint, "_MOMENT_S", 60.0)  # however slow this disk is
         began = time.monotonic()
         codes = [wait(start(folder, "undisturbed"))]
         longest = (time.monotonic() - began) / 6
