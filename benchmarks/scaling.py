@@ -1,0 +1,123 @@
+"""The table of docs/scaling.md: both large presets, both stages, on 8, 64 and 256 devices.
+
+    python benchmarks/scaling.py            # compiles 14 steps for 256 virtual devices, minutes
+    python benchmarks/scaling.py --record   # and rewrites the table
+    python benchmarks/scaling.py --quick    # the smallest preset on 8 devices, to see that it runs
+
+No device but a CPU is needed. Every number is one that `python train.py PRESET --plan` prints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from record import machine, record, table
+
+import configs
+from pewm_jax.config import ClipConfig, Config, MeshConfig
+from pewm_jax.training import chips, plan, stages, suggest
+from pewm_jax.training.footprint import Arranged
+from pewm_jax.training.log import duration
+from pewm_jax.training.plan_text import arranged, size
+from pewm_jax.training.stages import Stage
+
+PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
+DEVICES = (8, 64, 256)
+HEAD = (
+    "model",
+    "stage",
+    "devices",
+    "mesh",
+    "memory by the formula",
+    "CPU program (formula for it)",
+    "fits",
+    "TFLOP a device (program)",
+    "step",
+    "MFU",
+    "clips/s",
+    "fastest mesh",
+)
+
+
+def long_clip() -> Config:
+    """Return pewm_5b on 49 × 480 × 720, whose 17,550 video tokens four devices share."""
+    config = configs.load("pewm_5b")
+    mesh = MeshConfig(fsdp=16, context=4)
+    stage = dataclasses.replace(config.train.stage2, batch=16)
+    return dataclasses.replace(
+        config,
+        clip=ClipConfig(frames=49, height=480, width=720),
+        train=dataclasses.replace(config.train, mesh=mesh, stage1=stage, stage2=stage),
+    )
+
+
+def cases(quick: bool) -> Iterator[tuple[str, Config, int]]:
+    """Yield what is planned: label, settings, devices."""
+    if quick:
+        tiny = configs.load("tiny")
+        stage = dataclasses.replace(tiny.train.stage1, batch=8)
+        train = dataclasses.replace(tiny.train, stage1=stage, stage2=stage)
+        yield "tiny", dataclasses.replace(tiny, train=train), 8
+        return
+    for name in ("pewm_2b", "pewm_5b"):
+        for devices in DEVICES:
+            yield name, configs.load(name), devices
+    yield "pewm_5b, 49 × 480 × 720, 16 clips", long_clip(), 64
+
+
+def row(label: str, config: Config, stage: Stage, count: int, chip: chips.Chip) -> list[str]:
+    """Plan one case; returns its line of the table."""
+    print(f"{label}, stage {stage.number}, {count} × {chip.name}: compiling …", flush=True)
+    compiled = plan.compile_stage(config, stage, plan.virtual(count))
+    mesh = Arranged(*config.train.mesh.shape(count))
+    choice = suggest.weigh(config, stage, mesh, chip)
+    best = suggest.rank(config, stage, count, chip)
+    one = plan.Plan(config, stage, chip, choice, compiled, tuple(best[:1]))
+    print(f"  compiled in {compiled.seconds:.0f} s: {size(one.peak)}", flush=True)
+    return [
+        label,
+        str(stage.number),
+        f"{count} × {chip.name}",
+        arranged(choice),
+        size(choice.memory.peak),
+        f"{size(compiled.peak)} ({size(compiled.expected.peak)})",
+        "yes" if one.fits else "**no**",
+        f"{choice.time.hardware_flops / 1e12:.4g} ({compiled.program.flops / 1e12:.4g})",
+        duration(choice.time.step_s),
+        f"{choice.time.mfu:.0%}",
+        f"{choice.time.clips_per_s:.3g}",
+        f"{arranged(best[0])}: {duration(best[0].time.step_s)}",
+    ]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the table, and keep it if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="the smallest preset alone")
+    parser.add_argument("--record", action="store_true", help="rewrite docs/scaling.md")
+    parser.add_argument("--chip", default="h200", help="kind of device")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the page to rewrite")
+    options = parser.parse_args(argv)
+    chip = chips.named(options.chip)
+    found = list(cases(options.quick))
+    plan.virtual(max(count for *_, count in found))
+    wanted = [(*case, stage) for case in found for stage in stages.planned(case[1])]
+    rows: dict[int, list[str]] = {}
+    # The largest first: what is written after each is then never without them.
+    for index in sorted(range(len(wanted)), key=lambda k: "5b" not in wanted[k][0]):
+        label, config, count, stage = wanted[index]
+        rows[index] = row(label, config, stage, count, chip)
+        source = f"{chip.name}: {chip.source}. Compiled with {machine('jax')}."
+        text = f"{table(HEAD, [rows[k] for k in sorted(rows)])}\n\n{source}"
+        if options.record:
+            record("scaling", text, options.page)
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
