@@ -43,3 +43,11 @@ def test_what_the_table_plans_are_the_presets_and_they_fit():
         assert row[0].startswith(("| pewm_2b", "| pewm_5b")), row
         assert row[1] in ("1", "2"), row
         assert row[6] == "yes", row
+
+
+def test_the_table_has_both_presets_and_stages_on_all_numbers_of_devices():
+    rows = {tuple(row[:3]) for row in table(PAGE)[2:]}
+    for name in ("pewm_2b", "pewm_5b"):
+        for stage in ("1", "2"):
+            for devices in (8, 64, 256):
+                assert (f"| {name}", stage, f"{devices} × h200") in rows
