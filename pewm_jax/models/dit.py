@@ -30,7 +30,6 @@ BlockExpert = Callable[[Any, Array, Array], Array]
 OFS = 2.0
 """The second scalar that 1.5-5B-I2V is always given."""
 
-
 KEEP = jax.checkpoint_policies.dots_saveable
 """What a block keeps for its backward pass: matrix products. Norms, modulation, rotation and gelu
 are cheaper to compute again than to stack over layers and read back."""
@@ -240,10 +239,9 @@ def init(config: DiTConfig, key: Array) -> Params:
         jnp.zeros((1,)),
     )["params"]
     token, time = jnp.zeros((1, 1, config.width)), jnp.zeros((1, config.time_dim))
-    alone = TokenLayout(parts=1, text=0, frames=1, patches=1)
-    blocks = jax.vmap(lambda k: Block(config).init(k, token, time, None, alone)["params"])(
-        jax.random.split(blocks_key, config.layers)
-    )
+    blocks = jax.vmap(
+        lambda k: Block(config).init(k, token, time, None, TokenLayout(1, 0, 1, 1))["params"]
+    )(jax.random.split(blocks_key, config.layers))
     return {**ends, "blocks": blocks}
 
 
@@ -285,8 +283,8 @@ def apply(
     length = text_BLD.shape[1]
     out_channels = params["proj_out"]["bias"].shape[0] // (patch_t * patch**2)
     ends = Ends(config, out_channels, dtype)
-    ends_params = {k: v for k, v in params.items() if k != "blocks"}
-    ends_params = {"params": jax.tree.map(placement.constrain, ends_params)}
+    rest = {name: leaf for name, leaf in params.items() if name != "blocks"}
+    ends_params = {"params": jax.tree.map(placement.constrain, rest)}
     embedded: Any = ends.apply(
         ends_params,
         patchify(latents_BthwC, patch, patch_t),

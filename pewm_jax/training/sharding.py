@@ -85,7 +85,7 @@ def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_D
     return jax.make_mesh(arranged.shape(len(devices)), AXES, types, devices=devices)
 
 
-def of_state(mesh: Mesh, state: Any) -> Any:
+def of_state(mesh: Mesh | AbstractMesh, state: Any) -> Any:
     """Return the shardings of a (possibly abstract) state, as a tree of its structure.
 
     An axis of the mesh that does not divide its axis of a leaf is left out for that leaf;
@@ -114,7 +114,7 @@ def constrain(params: Params) -> Params:
     )
 
 
-def left_out(mesh: Mesh, state: Any) -> dict[str, tuple[str, ...]]:
+def left_out(mesh: Mesh | AbstractMesh, state: Any) -> dict[str, tuple[str, ...]]:
     """Return the leaves that are not split as their rule says, and the mesh axes left out.
 
     Args:
@@ -199,7 +199,7 @@ def _part(leaf: np.ndarray, dtype: np.dtype, index: tuple[slice, ...] | None) ->
     return np.asarray(leaf[index or ...], dtype)
 
 
-def require_divisible(config: Config, stage: Stage, mesh: Mesh) -> None:
+def require_divisible(config: Config, stage: Stage, mesh: Mesh | AbstractMesh) -> None:
     """Refuse what cannot be split evenly.
 
     Raises:

@@ -95,6 +95,7 @@ def fresh(config, stage, mesh):
     make = jax.jit(functools.partial(create, config, stage), out_shardings=where)
     compiled = make.lower(step.stage_key(config, stage), None).compile()
     memory = compiled.memory_analysis()
+    assert memory is not None
     return {
         "made": memory.output_size_in_bytes + memory.temp_size_in_bytes,
         "whole": sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(like)),
