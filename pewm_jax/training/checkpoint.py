@@ -283,7 +283,8 @@ def _read_arrays(folder: Path, like: Params) -> Params:
     how = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), like)
     with _reading(folder):
         return ocp.PyTreeCheckpointHandler().restore(
-            epath.Path(folder / WEIGHTS), args=ocp.args.PyTreeRestore(like, restore_args=how)
+            epath.Path((folder / WEIGHTS).resolve()),
+            args=ocp.args.PyTreeRestore(like, restore_args=how),
         )
 
 

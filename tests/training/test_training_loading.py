@@ -64,6 +64,13 @@ def test_a_run_in_mid_training_gives_its_newest_checkpoint(run):
     same(pewm_jax.load(folder / "stage1" / "6")[1], weights.load(run / "weights.safetensors"))
 
 
+def test_runs_and_checkpoints_are_named_by_relative_paths_too(run, monkeypatch):
+    _, params = pewm_jax.load(run)
+    monkeypatch.chdir(run.parent)
+    same(pewm_jax.load("run")[1], params)
+    same(pewm_jax.load("run/checkpoints/stage2/4")[1], params)
+
+
 def test_the_state_of_the_optimizer_is_never_touched(run):
     _, params = pewm_jax.load(run)
     newest = run / "checkpoints" / "stage2" / "4"
