@@ -27,7 +27,8 @@ class DataConfig:
     workers: int = 0
     """Threads that read and decode ahead of training; 0 means one."""
     bad_records: int = 0
-    """Records that may fail to decode before training stops; each is named, and skipped."""
+    """Records that may fail to decode before training stops; each is named, and skipped. Of several
+    processes, each counts those that it reads."""
 
     def __post_init__(self):
         """Validate."""

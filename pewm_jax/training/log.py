@@ -182,7 +182,7 @@ def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
     """Put the figures of a step into one line."""
     return (
         f"loss {metrics['loss']:.4f} · lr {metrics['learning_rate']:.2e} · "
-        f"grad {metrics['grad_norm']:.2f} · {duration(metrics['step_seconds'])}/step · "
+        f"grad {metrics['grad_norm']:.3g} · {duration(metrics['step_seconds'])}/step · "
         f"{metrics['clips_per_second']:.1f} clips/s · {_work(metrics)} · "
         f"{_counts(metrics)}{duration(seconds_left)} left"
     )

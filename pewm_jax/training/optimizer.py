@@ -7,7 +7,9 @@ enter the norm that is clipped. (``optax.masked`` alone would pass raw gradients
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import optax
+from jax import Array
 
 from pewm_jax import tree
 from pewm_jax.config import Config, StageConfig
@@ -37,6 +39,12 @@ def schedule(settings: StageConfig) -> optax.Schedule:
             settings.learning_rate, max(settings.steps - settings.warmup, 1)
         )
     return optax.join_schedules([warmup, rest], [settings.warmup])
+
+
+def rate(settings: StageConfig, opt_state: optax.OptState) -> Array:
+    """Return the learning rate of the next update; skipped ones have not counted."""
+    counted = optax.tree_utils.tree_get(opt_state, "ScaleByScheduleState")
+    return jnp.asarray(schedule(settings)(counted.count))
 
 
 def make(config: Config, stage: Stage) -> optax.GradientTransformation:

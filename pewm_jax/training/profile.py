@@ -42,6 +42,7 @@ class Profile:
         self._steps = range(begin, min(begin + steps, last + 1))
         self._stage, self._say = stage, say
         self._tracing = False
+        self._traced = 0
 
     @contextlib.contextmanager
     def around(self, step: int) -> Iterator[None]:
@@ -55,6 +56,7 @@ class Profile:
             self._tracing = True
         with jax.profiler.StepTraceAnnotation("train", step_num=step):
             yield
+        self._traced += 1
 
     def after(self, step: int, result: Any) -> float:
         """End the trace with its last step, once that is computed; returns seconds spent on it."""
@@ -75,6 +77,6 @@ class Profile:
         drop = f", or drop {made[-1]} on https://ui.perfetto.dev" if made else ""
         stage = self._stage.replace("stage", "stage ")
         self._say(
-            f"{stage}: traced {len(self._steps)} steps; open them with "
+            f"{stage}: traced {self._traced} step{'s'[: self._traced != 1]}; open with "
             f"`tensorboard --logdir {self.folder}` (and the xprof plugin){drop}"
         )

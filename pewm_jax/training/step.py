@@ -65,7 +65,7 @@ def train_step(
         **measured,
         "loss": loss,
         "grad_norm": _norm(gradients),
-        "learning_rate": optimizer.schedule(stage.settings(config))(state.step),
+        "learning_rate": optimizer.rate(stage.settings(config), state.opt_state),
     }
     after = TrainState(
         params=tree.merge(trained, frozen),

@@ -85,7 +85,7 @@ def test_without_a_terminal_there_is_a_line_now_and_then_and_one_at_the_end(monk
 def test_a_line_names_rate_flops_and_time_left():
     text = log.describe(METRICS, 90)
     assert text == (
-        "loss 0.5000 · lr 1.00e-03 · grad 1.00 · 250 ms/step · 32.0 clips/s · 2.5 GFLOP/s/device · "
+        "loss 0.5000 · lr 1.00e-03 · grad 1 · 250 ms/step · 32.0 clips/s · 2.5 GFLOP/s/device · "
         "1 min 30 s left"
     )
 

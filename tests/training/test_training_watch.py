@@ -17,7 +17,7 @@ import training_fakes as fakes
 from pewm_jax import weights
 from pewm_jax.config import UserError
 from pewm_jax.data import loader
-from pewm_jax.training import chips, costs, loop, samples, step, watch
+from pewm_jax.training import chips, costs, loop, optimizer, samples, step, watch
 from pewm_jax.training.sharding import make_mesh
 from pewm_jax.training.signals import Interrupted
 from pewm_jax.training.stages import STAGES
@@ -89,6 +89,8 @@ def test_a_skipped_update_leaves_all_but_the_step_as_it_was(fake_model, monkeypa
     )
     state, metrics = take(state, good, key)
     assert not metrics["skipped"]
+    rate = optimizer.schedule(stage.settings(config))
+    assert float(metrics["learning_rate"]) == pytest.approx(float(rate(1))), "that of Adam's count"
     moved = jax.device_get(state).params["memory"]["kernel"]
     assert np.isfinite(moved).all()
     assert not np.array_equal(moved, before.params["memory"]["kernel"])
@@ -167,9 +169,7 @@ def test_a_profile_is_written_and_said_where(fake_model, tmp_path, monkeypatch):
     (trace,) = folder.rglob("*.xplane.pb")
     assert trace.stat().st_size > 0
     (line,) = [text for text in told if "traced" in text]
-    assert line.startswith(
-        f"stage 1: traced 2 steps; open them with `tensorboard --logdir {folder}"
-    )
+    assert line.startswith(f"stage 1: traced 2 steps; open with `tensorboard --logdir {folder}")
     assert str(next(folder.rglob("*.trace.json.gz"))) in line
 
 
@@ -180,12 +180,10 @@ def test_a_profile_is_written_and_said_where(fake_model, tmp_path, monkeypatch):
 def test_the_first_steps_are_traced_only_where_there_are_no_others(
     monkeypatch, tmp_path, steps, first, last, traced
 ):
-    seen, ended = [], []
+    seen, ended, told = [], [], []
     monkeypatch.setattr(jax.profiler, "start_trace", seen.append)
     monkeypatch.setattr(jax.profiler, "stop_trace", lambda: ended.append(now))
-    profile = loop.Profile(
-        tmp_path, "stage1", steps=steps, first=first, last=last, say=lambda _: None
-    )
+    profile = loop.Profile(tmp_path, "stage1", steps=steps, first=first, last=last, say=told.append)
     annotated = []
     monkeypatch.setattr(
         jax.profiler,
@@ -199,6 +197,20 @@ def test_the_first_steps_are_traced_only_where_there_are_no_others(
     profile.close()
     assert annotated == traced
     assert (len(seen), ended) == ((1, traced[-1:]) if traced else (0, []))
+    said = f"traced {len(traced)} step{'s' * (len(traced) > 1)};"
+    assert [said in line for line in told] == [True] * len(seen)
+
+
+def test_a_trace_that_is_broken_off_counts_what_it_holds(monkeypatch, tmp_path):
+    monkeypatch.setattr(jax.profiler, "start_trace", lambda _folder: None)
+    monkeypatch.setattr(jax.profiler, "stop_trace", lambda: None)
+    told = []
+    profile = loop.Profile(tmp_path, "stage1", steps=5, first=1, last=9, say=told.append)
+    with profile.around(3):
+        pass
+    profile.close()
+    (line,) = told
+    assert "traced 1 step;" in line
 
 
 def test_what_a_preview_measures_stands_in_its_steps_line(fake_model, tmp_path, monkeypatch):
