@@ -22,7 +22,7 @@ from pewm_jax.config import ClipConfig, Config, MeshConfig
 from pewm_jax.training import chips, plan, stages, suggest
 from pewm_jax.training.footprint import Arranged
 from pewm_jax.training.log import duration
-from pewm_jax.training.plan_text import arranged, size
+from pewm_jax.training.plan_text import arranged, rate, size, work
 from pewm_jax.training.stages import Stage
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
@@ -32,10 +32,10 @@ HEAD = (
     "stage",
     "devices",
     "mesh",
-    "memory by the formula",
+    "memory by the formula, and raised as the verdict takes it",
     "CPU program (formula for it)",
     "fits",
-    "TFLOP a device (program)",
+    "work of a device (program)",
     "step",
     "MFU",
     "clips/s",
@@ -83,13 +83,13 @@ def row(label: str, config: Config, stage: Stage, count: int, chip: chips.Chip) 
         str(stage.number),
         f"{count} × {chip.name}",
         arranged(choice),
-        size(choice.memory.peak),
+        f"{size(choice.memory.peak)}, {size(one.peak)}",
         f"{size(compiled.peak)} ({size(compiled.expected.peak)})",
         "yes" if one.fits else "**no**",
-        f"{choice.time.hardware_flops / 1e12:.4g} ({compiled.program.flops / 1e12:.4g})",
+        f"{work(choice.time.hardware_flops)} ({work(compiled.program.flops)})",
         duration(choice.time.step_s),
         f"{choice.time.mfu:.0%}",
-        f"{choice.time.clips_per_s:.3g}",
+        rate(choice.time.clips_per_s),
         f"{arranged(best[0])}: {duration(best[0].time.step_s)}",
     ]
 

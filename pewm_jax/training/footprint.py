@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 
 from pewm_jax import tree
 from pewm_jax.config import Config
-from pewm_jax.models import blocked_attention, world_model
+from pewm_jax.models import blocked_attention, vae, world_model
 from pewm_jax.training import sharding
 from pewm_jax.training.costs import encodes, sizes
 from pewm_jax.training.stages import Stage
@@ -262,7 +262,9 @@ def _encoders(config: Config, stage: Stage, clips: float, wide: int, mesh: Arran
     clip, memory, held = config.clip, config.memory, 0.0
     pixels = clip.frames * clip.height * clip.width
     if config.codec.kind == "vae":
-        widest = 2 * pixels * config.codec.vae.widths[0] * wide  # colour and depth
+        at_once = vae.ENCODE_FRAMES + clip.frames % vae.ENCODE_FRAMES  # the first chunk's
+        chunk = pixels * min(at_once / clip.frames, 1)
+        widest = 2 * chunk * config.codec.vae.widths[0] * wide  # colour and depth
         held = 4.4 * widest
     if stage.memory and encodes(config):
         s = sizes(config)

@@ -1,8 +1,7 @@
 """What a compiled program does, counted from its text: FLOPs, and bytes between devices.
 
 XLA's own ``cost_analysis`` counts the body of a loop once; here a body counts as often as it runs.
-Only matrix products and convolutions are counted, 2 FLOPs per multiply-add, padding included. The
-program is what one device runs, so all figures are per device.
+Only products and convolutions are counted, 2 FLOPs per multiply-add. Figures are of one device.
 """
 
 from __future__ import annotations
@@ -120,12 +119,17 @@ def read(text: str) -> Program:
     users = {name: _users(lines) for name, lines in computations.items()}
     unknown: list[str] = []
 
-    def sliced(where: str, name: str) -> bool:
-        """Whether of an array, in a computation, only slices are used."""
+    def sliced(where: str, name: str, beyond: Callable[[], bool] = lambda: False) -> bool:
+        """Whether of an array only slices are used, here or ``beyond`` what gives it on."""
+        if name == next(reversed(computations[where])):  # what the computation gives
+            return beyond()
         return bool(users[where].get(name)) and all(
             _is_slice(line, name)
-            or (line.opcode in THROUGH and sliced(where, user))
-            or any(sliced(*place) for place in _parameters(line, name, computations))
+            or (line.opcode in THROUGH and sliced(where, user, beyond))
+            or any(
+                sliced(*place, functools.partial(sliced, where, user, beyond))
+                for place in _parameters(line, name, computations)
+            )
             for user, line in users[where][name]
         )
 

@@ -75,10 +75,14 @@ class Plan:
     best: tuple[Choice, ...]
 
     @property
+    def raised(self) -> float:
+        """By what the sums are raised where the compiler finds more; never less than 1."""
+        return max(1.0, self.compiled.peak / self.compiled.expected.peak)
+
+    @property
     def peak(self) -> float:
         """Bytes on a device that decide: by the sums, more where the compiler finds more."""
-        more = max(1.0, self.compiled.peak / self.compiled.expected.peak)
-        return self.choice.memory.peak * more
+        return self.choice.memory.peak * self.raised
 
     @property
     def fits(self) -> bool:

@@ -46,16 +46,12 @@ def lines(plan: Plan) -> Iterator[str]:
         f"{size(compiled.temporary)} = {size(compiled.peak)}, where the formula for a CPU, which "
         f"widens 16 bits to 32, has {size(compiled.expected.peak)}"
     )
-    verdict = "fits" if plan.fits else "does not fit"
-    yield (
-        f"    {verdict}: {size(plan.peak)} of {size(chip.memory)} ({suggest.MARGIN:.0%} may be "
-        f"used); the formula decides, raised where the compiler found more than it"
-    )
+    yield from _verdict(plan)
     yield "  work of a step"
-    yield f"    the model's own, all devices {time.model_flops / 1e12:>17.4g} TFLOP"
+    yield f"    {'the mathematics needs, all devices':<42}{work(time.model_flops):>12}"
     yield (
-        f"    done by a device, with what is recomputed {time.hardware_flops / 1e12:>4.4g} TFLOP "
-        f"(compiled program: {compiled.program.flops / 1e12:.4g})"
+        f"    {'done by a device, with what is recomputed':<42}{work(time.hardware_flops):>12} "
+        f"(compiled program: {work(compiled.program.flops)})"
     )
     yield "  sent by a device in a step, by the formula (compiled program, in 32 bits)"
     for kind in hlo.KINDS:
@@ -68,7 +64,7 @@ def lines(plan: Plan) -> Iterator[str]:
         f"{duration(time.streaming_s)}, waiting for other devices {duration(time.waiting_s)}"
     )
     yield (
-        f"    MFU {time.mfu:.1%}, {time.clips_per_s:.3g} clips/s, {time.tokens_per_s:,.0f} video "
+        f"    MFU {time.mfu:.1%}, {rate(time.clips_per_s)} clips/s, {time.tokens_per_s:,.0f} video "
         "tokens/s"
     )
     yield "  arrangements that suit best, by the formula"
@@ -79,6 +75,20 @@ def lines(plan: Plan) -> Iterator[str]:
         )
 
 
+def _verdict(plan: Plan) -> Iterator[str]:
+    """Yield whether it fits, and where that number comes from."""
+    verdict, raised = "fits" if plan.fits else "does not fit", plan.raised
+    yield (
+        f"    {verdict}: {size(plan.peak)} of {size(plan.chip.memory)}, of which "
+        f"{suggest.MARGIN:.0%} may be filled ({size(suggest.MARGIN * plan.chip.memory)})"
+    )
+    if raised > 1:
+        why = f"raised by the {raised - 1:.1%} that the CPU program needs above the formula for it"
+    else:
+        why = "not lowered, though the CPU program needs less than the formula for it"
+    yield f"    that is the formula's {size(plan.choice.memory.peak)}, {why}"
+
+
 def arranged(choice: Choice) -> str:
     """Write an arrangement: ``data 8 × fsdp 8 × tensor 1 × context 1``."""
     return " × ".join(f"{name} {count}" for name, count in choice.mesh.sizes.items())
@@ -86,7 +96,25 @@ def arranged(choice: Choice) -> str:
 
 def size(count: float) -> str:
     """Write bytes as people do."""
-    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+    for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= factor:
-            return f"{count / factor:.3g} {unit}"
+            return f"{_short(count / factor)} {unit}"
     return f"{count:.0f} B"
+
+
+def work(flops: float) -> str:
+    """Write a number of FLOPs as people do."""
+    for unit, factor in (("EFLOP", 1e18), ("PFLOP", 1e15), ("TFLOP", 1e12), ("GFLOP", 1e9)):
+        if flops >= factor:
+            return f"{_short(flops / factor)} {unit}"
+    return f"{_short(flops / 1e6)} MFLOP"
+
+
+def rate(count: float) -> str:
+    """Write a rate to three digits, without an exponent."""
+    return f"{count:,.0f}" if count >= 1000 else f"{count:.3g}"
+
+
+def _short(value: float) -> str:
+    """Write three digits, and all those before the point."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

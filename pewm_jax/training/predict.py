@@ -95,10 +95,11 @@ def predict(config: Config, stage: Stage, mesh: Arranged, chip: Chip) -> Predict
 def traffic(config: Config, stage: Stage, mesh: Arranged) -> dict[tuple[str, str], float]:
     """Return the bytes that a device sends in a step, by kind and axis of the mesh.
 
-    Per step: a block's weights are gathered for the forward and again for the backward pass
-    (``fsdp``), gradients are added up and scattered; copies of the weights add up theirs
-    (``data``). Per block and pass: what its two, with memory four, last products give is added up
-    over ``tensor``; keys and values are gathered over ``context`` and their gradients scattered.
+    Per step: a block's weights are gathered for the forward and again for the backward pass, once
+    more where it repeats the forward pass (``dit.remat``) in 16 bits, since XLA does not see then
+    that both are the same (``fsdp``); gradients are added up and scattered; copies of the weights add up theirs (``data``). Per block and pass: what its two,
+    with memory four, last products give is added up over ``tensor``; keys and values are gathered
+    over ``context`` and their gradients scattered.
     """
     c, s, dit = counts(config, stage), costs.sizes(config), config.dit
     wide = 2 if config.train.dtype == "bfloat16" else FLOAT
@@ -107,9 +108,11 @@ def traffic(config: Config, stage: Stage, mesh: Arranged) -> dict[tuple[str, str
     learnt = c.trained.on(mesh) * mesh.fsdp * wide
     tokens = clips * s.joint * s.width * wide / mesh.context
     passes = 2 + dit.remat  # forward, backward, forward again
+    gathered = 2 + (dit.remat and wide < FLOAT)
     sums = (4 if stage.memory else 2) * dit.layers * passes
     sent = {
-        ("all-gather", "fsdp"): (2 * parameters + c.encoders.count * wide) * _ring(mesh.fsdp),
+        ("all-gather", "fsdp"): (gathered * parameters + c.encoders.count * wide)
+        * _ring(mesh.fsdp),
         ("reduce-scatter", "fsdp"): learnt * _ring(mesh.fsdp),
         ("all-reduce", "data"): 2 * learnt / mesh.fsdp * _ring(mesh.data),
         ("all-reduce", "tensor"): 2 * sums * tokens * _ring(mesh.tensor),

@@ -131,6 +131,30 @@ def test_a_sum_of_which_only_slices_are_used_is_a_reduce_scatter():
     assert found.sent("all-reduce") == 2 * 256 * 7 / 8
 
 
+@pytest.mark.parametrize(("last", "kind"), [("cut", "reduce-scatter"), ("whole", "all-reduce")])
+def test_a_sum_may_be_converted_before_it_is_cut(last, kind):
+    fused = (
+        "%converted (q: f32[64]) -> bf16[64] {\n"
+        "  %q = f32[64]{0} parameter(0)\n"
+        "  ROOT %c = bf16[64]{0} convert(%q)\n"
+        "}\n\n"
+    )
+    rest = "replica_groups=[1,8]<=[8], to_apply=%region"
+    ends = {
+        "cut": ("cut", "bf16[8]{0}", "dynamic-slice(%narrow, %i), dynamic_slice_sizes={8}"),
+        "whole": ("whole", "bf16[64]{0}", "negate(%narrow)"),
+    }
+    rows = [
+        ("p", "f32[64]{0}", "parameter(0)"),
+        ("i", "s32[]", "partition-id()"),
+        ("sum", "f32[64]{0}", f"all-reduce(%p), {rest}"),
+        ("narrow", "bf16[64]{0}", "fusion(%sum), kind=kLoop, calls=%converted"),
+        ends[last],
+    ]
+    found = written(*rows, head=fused)
+    assert [one.kind for one in found.collectives] == [kind]
+
+
 def test_sizes_of_types_are_in_bytes():
     assert hlo.size("(f32[2,3]{1,0}, s32[], bf16[4]{0}, pred[5]{0})") == 24 + 4 + 8 + 5
     assert hlo.size("f8e4m3fn[16]{0}") == 16

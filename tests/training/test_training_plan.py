@@ -39,7 +39,7 @@ def test_the_command_plans_from_settings_alone_and_writes_nothing(tmp_path):
     stage1 = ("--train.stage2.steps", "0", "--train.stage1.batch", "4")
     done = run(tmp_path, "tiny", "--devices", "4", "--chip", "TPU v5p", *stage1)
     assert done.returncode == 0, done.stderr
-    for word in ("Stage 1 on 4 × v5p", "peak", " fits:", "TFLOP", "all-reduce", "MFU"):
+    for word in ("Stage 1 on 4 × v5p", "peak", " fits:", "FLOP (compiled program: ", "all-reduce", "MFU"):
         assert word in done.stdout, word
     assert "--train.mesh.data" in done.stdout
     assert list(tmp_path.iterdir()) == []

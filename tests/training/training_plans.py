@@ -21,7 +21,7 @@ from pewm_jax.config import (
     TrainConfig,
     VAEConfig,
 )
-from pewm_jax.training import costs, plan, stages
+from pewm_jax.training import costs, hlo, plan, predict, stages
 from pewm_jax.training.footprint import Arranged
 
 ENCODERS = {
@@ -98,10 +98,15 @@ def measure(number, settings, devices):
     compiled = plan.compile_stage(config, stage, used)
     mesh = Arranged(*config.train.mesh.shape(len(used)))
     clips = stage.settings(config).batch
+    sent = predict.traffic(config, stage, mesh)
     done = [costs.flops_of_device(p, mesh.sizes, clips) for p in costs.products(config, stage)]
     return {
         "flops": compiled.program.flops,
         "flops_expected": sum(done),
+        "sent": {kind: compiled.program.sent(kind) for kind in hlo.KINDS},
+        "sent_expected": {
+            kind: sum(size for (one, _), size in sent.items() if one == kind) for kind in hlo.KINDS
+        },
         "unknown": compiled.program.unknown,
         "state": compiled.arguments,
         "state_expected": compiled.expected.state,
