@@ -1,5 +1,6 @@
 """Several processes train as one: the same losses, one log, one decision, no one left waiting."""
 
+import json
 import signal
 import time
 
@@ -107,6 +108,7 @@ def test_two_processes_of_two_devices_compute_the_losses_of_one(tmp_path, monkey
     collect(CollectConfig(out=data, train=2, validation=0, test=0, frames=24, size=16, workers=1))
     argv = ["tiny", "--data.path", data, "--train.stage1.steps", 20, "--train.stage1.batch", 4]
     argv += ["--train.stage2.steps", 0, "--dit.layers", 1]
+    argv += ["--train.save_every", 20]
     one, two = tmp_path / "one", tmp_path / "two"
     assert run_here(monkeypatch, [*argv, "--train.run", one]) == 0
     spoken, silent = jobs.finish(
@@ -156,6 +158,26 @@ def test_a_signal_to_one_stops_all_after_the_same_step(tmp_path):
     assert (run / "checkpoints" / "stage1" / str(done)).is_dir()
 
 
+def test_what_is_not_finite_stops_all_or_is_skipped_by_all(tmp_path):
+    run, step = tmp_path / "run", 4
+    argv = ["tiny", *STAGES, "--train.stage1.steps", 6, "--train.stage2.steps", 0]
+    argv += ["--train.run", run]
+    nan = FAKE | {"NAN_AT": str(step)}
+    with jobs.Job(argv, processes=2, settings=nan) as job:
+        codes, _, errors = job.end()
+    assert codes == [2, 2], errors
+    for told in errors:
+        assert told.startswith(f"error: Stage 1 stopped at step {step}: loss nan")
+        assert told.count("\n") == 1
+    assert len(json.loads((run / "nonfinite-stage1-4.json").read_text())["records"]) == 8
+
+    argv[-1] = run = tmp_path / "skipping"
+    jobs.finish([*argv, "--train.on_nonfinite", "skip"], processes=2, settings=nan)
+    (entry,) = (json.loads(line) for line in (run / "nonfinite.jsonl").read_text().splitlines())
+    assert entry["step"] == step
+    assert [line["skipped"] for line in jobs.metrics(run)] == [0, 0, 0, 1, 1, 1]
+
+
 @pytest.mark.parametrize("killed", [0, 1])
 def test_when_one_is_killed_the_other_ends_with_one_sentence(killed):
     by_slurm = killed == 1  # once by hand, once as JAX finds the processes itself
@@ -174,8 +196,10 @@ def test_when_one_is_killed_the_other_ends_with_one_sentence(killed):
 @pytest.mark.parametrize("process", [0, 1])
 def test_processes_that_do_not_meet_say_so_in_time(process):
     argv = ["--distributed", "--patience", 1, "--processes", 2, "--process", process]
-    argv += ["--coordinator", f"localhost:{jobs.free_port()}"]
-    with jobs.Job(argv, settings={"MEET": ""}) as job:
+    with (
+        jobs.held_port() as port,
+        jobs.Job([*argv, "--coordinator", f"localhost:{port}"], settings={"MEET": ""}) as job,
+    ):
         codes, _, errors = job.end()
     assert codes == [2]
     assert errors[0].startswith("error: The processes of this training have not met at localhost:")

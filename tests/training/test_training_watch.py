@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import training_fakes as fakes
@@ -26,27 +25,10 @@ BAD = 5
 """The step whose batch makes everything NaN."""
 
 
-def poisoned(config, split="train", *, seed, batch, start_step=0, **_options):
-    """Clips whose depth is NaN at one step of each stage."""
-    source = fakes.clips(config, split, seed=seed, batch=batch, start_step=start_step)
-    for number, clip in enumerate(source, start_step + 1):
-        yield without_depth(clip) if number == BAD else clip
-
-
-def without_depth(clip):
-    depth = np.full_like(clip.frames.depth_THW, np.nan)
-    return dataclasses.replace(clip, frames=dataclasses.replace(clip.frames, depth_THW=depth))
-
-
-def loss_of_depth(config, params, clip, key, *, memory):
-    value, metrics = fakes.loss(config, params, clip, key, memory=memory)
-    return value * jnp.where(jnp.isnan(clip.frames.depth_THW).any(), jnp.nan, 1.0), metrics
-
-
 @pytest.fixture
 def nan_at_5(fake_model, monkeypatch):
-    monkeypatch.setattr(loader, "clips", poisoned)
-    monkeypatch.setattr(fakes.objective, "loss", loss_of_depth)
+    monkeypatch.setattr(loader, "clips", fakes.without_depth_at(BAD))
+    monkeypatch.setattr(fakes.objective, "loss", fakes.loss_of_depth)
 
 
 def lines(path):
@@ -70,12 +52,12 @@ def test_stopping_writes_the_step_and_the_records_and_names_the_file(nan_at_5, t
 
 
 def test_a_skipped_update_leaves_all_but_the_step_as_it_was(fake_model, monkeypatch):
-    monkeypatch.setattr(fakes.objective, "loss", loss_of_depth)
+    monkeypatch.setattr(fakes.objective, "loss", fakes.loss_of_depth)
     stage, config = STAGES[1], fakes.config(on_nonfinite="skip")
     mesh = make_mesh(jax.devices()[:1])
     key = step.stage_key(config, stage)
     good = fakes.clip(config, 8, 0)
-    bad = without_depth(good)
+    bad = fakes.without_depth(good)
     take = step.compile_step(config, stage, mesh, good)
     state, metrics = take(step.initial_state(config, stage, mesh), good, key)
     assert not metrics["skipped"]

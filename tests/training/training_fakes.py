@@ -89,6 +89,27 @@ def loss(config, params, clip, key, *, memory):
     return error, {"loss_rgb": error}
 
 
+def without_depth(clip):
+    depth = np.full_like(clip.frames.depth_THW, np.nan)
+    return dataclasses.replace(clip, frames=dataclasses.replace(clip.frames, depth_THW=depth))
+
+
+def without_depth_at(bad):
+    """Clips whose depth is NaN at one step of each stage."""
+
+    def poisoned(*args, start_step=0, **options):
+        source = clips(*args, start_step=start_step, **options)
+        for number, clip in enumerate(source, start_step + 1):
+            yield without_depth(clip) if number == bad else clip
+
+    return poisoned
+
+
+def loss_of_depth(config, params, clip, key, *, memory):
+    value, metrics = loss(config, params, clip, key, memory=memory)
+    return value * jnp.where(jnp.isnan(clip.frames.depth_THW).any(), jnp.nan, 1.0), metrics
+
+
 def install(patch):
     """Put the small model and its clips in place of the real ones."""
     patch.setattr(world_model, "init", init)

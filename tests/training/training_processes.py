@@ -2,11 +2,13 @@
 
 By the environment, ``FAKE`` puts the small model of ``training_fakes`` in place of the real one,
 ``PAUSE`` seconds are slept for every batch, ``TERM_AT`` sends the process SIGTERM when it reads
-that batch, and ``MEET`` has processes meet and do nothing else.
+that batch, ``NAN_AT`` makes the loss of that step NaN, and ``MEET`` has processes meet and do
+nothing else.
 """
 
 import contextlib
 import importlib
+import importlib.abc
 import itertools
 import json
 import os
@@ -47,8 +49,8 @@ class Job:
             "JAX_PLATFORMS": "cpu",
             "XLA_FLAGS": flags,
         }
-        port = free_port()
         self.running, self.written, self.files = [], [], contextlib.ExitStack()
+        port = self.files.enter_context(held_port())
         for index in range(processes):
             own, joining = dict(settings), ["--distributed"]
             if slurm:
@@ -97,10 +99,13 @@ def finish(argv, **options):
     return outputs
 
 
-def free_port():
-    with socket.socket() as trial:
-        trial.bind(("", 0))
-        return trial.getsockname()[1]
+@contextlib.contextmanager
+def held_port():
+    """A port that nothing else is given meanwhile, but that can be listened at."""
+    with socket.socket() as held:
+        held.bind(("", 0))  # alone: so no one is given a port that another holds
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        yield held.getsockname()[1]
 
 
 def by_hand(port, processes, index):
@@ -171,13 +176,26 @@ def meet(argv):
             time.sleep(0.01)
 
 
+class WithoutTorch(importlib.abc.MetaPathFinder):
+    """Finds no torch: where it is installed, TensorBoard's writer loads it, for seconds."""
+
+    def find_spec(self, name, path=None, target=None):
+        if name == "torch":
+            raise ModuleNotFoundError(name)
+
+
 def main():
+    sys.meta_path.insert(0, WithoutTorch())
     if "MEET" in os.environ:
         return cli.run(meet)
     loader = importlib.import_module("pewm_jax.data.loader")
     if "FAKE" in os.environ:
         patch = importlib.import_module("pytest").MonkeyPatch()
-        importlib.import_module("training_fakes").install(patch)
+        fakes = importlib.import_module("training_fakes")
+        fakes.install(patch)
+        if "NAN_AT" in os.environ:
+            patch.setattr(fakes.objective, "loss", fakes.loss_of_depth)
+            patch.setattr(loader, "clips", fakes.without_depth_at(int(os.environ["NAN_AT"])))
     loader.clips = told_at(
         loader.clips, int(os.environ.get("TERM_AT", "0")), float(os.environ.get("PAUSE", "0"))
     )
