@@ -155,7 +155,7 @@ class ExportStableHLO:
     """
 
     src: Annotated[Path, tyro.conf.Positional]
-    """A folder that `pewm_jax.load` reads: a run's, or that of `export inference`."""
+    """A run's folder with `weights.safetensors`, or that of `export inference`."""
     dst: Annotated[Path, tyro.conf.Positional]
     """Folder to make."""
     what: Literal["rollout", "denoise"] = "rollout"

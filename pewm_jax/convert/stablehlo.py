@@ -61,8 +61,8 @@ def export(
     """Write programs that run without this library into a new folder.
 
     Args:
-        run: a folder that ``pewm_jax.load`` reads; that of ``export inference`` has the smaller
-            weights.
+        run: a run's folder with ``weights.safetensors``, or that of ``export inference``, which has
+            the smaller weights.
         dst: the folder to make.
         what: ``rollout``, with the beginning of a world from frames; or one evaluation of the
             denoiser.

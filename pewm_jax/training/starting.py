@@ -8,7 +8,7 @@ from pathlib import Path
 from pewm_jax import rollouts, weights
 from pewm_jax.config import Config, UserError
 from pewm_jax.memory import feature_cache
-from pewm_jax.training import processes, runs, shelf
+from pewm_jax.training import loading, processes, runs, shelf
 from pewm_jax.training.stages import Stage
 from pewm_jax.types import Params
 
@@ -41,8 +41,10 @@ def named(config: Config, stage: Stage, say: Callable[[str], None]) -> Params | 
     """
     if not config.train.start:
         return None
-    _, params = rollouts.load(config.train.start, lazily=True)
-    processes.first(lambda: weights.verify(Path(config.train.start) / runs.WEIGHTS))
+    file = Path(config.train.start) / runs.WEIGHTS
+    params = _given(config)
+    if file.exists():  # else what was read from a checkpoint is compared already
+        processes.first(lambda: weights.verify(file))
     if "memory" in params and not stage.memory:
         say(f"{config.train.start}: its memory blocks are left out; stage 2 begins with fresh ones")
         params = {name: part for name, part in params.items() if name != "memory"}
@@ -53,7 +55,15 @@ def encoder(config: Config) -> Params:
     """Return the image encoder's weights as they are given, to compare kept features with."""
     if config.memory.encoder != "dinov2":
         return {}
-    return rollouts.load(config.train.start, lazily=True)[1]["encoder"]
+    return _given(config)["encoder"]
+
+
+def _given(config: Config) -> Params:
+    """Return the weights of the named folder: those of its file, or else of a checkpoint."""
+    folder = Path(config.train.start)
+    if (folder / runs.WEIGHTS).exists():
+        return rollouts.load(folder, lazily=True)[1]
+    return loading.load(folder)[1]
 
 
 def features(config: Config, stage: Stage) -> feature_cache.FeatureCache | None:

@@ -77,6 +77,14 @@ def test_stage_2_starts_from_another_run_of_stage_1_alone(fake_model, tmp_path):
     assert set(two) == {"backbone", "memory"}
     for name, leaf in one["backbone"].items():
         assert leaf.tobytes() == two["backbone"][name].tobytes()
+    (tmp_path / "one" / "weights.safetensors").unlink()
+    for number, start in enumerate(("one", "one/checkpoints/stage1/3")):
+        config = fakes.config(
+            tmp_path / f"again{number}", stage1=0, stage2=3, start=str(tmp_path / start)
+        )
+        loop.train(config, say=lambda _: None)
+        again = weights.load(tmp_path / f"again{number}" / "weights.safetensors")
+        assert same(again, two) == tree.flatten(two).keys()
     strict = fakes.config(
         tmp_path / "three", stage1=0, stage2=3, start=str(tmp_path / "one"), fresh=()
     )
