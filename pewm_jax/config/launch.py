@@ -13,6 +13,12 @@ def _flag(default: Any, text: str) -> Any:
     return dataclasses.field(default=default, metadata={"help": text})
 
 
+def is_address(text: str) -> bool:
+    """Tell whether a text is HOST:PORT with a port that exists."""
+    found = re.fullmatch(r".+:([0-9]{1,5})", text)
+    return found is not None and 1 <= int(found[1]) <= 65535
+
+
 @dataclasses.dataclass(frozen=True)
 class Launch:
     """The flags of ``train.py`` beside the settings; their help texts are in the metadata.
@@ -48,8 +54,9 @@ class Launch:
         require(self.processes >= 0, f"--processes is {self.processes}: use 1 or more.")
         require(self.patience >= 1, f"--patience is {self.patience}: use 1 second or more.")
         require(
-            not self.coordinator or re.fullmatch(r".+:\d{1,5}", self.coordinator) is not None,
-            f"--coordinator is {self.coordinator}: give it as HOST:PORT, such as node-0:1234.",
+            not self.coordinator or is_address(self.coordinator),
+            f"--coordinator is {self.coordinator}: give it as HOST:PORT, such as node-0:1234, with "
+            "a port from 1 to 65535.",
         )
         given = bool(self.coordinator), self.processes > 0, self.process >= 0
         require(

@@ -14,6 +14,7 @@ import numpy as np
 import tyro
 
 from pewm_jax.config import ActionConfig, ConfigError
+from pewm_jax.config.launch import is_address
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.navigation import NavGrid, navigable
 from pewm_jax.data.render import render
@@ -110,9 +111,10 @@ class CollectConfig:
     def _check_address(self) -> None:
         if self.address and self.engine != "ray":
             raise ConfigError(f"--address {self.address} needs --engine ray.")
-        port = self.address.rpartition(":")[2]
-        if self.address not in ("", "auto") and not port.isdecimal():
-            raise ConfigError(f"--address is {self.address!r}: use HOST:PORT or auto.")
+        if self.address not in ("", "auto") and not is_address(self.address):
+            raise ConfigError(
+                f"--address is {self.address!r}: use HOST:PORT (a port from 1 to 65535) or auto."
+            )
 
     @property
     def actions(self) -> ActionConfig:

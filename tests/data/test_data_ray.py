@@ -174,5 +174,6 @@ def test_a_cluster_that_does_not_answer_is_named(tmp_path, monkeypatch, capsys):
 def test_an_address_without_its_engine_or_port_is_refused():
     with pytest.raises(ConfigError, match="needs --engine ray"):
         CollectConfig(Path("x"), address="auto")
-    with pytest.raises(ConfigError, match="use HOST:PORT or auto"):
-        CollectConfig(Path("x"), engine="ray", address="machine")
+    for address in ("machine", "1234", "machine:0", "machine:65536"):
+        with pytest.raises(ConfigError, match=r"use HOST:PORT .* or auto"):
+            CollectConfig(Path("x"), engine="ray", address=address)

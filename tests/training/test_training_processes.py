@@ -55,8 +55,10 @@ def test_nothing_to_join_is_said_in_a_sentence(capsys, monkeypatch):
     monkeypatch.setattr(jax.config, "update", lambda *setting: None)
     with pytest.raises(UserError, match="--distributed found no processes to join"):
         processes.start(Launch(distributed=True))
-    assert cli.run(train.main, ["tiny", "--distributed", "--coordinator", "node-0"]) == 2
-    assert "HOST:PORT" in capsys.readouterr().err
+    for address in ("node-0", ":1234", "node-0:0", "node-0:65536"):
+        by_hand = ["--coordinator", address, "--processes", "2", "--process", "0"]
+        assert cli.run(train.main, ["tiny", "--distributed", *by_hand]) == 2
+        assert "HOST:PORT" in capsys.readouterr().err
 
 
 def test_a_port_in_use_is_refused(joining):
