@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import errno
+import os
 import time
 import types
 from collections.abc import Callable, Iterator
@@ -311,6 +313,9 @@ def _reading(folder: Path) -> Iterator[None]:
 
 def _reason(error: BaseException) -> str:
     said = getattr(error, "strerror", None) or str(error)
+    full = os.strerror(errno.ENOSPC)
+    if full in said:  # Orbax says so after much else
+        return full
     return " ".join(said.split())[:160]
 
 

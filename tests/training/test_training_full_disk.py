@@ -56,7 +56,11 @@ def found(tmp_path_factory):
 @pytest.mark.parametrize(
     ("when", "kept", "sentence"),
     [
-        ("save", 2, "A checkpoint in .* cannot be written .* that of step 2 is kept: free space"),
+        (
+            "save",
+            2,
+            r"A checkpoint in .* cannot .* \(No space left on device\); that of step 2 is kept",
+        ),
         ("log", 2, "step 2 is (kept|intact): free space .* then run the same command"),
         ("publish", 6, "checkpoint of step 6 is intact: free space there"),
     ],
