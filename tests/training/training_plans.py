@@ -38,13 +38,11 @@ TENSOR = MeshConfig(fsdp=4, tensor=2)
 CONTEXT = MeshConfig(fsdp=2, context=4)
 
 VARIANTS = {
-    "stage 1": (1, {}),
     "stage 1, deeper and narrower, kept": (
         1,
         {"layers": 4, "heads": 8, "batch": 16, "remat": False},
     ),
     "stage 2 with VAE and DINOv2": (2, {"size": 64, "batch": 4, **ENCODERS}),
-    "stage 1, fsdp 8": (1, {"mesh": FSDP, "batch": 16}),
     "stage 2, fsdp 8, bfloat16": (2, {"mesh": FSDP, "batch": 16, "layers": 4, "dtype": "bfloat16"}),
     "stage 2, tensor 2 × fsdp 4": (2, {"mesh": TENSOR, "batch": 16}),
     "stage 1, context 4 × fsdp 2": (1, {"mesh": CONTEXT, "batch": 16, "heads": 8}),
