@@ -3,6 +3,12 @@
 import os
 import signal
 
+from hypothesis import settings
+
+# No example has a deadline: a busy machine is no fault of the code.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
+
 os.environ["XLA_FLAGS"] = " ".join(
     [
         os.environ.get("XLA_FLAGS", ""),
@@ -15,7 +21,15 @@ os.environ["XLA_FLAGS"] = " ".join(
 # program that they start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-SLOW = ("test_readme.py", "test_train_cli.py", "test_evaluation_report.py")
+SLOW = (
+    "test_readme.py",
+    "test_training_devices.py",
+    "test_training_plan_sums.py",
+    "test_training_processes.py",
+    "test_training_kills.py",
+    "test_train_cli.py",
+    "test_evaluation_report.py",
+)
 """Files of long programs: begun first, so that no worker is left alone with one at the end."""
 
 

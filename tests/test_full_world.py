@@ -74,7 +74,7 @@ def world():
     return config, randomise(params, scale=0.1)
 
 
-def clips(config, split="train", *, seed, batch, start_step=0, features=None):
+def clips(config, split="train", *, seed, batch, start_step=0, **_):
     """Random clips in place of a data set."""
     assert split == "train"
     while True:
