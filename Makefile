@@ -40,7 +40,7 @@ demo: .venv/installed
 	@$(PY) evaluate.py $(RUN)
 
 test: .venv/installed-dev
-	@$(PY) -m pytest -n 2 --dist loadfile $(ARGS)
+	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: .venv/installed-dev
 	@.venv/bin/ruff format --check .

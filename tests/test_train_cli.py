@@ -307,7 +307,7 @@ def test_told_to_end_while_it_compiles_then_trained_without_a_record_that_is_dam
     named = rf"bad record 1 of 1 allowed, skipped: train/{shard.name} record 0: "
     assert len(re.findall(named, out)) == 1
     assert re.search(r"^stage 1 3/3 loss .* · bad records 1 · ", out, re.MULTILINE)
-    assert re.search(r"^stage 1: traced 1 steps; open them with `tensorboard ", out, re.MULTILINE)
+    assert re.search(r"^stage 1: traced 1 step; open with `tensorboard ", out, re.MULTILINE)
     assert list((tmp_path / "runs" / "it" / "profile").rglob("*.xplane.pb"))
 
 

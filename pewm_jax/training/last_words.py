@@ -12,7 +12,8 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 
 GONE = (
     "Another process of this training is gone, or cannot be reached: see what the others say, and "
@@ -26,10 +27,16 @@ _DRAIN_S = 5.0
 
 
 @contextlib.contextmanager
-def one_sentence() -> Iterator[None]:
-    """Pass standard error through the filter for a while, that of C++ included."""
+def one_sentence() -> Iterator[Callable[[], None]]:
+    """Pass standard error through the filter for a while, that of C++ included.
+
+    Yields:
+        A function to call when the process has said all: from then on, and after, it is silent.
+        (JAX's thread may notice what was just told in a sentence, and would tell it in pages.)
+    """
     sys.stderr.flush()
     before = os.dup(2)
+    said = threading.Event()
     # A session of its own: Ctrl-C in a terminal is for the training, not for this.
     filtering = subprocess.Popen(  # noqa: S603 - this very file
         [sys.executable, "-I", "-S", __file__], stdin=subprocess.PIPE, start_new_session=True
@@ -38,12 +45,14 @@ def one_sentence() -> Iterator[None]:
     os.dup2(filtering.stdin.fileno(), 2)
     filtering.stdin.close()
     try:
-        yield
+        yield said.set
     finally:
         with contextlib.suppress(OSError, ValueError):
             sys.stderr.flush()
-        os.dup2(before, 2)
-        os.close(before)
+        after = os.open(os.devnull, os.O_WRONLY) if said.is_set() else before
+        os.dup2(after, 2)
+        for handle in {before, after}:
+            os.close(handle)
         with contextlib.suppress(subprocess.TimeoutExpired):
             filtering.wait(_DRAIN_S)
 

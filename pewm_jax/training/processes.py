@@ -51,7 +51,7 @@ def joined(launch: Launch) -> Iterator[None]:
         yield
         return
     code: int | None = None
-    with last_words.one_sentence():
+    with last_words.one_sentence() as said_all:
         start(launch)
         with _quiet_but_first():
             try:
@@ -60,6 +60,8 @@ def joined(launch: Launch) -> Iterator[None]:
                 jax.distributed.shutdown()
             except BaseException as error:  # noqa: BLE001 - told, whatever it is
                 code = _tell(error)
+                sys.stderr.flush()
+                said_all()
     if code is not None:
         os._exit(code)  # else JAX waits for those that wait for this one
 

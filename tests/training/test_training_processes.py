@@ -2,6 +2,8 @@
 
 import json
 import signal
+import subprocess
+import sys
 import time
 
 import jax
@@ -178,6 +180,19 @@ def test_what_is_not_finite_stops_all_or_is_skipped_by_all(tmp_path):
     (entry,) = (json.loads(line) for line in (run / "nonfinite.jsonl").read_text().splitlines())
     assert entry["step"] == step
     assert [line["skipped"] for line in jobs.metrics(run)] == [0, 0, 0, 1, 1, 1]
+
+
+def test_nothing_follows_the_last_words():
+    code = (
+        "import os, sys\n"
+        "from pewm_jax.training import last_words\n"
+        "with last_words.one_sentence() as said_all:\n"
+        "    print('error: it ends.', file=sys.stderr, flush=True)\n"
+        "    said_all()\n"
+        "os.write(2, b'pages')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert done.stderr == b"error: it ends.\n"
 
 
 @pytest.mark.parametrize("killed", [0, 1])
