@@ -47,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
     )
     # Imported here and not above: help and refusals come at once, and Ctrl-C is clean meanwhile.
     if launch.plan:
-        importlib.import_module("pewm_jax.training.plan").show(config, launch)
+        importlib.import_module("pewm_jax.scaling.plan").show(config, launch)
         return 0
     with importlib.import_module("pewm_jax.training.processes").joined(launch):
         loop = importlib.import_module("pewm_jax.training.loop")

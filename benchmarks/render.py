@@ -21,11 +21,11 @@ from importlib.metadata import version
 import numpy as np
 import trimesh
 
-from pewm_jax.data.houses import generate_house
 from pewm_jax.data.navigation import navigable, sample_free
 from pewm_jax.data.render import camera_rays, render
 from pewm_jax.data.scenes import Scene, from_trimesh, house
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+from pewm_jax.houses.generate import generate_house
 from pewm_jax.types import Camera
 
 FRAMES = {64: 192, 128: 48, 256: 16}

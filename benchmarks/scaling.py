@@ -19,10 +19,11 @@ from record import machine, record, table
 
 import configs
 from pewm_jax.config import ClipConfig, Config, MeshConfig
-from pewm_jax.training import chips, plan, stages, suggest
-from pewm_jax.training.footprint import Arranged
+from pewm_jax.scaling import plan, suggest
+from pewm_jax.scaling.footprint import Arranged
+from pewm_jax.scaling.plan_text import arranged, rate, size, work
+from pewm_jax.training import chips, stages
 from pewm_jax.training.log import duration
-from pewm_jax.training.plan_text import arranged, rate, size, work
 from pewm_jax.training.stages import Stage
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"

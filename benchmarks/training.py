@@ -30,7 +30,7 @@ from pewm_jax import cli
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import read_manifest, write_manifest
-from pewm_jax.data.recording import CollectConfig
+from pewm_jax.data.make_episode import CollectConfig
 
 NAME = "training"
 ROOT = Path(__file__).parents[1]

@@ -32,8 +32,9 @@ import record
 import configs
 from pewm_jax import cli
 from pewm_jax.config import Config, MeshConfig, UserError
-from pewm_jax.training import chips, costs, plan, sharding, stages, step, suggest
-from pewm_jax.training.footprint import Arranged
+from pewm_jax.scaling import plan, suggest
+from pewm_jax.scaling.footprint import Arranged
+from pewm_jax.training import chips, costs, sharding, stages, step
 from pewm_jax.types import Clip
 
 NAME = "training_gpu"

@@ -15,8 +15,8 @@ import pytest
 import trimesh
 
 import configs
-from pewm_jax.data.houses import generate_house
 from pewm_jax.data.scenes import load_scene
+from pewm_jax.houses.generate import generate_house
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -23,7 +23,7 @@ from pewm_jax import cli
 from pewm_jax import config as configuration
 from pewm_jax.config import Config
 from pewm_jax.data.collect import collect
-from pewm_jax.data.recording import CollectConfig
+from pewm_jax.data.make_episode import CollectConfig
 from pewm_jax.evaluation import preview
 from pewm_jax.training import loop
 

@@ -11,10 +11,10 @@ from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import Config
-from pewm_jax.config.files import from_dict, load, save, to_dict
 from pewm_jax.config.launch import Launch
 from pewm_jax.config.memory import MemoryConfig
 from pewm_jax.config.mesh import AXES, MeshConfig
+from pewm_jax.config.serialize import from_dict, load, save, to_dict
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
 from pewm_jax.config.vae import VAEConfig
 

@@ -10,14 +10,7 @@ import numpy as np
 import tyro
 
 from pewm_jax import cli
-from pewm_jax.config import (
-    Config,
-    ConfigError,
-    DiffusionConfig,
-    DiTConfig,
-    UserError,
-    VAEConfig,
-)
+from pewm_jax.config import Config, ConfigError, DiffusionConfig, DiTConfig, UserError, VAEConfig
 from pewm_jax.convert import (
     base,
     cogvideox,

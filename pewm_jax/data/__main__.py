@@ -10,7 +10,7 @@ from pewm_jax import cli
 from pewm_jax.config import UserError
 from pewm_jax.data.collect import collect
 from pewm_jax.data.importer import ImportConfig, import_recording
-from pewm_jax.data.recording import CollectConfig
+from pewm_jax.data.make_episode import CollectConfig
 from pewm_jax.data.show import ShowConfig, show
 from pewm_jax.data.validate import ValidateConfig, validate
 

@@ -27,8 +27,8 @@ from pewm_jax.data.dataset import (
     write_manifest,
 )
 from pewm_jax.data.engines import Job
+from pewm_jax.data.make_episode import SPLITS, CollectConfig, dashed, settings_of
 from pewm_jax.data.progress import Meter
-from pewm_jax.data.recording import SPLITS, CollectConfig, dashed, settings_of
 
 State = Literal["fresh", "resume", "complete"]
 

@@ -22,7 +22,7 @@ from grain import sources
 
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import Episode, read_episode
-from pewm_jax.data.layout import VERSION, DamagedError
+from pewm_jax.data.record_format import VERSION, DamagedError
 
 MANIFEST = "dataset.json"
 UNFINISHED = "collecting.json"

@@ -30,7 +30,7 @@ import cv2
 
 from pewm_jax.config import UserError
 from pewm_jax.data.dataset import Shard, describe_shard, write_shard
-from pewm_jax.data.recording import CollectConfig, make_episode
+from pewm_jax.data.make_episode import CollectConfig, make_episode
 
 AHEAD = 2
 """Shards given to a cluster for each of its processors: one that is made and one that waits."""

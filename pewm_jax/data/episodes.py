@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.data.layout import (
+from pewm_jax.data.record_format import (
     CONVENTIONS,
     UNITS,
     VERSION,

@@ -33,7 +33,7 @@ from pewm_jax.data.dataset import (
 )
 from pewm_jax.data.episodes import EpisodeArrays, decode_image, read_episode, write_episode
 from pewm_jax.data.progress import Meter
-from pewm_jax.data.recordings import RecordedFrame, read_recording
+from pewm_jax.data.recording_folders import RecordedFrame, read_recording
 from pewm_jax.geometry.actions import actions_between
 from pewm_jax.geometry.cameras import resize_intrinsics
 

@@ -21,7 +21,7 @@ from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.data.clips import Choice, ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.layout import DamagedError
+from pewm_jax.data.record_format import DamagedError
 from pewm_jax.types import Clip
 
 BATCHES_AHEAD = 2

@@ -19,9 +19,9 @@ from embreex.rtcore_scene import EmbreeScene
 
 from pewm_jax.config import UserError
 from pewm_jax.data import lighting
-from pewm_jax.data.houses import generate_house
 from pewm_jax.data.materials import LEVELS, Textures, pack
 from pewm_jax.data.surfaces import Surface, read_surface
+from pewm_jax.houses.generate import generate_house
 
 _UNREADABLE = (
     ArithmeticError,

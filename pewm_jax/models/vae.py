@@ -29,7 +29,7 @@ from jax.core import Tracer
 
 from pewm_jax.config import UserError, VAEConfig
 from pewm_jax.models import vae_layers as layers
-from pewm_jax.models.vae_layout import init, layout
+from pewm_jax.models.vae_shapes import init, layout
 from pewm_jax.models.vae_tiles import in_tiles
 from pewm_jax.types import Array, Params
 

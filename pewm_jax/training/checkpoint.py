@@ -29,13 +29,13 @@ from etils import epath
 from pewm_jax import config as configuration
 from pewm_jax import tree
 from pewm_jax.config import Config, UserError
-from pewm_jax.training import integrity, processes, runs, shelf
+from pewm_jax.training import integrity, processes, runs, step_folders
 from pewm_jax.training.background import Quiet
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import TrainState, inference_params
 from pewm_jax.types import Params
 
-WEIGHTS, STATE, DATA, CONFIG = shelf.WEIGHTS, "state", "data", "config"
+WEIGHTS, STATE, DATA, CONFIG = step_folders.WEIGHTS, "state", "data", "config"
 
 _MOMENT_S, _SHARE = 2.0, 0.02
 """How long ``settle`` waits: seconds, or a share of the time between two saves if that is more."""
@@ -59,7 +59,7 @@ class Checkpoints:
 
     def __init__(self, run: Path, config: Config, stage: Stage, say: Callable[[str], None] = print):
         self.run = run
-        self.folder = shelf.of(run, stage.name).resolve()
+        self.folder = step_folders.of(run, stage.name).resolve()
         self.config = config
         self.stage = stage
         self._writer = ocp.AsyncCheckpointer(ocp.CompositeCheckpointHandler())
@@ -90,7 +90,7 @@ class Checkpoints:
                 raise
         finally:
             if processes.is_primary():
-                shelf.clear(self.folder)  # of a write that failed
+                step_folders.clear(self.folder)  # of a write that failed
             if not self._failed:  # else some threads have not said all yet
                 self._quiet.end()
 
@@ -124,7 +124,9 @@ class Checkpoints:
         }
         with self._writing():
             self._writer.save(
-                shelf.writing(self.folder, step), args=ocp.args.Composite(**items), force=True
+                step_folders.writing(self.folder, step),
+                args=ocp.args.Composite(**items),
+                force=True,
             )
         self._finishing = self._pool.submit(self._finish, step)
         now = time.monotonic()
@@ -211,8 +213,8 @@ class Checkpoints:
         """Wait for the background, seal, name and count the checkpoint, and delete old ones."""
         self._writer.wait_until_finished()
         if processes.is_primary():
-            shelf.put(self.folder, step)
-            shelf.prune(self.folder, self.config.train.keep, self.config.train.keep_every)
+            step_folders.put(self.folder, step)
+            step_folders.prune(self.folder, self.config.train.keep, self.config.train.keep_every)
         self._latest = step
 
     @contextlib.contextmanager
@@ -293,8 +295,8 @@ def _read_arrays(folder: Path, like: Params) -> Params:
 def _tidied(folder: Path, say: Callable[[str], None]) -> int | None:
     """Tidy the folder of a stage; returns the step of its newest whole checkpoint."""
     folder.mkdir(parents=True, exist_ok=True)
-    shelf.clear(folder)
-    return shelf.newest(folder, say)
+    step_folders.clear(folder)
+    return step_folders.newest(folder, say)
 
 
 @contextlib.contextmanager

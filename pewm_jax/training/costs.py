@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 
 from pewm_jax.config import Config
 from pewm_jax.models import codec, world_model
-from pewm_jax.models.vae_layout import layout
+from pewm_jax.models.vae_shapes import layout
 from pewm_jax.training.stages import Stage
 
 SPLIT = ("tensor", "context")

@@ -15,7 +15,7 @@ import jax
 from pewm_jax import rollouts, weights
 from pewm_jax.config import Config, UserError
 from pewm_jax.models import world_model
-from pewm_jax.training import runs, shelf, stages
+from pewm_jax.training import runs, stages, step_folders
 from pewm_jax.types import Params
 
 
@@ -36,7 +36,7 @@ def load(path: str | Path) -> tuple[Config, Params]:
         UserError: something is absent or damaged, or the weights do not fit the configuration.
     """
     folder = Path(path)
-    if (folder / shelf.WEIGHTS).is_dir():
+    if (folder / step_folders.WEIGHTS).is_dir():
         return _read(folder)
     newer = _checkpoints(folder)
     if not newer:
@@ -58,8 +58,8 @@ def _checkpoints(run: Path) -> list[Path]:
     have = (int(words.get("stage", 0)), int(words.get("step", 0)))
     found: dict[tuple[int, int], Path] = {}
     for stage in stages.STAGES:
-        folder = shelf.of(run, stage.name)
-        for step in shelf.steps(folder):
+        folder = step_folders.of(run, stage.name)
+        for step in step_folders.steps(folder):
             found[stage.number, step] = folder / str(step)
     return [found[when] for when in sorted(found, reverse=True) if when > have]
 

@@ -8,14 +8,16 @@ from pathlib import Path
 from pewm_jax import rollouts, weights
 from pewm_jax.config import Config, UserError
 from pewm_jax.memory import feature_cache
-from pewm_jax.training import loading, processes, runs, shelf
+from pewm_jax.training import loading, processes, runs, step_folders
 from pewm_jax.training.stages import Stage
 from pewm_jax.types import Params
 
 
 def left(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
     """Leave out stages that a later one has built on: its checkpoints hold what they gave."""
-    begun = [n for n, stage in enumerate(planned) if shelf.steps(shelf.of(run, stage.name))]
+    begun = [
+        n for n, stage in enumerate(planned) if step_folders.steps(step_folders.of(run, stage.name))
+    ]
     return planned[processes.agree(max(begun, default=0)) :]
 
 

@@ -24,7 +24,7 @@ from pewm_jax.data.checks import check_episode
 from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import EpisodeSource, write_shard
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.data.recording import CollectConfig, house_seed, make_episode, scenes_of
+from pewm_jax.data.make_episode import CollectConfig, house_seed, make_episode, scenes_of
 from pewm_jax.data.validate import ValidateConfig, validate
 
 ROOT = Path(__file__).parents[2]

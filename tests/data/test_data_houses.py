@@ -8,12 +8,12 @@ import sys
 import numpy as np
 import pytest
 
-from pewm_jax.data import connectivity, floorplan
-from pewm_jax.data import houses as houses_module
-from pewm_jax.data.houses import generate_house
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import from_trimesh, house
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+from pewm_jax.houses import connectivity, floorplan
+from pewm_jax.houses import generate as houses_module
+from pewm_jax.houses.generate import generate_house
 from pewm_jax.types import Camera
 
 SEEDS = range(12)

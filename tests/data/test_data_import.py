@@ -20,7 +20,7 @@ from pewm_jax.data.importer import (
     planar_actions,
     world_from_recording,
 )
-from pewm_jax.data.recordings import read_recording
+from pewm_jax.data.recording_folders import read_recording
 from pewm_jax.geometry.cameras import unproject
 
 SIZE = 48

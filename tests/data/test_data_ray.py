@@ -19,7 +19,7 @@ from pewm_jax.data.__main__ import main
 from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.engines import Job
-from pewm_jax.data.recording import CollectConfig
+from pewm_jax.data.make_episode import CollectConfig
 
 ROOT = Path(__file__).parents[2]
 SMALL = {"train": 3, "validation": 0, "test": 1, "frames": 30, "size": 16, "shard_episodes": 1}

@@ -12,10 +12,10 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from pewm_jax.config import UserError
-from pewm_jax.data.houses import generate_house
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import from_trimesh, house, load_scene
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, unproject
+from pewm_jax.houses.generate import generate_house
 from pewm_jax.types import Camera
 
 

@@ -12,7 +12,7 @@ import configs
 from pewm_jax import cli
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.collect import collect
-from pewm_jax.data.recording import CollectConfig
+from pewm_jax.data.make_episode import CollectConfig
 from pewm_jax.training import loop
 
 ROOT = Path(__file__).parents[2]

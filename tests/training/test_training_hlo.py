@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.training import hlo
+from pewm_jax.scaling import hlo
 
 
 def program(function, *shapes):

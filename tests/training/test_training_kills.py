@@ -12,7 +12,7 @@ import pytest
 import training_kills as kills
 
 from pewm_jax.data.collect import collect
-from pewm_jax.data.recording import CollectConfig
+from pewm_jax.data.make_episode import CollectConfig
 
 ROOT = Path(__file__).parents[2]
 QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"

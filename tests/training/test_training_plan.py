@@ -13,8 +13,9 @@ import training_fakes as fakes
 
 import configs
 from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
-from pewm_jax.training import chips, costs, plan, plan_text, predict, stages, suggest
-from pewm_jax.training.footprint import Arranged, counts, footprint
+from pewm_jax.scaling import plan, plan_text, predict, suggest
+from pewm_jax.scaling.footprint import Arranged, counts, footprint
+from pewm_jax.training import chips, costs, stages
 
 ROOT = Path(__file__).parents[2]
 H200 = chips.named("h200")

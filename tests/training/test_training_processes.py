@@ -16,7 +16,7 @@ from pewm_jax import cli
 from pewm_jax.config import Launch, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.collect import collect
-from pewm_jax.data.recording import CollectConfig
+from pewm_jax.data.make_episode import CollectConfig
 from pewm_jax.training import last_words, processes
 
 FAKE = {"FAKE": "1"}

@@ -14,7 +14,7 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax import cli
-from pewm_jax.training import integrity, loop, runs, shelf
+from pewm_jax.training import integrity, loop, runs, step_folders
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.log import MetricsLog
 
@@ -58,8 +58,8 @@ def meet(folder, when):
     with pytest.MonkeyPatch.context() as patch:
         before(patch, *traps[when], lambda: fill(folder))
         code, told = train(config)
-    stage = shelf.of(folder / when, "stage1")
-    whole = [step for step in shelf.steps(stage) if not integrity.flaws(stage / str(step))]
+    stage = step_folders.of(folder / when, "stage1")
+    whole = [step for step in step_folders.steps(stage) if not integrity.flaws(stage / str(step))]
     found = {"code": code, "told": told, "whole": whole}
     found["partial"] = [path.name for path in (folder / when).rglob("*.partial")]
     (folder / "ballast").unlink()

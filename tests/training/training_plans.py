@@ -21,8 +21,9 @@ from pewm_jax.config import (
     TrainConfig,
     VAEConfig,
 )
-from pewm_jax.training import costs, hlo, plan, predict, stages
-from pewm_jax.training.footprint import Arranged
+from pewm_jax.scaling import hlo, plan, predict
+from pewm_jax.scaling.footprint import Arranged
+from pewm_jax.training import costs, stages
 
 ENCODERS = {
     "codec": CodecConfig(

@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Iterator
 
 from pewm_jax.config import Config
+from pewm_jax.scaling.footprint import Arranged, Footprint, footprint
+from pewm_jax.scaling.predict import Prediction, predict
 from pewm_jax.training.chips import Chip
-from pewm_jax.training.footprint import Arranged, Footprint, footprint
-from pewm_jax.training.predict import Prediction, predict
 from pewm_jax.training.stages import Stage
 
 MARGIN = 0.9

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from pewm_jax.data.floorplan import Plan, Rect
+from pewm_jax.houses.floorplan import Plan, Rect
 
 CELL_M = 0.05
 """Cell of the raster."""

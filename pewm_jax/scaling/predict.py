@@ -12,9 +12,9 @@ import math
 import numpy as np
 
 from pewm_jax.config import AXES, Config
+from pewm_jax.scaling.footprint import FLOAT, Arranged, counts
 from pewm_jax.training import costs
 from pewm_jax.training.chips import Chip
-from pewm_jax.training.footprint import FLOAT, Arranged, counts
 from pewm_jax.training.stages import Stage
 
 REACHED = {"linear": 0.65, "attention": 0.4, "convolution": 0.4}

@@ -18,11 +18,12 @@ import numpy as np
 
 from pewm_jax.config import Config, Launch, UserError
 from pewm_jax.models import world_model
-from pewm_jax.training import chips, hlo, plan_text, sharding, stages, step, suggest
+from pewm_jax.scaling import hlo, plan_text, suggest
+from pewm_jax.scaling.footprint import Arranged, Footprint, footprint
+from pewm_jax.scaling.suggest import Choice
+from pewm_jax.training import chips, sharding, stages, step
 from pewm_jax.training.chips import Chip
-from pewm_jax.training.footprint import Arranged, Footprint, footprint
 from pewm_jax.training.stages import Stage
-from pewm_jax.training.suggest import Choice
 from pewm_jax.types import Camera, Clip, Frames
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}

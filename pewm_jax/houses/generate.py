@@ -8,14 +8,14 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from pewm_jax.data import textures
-from pewm_jax.data.connectivity import all_reachable
-from pewm_jax.data.floorplan import DOOR_TOP_M, Room, draw_plan
-from pewm_jax.data.furnish import Furnisher, Placed
-from pewm_jax.data.furniture_parts import Tones
-from pewm_jax.data.shapes import Piece
-from pewm_jax.data.shell import doorway_piece, level_mesh, trim_piece, wall_mesh, window_meshes
-from pewm_jax.data.textures import hsv, shade
+from pewm_jax.houses import textures
+from pewm_jax.houses.connectivity import all_reachable
+from pewm_jax.houses.floorplan import DOOR_TOP_M, Room, draw_plan
+from pewm_jax.houses.furnish import Furnisher, Placed
+from pewm_jax.houses.furniture_parts import Tones
+from pewm_jax.houses.shapes import Piece
+from pewm_jax.houses.shell import doorway_piece, level_mesh, trim_piece, wall_mesh, window_meshes
+from pewm_jax.houses.textures import hsv, shade
 
 _STREAM = 0x50457
 """Keeps the generator's random numbers apart from other uses of the same seed."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from pewm_jax.training import hlo, suggest
+from pewm_jax.scaling import hlo, suggest
+from pewm_jax.scaling.suggest import Choice
 from pewm_jax.training.log import duration
-from pewm_jax.training.suggest import Choice
 
 if TYPE_CHECKING:
-    from pewm_jax.training.plan import Plan
+    from pewm_jax.scaling.plan import Plan
 
 MEMORY = (
     ("weights that train, float32", "trained"),

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pewm_jax.data import furniture as f
-from pewm_jax.data import furniture_more as m
-from pewm_jax.data.furniture_parts import Tones
-from pewm_jax.data.shapes import Piece
+from pewm_jax.houses import fixtures as m
+from pewm_jax.houses import furniture as f
+from pewm_jax.houses.furniture_parts import Tones
+from pewm_jax.houses.shapes import Piece
 
 Maker = Callable[[np.random.Generator, Tones], Piece]
 """Builds one piece from chance and a room's palette."""

@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 
-from pewm_jax.data import textures
-from pewm_jax.data.furniture_parts import Tones, books, bright, legs, things
-from pewm_jax.data.shapes import Piece
-from pewm_jax.data.textures import hsv, shade
+from pewm_jax.houses import textures
+from pewm_jax.houses.furniture_parts import Tones, books, bright, legs, things
+from pewm_jax.houses.shapes import Piece
+from pewm_jax.houses.textures import hsv, shade
 
 
 def bed(rng: np.random.Generator, tones: Tones) -> Piece:

@@ -7,8 +7,8 @@ import itertools
 
 import numpy as np
 
-from pewm_jax.data.shapes import Piece
-from pewm_jax.data.textures import Rgb, hsv
+from pewm_jax.houses.shapes import Piece
+from pewm_jax.houses.textures import Rgb, hsv
 
 
 @dataclasses.dataclass(frozen=True)

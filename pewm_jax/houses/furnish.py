@@ -11,13 +11,13 @@ import dataclasses
 import numpy as np
 from scipy import ndimage
 
-from pewm_jax.data import furniture as f
-from pewm_jax.data import furniture_more as m
-from pewm_jax.data.floorplan import Rect, Room
-from pewm_jax.data.furniture_parts import Tones
-from pewm_jax.data.placement import against, apron, overlap, shift, turned, wall_frame
-from pewm_jax.data.programmes import PROGRAMMES, RUGS, TABLES
-from pewm_jax.data.shapes import Piece
+from pewm_jax.houses import fixtures as m
+from pewm_jax.houses import furniture as f
+from pewm_jax.houses.floorplan import Rect, Room
+from pewm_jax.houses.footprints import against, apron, overlap, shift, turned, wall_frame
+from pewm_jax.houses.furniture_parts import Tones
+from pewm_jax.houses.room_contents import PROGRAMMES, RUGS, TABLES
+from pewm_jax.houses.shapes import Piece
 
 CLEAR_M = 0.32
 """Room an agent needs on each side of its centre: a radius of 0.2 m and a margin for grids."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pewm_jax.data.floorplan import Rect, Room
+from pewm_jax.houses.floorplan import Rect, Room
 
 
 def overlap(a: Rect, b: Rect) -> bool:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pewm_jax.data import textures
-from pewm_jax.data.furniture_parts import Tones, books, bright, things
-from pewm_jax.data.shapes import Piece
-from pewm_jax.data.textures import hsv, shade
+from pewm_jax.houses import textures
+from pewm_jax.houses.furniture_parts import Tones, books, bright, things
+from pewm_jax.houses.shapes import Piece
+from pewm_jax.houses.textures import hsv, shade
 
 _STEEL = np.array([0.66, 0.68, 0.71])
 _BLACK = np.array([0.09, 0.09, 0.1])

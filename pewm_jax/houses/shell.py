@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 import trimesh
 
-from pewm_jax.data import textures
-from pewm_jax.data.floorplan import WALL_M, Opening, Rect, Room
-from pewm_jax.data.furniture_parts import Tones
-from pewm_jax.data.shapes import Piece, textured
-from pewm_jax.data.textures import shade
+from pewm_jax.houses import textures
+from pewm_jax.houses.floorplan import WALL_M, Opening, Rect, Room
+from pewm_jax.houses.furniture_parts import Tones
+from pewm_jax.houses.shapes import Piece, textured
+from pewm_jax.houses.textures import shade
 
 GRID_M = 0.5
 """Surfaces are cut at least this finely, so that light baked at corners is smooth."""
