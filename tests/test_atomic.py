@@ -1,0 +1,37 @@
+"""Nothing half-written is ever taken for whole."""
+
+import pytest
+
+from pewm_jax import atomic
+
+
+def test_a_file_is_replaced_whole(tmp_path):
+    path = tmp_path / "a.txt"
+    atomic.write_text(path, "old")
+    with atomic.replacing(path) as partial:
+        partial.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_what_fails_leaves_nothing_behind(tmp_path, folder):
+    path = tmp_path / "a"
+    with pytest.raises(KeyboardInterrupt), atomic.replacing(path) as partial:
+        if folder:
+            partial.mkdir()
+            (partial / "b").write_text("half")
+        else:
+            partial.write_text("half")
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_appears_whole(tmp_path):
+    path = tmp_path / "a"
+    with atomic.replacing(path) as partial:
+        partial.mkdir()
+        (partial / "b").write_text("c")
+        assert not path.exists()
+    assert (path / "b").read_text() == "c"
