@@ -18,7 +18,7 @@ def test_a_file_is_replaced_whole(tmp_path):
 @pytest.mark.parametrize("folder", [False, True])
 def test_what_fails_leaves_nothing_behind(tmp_path, folder):
     path = tmp_path / "a"
-    with pytest.raises(KeyboardInterrupt), atomic.replacing(path) as partial:
+    with pytest.raises(KeyboardInterrupt), atomic.replacing(path) as partial:  # noqa: PT012
         if folder:
             partial.mkdir()
             (partial / "b").write_text("half")
