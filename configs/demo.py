@@ -1,14 +1,16 @@
 """Procedural houses at 48×48 pixels: two stages and a report in minutes on two CPU cores."""
 
 from pewm_jax.config import (
+    AttentionConfig,
     ClipConfig,
     Config,
     DataConfig,
-    DiffusionConfig,
+    DDPMConfig,
     DiTConfig,
-    MemoryConfig,
+    ModelConfig,
     StageConfig,
     TrainConfig,
+    VoxelConfig,
 )
 
 
@@ -24,17 +26,16 @@ def config() -> Config:
     * memory narrower than the backbone: attention to the map is what a step's time goes to.
     """
     return Config(
-        clip=ClipConfig(height=48, width=48),
-        dit=DiTConfig(layers=4, heads=6, head_dim=32),
-        memory=MemoryConfig(
-            cell_m=(0.25, 0.25, 0.25),
-            tokens=384,
-            looks=96,
-            heads=8,
-            head_dim=24,
-            mlp_ratio=2,
+        model=ModelConfig(
+            clip=ClipConfig(height=48, width=48),
+            backbone=DiTConfig(layers=4, heads=6, head_dim=32),
+            memory=VoxelConfig(
+                cell_m=(0.25, 0.25, 0.25),
+                tokens=384,
+                reader=AttentionConfig(looks=96, heads=8, head_dim=24, mlp_ratio=2),
+            ),
+            noise=DDPMConfig(snr_shift=64.0, max_weight=1.0, sample_steps=4),
         ),
-        diffusion=DiffusionConfig(snr_shift=64.0, max_weight=1.0, sample_steps=4),
         data=DataConfig(path="data/demo", context=20),
         train=TrainConfig(
             run="runs/demo",

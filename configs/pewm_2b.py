@@ -3,17 +3,19 @@
 import dataclasses
 
 from pewm_jax.config import (
+    AttentionConfig,
     ClipConfig,
-    CodecConfig,
     Config,
     DataConfig,
-    DiffusionConfig,
+    DDPMConfig,
+    DINOv2EncoderConfig,
     EvalConfig,
-    MemoryConfig,
     MeshConfig,
+    ModelConfig,
     StageConfig,
     TrainConfig,
     VAEConfig,
+    VoxelConfig,
     published,
 )
 
@@ -41,22 +43,22 @@ def config(variant: str = "2b") -> Config:
     dit = dataclasses.replace(published(variant), in_channels=0, out_channels=0)
     stage = StageConfig(steps=20_000, batch=256, learning_rate=1e-4, warmup=500, decay="constant")
     return Config(
-        clip=ClipConfig(frames=9, height=512, width=512),
-        codec=CodecConfig(kind="vae", spatial=8, temporal=4, vae=VAEConfig.published(variant)),
-        dit=dataclasses.replace(dit, prompt="stored", remat=True),
-        memory=MemoryConfig(
-            cell_m=(0.25, 0.25, 1.0),
-            cells=(256, 256, 32),
-            capacity=8192,
-            tokens=512,
-            positions="sinusoid",
-            encoder="dinov2",
-            heads=16,
-            head_dim=64,
-            mlp_ratio=2,
-        ),
-        diffusion=DiffusionConfig(
-            target="v", snr_shift=3.0 if variant == "2b" else 1.0, sample_steps=50
+        model=ModelConfig(
+            clip=ClipConfig(frames=9, height=512, width=512),
+            codec=VAEConfig.published(variant),
+            backbone=dataclasses.replace(dit, prompt="stored", remat=True),
+            memory=VoxelConfig(
+                cell_m=(0.25, 0.25, 1.0),
+                cells=(256, 256, 32),
+                capacity=8192,
+                tokens=512,
+                encoder=DINOv2EncoderConfig(),
+                reader=AttentionConfig(positions="sinusoid", heads=16, head_dim=64, mlp_ratio=2),
+            ),
+            noise=DDPMConfig(
+                target="v", snr_shift=3.0 if variant == "2b" else 1.0, sample_steps=50
+            ),
+            dtype="bfloat16",
         ),
         data=DataConfig(path="data/pewm", context=16),
         train=TrainConfig(
@@ -67,7 +69,6 @@ def config(variant: str = "2b") -> Config:
             save_every=250,
             keep_every=5000,
             preview_every=1000,
-            dtype="bfloat16",
             mesh=MeshConfig(fsdp=8),
         ),
         evaluate=EvalConfig(clips=256, batch=8),

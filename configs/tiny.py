@@ -1,15 +1,17 @@
 """Absurdly small: shows in seconds that everything runs, learns next to nothing; for tests."""
 
 from pewm_jax.config import (
+    AttentionConfig,
     ClipConfig,
     Config,
     DataConfig,
-    DiffusionConfig,
+    DDPMConfig,
     DiTConfig,
     EvalConfig,
-    MemoryConfig,
+    ModelConfig,
     StageConfig,
     TrainConfig,
+    VoxelConfig,
 )
 
 
@@ -17,17 +19,20 @@ def config() -> Config:
     """Return the settings of the tests."""
     stage = StageConfig(steps=6, batch=2, warmup=2)
     return Config(
-        clip=ClipConfig(frames=5, height=16, width=16),
-        dit=DiTConfig(layers=2, heads=2, head_dim=16, text_length=1, text_dim=8, time_dim=16),
-        memory=MemoryConfig(
-            cell_m=(0.25, 0.25, 0.25),
-            cells=(32, 32, 8),
-            capacity=256,
-            tokens=16,
-            heads=4,
-            head_dim=8,
+        model=ModelConfig(
+            clip=ClipConfig(frames=5, height=16, width=16),
+            backbone=DiTConfig(
+                layers=2, heads=2, head_dim=16, text_length=1, text_dim=8, time_dim=16
+            ),
+            memory=VoxelConfig(
+                cell_m=(0.25, 0.25, 0.25),
+                cells=(32, 32, 8),
+                capacity=256,
+                tokens=16,
+                reader=AttentionConfig(heads=4, head_dim=8),
+            ),
+            noise=DDPMConfig(sample_steps=2),
         ),
-        diffusion=DiffusionConfig(sample_steps=2),
         data=DataConfig(path="data/tiny", stride_max=2, context=4),
         train=TrainConfig(
             run="runs/tiny", stage1=stage, stage2=stage, save_every=3, log_every=1, preview_every=0

@@ -16,13 +16,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pewm_jax.config import Config, ConfigError, UserError
+    from pewm_jax.config import Config, ConfigError, ModelConfig, UserError
     from pewm_jax.geometry.actions import integrate
     from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
-    from pewm_jax.models.codec import rgb_from_signal
-    from pewm_jax.rollouts import rollout, start
+    from pewm_jax.models.signals import rgb_from_signal
+    from pewm_jax.rollouts import rollout
     from pewm_jax.training.loading import load
-    from pewm_jax.types import Camera, Clip, Frames, VoxelMap, WorldState
+    from pewm_jax.types import Camera, Clip, Control, Frames, VoxelMap, WorldState
+    from pewm_jax.worlds import imagine, observe, start
 
 __version__ = "0.1.0"
 
@@ -30,18 +31,22 @@ _HOME = {
     "Camera": "types",
     "Clip": "types",
     "Config": "config",
+    "Control": "types",
+    "ModelConfig": "config",
     "ConfigError": "config",
     "Frames": "types",
     "UserError": "config",
     "VoxelMap": "types",
     "WorldState": "types",
     "integrate": "geometry.actions",
+    "imagine": "worlds",
     "intrinsics_from_fov": "geometry.cameras",
     "load": "training.loading",
+    "observe": "worlds",
     "pose_from_yaw": "geometry.cameras",
-    "rgb_from_signal": "models.codec",
+    "rgb_from_signal": "models.signals",
     "rollout": "rollouts",
-    "start": "rollouts",
+    "start": "worlds",
 }
 
 __all__ = [
@@ -49,13 +54,17 @@ __all__ = [
     "Clip",
     "Config",
     "ConfigError",
+    "Control",
     "Frames",
+    "ModelConfig",
     "UserError",
     "VoxelMap",
     "WorldState",
+    "imagine",
     "integrate",
     "intrinsics_from_fov",
     "load",
+    "observe",
     "pose_from_yaw",
     "rgb_from_signal",
     "rollout",

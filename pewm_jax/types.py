@@ -65,6 +65,20 @@ class Frames:
 
 @_pytree
 @dataclasses.dataclass(frozen=True)
+class Control:
+    """What steers a clip, any leading shape before T.
+
+    Attributes:
+        camera: cameras of leading shape (..., T), of the observed frame and of those to imagine.
+        actions_TA: (..., T − 1, A) actions, or None where only cameras are known.
+    """
+
+    camera: Camera
+    actions_TA: Array | None = None
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
 class Clip:
     """One training example or a batch of them: what is to be imagined and what was seen before.
 

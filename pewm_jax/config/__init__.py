@@ -4,44 +4,99 @@ A field's docstring is its ``--help`` text. A value that cannot work is refused 
 configuration is built, with a sentence that names the fix; nothing is checked deeper down.
 """
 
+from pewm_jax.config.backbone import BackboneSettings, Places
 from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
-from pewm_jax.config.codec import CodecConfig
-from pewm_jax.config.diffusion import DiffusionConfig
+from pewm_jax.config.codec import CodecSettings, PixelConfig
+from pewm_jax.config.control import CameraConfig, ControlSettings
 from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
+from pewm_jax.config.encoder import DINOv2EncoderConfig, EncoderSettings, PatchColoursConfig
 from pewm_jax.config.errors import ConfigError, UserError
-from pewm_jax.config.experiment import Config
+from pewm_jax.config.experiment import VERSION, Config
+from pewm_jax.config.kinds import Settings, functions, register
 from pewm_jax.config.launch import Launch
-from pewm_jax.config.memory import MemoryConfig
+from pewm_jax.config.memory import (
+    ImagesConfig,
+    Map2DConfig,
+    MemorySettings,
+    NoMemoryConfig,
+    PointsConfig,
+    VoxelConfig,
+)
 from pewm_jax.config.mesh import AXES, MeshConfig
+from pewm_jax.config.model import ModelConfig, WorldSettings
+from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettings
+from pewm_jax.config.reader import AttentionConfig, ReaderSettings
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
-from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
+from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.vae import VAEConfig
+
+register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
+register("backbone", "dit", DiTConfig, "pewm_jax.models.dit_backbone")
+register("codec", "pixel", PixelConfig, "pewm_jax.models.pixel_codec")
+register("codec", "vae", VAEConfig, "pewm_jax.models.vae_codec")
+register("control", "camera", CameraConfig, "pewm_jax.models.camera_control")
+register("encoder", "patch_colours", PatchColoursConfig, "pewm_jax.models.patch_colours")
+register("encoder", "dinov2", DINOv2EncoderConfig, "pewm_jax.models.dinov2_encoder")
+register("reader", "attention", AttentionConfig, "pewm_jax.models.attention_reader")
+register("memory", "voxel", VoxelConfig, "pewm_jax.memory.voxel_memory")
+register("memory", "map2d", Map2DConfig, "pewm_jax.memory.map2d")
+register("memory", "points", PointsConfig, "pewm_jax.memory.points")
+register("memory", "images", ImagesConfig, "pewm_jax.memory.images")
+register("memory", "none", NoMemoryConfig, "pewm_jax.memory.nothing")
+register("noise", "ddpm", DDPMConfig, "pewm_jax.diffusion.ddpm")
+register("noise", "edm", EDMConfig, "pewm_jax.diffusion.edm")
+register("noise", "flow", FlowConfig, "pewm_jax.diffusion.flow")
 
 __all__ = [
     "AXES",
     "PUBLISHED",
     "SMALLEST",
+    "VERSION",
     "ActionConfig",
+    "AttentionConfig",
+    "BackboneSettings",
+    "CameraConfig",
     "ClipConfig",
-    "CodecConfig",
+    "CodecSettings",
     "Config",
     "ConfigError",
+    "ControlSettings",
+    "DDPMConfig",
     "DINOv2Config",
+    "DINOv2EncoderConfig",
     "DataConfig",
     "DiTConfig",
-    "DiffusionConfig",
+    "EDMConfig",
+    "EncoderSettings",
     "EvalConfig",
+    "FlowConfig",
+    "ImagesConfig",
     "Launch",
-    "MemoryConfig",
+    "Map2DConfig",
+    "MemorySettings",
     "MeshConfig",
+    "ModelConfig",
+    "NoMemoryConfig",
+    "NoiseSettings",
+    "PatchColoursConfig",
+    "PixelConfig",
+    "Places",
+    "PointsConfig",
+    "ReaderSettings",
+    "Settings",
     "StageConfig",
     "TrainConfig",
+    "TrainSettings",
     "UserError",
     "VAEConfig",
+    "VoxelConfig",
+    "WorldSettings",
     "from_dict",
+    "functions",
     "load",
     "published",
+    "register",
     "save",
     "to_dict",
 ]

@@ -16,7 +16,8 @@ class ClipConfig:
     """The shape of what is imagined at once."""
 
     frames: int = 9
-    """Frames of a clip: the first is observed, the rest are generated. Must be 4k + 1."""
+    """Frames of a clip: the first is observed, the rest are generated. The codec folds the others
+    in time: with `codec.temporal` 4 there are 4k + 1."""
     height: int = 64
     """Image height in pixels."""
     width: int = 64
@@ -27,13 +28,15 @@ class ClipConfig:
     """Depth that maps to +1, metres; farther depths are clipped."""
     depth_scale: Literal["linear", "log"] = "log"
     """How metres map to [−1, 1] between near and far."""
+    depth: bool = True
+    """Whether the denoiser sees and makes depth; without it only observed frames are remembered."""
 
     def __post_init__(self):
         """Validate."""
         require(
-            self.frames >= 5 and self.frames % 4 == 1,
-            f"clip.frames is {self.frames}: a clip has 4k + 1 frames (5, 9, 13, …) because the "
-            "codec folds every 4 frames after the first into one; use 9.",
+            self.frames >= 2,
+            f"clip.frames is {self.frames}: a clip has an observed frame and at least one to be "
+            "imagined; use 9.",
         )
         require(
             0 < self.near_m < self.far_m,

@@ -3,35 +3,79 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, ClassVar
 
 from pewm_jax.config.errors import require, require_positive
-from pewm_jax.config.vae import VAEConfig
+from pewm_jax.config.kinds import Settings
+
+
+class CodecSettings(Settings):
+    """What the settings of every codec say; ``pewm_jax.models.codecs`` says what a codec does.
+
+    Attributes:
+        spatial: pixels per latent cell, each way.
+        temporal: frames per latent frame after the first: q·k + 1 frames become k + 1.
+        rgb_channels: latent channels of colour.
+        depth_channels: latent channels of depth.
+        DEPTH_AS_GREY: whether depth is encoded as a grey picture of three channels, not of one.
+        PIXELWISE: whether each latent channel of depth is one pixel of one frame.
+        CONVERTED: whether the weights are not trained here but come from ``train.start``.
+    """
+
+    SECTION: ClassVar[str] = "codec"
+    DEPTH_AS_GREY: ClassVar[bool] = False
+    PIXELWISE: ClassVar[bool] = False
+    CONVERTED: ClassVar[bool] = False
+    spatial: Any
+    temporal: Any
+    rgb_channels: Any
+    depth_channels: Any
+
+    @property
+    def channels(self) -> int:
+        """Latent channels of colour and depth together."""
+        return self.rgb_channels + self.depth_channels
+
+    def frames(self, count: int) -> int:
+        """Return the latent frames of a number of frames."""
+        return (count - 1) // self.temporal + 1
+
+    def check(self, model: Any) -> None:
+        """Refuse clips that cannot be folded."""
+        clip, q, s = model.clip, self.temporal, self.spatial
+        require(
+            (clip.frames - 1) % q == 0,
+            f"clip.frames is {clip.frames}: the codec folds every {q} frames after the first into "
+            f"one (codec.temporal), so use {q}k + 1 frames ({q + 1}, {2 * q + 1}, …).",
+        )
+        require(
+            clip.height % s == 0 and clip.width % s == 0,
+            f"clip {clip.height}×{clip.width}: height and width must be multiples of "
+            f"codec.spatial = {s}.",
+        )
 
 
 @dataclasses.dataclass(frozen=True)
-class CodecConfig:
-    """How pixels become latents and back."""
+class PixelConfig(CodecSettings):
+    """Space-to-depth and temporal fold: no parameters, exactly invertible."""
 
-    kind: Literal["pixel", "vae"] = "pixel"
-    """`pixel`: space-to-depth and temporal fold, no parameters, exactly invertible. `vae`:
-    CogVideoX's autoencoder, whose weights come from a converted checkpoint."""
+    PIXELWISE: ClassVar[bool] = True
+
     spatial: int = 4
     """Pixels per latent cell, each way."""
     temporal: int = 4
     """Frames per latent frame after the first."""
-    vae: VAEConfig = VAEConfig()
-    """The autoencoder of kind `vae`."""
+
+    @property
+    def rgb_channels(self) -> int:
+        """Latent channels of colour."""
+        return 3 * self.depth_channels
+
+    @property
+    def depth_channels(self) -> int:
+        """Latent channels of depth."""
+        return self.temporal * self.spatial**2
 
     def __post_init__(self):
         """Validate."""
         require_positive(self, "codec", "spatial", "temporal")
-        if self.kind == "vae":
-            have = (self.spatial, self.temporal)
-            need = (self.vae.spatial, self.vae.temporal)
-            require(
-                have == need,
-                f"codec.spatial {have[0]} and codec.temporal {have[1]}: this VAE folds {need[0]} "
-                f"pixels and {need[1]} frames; set codec.spatial {need[0]} and codec.temporal "
-                f"{need[1]}.",
-            )

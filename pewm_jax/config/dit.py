@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
+from pewm_jax.config.backbone import BackboneSettings, Places
 from pewm_jax.config.errors import ConfigError, require, require_positive
 
 Positions = Literal["rope_integer", "rope_crop", "rope_learned", "sincos"]
@@ -12,7 +13,7 @@ Positions = Literal["rope_integer", "rope_crop", "rope_learned", "sincos"]
 
 
 @dataclasses.dataclass(frozen=True)
-class DiTConfig:
+class DiTConfig(BackboneSettings):
     """The diffusion transformer in CogVideoX's form; ``published`` gives CogVideoX's own."""
 
     layers: int = 4
@@ -67,6 +68,26 @@ class DiTConfig:
     """Recompute activations in the backward pass: less memory, about a third more time."""
 
     @property
+    def places(self) -> Places:
+        """Where a memory reader runs: after every block."""
+        return Places(self.layers, self.width, self.time_dim, self.patch, self.patch_t)
+
+    @property
+    def text_shape(self) -> tuple[int, int]:
+        """(length, channels) of the text tokens."""
+        return self.text_length, self.text_dim
+
+    @property
+    def stores_prompt(self) -> bool:
+        """Whether a prompt's embedding is kept with the weights."""
+        return self.prompt == "stored"
+
+    @property
+    def split_heads(self) -> int:
+        """What ``train.mesh.tensor`` must divide."""
+        return self.heads
+
+    @property
     def width(self) -> int:
         """Model width D."""
         return self.heads * self.head_dim
@@ -76,33 +97,44 @@ class DiTConfig:
         """Latent frames of ``sample_frames`` video frames."""
         return (self.sample_frames - 1) // self.temporal + 1
 
+    def check(self, model: Any) -> None:
+        """Refuse latents that do not split into patches, and channels that are not the model's."""
+        super().check(model)
+        wanted = {"in_channels": model.in_channels, "out_channels": model.codec.channels}
+        for name, value in wanted.items():
+            require(
+                getattr(self, name) in (0, value),
+                f"backbone.{name} is {getattr(self, name)}: codec and control need {value}; leave "
+                "it at 0 to have it follow them.",
+            )
+
     def __post_init__(self):
         """Validate."""
-        require_positive(self, "dit", "layers", "heads", "head_dim", "patch", "patch_t")
-        require_positive(self, "dit", "text_length", "text_dim", "time_dim", "mlp_ratio")
-        require_positive(self, "dit", "temporal")
+        require_positive(self, "backbone", "layers", "heads", "head_dim", "patch", "patch_t")
+        require_positive(self, "backbone", "text_length", "text_dim", "time_dim", "mlp_ratio")
+        require_positive(self, "backbone", "temporal")
         for name in ("in_channels", "out_channels", "ofs_dim"):
             value = getattr(self, name)
-            require(value >= 0, f"dit.{name} is {value}: use 0 or more.")
+            require(value >= 0, f"backbone.{name} is {value}: use 0 or more.")
         rotary = self.positions != "sincos"
         require(
             not rotary or self.head_dim % 16 == 0,
-            f"dit.head_dim is {self.head_dim}: use a multiple of 16 (16, 32, 48, 64), the rotary "
-            "embedding splits a head into time, height and width parts.",
+            f"backbone.head_dim is {self.head_dim}: use a multiple of 16 (16, 32, 48, 64), the "
+            "rotary embedding splits a head into time, height and width parts.",
         )
         require(
             self.width % 16 == 0,
-            f"dit.heads × head_dim is {self.width}: use a multiple of 16, the sinusoid of "
+            f"backbone.heads × head_dim is {self.width}: use a multiple of 16, the sinusoid of "
             "positions splits it into time, height and width parts.",
         )
         require(
             self.ofs_dim in (0, self.time_dim),
-            f"dit.ofs_dim is {self.ofs_dim}: its embedding is added to the time embedding, so use "
-            f"dit.time_dim ({self.time_dim}), or 0 for none.",
+            f"backbone.ofs_dim is {self.ofs_dim}: its embedding is added to the time embedding, so "
+            f"use backbone.time_dim ({self.time_dim}), or 0 for none.",
         )
         for name in ("spatial_interpolation", "temporal_interpolation"):
             value = getattr(self, name)
-            require(value > 0, f"dit.{name} is {value}: use a number above 0.")
+            require(value > 0, f"backbone.{name} is {value}: use a number above 0.")
         self._require_sample()
 
     def _require_sample(self) -> None:
@@ -111,21 +143,21 @@ class DiTConfig:
         names = ("sample_height", "sample_width", "sample_frames")
         for index, name in enumerate(names):
             value = getattr(self, name)
-            require(value >= 0, f"dit.{name} is {value}: use 0 or more.")
+            require(value >= 0, f"backbone.{name} is {value}: use 0 or more.")
             require(
                 index >= asked or value > 0,
-                f"dit.{name} is 0: positions {self.positions} need the size that the network was "
-                "trained for (CogVideoX: 60 × 90 latents of 49 frames).",
+                f"backbone.{name} is 0: positions {self.positions} need the size that the network "
+                "was trained for (CogVideoX: 60 × 90 latents of 49 frames).",
             )
         learned = self.positions == "rope_learned"
         require(
             not learned or (self.sample_height % self.patch == self.sample_width % self.patch == 0),
-            f"dit.sample_height × sample_width {self.sample_height}×{self.sample_width}: learned "
-            f"positions need multiples of dit.patch ({self.patch}).",
+            f"backbone.sample_height × sample_width {self.sample_height}×{self.sample_width}: "
+            f"learned positions need multiples of backbone.patch ({self.patch}).",
         )
         require(
             self.patch_t == 1 or self.positions == "rope_integer",
-            f"dit.patch_t is {self.patch_t}: more than 1 goes with positions rope_integer "
+            f"backbone.patch_t is {self.patch_t}: more than 1 goes with positions rope_integer "
             f"(CogVideoX 1.5), not with {self.positions}.",
         )
 

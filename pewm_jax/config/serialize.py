@@ -8,23 +8,34 @@ import typing
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from pewm_jax import atomic
+from pewm_jax.config import kinds, migrations
 from pewm_jax.config.errors import ConfigError, require
 from pewm_jax.config.experiment import Config
+from pewm_jax.config.training import TrainSettings
 
 T = TypeVar("T")
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Turn a configuration into plain dictionaries, lists, numbers and strings."""
-    return dataclasses.asdict(config)
+    """Turn a configuration into plain dictionaries, lists, numbers and strings.
+
+    Settings of which there are several kinds say theirs by name under ``kind``.
+    """
+    out: dict[str, Any] = {"kind": kinds.of(config).name} if _has_kinds(type(config)) else {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        out[field.name] = to_dict(value) if dataclasses.is_dataclass(value) else value
+    return out
 
 
 def from_dict(kind: type[T], values: dict[str, Any], where: str = "config") -> T:
     """Build a configuration dataclass from plain dictionaries, strictly.
 
     Args:
-        kind: the dataclass to build, e.g. ``Config``.
-        values: nested plain values; absent fields take their defaults.
+        kind: the dataclass to build, e.g. ``Config``, or the base of several kinds of settings.
+        values: nested plain values; absent fields take their defaults. Of a ``Config``, those of
+            an earlier version are brought up to this one.
         where: name of this place in error messages.
 
     Raises:
@@ -32,19 +43,55 @@ def from_dict(kind: type[T], values: dict[str, Any], where: str = "config") -> T
     """
     if not isinstance(values, dict):
         raise ConfigError(f"{where} must be a table of settings, got {type(values).__name__}.")
-    fields = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    unknown = sorted(set(values) - fields)
+    if issubclass(kind, Config):
+        values = migrations.upgrade(values, where)
+    if _has_kinds(kind):
+        values, kind = dict(values), _named(kind, values, where)
+        values.pop("kind", None)
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    unknown = sorted(set(values) - set(fields))
     if unknown:
         raise ConfigError(
             f"{where} has no setting {', '.join(unknown)}; it has {', '.join(sorted(fields))}."
         )
     hints = typing.get_type_hints(kind)
-    return kind(**{k: _coerce(hints[k], v, f"{where}.{k}") for k, v in values.items()})
+    built: dict[str, Any] = {}
+    for name, value in values.items():
+        hint = fields[name].metadata.get("kinds", hints[name])
+        if _has_kinds(hint) and isinstance(value, dict) and "kind" not in value:
+            hint = type(fields[name].default)  # a section that does not say its kind has the usual
+        built[name] = _coerce(hint, value, f"{where}.{name}")
+    if issubclass(kind, Config):
+        built = _with_training(built, values, where)
+    return kind(**built)
+
+
+def _with_training(built: dict[str, Any], values: dict[str, Any], where: str) -> dict[str, Any]:
+    """Build the section ``train`` with the stages of the model's world."""
+    stages = built.get("model", Config().model).TRAIN
+    return built | {"train": _coerce(stages, values.get("train", {}), f"{where}.train")}
+
+
+def _has_kinds(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, kinds.Settings)
+
+
+def _named(base: type, values: dict[str, Any], where: str) -> type:
+    """Return the settings' type that a table asks for by its ``kind``."""
+    section = base.SECTION  # type: ignore[attr-defined]
+    if "kind" not in values:
+        return base if dataclasses.is_dataclass(base) else kinds.named(section, "").settings
+    try:
+        return kinds.named(section, values["kind"]).settings
+    except ConfigError as error:
+        raise ConfigError(f"{where}.kind: {error}") from None
 
 
 def _coerce(hint: Any, value: Any, where: str) -> Any:
     """Check one plain value against a type hint; lists become tuples."""
-    if dataclasses.is_dataclass(hint):
+    if dataclasses.is_dataclass(hint) or _has_kinds(hint):
+        if hint is TrainSettings:  # which stages it has, the model says; see ``_with_training``
+            return value
         return from_dict(typing.cast("type", hint), value, where)
     args = typing.get_args(hint)
     if typing.get_origin(hint) is tuple:
@@ -71,9 +118,7 @@ def _coerce_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, .
 
 def save(config: Any, path: Path) -> None:
     """Write a configuration as JSON, aside and then renamed."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(to_dict(config), indent=2) + "\n")
-    partial.replace(path)
+    atomic.write_text(path, json.dumps(to_dict(config), indent=2) + "\n")
 
 
 def load(path: Path, kind: type[T] = Config) -> T:

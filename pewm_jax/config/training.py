@@ -65,19 +65,15 @@ class StageConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainConfig:
-    """How the model learns: two stages, as the paper trains."""
+class TrainSettings:
+    """How a model learns, whatever its stages; each world adds a ``StageConfig`` for each stage."""
 
     run: str = "runs/demo"
     """Folder of this run: checkpoints, logs, pictures, report."""
     start: str = ""
     """Folder that training starts from, made by `python -m pewm_jax.convert import … --rgbd
-    --camera` or an earlier run; empty starts from random weights. Its memory blocks go on learning
-    if stage 1 has no steps; else they are left out, and stage 2 begins with fresh ones."""
-    stage1: StageConfig = StageConfig()
-    """The backbone learns without memory: domain, camera control, RGB-D."""
-    stage2: StageConfig = StageConfig()
-    """Only the memory blocks learn; all else stays bit-identical."""
+    --camera` or an earlier run; empty starts from random weights. What the first stage does not
+    train or need, as the memory blocks of stage 1, is left out and begins fresh later."""
     weight_decay: float = 0.0
     """Decoupled weight decay on matrices."""
     clip_norm: float = 1.0
@@ -96,14 +92,15 @@ class TrainConfig:
     """Steps between log lines."""
     preview_every: int = 250
     """Steps between sample pictures; 0 for none."""
-    dtype: Literal["float32", "bfloat16"] = "float32"
-    """Compute precision; master weights of what trains stay float32, frozen weights are kept in
-    this precision."""
     mesh: MeshConfig = MeshConfig()
     """How devices are arranged; may change between one start of a run and the next."""
     fresh: tuple[str, ...] = (r"memory/.*",)
     """Paths (regular expressions) of leaves that the weights a stage starts from may lack; those
     begin at random."""
+    image_noise_mean: float = -3.0
+    """Mean of log σ of the noise put on the observed first frame."""
+    image_noise_std: float = 0.5
+    """Spread of log σ of the noise put on the observed first frame."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
     """What a loss or gradient that is not finite does: `stop` the training, or `skip` that update
     and count it."""
@@ -121,6 +118,10 @@ class TrainConfig:
         )
         require(self.keep_every >= 0, f"train.keep_every is {self.keep_every}: use 0 or more.")
         require(self.grace_s > 0, f"train.grace_s is {self.grace_s}: use more than 0 seconds.")
+        require(
+            self.image_noise_std >= 0,
+            f"train.image_noise_std is {self.image_noise_std}: use 0 or more.",
+        )
         for pattern in self.fresh:
             require(is_pattern(pattern), f"train.fresh: {pattern!r} is no regular expression.")
         require(self.seed >= 0, f"train.seed is {self.seed}: use 0 or a positive number.")
@@ -131,6 +132,20 @@ class TrainConfig:
             self.preview_every >= 0,
             f"train.preview_every is {self.preview_every}: use 0 (no pictures) or more steps.",
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig(TrainSettings):
+    """How the model learns: two stages, as the paper trains."""
+
+    stage1: StageConfig = StageConfig()
+    """The backbone learns without memory: domain, camera control, RGB-D."""
+    stage2: StageConfig = StageConfig()
+    """Only the memory blocks learn; all else stays bit-identical."""
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
         require(
             bool(self.start) or self.stage1.steps > 0 or self.stage2.steps == 0,
             f"train.stage1.steps is 0 and train.stage2.steps is {self.stage2.steps}: stage 2 "

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
+from pewm_jax.config.codec import CodecSettings
 from pewm_jax.config.errors import ConfigError, require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)
-class VAEConfig:
+class VAEConfig(CodecSettings):
     """The video autoencoder in CogVideoX's form: causal 3D convolutions, encoded in chunks.
 
-    The defaults are the published sizes; ``VAEConfig.published`` names the variants.
+    The defaults are the published sizes; ``VAEConfig.published`` names the variants. Its weights
+    come from a converted checkpoint.
     """
+
+    DEPTH_AS_GREY: ClassVar[bool] = True
+    CONVERTED: ClassVar[bool] = True
 
     in_channels: int = 3
     """Channels of a frame that goes in."""
@@ -64,6 +69,26 @@ class VAEConfig:
         return 2 ** (len(self.widths) - 1)
 
     @property
+    def rgb_channels(self) -> int:
+        """Latent channels of colour."""
+        return self.latent_channels
+
+    @property
+    def depth_channels(self) -> int:
+        """Latent channels of depth, encoded as a grey picture."""
+        return self.latent_channels
+
+    def check(self, model: Any) -> None:
+        """Refuse clips that cannot be folded, or not be unfolded again."""
+        super().check(model)
+        require(
+            self.frames(model.clip.frames) % 2 == 1,
+            f"clip.frames {model.clip.frames}: the VAE decodes an even number of latent frames "
+            "without its first-frame rule (2 latent frames become 8 frames, not 5); use 8k + 1 "
+            "frames (9, 17, 25, …).",
+        )
+
+    @property
     def tile_pixels(self) -> tuple[int, int]:
         """Height and width of a tile in pixels."""
         return (
@@ -73,28 +98,28 @@ class VAEConfig:
 
     def __post_init__(self):
         """Validate."""
-        require(len(self.widths) > 0, "vae.widths is empty: name at least one level's channels.")
+        require(len(self.widths) > 0, "codec.widths is empty: name at least one level's channels.")
         sizes = ("in_channels", "out_channels", "latent_channels", "resnets", "groups")
-        require_positive(self, "vae", *sizes, "sample_height", "sample_width")
+        require_positive(self, "codec", *sizes, "sample_height", "sample_width")
         for width in self.widths:
             require(
                 width >= 1 and width % self.groups == 0,
-                f"vae.widths holds {width}, which vae.groups {self.groups} does not divide: use "
-                "multiples of the groups.",
+                f"codec.widths holds {width}, which codec.groups {self.groups} does not divide: "
+                "use multiples of the groups.",
             )
-        require(self.eps > 0, f"vae.eps is {self.eps}: use a small positive number, as 1e-6.")
+        require(self.eps > 0, f"codec.eps is {self.eps}: use a small positive number, as 1e-6.")
         require(
             self.temporal in {1, 2, 4, 8},
-            f"vae.temporal is {self.temporal}: use 1, 2, 4 or 8 (published weights have 4).",
+            f"codec.temporal is {self.temporal}: use 1, 2, 4 or 8 (published weights have 4).",
         )
         require(
             self.temporal <= self.spatial,
-            f"vae.temporal {self.temporal} needs as many halvings as vae.widths has steps between "
-            f"levels ({len(self.widths) - 1}): add levels or lower vae.temporal.",
+            f"codec.temporal {self.temporal} needs as many halvings as codec.widths has steps "
+            f"between levels ({len(self.widths) - 1}): add levels or lower codec.temporal.",
         )
         require(
             self.scaling_factor > 0,
-            f"vae.scaling_factor is {self.scaling_factor}: use the checkpoint's positive factor "
+            f"codec.scaling_factor is {self.scaling_factor}: use the checkpoint's positive factor "
             "(1.15258426 for 2b, 0.7 for the others).",
         )
         self._validate_tiles()
@@ -105,12 +130,12 @@ class VAEConfig:
         for name, pixels, share in zip(("height", "width"), self.tile_pixels, shares, strict=True):
             require(
                 0 <= share < 1,
-                f"vae.tile_overlap_{name} is {share}: use a share of the tile from 0 to below 1.",
+                f"codec.tile_overlap_{name} is {share}: use a share of the tile from 0 to below 1.",
             )
             require(
                 not self.tiling or int(pixels // self.spatial * (1 - share)) >= 1,
-                f"tiles of {pixels} pixels with vae.tile_overlap_{name} {share:.3g} advance by no "
-                f"latent: use a larger vae.tile_{name} or less overlap.",
+                f"tiles of {pixels} pixels with codec.tile_overlap_{name} {share:.3g} advance by "
+                f"no latent: use a larger codec.tile_{name} or less overlap.",
             )
 
     @classmethod

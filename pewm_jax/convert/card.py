@@ -10,7 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax.config import Config, UserError
+from pewm_jax import worlds
+from pewm_jax.config import Config, UserError, kinds
 from pewm_jax.data.dataset import read_manifest
 from pewm_jax.evaluation.page import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, number
 from pewm_jax.types import Params
@@ -59,13 +60,13 @@ def write(facts: Facts) -> str:
 
 
 def _what(facts: Facts) -> str:
-    config, clip = facts.config, facts.config.clip
+    config, clip = facts.config, facts.config.model.clip
     counts = {
         part: sum(np.size(leaf) for leaf in jax.tree.leaves(tree))
         for part, tree in facts.params.items()
     }
     rows = [f"| {part} | {count / 1e6:.2f} |" for part, count in counts.items()]
-    memory = f"a memory of kind `{config.memory.kind}`"
+    memory = f"a memory of kind `{kinds.of(config.model.memory).name}`"
     if "memory" not in facts.params:
         memory = "no memory (only its first stage is trained)"
     size = f"{clip.frames} frames of {clip.width} × {clip.height} pixels"
@@ -73,16 +74,17 @@ def _what(facts: Facts) -> str:
     return (
         "A persistent embodied world model: given posed RGB-D frames and an agent's actions, it "
         f"imagines what the agent will see, colour and depth, in clips of {size}, with {memory}, "
-        f"image features `{config.memory.encoder}` and codec `{config.codec.kind}`."
+        f"image features `{kinds.of(config.model.memory.encoder).name}` and codec "
+        f"`{kinds.of(config.model.codec).name}`."
         f"\n\n{table}\n\n"
         "Weights are the moving average of training where it trained and the unchanged base "
-        f"elsewhere, rounded to bfloat16; they compute in {config.train.dtype}. Written by "
+        f"elsewhere, rounded to bfloat16; they compute in {config.model.dtype}. Written by "
         f"pewm_jax {facts.version}."
     )
 
 
 def _use(facts: Facts) -> str:
-    clip, actions = facts.config.clip, facts.config.actions
+    clip, actions = facts.config.model.clip, facts.config.model.actions
     length = clip.frames - 1
     return f"""## Use
 
@@ -96,8 +98,14 @@ state, imagined = pewm_jax.rollout(config, params, state, [0] * {length}, jax.ra
 ```
 
 Actions: 0 forward {actions.step_m:g} m, 1 left and 2 right {actions.turn_deg:g}°, or floats
-(dx, dy, dyaw); {length} a clip. Sampling: {facts.config.diffusion.sampler}, \
-{facts.config.diffusion.sample_steps} steps."""
+(dx, dy, dyaw); {length} a clip. Sampling: {_sampler(facts)}, \
+{facts.config.model.noise.sample_steps} steps."""
+
+
+def _sampler(facts: Facts) -> str:
+    """Return the sampler's name, with that of the noise."""
+    noise = facts.config.model.noise
+    return " ".join([kinds.of(noise).name, *([noise.sampler] if hasattr(noise, "sampler") else [])])
 
 
 def _data(facts: Facts) -> str:
@@ -127,8 +135,8 @@ def _training(facts: Facts) -> str:
         return head + "None: these are converted weights, before any training."
     rows = ["| stage | steps | batch | learning rate | what learns |", "|---|---:|---:|---:|---|"]
     for number_, stage, what in (
-        ("1", train.stage1, "the backbone"),
-        ("2", train.stage2, "the memory blocks"),
+        (str(stage.number), stage.settings(facts.config), ", ".join(stage.trained))
+        for stage in worlds.stages(facts.config.model)
     ):
         if stage.steps == 0:
             done = "–"
@@ -137,9 +145,8 @@ def _training(facts: Facts) -> str:
         else:
             done = str(stage.steps) if number_ < (facts.stage or "") else f"0 of {stage.steps}"
         rows.append(f"| {number_} | {done} | {stage.batch} | {stage.learning_rate:g} | {what} |")
-    tail = f"\n\nMoving average {train.ema:g}, seed {train.seed}, target {{}}.".format(
-        facts.config.diffusion.target
-    )
+    noise = kinds.of(facts.config.model.noise).name
+    tail = f"\n\nMoving average {train.ema:g}, seed {train.seed}, noise {noise}."
     return head + "\n".join(rows) + tail
 
 

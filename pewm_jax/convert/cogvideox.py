@@ -23,7 +23,7 @@ import numpy as np
 
 from pewm_jax import config as configuration
 from pewm_jax import tree, weights
-from pewm_jax.config import DiffusionConfig, DiTConfig, UserError, VAEConfig
+from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig
 from pewm_jax.convert import assemble, base, files, output, scheduler, transformer, vae
 from pewm_jax.convert.mapping import Entry
 from pewm_jax.models import dit as dit_model
@@ -110,7 +110,7 @@ def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[VAEConfig, P
     return _read(VAE, Path(folder), dtype)
 
 
-def read_scheduler(folder: str | Path) -> DiffusionConfig:
+def read_scheduler(folder: str | Path) -> DDPMConfig:
     """Read the scheduler of a CogVideoX checkpoint: settings only, it has no weights.
 
     Args:
@@ -187,9 +187,9 @@ def load_vae(folder: str | Path) -> tuple[VAEConfig, Params]:
     return _load(VAE, Path(folder))
 
 
-def load_scheduler(folder: str | Path) -> DiffusionConfig:
+def load_scheduler(folder: str | Path) -> DDPMConfig:
     """Load the scheduler of an imported folder."""
-    return configuration.load(Path(folder) / "scheduler" / CONFIG, DiffusionConfig)
+    return configuration.load(Path(folder) / "scheduler" / CONFIG, DDPMConfig)
 
 
 def _load(network: Network, folder: Path) -> tuple[Any, Params]:

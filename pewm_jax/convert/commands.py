@@ -10,7 +10,15 @@ import numpy as np
 import tyro
 
 from pewm_jax import cli
-from pewm_jax.config import Config, ConfigError, DiffusionConfig, DiTConfig, UserError, VAEConfig
+from pewm_jax.config import (
+    Config,
+    ConfigError,
+    DDPMConfig,
+    DINOv2EncoderConfig,
+    DiTConfig,
+    UserError,
+    VAEConfig,
+)
 from pewm_jax.convert import (
     base,
     cogvideox,
@@ -183,7 +191,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
     else:
         prompt = next(iter(prompts.values()), None)
         told: Literal["zeros", "stored"] = "zeros" if prompt is None else "stored"
-        config = dataclasses.replace(config, dit=dataclasses.replace(config.dit, prompt=told))
+        config = config.with_model(backbone=dataclasses.replace(config.model.backbone, prompt=told))
         world.import_world(
             src,
             dst,
@@ -199,7 +207,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
 
 
 def _world(
-    options: ImportCogVideoX, dit: DiTConfig, vae: VAEConfig, diffusion: DiffusionConfig
+    options: ImportCogVideoX, dit: DiTConfig, vae: VAEConfig, diffusion: DDPMConfig
 ) -> tuple[Config, Params | None]:
     """Return the settings of the world model, and its image encoder if it has one.
 
@@ -212,12 +220,13 @@ def _world(
     world.require_size(config)
     if options.encoder:
         network, params = dinov2_model.load(options.encoder)
-        memory = dataclasses.replace(config.memory, encoder="dinov2", dinov2=network)
-        return dataclasses.replace(config, memory=memory), params
-    if config.memory.encoder == "dinov2":
+        encoder = DINOv2EncoderConfig(network=network)
+        memory = dataclasses.replace(config.model.memory, encoder=encoder)
+        return config.with_model(memory=memory), params
+    if config.model.memory.encoder.CONVERTED:
         raise UserError(
-            "memory.encoder dinov2 needs its weights; name the folder of `import dinov2` with "
-            "--encoder."
+            "memory.encoder of kind dinov2 needs its weights; name the folder of `import dinov2` "
+            "with --encoder."
         )
     return config, None
 

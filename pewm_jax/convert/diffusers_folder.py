@@ -16,7 +16,6 @@ from pewm_jax import weights
 from pewm_jax.config import Config, UserError
 from pewm_jax.convert import base, cogvideox, output, widen
 from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS, Network
-from pewm_jax.models import world_model
 from pewm_jax.types import Params
 
 _TEXT = ("text_encoder", "tokenizer")
@@ -92,7 +91,7 @@ def _run(src: Path, network: Network, record: dict[str, Any]) -> Params:
     else:
         old = network.config(record[network.folder], base.BASE)
         vae = VAE.config(record[VAE.folder], base.BASE)
-        plan = widen.plan(old, vae.latent_channels, world_model.camera_channels(config))
+        plan = widen.plan(old, vae.latent_channels, config.model.control.channels(config.model))
         backbone = weights.load(path, "backbone")
         weights.check(backbone, network.like(plan.new), f"the backbone in {path}")
         params = widen.narrow(plan, backbone)

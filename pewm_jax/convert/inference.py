@@ -8,7 +8,7 @@
         README.md             the card
 
 ``pewm_jax.load(DST)`` returns the leaves as they are stored, bfloat16, which halves the memory;
-the networks compute in ``train.dtype`` all the same, because every layer casts its weights to it.
+the networks compute in ``model.dtype`` all the same, because every layer casts its weights to it.
 """
 
 from __future__ import annotations

@@ -11,11 +11,12 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax import rollouts, tree
-from pewm_jax.config import Config, UserError
+from pewm_jax import tree, worlds
+from pewm_jax.config import Config, DDPMConfig, UserError, kinds
+from pewm_jax.data import abstract
 from pewm_jax.memory import memories
-from pewm_jax.models import codec, world_model
-from pewm_jax.types import Array, Camera, Frames, Params
+from pewm_jax.models import world_model
+from pewm_jax.types import Array, Camera, Control, Params
 
 Arrays: TypeAlias = dict[str, Array]
 """Name → array, or anything with a shape and a dtype."""
@@ -37,7 +38,7 @@ class Program:
 
 
 def rollout_programs(config: Config, params: Params, frames: int, clips: int) -> dict[str, Program]:
-    """Return ``start`` and ``rollout`` (see ``pewm_jax.rollouts``) on flat arrays.
+    """Return ``start`` and ``rollout`` (see ``pewm_jax.worlds``) on flat arrays.
 
     Args:
         config: the experiment.
@@ -45,24 +46,19 @@ def rollout_programs(config: Config, params: Params, frames: int, clips: int) ->
         frames: observed frames that a world begins with.
         clips: clips that one call imagines.
     """
-    clip = config.clip
-    size = (frames, clip.height, clip.width)
-    observed = Frames(
-        jax.ShapeDtypeStruct((*size, 3), jnp.uint8),
-        jax.ShapeDtypeStruct(size, jnp.float32),
-        _camera(frames),
-    )
-    state = jax.eval_shape(lambda p, f: rollouts.start(config, p, f), params, observed)
+    clip = config.model.clip
+    observed = abstract.frames(frames, height=clip.height, width=clip.width)
+    state = jax.eval_shape(lambda p, f: worlds.start(config, p, f), params, observed)
 
     def start(weights: Arrays, inputs: Arrays) -> Arrays:
         (given,) = _pack({"frames": observed}, inputs)
-        return _name(state=rollouts.start(config, tree.unflatten(weights), given))
+        return _name(state=worlds.start(config, tree.unflatten(weights), given))
 
     def rollout(weights: Arrays, inputs: Arrays) -> Arrays:
         (given,) = _pack({"state": state}, inputs)
         key = jax.random.wrap_key_data(inputs["key"], impl="threefry2x32")
         world = tree.unflatten(weights)
-        after, imagined = rollouts.rollout(config, world, given, inputs["actions"], key)
+        after, imagined = worlds.imagine(config, world, given, inputs["actions"], key)
         return _name(state=after, imagined=imagined)
 
     moves = jax.ShapeDtypeStruct((clips * (clip.frames - 1), 3), jnp.float32)
@@ -90,42 +86,46 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
         params: its weights; only their paths and shapes matter.
         batch: clips at once.
     """
-    clip = config.clip
+    model = config.model
+    clip = model.clip
 
     def like(shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((batch, *shape), dtype)
 
-    camera = jax.tree.map(lambda x: like(x.shape), _camera(clip.frames))
-    first = like((clip.height, clip.width, 3)), like((clip.height, clip.width))
+    camera = abstract.camera(batch, clip.frames)
+    observed = abstract.frames(batch, 1, height=clip.height, width=clip.width, colours=jnp.float32)
     told = jax.eval_shape(
-        lambda p, rgb, depth, c: world_model.condition(config, p, rgb, depth, c),
+        lambda p, observed, camera: world_model.condition(model, p, observed, Control(camera)),
         params,
-        *first,
+        observed,
         camera,
     )
     parts = {"conditioning": told}
     if "memory" in params:
 
         def read(c: Camera) -> Any:
-            return memories.tokens(config, memories.empty(config, jnp.zeros(3)), c)
+            return memories.tokens(model, memories.empty(model, jnp.zeros(3)), c)
 
         parts["tokens"] = jax.eval_shape(jax.vmap(read), camera)
-    noisy = like((*codec.latent_shape(config), codec.latent_channels(config)))
+    noisy = like((*model.latent_shape, model.codec.channels))
 
     def denoise(weights: Arrays, inputs: Arrays) -> Arrays:
         given = _pack(parts, inputs)
         tokens = given[1] if len(given) > 1 else None
         noisy, times = inputs["noisy_BthwC"], inputs["timesteps_B"]
         world = tree.unflatten(weights)
-        out = world_model.apply(config, world, noisy, given[0], times, tokens)
+        out = world_model.apply(model, world, noisy, given[0], times, tokens)
         return {"prediction_BthwC": out}
 
-    target = config.diffusion.target
+    noise, time = model.noise, like(())
+    meaning = f"noise {kinds.of(noise).name}, see `pewm_jax.diffusion`"
+    if isinstance(noise, DDPMConfig):
+        time = like((), jnp.int32)
+        meaning = f"the prediction is {noise.target} at levels 0 to {noise.train_steps - 1}"
     return Program(
-        f"one evaluation of the denoiser: the prediction is {target} at levels 0 to "
-        f"{config.diffusion.train_steps - 1}",
+        f"one evaluation of the denoiser: {meaning}",
         denoise,
-        {"noisy_BthwC": noisy, "timesteps_B": like((), jnp.int32), **_name(**parts)},
+        {"noisy_BthwC": noisy, "timesteps_B": time, **_name(**parts)},
     )
 
 
@@ -163,13 +163,6 @@ def lower(program: Program, weights: Arrays, platforms: Sequence[str]) -> jax.ex
                 f"({str(error).splitlines()[0]}); name other platforms."
             ) from None
         return attempt(names)
-
-
-def _camera(count: int) -> Camera:
-    return Camera(
-        jax.ShapeDtypeStruct((count, 4), jnp.float32),
-        jax.ShapeDtypeStruct((count, 4, 4), jnp.float32),
-    )
 
 
 def _name(**parts: Any) -> Arrays:

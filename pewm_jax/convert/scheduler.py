@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pewm_jax import config as configuration
-from pewm_jax.config import ConfigError, DiffusionConfig, UserError
+from pewm_jax.config import ConfigError, DDPMConfig, UserError
 
 CLASSES = {"CogVideoXDDIMScheduler": "ddim", "CogVideoXDPMScheduler": "dpm"}
 """Their classes and our samplers."""
@@ -47,7 +47,7 @@ _KINDS = {
 }
 
 
-def config_from_diffusers(values: Mapping[str, Any]) -> DiffusionConfig:
+def config_from_diffusers(values: Mapping[str, Any]) -> DDPMConfig:
     """Read the settings of ``scheduler/scheduler_config.json``.
 
     Args:
@@ -89,12 +89,12 @@ def config_from_diffusers(values: Mapping[str, Any]) -> DiffusionConfig:
         "set_alpha_to_one": given["set_alpha_to_one"],
     }
     try:
-        return configuration.from_dict(DiffusionConfig, ours, "scheduler")
+        return configuration.from_dict(DDPMConfig, ours, "scheduler")
     except ConfigError as error:
         raise UserError(f"The scheduler cannot be used: {error}") from None
 
 
-def config_to_diffusers(config: DiffusionConfig) -> dict[str, Any]:
+def config_to_diffusers(config: DDPMConfig) -> dict[str, Any]:
     """Write the settings as ``scheduler_config.json`` has them, the inverse of reading.
 
     What diffusers has no name for stays behind: the number of steps and the guidance, which its

@@ -33,7 +33,7 @@ import jax.export
 import numpy as np
 
 from pewm_jax import __version__, rollouts, tree
-from pewm_jax.config import Config, UserError
+from pewm_jax.config import Config, DiTConfig, UserError
 from pewm_jax.convert import output, standalone
 from pewm_jax.convert.programs import Arrays, Program, denoise_program, lower, rollout_programs
 from pewm_jax.geometry import actions as action_geometry
@@ -44,7 +44,7 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 """Where a program shall run, if it can be lowered for all."""
 SIGNATURE, SCRIPT = "signature.json", "run.py"
 TOLERANCE = {"float32": 1e-3, "bfloat16": 3e-2}
-"""How far, relative to the largest value, a program may be from the library, by train.dtype."""
+"""How far, relative to the largest value, a program may be from the library, by model.dtype."""
 
 
 def export(
@@ -84,7 +84,9 @@ def export(
     with output.new_folder(dst) as folder:
         say(f"reading {run} …")
         config, params = rollouts.load(run)
-        config = dataclasses.replace(config, dit=dataclasses.replace(config.dit, attention="xla"))
+        if isinstance(config.model.backbone, DiTConfig):
+            anywhere = dataclasses.replace(config.model.backbone, attention="xla")
+            config = config.with_model(backbone=anywhere)
         if what == "rollout":
             programs = rollout_programs(config, params, frames or config.data.context, clips)
         else:
@@ -111,7 +113,7 @@ def export(
         (folder / "README.md").write_text(_readme(dst.name, signature), encoding="utf-8")
         if check and "cpu" in platforms:
             say("checking in a fresh process, without this library …")
-            worst = verify(folder, programs, params, TOLERANCE[config.train.dtype])
+            worst = verify(folder, programs, params, TOLERANCE[config.model.dtype])
             say(f"largest difference from the library, of the largest value: {worst:.1e}")
     say(f"{dst} is ready: python {dst / SCRIPT}")
     return dst
@@ -207,7 +209,7 @@ def _described(arrays: Arrays) -> list[dict[str, Any]]:
 
 def _actions(config: Config) -> dict[str, list[float]]:
     """Return name → (dx, dy, dyaw) of the discrete actions."""
-    table = np.asarray(action_geometry.discrete_table(config.actions))
+    table = np.asarray(action_geometry.discrete_table(config.model.actions))
     return {name: table[i].tolist() for i, name in enumerate(action_geometry.NAMES)}
 
 

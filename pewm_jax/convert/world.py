@@ -17,26 +17,26 @@ import numpy as np
 from pewm_jax import config as configuration
 from pewm_jax import tree, weights
 from pewm_jax.config import (
+    AttentionConfig,
     ClipConfig,
-    CodecConfig,
     Config,
-    DiffusionConfig,
+    DDPMConfig,
     DiTConfig,
-    MemoryConfig,
-    TrainConfig,
+    ModelConfig,
     UserError,
     VAEConfig,
+    VoxelConfig,
 )
 from pewm_jax.convert import base, cogvideox, output, widen
 from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS
-from pewm_jax.models import codec, positions, world_model
+from pewm_jax.models import positions, readers
 from pewm_jax.types import Array, Params
 
 
 def config_of(
     dit: DiTConfig,
     vae: VAEConfig,
-    diffusion: DiffusionConfig,
+    diffusion: DDPMConfig,
     size: tuple[int | None, int | None, int | None],
     dtype: str | None,
 ) -> Config:
@@ -63,14 +63,18 @@ def config_of(
         value if given is None else given for given, value in zip(size, usual, strict=True)
     )
     return Config(
-        clip=ClipConfig(frames=frames, height=height, width=width),
-        codec=CodecConfig(kind="vae", spatial=vae.spatial, temporal=vae.temporal, vae=vae),
-        dit=dataclasses.replace(dit, in_channels=0, out_channels=0),
-        memory=MemoryConfig(
-            heads=max(dit.heads, vae.temporal * dit.patch_t), head_dim=dit.head_dim
-        ),
-        diffusion=diffusion,
-        train=TrainConfig(dtype="float32" if dtype in (None, "float32") else "bfloat16"),
+        model=ModelConfig(
+            clip=ClipConfig(frames=frames, height=height, width=width),
+            codec=vae,
+            backbone=dataclasses.replace(dit, in_channels=0, out_channels=0),
+            memory=VoxelConfig(
+                reader=AttentionConfig(
+                    heads=max(dit.heads, vae.temporal * dit.patch_t), head_dim=dit.head_dim
+                )
+            ),
+            noise=diffusion,
+            dtype="float32" if dtype in (None, "float32") else "bfloat16",
+        )
     )
 
 
@@ -80,11 +84,11 @@ def require_size(config: Config) -> None:
     Raises:
         UserError: they are learned for another size, or do not go so far.
     """
-    frames, height, width = codec.latent_shape(config)
-    frames += -frames % config.dit.patch_t
-    clip = config.clip
+    frames, height, width = config.model.latent_shape
+    frames += -frames % config.model.backbone.patch_t
+    clip = config.model.clip
     try:
-        positions.token_grid(config.dit, (1, frames, height, width, 1))
+        positions.token_grid(config.model.backbone, (1, frames, height, width, 1))
     except UserError as error:
         raise UserError(f"A clip of {clip.frames}×{clip.height}×{clip.width}: {error}") from None
 
@@ -119,8 +123,8 @@ def import_world(
         seed: of the memory blocks.
     """
     old = TRANSFORMER.config(record["transformer"], base.BASE)
-    channels = world_model.camera_channels(config)
-    plan = widen.plan(old, config.codec.vae.latent_channels, channels)
+    channels = config.model.control.channels(config.model)
+    plan = widen.plan(old, config.model.codec.latent_channels, channels)
     key = jax.random.key(seed)
     new_dtype = np.dtype(jax.numpy.dtype(dtype or "float32"))
 
@@ -128,7 +132,7 @@ def import_world(
         return widen.widen(plan, cogvideox.read_transformer(src, dtype)[1])
 
     def blocks() -> Params:
-        return jax.jit(lambda k: world_model.init_memory(config, k))(key)
+        return jax.jit(lambda k: readers.init(config.model, k))(key)
 
     parts: dict[str, tuple[dict[str, jax.ShapeDtypeStruct], Callable[[], Params]]] = {}
     wide = tree.flatten(TRANSFORMER.like(plan.new))
@@ -138,7 +142,7 @@ def import_world(
         backbone,
     )
     if memory:
-        like = jax.eval_shape(lambda k: world_model.init_memory(config, k), key)
+        like = jax.eval_shape(lambda k: readers.init(config.model, k), key)
         flat = tree.flatten(like)
         parts["memory"] = (
             {p: jax.ShapeDtypeStruct(leaf.shape, new_dtype) for p, leaf in flat.items()},

@@ -45,12 +45,12 @@ def choose(config: Config, length: int, rng: np.random.Generator, where: str = "
     Raises:
         UserError: the episode is too short for one clip.
     """
-    steps = config.clip.frames - 1
+    steps = config.model.clip.frames - 1
     largest = min(config.data.stride_max, (length - 1) // steps)
     if largest < config.data.stride_min:
         need = steps * config.data.stride_min + 1
         raise UserError(
-            f"{where} has {length} frames, a clip of {config.clip.frames} frames at stride "
+            f"{where} has {length} frames, a clip of {config.model.clip.frames} frames at stride "
             f"{config.data.stride_min} needs {need}; collect longer episodes, or lower "
             "data.stride_min or clip.frames."
         )
@@ -130,7 +130,7 @@ def clip_at(
     Raises:
         UserError: the episode ends before the clip does.
     """
-    count = config.clip.frames if frames is None else frames
+    count = config.model.clip.frames if frames is None else frames
     chosen = start + stride * np.arange(count)
     if start < 0 or chosen[-1] >= episode.length:
         raise UserError(

@@ -221,7 +221,7 @@ def _describe(source: EpisodeSource, drawn: _Drawn) -> str:
 
 
 def _check_size(config: Config, episode: Episode) -> None:
-    clip = config.clip
+    clip = config.model.clip
     if (episode.height, episode.width) != (clip.height, clip.width):
         raise UserError(
             f"episode {episode.name} has images of {episode.width}×{episode.height} pixels, the "
@@ -233,7 +233,7 @@ def _check_size(config: Config, episode: Episode) -> None:
 def _check_actions(config: Config, episode: Episode) -> None:
     """Compare the settings of the actions with what a collected episode was made with."""
     for name in ("step_m", "turn_deg"):
-        made, wanted = episode.info.get(name), getattr(config.actions, name)
+        made, wanted = episode.info.get(name), getattr(config.model.actions, name)
         if made is not None and not np.isclose(made, wanted, rtol=1e-6):
             raise ConfigError(
                 f"episode {episode.name} was collected with {name} {made:g}, the configuration has "

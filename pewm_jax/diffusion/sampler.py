@@ -10,18 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import Config, DiffusionConfig
-from pewm_jax.diffusion import schedule, solver
-from pewm_jax.models import world_model
-from pewm_jax.types import Array, MapTokens, Params
+from pewm_jax.config import DDPMConfig
+from pewm_jax.diffusion import solver
+from pewm_jax.types import Array
 
 Denoiser: TypeAlias = Callable[[Array, Array], Array]
 """``(x_t, timesteps_B) -> x0``; ``schedule.to_x0`` turns a v or an ε into it."""
 
 
-def ddim(
-    config: DiffusionConfig, denoise: Denoiser, noise: Array, *, every_step: bool = False
-) -> Array:
+def ddim(config: DDPMConfig, denoise: Denoiser, noise: Array, *, every_step: bool = False) -> Array:
     """Sample by DDIM (Song et al. 2021, η = 0; ``CogVideoXDDIMScheduler``).
 
     Args:
@@ -38,7 +35,7 @@ def ddim(
 
 
 def dpm(
-    config: DiffusionConfig,
+    config: DDPMConfig,
     denoise: Denoiser,
     noise: Array,
     key: Array | None = None,
@@ -77,50 +74,31 @@ def dpm(
 
 
 def sample(
-    config: Config,
-    params: Params,
-    conditioning: world_model.Conditioning,
-    tokens: MapTokens | None,
-    noise_BthwC: Array,
+    config: DDPMConfig,
+    denoise: Callable[[Array, Array, Array], Array],
+    noise: Array,
     key: Array | None = None,
 ) -> Array:
-    """Sample one batch of clips' latents with the configured sampler.
-
-    With ``diffusion.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map));
-    with ``diffusion.dynamic_guidance`` g varies with the step, see ``schedule.guidance``.
+    """Sample with the configured sampler.
 
     Args:
-        config: the experiment.
-        params: the world model's parameters.
-        conditioning: observed frame, cameras, text.
-        tokens: map tokens, or None for no memory.
-        noise_BthwC: standard normal start.
-        key: randomness of the steps; only ``diffusion.sampler`` dpm needs it.
+        config: schedule, sampler and steps.
+        denoise: ``(x_t, timesteps_B, weight) -> x0``; the weight is that of guidance, see
+            ``schedule.guidance``.
+        noise: (B, …) standard normal start.
+        key: randomness of the steps; only the sampler dpm needs it.
 
     Returns:
-        (B, t, h, w, C) latents.
+        (B, …) the sample.
 
     Raises:
         ValueError: the sampler is dpm and there is no key.
     """
-    diffusion = config.diffusion
-
-    def x0(x, timesteps, tokens):
-        out = world_model.apply(config, params, x, conditioning, timesteps, tokens)
-        return schedule.to_x0(diffusion, out, x, timesteps)
-
-    def denoise(x, timesteps, weight):
-        with_map = x0(x, timesteps, tokens)
-        if tokens is None or diffusion.guidance == 1:
-            return with_map
-        without = x0(x, timesteps, None)
-        return without + weight * (with_map - without)
-
-    if diffusion.sampler == "ddim":
-        return _follow(solver.steps(diffusion), denoise, noise_BthwC)
+    if config.sampler == "ddim":
+        return _follow(solver.steps(config), denoise, noise)
     if key is None:
-        raise ValueError("diffusion.sampler dpm draws fresh noise at every step: give it a key.")
-    return _follow(solver.steps(diffusion), denoise, noise_BthwC, _draw(key, noise_BthwC))
+        raise ValueError("noise.sampler dpm draws fresh noise at every step: give it a key.")
+    return _follow(solver.steps(config), denoise, noise, _draw(key, noise))
 
 
 def _plain(denoise: Denoiser) -> Callable[[Array, Array, Array], Array]:

@@ -11,11 +11,11 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import DiffusionConfig
+from pewm_jax.config import DDPMConfig
 from pewm_jax.types import Array
 
 
-def alphas_cumprod(config: DiffusionConfig) -> np.ndarray:
+def alphas_cumprod(config: DDPMConfig) -> np.ndarray:
     """Return (train_steps,) ᾱ from almost 1 down to exactly 0 (zero terminal SNR)."""
     root = np.linspace(config.beta_start**0.5, config.beta_end**0.5, config.train_steps)
     alphas = np.cumprod(1 - root**2)
@@ -27,7 +27,7 @@ def alphas_cumprod(config: DiffusionConfig) -> np.ndarray:
     return alphas
 
 
-def _coefficients(config: DiffusionConfig, timesteps_B: Array, ndim: int) -> tuple[Array, Array]:
+def _coefficients(config: DDPMConfig, timesteps_B: Array, ndim: int) -> tuple[Array, Array]:
     """Return √ᾱ and √(1 − ᾱ) of shape (B, 1, …)."""
     alphas = alphas_cumprod(config)
     shape = (-1,) + (1,) * (ndim - 1)
@@ -36,20 +36,20 @@ def _coefficients(config: DiffusionConfig, timesteps_B: Array, ndim: int) -> tup
     return signal, noise
 
 
-def add_noise(config: DiffusionConfig, x0: Array, noise: Array, timesteps_B: Array) -> Array:
+def add_noise(config: DDPMConfig, x0: Array, noise: Array, timesteps_B: Array) -> Array:
     """Return x_t = √ᾱ x0 + √(1 − ᾱ) ε."""
     a, b = _coefficients(config, timesteps_B, x0.ndim)
     return a * x0 + b * noise
 
 
-def target(config: DiffusionConfig, x0: Array, noise: Array, timesteps_B: Array) -> Array:
+def target(config: DDPMConfig, x0: Array, noise: Array, timesteps_B: Array) -> Array:
     """Return what the network is asked for: x0, ε, or v = √ᾱ ε − √(1 − ᾱ) x0."""
     a, b = _coefficients(config, timesteps_B, x0.ndim)
     return {"x0": x0, "eps": noise, "v": a * noise - b * x0}[config.target]
 
 
 def to_x0(
-    config: DiffusionConfig,
+    config: DDPMConfig,
     prediction: Array,
     x_t: Array,
     timesteps_B: Array,
@@ -65,14 +65,14 @@ def to_x0(
     return (x_t - b * prediction) / a
 
 
-def x0_weight(config: DiffusionConfig, timesteps_B: Array) -> Array:
+def x0_weight(config: DDPMConfig, timesteps_B: Array) -> Array:
     """Return (B,) min(1 / (1 − ᾱ), max_weight): the squared error of x0 becomes that of v."""
     alphas = alphas_cumprod(config)
     weight = np.minimum(1 / (1 - alphas), config.max_weight)
     return jnp.asarray(weight, jnp.float32)[timesteps_B]
 
 
-def timesteps(config: DiffusionConfig) -> np.ndarray:
+def timesteps(config: DDPMConfig) -> np.ndarray:
     """Return (sample_steps,) int32 visited levels, descending (Lin et al. 2023, Table 2).
 
     Trailing spacing begins at the last training level. It is always as many levels as asked; the
@@ -88,7 +88,7 @@ def timesteps(config: DiffusionConfig) -> np.ndarray:
     return levels.astype(np.int32)
 
 
-def guidance(config: DiffusionConfig) -> np.ndarray:
+def guidance(config: DDPMConfig) -> np.ndarray:
     """Return (sample_steps,) the weight of guidance at every visited level.
 
     Constant, or with ``dynamic_guidance`` CogVideoX's 1 + g (1 − cos(π ((N − t) / N)⁵)) / 2

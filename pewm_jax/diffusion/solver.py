@@ -15,7 +15,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from pewm_jax.config import DiffusionConfig
+from pewm_jax.config import DDPMConfig
 from pewm_jax.diffusion import schedule
 from pewm_jax.types import Array
 
@@ -42,7 +42,7 @@ class Steps:
     guidance: Array
 
 
-def steps(config: DiffusionConfig) -> Steps:
+def steps(config: DDPMConfig) -> Steps:
     """Return the coefficients of the configured sampler, float32, in the order of the steps."""
     coefficients = {"ddim": _ddim, "dpm": _dpm}[config.sampler]
     levels = schedule.timesteps(config)
@@ -52,7 +52,7 @@ def steps(config: DiffusionConfig) -> Steps:
     return Steps(levels, *narrow)
 
 
-def signal_power(config: DiffusionConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def signal_power(config: DDPMConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (steps,) ᾱ of each visited level, of the level it leads to, and of the one before.
 
     The level before is NaN where a step must be of first order: at the first step, and at the

@@ -131,7 +131,7 @@ def _video(config: Config, long: LongRollouts, item: _Shown) -> tuple[str, bytes
         for t in range(count)
     ]
     pictures = side_by_side(columns, footers, far_m=farthest(item.truth))
-    per_clip = config.clip.frames - 1
+    per_clip = config.model.clip.frames - 1
     caption = (
         f"{item.choice.name}, from frame {item.choice.start}: {count} frames imagined in "
         f"{long.chain} clips of {per_clip}, stride {config.evaluate.stride}, sampling seed "
@@ -150,7 +150,7 @@ def _above(config: Config, long: LongRollouts, index: int, item: _Shown) -> np.n
     for when in ("first", "last"):
         valid = kept[f"{when}_valid"][index] & (kept[f"{when}_points"][index][:, 2] < ceiling)
         points = kept[f"{when}_points"][index][valid]
-        shades = memories.colours(config, kept[f"{when}_features"][index][valid])
+        shades = memories.colours(config.model, kept[f"{when}_features"][index][valid])
         clouds.append((points, as_bytes(shades)))
     bounds = map_bounds(*[points for points, _ in clouds], poses[:, :3, 3])
     panels = []
@@ -158,7 +158,7 @@ def _above(config: Config, long: LongRollouts, index: int, item: _Shown) -> np.n
     for (title, track), (points, shades) in zip(tracks, clouds, strict=True):
         path = track if track is poses else np.concatenate([poses[-1:], track])
         yaw = float(heading(track[-1]))
-        cell_m = config.memory.cell_m
+        cell_m = config.model.memory.cell_m
         panels.append(
             from_above(points, shades, cell_m, path[:, :3, 3], yaw, title=title, bounds=bounds)
         )

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import Config
+from pewm_jax.data import abstract
 from pewm_jax.rollouts import rollout, start
-from pewm_jax.types import Array, Camera, Frames, Params, WorldState
+from pewm_jax.types import Array, Frames, Params, WorldState
 
 METHODS = ("memory", "empty", "copy")
 """With the map; the same weights with an empty map; the last observed frame, repeated."""
@@ -65,12 +66,14 @@ class Imagination:
                 (self.params, self._abstract_context()),
                 self._say,
             )
-        actions = jax.ShapeDtypeStruct((self.batch, self.config.clip.frames - 1, 3), jnp.float32)
+        actions = jax.ShapeDtypeStruct(
+            (self.batch, self.config.model.clip.frames - 1, 3), jnp.float32
+        )
         keys = jax.eval_shape(clip_keys, jax.ShapeDtypeStruct((self.batch, 2), jnp.uint32))
         for memory in memories:
             self._clip[memory] = _compile(
                 f"the sampler with {'its' if memory else 'an empty'} map "
-                f"({self.config.diffusion.sample_steps} steps, {self.batch} clips at once)",
+                f"({self.config.model.noise.sample_steps} steps, {self.batch} clips at once)",
                 jax.vmap(functools.partial(rollout, self.config, memory=memory), (None, 0, 0, 0)),
                 (self.params, states, actions, keys),
                 self._say,
@@ -103,7 +106,7 @@ class Imagination:
         params = self.params if params is None else params
         first = state = self._begin(params, context)
         keys = clip_keys(jnp.asarray(seeds_B2, jnp.uint32))
-        per_clip = self.config.clip.frames - 1
+        per_clip = self.config.model.clip.frames - 1
         made = []
         for index in range(actions_BN3.shape[1] // per_clip):
             part = jnp.asarray(actions_BN3[:, index * per_clip : (index + 1) * per_clip])
@@ -116,13 +119,8 @@ class Imagination:
         return jax.vmap(functools.partial(start, self.config), (None, 0))(params, context)
 
     def _abstract_context(self) -> Frames:
-        lead, clip = (self.batch, self.context), self.config.clip
-        spec = jax.ShapeDtypeStruct
-        return Frames(
-            spec((*lead, clip.height, clip.width, 3), jnp.uint8),
-            spec((*lead, clip.height, clip.width), jnp.float32),
-            Camera(spec((*lead, 4), jnp.float32), spec((*lead, 4, 4), jnp.float32)),
-        )
+        clip = self.config.model.clip
+        return abstract.frames(self.batch, self.context, height=clip.height, width=clip.width)
 
 
 def clip_keys(seeds_B2: Array) -> Array:

@@ -81,7 +81,7 @@ def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) 
     Raises:
         UserError: no episode is long enough.
     """
-    length = chain * (config.clip.frames - 1) * config.evaluate.stride
+    length = chain * (config.model.clip.frames - 1) * config.evaluate.stride
     per_episode = -(-clips // max(len(episodes), 1))
     ranked: list[tuple[int, ClipChoice]] = []
     longest = 0
@@ -132,7 +132,7 @@ def load_clip(
     episode = episodes[choice.episode]
     context = episode.frames(list(choice.context_S))
     targets = episode.frames(list(choice.targets_N))
-    size = (config.clip.height, config.clip.width)
+    size = (config.model.clip.height, config.model.clip.width)
     if targets.rgb_THWC.shape[1:3] != size:
         height, width = targets.rgb_THWC.shape[1:3]
         raise UserError(
@@ -145,7 +145,7 @@ def load_clip(
     actions_N3 = np.asarray(actions_between(poses))
     _check_motion(np.asarray(integrate(poses[0], actions_N3)), poses, choice, "upright motion")
     if episode.actions is not None:
-        recorded = np.asarray(continuous(config.actions, episode.actions))
+        recorded = np.asarray(continuous(config.model.actions, episode.actions))
         steps = recorded[choice.start : choice.targets_N[-1]]
         every = np.asarray(integrate(poses[0], steps))
         taken = every[[index - choice.start for index in (choice.start, *choice.targets_N)]]

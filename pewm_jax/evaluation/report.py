@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import Config, UserError, to_dict
+from pewm_jax.config import Config, UserError, kinds, to_dict
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import statistics
 from pewm_jax.evaluation.gallery import make_gallery
@@ -46,8 +46,9 @@ def override(config: Config, **changes: Any) -> Config:
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
     if steps is not None:
-        diffusion = dataclasses.replace(config.diffusion, sample_steps=steps)
-        config = dataclasses.replace(config, diffusion=diffusion)
+        config = config.with_model(
+            noise=dataclasses.replace(config.model.noise, sample_steps=steps)
+        )
     if data is not None:
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
     return dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, **changes))
@@ -175,7 +176,7 @@ def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any
 
 def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
     """State what was measured, completely enough to be repeated."""
-    clip, choices = config.clip, scored.choices
+    clip, choices = config.model.clip, scored.choices
     scenes = sorted({choice.scene for choice in choices + long.scored.choices})
     return {
         "scenes": len(scenes),
@@ -187,15 +188,17 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "frames": clip.frames,
         "imagined_frames": config.evaluate.chain * (clip.frames - 1),
         "stride": config.evaluate.stride,
-        "sampler": config.diffusion.sampler,
-        "sampling_steps": config.diffusion.sample_steps,
-        "guidance": config.diffusion.guidance,
+        "noise": kinds.of(config.model.noise).name,
+        "sampler": getattr(config.model.noise, "sampler", "euler"),
+        "sampling_steps": config.model.noise.sample_steps,
+        "guidance": config.model.noise.guidance,
         "resolution": f"{clip.width} × {clip.height} pixels",
-        "memory": config.memory.kind,
-        "encoder": config.memory.encoder,
-        "positions": config.memory.positions,
-        "map": f"{config.memory.capacity} cells of {config.memory.cell_m} m, "
-        f"{config.memory.tokens} read per clip",
+        "memory": kinds.of(config.model.memory).name,
+        "encoder": kinds.of(config.model.memory.encoder).name,
+        "reader": kinds.of(config.model.memory.reader).name,
+        "positions": getattr(config.model.memory.reader, "positions", ""),
+        "map": f"{config.model.memory.capacity} cells of {config.model.memory.cell_m} m, "
+        f"{config.model.memory.tokens} read per clip",
         "dataset": config.data.path,
         "split": config.evaluate.split,
         "starts": "spread evenly over the way back of every episode; no randomness",

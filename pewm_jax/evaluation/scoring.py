@@ -126,7 +126,7 @@ def score_table(
     if pieces:
         say(f"{len(pieces)} of {len(pieces) + len(todo)} pieces were scored before and are kept")
     model.prepare(sorted({method == "memory" for method, _, _ in todo if method != "copy"}))
-    frames_each = config.evaluate.chain * (config.clip.frames - 1)
+    frames_each = config.evaluate.chain * (config.model.clip.frames - 1)
     total = sum(
         frames_each * min(config.evaluate.batch, len(choices) - first) for _, _, first in todo
     )
@@ -207,7 +207,7 @@ def roll_long(
     if todo:
         model.prepare(sorted({method == "memory" for method in todo if method != "copy"}))
         batch = _load(config, episodes, choices, 0)
-        count = chain * (config.clip.frames - 1)
+        count = chain * (config.model.clip.frames - 1)
         with Meter("long rollouts", len(todo) * count * batch.real, "frames") as meter:
             for method in todo:
                 first, last, frames = _imagine(model, batch, method, config.evaluate.seeds[0])
@@ -230,7 +230,7 @@ def roll_long(
 
 def _map_points(config: Config, maps: Any, shown: int, when: str) -> dict[str, np.ndarray]:
     some = jax.tree.map(lambda leaf: leaf[:shown], maps)
-    points, features, valid = jax.vmap(lambda one: memories.to_points(config, one))(some)
+    points, features, valid = jax.vmap(lambda one: memories.to_points(config.model, one))(some)
     return {
         f"{when}_points": np.asarray(points),
         f"{when}_features": np.asarray(features),

@@ -11,7 +11,12 @@ from typing import Annotated
 import tyro
 
 from pewm_jax import cli
-from pewm_jax.config import MemoryConfig, UserError
+from pewm_jax.config import (
+    DINOv2EncoderConfig,
+    EncoderSettings,
+    PatchColoursConfig,
+    UserError,
+)
 from pewm_jax.data import dataset
 from pewm_jax.memory import feature_build
 from pewm_jax.memory.feature_cache import Dtype
@@ -43,10 +48,10 @@ class CacheConfig:
     """Folder of DINOv2 made by `python -m pewm_jax.convert import dinov2`; empty for the patch
     colours, which have no weights."""
     size: int = 518
-    """Side of the square picture that DINOv2 is shown, pixels; `memory.encoder_size` of the
+    """Side of the square picture that DINOv2 is shown, pixels; `memory.encoder.size` of the
     experiment."""
     patch: int = 2
-    """Pixels per patch of the patch colours; `memory.encoder_patch` of the experiment."""
+    """Pixels per patch of the patch colours; `memory.encoder.patch` of the experiment."""
     dtype: Dtype = "float16"
     """How features are stored."""
     batch: int = 16
@@ -87,13 +92,12 @@ def cache(config: CacheConfig) -> None:
         feature_build.build(settings, params, data, out, dtype=config.dtype, batch=config.batch)
 
 
-def _encoder(config: CacheConfig) -> tuple[MemoryConfig, Params]:
+def _encoder(config: CacheConfig) -> tuple[EncoderSettings, Params]:
     """Return the settings that an experiment with this encoder has, and its parameters."""
     if not config.encoder:
-        return MemoryConfig(encoder="patch_colours", encoder_patch=config.patch), {}
+        return PatchColoursConfig(patch=config.patch), {}
     network, params = dinov2.load(Path(config.encoder))
-    settings = MemoryConfig(encoder="dinov2", dinov2=network, encoder_size=config.size)
-    return settings, params
+    return DINOv2EncoderConfig(size=config.size, network=network), params
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import MemorySettings
 from pewm_jax.geometry.cameras import project, unproject
 from pewm_jax.types import Array, Camera, Frames
 
@@ -19,14 +19,14 @@ FAR_M = 1e4
 """Added to the distance of what no camera has in view, so that it comes after all that is."""
 
 
-def origin(config: MemoryConfig, centre_3: Array) -> Array:
+def origin(config: MemorySettings, centre_3: Array) -> Array:
     """Return (3,) the lower corner of a grid around a world position, snapped to whole cells."""
     cell = np.asarray(config.cell_m, np.float32)
     half = np.asarray(config.cells, np.float32) * cell / 2
     return (jnp.round((jnp.asarray(centre_3) - half) / cell) * cell).astype(jnp.float32)
 
 
-def keys(config: MemoryConfig, origin_3: Array, points_3: Array) -> Array:
+def keys(config: MemorySettings, origin_3: Array, points_3: Array) -> Array:
     """Return (...,) int32: the number of the cell of each point (..., 3).
 
     Points beyond the grid and points that are not numbers get the number of cells.

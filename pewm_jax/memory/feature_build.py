@@ -14,11 +14,10 @@ from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax import tree, weights
-from pewm_jax.config import MemoryConfig, UserError
+from pewm_jax.config import EncoderSettings, UserError
 from pewm_jax.data.dataset import EpisodeSource, write_json
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.progress import Meter
-from pewm_jax.memory import features as image_features
 from pewm_jax.memory.feature_cache import (
     MANIFEST,
     TENSOR,
@@ -31,12 +30,13 @@ from pewm_jax.memory.feature_cache import (
     read_json,
     refuse_stale,
 )
-from pewm_jax.models import codec
+from pewm_jax.models import encoders
+from pewm_jax.models.signals import signal_from_rgb
 from pewm_jax.types import Array, Params
 
 
 def build(
-    config: MemoryConfig,
+    config: EncoderSettings,
     params: Params,
     data: Path,
     out: Path,
@@ -50,7 +50,7 @@ def build(
     Frames are spread over all devices. Each episode's file is written aside and renamed.
 
     Args:
-        config: names the encoder and how pictures are shown to it.
+        config: the encoder.
         params: the encoder's parameters, empty where it has none.
         data: a finished split.
         out: the folder to fill.
@@ -101,7 +101,7 @@ class _Encoder:
     """The encoder compiled for batches of frames, spread over all devices."""
 
     def __init__(
-        self, config: MemoryConfig, params: Params, batch: int, say: Callable[[str], None]
+        self, config: EncoderSettings, params: Params, batch: int, say: Callable[[str], None]
     ):
         devices = jax.devices()
         mesh = jax.make_mesh((len(devices),), ("frames",), (AxisType.Auto,), devices=devices)
@@ -111,7 +111,7 @@ class _Encoder:
         self._say, self._compiled = say, set()
 
         def encode(params: Params, rgb_THWC: Array) -> Array:
-            return image_features.encode(config, params, codec.signal_from_rgb(rgb_THWC))
+            return encoders.encode(config, params, signal_from_rgb(rgb_THWC))
 
         self._encode = jax.jit(encode, out_shardings=self._spread)
 

@@ -20,10 +20,9 @@ import numpy as np
 
 from pewm_jax import config as configuration
 from pewm_jax import tree, weights
-from pewm_jax.config import MemoryConfig, UserError
+from pewm_jax.config import EncoderSettings, UserError, kinds
 from pewm_jax.data.dataset import Manifest, read_manifest
 from pewm_jax.data.episodes import Episode
-from pewm_jax.models import dinov2
 from pewm_jax.types import Params
 
 MANIFEST = "cache.json"
@@ -49,27 +48,17 @@ class FeatureCache:
     files: Mapping[str, tuple[str, int]]
 
 
-def fingerprint(config: MemoryConfig, params: Params, data: Manifest) -> dict[str, Any]:
+def fingerprint(config: EncoderSettings, params: Params, data: Manifest) -> dict[str, Any]:
     """Return what features depend on: encoder, weights, preprocessing, data.
 
     Weights count by their float32 values, whatever dtype they are stored in; data by the hashes of
     the split's shards.
 
     Args:
-        config: names the encoder and how pictures are shown to it.
+        config: the encoder.
         params: the encoder's parameters, empty where it has none.
         data: the split's manifest.
     """
-    if config.encoder == "dinov2":
-        network: dict[str, Any] = configuration.to_dict(config.dinov2)
-        preprocessing: dict[str, Any] = {
-            "size": config.encoder_size,
-            "resize": "bicubic, antialiased",
-            "mean": list(dinov2.MEAN_3),
-            "std": list(dinov2.STD_3),
-        }
-    else:
-        network, preprocessing = {}, {"patch": config.encoder_patch}
     digest = hashlib.sha256()
     for path, leaf in sorted(tree.flatten(params).items()):
         values = np.ascontiguousarray(jax.device_get(leaf), np.float32)
@@ -77,20 +66,19 @@ def fingerprint(config: MemoryConfig, params: Params, data: Manifest) -> dict[st
         digest.update(values.data)
     shards = "\n".join(shard.sha256 for shard in data.shards)
     return {
-        "encoder": config.encoder,
-        "network": network,
+        "encoder": kinds.of(config).name,
+        **configuration.functions(config).preprocessing(config),
         "weights": digest.hexdigest(),
-        "preprocessing": preprocessing,
         "data": hashlib.sha256(shards.encode()).hexdigest(),
     }
 
 
-def open_cache(path: Path, config: MemoryConfig, params: Params, data: Path) -> FeatureCache:
+def open_cache(path: Path, config: EncoderSettings, params: Params, data: Path) -> FeatureCache:
     """Open a finished cache, if it holds what this encoder makes of this data.
 
     Args:
         path: the cache of one split.
-        config: names the encoder and how pictures are shown to it.
+        config: the encoder.
         params: the encoder's parameters, empty where it has none.
         data: the split that it should belong to.
 
@@ -103,7 +91,7 @@ def open_cache(path: Path, config: MemoryConfig, params: Params, data: Path) -> 
     return cache
 
 
-def require_fresh(cache: FeatureCache, config: MemoryConfig, params: Params, data: Path) -> None:
+def require_fresh(cache: FeatureCache, config: EncoderSettings, params: Params, data: Path) -> None:
     """Refuse a cache of other weights, other preprocessing or other data; see ``open_cache``.
 
     Raises:

@@ -14,9 +14,9 @@ import math
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import Config, MemoryConfig
+from pewm_jax.config import ImagesConfig, ModelConfig
 from pewm_jax.memory import cells
-from pewm_jax.types import Array, Frames, MapTokens
+from pewm_jax.types import Array, Camera, Frames, MapTokens
 
 MOST = 24 * 24
 """Pixels of a frame, in an even grid, whose cells count as covered by it."""
@@ -45,17 +45,22 @@ class Snapshots:
     dropped: Array
 
 
-def patch_grid(config: Config) -> tuple[int, int]:
+def _settings(model: ModelConfig) -> ImagesConfig:
+    assert isinstance(model.memory, ImagesConfig)
+    return model.memory
+
+
+def patch_grid(model: ModelConfig) -> tuple[int, int]:
     """Return rows and columns of patches of a snapshot: K snapshots fit into ``memory.tokens``."""
-    memory, clip = config.memory, config.clip
+    memory, clip = _settings(model), model.clip
     return cells.grid_of(clip.height, clip.width, memory.tokens // memory.snapshots)
 
 
-def empty(config: Config, centre_3: Array, channels: int) -> Snapshots:
+def empty(model: ModelConfig, centre_3: Array) -> Snapshots:
     """Return no snapshots; the cells they will cover are of a grid around a world position."""
-    count, memory = config.memory.snapshots, config.memory
-    patches = math.prod(patch_grid(config))
-    covers = math.prod(cells.grid_of(config.clip.height, config.clip.width, MOST))
+    memory, channels = _settings(model), model.memory.encoder.channels
+    count, patches = memory.snapshots, math.prod(patch_grid(model))
+    covers = math.prod(cells.grid_of(model.clip.height, model.clip.width, MOST))
     return Snapshots(
         jnp.zeros((count, patches, channels)),
         jnp.zeros((count, patches, 3)),
@@ -67,7 +72,7 @@ def empty(config: Config, centre_3: Array, channels: int) -> Snapshots:
 
 
 def remember(
-    config: Config,
+    model: ModelConfig,
     kept: Snapshots,
     frames: Frames,
     features_ThwF: Array,
@@ -76,14 +81,14 @@ def remember(
     """Choose anew among the snapshots kept so far and T frames.
 
     Args:
-        config: the experiment.
+        model: the model.
         kept: the snapshots so far; they win ties against new frames.
         frames: T frames.
         features_ThwF: (T, h, w, F) their patch features, pooled to the patches of a snapshot.
         valid_T: (T,) bool; False frames are ignored.
     """
-    memory, shape = config.memory, features_ThwF.shape
-    rows, columns = patch_grid(config)
+    memory, shape = _settings(model), features_ThwF.shape
+    rows, columns = patch_grid(model)
     points, _, valid = cells.sample(frames, rows, columns, valid_T)
     pooled = jax.image.resize(features_ThwF, (shape[0], rows, columns, shape[-1]), "linear")
     pooled = pooled.reshape(shape[0], rows * columns, shape[-1])
@@ -147,8 +152,9 @@ def greedy_cover(cell_XC: Array, count: int, nowhere: int) -> tuple[Array, Array
     return chosen, gain, left_U.sum(dtype=jnp.int32)
 
 
-def to_points(kept: Snapshots) -> tuple[Array, Array, Array]:
+def to_points(model: ModelConfig, kept: Snapshots) -> tuple[Array, Array, Array]:
     """Return all patches as ``(points_world_V3, features_VF, valid_V)``."""
+    del model
     channels = kept.features_KPF.shape[-1]
     return (
         kept.points_KP3.reshape(-1, 3),
@@ -157,10 +163,11 @@ def to_points(kept: Snapshots) -> tuple[Array, Array, Array]:
     )
 
 
-def tokens(config: MemoryConfig, kept: Snapshots) -> MapTokens:
+def tokens(model: ModelConfig, kept: Snapshots, camera: Camera) -> MapTokens:
     """Return all patches of all snapshots, then masked tokens up to ``memory.tokens``."""
-    parts = to_points(kept)
-    missing = config.tokens - parts[2].shape[0]
+    del camera
+    parts = to_points(model, kept)
+    missing = model.memory.tokens - parts[2].shape[0]
     points, features, valid = (
         jnp.pad(part, [(0, missing)] + [(0, 0)] * (part.ndim - 1)) for part in parts
     )

@@ -10,24 +10,47 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import MemorySettings, ModelConfig
 from pewm_jax.memory import voxel_map
-from pewm_jax.types import Array, VoxelMap
+from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 
 
-def flattened(config: MemoryConfig) -> MemoryConfig:
+def flattened(config: MemorySettings) -> MemorySettings:
     """Return the settings of the voxel map that a 2D map is."""
     (x, y, z), (nx, ny, nz) = config.cell_m, config.cells
     return dataclasses.replace(config, cell_m=(x, y, z * nz), cells=(nx, ny, 1))
 
 
-def empty(config: MemoryConfig, centre_3: Array, channels: int) -> VoxelMap:
-    """Return a 2D map that has seen nothing; arguments as for ``voxel_map.empty``.
+def empty(model: ModelConfig, centre_3: Array) -> VoxelMap:
+    """Return a 2D map that has seen nothing.
 
     The single layer is centred on the given height exactly: snapped to its whole height, as the
     sides are to theirs, it could miss the room.
     """
-    flat = flattened(config)
-    voxels = voxel_map.empty(flat, centre_3, channels)
+    flat = flattened(model.memory)
+    voxels = voxel_map.empty(flat, centre_3, model.memory.encoder.channels)
     bottom = jnp.asarray(centre_3, jnp.float32)[2] - flat.cell_m[2] / 2
     return dataclasses.replace(voxels, origin_3=voxels.origin_3.at[2].set(bottom))
+
+
+def remember(
+    model: ModelConfig,
+    voxels: VoxelMap,
+    frames: Frames,
+    features_ThwF: Array,
+    valid_T: Array | None = None,
+) -> VoxelMap:
+    """Insert the pixels of frames; see ``voxel_map.insert_frames``."""
+    flat = flattened(model.memory)
+    return voxel_map.insert_frames(flat, voxels, frames, features_ThwF, valid_T)
+
+
+def tokens(model: ModelConfig, voxels: VoxelMap, camera: Camera) -> MapTokens:
+    """Choose the cells that condition one clip; see ``voxel_map.tokens``."""
+    size = (model.clip.height, model.clip.width)
+    return voxel_map.tokens(flattened(model.memory), voxels, camera, size)
+
+
+def to_points(model: ModelConfig, voxels: VoxelMap) -> tuple[Array, Array, Array]:
+    """Return the cells' centres, features and whether they are taken."""
+    return voxel_map.to_points(flattened(model.memory), voxels)

@@ -11,7 +11,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.types import MapTokens
+from pewm_jax.config import ModelConfig
+from pewm_jax.types import Array, Camera, Frames, MapTokens
 
 
 @jax.tree_util.register_dataclass
@@ -20,6 +21,37 @@ class Nothing:
     """Holds nothing."""
 
 
-def tokens(count: int, channels: int) -> MapTokens:
-    """Return ``count`` masked tokens."""
+def empty(model: ModelConfig, centre_3: Array) -> Nothing:
+    """Return nothing."""
+    del model, centre_3
+    return Nothing()
+
+
+def remember(
+    model: ModelConfig,
+    memory: Nothing,
+    frames: Frames,
+    features_ThwF: Array,
+    valid_T: Array | None = None,
+) -> Nothing:
+    """Remember nothing."""
+    del model, frames, features_ThwF, valid_T
+    return memory
+
+
+def tokens(model: ModelConfig, memory: Nothing, camera: Camera) -> MapTokens:
+    """Return masked tokens."""
+    del memory, camera
+    return _masked(model, model.memory.tokens)
+
+
+def to_points(model: ModelConfig, memory: Nothing) -> tuple[Array, Array, Array]:
+    """Return one place, not taken."""
+    del memory
+    blank = _masked(model, 1)
+    return blank.points_world_M3, blank.features_MF, blank.valid_M
+
+
+def _masked(model: ModelConfig, count: int) -> MapTokens:
+    channels = model.memory.encoder.channels
     return MapTokens(jnp.zeros((count, channels)), jnp.zeros((count, 3)), jnp.zeros((count,), bool))

@@ -13,7 +13,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import MemorySettings, ModelConfig
 from pewm_jax.memory import cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
@@ -45,8 +45,9 @@ class PointCloud:
     outside: Array
 
 
-def empty(config: MemoryConfig, centre_3: Array) -> PointCloud:
+def empty(model: ModelConfig, centre_3: Array) -> PointCloud:
     """Return a cloud without points, its grid centred on a world position."""
+    config = model.memory
     zero = jnp.zeros((), jnp.int32)
     return PointCloud(
         jnp.full((config.capacity,), math.prod(config.cells), jnp.int32),
@@ -59,7 +60,7 @@ def empty(config: MemoryConfig, centre_3: Array) -> PointCloud:
 
 
 def insert(
-    config: MemoryConfig, cloud: PointCloud, points_P3: Array, rgb_PC: Array, valid_P: Array
+    config: MemorySettings, cloud: PointCloud, points_P3: Array, rgb_PC: Array, valid_P: Array
 ) -> PointCloud:
     """Insert coloured points; new cells beyond the capacity are counted, lower cells stay.
 
@@ -102,23 +103,29 @@ def insert(
 
 
 def remember(
-    config: MemoryConfig, cloud: PointCloud, frames: Frames, valid_T: Array | None = None
+    model: ModelConfig,
+    cloud: PointCloud,
+    frames: Frames,
+    features_ThwF: Array | None = None,
+    valid_T: Array | None = None,
 ) -> PointCloud:
-    """Insert the pixels of posed RGB-D frames, colours in [−1, 1]."""
+    """Insert the pixels of posed RGB-D frames, colours in [−1, 1]; features are not kept."""
+    del features_ThwF
     rows, columns = cells.grid_of(frames.depth_THW.shape[1], frames.depth_THW.shape[2], MOST)
     points, rgb, valid = cells.sample(frames, rows, columns, valid_T)
-    return insert(config, cloud, points.reshape(-1, 3), rgb.reshape(-1, 3), valid.reshape(-1))
+    return insert(model.memory, cloud, points.reshape(-1, 3), rgb.reshape(-1, 3), valid.reshape(-1))
 
 
-def to_points(cloud: PointCloud, channels: int) -> tuple[Array, Array, Array]:
+def to_points(model: ModelConfig, cloud: PointCloud) -> tuple[Array, Array, Array]:
     """Return all slots as ``(points_world_V3, features_VF, valid_V)``.
 
-    Features are the colour and a 1 for being there, then zeros up to ``channels``; free slots are
-    0 altogether.
+    Features are the colour and a 1 for being there, then zeros up to the encoder's channels; free
+    slots are 0 altogether.
 
     Raises:
         ValueError: fewer than four channels.
     """
+    channels = model.memory.encoder.channels
     if channels < CHANNELS:
         raise ValueError(f"a coloured point needs {CHANNELS} channels, got {channels}.")
     valid = cloud.sums_V7[:, 0] > 0
@@ -129,10 +136,9 @@ def to_points(cloud: PointCloud, channels: int) -> tuple[Array, Array, Array]:
     return points, jnp.concatenate([mean[:, 3:], there, padding], -1), valid
 
 
-def tokens(
-    config: MemoryConfig, cloud: PointCloud, camera: Camera, size: tuple[int, int], channels: int
-) -> MapTokens:
+def tokens(model: ModelConfig, cloud: PointCloud, camera: Camera) -> MapTokens:
     """Choose the points that condition one clip: in view first, nearest first."""
-    points, features, valid = to_points(cloud, channels)
-    order = cells.in_view_first(points, valid, camera, size, config.tokens)
+    points, features, valid = to_points(model, cloud)
+    size = (model.clip.height, model.clip.width)
+    order = cells.in_view_first(points, valid, camera, size, model.memory.tokens)
     return MapTokens(features[order], points[order], valid[order])

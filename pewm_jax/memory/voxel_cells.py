@@ -14,11 +14,11 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import MemorySettings
 from pewm_jax.types import Array
 
 
-def nowhere(config: MemoryConfig) -> int:
+def nowhere(config: MemorySettings) -> int:
     """Return the number that stands for no cell; it sorts after all cells."""
     return math.prod(config.cells)
 

@@ -10,13 +10,13 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
 
-from pewm_jax.config import MemoryConfig, UserError
+from pewm_jax.config import MemorySettings, UserError
 from pewm_jax.memory import cells, voxel_cells, voxel_frames
 from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 
 
 def empty(
-    config: MemoryConfig, centre_3: Array, channels: int, dtype: DTypeLike = jnp.float32
+    config: MemorySettings, centre_3: Array, channels: int, dtype: DTypeLike = jnp.float32
 ) -> VoxelMap:
     """Return a map that has seen nothing.
 
@@ -38,7 +38,7 @@ def empty(
     )
 
 
-def cell_centres(config: MemoryConfig, origin_3: Array, cell_V: Array) -> Array:
+def cell_centres(config: MemorySettings, origin_3: Array, cell_V: Array) -> Array:
     """Return (V, 3) world centres of cell numbers (see ``cells.keys``)."""
     _, ny, nz = config.cells
     grid = jnp.stack([cell_V // (ny * nz), cell_V // nz % ny, cell_V % nz], -1)
@@ -46,7 +46,7 @@ def cell_centres(config: MemoryConfig, origin_3: Array, cell_V: Array) -> Array:
 
 
 def insert(
-    config: MemoryConfig, voxels: VoxelMap, points_P3: Array, features_PF: Array, valid_P: Array
+    config: MemorySettings, voxels: VoxelMap, points_P3: Array, features_PF: Array, valid_P: Array
 ) -> VoxelMap:
     """Insert points by scatter-max.
 
@@ -90,7 +90,7 @@ def insert(
 
 
 def insert_frames(
-    config: MemoryConfig,
+    config: MemorySettings,
     voxels: VoxelMap,
     frames: Frames,
     features_ThwF: Array,
@@ -133,7 +133,7 @@ def insert_frames(
     return renewed(config, voxels, cell_V, rows, dropped, beyond)
 
 
-def merge(config: MemoryConfig, a: VoxelMap, b: VoxelMap) -> VoxelMap:
+def merge(config: MemorySettings, a: VoxelMap, b: VoxelMap) -> VoxelMap:
     """Return the union of two maps of one world: the maximum where both have a cell.
 
     While the capacity holds, inserting into a and then into b's points gives the same as merging.
@@ -166,7 +166,7 @@ def count(voxels: VoxelMap) -> Array:
     return voxels.occupied
 
 
-def to_points(config: MemoryConfig, voxels: VoxelMap) -> tuple[Array, Array, Array]:
+def to_points(config: MemorySettings, voxels: VoxelMap) -> tuple[Array, Array, Array]:
     """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0."""
     valid = voxels.cell_of_slot_V < voxel_cells.nowhere(config)
     points = cell_centres(config, voxels.origin_3, jnp.where(valid, voxels.cell_of_slot_V, 0))
@@ -175,7 +175,7 @@ def to_points(config: MemoryConfig, voxels: VoxelMap) -> tuple[Array, Array, Arr
 
 
 def tokens(
-    config: MemoryConfig, voxels: VoxelMap, camera: Camera, size: tuple[int, int]
+    config: MemorySettings, voxels: VoxelMap, camera: Camera, size: tuple[int, int]
 ) -> MapTokens:
     """Choose the M = ``memory.tokens`` cells that condition one clip.
 
@@ -197,7 +197,7 @@ def tokens(
 
 
 def renewed(
-    config: MemoryConfig,
+    config: MemorySettings,
     voxels: VoxelMap,
     cell_V: Array,
     features_VF: Array,

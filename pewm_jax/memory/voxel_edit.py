@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from pewm_jax.config import MemoryConfig, UserError
+from pewm_jax.config import MemorySettings, UserError
 from pewm_jax.geometry.cameras import invert_rigid, transform_points
 from pewm_jax.memory import cells, voxel_cells, voxel_core
 from pewm_jax.types import Array, VoxelMap
 
 
-def erase(config: MemoryConfig, voxels: VoxelMap, box_23: Array) -> VoxelMap:
+def erase(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> VoxelMap:
     """Forget the cells in a box, as if nothing had ever been seen there.
 
     Args:
@@ -38,7 +38,7 @@ def erase(config: MemoryConfig, voxels: VoxelMap, box_23: Array) -> VoxelMap:
     return _only(config, voxels, ~_within(config, voxels, box_23))
 
 
-def copy(config: MemoryConfig, voxels: VoxelMap, box_23: Array) -> VoxelMap:
+def copy(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> VoxelMap:
     """Return a map of the cells in a box alone; nothing counts as dropped or outside in it.
 
     Args:
@@ -55,7 +55,7 @@ def copy(config: MemoryConfig, voxels: VoxelMap, box_23: Array) -> VoxelMap:
 
 
 def paste(
-    config: MemoryConfig, voxels: VoxelMap, piece: VoxelMap, transform: Array | None = None
+    config: MemorySettings, voxels: VoxelMap, piece: VoxelMap, transform: Array | None = None
 ) -> VoxelMap:
     """Put a piece into a map; where both have a cell, the maximum counts.
 
@@ -107,7 +107,7 @@ def paste(
     return voxel_core.renewed(config, voxels, cell_V, jnp.maximum(old, new), dropped, outside)
 
 
-def move(config: MemoryConfig, voxels: VoxelMap, box_23: Array, transform: Array) -> VoxelMap:
+def move(config: MemorySettings, voxels: VoxelMap, box_23: Array, transform: Array) -> VoxelMap:
     """Move what is in a box: copy it, erase it, paste it elsewhere.
 
     Args:
@@ -129,7 +129,7 @@ def _is_rigid(transform: np.ndarray) -> bool:
     return bool(turns and (transform[3] == (0, 0, 0, 1)).all() and np.isfinite(transform).all())
 
 
-def _within(config: MemoryConfig, voxels: VoxelMap, box_23: Array) -> Array:
+def _within(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> Array:
     box_23 = jnp.asarray(box_23, jnp.float32)
     if box_23.shape != (2, 3):
         raise UserError(
@@ -144,14 +144,14 @@ def _within(config: MemoryConfig, voxels: VoxelMap, box_23: Array) -> Array:
     return valid & ((points >= box_23[0]) & (points < box_23[1])).all(-1)
 
 
-def _only(config: MemoryConfig, voxels: VoxelMap, keep_V: Array) -> VoxelMap:
+def _only(config: MemorySettings, voxels: VoxelMap, keep_V: Array) -> VoxelMap:
     none = voxel_cells.nowhere(config)
     cell_V = jnp.sort(jnp.where(keep_V, voxels.cell_of_slot_V, none))
     rows = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, none)
     return voxel_core.renewed(config, voxels, cell_V, rows)
 
 
-def _neighbours(config: MemoryConfig) -> np.ndarray:
+def _neighbours(config: MemorySettings) -> np.ndarray:
     """Return (O, 3) steps to all cells whose centre a turned cell can cover, metres."""
     half_diagonal = math.dist(config.cell_m, (0, 0, 0)) / 2
     reach = [int(half_diagonal / size + 0.5) for size in config.cell_m]

@@ -6,6 +6,7 @@ hand: they are a header and three arrays.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import struct
@@ -15,9 +16,9 @@ from typing import Literal
 import numpy as np
 
 from pewm_jax import weights
-from pewm_jax.config import MemoryConfig, UserError
-from pewm_jax.memory import features as image_features
+from pewm_jax.config import MemorySettings, UserError
 from pewm_jax.memory import voxel_core
+from pewm_jax.models import encoders
 from pewm_jax.types import Array, VoxelMap
 
 FILLED = 0.9
@@ -29,7 +30,7 @@ _TRIANGLES = np.asarray([t for a, b, c, d in _SIDES for t in ((a, b, c), (a, c, 
 
 
 def export(
-    config: MemoryConfig,
+    config: MemorySettings,
     voxels: VoxelMap,
     path: Path,
     *,
@@ -43,7 +44,7 @@ def export(
         voxels: one map.
         path: the file; its suffix, ``.ply`` or ``.glb``, says the format. Its folder is made.
         style: `cubes` or `points`.
-        colours_V3: (V, 3) in [−1, 1] of all slots; by default ``features.colours``: the true ones
+        colours_V3: (V, 3) in [−1, 1] of all slots; by default ``encoders.colours``: the true ones
             where features are colours, else the three principal components.
 
     Raises:
@@ -58,7 +59,9 @@ def export(
         raise UserError(f"the map is empty, so {path} is not written; insert something first.")
     points = points[valid]
     if colours_V3 is None:
-        chosen = image_features.colours(values[valid])
+        fits = values.shape[-1] == config.encoder.channels
+        draw = functools.partial(encoders.colours, config.encoder)
+        chosen = (draw if fits else encoders.principal_colours)(values[valid])
     else:
         chosen = np.asarray(colours_V3, np.float32)[valid]
     chosen = np.pad(chosen, ((0, 0), (0, 3 - chosen.shape[1])))

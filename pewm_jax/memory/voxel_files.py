@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import weights
-from pewm_jax.config import MemoryConfig, UserError
+from pewm_jax.config import MemorySettings, UserError
 from pewm_jax.memory import voxel_cells
 from pewm_jax.types import VoxelMap
 
@@ -17,7 +17,7 @@ NAMES = {"cells_NI": "int32", "counts_3": "int32", "features_NF": "", "origin_3"
 """Tensors of a file and their dtypes; features are float32, bfloat16 or float16."""
 
 
-def save(config: MemoryConfig, voxels: VoxelMap, path: Path) -> None:
+def save(config: MemorySettings, voxels: VoxelMap, path: Path) -> None:
     """Write a map, aside and then renamed; free slots take no space.
 
     Args:
@@ -43,7 +43,7 @@ def save(config: MemoryConfig, voxels: VoxelMap, path: Path) -> None:
     weights.save(Path(path), tensors, words)
 
 
-def load(config: MemoryConfig, path: Path) -> VoxelMap:
+def load(config: MemorySettings, path: Path) -> VoxelMap:
     """Read a map written by ``save``.
 
     Args:
@@ -79,7 +79,7 @@ def load(config: MemoryConfig, path: Path) -> VoxelMap:
     )
 
 
-def _check(config: MemoryConfig, path: Path, words: dict, tensors: dict) -> None:
+def _check(config: MemorySettings, path: Path, words: dict, tensors: dict) -> None:
     """Refuse what is not a map of this grid that fits."""
     if words.get("format") != "voxel map 1" or tensors.keys() != NAMES.keys():
         raise UserError(f"{path} is not a voxel map; give a file that save() has written.")

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import MemorySettings
 from pewm_jax.memory import voxel_cells
 from pewm_jax.types import Array, Camera
 
@@ -26,7 +26,7 @@ WORTH_A_BRANCH = 8192
 """Pixels from which on few corner pixels are sorted by a program of their own."""
 
 
-def pixel_cells(config: MemoryConfig, origin_3: Array, depth_THW: Array, camera: Camera) -> Array:
+def pixel_cells(config: MemorySettings, origin_3: Array, depth_THW: Array, camera: Camera) -> Array:
     """Return (T, H, W) int32, the cell each pixel's surface lies in, as ``cells.keys`` numbers it.
 
     The same as unprojecting to points first, but one pass over the pixels without them.
@@ -116,7 +116,7 @@ def _running_sum(mask_THW: Array) -> Array:
 
 
 def insert(
-    config: MemoryConfig,
+    config: MemorySettings,
     cell_V: Array,
     features_VF: Array,
     cell_THW: Array,

@@ -57,7 +57,8 @@ class LayerNormZero(nn.Module):
 
         Args:
             tokens_BND: (B, L + N, D) text and video tokens.
-            time_BE: (B, E) time embedding.
+            time_BE: (B, E) time embedding; or (B, 1 + t, E): that of the text, and one for each
+                token in time.
             layout: their order.
         """
         width, dtype = tokens_BND.shape[-1], tokens_BND.dtype
@@ -69,7 +70,13 @@ class LayerNormZero(nn.Module):
             name="linear",
         )
         modulation = placement.constrain(linear(nn.silu(time_BE)), "batch")
-        video, text = jnp.split(modulation[:, None], 2, -1)
+        video, text = jnp.split(layers.to_tokens(modulation), 2, -1)
+        if time_BE.ndim == 3:
+            text = jnp.broadcast_to(
+                text[:, :1], (len(text), layout.parts * layout.length, text.shape[-1])
+            )
+            joined = layout.join(text, layout.per_token(video[:, 1:]))
+            video = text = joined
         is_text = jnp.asarray(layout.is_text)
         shift, scale, gate = jnp.split(jnp.where(is_text, text, video), 3, -1)
         normed = layers.layer_norm(tokens_BND, "norm")
@@ -163,12 +170,15 @@ class Ends(nn.Module):
         tokens = placement.constrain(tokens, "batch")
         time = self.time_embed(timesteps_B)
         if self.config.ofs_dim:
-            time += self.ofs_embed(ofs_B)
+            ofs = self.ofs_embed(ofs_B)
+            time += ofs if time.ndim == 2 else ofs[:, None]
         return tokens, time
 
-    def project(self, video_BND: Array, time_BE: Array) -> Array:
-        """Return output patches (B, N, C·p_t·p·p)."""
+    def project(self, video_BND: Array, time_BE: Array, layout: TokenLayout | None = None) -> Array:
+        """Return output patches (B, N, C·p_t·p·p); ``time_BE`` is as for the blocks."""
         modulation = placement.constrain(self.modulate_out(nn.silu(time_BE)), "batch")
+        if layout is not None and time_BE.ndim == 3:
+            modulation = layout.per_token(modulation[:, 1:])
         shift, scale = jnp.split(modulation, 2, -1)
         video = self.norm_out(self.norm_final(video_BND)).astype(self.dtype)
         return self.proj_out(layers.modulate(video, shift, scale))
@@ -255,6 +265,8 @@ def apply(
     *,
     expert: BlockExpert | None = None,
     expert_params: Any = None,
+    modulation_BtE: Array | None = None,
+    added_BND: Array | None = None,
 ) -> Array:
     """Denoise.
 
@@ -264,11 +276,15 @@ def apply(
         latents_BthwC: (B, t, h, w, C) input latents; h and w are multiples of the patch, t of
             ``patch_t``. Their dtype is the dtype of the computation.
         text_BLD: (B, L, text_dim) text tokens.
-        timesteps_B: (B,) diffusion times, 0 … train_steps − 1, or one for all.
+        timesteps_B: (B,) diffusion times, 0 … train_steps − 1, or one for all; or (B, t'), one
+            for each of the t' = t / ``patch_t`` tokens in time (the text gets their mean).
         ofs_B: (B,) second scalar of 1.5-5B-I2V; None is the 2.0 it was trained with.
         expert: run after every block on the video tokens (the memory block), in the order that
             ``layout_of`` says.
         expert_params: the experts' parameters, stacked over layers.
+        modulation_BtE: (B, t', E) added to the time embedding of each token in time (not to that
+            of the text).
+        added_BND: (B, N, D) added to the embedded video tokens, in the order of ``layout_of``.
 
     Returns:
         (B, t, h, w, C_out) prediction in the latents' dtype; C_out is the output layer's.
@@ -289,11 +305,13 @@ def apply(
         ends_params,
         patchify(latents_BthwC, patch, patch_t),
         text_BLD.astype(dtype),
-        jnp.broadcast_to(jnp.asarray(timesteps_B), (batch,)),
+        _for_all(jnp.asarray(timesteps_B), batch),
         jnp.broadcast_to(jnp.asarray(OFS if ofs_B is None else ofs_B), (batch,)),
         method="embed",
     )
     tokens, time = embedded
+    if modulation_BtE is not None or time.ndim == 3:
+        time = _frame_times(time, modulation_BtE)
     if positions.takes_learned(config, grid):
         tokens += params["positions"].astype(dtype)
     elif config.positions in {"sincos", "rope_learned"}:
@@ -301,20 +319,37 @@ def apply(
     angles = positions.joint_angles(config, grid, length)
     layout = layout_of(config, latents_BthwC.shape, length)
     tokens = placement.constrain(layout.arrange(tokens), "batch", "tokens")
+    if added_BND is not None:
+        text, video = layout.split(tokens)
+        tokens = layout.join(text, video + added_BND.astype(dtype))
     angles = None if angles is None else layout.arrange(angles[None])[0]
 
     def body(tokens: Array, layer: tuple[Params, Any]) -> tuple[Array, None]:
         tokens = Block(config).apply({"params": layer[0]}, tokens, time, angles, layout)
         if expert is not None:
             text, video = layout.split(tokens)
-            tokens = layout.join(text, expert(layer[1], video, time))
+            video_time = time[:, 1:] if time.ndim == 3 else time
+            tokens = layout.join(text, expert(layer[1], video, video_time))
         return placement.constrain(tokens, "batch", "tokens"), None
 
     body = jax.checkpoint(body) if config.remat else body
     tokens, _ = jax.lax.scan(body, tokens, (params["blocks"], expert_params))
     video = layout.split(tokens)[1]
-    patches: Array = ends.apply(ends_params, video, time, method="project")
+    patches: Array = ends.apply(ends_params, video, time, layout, method="project")
     return unpatchify(layout.gather(patches), frames, height, width, patch, patch_t)
+
+
+def _for_all(timesteps: Array, batch: int) -> Array:
+    """Give every clip its time, or its times."""
+    return jnp.broadcast_to(timesteps, (batch, *timesteps.shape[1:]))
+
+
+def _frame_times(time: Array, modulation_BtE: Array | None) -> Array:
+    """Return (B, 1 + t, E): the time embedding of the text, and that of each token in time."""
+    base, frames = (time, time[:, None]) if time.ndim == 2 else (time.mean(1), time)
+    if modulation_BtE is not None:
+        frames = frames + modulation_BtE.astype(time.dtype)
+    return jnp.concatenate([base[:, None], frames], 1)
 
 
 def layout_of(config: DiTConfig, shape: tuple[int, ...], length: int) -> TokenLayout:

@@ -46,8 +46,13 @@ def sinusoid(values: Array, channels: int, max_period: float = 1e4) -> Array:
 
 
 def modulate(x: Array, shift_BD: Array, scale_BD: Array) -> Array:
-    """Return x·(1 + scale) + shift, with (B, D) modulation of (B, N, D) tokens."""
-    return x * (1 + scale_BD[:, None]) + shift_BD[:, None]
+    """Return x·(1 + scale) + shift of (B, N, D) tokens, with (B, D) or (B, N, D) modulation."""
+    return x * (1 + to_tokens(scale_BD)) + to_tokens(shift_BD)
+
+
+def to_tokens(x_BD: Array) -> Array:
+    """Let (B, D) stand for all tokens; (B, N, D), one for each, stays."""
+    return x_BD[:, None] if x_BD.ndim == 2 else x_BD
 
 
 def rotate(x: Array, angles: Array) -> Array:

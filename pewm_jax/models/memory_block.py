@@ -13,6 +13,7 @@ stage-1 model. Where a clip's map is empty the whole block is skipped, exactly; 
 
 from __future__ import annotations
 
+import functools
 import math
 
 import flax.linen as nn
@@ -20,9 +21,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import Config
+from pewm_jax.config import AttentionConfig
 from pewm_jax.models import layers, placement
 from pewm_jax.models.memory_geometry import Sightings, frequencies
+from pewm_jax.models.token_layout import TokenLayout
 from pewm_jax.types import Array
 
 PEAK = 12.0
@@ -180,7 +182,13 @@ def _read_seen(
 class MemoryBlock(nn.Module):
     """One memory expert block."""
 
-    config: Config
+    config: AttentionConfig
+    grid: int
+    """Patches along the longer side of the image."""
+    layout: TokenLayout
+    """The order of the video tokens."""
+    always: bool = False
+    """Whether a clip whose memory is empty keeps what does not read it, the feed-forward."""
 
     @nn.compact
     def __call__(
@@ -196,20 +204,24 @@ class MemoryBlock(nn.Module):
 
         Args:
             video_BND: (B, N, D) hidden states H.
-            time_BE: (B, E) time embedding.
+            time_BE: (B, E) time embedding, or (B, t, E), one for each token in time (the map's
+                tokens get their mean).
             camera_BNC: (B, N, C) camera embedding of each video token.
             memory_BMD: (B, M, Dm) embedded map tokens.
             valid_BM: (B, M) bool, False tokens contribute nothing.
             seen: the tokens through the clip's cameras, for projective positions.
         """
-        memory, dtype = self.config.memory, video_BND.dtype
+        config, dtype = self.config, video_BND.dtype
         width, memory_width = video_BND.shape[-1], memory_BMD.shape[-1]
         sizes = [width, width, memory_width, memory_width, width]
         modulation = layers.dense(sum(sizes) + width, dtype, "linear", zero=True)(nn.silu(time_BE))
         modulation = placement.constrain(modulation, "batch")
-        shift, scale, m_shift, m_scale, m_gate, gate = jnp.split(
-            modulation, np.cumsum(sizes).tolist(), -1
-        )
+        parts = jnp.split(modulation, np.cumsum(sizes).tolist(), -1)
+        if time_BE.ndim == 3:
+            spread, mean = self.layout.per_token, functools.partial(jnp.mean, axis=1)
+            apart = (spread, spread, mean, mean, spread, spread)
+            parts = [turn(part) for turn, part in zip(apart, parts, strict=True)]
+        shift, scale, m_shift, m_scale, m_gate, gate = parts
         query = layers.dense(width, dtype, "with_camera")(
             jnp.concatenate([video_BND, camera_BNC], -1)
         )
@@ -219,19 +231,17 @@ class MemoryBlock(nn.Module):
         keys = layers.modulate(layers.layer_norm(memory_BMD, "norm_memory"), m_shift, m_scale)
 
         if seen is None:
-            attend = SinusoidAttention(memory.heads, memory.head_dim, name="attention")
+            attend = SinusoidAttention(config.heads, config.head_dim, name="attention")
             mixed = attend(query, keys, valid_BM)
         else:
-            patch = self.config.codec.spatial * self.config.dit.patch
-            grid = max(self.config.clip.height, self.config.clip.width) // patch
-            attend = ProjectiveAttention(memory.heads, memory.head_dim, grid, name="attention")
+            attend = ProjectiveAttention(config.heads, config.head_dim, self.grid, name="attention")
             mixed = attend(query, keys, seen)
         mixed = layers.dense(width, dtype, "to_out")(mixed)
 
-        out = placement.constrain(video_BND + m_gate[:, None] * mixed, "batch", "tokens")
-        forward = layers.FeedForward(memory.mlp_ratio, name="ff")(layers.layer_norm(out, "norm2"))
-        out = out + gate[:, None] * forward
-        if memory.kind == "none":
+        out = placement.constrain(video_BND + layers.to_tokens(m_gate) * mixed, "batch", "tokens")
+        forward = layers.FeedForward(config.mlp_ratio, name="ff")(layers.layer_norm(out, "norm2"))
+        out = out + layers.to_tokens(gate) * forward
+        if self.always:
             return out
         remembers = valid_BM.any(-1)[:, None, None]
         return jnp.where(remembers, out, video_BND)

@@ -3,7 +3,7 @@
 Two schemes:
 
 * ``sinusoid`` (the paper): a 3D sinusoid of the cell's position, concatenated to its features. The
-  position is in the camera of the clip's first frame or, with ``memory.frame`` world, absolute.
+  position is in the camera of the clip's first frame or, with ``frame`` world, absolute.
 * ``projective``: every cell is moved into the camera of every frame. Its image coordinates give
   the key a rotary embedding, the centre of a patch gives the query the same one, so that a query's
   logit is largest for cells that project into its patch; cells behind the camera or far outside
@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import Config
+from pewm_jax.config import AttentionConfig, ModelConfig
 from pewm_jax.geometry.cameras import invert_rigid, project, transform_points
 from pewm_jax.geometry.plucker import fold_frames
 from pewm_jax.models import placement
@@ -40,7 +40,7 @@ NEAREST_M = 0.05
 class Sightings:
     """Map tokens as seen through the cameras of every token's frames.
 
-    A token covers t = 1 latent frame of q cameras, or ``dit.patch_t`` latent frames and as many
+    A token covers t = 1 latent frame of q cameras, or ``patch_t`` latent frames and as many
     times the cameras; below, t and q count tokens in time and cameras of a token.
 
     Attributes:
@@ -96,38 +96,46 @@ def hidden(uv_TM2: Array, z_TM: Array, visible_TM: Array, size: np.ndarray, bin_
     return visible_TM & (z_TM > BEHIND * nearest)
 
 
-def sightings(config: Config, camera: Camera, points_M3: Array, valid_M: Array) -> Sightings:
+def patch_pixels(model: ModelConfig) -> int:
+    """Return the pixels of a video token, each way."""
+    return model.codec.spatial * model.backbone.places.patch
+
+
+def sightings(
+    model: ModelConfig, config: AttentionConfig, camera: Camera, points_M3: Array, valid_M: Array
+) -> Sightings:
     """Choose and place the map tokens that each camera of a batch of clips looks at.
 
-    Each camera gets the J = ``memory.looks`` nearest tokens in its view; tokens hidden behind
-    much nearer ones come last.
+    Each camera gets the J = ``looks`` nearest tokens in its view; tokens hidden behind much nearer
+    ones come last.
 
     Args:
-        config: the experiment.
+        model: the model.
+        config: the reader.
         camera: (B, T) cameras of the clips.
         points_M3: (B, M, 3) cell centres in the world.
         valid_M: (B, M) bool.
     """
-    clip = config.clip
-    patch = config.codec.spatial * config.dit.patch
+    clip, patch = model.clip, patch_pixels(model)
     rows, columns = clip.height // patch, clip.width // patch
     v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
     centres = np.stack([u.ravel(), v.ravel()], -1).astype(np.float32)
 
     def look(_: None, camera: Camera, points: Array, valid: Array) -> tuple[Array, ...]:
-        return _look(config, camera, points, valid)
+        return _look(model, config, camera, points, valid)
 
     looked = placement.by_batch(look, None, camera, points_M3, valid_M)
-    turns = _angles(jnp.asarray(centres), config.memory.head_dim, max(rows, columns))
+    turns = _angles(jnp.asarray(centres), config.head_dim, max(rows, columns))
     return Sightings(*looked, query_angles_nR=turns)
 
 
-def _look(config: Config, camera: Camera, points_M3: Array, valid_M: Array) -> tuple[Array, ...]:
+def _look(
+    model: ModelConfig, config: AttentionConfig, camera: Camera, points_M3: Array, valid_M: Array
+) -> tuple[Array, ...]:
     """Return the first four fields of ``Sightings``."""
-    clip, codec = config.clip, config.codec
-    patch = codec.spatial * config.dit.patch
-    head_dim, grid = config.memory.head_dim, max(clip.height // patch, clip.width // patch)
-    looks = min(config.memory.looks, points_M3.shape[1])
+    clip, patch, patch_t = model.clip, patch_pixels(model), model.backbone.places.patch_t
+    head_dim, grid = config.head_dim, max(clip.height // patch, clip.width // patch)
+    looks = min(config.looks, points_M3.shape[1])
 
     uv, z = project(points_M3[:, None], camera)
     size = np.array([clip.width, clip.height], np.float32)
@@ -144,27 +152,29 @@ def _look(config: Config, camera: Camera, points_M3: Array, valid_M: Array) -> t
     log_z = jnp.log(jnp.where(visible, z, 1.0))
     place = jnp.concatenate([2 * uv / size - 1, log_z[..., None]], -1)
 
-    fold = jax.vmap(lambda x: group_latents(fold_frames(x, codec.temporal), config.dit.patch_t))
+    fold = jax.vmap(lambda x: group_latents(fold_frames(x, model.codec.temporal), patch_t))
     return fold(index), _angles(fold(uv) / patch, head_dim, grid), fold(place), fold(visible)
 
 
-def sinusoid_3d(config: Config, camera: Camera, points_M3: Array) -> Array:
+def sinusoid_3d(
+    model: ModelConfig, config: AttentionConfig, camera: Camera, points_M3: Array
+) -> Array:
     """Return (B, M, 6·10) sines and cosines of the positions of map tokens.
 
     Wavelengths are geometric from 4 cells' smallest side to 4 × the map's largest extent.
 
     Args:
-        config: the experiment; ``memory.frame`` says where positions count from.
+        model: the model; of its memory, cell size and extent.
+        config: the reader; ``frame`` says where positions count from.
         camera: (B, T) cameras of the clips.
         points_M3: (B, M, 3) world points, metres.
     """
     local = points_M3
-    if config.memory.frame == "camera":
+    if config.frame == "camera":
         first_from_world = invert_rigid(jnp.asarray(camera.world_from_camera)[:, 0])
         local = transform_points(first_from_world, points_M3)
-    shortest = 4 * min(config.memory.cell_m)
-    extent = max(c * n for c, n in zip(config.memory.cell_m, config.memory.cells, strict=True))
-    wavelengths = np.geomspace(shortest, 4 * extent, 10)
+    memory = model.memory
+    wavelengths = np.geomspace(4 * min(memory.cell_m), 4 * memory.extent_m, 10)
     angle = local[..., None] * (2 * math.pi / wavelengths).astype(np.float32)
     angle = angle.reshape(*local.shape[:-1], -1)
     return jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1)

@@ -9,17 +9,42 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import CodecConfig
+from pewm_jax.config import ModelConfig, PixelConfig
 from pewm_jax.geometry.plucker import fold_frames
-from pewm_jax.types import Array
+from pewm_jax.models.costs import Costs
+from pewm_jax.types import Array, Params
+
+SHARDING = ()
+"""It has no parameters."""
 
 
-def encode(config: CodecConfig, video_BTHWC: Array) -> Array:
-    """Encode a video.
+def init(config: PixelConfig, key: Array) -> Params:
+    """Return the parameters: none."""
+    del config, key
+    return {}
+
+
+def costs(model: ModelConfig) -> Costs:
+    """Return the costs: none that count."""
+    del model
+    return Costs()
+
+
+def encode(
+    config: PixelConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
+) -> Array:
+    """Encode a video (B, q·k + 1, H, W, C); see ``fold``."""
+    del params, condition
+    return fold(video_BTHWC, config.spatial, config.temporal)
+
+
+def fold(video_BTHWC: Array, spatial: int, temporal: int) -> Array:
+    """Gather s × s pixels of q frames into the channels of one latent cell.
 
     Args:
-        config: the codec.
         video_BTHWC: (B, q·k + 1, H, W, C) float.
+        spatial: s.
+        temporal: q.
 
     Returns:
         (B, k + 1, H/s, W/s, q·s·s·C) latents.
@@ -28,7 +53,7 @@ def encode(config: CodecConfig, video_BTHWC: Array) -> Array:
         ValueError: the frame count is not q·k + 1, or s does not divide the image.
     """
     batch, frames, height, width, channels = video_BTHWC.shape
-    s, q = config.spatial, config.temporal
+    s, q = spatial, temporal
     if (frames - 1) % q or height % s or width % s:
         raise ValueError(
             f"a video of {frames}×{height}×{width} cannot be folded: the codec needs {q}k + 1 "
@@ -40,16 +65,18 @@ def encode(config: CodecConfig, video_BTHWC: Array) -> Array:
     return grid.reshape(*grid.shape[:4], q * s * s * channels)
 
 
-def decode(config: CodecConfig, latents_BthwC: Array) -> Array:
+def decode(config: PixelConfig, params: Params, latents_BthwC: Array) -> Array:
     """Invert ``encode``; the q copies of the first frame are averaged.
 
     Args:
         config: the codec.
+        params: none.
         latents_BthwC: (B, k + 1, h, w, q·s·s·C).
 
     Returns:
         (B, q·k + 1, h·s, w·s, C) video.
     """
+    del params
     batch, latent_frames, h, w, width = latents_BthwC.shape
     s, q = config.spatial, config.temporal
     grid = latents_BthwC.reshape(batch, latent_frames, h, w, q, s, s, width // (q * s * s))

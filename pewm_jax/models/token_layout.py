@@ -104,6 +104,10 @@ class TokenLayout:
         )
         return text, video
 
+    def per_token(self, frames_BtC: Array) -> Array:
+        """(B, t, C) of tokens in time → (B, N, C) of video tokens, each part by part."""
+        return self.spread(jnp.repeat(frames_BtC, self.patches, 1))
+
     @property
     def is_text(self) -> np.ndarray:
         """Return (N', 1) bool over all tokens: which are text."""

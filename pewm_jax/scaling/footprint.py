@@ -15,16 +15,12 @@ import math
 import jax
 from jax.sharding import Mesh
 
-from pewm_jax import tree
-from pewm_jax.config import Config
-from pewm_jax.models import blocked_attention, vae, world_model
-from pewm_jax.training import sharding
-from pewm_jax.training.costs import encodes, sizes
+from pewm_jax import tree, worlds
+from pewm_jax.config import Config, WorldSettings
+from pewm_jax.models.costs import FLOAT, Share
 from pewm_jax.training.stages import Stage
 from pewm_jax.types import Params
-
-FLOAT = 4
-"""Bytes of a float32: what trains, its moments, average and gradients, and logits."""
+from pewm_jax.worlds import costs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,9 +60,9 @@ class Weights:
     split: tuple[tuple[tuple[str, ...], int], ...]
 
     @classmethod
-    def of(cls, params: Params) -> Weights:
-        """Count parameters, abstract ones too, by the table of ``sharding``."""
-        specs = tree.flatten(tree.assign(sharding.PARAMETERS, params, "sharding rules"))
+    def of(cls, model: WorldSettings, params: Params) -> Weights:
+        """Count parameters, abstract ones too, by the networks' sharding rules."""
+        specs = tree.flatten(tree.assign(worlds.sharding(model), params, "sharding rules"))
         found: dict[tuple[str, ...], int] = {}
         for path, leaf in tree.flatten(params).items():
             axes = tuple(axis for axis in specs[path] if axis)
@@ -106,23 +102,29 @@ class Counts:
 @functools.cache
 def counts(config: Config, stage: Stage) -> Counts:
     """Count the parameters of a stage, without making them."""
-    make = functools.partial(world_model.init, config, memory=stage.memory)
-    params = jax.eval_shape(make, jax.random.key(0))
+    params = jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
     trained, frozen = tree.split(params, stage.trained)
     encoders = {name: frozen.pop(name) for name in ("codec", "encoder") if name in frozen}
-    blocks = {
-        name: {"blocks": params[name]["blocks"]}
-        for name in ("backbone", "memory")
-        if name in params
-    }
-    learning = blocks["memory" if stage.memory else "backbone"]
+    weigh = functools.partial(Weights.of, config.model)
     return Counts(
-        trained=Weights.of(trained),
-        frozen=Weights.of(frozen),
-        encoders=Weights.of(encoders),
-        layer=_count(blocks) // config.dit.layers,
-        trained_layer=_count(learning) // config.dit.layers,
+        trained=weigh(trained),
+        frozen=weigh(frozen),
+        encoders=weigh(encoders),
+        layer=_one_block(params),
+        trained_layer=_one_block(trained),
     )
+
+
+def _one_block(params: Params) -> int:
+    """Count the parameters of one block: what is stacked under ``blocks``, else a whole network."""
+    total = 0
+    for name, part in params.items():
+        if name in ("codec", "encoder", "text"):
+            continue
+        blocks = part.get("blocks", part)
+        layers = jax.tree.leaves(blocks)[0].shape[0] if "blocks" in part else 1
+        total += _count(blocks) // layers
+    return total
 
 
 def _count(params: Params) -> int:
@@ -186,10 +188,14 @@ def footprint(config: Config, stage: Stage, mesh: Arranged, *, wide: int, flash:
     """
     c = counts(config, stage)
     clips = stage.settings(config).batch / mesh.batch
-    frozen_wide = 2 if config.train.dtype == "bfloat16" else FLOAT
+    frozen_wide = 2 if config.model.dtype == "bfloat16" else FLOAT
     trained = FLOAT * c.trained.on(mesh)
     widened = FLOAT * c.frozen.on(mesh) if wide > frozen_wide else 0.0
-    kept, block = _activations(config, stage, mesh, clips, wide, flash=flash)
+    share = share_of(config, stage, mesh, wide=wide, flash=flash)
+    parts = costs.of_stage(config, stage, share)
+    # Encoders work clip by clip, their weights gathered; what comes of it is kept for all clips.
+    pixels = clips * config.model.clip.frames * config.model.clip.height * config.model.clip.width
+    held = max(part.held for part in parts.values()) + 2 * pixels * 3 * FLOAT
     return Footprint(
         trained=trained,
         frozen=frozen_wide * (c.frozen.on(mesh) + c.encoders.on(mesh)),
@@ -197,79 +203,26 @@ def footprint(config: Config, stage: Stage, mesh: Arranged, *, wide: int, flash:
         moments=2 * trained,
         batch=clips * clip_bytes(config, stage),
         gradients=trained,
-        kept=kept,
-        block=block,
+        kept=sum(part.kept for part in parts.values()),
+        block=sum(part.block for part in parts.values()),
         gathered=max(c.layer * wide, c.trained_layer * FLOAT) / mesh.tensor + widened,
-        encoders=_encoders(config, stage, clips, wide, mesh),
+        encoders=held + (c.encoders.count * wide if mesh.fsdp > 1 else 0),
     )
+
+
+def share_of(
+    config: Config, stage: Stage, mesh: Arranged, *, wide: int, flash: bool = False
+) -> Share:
+    """Return what one device has of a step; arguments as for ``footprint``."""
+    clips = stage.settings(config).batch / mesh.batch
+    return Share(clips, mesh.tensor, mesh.context, wide, flash)
 
 
 def clip_bytes(config: Config, stage: Stage) -> float:
     """Return the bytes of one clip of a batch: colours in 8 bits, depth in 32, kept features."""
-    clip, context = config.clip, config.data.context
+    clip, context = config.model.clip, config.data.context
     pixels = (clip.frames + context) * clip.height * clip.width * (3 + FLOAT)
     if not (config.data.features and stage.memory):
         return pixels
-    memory = config.memory
-    if memory.encoder == "dinov2":
-        places = (memory.encoder_size // memory.dinov2.patch) ** 2
-    else:
-        places = (clip.height // memory.encoder_patch) * (clip.width // memory.encoder_patch)
-    return pixels + 2 * context * places * world_model.feature_channels(config)
-
-
-def _activations(
-    config: Config, stage: Stage, mesh: Arranged, clips: float, wide: int, *, flash: bool
-) -> tuple[float, float]:
-    """Return what the forward pass keeps for all blocks, and what one block's backward pass needs.
-
-    In units of a block's tokens (``whole``: B·S·D values, split by ``context``), of what ``tensor``
-    splits too (``part``), of hidden channels, and of tables of logits.
-    """
-    dit, memory, s = config.dit, config.memory, sizes(config)
-    whole = clips * s.joint * s.width * wide / mesh.context
-    part, hidden = whole / mesh.tensor, whole / mesh.tensor * dit.mlp_ratio
-    each = clips * s.video / mesh.context / mesh.tensor
-    video, inner = each * s.width * wide, each * s.inner * wide
-    wider, table = video * memory.mlp_ratio, each * s.seen * memory.heads * FLOAT
-    cells = dit.patch**2 * dit.patch_t
-    patches = clips * s.video * cells * world_model.in_channels(config) * wide
-    logits = clips * dit.heads / mesh.tensor * s.joint**2 / mesh.context
-    if flash:
-        logits = 0.0
-    elif wide == FLOAT and logits > blocked_attention.LOGITS:  # a CPU: in pieces of a head
-        logits = min(clips * s.joint**2 / mesh.context, blocked_attention.LOGITS)
-    shared = 2 * part * (mesh.context - 1)  # keys and values of all tokens, or their gradients
-    common = 4 * FLOAT * logits + shared
-
-    kept = dit.layers * whole
-    if stage.memory and dit.remat:
-        block = 18 * whole + 13 * part + 2 * hidden + 5 * wider + 4 * inner + 3.3 * table
-    elif stage.memory:
-        block = 17 * whole + 13 * part
-        kept = dit.layers * (3 * whole + 7 * part + hidden)
-        kept += dit.layers * (10 * video + 6 * wider + 4.5 * inner + 3.3 * table)
-    elif dit.remat:
-        block = 12 * whole + 13 * part + 5 * hidden + 0.8 * patches
-    else:
-        block = 11 * whole + 13 * part + hidden + 0.8 * patches
-        kept = dit.layers * (3 * whole + 7 * part + hidden)
-    return kept, block + common
-
-
-def _encoders(config: Config, stage: Stage, clips: float, wide: int, mesh: Arranged) -> float:
-    """Return what VAE and DINOv2 hold while they run, clip by clip, their weights gathered."""
-    clip, memory, held = config.clip, config.memory, 0.0
-    pixels = clip.frames * clip.height * clip.width
-    if config.codec.kind == "vae":
-        at_once = vae.ENCODE_FRAMES + clip.frames % vae.ENCODE_FRAMES  # the first chunk's
-        chunk = pixels * min(at_once / clip.frames, 1)
-        widest = 2 * chunk * config.codec.vae.widths[0] * wide  # colour and depth
-        held = 4.4 * widest
-    if stage.memory and encodes(config):
-        s = sizes(config)
-        logits = s.context * memory.dinov2.heads * s.image**2
-        values = s.context * s.image * memory.dinov2.width
-        held = max(held, FLOAT * (2 * logits + 12 * values))
-    signal = 2 * clips * pixels * 3 * FLOAT
-    return held + signal + (counts(config, stage).encoders.count * wide if mesh.fsdp > 1 else 0)
+    encoder = config.model.memory.encoder
+    return pixels + 2 * context * math.prod(encoder.grid(clip)) * encoder.channels

@@ -14,81 +14,17 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import numpy as np
 
-from pewm_jax.config import Config, Launch, UserError
-from pewm_jax.models import world_model
+from pewm_jax.config import Config, Launch, UserError, VAEConfig
+from pewm_jax.data import abstract
 from pewm_jax.scaling import hlo, plan_text, suggest
-from pewm_jax.scaling.footprint import Arranged, Footprint, footprint
-from pewm_jax.scaling.suggest import Choice
+from pewm_jax.scaling.footprint import Arranged, footprint
+from pewm_jax.scaling.stage_plan import Compiled, Plan
 from pewm_jax.training import chips, sharding, stages, step
-from pewm_jax.training.chips import Chip
 from pewm_jax.training.stages import Stage
-from pewm_jax.types import Camera, Clip, Frames
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 """What is never run need not be fast: only the machine code differs, not what is planned."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Compiled:
-    """What the compiler says about one stage's step, per device.
-
-    Attributes:
-        program: its products and communication.
-        arguments: bytes of state and batch.
-        temporary: bytes that the step needs besides.
-        expected: the sum on paper for a CPU, which widens 16 bits to 32 and cuts attention in
-            pieces; to be compared with.
-        seconds: what compiling took.
-    """
-
-    program: hlo.Program
-    arguments: float
-    temporary: float
-    expected: Footprint
-    seconds: float
-
-    @property
-    def peak(self) -> float:
-        """All together."""
-        return self.arguments + self.temporary
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """One stage on one kind of device.
-
-    Attributes:
-        config: the experiment.
-        stage: the stage.
-        chip: the kind of device.
-        choice: the arrangement asked for, and what it takes by the sums on paper.
-        compiled: what the compiler says.
-        best: the best arrangements.
-    """
-
-    config: Config
-    stage: Stage
-    chip: Chip
-    choice: Choice
-    compiled: Compiled
-    best: tuple[Choice, ...]
-
-    @property
-    def raised(self) -> float:
-        """By what the sums are raised where the compiler finds more; never less than 1."""
-        return max(1.0, self.compiled.peak / self.compiled.expected.peak)
-
-    @property
-    def peak(self) -> float:
-        """Bytes on a device that decide: by the sums, more where the compiler finds more."""
-        return self.choice.memory.peak * self.raised
-
-    @property
-    def fits(self) -> bool:
-        """Whether the step fits, with a margin."""
-        return self.peak <= suggest.MARGIN * self.chip.memory
 
 
 def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> list[Plan]:
@@ -111,9 +47,9 @@ def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> 
     devices = virtual(launch.devices)
     plans = []
     for stage in planned:
-        say(f"stage {stage.number}: compiling the real step for {launch.devices} devices …")
+        say(f"{stage.title}: compiling the real step for {launch.devices} devices …")
         compiled = compile_stage(config, stage, devices)
-        say(f"stage {stage.number}: compiled in {compiled.seconds:.0f} s")
+        say(f"{stage.title}: compiled in {compiled.seconds:.0f} s")
         best = suggest.rank(config, stage, launch.devices, chip)[:3]
         choice = suggest.weigh(config, stage, arranged, chip)
         plans.append(Plan(config, stage, chip, choice, compiled, tuple(best)))
@@ -147,7 +83,12 @@ def compile_stage(config: Config, stage: Stage, devices: Sequence[Any]) -> Compi
     began = time.monotonic()
     mesh = sharding.make_mesh(devices, config.train.mesh)
     as_there = _as_on_chips(config)
-    lowered = step.lower_step(as_there, stage, mesh, abstract_clip(config, stage))
+    lowered = step.lower_step(
+        as_there,
+        stage,
+        mesh,
+        abstract.clip(config, stage.settings(config).batch, features=stage.memory),
+    )
     compiled = lowered.compile(compiler_options=QUICK)
     memory, text = compiled.memory_analysis(), compiled.as_text()
     if memory is None or text is None:
@@ -162,39 +103,12 @@ def compile_stage(config: Config, stage: Stage, devices: Sequence[Any]) -> Compi
     )
 
 
-def abstract_clip(config: Config, stage: Stage) -> Clip:
-    """Return the shapes and types of a batch, as the loader makes it, without reading any."""
-    batch, clip = stage.settings(config).batch, config.clip
-
-    def array(*shape: int, dtype: Any = np.float32) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((batch, *shape), dtype)
-
-    def frames(count: int) -> Frames:
-        return Frames(
-            array(count, clip.height, clip.width, 3, dtype=np.uint8),
-            array(count, clip.height, clip.width),
-            Camera(array(count, 4), array(count, 4, 4)),
-        )
-
-    context, features = config.data.context, None
-    if config.data.features and stage.memory:
-        memory = config.memory
-        rows = columns = memory.encoder_size // memory.dinov2.patch
-        if memory.encoder != "dinov2":
-            rows, columns = (n // memory.encoder_patch for n in (clip.height, clip.width))
-        channels = world_model.feature_channels(config)
-        features = array(context, rows, columns, channels, dtype=np.float16)
-    valid = array(context, dtype=np.bool_)
-    return Clip(frames(clip.frames), frames(context), valid, features)
-
-
 def _as_on_chips(config: Config) -> Config:
     """Have the VAE's convolutions as accelerators run them, not in a CPU's form."""
-    codec = config.codec
-    if codec.vae.convolution != "auto":
+    codec = config.model.codec
+    if not isinstance(codec, VAEConfig) or codec.convolution != "auto":
         return config
-    vae = dataclasses.replace(codec.vae, convolution="volume")
-    return dataclasses.replace(config, codec=dataclasses.replace(codec, vae=vae))
+    return config.with_model(codec=dataclasses.replace(codec, convolution="volume"))
 
 
 def _abstract(arranged: Arranged) -> Any:

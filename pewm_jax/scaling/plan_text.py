@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from pewm_jax.scaling import hlo, suggest
+from pewm_jax.scaling.stage_plan import Plan
 from pewm_jax.scaling.suggest import Choice
 from pewm_jax.training.log import duration
-
-if TYPE_CHECKING:
-    from pewm_jax.scaling.plan import Plan
 
 MEMORY = (
     ("weights that train, float32", "trained"),
@@ -34,13 +31,13 @@ def lines(plan: Plan) -> Iterator[str]:
     clips = plan.stage.settings(config).batch
     yield ""
     yield (
-        f"Stage {plan.stage.number} on {choice.mesh.devices} × {chip.name}: {arranged(choice)}; "
-        f"{clips} clips a step, {clips / choice.mesh.batch:g} a device"
+        f"{plan.stage.title.capitalize()} on {choice.mesh.devices} × {chip.name}: "
+        f"{arranged(choice)}; {clips} clips a step, {clips / choice.mesh.batch:g} a device"
     )
     yield "  memory of a device"
     for label, name in MEMORY:
-        yield f"    {label:<42}{size(getattr(choice.memory, name)):>10}"
-    yield f"    {'peak, by the formula':<42}{size(choice.memory.peak):>10}"
+        yield f"    {label:<42}{size(getattr(choice.footprint, name)):>10}"
+    yield f"    {'peak, by the formula':<42}{size(choice.footprint.peak):>10}"
     yield (
         f"    the compiled CPU program: {size(compiled.arguments)} of state and batch + "
         f"{size(compiled.temporary)} = {size(compiled.peak)}, where the formula for a CPU, which "
@@ -71,7 +68,8 @@ def lines(plan: Plan) -> Iterator[str]:
     for best in plan.best:
         fits = "fits" if best.fits else "does not fit"
         yield (
-            f"    {duration(best.time.step_s)}/step, {size(best.memory.peak)}, {fits}: {best.flags}"
+            f"    {duration(best.time.step_s)}/step, {size(best.footprint.peak)}, {fits}: "
+            f"{best.flags}"
         )
 
 
@@ -86,7 +84,7 @@ def _verdict(plan: Plan) -> Iterator[str]:
         why = f"raised by the {raised - 1:.1%} that the CPU program needs above the formula for it"
     else:
         why = "not lowered, though the CPU program needs less than the formula for it"
-    yield f"    that is the formula's {size(plan.choice.memory.peak)}, {why}"
+    yield f"    that is the formula's {size(plan.choice.footprint.peak)}, {why}"
 
 
 def arranged(choice: Choice) -> str:

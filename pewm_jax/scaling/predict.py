@@ -12,19 +12,16 @@ import math
 import numpy as np
 
 from pewm_jax.config import AXES, Config
-from pewm_jax.scaling.footprint import FLOAT, Arranged, counts
-from pewm_jax.training import costs
+from pewm_jax.models.costs import FLOAT, SPLIT, video_tokens
+from pewm_jax.scaling.footprint import Arranged, counts, share_of
 from pewm_jax.training.chips import Chip
 from pewm_jax.training.stages import Stage
+from pewm_jax.worlds import costs
 
 REACHED = {"linear": 0.65, "attention": 0.4, "convolution": 0.4}
 """Shares of the peak that large products reach: assumed, from what is published of such kernels."""
 STREAMED = 0.8
 """Share of the memory's bandwidth that element-wise work reaches; assumed."""
-PASSES = {"backbone": (16, 40), "memory": (14, 34)}
-"""Times that a block's tokens are read or written by element-wise work, forward and backward."""
-PASSES_CODEC = 70
-"""Times that the VAE's widest array is read or written while a clip is encoded."""
 OPTIMIZER = 10
 """Times that each trained parameter's 4 bytes are read or written by clipping, Adam, average."""
 
@@ -67,13 +64,13 @@ def predict(config: Config, stage: Stage, mesh: Arranged, chip: Chip) -> Predict
     products = costs.products(config, stage)
     clips = stage.settings(config).batch
     work = {product: costs.flops_of_device(product, mesh.sizes, clips) for product in products}
-    peak = chip.flops if config.train.dtype == "bfloat16" else chip.flops / 2
+    peak = chip.flops if config.model.dtype == "bfloat16" else chip.flops / 2
     products_s = sum(flops / (peak * REACHED[p.kind]) for p, flops in work.items())
     streaming_s = _streamed(config, stage, mesh) / (chip.bandwidth * STREAMED)
     sent = traffic(config, stage, mesh)
     seconds = {key: size / _rate(mesh, key[1], chip) for key, size in sent.items()}
-    needed = sum(s for (_, axis), s in seconds.items() if axis in costs.SPLIT)
-    behind = sum(s for (_, axis), s in seconds.items() if axis not in costs.SPLIT)
+    needed = sum(s for (_, axis), s in seconds.items() if axis in SPLIT)
+    behind = sum(s for (_, axis), s in seconds.items() if axis not in SPLIT)
     busy = products_s + streaming_s
     waiting_s = needed + max(0.0, behind - busy)
     step_s = busy + waiting_s
@@ -88,7 +85,7 @@ def predict(config: Config, stage: Stage, mesh: Arranged, chip: Chip) -> Predict
         hardware_flops=sum(work.values()),
         mfu=model / (step_s * chip.flops * mesh.devices),
         clips_per_s=clips / step_s,
-        tokens_per_s=clips * costs.sizes(config).video / step_s,
+        tokens_per_s=clips * math.prod(video_tokens(config.model)) / step_s,
     )
 
 
@@ -102,28 +99,22 @@ def traffic(config: Config, stage: Stage, mesh: Arranged) -> dict[tuple[str, str
     is added up over ``tensor``; keys and values are gathered over ``context`` and their gradients
     scattered.
     """
-    c, s, dit = counts(config, stage), costs.sizes(config), config.dit
-    wide = 2 if config.train.dtype == "bfloat16" else FLOAT
-    clips = stage.settings(config).batch / mesh.batch
+    c, remat = counts(config, stage), bool(config.model.backbone.remat)
+    wide = 2 if config.model.dtype == "bfloat16" else FLOAT
+    parts = costs.of_stage(config, stage, share_of(config, stage, mesh, wide=wide))
     parameters = (c.trained.on(mesh) + c.frozen.on(mesh)) * mesh.fsdp * wide
     learnt = c.trained.on(mesh) * mesh.fsdp * wide
-    tokens = clips * s.joint * s.width * wide / mesh.context
-    passes = 2 + dit.remat  # forward, backward, forward again
-    gathered = 2 + (dit.remat and wide < FLOAT)
-    sums = (4 if stage.memory else 2) * dit.layers * passes
+    gathered = 2 + (remat and wide < FLOAT)
+    summed = sum(part.summed for part in parts.values())
+    others = mesh.context - 1
     sent = {
         ("all-gather", "fsdp"): (gathered * parameters + c.encoders.count * wide)
         * _ring(mesh.fsdp),
         ("reduce-scatter", "fsdp"): learnt * _ring(mesh.fsdp),
         ("all-reduce", "data"): 2 * learnt / mesh.fsdp * _ring(mesh.data),
-        ("all-reduce", "tensor"): 2 * sums * tokens * _ring(mesh.tensor),
-        ("all-gather", "context"): (1 + dit.remat)
-        * dit.layers
-        * 2
-        * tokens
-        / mesh.tensor
-        * (mesh.context - 1),
-        ("reduce-scatter", "context"): dit.layers * 2 * tokens / mesh.tensor * (mesh.context - 1),
+        ("all-reduce", "tensor"): 2 * summed * _ring(mesh.tensor),
+        ("all-gather", "context"): others * sum(part.gathered for part in parts.values()),
+        ("reduce-scatter", "context"): others * sum(part.scattered for part in parts.values()),
         ("all-reduce", "context"): 2 * learnt / mesh.fsdp * _ring(mesh.context),
     }
     return {key: size for key, size in sent.items() if size > 0}
@@ -154,15 +145,7 @@ def rate(group: tuple[int, ...], chip: Chip) -> float:
 
 def _streamed(config: Config, stage: Stage, mesh: Arranged) -> float:
     """Return the bytes that element-wise work reads and writes on one device."""
-    s, dit, clip = costs.sizes(config), config.dit, config.clip
-    wide = 2 if config.train.dtype == "bfloat16" else FLOAT
-    clips = stage.settings(config).batch / mesh.batch
-    tokens = clips * s.joint * s.width * wide / mesh.context
-    total = 0.0
-    for part in ("backbone", "memory") if stage.memory else ("backbone",):
-        forward, backward = PASSES[part]
-        total += dit.layers * tokens * (forward * (1 + dit.remat) + backward)
-    if config.codec.kind == "vae":
-        pixels = 2 * (clip.frames + 1) * clip.height * clip.width
-        total += PASSES_CODEC * clips * pixels * config.codec.vae.widths[0] * wide
+    wide = 2 if config.model.dtype == "bfloat16" else FLOAT
+    share = share_of(config, stage, mesh, wide=wide)
+    total = sum(part.streamed for part in costs.of_stage(config, stage, share).values())
     return total + OPTIMIZER * FLOAT * counts(config, stage).trained.on(mesh)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
-from pewm_jax.config import Config
+from pewm_jax.config import Config, functions
 from pewm_jax.scaling.footprint import Arranged, Footprint, footprint
 from pewm_jax.scaling.predict import Prediction, predict
 from pewm_jax.training.chips import Chip
@@ -21,13 +21,13 @@ class Choice:
 
     Attributes:
         mesh: the arrangement.
-        memory: bytes on one device.
+        footprint: bytes on one device.
         time: the step.
         fits: whether memory suffices.
     """
 
     mesh: Arranged
-    memory: Footprint
+    footprint: Footprint
     time: Prediction
     fits: bool
 
@@ -40,15 +40,19 @@ class Choice:
 def has_flash(config: Config, chip: Chip) -> bool:
     """Whether attention runs in a kernel that holds no logits: cuDNN's, in 16 bits."""
     gpu = "NVIDIA" in chip.device_kind
-    return gpu and config.train.dtype == "bfloat16" and config.dit.attention != "xla"
+    return (
+        gpu
+        and config.model.dtype == "bfloat16"
+        and getattr(config.model.backbone, "attention", "xla") != "xla"
+    )
 
 
 def weigh(config: Config, stage: Stage, mesh: Arranged, chip: Chip) -> Choice:
     """Say what a stage takes on an arrangement of one kind of device."""
-    wide = 2 if config.train.dtype == "bfloat16" else 4
-    memory = footprint(config, stage, mesh, wide=wide, flash=has_flash(config, chip))
+    wide = 2 if config.model.dtype == "bfloat16" else 4
+    needed = footprint(config, stage, mesh, wide=wide, flash=has_flash(config, chip))
     time = predict(config, stage, mesh, chip)
-    return Choice(mesh, memory, time, memory.peak <= MARGIN * chip.memory)
+    return Choice(mesh, needed, time, needed.peak <= MARGIN * chip.memory)
 
 
 def arrangements(config: Config, stage: Stage, devices: int) -> Iterator[Arranged]:
@@ -58,7 +62,7 @@ def arrangements(config: Config, stage: Stage, devices: int) -> Iterator[Arrange
     frame for each device.
     """
     batch = stage.settings(config).batch
-    heads = [config.dit.heads, config.memory.heads][: 1 + stage.memory]
+    heads = functions(config.model).split_heads(config.model, stage).values()
     for tensor in _divisors(devices):
         if any(count % tensor for count in heads):
             continue
@@ -82,8 +86,8 @@ def rank(config: Config, stage: Stage, devices: int, chip: Chip) -> list[Choice]
 
 
 def _order(choice: Choice) -> tuple[bool, float, float]:
-    seconds = float(f"{choice.time.step_s:.2g}") if choice.fits else choice.memory.peak
-    return not choice.fits, seconds, choice.memory.peak
+    seconds = float(f"{choice.time.step_s:.2g}") if choice.fits else choice.footprint.peak
+    return not choice.fits, seconds, choice.footprint.peak
 
 
 def _divisors(number: int) -> list[int]:

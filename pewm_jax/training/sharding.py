@@ -1,4 +1,4 @@
-"""Where the state lives: a mesh with four axes, and a table from paths to placements.
+"""Where the state lives: a mesh with four axes, and rules from paths to placements.
 
 ``data`` holds copies of the weights, ``fsdp`` splits weights, optimizer and average (a layer's
 weights are gathered when it computes), ``tensor`` splits heads and feed-forward channels,
@@ -17,8 +17,8 @@ import numpy as np
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax import tree
-from pewm_jax.config import AXES, Config, ConfigError, MeshConfig
+from pewm_jax import tree, worlds
+from pewm_jax.config import AXES, Config, ConfigError, MeshConfig, WorldSettings, functions
 from pewm_jax.models.placement import BATCH
 from pewm_jax.training.stages import Stage
 from pewm_jax.types import Params
@@ -28,50 +28,20 @@ ALL_DATA = MeshConfig()
 
 WHOLE = P()
 
-PARAMETERS: tuple[tuple[str, P], ...] = (
-    # The backbone: matrices into heads and hidden channels, and out of them.
-    (r"backbone/blocks/(to_[qkv]|ff/up|norm[12]/linear)/kernel", P("fsdp", "tensor")),
-    (r"backbone/blocks/(to_[qkv]|ff/up|norm[12]/linear)/bias", P("tensor")),
-    (r"backbone/blocks/(to_out|ff/down)/kernel", P("tensor", "fsdp")),
-    (r"backbone/blocks/(to_out|ff/down)/bias", WHOLE),
-    (r"backbone/blocks/(norm_[qk]|norm[12]/norm)/(scale|bias)", WHOLE),
-    (r"backbone/(patch_embed|text_embed)/kernel", P(None, "fsdp")),
-    (r"backbone/(time_embed|ofs_embed)/linear_[12]/kernel", P(None, "fsdp")),
-    (r"backbone/modulate_out/kernel", P("fsdp", "tensor")),
-    (r"backbone/modulate_out/bias", P("tensor")),
-    (r"backbone/proj_out/kernel", P("fsdp", None)),
-    (r"backbone/positions", P(None, "fsdp")),
-    (r"backbone/(patch_embed|text_embed|proj_out|(time|ofs)_embed/linear_[12])/bias", WHOLE),
-    (r"backbone/norm_(final|out)/(scale|bias)", WHOLE),
-    # The memory blocks.
-    (r"memory/blocks/(attention/to_[qkv]|ff/up|linear)/kernel", P("fsdp", "tensor")),
-    (r"memory/blocks/(attention/to_[qkv]|ff/up|linear)/bias", P("tensor")),
-    (r"memory/blocks/(to_out|ff/down)/kernel", P("tensor", "fsdp")),
-    (r"memory/blocks/with_camera/kernel", P(None, "fsdp")),
-    (r"memory/(camera|tokens)/kernel", P(None, "fsdp")),
-    (r"memory/blocks/attention/([qk]_constant|k_depth)", P("tensor", None)),
-    (r"memory/blocks/attention/(nearer|sink)", P("tensor")),
-    (r"memory/blocks/(to_out|ff/down|with_camera)/bias", WHOLE),
-    (r"memory/(camera|tokens)/bias", WHOLE),
-    (r"memory/blocks/(attention/norm_[qk]|norm_video|norm_memory|norm2)/(scale|bias)", WHOLE),
-    # Frozen networks: gathered when they compute, each device its own examples.
-    (r"(codec|encoder)/.*/kernel", P(None, "fsdp")),
-    (r"encoder/position_embed", P(None, "fsdp")),
-    (r"encoder/register_tokens", P(None, "fsdp")),
-    (r"encoder/blocks/scale[12]", WHOLE),
-    (r"encoder/cls_token", WHOLE),
-    (r"(codec|encoder)/.*/(scale|bias)", WHOLE),
-    (r"text/prompt_LC", P(None, "fsdp")),
-)
-"""Path of a parameter → the mesh axes of its *last* axes; those before them (stacked layers, taps
-of a convolution) are never split. The first match wins, and every parameter must be matched."""
 
-STATE_RULES: tuple[tuple[str, P], ...] = (
-    *((rf"(params|ema|opt_state/.+)/{path}", spec) for path, spec in PARAMETERS),
-    (r"opt_state/.*count", WHOLE),
-    (r"step", WHOLE),
-)
-"""The same for each leaf of a ``TrainState``: average and moments lie with their parameter."""
+def rules(model: WorldSettings) -> tuple[tuple[str, P], ...]:
+    """Return the rules of a ``TrainState``: average and moments lie with their parameter.
+
+    A rule leads from the path of a parameter to the mesh axes of its *last* axes; those before them
+    (stacked layers, taps of a convolution) are never split. The first match wins, and every
+    parameter must be matched. Each network says its own (``SHARDING``, beside its functions).
+    """
+    parameters = worlds.sharding(model)
+    return (
+        *((rf"(params|ema|opt_state/.+)/{path}", spec) for path, spec in parameters),
+        (r"opt_state/.*count", WHOLE),
+        (r"step", WHOLE),
+    )
 
 
 def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_DATA) -> Mesh:
@@ -85,7 +55,7 @@ def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_D
     return jax.make_mesh(arranged.shape(len(devices)), AXES, types, devices=devices)
 
 
-def of_state(mesh: Mesh | AbstractMesh, state: Any) -> Any:
+def of_state(model: WorldSettings, mesh: Mesh | AbstractMesh, state: Any) -> Any:
     """Return the shardings of a (possibly abstract) state, as a tree of its structure.
 
     An axis of the mesh that does not divide its axis of a leaf is left out for that leaf;
@@ -97,16 +67,16 @@ def of_state(mesh: Mesh | AbstractMesh, state: Any) -> Any:
     return jax.tree.map(
         lambda leaf, spec: NamedSharding(mesh, _fitted(mesh, leaf, spec)[0]),
         state,
-        _specs(state),
+        _specs(model, state),
     )
 
 
-def constrain(params: Params) -> Params:
+def constrain(model: WorldSettings, params: Params) -> Params:
     """Keep a tree of parameters, or of their gradients, where the table says; within a step."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty or mesh.size == 1:
         return params
-    specs = tree.assign(STATE_RULES, {"params": params}, "sharding rules")["params"]
+    specs = tree.assign(rules(model), {"params": params}, "sharding rules")["params"]
     return jax.tree.map(
         lambda x, spec: jax.lax.with_sharding_constraint(x, _fitted(mesh, x, spec)[0]),
         params,
@@ -114,20 +84,23 @@ def constrain(params: Params) -> Params:
     )
 
 
-def left_out(mesh: Mesh | AbstractMesh, state: Any) -> dict[str, tuple[str, ...]]:
+def left_out(
+    model: WorldSettings, mesh: Mesh | AbstractMesh, state: Any
+) -> dict[str, tuple[str, ...]]:
     """Return the leaves that are not split as their rule says, and the mesh axes left out.
 
     Args:
+        model: says where its parameters lie.
         mesh: the devices.
         state: a (possibly abstract) state.
     """
-    leaves, specs = tree.flatten(state), tree.flatten(_specs(state))
+    leaves, specs = tree.flatten(state), tree.flatten(_specs(model, state))
     missed = {path: _fitted(mesh, leaf, specs[path])[1] for path, leaf in leaves.items()}
     return {path: axes for path, axes in missed.items() if axes}
 
 
-def _specs(state: Any) -> Any:
-    return tree.assign(STATE_RULES, state, "sharding rules")
+def _specs(model: WorldSettings, state: Any) -> Any:
+    return tree.assign(rules(model), state, "sharding rules")
 
 
 def _fitted(mesh: Mesh | AbstractMesh, leaf: Any, spec: P) -> tuple[P, tuple[str, ...]]:
@@ -213,9 +186,7 @@ def require_divisible(config: Config, stage: Stage, mesh: Mesh | AbstractMesh) -
             f"use a multiple of {devices}."
         )
     tensor = mesh.shape["tensor"]
-    heads: Mapping[str, int] = {"dit.heads": config.dit.heads}
-    if stage.memory:
-        heads = {**heads, "memory.heads": config.memory.heads}
+    heads: Mapping[str, int] = functions(config.model).split_heads(config.model, stage)
     for name, count in heads.items():
         if count % tensor:
             raise ConfigError(

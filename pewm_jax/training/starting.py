@@ -24,8 +24,8 @@ def left(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
 def require_weights(config: Config) -> None:
     """Refuse networks that are not trained here and that no converted weights are named for."""
     frozen = {
-        "codec.kind vae": config.codec.kind == "vae",
-        "memory.encoder dinov2": config.memory.encoder == "dinov2",
+        "codec.kind vae": config.model.codec.kind == "vae",
+        "memory.encoder dinov2": config.model.memory.encoder == "dinov2",
     }
     for setting, wanted in frozen.items():
         if wanted and not config.train.start:
@@ -55,7 +55,7 @@ def named(config: Config, stage: Stage, say: Callable[[str], None]) -> Params | 
 
 def encoder(config: Config) -> Params:
     """Return the image encoder's weights as they are given, to compare kept features with."""
-    if config.memory.encoder != "dinov2":
+    if config.model.memory.encoder != "dinov2":
         return {}
     return _given(config)["encoder"]
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 
 from pewm_jax import tree
 from pewm_jax.config import Config
-from pewm_jax.models import world_model
 from pewm_jax.training import optimizer
 from pewm_jax.training.stages import Stage
 from pewm_jax.types import Array, Params
@@ -27,8 +26,8 @@ class TrainState:
     """The state of one stage.
 
     Attributes:
-        params: all parameters of the stage: trained ones in float32, frozen ones in
-            ``train.dtype``, which is all that computing with them takes.
+        params: all parameters of the stage: trained ones in float32, frozen ones in the model's
+            ``dtype``, which is all that computing with them takes.
         ema: exponential moving average of the trained parameters only.
         opt_state: optimizer state; moments of the trained parameters only.
         step: () int32, steps done; also the position in the data.
@@ -52,7 +51,7 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
     Raises:
         TreeError: ``start`` has other paths or shapes.
     """
-    params = world_model.init(config, key, memory=stage.memory)
+    params = stage.init(config.model, key)
     if start is not None:
         require_start(config, stage, start, params)
         given = tree.flatten(start)
@@ -63,13 +62,18 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
             }
         )
     trained, frozen = tree.split(params, stage.trained)
-    params = tree.merge(trained, jax.tree.map(lambda x: x.astype(config.train.dtype), frozen))
+    params = tree.merge(trained, jax.tree.map(lambda x: x.astype(config.model.dtype), frozen))
     return TrainState(
         params=params,
         ema=jax.tree.map(jnp.copy, trained),
         opt_state=optimizer.make(config, stage).init(params),
         step=jnp.zeros((), jnp.int32),
     )
+
+
+def _frozen_dtype(config: Config) -> str:
+    """Return the dtype that frozen weights are kept in: that of the model's computation."""
+    return getattr(config.model, "dtype", "float32")
 
 
 def require_start(config: Config, stage: Stage, start: Any, like: Params) -> None:
@@ -95,7 +99,7 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Non
         if path in given or not any(re.fullmatch(rule, path) for rule in config.train.fresh)
     }
     allowed = ", ".join(config.train.fresh) or "none"
-    what = f"What stage {stage.number} starts from (train.fresh, what it may lack: {allowed})"
+    what = f"What {stage.title} starts from (train.fresh, what it may lack: {allowed})"
     tree.require_like(given, wanted, what)
 
 

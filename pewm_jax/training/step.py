@@ -19,7 +19,6 @@ from jax.sharding import Mesh
 
 from pewm_jax import tree
 from pewm_jax.config import Config
-from pewm_jax.diffusion import objective
 from pewm_jax.training import optimizer, sharding
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import TrainState, create, require_start, update_ema
@@ -51,10 +50,10 @@ def train_step(
 
     def loss_of(trained: Params) -> tuple[Array, Metrics]:
         params = tree.merge(trained, frozen)
-        return objective.loss(config, params, clip, step_key, memory=stage.memory)
+        return stage.loss(config.model, config.train, params, clip, step_key)
 
     (loss, measured), gradients = jax.value_and_grad(loss_of, has_aux=True)(trained)
-    gradients = sharding.constrain(gradients)
+    gradients = sharding.constrain(config.model, gradients)
     still = jax.tree.map(jnp.zeros_like, frozen)
     updates, opt_state = optimizer.make(config, stage).update(
         tree.merge(gradients, still), state.opt_state, state.params
@@ -89,7 +88,7 @@ def stage_key(config: Config, stage: Stage) -> Array:
 def abstract_state(config: Config, stage: Stage, mesh: Mesh) -> Any:
     """Return the state's shapes, types and placements without computing anything."""
     shapes = jax.eval_shape(functools.partial(create, config, stage), stage_key(config, stage))
-    return sharding.abstract(shapes, sharding.of_state(mesh, shapes))
+    return sharding.abstract(shapes, sharding.of_state(config.model, mesh, shapes))
 
 
 def initial_state(

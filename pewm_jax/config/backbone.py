@@ -1,0 +1,57 @@
+"""What the settings of every denoiser say."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+from pewm_jax.config.errors import require
+from pewm_jax.config.kinds import Settings
+
+
+@dataclasses.dataclass(frozen=True)
+class Places:
+    """Where in a backbone a memory reader runs, and what it finds there.
+
+    Attributes:
+        count: how often it runs; its parameters are stacked over that.
+        width: D, channels of the hidden video tokens (B, N, D).
+        time: E, channels of the time embedding (B, E).
+        patch: latent cells per token, each way.
+        patch_t: latent frames per token.
+    """
+
+    count: int
+    width: int
+    time: int
+    patch: int = 1
+    patch_t: int = 1
+
+
+class BackboneSettings(Settings):
+    """What the settings of every backbone say; ``pewm_jax.models.backbones`` says what it does.
+
+    Attributes:
+        places: where a memory reader runs.
+        text_shape: (length, channels) of the text tokens that it takes; None where it takes none.
+        stores_prompt: whether a prompt's embedding is kept with the weights.
+        split_heads: what ``train.mesh.tensor`` must divide.
+        remat: whether the backward pass computes activations anew.
+    """
+
+    SECTION: ClassVar[str] = "backbone"
+    places: Any
+    text_shape: Any = None
+    stores_prompt: Any = False
+    split_heads: Any = 1
+    remat: Any = False
+
+    def check(self, model: Any) -> None:
+        """Refuse latents that do not split into the backbone's patches."""
+        step = model.codec.spatial * self.places.patch
+        clip = model.clip
+        require(
+            clip.height % step == 0 and clip.width % step == 0,
+            f"clip {clip.height}×{clip.width}: height and width must be multiples of "
+            f"codec.spatial × backbone.patch = {step}; change the clip's size or the patch.",
+        )

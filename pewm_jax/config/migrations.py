@@ -1,0 +1,122 @@
+"""Settings written by earlier versions of this library, brought up to the present one.
+
+``config.json`` says its version; files from before there was one are version 1. Each version has
+one function that turns its values into those of the next.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+from pewm_jax.config.errors import ConfigError
+from pewm_jax.config.experiment import VERSION
+
+Values = dict[str, Any]
+
+
+def upgrade(values: Values, where: str) -> Values:
+    """Bring a configuration's plain values to the present version.
+
+    Args:
+        values: nested plain values, as read from JSON; they are not changed.
+        where: name of the file in the error message.
+
+    Raises:
+        ConfigError: the values are of a newer version than this library knows, or of none.
+    """
+    version = values.get("version", 1)
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        raise ConfigError(f"{where} says version {version!r}: it must be a whole number from 1.")
+    if version > VERSION:
+        raise ConfigError(
+            f"{where} is of version {version}, and this pewm_jax reads versions up to {VERSION}: "
+            "install a newer pewm_jax."
+        )
+    values = copy.deepcopy(values)
+    for number in range(version, VERSION):
+        values = MIGRATIONS[number](values)
+        values["version"] = number + 1
+    return values
+
+
+def from_1(values: Values) -> Values:
+    """Gather the model's sections under ``model``, and name the kind of each part."""
+    old = dict(values)
+    model: Values = {}
+    for name in ("clip", "actions"):
+        if name in old:
+            model[name] = old.pop(name)
+    train = old.get("train", {})
+    _move(train, "dtype", model, "dtype")
+    diffusion = old.pop("diffusion", {})
+    for name in ("image_noise_mean", "image_noise_std"):
+        _move(diffusion, name, train, name)
+    if diffusion:
+        model["noise"] = {"kind": "ddpm", **diffusion}
+    if train:
+        old["train"] = train
+    if "codec" in old:
+        model["codec"] = _codec(old.pop("codec"))
+    if "dit" in old:
+        model["backbone"] = {"kind": "dit", **old.pop("dit")}
+    if "memory" in old:
+        memory = old.pop("memory")
+        clip = model.setdefault("clip", {})
+        _move(memory, "depth", clip, "depth")
+        model["memory"] = _memory(memory)
+    return {"version": 2, "model": {"kind": "pewm", **model}, **old}
+
+
+def _codec(old: Values) -> Values:
+    if old.get("kind", "pixel") == "vae":
+        return {"kind": "vae", **old.get("vae", {})}
+    kept = {name: value for name, value in old.items() if name != "vae"}
+    return {"kind": "pixel", **kept}
+
+
+def _memory(old: Values) -> Values:
+    """Split what is remembered from its features (``encoder``) and from who reads it."""
+    new: Values = {"kind": old.pop("kind", "voxel")}
+    encoder: Values = {"kind": old.pop("encoder", "patch_colours")}
+    patch, size, network = (old.pop(n, None) for n in ("encoder_patch", "encoder_size", "dinov2"))
+    parts = (
+        {"patch": patch}
+        if encoder["kind"] == "patch_colours"
+        else {"size": size, "network": network}
+    )
+    encoder |= {name: value for name, value in parts.items() if value is not None}
+    reader: Values = {"kind": "attention"}
+    for name in ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio"):
+        _move(old, name, reader, name)
+    if new["kind"] != "images":
+        old.pop("snapshots", None)
+    return new | old | {"encoder": encoder, "reader": reader}
+
+
+def _move(old: Values, name: str, new: Values, to: str) -> None:
+    if name in old:
+        new[to] = old.pop(name)
+
+
+MIGRATIONS: dict[int, Callable[[Values], Values]] = {1: from_1}
+"""Version → the function that leads to the next."""
+
+RENAMED_FLAGS = (
+    ("dit.", "model.backbone."),
+    ("diffusion.image_noise_", "train.image_noise_"),
+    ("diffusion.", "model.noise."),
+    ("codec.vae.", "model.codec."),
+    ("train.dtype", "model.dtype"),
+    ("memory.depth", "model.clip.depth"),
+    ("memory.dinov2.", "model.memory.encoder.network."),
+    ("memory.encoder_patch", "model.memory.encoder.patch"),
+    ("memory.encoder_size", "model.memory.encoder.size"),
+    *(
+        (f"memory.{name}", f"model.memory.reader.{name}")
+        for name in ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio")
+    ),
+)
+"""How flags were called in version 1 → how they are called now; the first match counts. An entry
+that ends in a dot stands for all that begins so."""

@@ -1,0 +1,89 @@
+"""Continuous noise σ with preconditioning (Karras et al. 2022, arXiv 2206.00364).
+
+The network F sees c_in x and log σ / 4; clean latents are c_skip x + c_out F (its Eq. 7 and Table
+1), so that input and target have unit variance at every σ.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import EDMConfig
+from pewm_jax.diffusion.noise import Denoiser, spread
+from pewm_jax.types import Array
+
+
+def draw(config: EDMConfig, key: Array, batch: int, frames: int) -> Array:
+    """Draw (B,) σ, log-normal."""
+    del frames
+    return jnp.exp(config.log_mean + config.log_std * jax.random.normal(key, (batch,)))
+
+
+def corrupt(config: EDMConfig, x0: Array, noise: Array, time_B: Array) -> Array:
+    """Return x0 + σ ε."""
+    del config
+    return x0 + spread(time_B, x0.ndim) * noise
+
+
+def _scales(config: EDMConfig, sigma: Array) -> tuple[Array, Array, Array]:
+    """Return c_skip, c_out and c_in."""
+    data = config.sigma_data
+    total = sigma**2 + data**2
+    return data**2 / total, sigma * data / jnp.sqrt(total), 1 / jnp.sqrt(total)
+
+
+def shown(config: EDMConfig, x_t: Array, time_B: Array) -> tuple[Array, Array]:
+    """Return c_in x and log σ / 4."""
+    _, _, scale = _scales(config, spread(time_B, x_t.ndim))
+    return scale * x_t, jnp.log(time_B) / 4
+
+
+def target(config: EDMConfig, x0: Array, noise: Array, time_B: Array) -> Array:
+    """Return (x0 − c_skip x_t) / c_out."""
+    skip, out, _ = _scales(config, spread(time_B, x0.ndim))
+    return (x0 - skip * corrupt(config, x0, noise, time_B)) / out
+
+
+def weight(config: EDMConfig, time_B: Array) -> Array:
+    """Return 1: λ(σ) c_out² = 1 in the paper's weighting of the error of x0."""
+    del config
+    return jnp.ones(time_B.shape)
+
+
+def to_x0(config: EDMConfig, prediction: Array, x_t: Array, time_B: Array) -> Array:
+    """Return c_skip x + c_out F."""
+    skip, out, _ = _scales(config, spread(time_B, x_t.ndim))
+    return skip * x_t + out * prediction
+
+
+def levels(config: EDMConfig) -> np.ndarray:
+    """Return (sample_steps,) σ from sigma_max to sigma_min (its Eq. 5)."""
+    high, low = config.sigma_max ** (1 / config.rho), config.sigma_min ** (1 / config.rho)
+    share = np.linspace(0, 1, config.sample_steps)
+    return (high + share * (low - high)) ** config.rho
+
+
+def sample(config: EDMConfig, denoise: Denoiser, noise: Array, key: Array | None = None) -> Array:
+    """Follow the probability-flow ODE dx/dσ = (x − x0)/σ by Euler's or Heun's method (Alg. 1)."""
+    del key
+    sigmas = np.asarray(levels(config), np.float32)
+    after = np.append(sigmas[1:], np.float32(0))
+
+    def slope(x: Array, sigma: Array) -> Array:
+        x0 = denoise(x, jnp.full((x.shape[0],), sigma), jnp.float32(config.guidance))
+        return (x - x0) / sigma
+
+    def step(x: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
+        now, then = row
+        first = slope(x, now)
+        moved = x + (then - now) * first
+        if config.sampler == "heun":
+            second = slope(moved, jnp.maximum(then, config.sigma_min))
+            better = x + (then - now) * (first + second) / 2
+            moved = jnp.where(then > 0, better, moved)
+        return moved.astype(x.dtype), None
+
+    out, _ = jax.lax.scan(step, noise * sigmas[0], (jnp.asarray(sigmas), jnp.asarray(after)))
+    return out

@@ -1,0 +1,33 @@
+"""The voxel map as a memory: the functions that ``memories`` calls."""
+
+from __future__ import annotations
+
+from pewm_jax.config import ModelConfig
+from pewm_jax.memory import voxel_map
+from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
+
+
+def empty(model: ModelConfig, centre_3: Array) -> VoxelMap:
+    """Return a map that has seen nothing, its grid around a world position."""
+    return voxel_map.empty(model.memory, centre_3, model.memory.encoder.channels)
+
+
+def remember(
+    model: ModelConfig,
+    voxels: VoxelMap,
+    frames: Frames,
+    features_ThwF: Array,
+    valid_T: Array | None = None,
+) -> VoxelMap:
+    """Insert the pixels of frames; see ``voxel_map.insert_frames``."""
+    return voxel_map.insert_frames(model.memory, voxels, frames, features_ThwF, valid_T)
+
+
+def tokens(model: ModelConfig, voxels: VoxelMap, camera: Camera) -> MapTokens:
+    """Choose the cells that condition one clip; see ``voxel_map.tokens``."""
+    return voxel_map.tokens(model.memory, voxels, camera, (model.clip.height, model.clip.width))
+
+
+def to_points(model: ModelConfig, voxels: VoxelMap) -> tuple[Array, Array, Array]:
+    """Return the cells' centres, features and whether they are taken."""
+    return voxel_map.to_points(model.memory, voxels)

@@ -1,0 +1,134 @@
+"""Pixels ↔ latents: every codec behind one interface, chosen by the type of its settings.
+
+A codec is a ``CodecSettings`` and a module (or object) with
+
+    init(settings, key) -> params                                    {} where there are none
+    encode(settings, params, video_BTHWC, *, condition=False) -> latents_BthwC
+    decode(settings, params, latents_BthwC) -> video_BTHWC
+    SHARDING                                                         rules over ``codec/…`` paths
+    costs(model) -> Costs                                            see ``models.costs``
+
+and keeps the frame rule q·k + 1 frames → k + 1 latent frames. Colour and depth are encoded
+separately and their channels concatenated, as the paper does with the VAE, which sees depth as a
+grey picture (``DEPTH_AS_GREY``).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+
+from pewm_jax.config import CodecSettings, ModelConfig, functions
+from pewm_jax.models import placement
+from pewm_jax.models.pixel_codec import fold
+from pewm_jax.models.signals import depth_from_signal, signal_from_depth
+from pewm_jax.types import Array, Params
+
+
+def init(config: CodecSettings, key: Array) -> Params:
+    """Return random parameters of a codec; the pixel codec has none."""
+    return functions(config).init(config, key)
+
+
+def encode(
+    config: CodecSettings, params: Params, video_BTHWC: Array, *, condition: bool = False
+) -> Array:
+    """Encode a video.
+
+    Args:
+        config: the codec.
+        params: its parameters, empty for the pixel codec.
+        video_BTHWC: (B, q·k + 1, H, W, C) float in [−1, 1]; C is 3 where depth is encoded as grey.
+        condition: whether the latents are what the denoiser is conditioned on. CogVideoX-1.5's
+            image-to-video model divides these by the scaling factor instead of multiplying.
+
+    Returns:
+        (B, k + 1, H/s, W/s, C') latents.
+
+    Raises:
+        ValueError: the video's size cannot be encoded.
+    """
+    return functions(config).encode(config, params, video_BTHWC, condition=condition)
+
+
+def decode(config: CodecSettings, params: Params, latents_BthwC: Array) -> Array:
+    """Decode latents, the inverse of ``encode``.
+
+    Args:
+        config: the codec.
+        params: its parameters, empty for the pixel codec.
+        latents_BthwC: (B, k + 1, h, w, C') latents; for the VAE k is even.
+
+    Returns:
+        (B, q·k + 1, h·s, w·s, C) video.
+
+    Raises:
+        UserError: latents that the VAE decodes to another number of frames.
+    """
+    return functions(config).decode(config, params, latents_BthwC)
+
+
+def encode_rgbd(
+    model: ModelConfig,
+    params: Params,
+    rgb_BTHWC: Array,
+    depth_BTHW: Array,
+    *,
+    condition: bool = False,
+) -> Array:
+    """Encode colour in [−1, 1] and metric depth separately and concatenate the channels.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; those of the codec are under ``codec``.
+        rgb_BTHWC: (B, T, H, W, 3).
+        depth_BTHW: (B, T, H, W) metres.
+        condition: see ``encode``.
+    """
+    signal = signal_from_depth(model.clip, depth_BTHW)[..., None]
+    weights = params.get("codec", {})
+    if not model.codec.DEPTH_AS_GREY:
+        parts = [encode(model.codec, weights, x, condition=condition) for x in (rgb_BTHWC, signal)]
+        return jnp.concatenate(parts, -1)
+
+    def together(weights: Params, rgb: Array, signal: Array) -> Array:
+        grey = jnp.broadcast_to(signal, rgb.shape)
+        both = jnp.concatenate([rgb, grey]).astype(jnp.dtype(model.dtype))
+        latents = encode(model.codec, weights, both, condition=condition)
+        return jnp.concatenate(jnp.split(latents.astype(jnp.float32), 2), -1)
+
+    def one_by_one(weights: Params, *videos: Array) -> Array:
+        """Encode clip by clip, so that memory does not grow with the batch."""
+        if len(videos[0]) == 1:
+            return together(weights, *videos)
+        one = jax.lax.map(lambda clip: together(weights, *(x[None] for x in clip)), videos)
+        return one[:, 0]
+
+    traced = isinstance(rgb_BTHWC, Tracer)
+    return placement.by_batch(one_by_one if traced else together, weights, rgb_BTHWC, signal)
+
+
+def decode_rgbd(model: ModelConfig, params: Params, latents_BthwC: Array) -> tuple[Array, Array]:
+    """Invert ``encode_rgbd``: colour in [−1, 1] (B, T, H, W, 3) and metric depth (B, T, H, W)."""
+    parts = jnp.split(latents_BthwC, [model.codec.rgb_channels], -1)
+    weights = params.get("codec", {})
+    if not model.codec.DEPTH_AS_GREY:
+        rgb, signal = (decode(model.codec, weights, part) for part in parts)
+    else:
+        both = jnp.concatenate(parts).astype(jnp.dtype(model.dtype))
+        video = decode(model.codec, weights, both).astype(jnp.float32)
+        rgb, signal = jnp.split(video, 2)
+    return jnp.clip(rgb, -1, 1), depth_from_signal(model.clip, signal.mean(-1))
+
+
+def measured(model: ModelConfig, depth_BTHW: Array) -> Array:
+    """Return what share of each depth latent was measured, to weigh its error with.
+
+    Shape (B, t, h, w, C) that broadcasts with the depth channels of ``encode_rgbd``. Where a
+    channel is one pixel, as the pixel codec's are, that is 0 or 1; other latents count by the share
+    of their pixels.
+    """
+    valid = (depth_BTHW > 0).astype(jnp.float32)[..., None]
+    share = fold(valid, model.codec.spatial, model.codec.temporal)
+    return share if model.codec.PIXELWISE else share.mean(-1, keepdims=True)

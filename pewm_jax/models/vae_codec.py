@@ -1,0 +1,89 @@
+"""CogVideoX's video autoencoder as a codec: the mean of its latents, scaled to unit variance."""
+
+from __future__ import annotations
+
+import math
+
+from jax.sharding import PartitionSpec as P
+
+from pewm_jax.config import ModelConfig, VAEConfig
+from pewm_jax.models import vae
+from pewm_jax.models.costs import Costs, Product
+from pewm_jax.models.vae_shapes import layout
+from pewm_jax.types import Array, Params
+
+SHARDING = (
+    (r"codec/.*/kernel", P(None, "fsdp")),
+    (r"codec/.*/(scale|bias)", P()),
+)
+"""Gathered when it computes, each device its own clips."""
+
+PASSES = 70
+"""Times that the widest array is read or written while a clip is encoded."""
+HELD = 4.4
+"""Copies of the widest array of a chunk that are held while it is encoded."""
+
+init = vae.init
+
+
+def encode(
+    config: VAEConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
+) -> Array:
+    """Encode a video to the mean of its latents, scaled; see ``pewm_jax.models.codecs.encode``."""
+    mean, _ = vae.encode(config, params, video_BTHWC)
+    return mean * _scale(config, condition=condition)
+
+
+def decode(config: VAEConfig, params: Params, latents_BthwC: Array) -> Array:
+    """Decode scaled latents to q·(t − 1) + 1 frames.
+
+    Raises:
+        UserError: latents that the VAE decodes to another number of frames.
+    """
+    frames = config.temporal * (latents_BthwC.shape[1] - 1) + 1
+    return vae.decode(config, params, latents_BthwC / config.scaling_factor, frames=frames)
+
+
+def _scale(config: VAEConfig, *, condition: bool) -> float:
+    factor = config.scaling_factor
+    return 1 / factor if condition and config.invert_scale_latents else factor
+
+
+def costs(model: ModelConfig) -> Costs:
+    """Return what encoding colour and depth costs, of the clip and of its first frame."""
+    config, clip = model.codec, model.clip
+    assert isinstance(config, VAEConfig)
+    macs = sum(_encode_macs(config, model, frames) for frames in (clip.frames, 1))
+    pixels = 2 * (clip.frames + 1) * clip.height * clip.width
+    at_once = vae.ENCODE_FRAMES + clip.frames % vae.ENCODE_FRAMES  # the first chunk's
+    chunk = clip.height * clip.width * min(at_once, clip.frames)
+    return Costs(
+        products=(Product("codec", "convolution", 2 * macs),),
+        streamed=PASSES * pixels * config.widths[0],
+        held=HELD * 2 * chunk * config.widths[0],  # colour and depth
+    )
+
+
+def _encode_macs(config: VAEConfig, model: ModelConfig, frames: int) -> float:
+    """Return the multiply-adds of encoding one video."""
+    clip = model.clip
+    halvings = config.temporal.bit_length() - 1
+    total = 0.0
+    for path, shape in layout(config).items():
+        if not (path.startswith("encoder/") and path.endswith("kernel")):
+            continue
+        level = _level(path, len(config.widths))
+        spatial, temporal = level, min(level, halvings)
+        if "resample" in path:
+            spatial, temporal = level + 1, min(level + 1, halvings)
+        cells = (clip.height >> spatial) * (clip.width >> spatial)
+        total += -(-frames // 2**temporal) * cells * math.prod(shape)
+    return total
+
+
+def _level(path: str, levels: int) -> int:
+    """Return how often the frame was halved where a layer of the encoder works."""
+    name = path.split("/")[1]
+    if name == "conv_in":
+        return 0
+    return int(name.removeprefix("down_")) if name.startswith("down_") else levels - 1

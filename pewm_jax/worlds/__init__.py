@@ -1,0 +1,123 @@
+"""Chapter 6, worlds: what is imagined next, whatever it is imagined by.
+
+A world is driven the same way whatever it is made of. All three are pure: jit them with the model
+static, vmap them over states, controls and keys. ::
+
+    state = start(model, params, frames)                        # a few posed RGB-D frames
+    state = observe(model, params, state, frames)               # more of them, half-way
+    state, frames = imagine(model, params, state, control, key) # what will be seen
+
+A world is a ``WorldSettings`` and a module (or object) with these three functions and
+
+    init(model, key) -> params               all parameters
+    stages(model) -> (Stage, …)              how it is trained: ``worlds.stages``
+    sharding(model) -> rules                 path of a parameter → the mesh axes of its last axes
+    split_heads(model, stage) -> {name: n}   what ``train.mesh.tensor`` must divide
+    costs(config, stage, share) -> {part: Costs}
+
+``worlds.pewm`` is the first of them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pewm_jax.config import Config, WorldSettings, functions
+from pewm_jax.types import Array, Frames, Params, WorldState
+from pewm_jax.worlds.stages import Stage
+
+
+def model_of(config: Config | WorldSettings) -> Any:
+    """Return the model's settings, also where a whole experiment's are given."""
+    return config.model if isinstance(config, Config) else config
+
+
+def start(model: Config | WorldSettings, params: Params, frames: Frames) -> WorldState:
+    """Begin a world from a few posed RGB-D frames.
+
+    Args:
+        model: the model's settings, or an experiment's, of which they are taken.
+        params: the world model's parameters; those of the image encoder are used, if it has any.
+        frames: S ≥ 1 frames (S, H, W, …), uint8 or float colours; all are remembered, the last one
+            is the present.
+
+    Returns:
+        The state to imagine from.
+
+    Raises:
+        UserError: the frames' shapes do not agree with each other or with the model.
+    """
+    model = model_of(model)
+    return functions(model).start(model, params, frames)
+
+
+def observe(
+    model: Config | WorldSettings, params: Params, state: WorldState, frames: Frames
+) -> WorldState:
+    """Take in real frames: they are remembered, and the last one becomes the present.
+
+    Args:
+        model: as for ``start``.
+        params: the world model's parameters.
+        state: the world so far.
+        frames: S ≥ 1 frames, as for ``start``.
+
+    Raises:
+        UserError: as ``start``.
+    """
+    model = model_of(model)
+    return functions(model).observe(model, params, state, frames)
+
+
+def imagine(
+    model: Config | WorldSettings,
+    params: Params,
+    state: WorldState,
+    control: Any,
+    key: Array,
+    *,
+    remember: bool = True,
+    memory: bool = True,
+) -> tuple[WorldState, Frames]:
+    """Imagine what will be seen.
+
+    Args:
+        model: as for ``start``; static under jit.
+        params: the world model's parameters.
+        state: from ``start``, ``observe`` or an earlier ``imagine``.
+        control: what is done, for any number n ≥ 1 of frames: (n,) discrete actions (0 forward,
+            1 turn left, 2 turn right), (n, 3) continuous ones (dx, dy, dyaw: metres forward, metres
+            left, radians counter-clockwise), a ``Camera`` (n,) for each frame to imagine (six
+            degrees of freedom), or a ``Control`` with (n,) cameras and (n, A) actions.
+        key: randomness of the sampling noise.
+        remember: whether what is imagined is remembered. Without, states share the memory that
+            they came from: cheap for comparing many controls.
+        memory: False ignores what is remembered (the empty-memory baseline).
+
+    Returns:
+        ``(state, frames)``: the world after the last frame, and the n imagined frames, colours
+        float32 in [−1, 1], depth in metres. Clips are imagined whole; of the last one, what was
+        not asked for is dropped.
+
+    Raises:
+        UserError: the control has another form, or no frames.
+    """
+    model = model_of(model)
+    return functions(model).imagine(
+        model, params, state, control, key, remember=remember, memory=memory
+    )
+
+
+def init(model: WorldSettings, key: Array) -> Params:
+    """Return random parameters of all of a world's networks."""
+    return functions(model).init(model, key)
+
+
+def stages(model: WorldSettings) -> tuple[Stage, ...]:
+    """Return how a world is trained, stage by stage, in order."""
+    return functions(model).stages(model)
+
+
+def sharding(model: WorldSettings) -> tuple[tuple[str, Any], ...]:
+    """Return the rules from paths of parameters to the mesh axes of their last axes."""
+    return functions(model).sharding(model)

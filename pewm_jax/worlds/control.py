@@ -1,0 +1,83 @@
+"""What people give to steer a world, brought into one form: cameras, and actions where known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from pewm_jax.config import ModelConfig, UserError
+from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.types import Array, Camera, Control
+
+
+def control_of(model: ModelConfig, present: Camera, control: Any) -> Control:
+    """Return (n,) cameras of the frames to imagine, and the (n, A) actions that lead to them.
+
+    Args:
+        model: says what a discrete action does.
+        present: (1,) the camera of the present frame.
+        control: actions, a ``Camera`` or a ``Control``; see ``worlds.imagine``.
+
+    Raises:
+        UserError: it has another form, or no frames, or a discrete action is not known (under jit,
+            vmap and grad values are unknown and not checked).
+    """
+    if isinstance(control, Control):
+        count = _require_cameras(control.camera)
+        actions = control.actions_TA
+        if actions is not None and (actions.ndim != 2 or len(actions) != count):
+            raise UserError(
+                f"imagine() got {count} cameras and actions of shape {actions.shape}; give "
+                f"({count}, A): action k leads to camera k."
+            )
+        return Control(_as_arrays(control.camera), actions)
+    if isinstance(control, Camera):
+        _require_cameras(control)
+        return Control(_as_arrays(control))
+    actions = jnp.asarray(control)
+    count = actions.shape[0] if actions.ndim else 0
+    if count == 0:
+        raise UserError("imagine() got no actions; give at least one.")
+    _require_known(actions)
+    moves = action_geometry.continuous(model.actions, actions)
+    if moves.ndim != 2 or moves.shape[1] != 3:
+        raise UserError(
+            f"imagine() got actions of shape {actions.shape}; give ({count},) integers or "
+            f"({count}, 3) floats (dx, dy, dyaw); actions of another kind come with their cameras, "
+            "as a Control."
+        )
+    poses = action_geometry.integrate(present.world_from_camera[0], moves)[1:]
+    intrinsics = jnp.broadcast_to(present.intrinsics_4, (count, 4))
+    return Control(Camera(intrinsics, poses), moves)
+
+
+def _as_arrays(camera: Camera) -> Camera:
+    return Camera(jnp.asarray(camera.intrinsics_4), jnp.asarray(camera.world_from_camera))
+
+
+def _require_cameras(camera: Camera) -> int:
+    """Refuse cameras that are no sequence; returns how many there are."""
+    poses, intrinsics = camera.world_from_camera.shape, camera.intrinsics_4.shape
+    count = poses[0] if len(poses) == 3 else 0
+    if count < 1 or poses != (count, 4, 4) or intrinsics != (count, 4):
+        raise UserError(
+            f"imagine() got cameras with poses {poses} and intrinsics {intrinsics}; give (n, 4, 4) "
+            "and (n, 4), a camera for each of n ≥ 1 frames to imagine."
+        )
+    return count
+
+
+def _require_known(actions: Array) -> None:
+    """Refuse discrete actions outside the table, which a lookup would clamp to the last row."""
+    if isinstance(actions, Tracer) or not jnp.issubdtype(actions.dtype, jnp.integer):
+        return
+    wrong = sorted({int(a) for a in np.ravel(actions)} - set(range(len(action_geometry.NAMES))))
+    if wrong:
+        known = ", ".join(f"{a} {name}" for a, name in enumerate(action_geometry.NAMES))
+        raise UserError(
+            f"imagine() got the discrete actions {wrong}; there is {known} (continuous actions are "
+            "floats of shape (n, 3))."
+        )

@@ -1,0 +1,108 @@
+"""The training loss of PEWM's stages (paper, Eqs. 3 and 4; see ``diffusion.noise`` for targets)."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import ModelConfig, TrainSettings
+from pewm_jax.diffusion import noise as noises
+from pewm_jax.memory import memories
+from pewm_jax.models import codecs, encoders, placement, world_model
+from pewm_jax.models.signals import as_signal, signal_from_rgb
+from pewm_jax.types import Array, Camera, Clip, Control, Frames, MapTokens, Params
+
+
+def clip_tokens(model: ModelConfig, params: Params, clip: Clip) -> MapTokens:
+    """Build every clip's memory from its context and return its tokens, leading axis B."""
+
+    def one(context: Frames, valid_S: Array, features: Array, camera: Camera) -> MapTokens:
+        memory = memories.from_context(model, {}, context, valid_S, features)
+        return memories.tokens(model, memory, camera)
+
+    def some(weights: Params, clip: Clip) -> MapTokens:
+        features = clip.context_features_ShwF
+        if features is None:
+            features = _encode(model, weights, clip.context.rgb_THWC)
+        context = as_signal(clip.context)
+        return jax.vmap(one)(context, clip.context_valid_S, features, clip.frames.camera)
+
+    return placement.by_batch(some, params.get("encoder", {}), clip)
+
+
+def _encode(model: ModelConfig, weights: Params, rgb_BSHWC: Array) -> Array:
+    """Return the features of every clip's context; a large encoder sees clip by clip."""
+    encoder = model.memory.encoder
+
+    def one(rgb_SHWC: Array) -> Array:
+        return encoders.encode(encoder, weights, signal_from_rgb(rgb_SHWC))
+
+    return jax.lax.map(one, rgb_BSHWC) if encoder.CONVERTED else jax.vmap(one)(rgb_BSHWC)
+
+
+def loss(
+    model: ModelConfig,
+    train: TrainSettings,
+    params: Params,
+    clip: Clip,
+    key: Array,
+    *,
+    memory: bool,
+) -> tuple[Array, dict[str, Array]]:
+    """Return the loss of one batch and its parts.
+
+    Args:
+        model: the model.
+        train: of the training, the noise on the observed frame.
+        params: the world model's parameters.
+        clip: a batch, leading axis B, colours uint8 or float.
+        key: randomness of times, noise and image noise.
+        memory: whether the memory is read: not in stage 1, but in stage 2.
+
+    Returns:
+        ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of what the network is
+        asked for, averaged over everything with valid depth. Where the denoiser works without depth
+        (``clip.depth``), colour alone counts.
+    """
+    frames = as_signal(clip.frames)
+    x0 = codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
+    batch = x0.shape[0]
+    time_key, noise_key, level_key, image_key = jax.random.split(key, 4)
+    times = noises.draw(model.noise, time_key, batch, x0.shape[1])
+    noise = jax.random.normal(noise_key, x0.shape)
+    x_t = noises.corrupt(model.noise, x0, noise, times)
+
+    level = jnp.exp(
+        train.image_noise_mean
+        + train.image_noise_std * jax.random.normal(level_key, (batch, 1, 1, 1))
+    )
+    first = frames.rgb_THWC[:, 0]
+    first = first + level * jax.random.normal(image_key, first.shape)
+    observed = Frames(
+        first[:, None], frames.depth_THW[:, :1], jax.tree.map(lambda x: x[:, :1], frames.camera)
+    )
+    control = Control(frames.camera, clip.actions_TA)
+    conditioning = world_model.condition(model, params, observed, control)
+    tokens = clip_tokens(model, params, clip) if memory else None
+    shown, told = noises.shown(model.noise, x_t, times)
+    prediction = world_model.apply(model, params, shown, conditioning, told, tokens)
+
+    error = (prediction - noises.target(model.noise, x0, noise, times)) ** 2
+    error = error * noises.spread(noises.weight(model.noise, times), error.ndim)
+    split = model.codec.rgb_channels
+    measured = jnp.broadcast_to(codecs.measured(model, frames.depth_THW), error[..., split:].shape)
+    rgb = error[..., :split].mean()
+    depth = (error[..., split:] * measured).sum() / jnp.maximum(measured.sum(), 1)
+    if not model.clip.depth:
+        return rgb, {"loss_rgb": rgb, "loss_depth": depth}
+    channels = error.shape[-1]
+    total = (rgb * split + depth * (channels - split)) / channels
+    return total, {"loss_rgb": rgb, "loss_depth": depth}
+
+
+without_memory = functools.partial(loss, memory=False)
+"""The loss of stage 1."""
+with_memory = functools.partial(loss, memory=True)
+"""The loss of stage 2."""

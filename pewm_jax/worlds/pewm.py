@@ -1,0 +1,255 @@
+"""The world of PEWM: a video diffusion model, clip after clip, with a memory.
+
+Each clip is conditioned on the present frame, on what steers it, and on what of the memory its
+cameras see; what it imagines is remembered exactly as what was observed.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
+
+from pewm_jax.config import ModelConfig, UserError, functions
+from pewm_jax.diffusion import noise as noises
+from pewm_jax.memory import memories
+from pewm_jax.models import codecs, encoders, world_model
+from pewm_jax.models.signals import as_signal
+from pewm_jax.types import Array, Control, Frames, MapTokens, Params, WorldState
+from pewm_jax.worlds import objective, pewm_costs
+from pewm_jax.worlds.control import control_of
+from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
+
+init = world_model.init
+costs = pewm_costs.costs
+
+STAGES = (
+    Stage(
+        name="stage1",
+        number=1,
+        rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|encoder|text)/.*", FREEZE)),
+        init=functools.partial(world_model.init, memory=False),
+        loss=objective.without_memory,
+    ),
+    Stage(
+        name="stage2",
+        number=2,
+        rules=((r"memory/.*", TRAIN), (r"(backbone|control|codec|encoder|text)/.*", FREEZE)),
+        init=world_model.init,
+        loss=objective.with_memory,
+        memory=True,
+    ),
+)
+"""Stage 1 fine-tunes the backbone, without any memory, to the domain, to the control and to RGB-D.
+Stage 2 adds the memory's reader, which changes nothing at first, and trains nothing else."""
+
+
+def stages(model: ModelConfig) -> tuple[Stage, ...]:
+    """Return the paper's two stages."""
+    del model
+    return STAGES
+
+
+def sharding(model: ModelConfig) -> tuple[tuple[str, Any], ...]:
+    """Return the rules of all parts, each part's own."""
+    memory = model.memory
+    parts = (model.backbone, memory.reader, model.codec, memory.encoder, model.control)
+    rules = [rule for part in parts for rule in functions(part).SHARDING]
+    return (*rules, (r"text/prompt_LC", P(None, "fsdp")))
+
+
+def split_heads(model: ModelConfig, stage: Stage) -> dict[str, int]:
+    """Return what ``train.mesh.tensor`` must divide."""
+    heads = {"backbone.heads": model.backbone.split_heads}
+    if stage.memory:
+        heads["memory.reader.heads"] = model.memory.reader.split_heads
+    return heads
+
+
+def start(model: ModelConfig, params: Params, frames: Frames) -> WorldState:
+    """Begin a world; see ``worlds.start``."""
+    count = _require_frames(model, frames, "start")
+    frames = jax.tree.map(jnp.asarray, as_signal(frames))
+    remembered = memories.from_context(model, params, frames, jnp.ones((count,), bool))
+    return WorldState(jax.tree.map(lambda x: x[-1:], frames), remembered)
+
+
+def observe(model: ModelConfig, params: Params, state: WorldState, frames: Frames) -> WorldState:
+    """Take in real frames; see ``worlds.observe``."""
+    _require_frames(model, frames, "observe")
+    frames = jax.tree.map(jnp.asarray, as_signal(frames))
+    remembered = _remember(model, params, state.map, frames)
+    return WorldState(jax.tree.map(lambda x: x[-1:], frames), remembered)
+
+
+def imagine(
+    model: ModelConfig,
+    params: Params,
+    state: WorldState,
+    control: Any,
+    key: Array,
+    *,
+    remember: bool = True,
+    memory: bool = True,
+) -> tuple[WorldState, Frames]:
+    """Imagine clip after clip; see ``worlds.imagine``."""
+    asked = control_of(model, state.frame.camera, control)
+    length = model.clip.frames - 1
+    count = asked.camera.world_from_camera.shape[0]
+    clips = -(-count // length)
+    missing = clips * length - count
+
+    def cut(x: Array) -> Array:
+        """(n, …) → (clips, T − 1, …), the last row repeated where frames are missing."""
+        filled = jnp.concatenate([x, jnp.repeat(x[-1:], missing, 0)]) if missing else x
+        return filled.reshape(clips, length, *x.shape[1:])
+
+    wanted = jnp.arange(clips * length).reshape(clips, length) < count if missing else None
+
+    def step(state: WorldState, inputs: tuple[Control, Array, Array | None]) -> Any:
+        chunk, clip_key, valid = inputs
+        return imagine_clip(
+            model, params, state, chunk, clip_key, remember=remember, memory=memory, valid_T=valid
+        )
+
+    inputs = (jax.tree.map(cut, asked), jax.random.split(key, clips), wanted)
+    state, frames = jax.lax.scan(step, state, inputs)
+    return state, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], frames)
+
+
+def imagine_clip(
+    model: ModelConfig,
+    params: Params,
+    state: WorldState,
+    control: Control,
+    key: Array,
+    *,
+    remember: bool = True,
+    memory: bool = True,
+    valid_T: Array | None = None,
+) -> tuple[WorldState, Frames]:
+    """Imagine one clip: the T − 1 frames after the present one.
+
+    Args:
+        model: the model.
+        params: the world model's parameters.
+        state: the world so far.
+        control: (T − 1) cameras of the frames to imagine, and actions that lead to them.
+        key: sampling noise.
+        remember: see ``worlds.imagine``.
+        memory: False ignores the memory.
+        valid_T: (T − 1,) bool, True for the first frames, which count; None where all do.
+
+    Returns:
+        The next state and T − 1 frames, colours float in [−1, 1]. A denoiser that works without
+        depth (``clip.depth``) imagines none: 0 everywhere, which no memory keeps.
+    """
+    present, future = state.frame, control.camera
+    camera = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), present.camera, future)
+    whole = jax.tree.map(lambda x: x[None], Control(camera, control.actions_TA))
+    observed = jax.tree.map(lambda x: x[None], present)
+    conditioning = world_model.condition(model, params, observed, whole)
+    tokens = None
+    if memory and "memory" in params:
+        tokens = jax.tree.map(lambda x: x[None], memories.tokens(model, state.map, camera))
+    latents = _sample(model, params, conditioning, tokens, key)
+    rgb, depth = codecs.decode_rgbd(model, params, latents)
+    depth = depth if model.clip.depth else jnp.zeros_like(depth)
+    frames = Frames(rgb[0, 1:], depth[0, 1:], future)
+    remembered = state.map
+    if remember:
+        remembered = _remember(model, params, state.map, frames, valid_T)
+    last = frames.depth_THW.shape[0] - 1 if valid_T is None else valid_T.sum() - 1
+    present = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, last, 1), frames)
+    return WorldState(present, remembered), frames
+
+
+def _sample(
+    model: ModelConfig,
+    params: Params,
+    conditioning: world_model.ClipConditioning,
+    tokens: MapTokens | None,
+    key: Array,
+) -> Array:
+    """Sample the latents of one clip, (1, t, h, w, C)."""
+    noise = jax.random.normal(key, (1, *model.latent_shape, model.codec.channels))
+    return sample(model, params, conditioning, tokens, noise, jax.random.fold_in(key, 1))
+
+
+def sample(
+    model: ModelConfig,
+    params: Params,
+    conditioning: world_model.ClipConditioning,
+    tokens: MapTokens | None,
+    noise_BthwC: Array,
+    key: Array | None = None,
+) -> Array:
+    """Sample one batch of clips' latents with the configured noise and sampler.
+
+    With ``noise.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map)); DDPM
+    lets g vary with the step (``noise.dynamic_guidance``).
+
+    Args:
+        model: the model.
+        params: the world model's parameters.
+        conditioning: observed frame, control, text.
+        tokens: map tokens, or None for no memory.
+        noise_BthwC: standard normal start.
+        key: randomness of the steps, where the sampler draws any.
+
+    Returns:
+        (B, t, h, w, C) latents.
+
+    Raises:
+        ValueError: the sampler draws noise at every step and there is no key.
+    """
+    noise = model.noise
+
+    def x0(x: Array, times: Array, tokens: MapTokens | None) -> Array:
+        shown, told = noises.shown(noise, x, times)
+        out = world_model.apply(model, params, shown, conditioning, told, tokens)
+        return noises.to_x0(noise, out, x, times)
+
+    def denoise(x: Array, times: Array, weight: Array) -> Array:
+        with_map = x0(x, times, tokens)
+        if tokens is None or noise.guidance == 1:
+            return with_map
+        without = x0(x, times, None)
+        return without + weight * (with_map - without)
+
+    return noises.sample(noise, denoise, noise_BthwC, key)
+
+
+def _remember(
+    model: ModelConfig,
+    params: Params,
+    memory: Any,
+    frames: Frames,
+    valid_T: Array | None = None,
+) -> Any:
+    """Put frames into the memory."""
+    weights = params.get("encoder", {})
+    features = encoders.encode(model.memory.encoder, weights, frames.rgb_THWC)
+    return memories.remember(model, memory, frames, features, valid_T)
+
+
+def _require_frames(model: ModelConfig, frames: Frames, who: str) -> int:
+    """Refuse frames of other shapes than the model's; returns how many there are."""
+    count = frames.depth_THW.shape[0] if frames.depth_THW.ndim else 0
+    expected = (count, model.clip.height, model.clip.width)
+    if count < 1 or frames.rgb_THWC.shape != (*expected, 3) or frames.depth_THW.shape != expected:
+        raise UserError(
+            f"{who}() got colours {frames.rgb_THWC.shape} and depth {frames.depth_THW.shape}; this "
+            f"model needs (S, {expected[1]}, {expected[2]}, 3) and (S, {expected[1]}, "
+            f"{expected[2]}) with S ≥ 1: resize the frames and scale their intrinsics."
+        )
+    poses, intrinsics = frames.camera.world_from_camera, frames.camera.intrinsics_4
+    if poses.shape != (count, 4, 4) or intrinsics.shape != (count, 4):
+        raise UserError(
+            f"{who}() got {count} frames but poses {poses.shape} and intrinsics "
+            f"{intrinsics.shape}; give ({count}, 4, 4) and ({count}, 4)."
+        )
+    return count

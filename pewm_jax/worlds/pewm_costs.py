@@ -1,0 +1,37 @@
+"""What a step of PEWM's stages costs: the sum over its parts, each of which knows its own."""
+
+from __future__ import annotations
+
+from pewm_jax.config import Config, ModelConfig, functions
+from pewm_jax.models.costs import Costs, Share
+from pewm_jax.worlds.stages import Stage
+
+
+def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
+    """Return the costs of one device by part, named as the parameters are.
+
+    Args:
+        config: the experiment.
+        stage: the stage.
+        share: what one device has of the step.
+    """
+    model = config.model
+    assert isinstance(model, ModelConfig)
+    trained = not stage.memory
+    found = {
+        "backbone": functions(model.backbone).costs(model, share, trained=trained),
+        "control": functions(model.control).costs(model, share, trained=trained),
+        "codec": functions(model.codec).costs(model),
+    }
+    if stage.memory:
+        found["memory"] = functions(model.memory.reader).costs(model, share)
+        if encodes(config):
+            encoder = functions(model.memory.encoder)
+            found["encoder"] = encoder.costs(model, share, config.data.context)
+    return found
+
+
+def encodes(config: Config) -> bool:
+    """Whether a stage with memory runs the image encoder: features are kept, and not cached."""
+    assert isinstance(config.model, ModelConfig)
+    return config.model.memory.KEEPS_FEATURES and not config.data.features
