@@ -9,7 +9,7 @@ import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.data.consistency import find_disagreement
-from pewm_jax.data.episodes import DEPTH_LIMIT_M, Episode
+from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
 
 MEDIAN_DEPTH_M = (0.05, 40.0)
 """Outside of this range the median depth of a recording is in a wrong unit, metres."""
@@ -60,7 +60,7 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
             episode.ids()
     except UserError as error:
         return [*found, Problem(where, None, "images", str(error))]
-    found += check_depth(depth_THW, where)
+    found += _check_saturation(depth_THW, where) or check_depth(depth_THW, where)
     if not found:  # wrong poses or units would only be reported once more
         found += _check_geometry(episode, depth_THW, where)
     return found
@@ -83,8 +83,9 @@ def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
                 where,
                 None,
                 "depth",
-                f"{missing:.0%} of the pixels have no depth (0, or beyond {DEPTH_LIMIT_M} m): the "
-                "unit is wrong or the depth images are empty; correct the depth scale.",
+                f"{missing:.0%} of the pixels have no depth (0, saturated, or beyond the largest "
+                "depth kept): the unit is wrong or the depth images are empty; correct the depth "
+                "scale.",
             )
         ]
     for frame, image in enumerate(depth_THW):
@@ -92,6 +93,23 @@ def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
         if len(seen) > (1 - MOST_MISSING) * image.size and not _plausible(np.median(seen)):
             return [_wrong_unit(where, frame, "this frame", float(np.median(seen)))]
     return []
+
+
+def _check_saturation(depth_THW: np.ndarray, where: str) -> list[Problem]:
+    """Check that no stored depth is the saturated value, which is a mark and no distance."""
+    saturated = depth_THW > (SATURATED - 0.5) / MILLIMETRES
+    if not saturated.any():
+        return []
+    return [
+        Problem(
+            where,
+            int(np.flatnonzero(saturated.any((1, 2)))[0]),
+            "depth",
+            f"{saturated.mean():.1%} of the episode's pixels hold the saturated value {SATURATED}, "
+            "which is no measurement: import the recording again with --overwrite, which stores 0 "
+            "there, or write 0 there yourself.",
+        )
+    ]
 
 
 def _plausible(median: float) -> bool:

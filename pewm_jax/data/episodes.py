@@ -26,8 +26,10 @@ from pewm_jax.data.record_format import (
 from pewm_jax.types import Camera, Frames
 
 MILLIMETRES = 1000.0
-DEPTH_LIMIT_M = 65.535
-"""Depths beyond what 16 bits of millimetres hold are stored as 0, "no measurement"."""
+SATURATED = 65535
+"""The largest 16-bit value: sensors mark missing or too far depth with it. It is never written."""
+DEPTH_LIMIT_M = (SATURATED - 1) / MILLIMETRES
+"""The largest depth stored; depths beyond it become 0, "no measurement"."""
 PNG_LEVEL = 1
 
 
@@ -186,10 +188,10 @@ def write_episode(
 
 
 def to_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Return metres as uint16 millimetres, rounded; beyond 65.535 m or not finite becomes 0."""
+    """Return metres as uint16 millimetres, rounded; beyond 65.534 m or not finite becomes 0."""
     millimetres = np.rint(np.asarray(depth, np.float64) * MILLIMETRES)
     with np.errstate(invalid="ignore"):
-        kept = (millimetres > 0) & (millimetres <= DEPTH_LIMIT_M * MILLIMETRES)
+        kept = (millimetres > 0) & (millimetres < SATURATED)
     return np.where(kept, millimetres, 0).astype(np.uint16)
 
 

@@ -31,7 +31,14 @@ from pewm_jax.data.dataset import (
     write_manifest,
     write_shard,
 )
-from pewm_jax.data.episodes import EpisodeArrays, decode_image, read_episode, write_episode
+from pewm_jax.data.episodes import (
+    DEPTH_LIMIT_M,
+    SATURATED,
+    EpisodeArrays,
+    decode_image,
+    read_episode,
+    write_episode,
+)
 from pewm_jax.data.progress import Meter
 from pewm_jax.data.recording_folders import RecordedFrame, read_recording
 from pewm_jax.geometry.actions import actions_between
@@ -59,7 +66,11 @@ class ImportConfig:
     """Where cx and cy have the centre of the first pixel: `integer` at 0 (Open3D, TUM, OpenCV),
     `half` at 0.5."""
     depth_scale: float = 1000.0
-    """Value of a depth image that means one metre: 1000 for millimetres, 5000 for TUM."""
+    """Value of a depth image that means one metre: 1000 for millimetres, 5000 for TUM. The largest
+    value of 16 bits, 65535, is no measurement whatever the scale."""
+    max_depth: float = DEPTH_LIMIT_M
+    """Depths beyond this are no measurement, metres. By default all that the format can store is
+    kept; give the range of the sensor, such as 10, to leave out what it measures badly."""
     stride: int = 1
     """Keep every so many-th frame."""
     size: tuple[int, int] | None = None
@@ -82,6 +93,11 @@ class ImportConfig:
             raise ConfigError(f"--stride is {self.stride}: use 1 or more.")
         if not self.depth_scale > 0:
             raise ConfigError(f"--depth-scale is {self.depth_scale}: use 1000 for millimetres.")
+        if not 0 < self.max_depth <= DEPTH_LIMIT_M:
+            raise ConfigError(
+                f"--max-depth is {self.max_depth}: use metres above 0, up to the {DEPTH_LIMIT_M} "
+                "that the format can store."
+            )
         if self.size is not None and min(self.size) < 1:
             raise ConfigError(f"--size is {self.size}: use a width and height in pixels.")
         if min(self.intrinsics[:2]) <= 0:
@@ -114,7 +130,9 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
     intrinsics = np.array(config.intrinsics, np.float32) + np.array([0, 0, half, half], np.float32)
     scale = (width / source_size[0], height / source_size[1])
     pose = world_from_recording(config.up) @ np.stack([f.world_from_camera for f in frames])
+    # The units are judged before anything is left out, which could hide that they are wrong.
     _refuse(check_depth(depth, str(config.src)), config, frames)
+    depth[depth > config.max_depth] = 0
     arrays = EpisodeArrays(
         rgb, depth, resize_intrinsics(intrinsics, *scale), pose, planar_actions(pose)
     )
@@ -211,9 +229,17 @@ def _read_images(
             shrink = size[0] < source[0]
             how = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
             rgb[k] = cv2.resize(colour, size, interpolation=how)[..., ::-1]
-            depth[k] = _nearest(distance, size) / config.depth_scale
+            depth[k] = _metres(_nearest(distance, size), config.depth_scale)
             meter.advance(1)
     return rgb, depth, source
+
+
+def _metres(values_HW: np.ndarray, scale: float) -> np.ndarray:
+    """Return depths in metres; the saturated value of a 16-bit image becomes 0."""
+    metres = values_HW / scale
+    if values_HW.dtype == np.uint16:
+        metres[values_HW == SATURATED] = 0
+    return metres
 
 
 def _nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
