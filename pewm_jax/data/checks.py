@@ -10,6 +10,7 @@ import numpy as np
 from pewm_jax.config import UserError
 from pewm_jax.data.consistency import find_disagreement
 from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
+from pewm_jax.geometry.actions import PLANAR
 
 MEDIAN_DEPTH_M = (0.05, 40.0)
 """Outside of this range the median depth of a recording is in a wrong unit, metres."""
@@ -194,6 +195,8 @@ def _check_actions(episode: Episode, where: str) -> Iterator[Problem]:
     if not finite.all():
         frame = int(np.flatnonzero(~finite)[0])
         yield Problem(where, frame, "actions", "holds NaN or infinity.")
+        return
+    if actions.shape[1] != PLANAR:  # another kind of control: nobody knows where it leads
         return
     metres, radians = action_errors(episode.world_from_camera, actions)
     for frame in np.flatnonzero((metres > ACTION_M) | (radians > ACTION_RAD))[:1]:

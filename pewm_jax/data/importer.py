@@ -48,6 +48,21 @@ _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 
 
 @dataclasses.dataclass(frozen=True)
+class _Imported:
+    """A shard of a split made by ``import``: it holds one episode.
+
+    Attributes:
+        shard: the file.
+        frames: frames of the episode.
+        actions: whether it has actions.
+    """
+
+    shard: Shard
+    frames: int
+    actions: bool
+
+
+@dataclasses.dataclass(frozen=True)
 class ImportConfig:
     """Import a recording: a folder of colour images, depth images and a trajectory.
 
@@ -122,7 +137,7 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
     """
     name = config.name or config.src.resolve().name
     folder = config.out / config.split
-    shards = _others(config, folder, name)
+    imported = _others(config, folder, name)
     frames = read_recording(config.src, config.trajectory)[:: config.stride]
     rgb, depth, source_size = _read_images(config, frames)
     width, height = depth.shape[2], depth.shape[1]
@@ -141,11 +156,15 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
     _refuse(check_episode(read_episode(record), str(config.src)), config, frames)
     path = folder / f"recording-{name}.array_record"
     write_shard(path, [record])
-    shards.append((describe_shard(path), len(frames)))
-    total = sum(count for _, count in shards)
-    settings = {"made_by": "import", "frames": {shard.file: count for shard, count in shards}}
+    imported.append(_Imported(describe_shard(path), len(frames), arrays.actions is not None))
+    settings = {
+        "made_by": "import",
+        "frames": {one.shard.file: one.frames for one in imported},
+        "actions": {one.shard.file: one.actions for one in imported},
+    }
+    total = sum(one.frames for one in imported)
     write_manifest(
-        folder, Manifest(config.split, tuple(shard for shard, _ in shards), settings, total)
+        folder, Manifest(config.split, tuple(one.shard for one in imported), settings, total)
     )
     moves = "planar actions" if arrays.actions is not None else "poses only (moves in 6 degrees)"
     say(f"{folder}: added {name}, {len(frames)} frames of {width}×{height} pixels, {moves}.")
@@ -173,8 +192,8 @@ def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     return actions if bool(((metres < ACTION_M) & (radians < ACTION_RAD)).all()) else None
 
 
-def _others(config: ImportConfig, folder: Path, name: str) -> list[tuple[Shard, int]]:
-    """Return the shards that are there already, and how many frames each has."""
+def _others(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
+    """Return the shards that are there already, without the one to replace."""
     if not folder.exists():
         return []
     file = f"recording-{name}.array_record"
@@ -185,7 +204,7 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[tuple[Shard, 
             raise UserError(
                 f"{folder} holds an unfinished collection; finish it, or give another --split."
             )
-        return [(describe_shard(path), _length(path)) for path in strays if path.name != file]
+        return [_look(path, describe_shard(path)) for path in strays if path.name != file]
     # The shard to replace may be newer than the list, where an import was killed between the two.
     manifest = read_manifest(folder, check_files=False)
     if manifest.settings.get("made_by") != "import":
@@ -197,11 +216,19 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[tuple[Shard, 
     kept = [shard for shard in manifest.shards if shard.file != file]
     for shard in kept:
         check_size(folder / shard.file, shard)
-    return [(shard, manifest.settings["frames"][shard.file]) for shard in kept]
+    frames, actions = manifest.settings["frames"], manifest.settings.get("actions", {})
+    return [
+        _Imported(shard, frames[shard.file], actions[shard.file])
+        if shard.file in actions
+        else _look(folder / shard.file, shard)  # imported before actions were listed
+        for shard in kept
+    ]
 
 
-def _length(path: Path) -> int:
-    return read_episode(read_record(path, 0), str(path)).length
+def _look(path: Path, shard: Shard) -> _Imported:
+    """Open a shard to see what it holds."""
+    episode = read_episode(read_record(path, 0), str(path))
+    return _Imported(shard, episode.length, episode.actions is not None)
 
 
 def _read_images(

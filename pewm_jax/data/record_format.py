@@ -55,6 +55,30 @@ class DamagedError(UserError):
     """A record whose bytes are not what was written: it can only be made again, or done without."""
 
 
+def array_shapes(frames: int) -> dict[str, tuple[int | str, ...]]:
+    """Return the shapes of the arrays of an episode; a letter stands for any number."""
+    return {
+        "intrinsics": (4,),
+        "world_from_camera": (frames, 4, 4),
+        "actions": (frames - 1, "A"),
+        "action_ids": (frames - 1,),
+        "voxels": (frames, "X", "Y", "Z"),
+    }
+
+
+def shape_fits(shape: tuple[int, ...], expected: tuple[int | str, ...]) -> bool:
+    """Return whether a shape is what ``array_shapes`` says."""
+    return len(shape) == len(expected) and all(
+        isinstance(wanted, str) or size == wanted
+        for size, wanted in zip(shape, expected, strict=True)
+    )
+
+
+def shape_text(expected: tuple[int | str, ...] | None) -> str:
+    """Return an expected shape as text, or that there is no such field."""
+    return "no such field" if expected is None else f"({', '.join(map(str, expected))})"
+
+
 def pack_record(
     header: dict[str, Any], arrays: Mapping[str, np.ndarray], streams: Mapping[str, list[bytes]]
 ) -> bytes:

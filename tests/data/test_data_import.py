@@ -189,6 +189,8 @@ def test_recordings_are_added_and_replaced_by_name(tmp_path, walk):
         config(tmp_path / "rec", out, name="a", stride=2, overwrite=True), lambda _: None
     )
     assert [episode.length for episode in EpisodeSource(out / "train")] == [24, 12]
+    listed = EpisodeSource(out / "train").manifest.settings["actions"]
+    assert list(listed.values()) == [True, True]
     collected = split(tmp_path / "collected" / "train")
     before = (collected / "dataset.json").read_bytes()
     with pytest.raises(UserError, match="was made by `collect`"):
