@@ -1,4 +1,4 @@
-"""What can be wrong with an episode, found from the episode alone."""
+"""Checks of a single episode: cameras, actions, depth, and whether they agree."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ACTION_M, ACTION_RAD = 2e-3, 2e-3
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """Something wrong, and where.
+    """A problem and its place.
 
     Attributes:
         where: file and record.
@@ -196,7 +196,7 @@ def _check_actions(episode: Episode, where: str) -> Iterator[Problem]:
         frame = int(np.flatnonzero(~finite)[0])
         yield Problem(where, frame, "actions", "holds NaN or infinity.")
         return
-    if actions.shape[1] != PLANAR:  # another kind of control: nobody knows where it leads
+    if actions.shape[1] != PLANAR:  # another kind of control: not a motion that can be checked
         return
     metres, radians = action_errors(episode.world_from_camera, actions)
     for frame in np.flatnonzero((metres > ACTION_M) | (radians > ACTION_RAD))[:1]:
@@ -212,7 +212,7 @@ def _check_actions(episode: Episode, where: str) -> Iterator[Problem]:
 def action_errors(
     world_from_camera: np.ndarray, actions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Carry out every action from its frame's pose and compare with the next frame's.
+    """Return how far every action leads from the pose of the next frame.
 
     Args:
         world_from_camera: (T, 4, 4) poses.

@@ -1,4 +1,4 @@
-"""Clips cut from episodes: which frames are imagined, and which earlier ones are remembered."""
+"""Clips cut from episodes: the frames to generate, and earlier frames as context."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class Choice:
 
 
 def choose(config: Config, length: int, rng: np.random.Generator, where: str = "episode") -> Choice:
-    """Draw a clip from an episode: its stride, its start, and what of the past is remembered.
+    """Draw a clip from an episode: its stride, its start and its context frames.
 
     Every stride of ``data.stride_min … stride_max`` that fits is equally likely, and so is every
-    start. The context is spread over the whole past, one frame out of each of S − 1 equal parts
-    of it, always with the frame just before the clip, and ends with the clip's first frame.
+    start. The context has one frame from each of S − 1 equal parts of the past, among them the
+    frame just before the clip, and the clip's first frame.
 
     Args:
         config: ``clip.frames``, ``data.stride_min``, ``data.stride_max``, ``data.context``.
@@ -63,12 +63,12 @@ def choose(config: Config, length: int, rng: np.random.Generator, where: str = "
 
 
 def choose_context(start: int, slots: int, rng: np.random.Generator | None = None) -> np.ndarray:
-    """Return which frames up to ``start`` are remembered, at most ``slots`` of them.
+    """Return the context frames of a clip: at most ``slots`` frames up to ``start``.
 
     Args:
-        start: first frame of the clip; always the last one remembered.
+        start: first frame of the clip; always the last context frame.
         slots: S.
-        rng: where in each part of the past to look; None takes the middle, always the same.
+        rng: draws the frame of each part of the past; None takes the middle.
 
     Returns:
         (≤ S,) increasing frame numbers.
@@ -88,7 +88,7 @@ def choose_context(start: int, slots: int, rng: np.random.Generator | None = Non
 
 
 def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | None = None) -> Clip:
-    """Decode the chosen frames, each once.
+    """Decode the frames of a clip, each once, and join its actions.
 
     Args:
         episode: where they come from.
@@ -147,7 +147,7 @@ def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:
 def clip_at(
     config: Config, episode: Episode, start: int, stride: int = 1, frames: int | None = None
 ) -> Clip:
-    """Return a certain clip, always the same: its context is spread evenly over the past.
+    """Return the clip at given frames, without randomness; its context is spread evenly.
 
     Args:
         config: ``clip.frames`` and ``data.context``.

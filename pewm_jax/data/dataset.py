@@ -1,8 +1,8 @@
 """A split on disk: ArrayRecord shards, and ``dataset.json`` written last.
 
-A split folder without ``dataset.json`` is unfinished and is never read. Shards are written aside
-and renamed; ``dataset.json`` names every shard with its number of records, size and SHA-256, so
-that a shard cut short is noticed when the split is opened.
+A split folder without ``dataset.json`` is unfinished and is never read. ``dataset.json`` lists
+every shard with its number of records, size and SHA-256, so a truncated shard is noticed when the
+split is opened.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pewm_jax.data.record_format import VERSION, DamagedError
 
 MANIFEST = "dataset.json"
 UNFINISHED = "collecting.json"
-"""Lies in a split folder while it is being made, and says with what settings."""
+"""File in a split folder while the split is being made; holds its settings."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Shard:
 
 @dataclasses.dataclass(frozen=True)
 class Manifest:
-    """What ``dataset.json`` says.
+    """The content of ``dataset.json``.
 
     Attributes:
         split: name of the split.
@@ -102,7 +102,7 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
 
 @contextlib.contextmanager
 def _refused_writes(path: Path) -> Iterator[None]:
-    """Say in one sentence what ArrayRecord raises where the system refuses to write."""
+    """Turn ArrayRecord's write errors into one sentence."""
     try:
         yield
     except RuntimeError as error:
@@ -176,7 +176,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Publish a split: from now on it reads as whole."""
+    """Write ``dataset.json``, which makes a split readable."""
     value = {
         "format": "pewm-dataset",
         "version": VERSION,
@@ -312,7 +312,7 @@ class EpisodeSource(Sequence[Episode]):
             ) from None
 
     def where(self, index: int, between: str = ", record ") -> str:
-        """Return the place of an episode in words: file and record."""
+        """Return the file and record of an episode, for messages."""
         for shard in self.manifest.shards:
             if index < shard.records:
                 return f"{self.path / shard.file}{between}{index}"

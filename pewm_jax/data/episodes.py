@@ -1,7 +1,8 @@
-"""The episode: what it holds, and how it becomes bytes and comes back.
+"""The episode: its fields, and how it is written to and read from a record.
 
 One record is one episode. Its header says where every array and every encoded image lies, so that
-single frames are decoded without touching the others (``layout.py``, ``docs/data_format.md``).
+single frames are decoded without reading the others (``record_format.py``,
+``docs/data_format.md``).
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ PNG_LEVEL = 1
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeArrays:
-    """What an episode is written from.
+    """The arrays of an episode to write.
 
     Attributes:
         rgb_THWC: (T, H, W, 3) uint8.
@@ -64,7 +65,7 @@ class EpisodeArrays:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Episode:
-    """An episode as it lies on disk: small arrays are at hand, images are decoded when asked for.
+    """An episode read from disk: small arrays are decoded, images on request.
 
     Attributes:
         name: name of the episode, e.g. ``house-000012/follow``.
@@ -205,7 +206,7 @@ def to_millimetres(depth: np.ndarray) -> np.ndarray:
 
 
 def read_episode(record: bytes, where: str = "record") -> Episode:
-    """Open a record; nothing but the small arrays is decoded.
+    """Open a record and decode its small arrays; images stay encoded.
 
     Args:
         record: the bytes of ``write_episode``.

@@ -1,4 +1,4 @@
-"""Import a recording of colour, depth and trajectory as an episode, checked before it counts."""
+"""Import a recording (colour, depth, trajectory) as an episode; it is validated before writing."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class ImportConfig:
     """Depths beyond this are no measurement, metres. By default all that the format can store is
     kept; give the range of the sensor, such as 10, to leave out what it measures badly."""
     stride: int = 1
-    """Keep every so many-th frame."""
+    """Keep every n-th frame."""
     size: tuple[int, int] | None = None
     """Width and height to resize to, pixels; by default the images keep their size."""
     trajectory: Path | None = None
@@ -171,7 +171,7 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
 
 
 def world_from_recording(up: str) -> np.ndarray:
-    """Return the (4, 4) rotation that turns a recording's up axis to z, moving least axes."""
+    """Return the (4, 4) rotation that takes a recording's up axis to z."""
     axis = np.array(_AXES[up[-1]], float) * (-1 if up.startswith("-") else 1)
     keep = np.array(_AXES["y" if up[-1] == "x" else "x"], float)  # this one stays horizontal
     rotation = np.eye(4)
@@ -270,7 +270,7 @@ def _metres(values_HW: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize by picking pixels: blended depths would lie between surfaces."""
+    """Resize by nearest neighbour: interpolated depths would lie between surfaces."""
     height, width = image.shape
     rows = ((np.arange(size[1]) + 0.5) * height / size[1]).astype(int)
     columns = ((np.arange(size[0]) + 0.5) * width / size[0]).astype(int)
@@ -289,7 +289,7 @@ def _read(path: Path, flags: int) -> np.ndarray:
 
 
 def _refuse(problems: list[Problem], config: ImportConfig, frames: list[RecordedFrame]) -> None:
-    """Refuse what has problems; the frame of the first is named by its depth image too."""
+    """Refuse a recording with problems; name the first, with the file of its depth image."""
     if not problems:
         return
     first = problems[0]

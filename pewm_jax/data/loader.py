@@ -1,9 +1,8 @@
 """Batches of clips by Grain: batch k is a function of (seed, k), so a position is one integer.
 
-Every epoch visits every episode once, in an order drawn from the seed; a clip is drawn from the
-episode. Nothing but k is needed to go on where an interrupted training stopped. In the place of an
-episode that does not decode comes another, drawn from the same (seed, place): which one depends on
-what lies on disk alone.
+Every epoch visits every episode once, in an order drawn from the seed, and draws one clip from
+each. An interrupted training goes on from k alone. An episode that does not decode is replaced by
+another, drawn from the same seed and position, so the replacement depends only on the files.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from pewm_jax.types import Clip
 BATCHES_AHEAD = 2
 """Batches decoded before they are asked for; with the one in use, what the loader holds."""
 EPOCHS = 2**31
-"""Times that the episodes are gone through: without end, and countable in batches of one."""
+"""Epochs of the dataset: practically endless, and its length still fits an integer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +70,7 @@ class _DrawClip(grain.transforms.RandomMap):
 
         Raises:
             UserError: the episode does not fit the configuration, more records do not decode than
-                are done without, or none does.
+                ``data.bad_records`` allows, or none does.
         """
         refused: set[int] = set()
         while True:
@@ -137,7 +136,7 @@ def dataset(
 
 
 def records(config: Config, split: str = "train", *, seed: int, batch: int, step: int) -> list[str]:
-    """Name what a batch was made of, found out again from its number.
+    """Name the clips of a batch, recomputed from its number.
 
     Args:
         config: as for ``clips``.

@@ -1,4 +1,4 @@
-"""Where everything lies in a record: magic word, header, payload.
+"""The layout of a record: magic word, header, payload.
 
 Byte by byte in ``docs/data_format.md``.
 """
@@ -30,7 +30,7 @@ FIELDS = (
     "arrays",
     "streams",
 )
-"""What every header has."""
+"""Required fields of a header."""
 
 CONVENTIONS = {
     "camera": "OpenCV axes: x right, y down, z forward",
@@ -52,7 +52,7 @@ UNITS = {
 
 
 class DamagedError(UserError):
-    """A record whose bytes are not what was written: it can only be made again, or done without."""
+    """A record is damaged: it must be made again, or it can be skipped."""
 
 
 def array_shapes(frames: int) -> dict[str, tuple[int | str, ...]]:
@@ -82,7 +82,7 @@ def shape_text(expected: tuple[int | str, ...] | None) -> str:
 def pack_record(
     header: dict[str, Any], arrays: Mapping[str, np.ndarray], streams: Mapping[str, list[bytes]]
 ) -> bytes:
-    """Lay out arrays, then images, and describe them with offsets from the end of the header."""
+    """Concatenate header, arrays and images; offsets count from the end of the header."""
     blobs: list[bytes] = []
     offset = 0
     for field, array in arrays.items():

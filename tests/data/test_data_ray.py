@@ -108,7 +108,7 @@ def test_the_rest_is_given_up_when_it_is_not_wanted_any_more(cluster, tmp_path, 
     made = engines.run(many, many[0].config)
     next(made)
     made.close()
-    assert len(given_up) == engines.AHEAD - 1
+    assert len(given_up) == engines.SHARDS_PER_PROCESSOR - 1
     assert len(list(tmp_path.iterdir())) == 1
     limit = time.monotonic() + 20
     while cluster.available_resources().get("CPU") != 1 and time.monotonic() < limit:
