@@ -20,6 +20,7 @@ from typing import Any
 import array_record.python.array_record_module as array_file
 from grain import sources
 
+from pewm_jax import atomic
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import Episode, read_episode
 from pewm_jax.data.record_format import VERSION, DamagedError
@@ -78,9 +79,8 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
         UserError: the file cannot be written, e.g. because the disk is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     count = 0
-    try:
+    with atomic.replacing(path) as partial:
         # Images are compressed already, and one record per group makes a single one cheap to read.
         with _refused_writes(path):
             writer = array_file.ArrayRecordWriter(str(partial), "group_size:1,uncompressed")
@@ -94,9 +94,6 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
                 writer.close()
         with partial.open("rb") as file:
             os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
     return count
 
 
@@ -168,11 +165,9 @@ def read_record(path: Path, index: int) -> bytes:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON aside, then rename."""
+    """Write JSON, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", "utf-8")
-    partial.replace(path)
+    atomic.write_text(path, json.dumps(value, indent=2, ensure_ascii=False) + "\n")
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:

@@ -28,6 +28,7 @@ from typing import Any
 
 import cv2
 
+from pewm_jax import atomic
 from pewm_jax.config import UserError
 from pewm_jax.data.dataset import Shard, describe_shard, write_shard
 from pewm_jax.data.make_episode import CollectConfig, make_episode
@@ -46,6 +47,8 @@ DIED = (
 )
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 """Environment variables for Ray: no usage reports, no warning about unused GPUs."""
+CHAPTERS = ("config", "geometry", "houses", "data")
+"""Folders of this library whose code can change the bytes of a shard."""
 LIBRARIES = ("numpy", "scipy", "trimesh", "embreex", "opencv-python-headless", "array_record")
 """Libraries whose versions can change the bytes of a shard."""
 
@@ -217,7 +220,7 @@ def software_here() -> dict[str, str]:
     """Return the versions that a shard's bytes depend on; of this library, a hash of its code."""
     root = Path(__file__).parents[1]
     code = hashlib.sha256()
-    for chapter in ("config", "geometry", "data"):
+    for chapter in CHAPTERS:
         for path in sorted((root / chapter).glob("*.py")):
             code.update(path.name.encode() + path.read_bytes())
     versions = {name: importlib.metadata.version(name) for name in LIBRARIES}
@@ -304,15 +307,10 @@ def _with_absolute_paths(job: Job) -> Job:
 
 def _write_received(path: Path, made: Shard, content: bytes) -> Shard:
     """Write a shard that another machine made, after comparing its hash."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        if hashlib.sha256(content).hexdigest() != made.sha256:
-            raise UserError(f"{path} arrived damaged; run the same command again to go on.")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    if hashlib.sha256(content).hexdigest() != made.sha256:
+        raise UserError(f"{path} arrived damaged; run the same command again to go on.")
+    with atomic.replacing(path) as partial, partial.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
     return made

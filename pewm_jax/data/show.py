@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import tyro
 
+from pewm_jax import atomic
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
@@ -63,9 +64,8 @@ def show(config: ShowConfig, say: Callable[[str], None] = print) -> None:
     config.out.parent.mkdir(parents=True, exist_ok=True)
     done, code = cv2.imencode(".png", picture[..., ::-1])
     assert done
-    partial = config.out.with_name(config.out.name + ".partial")
-    partial.write_bytes(code.tobytes())
-    partial.replace(config.out)
+    with atomic.replacing(config.out) as partial:
+        partial.write_bytes(code.tobytes())
     say(f"{config.out}: {episode.name} in {episode.scene}, {episode.length} frames.")
 
 

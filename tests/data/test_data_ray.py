@@ -148,6 +148,15 @@ def test_ctrl_c_ends_the_cluster_that_was_started_and_the_pool_goes_on(tmp_path)
     assert 1 <= there < 200
 
 
+def test_the_code_that_is_compared_is_all_that_makes_episodes():
+    """Machines whose houses differ must not make shards of one dataset."""
+    program = "import sys, pewm_jax.data.make_episode; print(*sys.modules)"
+    modules = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, text=True)
+    names = [name.split(".") for name in modules.split() if name.startswith("pewm_jax.")]
+    chapters = {name[1] for name in names if (ROOT / "pewm_jax" / name[1]).is_dir()}
+    assert chapters == set(engines.CHAPTERS)
+
+
 def test_an_engine_that_cannot_be_used_is_refused_before_anything_is_touched(
     tmp_path, monkeypatch, capsys
 ):
