@@ -1,7 +1,8 @@
 """The pytrees that travel through the library, and the letters in their names.
 
 Letters: B batch, T frames, S context frames, H W pixels, t h w latent grid, C channels,
-N video tokens, M map tokens, L text tokens, D width, K heads, V map slots, F map features.
+N video tokens, M map tokens, L text tokens, D width, K heads, V map slots, F map features,
+A numbers of an action, X Y Z voxels.
 
 Conventions, stated once:
 
@@ -10,7 +11,8 @@ Conventions, stated once:
 * ``intrinsics`` are ``(fx, fy, cx, cy)`` in pixels, pixel centres at +0.5: the centre of the
   top-left pixel is (0.5, 0.5), an image of width W spans u in [0, W].
 * Depth is z in metres (not the length of the ray); 0 means "no measurement".
-* Action k leads from frame k to frame k + 1, so T frames have T − 1 actions.
+* Action k leads from frame k to frame k + 1, so T frames have T − 1 actions. A planar action is
+  (dx, dy, dyaw): metres forward, metres left, radians counter-clockwise; first move, then turn.
 * Colours are uint8 in [0, 255] on disk and in batches, float32 in [−1, 1] inside the networks.
 """
 
@@ -88,12 +90,18 @@ class Clip:
         context_valid_S: (..., S) bool, False where the episode had no more earlier frames.
         context_features_ShwF: (..., S, h, w, F) the image encoder's features of the context, where
             they were computed beforehand (``pewm_jax.memory.feature_cache``), else None.
+        actions_TA: (..., T − 1, A) float32, action k leads from frame k to frame k + 1 of the clip;
+            None where none were recorded (hand-held cameras). A = 3 is a planar action.
+        voxels_TXYZ: (..., T, X, Y, Z) integer class ids of the cells around the agent at each
+            frame, None where none were recorded.
     """
 
     frames: Frames
     context: Frames
     context_valid_S: Array
     context_features_ShwF: Array | None = None
+    actions_TA: Array | None = None
+    voxels_TXYZ: Array | None = None
 
 
 @_pytree

@@ -1,4 +1,4 @@
-"""Records that fail to decode: each is named once, and so many are done without and no more."""
+"""Records that fail to decode: they are skipped up to a limit, and each is reported once."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pewm_jax.config import UserError
 
 
 class BadRecords:
-    """What turned out not to decode; may be shared by threads and by several loaders.
+    """The records that failed to decode; may be shared by threads and by several loaders.
 
     Args:
-        budget: distinct records that may be skipped, ``data.bad_records``; None for any number.
-        say: told the name of each record that is skipped, once.
+        budget: most distinct records that may be skipped, ``data.bad_records``; None = no limit.
+        say: called once per skipped record with a line that names it.
     """
 
     def __init__(self, budget: int | None = None, say: Callable[[str], Any] | None = None):
@@ -28,18 +28,18 @@ class BadRecords:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the records, in the order in which they were met."""
+        """Return the names of the records, in the order in which they were found."""
         return tuple(self._reasons)
 
     def add(self, record: str, reason: str) -> None:
-        """Note a record that does not decode.
+        """Count a record that does not decode.
 
         Args:
             record: its name.
             reason: the sentence with which it was refused.
 
         Raises:
-            UserError: that is more than are done without; the message names all of them.
+            UserError: the limit is exceeded; the message names all of them.
         """
         with self._lock:
             known = record in self._reasons

@@ -1,4 +1,4 @@
-"""What can be wrong with an episode, found from the episode alone."""
+"""Checks of a single episode: cameras, actions, depth, and whether they agree."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.data.consistency import find_disagreement
-from pewm_jax.data.episodes import DEPTH_LIMIT_M, Episode
+from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
+from pewm_jax.geometry.actions import PLANAR
 
 MEDIAN_DEPTH_M = (0.05, 40.0)
 """Outside of this range the median depth of a recording is in a wrong unit, metres."""
@@ -23,7 +24,7 @@ ACTION_M, ACTION_RAD = 2e-3, 2e-3
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """Something wrong, and where.
+    """A problem and its place.
 
     Attributes:
         where: file and record.
@@ -60,7 +61,7 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
             episode.ids()
     except UserError as error:
         return [*found, Problem(where, None, "images", str(error))]
-    found += check_depth(depth_THW, where)
+    found += _check_saturation(depth_THW, where) or check_depth(depth_THW, where)
     if not found:  # wrong poses or units would only be reported once more
         found += _check_geometry(episode, depth_THW, where)
     return found
@@ -83,8 +84,9 @@ def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
                 where,
                 None,
                 "depth",
-                f"{missing:.0%} of the pixels have no depth (0, or beyond {DEPTH_LIMIT_M} m): the "
-                "unit is wrong or the depth images are empty; correct the depth scale.",
+                f"{missing:.0%} of the pixels have no depth (0, saturated, or beyond the largest "
+                "depth kept): the unit is wrong or the depth images are empty; correct the depth "
+                "scale.",
             )
         ]
     for frame, image in enumerate(depth_THW):
@@ -92,6 +94,23 @@ def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
         if len(seen) > (1 - MOST_MISSING) * image.size and not _plausible(np.median(seen)):
             return [_wrong_unit(where, frame, "this frame", float(np.median(seen)))]
     return []
+
+
+def _check_saturation(depth_THW: np.ndarray, where: str) -> list[Problem]:
+    """Check that no stored depth is the saturated value, which is a mark and no distance."""
+    saturated = depth_THW > (SATURATED - 0.5) / MILLIMETRES
+    if not saturated.any():
+        return []
+    return [
+        Problem(
+            where,
+            int(np.flatnonzero(saturated.any((1, 2)))[0]),
+            "depth",
+            f"{saturated.mean():.1%} of the episode's pixels hold the saturated value {SATURATED}, "
+            "which is no measurement: import the recording again with --overwrite, which stores 0 "
+            "there, or write 0 there yourself.",
+        )
+    ]
 
 
 def _plausible(median: float) -> bool:
@@ -177,6 +196,8 @@ def _check_actions(episode: Episode, where: str) -> Iterator[Problem]:
         frame = int(np.flatnonzero(~finite)[0])
         yield Problem(where, frame, "actions", "holds NaN or infinity.")
         return
+    if actions.shape[1] != PLANAR:  # another kind of control: not a motion that can be checked
+        return
     metres, radians = action_errors(episode.world_from_camera, actions)
     for frame in np.flatnonzero((metres > ACTION_M) | (radians > ACTION_RAD))[:1]:
         yield Problem(
@@ -191,7 +212,7 @@ def _check_actions(episode: Episode, where: str) -> Iterator[Problem]:
 def action_errors(
     world_from_camera: np.ndarray, actions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Carry out every action from its frame's pose and compare with the next frame's.
+    """Return how far every action leads from the pose of the next frame.
 
     Args:
         world_from_camera: (T, 4, 4) poses.

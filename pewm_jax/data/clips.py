@@ -1,4 +1,4 @@
-"""Clips cut from episodes: which frames are imagined, and which earlier ones are remembered."""
+"""Clips cut from episodes: the frames to generate, and earlier frames as context."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
+from pewm_jax.geometry.actions import PLANAR, compose
 from pewm_jax.types import Camera, Clip, Frames
 
 ReadFeatures: TypeAlias = Callable[[Episode, np.ndarray], np.ndarray]
@@ -30,11 +31,11 @@ class Choice:
 
 
 def choose(config: Config, length: int, rng: np.random.Generator, where: str = "episode") -> Choice:
-    """Draw a clip from an episode: its stride, its start, and what of the past is remembered.
+    """Draw a clip from an episode: its stride, its start and its context frames.
 
     Every stride of ``data.stride_min … stride_max`` that fits is equally likely, and so is every
-    start. The context is spread over the whole past, one frame out of each of S − 1 equal parts
-    of it, always with the frame just before the clip, and ends with the clip's first frame.
+    start. The context has one frame from each of S − 1 equal parts of the past, among them the
+    frame just before the clip, and the clip's first frame.
 
     Args:
         config: ``clip.frames``, ``data.stride_min``, ``data.stride_max``, ``data.context``.
@@ -62,12 +63,12 @@ def choose(config: Config, length: int, rng: np.random.Generator, where: str = "
 
 
 def choose_context(start: int, slots: int, rng: np.random.Generator | None = None) -> np.ndarray:
-    """Return which frames up to ``start`` are remembered, at most ``slots`` of them.
+    """Return the context frames of a clip: at most ``slots`` frames up to ``start``.
 
     Args:
-        start: first frame of the clip; always the last one remembered.
+        start: first frame of the clip; always the last context frame.
         slots: S.
-        rng: where in each part of the past to look; None takes the middle, always the same.
+        rng: draws the frame of each part of the past; None takes the middle.
 
     Returns:
         (≤ S,) increasing frame numbers.
@@ -87,7 +88,7 @@ def choose_context(start: int, slots: int, rng: np.random.Generator | None = Non
 
 
 def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | None = None) -> Clip:
-    """Decode the chosen frames, each once.
+    """Decode the frames of a clip, each once, and join its actions.
 
     Args:
         episode: where they come from.
@@ -98,7 +99,8 @@ def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | N
             features of the clip's first frame.
 
     Returns:
-        A NumPy clip without batch axis: rgb uint8, depth float32 metres.
+        A NumPy clip without batch axis: rgb uint8, depth float32 metres, and the actions and voxels
+        that the episode has.
     """
     wanted, place = np.unique(
         np.concatenate([choice.frames_T, choice.context_S]), return_inverse=True
@@ -112,13 +114,40 @@ def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | N
     context.rgb_THWC[~valid] = 0
     context.depth_THW[~valid] = 0
     found = None if features is None else features(episode, wanted[fill])
-    return Clip(_take(frames, place[:count]), context, valid, found)
+    return Clip(
+        _take(frames, place[:count]),
+        context,
+        valid,
+        found,
+        None if episode.actions is None else join_actions(episode.actions, choice.frames_T),
+        None if episode.voxels_TXYZ is None else episode.voxels_TXYZ[choice.frames_T],
+    )
+
+
+def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:
+    """Return the actions that lead from each frame of a clip to its next frame.
+
+    Args:
+        actions_TA: (episode's frames − 1, A), action k leads from frame k to frame k + 1 of the
+            episode.
+        frames_T: (T,) evenly spaced frames of the episode.
+
+    Returns:
+        (T − 1, A) float32. The actions between two frames of the clip become one: planar actions
+        (A = 3) by composing the motions; of other kinds nothing is known, and they are laid end to
+        end, (T − 1, stride · A).
+    """
+    stride = int(frames_T[1] - frames_T[0]) if len(frames_T) > 1 else 1
+    steps_TSA = actions_TA[frames_T[:-1, None] + np.arange(stride)]
+    if actions_TA.shape[1] == PLANAR:
+        return compose(steps_TSA)
+    return steps_TSA.reshape(len(steps_TSA), stride * actions_TA.shape[1]).astype(np.float32)
 
 
 def clip_at(
     config: Config, episode: Episode, start: int, stride: int = 1, frames: int | None = None
 ) -> Clip:
-    """Return a certain clip, always the same: its context is spread evenly over the past.
+    """Return the clip at given frames, without randomness; its context is spread evenly.
 
     Args:
         config: ``clip.frames`` and ``data.context``.
@@ -142,7 +171,22 @@ def clip_at(
 
 
 def stack(clips: Sequence[Clip]) -> Clip:
-    """Stack clips to a batch: every array gets a leading B."""
+    """Stack clips to a batch: every array gets a leading B.
+
+    Raises:
+        UserError: some clips have actions or voxels and others have none, or of another size.
+    """
+
+    def optional(field: str) -> np.ndarray | None:
+        parts = [getattr(clip, field) for clip in clips]
+        shapes = {None if part is None else np.shape(part) for part in parts}
+        if len(shapes) > 1:
+            sizes = " and ".join(sorted("none" if s is None else str(s) for s in shapes))
+            raise UserError(
+                f"clips of one batch have {field} of different shapes ({sizes}): use episodes that "
+                "record the same, and one stride where actions are not planar (dx, dy, dyaw)."
+            )
+        return None if None in shapes else np.stack(parts)
 
     def frames(parts: Sequence[Frames]) -> Frames:
         return Frames(
@@ -154,13 +198,13 @@ def stack(clips: Sequence[Clip]) -> Clip:
             ),
         )
 
-    features = [clip.context_features_ShwF for clip in clips]
-    features = [feature for feature in features if feature is not None]
     return Clip(
         frames([clip.frames for clip in clips]),
         frames([clip.context for clip in clips]),
         np.stack([clip.context_valid_S for clip in clips]),
-        np.stack(features) if features else None,
+        optional("context_features_ShwF"),
+        optional("actions_TA"),
+        optional("voxels_TXYZ"),
     )
 
 

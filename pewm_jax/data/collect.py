@@ -1,8 +1,8 @@
-"""Collect a dataset with many workers, so that nothing half-made is ever taken for whole.
+"""Collect a dataset with many workers; an interrupted collection goes on where it stopped.
 
-The unit of work is a shard. A shard is written aside and renamed, ``dataset.json`` is written when
-all shards of a split are there: a collection that was killed goes on with the missing shards, and
-neither that nor who made the shards (see ``engines``) leaves a trace in the files.
+The unit of work is a shard. A shard is written under another name and then renamed;
+``dataset.json`` is written when all shards of a split exist. A collection that was killed goes on
+with the missing shards. The files depend neither on interruptions nor on the engine (``engines``).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ State = Literal["fresh", "resume", "complete"]
 
 
 def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
-    """Make the dataset, or what is missing of it.
+    """Make a dataset, or its missing shards.
 
     Args:
         config: what to make and where.
@@ -92,7 +92,7 @@ def _jobs(config: CollectConfig, split: str) -> list[Job]:
 
 
 def _examine(config: CollectConfig, split: str) -> State:
-    """Look at what is there without touching it, and refuse to mix it with other settings."""
+    """Find out what exists of a split, and refuse to mix settings. Nothing is changed."""
     folder = config.out / split
     finished = (folder / MANIFEST).is_file()
     if finished:
@@ -128,7 +128,7 @@ def _read_settings(path: Path) -> Mapping[str, Any]:
 
 
 def _prepare(config: CollectConfig, split: str, state: State, jobs: list[Job]) -> dict[str, Shard]:
-    """Mark a split as unfinished, clear away what is not whole, and return what is."""
+    """Mark a split as unfinished, delete incomplete files, and return the complete shards."""
     folder = config.out / split
     folder.mkdir(parents=True, exist_ok=True)
     listed = {}
@@ -139,19 +139,20 @@ def _prepare(config: CollectConfig, split: str, state: State, jobs: list[Job]) -
         (folder / MANIFEST).unlink(missing_ok=True)
     write_json(folder / UNFINISHED, settings_of(config, split))
     (folder / MANIFEST).unlink(missing_ok=True)
-    whole: dict[str, Shard] = {}
+    complete: dict[str, Shard] = {}
     if state == "resume":
         for job in jobs:
-            shard = _whole(job)
+            shard = _complete_shard(job)
             if shard is not None and listed.get(shard.file, shard) == shard:
-                whole[shard.file] = shard
+                complete[shard.file] = shard
     for path in (*folder.glob("*.array_record"), *folder.glob("*.partial")):
-        if path.name not in whole:
+        if path.name not in complete:
             path.unlink(missing_ok=True)
-    return whole
+    return complete
 
 
-def _whole(job: Job) -> Shard | None:
+def _complete_shard(job: Job) -> Shard | None:
+    """Return the description of a shard that exists with all its records, else None."""
     if not job.path.is_file():
         return None
     try:

@@ -1,4 +1,4 @@
-"""Do the depth images, the poses and the intrinsics of an episode describe one and the same world?
+"""Check that depth images, poses and intrinsics of an episode describe the same world.
 
 A surface that one frame sees, moved into another frame, may be hidden there behind something, but
 it cannot float in front of what that frame sees. Wrong intrinsics, wrong axes, inverted poses, a

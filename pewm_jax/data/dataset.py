@@ -1,8 +1,8 @@
 """A split on disk: ArrayRecord shards, and ``dataset.json`` written last.
 
-A split folder without ``dataset.json`` is unfinished and is never read. Shards are written aside
-and renamed; ``dataset.json`` names every shard with its number of records, size and SHA-256, so
-that a shard cut short is noticed when the split is opened.
+A split folder without ``dataset.json`` is unfinished and is never read. ``dataset.json`` lists
+every shard with its number of records, size and SHA-256, so a truncated shard is noticed when the
+split is opened.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from typing import Any
 import array_record.python.array_record_module as array_file
 from grain import sources
 
+from pewm_jax import atomic
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import Episode, read_episode
 from pewm_jax.data.record_format import VERSION, DamagedError
 
 MANIFEST = "dataset.json"
 UNFINISHED = "collecting.json"
-"""Lies in a split folder while it is being made, and says with what settings."""
+"""File in a split folder while the split is being made; holds its settings."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Shard:
 
 @dataclasses.dataclass(frozen=True)
 class Manifest:
-    """What ``dataset.json`` says.
+    """The content of ``dataset.json``.
 
     Attributes:
         split: name of the split.
@@ -78,9 +79,8 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
         UserError: the file cannot be written, e.g. because the disk is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     count = 0
-    try:
+    with atomic.replacing(path) as partial:
         # Images are compressed already, and one record per group makes a single one cheap to read.
         with _refused_writes(path):
             writer = array_file.ArrayRecordWriter(str(partial), "group_size:1,uncompressed")
@@ -94,15 +94,12 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
                 writer.close()
         with partial.open("rb") as file:
             os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
     return count
 
 
 @contextlib.contextmanager
 def _refused_writes(path: Path) -> Iterator[None]:
-    """Say in one sentence what ArrayRecord raises where the system refuses to write."""
+    """Turn ArrayRecord's write errors into one sentence."""
     try:
         yield
     except RuntimeError as error:
@@ -168,15 +165,13 @@ def read_record(path: Path, index: int) -> bytes:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON aside, then rename."""
+    """Write JSON, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n", "utf-8")
-    partial.replace(path)
+    atomic.write_text(path, json.dumps(value, indent=2, ensure_ascii=False) + "\n")
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Publish a split: from now on it reads as whole."""
+    """Write ``dataset.json``, which makes a split readable."""
     value = {
         "format": "pewm-dataset",
         "version": VERSION,
@@ -312,7 +307,7 @@ class EpisodeSource(Sequence[Episode]):
             ) from None
 
     def where(self, index: int, between: str = ", record ") -> str:
-        """Return the place of an episode in words: file and record."""
+        """Return the file and record of an episode, for messages."""
         for shard in self.manifest.shards:
             if index < shard.records:
                 return f"{self.path / shard.file}{between}{index}"

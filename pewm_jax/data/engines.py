@@ -1,7 +1,7 @@
-"""Who makes the shards: this process, several of this machine, or those of a Ray cluster.
+"""Engines that make shards: this process, a pool of processes, or a Ray cluster.
 
-A shard is a pure function of the settings and its number, so that it does not show in the files
-who made them. Machines of a cluster send the bytes of a shard back and see no common folder.
+A shard is a pure function of the settings and its number, so the files do not depend on the engine.
+Machines of a cluster send the bytes of a shard back; they need no shared folder.
 """
 
 from __future__ import annotations
@@ -28,26 +28,29 @@ from typing import Any
 
 import cv2
 
+from pewm_jax import atomic
 from pewm_jax.config import UserError
 from pewm_jax.data.dataset import Shard, describe_shard, write_shard
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 
-AHEAD = 2
-"""Shards given to a cluster for each of its processors: one that is made and one that waits."""
+SHARDS_PER_PROCESSOR = 2
+"""Shards submitted to a cluster per processor: one that is made and one that waits."""
 RETRIES = 3
-"""Times that a shard is made again, by another worker, when its worker or machine is lost."""
+"""Retries of a shard whose worker or machine was lost."""
 CONNECT_S = 10.0
-"""How long a cluster may take to answer."""
-PATIENCE_S = 5.0
-"""How long the shards that are not wanted any more may take to be given up."""
+"""Timeout of the connection to a cluster, seconds."""
+CANCEL_S = 5.0
+"""Timeout for cancelled shards to stop, seconds."""
 DIED = (
     "a worker process died (killed, or out of memory); run the same command again to go on, with "
     "fewer --workers if memory is short."
 )
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
-"""Ray's own switches: no reports on its users, no warning about GPUs that nobody uses here."""
+"""Environment variables for Ray: no usage reports, no warning about unused GPUs."""
+CHAPTERS = ("config", "geometry", "houses", "data")
+"""Folders of this library whose code can change the bytes of a shard."""
 LIBRARIES = ("numpy", "scipy", "trimesh", "embreex", "opencv-python-headless", "array_record")
-"""What the bytes of a shard depend on beside this library's own code."""
+"""Libraries whose versions can change the bytes of a shard."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Job:
 def run(
     jobs: list[Job], config: CollectConfig, say: Callable[[str], None] = print
 ) -> Generator[tuple[Job, Shard]]:
-    """Make shards with the engine that the settings name; yields them as they get ready.
+    """Make shards with the engine of the settings; yield each when it is done.
 
     Args:
         jobs: the shards.
@@ -104,7 +107,7 @@ def on_processes(jobs: list[Job], workers: int) -> Generator[tuple[Job, Shard]]:
         min(workers, len(jobs)), multiprocessing.get_context("spawn"), _start_worker
     )
     try:
-        with _deaf():  # workers are spawned here, and inherit it before any line of theirs runs
+        with _sigint_ignored():  # workers are spawned here and inherit it from their first line on
             futures = {pool.submit(job.run): job for job in jobs}
         for future in concurrent.futures.as_completed(futures):
             yield futures[future], future.result()
@@ -119,8 +122,8 @@ def on_processes(jobs: list[Job], workers: int) -> Generator[tuple[Job, Shard]]:
 
 
 @contextlib.contextmanager
-def _deaf() -> Iterator[None]:
-    """Ignore Ctrl-C for a moment, here and for ever in the processes spawned meanwhile."""
+def _sigint_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C inside the block; processes spawned in it ignore it for good."""
     if threading.current_thread() is not threading.main_thread():  # others cannot set signals
         yield
         return
@@ -132,7 +135,7 @@ def _deaf() -> Iterator[None]:
 
 
 def _start_worker() -> None:
-    """Prepare a worker: one thread, deaf to Ctrl-C (its parent ends it), gone with its parent."""
+    """Set up a worker: one thread, ignores Ctrl-C (its parent ends it), ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
     parent = multiprocessing.parent_process()
@@ -150,23 +153,25 @@ def on_cluster(
 ) -> Generator[tuple[Job, Shard]]:
     """Make shards on the machines of a Ray cluster; arguments and errors as for ``run``.
 
-    Few shards are given out at a time, so that what comes back never fills the cluster's memory,
-    and always more than there are processors, so that a cluster that grows on demand does.
+    Few shards are submitted at a time, so that results do not fill the cluster's memory, but more
+    than there are processors, so that an autoscaling cluster grows.
     """
     ray = _import_ray()
     with cluster(ray, config, say):
         make = ray.remote(num_cpus=1, max_retries=RETRIES)(make_bytes)
         software = software_here()
-        waiting, going = list(reversed(jobs)), {}
+        waiting, running = list(reversed(jobs)), {}
         try:
-            while waiting or going:
+            while waiting or running:
                 processors = int(ray.cluster_resources().get("CPU", 1))
-                while waiting and len(going) < (config.workers or AHEAD * max(processors, 1)):
+                while waiting and len(running) < (
+                    config.workers or SHARDS_PER_PROCESSOR * max(processors, 1)
+                ):
                     job = waiting.pop()
-                    going[make.remote(_reachable(job), software)] = job
-                ready, _ = ray.wait(list(going), num_returns=1)
-                job = going.pop(ready[0])
-                yield job, _place(job.path, *ray.get(ready[0]))
+                    running[make.remote(_with_absolute_paths(job), software)] = job
+                ready, _ = ray.wait(list(running), num_returns=1)
+                job = running.pop(ready[0])
+                yield job, _write_received(job.path, *ray.get(ready[0]))
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, UserError):
                 raise UserError(str(error.cause)) from None
@@ -174,11 +179,11 @@ def on_cluster(
         except ray.exceptions.RayError:
             raise UserError(DIED) from None
         finally:
-            for reference in going:
+            for reference in running:
                 with contextlib.suppress(ray.exceptions.RayError):
                     ray.cancel(reference)
-            if going:
-                ray.wait(list(going), num_returns=len(going), timeout=PATIENCE_S)
+            if running:
+                ray.wait(list(running), num_returns=len(running), timeout=CANCEL_S)
 
 
 def make_bytes(job: Job, software: Mapping[str, str]) -> tuple[Shard, bytes]:
@@ -215,7 +220,7 @@ def software_here() -> dict[str, str]:
     """Return the versions that a shard's bytes depend on; of this library, a hash of its code."""
     root = Path(__file__).parents[1]
     code = hashlib.sha256()
-    for chapter in ("config", "geometry", "data"):
+    for chapter in CHAPTERS:
         for path in sorted((root / chapter).glob("*.py")):
             code.update(path.name.encode() + path.read_bytes())
     versions = {name: importlib.metadata.version(name) for name in LIBRARIES}
@@ -223,7 +228,7 @@ def software_here() -> dict[str, str]:
 
 
 def require(config: CollectConfig) -> None:
-    """Make sure that the engine can be used, before anything is touched.
+    """Check that the engine can be used, before any file is written.
 
     Raises:
         UserError: Ray is not installed, or nothing answers at the address.
@@ -240,7 +245,7 @@ def require(config: CollectConfig) -> None:
 
 
 def _import_ray() -> Any:
-    """Import Ray, which is heavy, wants to report on its users, and is not always there."""
+    """Import Ray when it is needed: it is slow to import and an optional dependency."""
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
     try:
@@ -261,7 +266,7 @@ def _no_cluster(config: CollectConfig, reason: str) -> str:
 
 @contextlib.contextmanager
 def cluster(ray: Any, config: CollectConfig, say: Callable[[str], None]) -> Iterator[None]:
-    """Use the cluster that this process has joined, or join one, or start one of this machine.
+    """Connect to a cluster, or start one on this machine; keep a connection that exists already.
 
     Args:
         ray: the module.
@@ -294,23 +299,18 @@ def cluster(ray: Any, config: CollectConfig, say: Callable[[str], None]) -> Iter
         ray.shutdown()
 
 
-def _reachable(job: Job) -> Job:
-    """Return the job with meshes named by where they are for a process of any folder."""
+def _with_absolute_paths(job: Job) -> Job:
+    """Return the job with absolute paths of the meshes; workers have another working folder."""
     scene = tuple(path.absolute() for path in job.config.scene)
     return dataclasses.replace(job, config=dataclasses.replace(job.config, scene=scene))
 
 
-def _place(path: Path, made: Shard, content: bytes) -> Shard:
-    """Write a shard that came from elsewhere, aside and then renamed, and compare its hash."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        if hashlib.sha256(content).hexdigest() != made.sha256:
-            raise UserError(f"{path} arrived damaged; run the same command again to go on.")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+def _write_received(path: Path, made: Shard, content: bytes) -> Shard:
+    """Write a shard that another machine made, after comparing its hash."""
+    if hashlib.sha256(content).hexdigest() != made.sha256:
+        raise UserError(f"{path} arrived damaged; run the same command again to go on.")
+    with atomic.replacing(path) as partial, partial.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
     return made

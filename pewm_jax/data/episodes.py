@@ -1,7 +1,8 @@
-"""The episode: what it holds, and how it becomes bytes and comes back.
+"""The episode: its fields, and how it is written to and read from a record.
 
 One record is one episode. Its header says where every array and every encoded image lies, so that
-single frames are decoded without touching the others (``layout.py``, ``docs/data_format.md``).
+single frames are decoded without reading the others (``record_format.py``,
+``docs/data_format.md``).
 """
 
 from __future__ import annotations
@@ -19,30 +20,37 @@ from pewm_jax.data.record_format import (
     UNITS,
     VERSION,
     DamagedError,
+    array_shapes,
     check_span,
     pack_record,
     read_header,
+    shape_fits,
+    shape_text,
 )
 from pewm_jax.types import Camera, Frames
 
 MILLIMETRES = 1000.0
-DEPTH_LIMIT_M = 65.535
-"""Depths beyond what 16 bits of millimetres hold are stored as 0, "no measurement"."""
+SATURATED = 65535
+"""The largest 16-bit value: sensors mark missing or too far depth with it. It is never written."""
+DEPTH_LIMIT_M = (SATURATED - 1) / MILLIMETRES
+"""The largest depth stored; depths beyond it become 0, "no measurement"."""
 PNG_LEVEL = 1
 
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeArrays:
-    """What an episode is written from.
+    """The arrays of an episode to write.
 
     Attributes:
         rgb_THWC: (T, H, W, 3) uint8.
         depth_THW: (T, H, W) float metres along z, 0 = no measurement.
         intrinsics_4: (4,) fx, fy, cx, cy in pixels, centres at +0.5.
         world_from_camera: (T, 4, 4) camera-to-world.
-        actions: (T − 1, 3) dx, dy, dyaw, or None where the camera does not move like the agent.
+        actions: (T − 1, 3) dx, dy, dyaw, or (T − 1, A) of another kind of control, or None where
+            the camera does not move like the agent.
         action_ids: (T − 1,) discrete actions, or None.
         ids_THW: (T, H, W) instance ids from −1 (nothing) to 65534, or None.
+        voxels_TXYZ: (T, X, Y, Z) integer class ids of the cells around the agent, or None.
     """
 
     rgb_THWC: np.ndarray
@@ -52,11 +60,12 @@ class EpisodeArrays:
     actions: np.ndarray | None = None
     action_ids: np.ndarray | None = None
     ids_THW: np.ndarray | None = None
+    voxels_TXYZ: np.ndarray | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Episode:
-    """An episode as it lies on disk: small arrays are at hand, images are decoded when asked for.
+    """An episode read from disk: small arrays are decoded, images on request.
 
     Attributes:
         name: name of the episode, e.g. ``house-000012/follow``.
@@ -66,8 +75,9 @@ class Episode:
         width: image width in pixels.
         intrinsics_4: (4,) float32.
         world_from_camera: (T, 4, 4) float32.
-        actions: (T − 1, 3) float32 or None.
+        actions: (T − 1, A) float32 or None; A = 3 is (dx, dy, dyaw).
         action_ids: (T − 1,) int32 or None.
+        voxels_TXYZ: (T, X, Y, Z) integers or None; a read-only view of the record.
         info: free-form facts about the episode, e.g. ``return_frame`` of a revisit episode.
         header: the whole JSON header.
         record: the bytes.
@@ -82,6 +92,7 @@ class Episode:
     world_from_camera: np.ndarray
     actions: np.ndarray | None
     action_ids: np.ndarray | None
+    voxels_TXYZ: np.ndarray | None
     info: Mapping[str, Any]
     header: Mapping[str, Any] = dataclasses.field(repr=False)
     record: bytes = dataclasses.field(repr=False)
@@ -167,6 +178,7 @@ def write_episode(
         "world_from_camera": np.asarray(arrays.world_from_camera, "<f4"),
         "actions": None if arrays.actions is None else np.asarray(arrays.actions, "<f4"),
         "action_ids": None if arrays.action_ids is None else np.asarray(arrays.action_ids, "<i4"),
+        "voxels": arrays.voxels_TXYZ,
     }
     header: dict[str, Any] = {
         "format": "pewm-episode",
@@ -186,15 +198,15 @@ def write_episode(
 
 
 def to_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Return metres as uint16 millimetres, rounded; beyond 65.535 m or not finite becomes 0."""
+    """Return metres as uint16 millimetres, rounded; beyond 65.534 m or not finite becomes 0."""
     millimetres = np.rint(np.asarray(depth, np.float64) * MILLIMETRES)
     with np.errstate(invalid="ignore"):
-        kept = (millimetres > 0) & (millimetres <= DEPTH_LIMIT_M * MILLIMETRES)
+        kept = (millimetres > 0) & (millimetres < SATURATED)
     return np.where(kept, millimetres, 0).astype(np.uint16)
 
 
 def read_episode(record: bytes, where: str = "record") -> Episode:
-    """Open a record; nothing but the small arrays is decoded.
+    """Open a record and decode its small arrays; images stay encoded.
 
     Args:
         record: the bytes of ``write_episode``.
@@ -206,23 +218,18 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
     """
     header = read_header(record, where)
     frames = header["frames"]
-    expected = {
-        "intrinsics": (4,),
-        "world_from_camera": (frames, 4, 4),
-        "actions": (frames - 1, 3),
-        "action_ids": (frames - 1,),
-    }
-    arrays: dict[str, np.ndarray | None] = dict.fromkeys(expected)
+    arrays: dict[str, np.ndarray] = {}
     for field, place in header["arrays"].items():
-        if tuple(place["shape"]) != expected.get(field):
+        shape, expected = tuple(place["shape"]), array_shapes(frames).get(field)
+        if expected is None or not shape_fits(shape, expected):
             raise DamagedError(
-                f"{where}, field {field}: shape {tuple(place['shape'])} for {frames} frames, "
-                f"expected {expected.get(field)}; the counts do not match, write it again."
+                f"{where}, field {field}: shape {shape} for {frames} frames, expected "
+                f"{shape_text(expected)}; the counts do not match, write it again."
             )
-        count = int(np.prod(place["shape"]))
-        check_span(record, place["offset"], count * 4, where, field)
-        flat = np.frombuffer(record, place["dtype"], count, place["offset"])
-        arrays[field] = flat.reshape(place["shape"]).copy()
+        dtype, count = np.dtype(place["dtype"]), int(np.prod(shape))
+        check_span(record, place["offset"], count * dtype.itemsize, where, field)
+        found = np.frombuffer(record, dtype, count, place["offset"]).reshape(shape)
+        arrays[field] = found if field == "voxels" else found.copy()
     for stream in ("rgb", "depth", *header["streams"]):
         spans = header["streams"].get(stream, {"spans": []})["spans"]
         if len(spans) != frames:
@@ -232,8 +239,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
             )
         if spans:
             check_span(record, spans[-1][0], spans[-1][1], where, stream)
-    intrinsics, pose = arrays["intrinsics"], arrays["world_from_camera"]
-    if intrinsics is None or pose is None:
+    if not {"intrinsics", "world_from_camera"} <= arrays.keys():
         raise DamagedError(f"{where} lacks intrinsics or world_from_camera; write it again.")
     return Episode(
         name=header["name"],
@@ -241,10 +247,11 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
         length=frames,
         height=header["height"],
         width=header["width"],
-        intrinsics_4=intrinsics,
-        world_from_camera=pose,
-        actions=arrays["actions"],
-        action_ids=arrays["action_ids"],
+        intrinsics_4=arrays["intrinsics"],
+        world_from_camera=arrays["world_from_camera"],
+        actions=arrays.get("actions"),
+        action_ids=arrays.get("action_ids"),
+        voxels_TXYZ=arrays.get("voxels"),
         info=header["info"],
         header=header,
         record=record,
@@ -272,18 +279,29 @@ def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
         raise UserError(f"episode {name}: depth has shape {depth.shape}, expected (T, H, W).")
     frames = len(depth)
     expected = {
-        "rgb": (rgb, (*depth.shape, 3)),
-        "intrinsics": (arrays.intrinsics_4, (4,)),
-        "world_from_camera": (arrays.world_from_camera, (frames, 4, 4)),
-        "actions": (arrays.actions, (frames - 1, 3)),
-        "action_ids": (arrays.action_ids, (frames - 1,)),
-        "ids": (arrays.ids_THW, depth.shape),
+        "rgb": (*depth.shape, 3),
+        "ids": depth.shape,
+        **array_shapes(frames),
     }
-    for field, (array, shape) in expected.items():
-        if array is not None and np.shape(array) != shape:
+    given = {
+        "rgb": rgb,
+        "ids": arrays.ids_THW,
+        "intrinsics": arrays.intrinsics_4,
+        "world_from_camera": arrays.world_from_camera,
+        "actions": arrays.actions,
+        "action_ids": arrays.action_ids,
+        "voxels": arrays.voxels_TXYZ,
+    }
+    for field, array in given.items():
+        if array is not None and not shape_fits(np.shape(array), expected[field]):
             raise UserError(
                 f"episode {name}, field {field}: shape {np.shape(array)} for {frames} frames of "
-                f"depth, expected {shape}; the counts do not match."
+                f"depth, expected {shape_text(expected[field])}; the counts do not match."
             )
+    voxels = arrays.voxels_TXYZ
+    if voxels is not None and not np.issubdtype(voxels.dtype, np.integer):
+        raise UserError(
+            f"episode {name}, field voxels: dtype {voxels.dtype}, expected integer class ids."
+        )
     if rgb.dtype != np.uint8:
         raise UserError(f"episode {name}, field rgb: dtype {rgb.dtype}, expected uint8 in 0…255.")

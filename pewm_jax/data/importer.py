@@ -1,4 +1,4 @@
-"""Import a recording of colour, depth and trajectory as an episode, checked before it counts."""
+"""Import a recording (colour, depth, trajectory) as an episode; it is validated before writing."""
 
 from __future__ import annotations
 
@@ -31,13 +31,35 @@ from pewm_jax.data.dataset import (
     write_manifest,
     write_shard,
 )
-from pewm_jax.data.episodes import EpisodeArrays, decode_image, read_episode, write_episode
+from pewm_jax.data.episodes import (
+    DEPTH_LIMIT_M,
+    SATURATED,
+    EpisodeArrays,
+    decode_image,
+    read_episode,
+    write_episode,
+)
 from pewm_jax.data.progress import Meter
 from pewm_jax.data.recording_folders import RecordedFrame, read_recording
 from pewm_jax.geometry.actions import actions_between
 from pewm_jax.geometry.cameras import resize_intrinsics
 
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Imported:
+    """A shard of a split made by ``import``: it holds one episode.
+
+    Attributes:
+        shard: the file.
+        frames: frames of the episode.
+        actions: whether it has actions.
+    """
+
+    shard: Shard
+    frames: int
+    actions: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,9 +81,13 @@ class ImportConfig:
     """Where cx and cy have the centre of the first pixel: `integer` at 0 (Open3D, TUM, OpenCV),
     `half` at 0.5."""
     depth_scale: float = 1000.0
-    """Value of a depth image that means one metre: 1000 for millimetres, 5000 for TUM."""
+    """Value of a depth image that means one metre: 1000 for millimetres, 5000 for TUM. The largest
+    value of 16 bits, 65535, is no measurement whatever the scale."""
+    max_depth: float = DEPTH_LIMIT_M
+    """Depths beyond this are no measurement, metres. By default all that the format can store is
+    kept; give the range of the sensor, such as 10, to leave out what it measures badly."""
     stride: int = 1
-    """Keep every so many-th frame."""
+    """Keep every n-th frame."""
     size: tuple[int, int] | None = None
     """Width and height to resize to, pixels; by default the images keep their size."""
     trajectory: Path | None = None
@@ -82,6 +108,11 @@ class ImportConfig:
             raise ConfigError(f"--stride is {self.stride}: use 1 or more.")
         if not self.depth_scale > 0:
             raise ConfigError(f"--depth-scale is {self.depth_scale}: use 1000 for millimetres.")
+        if not 0 < self.max_depth <= DEPTH_LIMIT_M:
+            raise ConfigError(
+                f"--max-depth is {self.max_depth}: use metres above 0, up to the {DEPTH_LIMIT_M} "
+                "that the format can store."
+            )
         if self.size is not None and min(self.size) < 1:
             raise ConfigError(f"--size is {self.size}: use a width and height in pixels.")
         if min(self.intrinsics[:2]) <= 0:
@@ -106,7 +137,7 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
     """
     name = config.name or config.src.resolve().name
     folder = config.out / config.split
-    shards = _others(config, folder, name)
+    imported = _others(config, folder, name)
     frames = read_recording(config.src, config.trajectory)[:: config.stride]
     rgb, depth, source_size = _read_images(config, frames)
     width, height = depth.shape[2], depth.shape[1]
@@ -114,7 +145,9 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
     intrinsics = np.array(config.intrinsics, np.float32) + np.array([0, 0, half, half], np.float32)
     scale = (width / source_size[0], height / source_size[1])
     pose = world_from_recording(config.up) @ np.stack([f.world_from_camera for f in frames])
+    # The units are judged before anything is left out, which could hide that they are wrong.
     _refuse(check_depth(depth, str(config.src)), config, frames)
+    depth[depth > config.max_depth] = 0
     arrays = EpisodeArrays(
         rgb, depth, resize_intrinsics(intrinsics, *scale), pose, planar_actions(pose)
     )
@@ -123,18 +156,22 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
     _refuse(check_episode(read_episode(record), str(config.src)), config, frames)
     path = folder / f"recording-{name}.array_record"
     write_shard(path, [record])
-    shards.append((describe_shard(path), len(frames)))
-    total = sum(count for _, count in shards)
-    settings = {"made_by": "import", "frames": {shard.file: count for shard, count in shards}}
+    imported.append(_Imported(describe_shard(path), len(frames), arrays.actions is not None))
+    settings = {
+        "made_by": "import",
+        "frames": {one.shard.file: one.frames for one in imported},
+        "actions": {one.shard.file: one.actions for one in imported},
+    }
+    total = sum(one.frames for one in imported)
     write_manifest(
-        folder, Manifest(config.split, tuple(shard for shard, _ in shards), settings, total)
+        folder, Manifest(config.split, tuple(one.shard for one in imported), settings, total)
     )
     moves = "planar actions" if arrays.actions is not None else "poses only (moves in 6 degrees)"
     say(f"{folder}: added {name}, {len(frames)} frames of {width}×{height} pixels, {moves}.")
 
 
 def world_from_recording(up: str) -> np.ndarray:
-    """Return the (4, 4) rotation that turns a recording's up axis to z, moving least axes."""
+    """Return the (4, 4) rotation that takes a recording's up axis to z."""
     axis = np.array(_AXES[up[-1]], float) * (-1 if up.startswith("-") else 1)
     keep = np.array(_AXES["y" if up[-1] == "x" else "x"], float)  # this one stays horizontal
     rotation = np.eye(4)
@@ -155,8 +192,8 @@ def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     return actions if bool(((metres < ACTION_M) & (radians < ACTION_RAD)).all()) else None
 
 
-def _others(config: ImportConfig, folder: Path, name: str) -> list[tuple[Shard, int]]:
-    """Return the shards that are there already, and how many frames each has."""
+def _others(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
+    """Return the shards that are there already, without the one to replace."""
     if not folder.exists():
         return []
     file = f"recording-{name}.array_record"
@@ -167,7 +204,7 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[tuple[Shard, 
             raise UserError(
                 f"{folder} holds an unfinished collection; finish it, or give another --split."
             )
-        return [(describe_shard(path), _length(path)) for path in strays if path.name != file]
+        return [_look(path, describe_shard(path)) for path in strays if path.name != file]
     # The shard to replace may be newer than the list, where an import was killed between the two.
     manifest = read_manifest(folder, check_files=False)
     if manifest.settings.get("made_by") != "import":
@@ -179,11 +216,19 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[tuple[Shard, 
     kept = [shard for shard in manifest.shards if shard.file != file]
     for shard in kept:
         check_size(folder / shard.file, shard)
-    return [(shard, manifest.settings["frames"][shard.file]) for shard in kept]
+    frames, actions = manifest.settings["frames"], manifest.settings.get("actions", {})
+    return [
+        _Imported(shard, frames[shard.file], actions[shard.file])
+        if shard.file in actions
+        else _look(folder / shard.file, shard)  # imported before actions were listed
+        for shard in kept
+    ]
 
 
-def _length(path: Path) -> int:
-    return read_episode(read_record(path, 0), str(path)).length
+def _look(path: Path, shard: Shard) -> _Imported:
+    """Open a shard to see what it holds."""
+    episode = read_episode(read_record(path, 0), str(path))
+    return _Imported(shard, episode.length, episode.actions is not None)
 
 
 def _read_images(
@@ -211,13 +256,21 @@ def _read_images(
             shrink = size[0] < source[0]
             how = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
             rgb[k] = cv2.resize(colour, size, interpolation=how)[..., ::-1]
-            depth[k] = _nearest(distance, size) / config.depth_scale
+            depth[k] = _metres(_nearest(distance, size), config.depth_scale)
             meter.advance(1)
     return rgb, depth, source
 
 
+def _metres(values_HW: np.ndarray, scale: float) -> np.ndarray:
+    """Return depths in metres; the saturated value of a 16-bit image becomes 0."""
+    metres = values_HW / scale
+    if values_HW.dtype == np.uint16:
+        metres[values_HW == SATURATED] = 0
+    return metres
+
+
 def _nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize by picking pixels: blended depths would lie between surfaces."""
+    """Resize by nearest neighbour: interpolated depths would lie between surfaces."""
     height, width = image.shape
     rows = ((np.arange(size[1]) + 0.5) * height / size[1]).astype(int)
     columns = ((np.arange(size[0]) + 0.5) * width / size[0]).astype(int)
@@ -236,7 +289,7 @@ def _read(path: Path, flags: int) -> np.ndarray:
 
 
 def _refuse(problems: list[Problem], config: ImportConfig, frames: list[RecordedFrame]) -> None:
-    """Refuse what has problems; the frame of the first is named by its depth image too."""
+    """Refuse a recording with problems; name the first, with the file of its depth image."""
     if not problems:
         return
     first = problems[0]

@@ -15,7 +15,7 @@ SUN_3 = np.array([0.35, 0.55, 0.76])
 RAYS = 16
 """Occlusion rays per vertex."""
 LIFT_M = 0.04
-"""Occlusion is judged this far above a surface, so that skirting and frames cast no halos."""
+"""Occlusion rays start this far above a surface, so that skirting and frames cast no halos."""
 
 
 def embree(vertices_V3: np.ndarray, faces_F3: np.ndarray) -> EmbreeScene:
@@ -84,7 +84,7 @@ def soft_light(
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     inward = inside - vertices_V3
     length = np.linalg.norm(inward, axis=-1, keepdims=True).clip(1e-9)
-    # Corners touch the next surface exactly; judge them a little inside their own.
+    # Corners touch the next surface: the rays start a little inside the face.
     points = vertices_V3 + inward * np.minimum(0.03 / length, 0.4)
     used = np.flatnonzero(np.bincount(index, minlength=size))
     openness = np.ones(size)

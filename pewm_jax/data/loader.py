@@ -1,9 +1,8 @@
 """Batches of clips by Grain: batch k is a function of (seed, k), so a position is one integer.
 
-Every epoch visits every episode once, in an order drawn from the seed; a clip is drawn from the
-episode. Nothing but k is needed to go on where an interrupted training stopped. In the place of an
-episode that does not decode comes another, drawn from the same (seed, place): which one depends on
-what lies on disk alone.
+Every epoch visits every episode once, in an order drawn from the seed, and draws one clip from
+each. An interrupted training goes on from k alone. An episode that does not decode is replaced by
+another, drawn from the same seed and position, so the replacement depends only on the files.
 """
 
 from __future__ import annotations
@@ -22,12 +21,13 @@ from pewm_jax.data.clips import Choice, ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.record_format import DamagedError
+from pewm_jax.geometry.actions import PLANAR
 from pewm_jax.types import Clip
 
 BATCHES_AHEAD = 2
 """Batches decoded before they are asked for; with the one in use, what the loader holds."""
 EPOCHS = 2**31
-"""Times that the episodes are gone through: without end, and countable in batches of one."""
+"""Epochs of the dataset: practically endless, and its length still fits an integer."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,15 @@ class _Drawn:
 
 
 class _DrawClip(grain.transforms.RandomMap):
-    """Number of a record → a clip of its episode, or of another's where it does not decode."""
+    """Number of a record → a clip of its episode, or of another's where it does not decode.
+
+    Args:
+        config: as for ``clips``.
+        source: the episodes.
+        features: as for ``clips``.
+        bad: as for ``clips``.
+        left_out: optional fields of a clip that are not read, see ``_not_in_all``.
+    """
 
     def __init__(
         self,
@@ -49,8 +57,10 @@ class _DrawClip(grain.transforms.RandomMap):
         source: EpisodeSource,
         features: ReadFeatures | None,
         bad: BadRecords,
+        left_out: tuple[str, ...] = (),
     ):
         self.config, self.source, self.features, self.bad = config, source, features, bad
+        self.left_out = left_out
 
     def random_map(self, element: int, rng: np.random.Generator) -> Clip:
         return self.draw(element, rng).clip
@@ -60,7 +70,7 @@ class _DrawClip(grain.transforms.RandomMap):
 
         Raises:
             UserError: the episode does not fit the configuration, more records do not decode than
-                are done without, or none does.
+                ``data.bad_records`` allows, or none does.
         """
         refused: set[int] = set()
         while True:
@@ -69,6 +79,7 @@ class _DrawClip(grain.transforms.RandomMap):
                 _check_size(self.config, episode)
                 choice = choose(self.config, episode.length, rng, f"episode {episode.name}")
                 clip = cut(episode, choice, self.config.data.context, self.features)
+                clip = dataclasses.replace(clip, **dict.fromkeys(self.left_out))
             except DamagedError as error:
                 self.bad.add(_name(self.source, record), str(error))
                 refused.add(record)
@@ -104,6 +115,9 @@ def dataset(
 ) -> grain.MapDataset:
     """Return the endless dataset whose element k is batch k, or some rows of it.
 
+    All batches have the same fields: actions and voxels where all episodes have them (``import``
+    lists which have actions; a split of another maker is judged by its first episode).
+
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit the
             configuration.
@@ -111,8 +125,8 @@ def dataset(
     """
     source = EpisodeSource(Path(config.data.path) / split)
     bad = BadRecords(config.data.bad_records) if bad is None else bad
-    _check_first(config, source, bad)
-    drawn = _order(source, seed).random_map(_DrawClip(config, source, features, bad))
+    left_out = _not_in_all(source, _check_first(config, source, bad))
+    drawn = _order(source, seed).random_map(_DrawClip(config, source, features, bad, left_out))
     wanted = range(batch)[rows or slice(None)]
 
     def read(number: int) -> Clip:
@@ -122,7 +136,7 @@ def dataset(
 
 
 def records(config: Config, split: str = "train", *, seed: int, batch: int, step: int) -> list[str]:
-    """Name what a batch was made of, found out again from its number.
+    """Name the clips of a batch, recomputed from its number.
 
     Args:
         config: as for ``clips``.
@@ -175,7 +189,8 @@ def clips(
             reads its own. Each clip is the same whoever reads it.
 
     Returns:
-        NumPy clips with a leading B (the number of rows): rgb uint8, depth float32 in metres.
+        NumPy clips with a leading B (the number of rows): rgb uint8, depth float32 in metres, and
+        actions and voxels where all episodes have them.
 
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit, or (where
@@ -186,8 +201,11 @@ def clips(
     return iter(batches.to_iter_dataset(grain.ReadOptions(threads, BATCHES_AHEAD + threads - 1)))
 
 
-def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> None:
+def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Episode:
     """Compare the first episode that decodes with the configuration, before anything is compiled.
+
+    Returns:
+        That episode.
 
     Raises:
         UserError: it does not fit, or none is left.
@@ -201,8 +219,26 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> None
         _check_size(config, first)
         _check_actions(config, first)
         choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
-        return
+        return first
     raise UserError(f"{source.path}: none of its records can be read; make the split again.")
+
+
+def _not_in_all(source: EpisodeSource, first: Episode) -> tuple[str, ...]:
+    """Return the optional fields of a clip that not all episodes of a split have.
+
+    Args:
+        source: the split.
+        first: its first episode.
+    """
+    actions = first.actions is not None
+    settings = source.manifest.settings
+    if settings.get("made_by") == "import":  # hand-held cameras among others
+        listed = settings.get("actions")
+        if listed is None:  # imported before actions were listed: a few recordings, looked at
+            listed = {k: source[k].actions is not None for k in range(len(source))}
+        actions = all(listed.values())
+    has = {"actions_TA": actions, "voxels_TXYZ": first.voxels_TXYZ is not None}
+    return tuple(field for field, there in has.items() if not there)
 
 
 def _name(source: EpisodeSource, record: int) -> str:
@@ -231,7 +267,14 @@ def _check_size(config: Config, episode: Episode) -> None:
 
 
 def _check_actions(config: Config, episode: Episode) -> None:
-    """Compare the settings of the actions with what a collected episode was made with."""
+    """Compare the settings of the actions with what an episode was made with, or has."""
+    data, actions = config.data, episode.actions
+    if actions is not None and actions.shape[1] != PLANAR and data.stride_min < data.stride_max:
+        raise ConfigError(
+            f"episode {episode.name} has actions of width {actions.shape[1]}, which only join to "
+            "one size where all clips have one stride: set data.stride_min and data.stride_max "
+            f"to the same number, for instance --data.stride_max {data.stride_min}."
+        )
     for name in ("step_m", "turn_deg"):
         made, wanted = episode.info.get(name), getattr(config.model.actions, name)
         if made is not None and not np.isclose(made, wanted, rtol=1e-6):

@@ -1,6 +1,6 @@
-"""One episode from settings and an index: scene, walk, pictures, bytes.
+"""Make one episode: scene, trajectory, rendered frames, encoded record.
 
-Every episode is a pure function of the settings and its index, whatever process makes it.
+Every episode is a pure function of the settings and its index.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from pewm_jax.types import Camera
 SPLITS = ("train", "validation", "revisit")
 """Folders written; ``revisit`` holds the test scenes, walked out and back."""
 HOUSES_PER_SEED = 1_000_000
-_FREE = ("out", "workers", "engine", "address", "overwrite")
-"""Settings that do not show in the files."""
+_NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
+"""Settings that do not change the files."""
 HEADROOM_M = 0.1
 """Free room above the camera where the agent may stand, metres."""
 
@@ -129,7 +129,7 @@ class CollectConfig:
 def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
     """Return what determines the bytes of a split, as plain values."""
     settings = dataclasses.asdict(config)
-    for name in (*_FREE, "train", "validation", "test"):
+    for name in (*_NOT_IN_FILES, "train", "validation", "test"):
         del settings[name]
     settings["scene"] = [f"{p.name} ({p.stat().st_size} bytes)" for p in config.scene]
     return {"made_by": "collect", "episodes": config.episodes(split), **settings}
@@ -155,7 +155,7 @@ def scenes_of(config: CollectConfig, split: str) -> tuple[Path, ...]:
 
 
 def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
-    """Make one episode: scene, walk, pictures, bytes.
+    """Make one episode and return its record.
 
     Raises:
         UserError: a mesh that does not load or has no floor to stand on.

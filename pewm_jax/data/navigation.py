@@ -1,4 +1,4 @@
-"""Where an agent can stand in any mesh, and how it gets from one place to another.
+"""The navigable area of any mesh, as a grid, and shortest paths on it.
 
 The grid is found with rays alone, so scans and procedural houses go the same way: rays downward
 from head height must land on the floor, and rays across cells at several heights must be free.
@@ -19,7 +19,7 @@ from pewm_jax.data.scenes import Scene
 STEP_M = 0.12
 """Height differences that count as the same floor."""
 _HEIGHTS = (0.15, 0.4, 0.7, 1.0)
-"""Heights above the floor at which obstacles are felt, as a fraction of the agent's height."""
+"""Heights at which obstacles are tested, as fractions of the agent's height."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def navigable(
     agent_radius_m: float = 0.2,
     agent_height_m: float = 1.2,
 ) -> NavGrid:
-    """Find where an agent can stand.
+    """Find the cells in which an agent can stand.
 
     Args:
         scene: any mesh, z up.

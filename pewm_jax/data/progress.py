@@ -1,4 +1,4 @@
-"""Progress with rate and time left: a bar on a terminal, a line now and then elsewhere."""
+"""Progress with rate and remaining time: a bar on a terminal, else a line every few seconds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EVERY_S = 10.0
 
 
 class Meter:
-    """Counts work done; a context manager.
+    """Progress meter; a context manager.
 
     Example:
         >>> with Meter("train", total=100, unit="frames") as meter:
@@ -26,7 +26,7 @@ class Meter:
         self.label, self.total, self.unit = label, total, unit
         self.done = 0
         self._stream = sys.stdout if stream is None else stream
-        self._began = self._told = time.monotonic()
+        self._start = self._last_line = time.monotonic()
         self._bar: Progress | None = None
 
     def __enter__(self) -> Self:
@@ -34,34 +34,34 @@ class Meter:
             self._bar = Progress(
                 TextColumn("{task.description}"),
                 BarColumn(),
-                TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[words]}"),
+                TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}"),
                 TimeRemainingColumn(),
                 console=Console(file=self._stream),
             )
             self._bar.start()
-            self._task = self._bar.add_task(self.label, total=self.total, words=self.unit)
+            self._task = self._bar.add_task(self.label, total=self.total, unit=self.unit)
         return self
 
     def advance(self, count: int) -> None:
-        """Say that so much more is done."""
+        """Add to the work done."""
         self.done += count
         now = time.monotonic()
-        rate = self.done / max(now - self._began, 1e-6)
+        rate = self.done / max(now - self._start, 1e-6)
         if self._bar is not None:
-            self._bar.update(self._task, advance=count, words=f"{self.unit}, {rate:.0f}/s")
-        elif now - self._told >= EVERY_S:
-            self._told = now
-            left = (self.total - self.done) / max(rate, 1e-6)
+            self._bar.update(self._task, advance=count, unit=f"{self.unit}, {rate:.0f}/s")
+        elif now - self._last_line >= EVERY_S:
+            self._last_line = now
+            remaining = (self.total - self.done) / max(rate, 1e-6)
             print(
                 f"{self.label}: {self.done}/{self.total} {self.unit}, {rate:.0f}/s, "
-                f"{left:.0f} s left",
+                f"{remaining:.0f} s left",
                 file=self._stream,
                 flush=True,
             )
 
     def summary(self) -> str:
-        """Return what was done, how fast, in one line."""
-        seconds = max(time.monotonic() - self._began, 1e-6)
+        """Return one line: work done, time and rate."""
+        seconds = max(time.monotonic() - self._start, 1e-6)
         return (
             f"{self.label}: {self.done} {self.unit} in {seconds:.1f} s "
             f"({self.done / seconds:.0f}/s)"

@@ -1,4 +1,4 @@
-"""Where everything lies in a record: magic word, header, payload.
+"""The layout of a record: magic word, header, payload.
 
 Byte by byte in ``docs/data_format.md``.
 """
@@ -30,7 +30,7 @@ FIELDS = (
     "arrays",
     "streams",
 )
-"""What every header has."""
+"""Required fields of a header."""
 
 CONVENTIONS = {
     "camera": "OpenCV axes: x right, y down, z forward",
@@ -52,13 +52,37 @@ UNITS = {
 
 
 class DamagedError(UserError):
-    """A record whose bytes are not what was written: it can only be made again, or done without."""
+    """A record is damaged: it must be made again, or it can be skipped."""
+
+
+def array_shapes(frames: int) -> dict[str, tuple[int | str, ...]]:
+    """Return the shapes of the arrays of an episode; a letter stands for any number."""
+    return {
+        "intrinsics": (4,),
+        "world_from_camera": (frames, 4, 4),
+        "actions": (frames - 1, "A"),
+        "action_ids": (frames - 1,),
+        "voxels": (frames, "X", "Y", "Z"),
+    }
+
+
+def shape_fits(shape: tuple[int, ...], expected: tuple[int | str, ...]) -> bool:
+    """Return whether a shape is what ``array_shapes`` says."""
+    return len(shape) == len(expected) and all(
+        isinstance(wanted, str) or size == wanted
+        for size, wanted in zip(shape, expected, strict=True)
+    )
+
+
+def shape_text(expected: tuple[int | str, ...] | None) -> str:
+    """Return an expected shape as text, or that there is no such field."""
+    return "no such field" if expected is None else f"({', '.join(map(str, expected))})"
 
 
 def pack_record(
     header: dict[str, Any], arrays: Mapping[str, np.ndarray], streams: Mapping[str, list[bytes]]
 ) -> bytes:
-    """Lay out arrays, then images, and describe them with offsets from the end of the header."""
+    """Concatenate header, arrays and images; offsets count from the end of the header."""
     blobs: list[bytes] = []
     offset = 0
     for field, array in arrays.items():

@@ -1,4 +1,4 @@
-"""Other people's recordings: which files belong together, and where the camera was.
+"""Recordings in the folders of Open3D and TUM: which files form a frame, and its camera pose.
 
 Two shapes of folders are read. Open3D's: a folder of colour images, a folder of depth images and a
 ``.log`` trajectory (a line of three integers, then a 4×4 camera-to-world matrix, per frame). TUM's:
@@ -38,7 +38,7 @@ class RecordedFrame:
 
 
 def read_recording(folder: Path, trajectory: Path | None = None) -> list[RecordedFrame]:
-    """List the frames of a recording, in order.
+    """Return the frames of a recording, in order.
 
     Args:
         folder: the recording.
@@ -108,22 +108,22 @@ def read_log(path: Path) -> np.ndarray:
             "then four rows of a matrix); it is cut short or of another format."
         )
     poses = np.empty((len(lines) // 5, 4, 4))
-    for k, (number, words) in enumerate(lines):
+    for k, (number, fields) in enumerate(lines):
         if k % 5:
-            poses[k // 5, k % 5 - 1] = _numbers(path, number, words, 4)
+            poses[k // 5, k % 5 - 1] = _numbers(path, number, fields, 4)
     return poses
 
 
 def _read_tum(folder: Path, trajectory: Path) -> list[RecordedFrame]:
     colours, depths = (_stamped(folder / name) for name in ("rgb.txt", "depth.txt"))
-    poses = [(stamp, words, number) for number, stamp, words in _stamped_lines(trajectory)]
+    poses = [(stamp, fields, number) for number, stamp, fields in _stamped_lines(trajectory)]
     depth_times, pose_times = (np.array([row[0] for row in rows]) for rows in (depths, poses))
     frames = []
     for stamp, name in colours:
         depth, pose = _nearest(depth_times, stamp), _nearest(pose_times, stamp)
         if depth is not None and pose is not None:
-            _, words, number = poses[pose]
-            matrix = _from_quaternion(trajectory, number, words)
+            _, fields, number = poses[pose]
+            matrix = _from_quaternion(trajectory, number, fields)
             frames.append(RecordedFrame(folder / name, folder / depths[depth][1], matrix))
     if not frames:
         raise UserError(
@@ -144,24 +144,24 @@ def _stamped(path: Path) -> list[tuple[float, str]]:
     if not path.is_file():
         raise UserError(f"{path} does not exist; a TUM recording lists its images there.")
     rows = []
-    for number, stamp, words in _stamped_lines(path):
-        if not words:
+    for number, stamp, fields in _stamped_lines(path):
+        if not fields:
             raise UserError(f"{path}, line {number}: a time stamp without a file name.")
-        rows.append((stamp, words[0]))
+        rows.append((stamp, fields[0]))
     return rows
 
 
 def _stamped_lines(path: Path) -> list[tuple[int, float, list[str]]]:
     rows = []
     for number, line in enumerate(_lines(path), 1):
-        words = line.split()
-        if words and not words[0].startswith("#"):
-            rows.append((number, float(_numbers(path, number, words[:1], 1)[0]), words[1:]))
+        fields = line.split()
+        if fields and not fields[0].startswith("#"):
+            rows.append((number, float(_numbers(path, number, fields[:1], 1)[0]), fields[1:]))
     return rows
 
 
-def _from_quaternion(path: Path, number: int, words: list[str]) -> np.ndarray:
-    values = _numbers(path, number, words, 7)
+def _from_quaternion(path: Path, number: int, fields: list[str]) -> np.ndarray:
+    values = _numbers(path, number, fields, 7)
     norm = float(np.linalg.norm(values[3:]))
     if not abs(norm - 1) < 1e-2:
         raise UserError(f"{path}, line {number}: the quaternion has length {norm:.3g}, not 1.")
@@ -178,13 +178,13 @@ def _lines(path: Path) -> list[str]:
         raise UserError(f"{path} does not read as text ({error}).") from None
 
 
-def _numbers(path: Path, line: int, words: list[str], count: int) -> np.ndarray:
+def _numbers(path: Path, line: int, fields: list[str], count: int) -> np.ndarray:
     try:
-        values = np.array([float(word) for word in words])
+        values = np.array([float(field) for field in fields])
     except ValueError:
         values = np.empty(0)
     if len(values) != count:
         raise UserError(
-            f"{path}, line {line}: expected {count} numbers, found {' '.join(words)!r}."
+            f"{path}, line {line}: expected {count} numbers, found {' '.join(fields)!r}."
         )
     return values

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import tyro
 
+from pewm_jax import atomic
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
@@ -63,9 +64,8 @@ def show(config: ShowConfig, say: Callable[[str], None] = print) -> None:
     config.out.parent.mkdir(parents=True, exist_ok=True)
     done, code = cv2.imencode(".png", picture[..., ::-1])
     assert done
-    partial = config.out.with_name(config.out.name + ".partial")
-    partial.write_bytes(code.tobytes())
-    partial.replace(config.out)
+    with atomic.replacing(config.out) as partial:
+        partial.write_bytes(code.tobytes())
     say(f"{config.out}: {episode.name} in {episode.scene}, {episode.length} frames.")
 
 
@@ -163,17 +163,17 @@ def _points(episode: Episode) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(points), np.concatenate(colours)
 
 
-def _thumb(image: np.ndarray, width: int, words: str = "") -> np.ndarray:
+def _thumb(image: np.ndarray, width: int, text: str = "") -> np.ndarray:
     large = np.ascontiguousarray(cv2.resize(image, (width, THUMB), interpolation=cv2.INTER_NEAREST))
-    if words:
-        _write(large, words, (5, 15))
+    if text:
+        _write(large, text, (5, 15))
     large[:, -1] = large[-1] = BACKGROUND
     return large
 
 
-def _write(image: np.ndarray, words: str, where: tuple[int, int]) -> None:
+def _write(image: np.ndarray, text: str, where: tuple[int, int]) -> None:
     for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(image, words, where, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thick, cv2.LINE_AA)
+        cv2.putText(image, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thick, cv2.LINE_AA)
 
 
 def _line(

@@ -1,4 +1,4 @@
-"""One mesh's positions, texture coordinates and colours, whatever kind of colours it has."""
+"""Positions, texture coordinates and colours of one mesh, in one form for all kinds of colour."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from trimesh.visual.material import PBRMaterial
 from pewm_jax.config import UserError
 
 GREY = np.array([170, 170, 170], np.uint8)
-"""Colour of a mesh that brings none."""
+"""Colour of a mesh without colours."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,8 +26,8 @@ class Surface:
         colour_F33: (F, 3, 3) float32, RGB in [0, 1] at each corner; multiplies the image.
         uv_F32: (F, 3, 2) float32, from the image's top left corner.
         image: (H, W, 3) uint8, or None.
-        bare: it has one colour all over, so that only shading can show its form.
-        glowing: it is seen without light.
+        bare: it has a single colour and no image; it is shaded by its normals.
+        glowing: it emits light and is not shaded.
     """
 
     vertices_V3: np.ndarray

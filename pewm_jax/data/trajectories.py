@@ -1,4 +1,4 @@
-"""How the agent walks: policies over a navigation grid, in discrete or continuous actions.
+"""Policies that walk over a navigation grid, with discrete or continuous actions.
 
 A trajectory is a list of planar poses (x, y, yaw), one per frame, and the actions between them.
 No policy ever moves through a wall: a forward move is made only where the whole segment is free.
@@ -25,7 +25,7 @@ from pewm_jax.geometry.cameras import pose_from_yaw
 
 Policy = Literal["follow", "walk", "revisit"]
 TURN_COST_M = 0.02
-"""A turn must bring the goal this much nearer, metres: keeps the agent from zigzagging."""
+"""Cost of a turn, metres: without it the agent zigzags."""
 CLEARANCE_M = 0.3
 """The agent prefers to stay this far inside the free area."""
 GOALS_TRIED = 24
@@ -34,7 +34,7 @@ GOALS_TRIED = 24
 
 @dataclasses.dataclass(frozen=True)
 class Trajectory:
-    """Where the agent was and what it did.
+    """Poses of the agent and its actions.
 
     Attributes:
         planar_T3: (T, 3) float64 x, y, yaw in the world, metres and radians.
@@ -125,7 +125,7 @@ class _Agent:
         return self.pose[:2] + length * np.stack([np.cos(yaw), np.sin(yaw)], -1)
 
     def turn_around(self) -> None:
-        """Look about: a full circle."""
+        """Turn by a full circle, left or right."""
         side = TURN_LEFT if self.rng.random() < 0.5 else TURN_RIGHT
         for _ in range(round(2 * math.pi / self.turn)):
             self.act(side)
@@ -185,7 +185,7 @@ def _half_turn(config: ActionConfig) -> int:
 
 
 def _revisit(agent: _Agent) -> Trajectory:
-    """Look around, go out, turn back, and retrace the way with the opposite heading."""
+    """Turn around, go to a goal, and come back along the same poses with the opposite heading."""
     total = agent.frames
     half = _half_turn(agent.config)
     out = (total - 1 - 3 * half) // 2
@@ -250,7 +250,7 @@ def _next_goal(agent: _Agent) -> np.ndarray:
 
 
 def _distance(grid: NavGrid, field_YX: np.ndarray, xy_N2: np.ndarray) -> np.ndarray:
-    """Look a field up at points; outside the grid it is infinite."""
+    """Return a field's values at points; infinite outside the grid."""
     cell = grid.cell_of(xy_N2)
     inside = np.all((cell >= 0) & (cell < field_YX.shape), axis=-1)
     cell = np.where(inside[..., None], cell, 0)
@@ -258,7 +258,7 @@ def _distance(grid: NavGrid, field_YX: np.ndarray, xy_N2: np.ndarray) -> np.ndar
 
 
 def _value(agent: _Agent, field_YX: np.ndarray, xy_N2: np.ndarray) -> np.ndarray:
-    """Distance to the goal, plus a dislike of walls."""
+    """Return the distance to the goal plus a penalty near walls, metres."""
     near = np.maximum(0, CLEARANCE_M - _distance(agent.grid, agent.clearance_YX, xy_N2))
     return _distance(agent.grid, field_YX, xy_N2) + 0.3 * np.where(np.isfinite(near), near, 0)
 
@@ -294,10 +294,10 @@ def _drift(agent: _Agent, heading: float) -> None:
 
 
 def _walk(agent: _Agent, steps: int | None = None) -> None:
-    """Go straight; at an obstacle, or now and then, turn to a free heading."""
-    left = agent.frames if steps is None else steps
-    while not agent.done and left > 0:
-        left -= 1
+    """Go straight; turn by a random angle at obstacles and with probability 0.05."""
+    remaining = agent.frames if steps is None else steps
+    while not agent.done and remaining > 0:
+        remaining -= 1
         if agent.clear(agent.ahead(agent.pose[2])) and agent.rng.random() > 0.05:
             if agent.continuous:
                 _drift(agent, agent.pose[2])

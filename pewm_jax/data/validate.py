@@ -25,7 +25,7 @@ from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.progress import Meter
 
 SHOWN = 20
-"""Problems printed at most."""
+"""Most problems printed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,12 +38,12 @@ class ValidateConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What a validation found.
+    """The result of a validation.
 
     Attributes:
         episodes: how many were checked.
         frames: how many frames these have.
-        problems: all that is wrong.
+        problems: all problems found.
     """
 
     episodes: int

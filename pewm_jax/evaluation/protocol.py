@@ -20,7 +20,7 @@ import numpy as np
 from pewm_jax.config import Config, UserError, to_dict
 from pewm_jax.data.clips import choose_context
 from pewm_jax.data.episodes import Episode
-from pewm_jax.geometry.actions import actions_between, continuous, integrate
+from pewm_jax.geometry.actions import PLANAR, actions_between, continuous, integrate
 from pewm_jax.types import Frames
 
 VERSION = 1
@@ -144,7 +144,7 @@ def load_clip(
     )
     actions_N3 = np.asarray(actions_between(poses))
     _check_motion(np.asarray(integrate(poses[0], actions_N3)), poses, choice, "upright motion")
-    if episode.actions is not None:
+    if episode.actions is not None and episode.actions.shape[1] == PLANAR:
         recorded = np.asarray(continuous(config.model.actions, episode.actions))
         steps = recorded[choice.start : choice.targets_N[-1]]
         every = np.asarray(integrate(poses[0], steps))

@@ -17,6 +17,8 @@ from pewm_jax.config import ActionConfig
 from pewm_jax.types import Array
 
 FORWARD, TURN_LEFT, TURN_RIGHT = 0, 1, 2
+PLANAR = 3
+"""Numbers of a planar action; recorded actions of another width are another kind of control."""
 NAMES = ("forward", "turn left", "turn right")
 
 
@@ -74,6 +76,24 @@ def integrate(world_from_camera: Array, actions_T3: Array) -> Array:
     start = jnp.asarray(world_from_camera, jnp.float32)
     _, rest = jax.lax.scan(step, start, jnp.asarray(actions_T3, jnp.float32))
     return jnp.concatenate([start[None], rest], 0)
+
+
+def compose(actions_S3: np.ndarray) -> np.ndarray:
+    """Return the single actions that do what several actions in a row do.
+
+    Args:
+        actions_S3: (..., S, 3) planar actions, carried out one after the other.
+
+    Returns:
+        (..., 3) float32: where the agent ends, seen from where it began, and the sum of its turns
+        (not wrapped: a full circle is 2π).
+    """
+    moves = np.asarray(actions_S3, np.float64)
+    dx, dy, turn = moves[..., 0], moves[..., 1], moves[..., 2]
+    yaw = np.cumsum(turn, -1) - turn  # before each action
+    forward = (np.cos(yaw) * dx - np.sin(yaw) * dy).sum(-1)
+    left = (np.sin(yaw) * dx + np.cos(yaw) * dy).sum(-1)
+    return np.stack([forward, left, turn.sum(-1)], -1).astype(np.float32)
 
 
 def actions_between(world_from_camera_T: Array) -> Array:

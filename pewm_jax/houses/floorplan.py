@@ -12,9 +12,9 @@ WALL_M = 0.12
 """Thickness of walls."""
 DOOR_TOP_M = 2.08
 """Height of doorways."""
-SMALLEST_M = 2.7
+MIN_ROOM_SIDE_M = 2.7
 """Shortest side of a room between wall centres."""
-SHARE_M = 1.5
+MIN_SHARED_WALL_M = 1.5
 """Shortest common wall that gets a doorway."""
 Rect = tuple[float, float, float, float]
 """x0, y0, x1, y1 in metres."""
@@ -95,7 +95,7 @@ def draw_plan(rng: np.random.Generator) -> Plan:
 
 
 def _split(rng: np.random.Generator, count: int) -> list[Rect]:
-    """Cut a rectangle into that many rooms, larger ones first, across their longer side."""
+    """Split a rectangle into rooms; large ones are split first, across their longer side."""
     while True:
         area = count * rng.uniform(12.5, 17.0)
         aspect = rng.uniform(0.75, 1.35)
@@ -106,15 +106,17 @@ def _split(rng: np.random.Generator, count: int) -> list[Rect]:
             pick = int(rng.choice(len(cells), p=sizes**2 / (sizes**2).sum()))
             if (
                 max(cells[pick][2] - cells[pick][0], cells[pick][3] - cells[pick][1])
-                < 2 * SMALLEST_M
+                < 2 * MIN_ROOM_SIDE_M
             ):
                 pick = int(sizes.argmax())
             x0, y0, x1, y1 = cells.pop(pick)
             across, fraction = x1 - x0 > y1 - y0, rng.uniform(0.36, 0.64)
             length = x1 - x0 if across else y1 - y0
-            if length < 2 * SMALLEST_M:
+            if length < 2 * MIN_ROOM_SIDE_M:
                 break
-            cut = round(float(np.clip(fraction * length, SMALLEST_M, length - SMALLEST_M)), 2)
+            cut = round(
+                float(np.clip(fraction * length, MIN_ROOM_SIDE_M, length - MIN_ROOM_SIDE_M)), 2
+            )
             if across:
                 cells += [(x0, y0, x0 + cut, y1), (x0 + cut, y0, x1, y1)]
             else:
@@ -124,7 +126,7 @@ def _split(rng: np.random.Generator, count: int) -> list[Rect]:
 
 
 def _shared_walls(cells: list[Rect]) -> list[tuple[int, int, int, float, float]]:
-    """Return (a, b, side of a, low, high) for every wall long enough for a doorway."""
+    """Return (a, b, side of a, low, high) of all shared walls long enough for a doorway."""
     found = []
     for a, ra in enumerate(cells):
         for b, rb in enumerate(cells):
@@ -133,7 +135,7 @@ def _shared_walls(cells: list[Rect]) -> list[tuple[int, int, int, float, float]]
                     continue
                 along = 1 - axis
                 low, high = max(ra[along], rb[along]), min(ra[along + 2], rb[along + 2])
-                if high - low >= SHARE_M:
+                if high - low >= MIN_SHARED_WALL_M:
                     found.append((a, b, side, low, high))
     return found
 
@@ -190,7 +192,7 @@ def _windows(rng: np.random.Generator, cell: Rect, outer: Rect) -> list[Opening]
 
 
 def _uses(rng: np.random.Generator, areas: list[float]) -> list[str]:
-    """Give the largest room to living, the smallest to washing, and share out the rest."""
+    """Make the largest room the living room, the smallest the bathroom, and draw the rest."""
     order = np.argsort(areas)[::-1]
     middle = ["bedroom", "kitchen", "study", "dining", "kids", "bedroom"]
     rest = [*middle[:2], *rng.permutation(middle[2:])][: len(areas) - 2]

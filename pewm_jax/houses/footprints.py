@@ -1,4 +1,4 @@
-"""Footprints and poses of things in a room: at a wall, in front of a doorway, turned about z."""
+"""Rectangles and poses in a room: against a wall, in front of a doorway, rotated about z."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def overlap(a: Rect, b: Rect) -> bool:
 
 
 def against(room: Room, side: int, at: float, depth: float, width: float) -> Rect:
-    """Return the footprint of a piece at a wall."""
+    """Return the rectangle on the floor of a piece that stands against a wall."""
     x0, y0, x1, y1 = room.rect
     low, high = at - width / 2, at + width / 2
     return (
@@ -26,20 +26,20 @@ def against(room: Room, side: int, at: float, depth: float, width: float) -> Rec
     )[side]
 
 
-def apron(room: Room, side: int, low: float, high: float) -> Rect:
-    """Return the floor inside a room that its doorway needs."""
+def doorway_clearance(room: Room, side: int, low: float, high: float) -> Rect:
+    """Return the floor in front of a doorway that must stay free: 0.75 m deep."""
     return against(room, side, (low + high) / 2, 0.75, high - low)
 
 
 def shift(x: float, y: float) -> np.ndarray:
-    """Return a pose moved along the ground."""
+    """Return the (4, 4) translation by (x, y)."""
     pose = np.eye(4)
     pose[:2, 3] = x, y
     return pose
 
 
 def turned(quarters: int, at_2: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return a pose turned by quarter circles about z."""
+    """Return the (4, 4) pose at a point, rotated about z by multiples of 90 degrees."""
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
     pose = shift(float(at_2[0]), float(at_2[1]))
     pose[:2, :2] = [[c, -s], [s, c]]
@@ -47,6 +47,6 @@ def turned(quarters: int, at_2: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def wall_frame(room: Room, side: int, at: float) -> np.ndarray:
-    """Return the frame of a wall at a place along it: y points into the room."""
+    """Return the (4, 4) pose of a point on a wall: x along the wall, y into the room."""
     x0, y0, x1, y1 = room.rect
     return turned(side, ((at, y0), (x1, at), (at, y1), (x0, at))[side])

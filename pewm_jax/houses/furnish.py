@@ -1,4 +1,4 @@
-"""What stands where: furniture placed in a room so that every doorway stays reachable.
+"""Place furniture in a room so that every doorway stays reachable.
 
 A piece is accepted only if it keeps clear of others, of doorways and of windows, and if the
 floor that an agent can stand on still connects all doorways of the room.
@@ -11,36 +11,42 @@ import dataclasses
 import numpy as np
 from scipy import ndimage
 
-from pewm_jax.houses import fixtures as m
-from pewm_jax.houses import furniture as f
+from pewm_jax.houses import fixtures, furniture
 from pewm_jax.houses.floorplan import Rect, Room
-from pewm_jax.houses.footprints import against, apron, overlap, shift, turned, wall_frame
-from pewm_jax.houses.furniture_parts import Tones
-from pewm_jax.houses.room_contents import PROGRAMMES, RUGS, TABLES
+from pewm_jax.houses.footprints import (
+    against,
+    doorway_clearance,
+    overlap,
+    shift,
+    turned,
+    wall_frame,
+)
+from pewm_jax.houses.furniture_parts import Palette
+from pewm_jax.houses.room_contents import DINING_TABLE_PROBABILITY, FURNITURE, RUG_PROBABILITY
 from pewm_jax.houses.shapes import Piece
 
 CLEAR_M = 0.32
-"""Room an agent needs on each side of its centre: a radius of 0.2 m and a margin for grids."""
+"""Free space that an agent needs around its centre: a radius of 0.2 m and a grid margin."""
 CELL_M = 0.1
 """Cell of the floor grid on which reachability is checked."""
 TRIES = 12
-"""Places tried for a piece before it is left out."""
+"""Random places tried for a piece before it is skipped."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Placed:
-    """A piece and where it is: ``world_from_piece`` (4, 4)."""
+    """A piece of furniture and its pose ``world_from_piece`` (4, 4)."""
 
     piece: Piece
     world_from_piece: np.ndarray
 
 
 class Furnisher:
-    """Places pieces in one room and keeps account of walls and floor."""
+    """Places furniture in one room and tracks which walls and floor cells are taken."""
 
-    def __init__(self, room: Room, rng: np.random.Generator, tones: Tones, height: float):
+    def __init__(self, room: Room, rng: np.random.Generator, palette: Palette, height: float):
         """Start with the bare room."""
-        self.room, self.rng, self.tones, self.height = room, rng, tones, height
+        self.room, self.rng, self.palette, self.height = room, rng, palette, height
         self.placed: list[Placed] = []
         self.footprints: list[Rect] = []
         self._last = (0, 0.0, 0.0)  # side, place along it and width of the last piece at a wall
@@ -49,7 +55,7 @@ class Furnisher:
             gap = 0.12
             self.used[hole.side].append((hole.low - gap, hole.bottom, hole.high + gap, hole.top))
         self.doors = [
-            apron(room, hole.side, hole.low, hole.high)
+            doorway_clearance(room, hole.side, hole.low, hole.high)
             for hole in room.openings
             if hole.kind == "door"
         ]
@@ -60,41 +66,41 @@ class Furnisher:
         self.open_cells = int((~self.blocked).sum())
 
     def furnish(self) -> list[Placed]:
-        """Fill the room by the programme of its use."""
+        """Place the furniture that belongs to the room's use, then decorate."""
         rng, use = self.rng, self.room.use
-        must, may = PROGRAMMES[use]
-        for maker in must:
-            if not self.at_wall(maker(rng, self.tones)):
+        required, optional = FURNITURE[use]
+        for maker in required:
+            if not self.at_wall(maker(rng, self.palette)):
                 continue
-            if maker is f.bed:
-                self.beside_last(f.nightstand(rng, self.tones))
-            elif maker is f.desk:
-                self.before_last(f.office_chair(rng, self.tones), 0.72, turned=True)
-            elif maker is f.sofa and rng.uniform() < 0.8:
-                self.before_last(f.coffee_table(rng, self.tones), 1.25, turned=False)
-        if rng.uniform() < TABLES.get(use, 0.0):
+            if maker is furniture.bed:
+                self.beside_last(furniture.nightstand(rng, self.palette))
+            elif maker is furniture.desk:
+                self.before_last(furniture.office_chair(rng, self.palette), 0.72, turned=True)
+            elif maker is furniture.sofa and rng.uniform() < 0.8:
+                self.before_last(furniture.coffee_table(rng, self.palette), 1.25, turned=False)
+        if rng.uniform() < DINING_TABLE_PROBABILITY.get(use, 0.0):
             self.table_with_chairs()
-        for index in rng.permutation(len(may)):
+        for index in rng.permutation(len(optional)):
             if rng.uniform() < 0.85:
-                self.at_wall(may[index](rng, self.tones))
+                self.at_wall(optional[index](rng, self.palette))
         self.decorate()
         return self.placed
 
     def decorate(self) -> None:
-        """Add what takes no floor: a rug, things on the walls, a lamp at the ceiling."""
+        """Add what blocks no floor: a rug, objects on the walls, a ceiling lamp."""
         rng = self.rng
-        if rng.uniform() < RUGS.get(self.room.use, 0.3):
+        if rng.uniform() < RUG_PROBABILITY.get(self.room.use, 0.3):
             self.rug()
         if rng.uniform() < 0.3:
-            self.hang(m.clock(rng, self.tones), 1.6)
+            self.hang(fixtures.clock(rng, self.palette), 1.6)
         if rng.uniform() < 0.7:
-            self.hang(m.wall_shelf(rng, self.tones), 1.1)
+            self.hang(fixtures.wall_shelf(rng, self.palette), 1.1)
         for _ in range(int(rng.integers(3, 6))):
-            self.hang(m.picture(rng, self.tones), rng.uniform(1.25, 1.45))
+            self.hang(fixtures.picture(rng, self.palette), rng.uniform(1.25, 1.45))
         self.ceiling_lamp()
 
     def at_wall(self, piece: Piece) -> bool:
-        """Put a piece with its back to some wall; False if there is no place."""
+        """Put a piece with its back to a random wall; return False if no place was found."""
         width, depth, high = piece.size
         for _ in range(TRIES):
             side = int(self.rng.integers(4))
@@ -149,7 +155,7 @@ class Furnisher:
     def table_with_chairs(self) -> bool:
         """Put a dining table somewhere in the room with chairs around it."""
         rng, x0y0x1y1 = self.rng, self.room.rect
-        table = f.dining_table(rng, self.tones)
+        table = furniture.dining_table(rng, self.palette)
         for _ in range(2 * TRIES):
             turn = int(rng.integers(2))
             w, d = table.size[:2] if turn == 0 else table.size[1::-1]
@@ -167,7 +173,7 @@ class Furnisher:
             spots = [(0.3, -0.42, 0), (-0.3, -0.42, 0), (0.3, 0.42, 2), (-0.3, 0.42, 2)]
             seed = int(rng.integers(1 << 30))
             for x, y, k in spots if rng.uniform() < 0.6 else spots[1::2] + spots[:1]:
-                chair = f.chair(np.random.default_rng(seed), self.tones)
+                chair = furniture.chair(np.random.default_rng(seed), self.palette)
                 there = np.sign(y) * (middle + 0.12)
                 local = shift(x, middle + there) @ turned(k, (0, 0)) @ shift(0, -0.3)
                 self._free_standing(chair, pose @ local, margin=-0.2)
@@ -176,7 +182,7 @@ class Furnisher:
 
     def rug(self) -> None:
         """Lay a rug in the middle."""
-        piece = m.rug(self.rng, self.tones)
+        piece = fixtures.rug(self.rng, self.palette)
         x0, y0, x1, y1 = self.room.rect
         turn = int(y1 - y0 > x1 - x0)
         w, d = piece.size[:2] if turn == 0 else piece.size[1::-1]
@@ -216,7 +222,7 @@ class Furnisher:
         x0, y0, x1, y1 = self.room.rect
         pose = shift((x0 + x1) / 2, (y0 + y1) / 2)
         pose[2, 3] = self.height
-        self.placed.append(Placed(m.ceiling_lamp(self.rng, self.tones), pose))
+        self.placed.append(Placed(fixtures.ceiling_lamp(self.rng, self.palette), pose))
 
     def _stand(self, piece: Piece, rect: Rect, side: int, at: float) -> bool:
         if not self._accept(rect):

@@ -1,4 +1,4 @@
-"""What furniture is made from: a room's palette, legs, rows of books, things on tops."""
+"""Parts shared by many pieces of furniture: a room's palette, legs, books, small objects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pewm_jax.houses.textures import Rgb, hsv
 
 
 @dataclasses.dataclass(frozen=True)
-class Tones:
+class Palette:
     """The palette of one room."""
 
     wall: Rgb
@@ -72,7 +72,7 @@ def books(
             at += rng.uniform(0.08, 0.2)
 
 
-def things(
+def small_objects(
     piece: Piece,
     rng: np.random.Generator,
     x: tuple[float, float],

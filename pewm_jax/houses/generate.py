@@ -12,7 +12,7 @@ from pewm_jax.houses import textures
 from pewm_jax.houses.connectivity import all_reachable
 from pewm_jax.houses.floorplan import DOOR_TOP_M, Room, draw_plan
 from pewm_jax.houses.furnish import Furnisher, Placed
-from pewm_jax.houses.furniture_parts import Tones
+from pewm_jax.houses.furniture_parts import Palette
 from pewm_jax.houses.shapes import Piece
 from pewm_jax.houses.shell import doorway_piece, level_mesh, trim_piece, wall_mesh, window_meshes
 from pewm_jax.houses.textures import hsv, shade
@@ -58,16 +58,16 @@ def _draw(rng: np.random.Generator) -> trimesh.Scene | None:
         for index, room in enumerate(plan.rooms)
     ]
     furnishers = [
-        Furnisher(room, rng, tones, plan.height)
-        for room, tones in zip(plan.rooms, palettes, strict=True)
+        Furnisher(room, rng, palette, plan.height)
+        for room, palette in zip(plan.rooms, palettes, strict=True)
     ]
     furniture = [furnisher.furnish() for furnisher in furnishers]
     if not all_reachable(plan, [rect for each in furnishers for rect in each.footprints]):
         return None
     scene = trimesh.Scene()
-    for index, (room, tones) in enumerate(zip(plan.rooms, palettes, strict=True)):
+    for index, (room, palette) in enumerate(zip(plan.rooms, palettes, strict=True)):
         name = f"room{index}-{room.use}"
-        _add_shell(scene, rng, room, name=name, tones=tones, height=plan.height)
+        _add_shell(scene, rng, room, name=name, palette=palette, height=plan.height)
         for number, placed in enumerate(furniture[index]):
             _add_piece(scene, f"room{index}-{placed.piece.kind}-{number}", placed)
     for index, (a, _, rect) in enumerate(plan.doorways):
@@ -81,12 +81,12 @@ def _draw(rng: np.random.Generator) -> trimesh.Scene | None:
     return scene
 
 
-def _palette(rng: np.random.Generator, hue: float, use: str) -> Tones:
+def _palette(rng: np.random.Generator, hue: float, use: str) -> Palette:
     """Draw a room's colours: walls of one hue, furniture in hues apart from it."""
     saturation = rng.uniform(0.25, 0.5) if use != "bathroom" else rng.uniform(0.2, 0.4)
     accent_hue = hue + rng.choice([0.42, 0.5, 0.58])
     fabric_hue = hue + rng.choice([0.25, 0.33, 0.67, 0.75])
-    return Tones(
+    return Palette(
         wall=hsv(hue, saturation, rng.uniform(0.78, 0.93)),
         wood=hsv(rng.uniform(0.05, 0.1), rng.uniform(0.4, 0.65), rng.uniform(0.35, 0.75)),
         fabric=hsv(fabric_hue, rng.uniform(0.5, 0.8), rng.uniform(0.45, 0.75)),
@@ -103,15 +103,15 @@ def _add_shell(
     room: Room,
     *,
     name: str,
-    tones: Tones,
+    palette: Palette,
     height: float,
 ) -> None:
     """Add a room's walls, floor, ceiling, trim and windows."""
     style = str(rng.choice(_WALLS))
-    image = textures.wall(rng, tones.wall, height, style)
+    image = textures.wall(rng, palette.wall, height, style)
     accent_side = int(rng.integers(4)) if rng.uniform() < 0.5 else -1
     strong = textures.wall(
-        rng, shade(tones.wall, 0.8) * [1, 0.96, 0.96], height, str(rng.choice(["bricks", style]))
+        rng, shade(palette.wall, 0.8) * [1, 0.96, 0.96], height, str(rng.choice(["bricks", style]))
     )
     for side in range(4):
         mesh = wall_mesh(room, side, height, strong if side == accent_side else image)
@@ -132,9 +132,9 @@ def _add_shell(
     scene.add_geometry(
         level_mesh(room.rect, height, above, facing_up=False), node_name=f"{name}-ceiling"
     )
-    _add_piece(scene, f"{name}-trim", Placed(trim_piece(room, tones), np.eye(4)))
+    _add_piece(scene, f"{name}-trim", Placed(trim_piece(room, palette), np.eye(4)))
     for number, hole in enumerate(hole for hole in room.openings if hole.kind == "window"):
-        for part, mesh in enumerate(window_meshes(room, hole, rng, tones)):
+        for part, mesh in enumerate(window_meshes(room, hole, rng, palette)):
             scene.add_geometry(mesh, node_name=f"{name}-window{number}-{part}")
 
 

@@ -6,50 +6,90 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pewm_jax.houses import fixtures as m
-from pewm_jax.houses import furniture as f
-from pewm_jax.houses.furniture_parts import Tones
+from pewm_jax.houses import fixtures, furniture
+from pewm_jax.houses.furniture_parts import Palette
 from pewm_jax.houses.shapes import Piece
 
-Maker = Callable[[np.random.Generator, Tones], Piece]
-"""Builds one piece from chance and a room's palette."""
+Maker = Callable[[np.random.Generator, Palette], Piece]
+"""Builds one piece of furniture from random numbers and a room's palette."""
 
-PROGRAMMES: dict[str, tuple[tuple[Maker, ...], tuple[Maker, ...]]] = {
+FURNITURE: dict[str, tuple[tuple[Maker, ...], tuple[Maker, ...]]] = {
     "living": (
-        (f.sofa, f.tv_stand, f.bookshelf),
-        (f.armchair, m.plant, m.floor_lamp, m.fireplace, m.piano, f.dresser, f.armchair, m.plant),
+        (furniture.sofa, furniture.tv_stand, furniture.bookshelf),
+        (
+            furniture.armchair,
+            fixtures.plant,
+            fixtures.floor_lamp,
+            fixtures.fireplace,
+            fixtures.piano,
+            furniture.dresser,
+            furniture.armchair,
+            fixtures.plant,
+        ),
     ),
     "bedroom": (
-        (f.bed, f.wardrobe, f.nightstand),
-        (f.dresser, m.plant, m.floor_lamp, f.armchair, f.bookshelf, f.desk),
+        (furniture.bed, furniture.wardrobe, furniture.nightstand),
+        (
+            furniture.dresser,
+            fixtures.plant,
+            fixtures.floor_lamp,
+            furniture.armchair,
+            furniture.bookshelf,
+            furniture.desk,
+        ),
     ),
     "kitchen": (
-        (m.kitchen_counter, m.fridge, m.stove),
-        (m.plant, f.dresser, m.kitchen_counter),
+        (fixtures.kitchen_counter, fixtures.fridge, fixtures.stove),
+        (fixtures.plant, furniture.dresser, fixtures.kitchen_counter),
     ),
     "bathroom": (
-        (m.bathtub, m.toilet, m.washbasin),
-        (m.washing_machine, m.plant, f.dresser),
+        (fixtures.bathtub, fixtures.toilet, fixtures.washbasin),
+        (fixtures.washing_machine, fixtures.plant, furniture.dresser),
     ),
     "study": (
-        (f.desk, f.bookshelf, f.bookshelf),
-        (f.armchair, m.floor_lamp, m.plant, f.sofa, m.piano),
+        (furniture.desk, furniture.bookshelf, furniture.bookshelf),
+        (furniture.armchair, fixtures.floor_lamp, fixtures.plant, furniture.sofa, fixtures.piano),
     ),
     "dining": (
-        (f.dresser, m.plant),
-        (m.fireplace, m.floor_lamp, f.bookshelf, m.piano, m.plant),
+        (furniture.dresser, fixtures.plant),
+        (
+            fixtures.fireplace,
+            fixtures.floor_lamp,
+            furniture.bookshelf,
+            fixtures.piano,
+            fixtures.plant,
+        ),
     ),
     "kids": (
-        (f.bed, m.toy_chest, f.wardrobe),
-        (f.desk, f.bookshelf, m.toy_chest, m.plant, m.floor_lamp),
+        (furniture.bed, fixtures.toy_chest, furniture.wardrobe),
+        (
+            furniture.desk,
+            furniture.bookshelf,
+            fixtures.toy_chest,
+            fixtures.plant,
+            fixtures.floor_lamp,
+        ),
     ),
     "hall": (
-        (m.coat_rack, f.dresser),
-        (m.plant, f.wardrobe, m.floor_lamp, f.armchair, f.bookshelf),
+        (fixtures.coat_rack, furniture.dresser),
+        (
+            fixtures.plant,
+            furniture.wardrobe,
+            fixtures.floor_lamp,
+            furniture.armchair,
+            furniture.bookshelf,
+        ),
     ),
 }
-"""For each use of a room: what it must have, and what it may have."""
-TABLES = {"kitchen": 0.7, "dining": 1.0, "living": 0.25}
-"""Chance of a dining table in the middle."""
-RUGS = {"living": 0.9, "bedroom": 0.7, "kids": 0.9, "study": 0.5, "hall": 0.6, "dining": 0.4}
-"""Chance of a rug."""
+"""For each use of a room: the furniture placed first, and the furniture placed as space allows."""
+DINING_TABLE_PROBABILITY = {"kitchen": 0.7, "dining": 1.0, "living": 0.25}
+"""Probability of a dining table in the middle of the room, 0 for the other uses."""
+RUG_PROBABILITY = {
+    "living": 0.9,
+    "bedroom": 0.7,
+    "kids": 0.9,
+    "study": 0.5,
+    "hall": 0.6,
+    "dining": 0.4,
+}
+"""Probability of a rug."""

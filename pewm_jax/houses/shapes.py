@@ -1,4 +1,4 @@
-"""Boxes, prisms, balls and sheets, gathered into one coloured mesh and a few textured ones.
+"""Boxes, prisms, ellipsoids and textured rectangles, merged into meshes.
 
 A piece of furniture lives in its own frame: x along the wall, y away from it (the back is at
 y = 0), z up, metres. Faces keep their own vertices, so that baked light has hard edges.
@@ -30,7 +30,7 @@ BOX_FACES = np.array([[4 * q, 4 * q + i, 4 * q + i + 1] for q in range(6) for i 
 
 @dataclasses.dataclass
 class Piece:
-    """A thing under construction.
+    """A piece of furniture, built by adding shapes.
 
     Attributes:
         kind: what it is, e.g. ``sofa``.

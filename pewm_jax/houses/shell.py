@@ -9,7 +9,7 @@ import trimesh
 
 from pewm_jax.houses import textures
 from pewm_jax.houses.floorplan import WALL_M, Opening, Rect, Room
-from pewm_jax.houses.furniture_parts import Tones
+from pewm_jax.houses.furniture_parts import Palette
 from pewm_jax.houses.shapes import Piece, textured
 from pewm_jax.houses.textures import shade
 
@@ -70,10 +70,10 @@ def level_mesh(rect: Rect, z: float, image: np.ndarray, *, facing_up: bool) -> t
     return textured(vertices, faces if facing_up else faces[:, ::-1], points / TILE_M, image)
 
 
-def trim_piece(room: Room, tones: Tones) -> Piece:
+def trim_piece(room: Room, palette: Palette) -> Piece:
     """Return a room's skirting boards and the frames around its openings, in world axes."""
     piece = Piece("trim", (0.0, 0.0, 0.0))
-    colour = tones.white
+    colour = palette.white
     for side in range(4):
         start, end = room.span(side)
         doors = sorted(
@@ -124,12 +124,12 @@ def _strip(
         piece.box(across, span, z, colour)
 
 
-def doorway_piece(rect: Rect, top: float, tones: Tones) -> Piece:
+def doorway_piece(rect: Rect, top: float, palette: Palette) -> Piece:
     """Return the lining of a doorway: threshold, two sides and the top, as thin boards."""
     piece = Piece("doorway", (0.0, 0.0, 0.0))
     x0, y0, x1, y1 = rect
-    colour, thin = shade(tones.white, 0.92), 0.01
-    piece.box((x0, x1), (y0, y1), (-thin, 0.004), shade(tones.wood, 0.8))
+    colour, thin = shade(palette.white, 0.92), 0.01
+    piece.box((x0, x1), (y0, y1), (-thin, 0.004), shade(palette.wood, 0.8))
     piece.box((x0, x1), (y0, y1), (top, top + thin), colour)
     if x1 - x0 < y1 - y0:
         piece.box((x0, x1), (y0 - thin, y0), (0, top), colour)
@@ -141,7 +141,7 @@ def doorway_piece(rect: Rect, top: float, tones: Tones) -> Piece:
 
 
 def window_meshes(
-    room: Room, hole: Opening, rng: np.random.Generator, tones: Tones
+    room: Room, hole: Opening, rng: np.random.Generator, palette: Palette
 ) -> list[trimesh.Trimesh]:
     """Return the lining of a window and its view, a picture set back in the wall."""
     x0, y0, x1, y1 = room.rect
@@ -177,6 +177,6 @@ def window_meshes(
         ((hole.low, hole.high), (hi, hi + thin)),
     ):
         p, q = low_2 + a * axis, high_2 + b * axis
-        piece.box((p[0], q[0]), (p[1], q[1]), z, tones.white)
+        piece.box((p[0], q[0]), (p[1], q[1]), z, palette.white)
     solid = piece.solid()
     return piece.pictures() + ([solid] if solid is not None else [])

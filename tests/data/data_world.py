@@ -39,7 +39,7 @@ def box_views(world_from_camera, intrinsics_4, height, width):
     return np.stack(rgb), np.stack(depth).astype(np.float32)
 
 
-def arrays(frames=12, size=16, seed=0, policy="follow", turn_around=0.0, width=None):
+def arrays(frames=12, size=16, seed=0, policy="follow", turn_around=0.0, width=None, **options):
     """What an agent sees on a walk through the box."""
     walk = make_trajectory(
         two_rooms(),
@@ -48,6 +48,7 @@ def arrays(frames=12, size=16, seed=0, policy="follow", turn_around=0.0, width=N
         np.random.default_rng(seed),
         policy=policy,
         turn_around=turn_around,
+        **options,
     )
     pose = walk.world_from_camera(CAMERA_Z)
     intrinsics = intrinsics_from_fov(size, width or size, 90.0)
@@ -61,11 +62,15 @@ def split(folder, episodes=4, shards=2, info=None, **options):
         write_episode(arrays(seed=i, **options), f"episode-{i}", "box", info)
         for i in range(episodes)
     ]
+    return write_split(folder, records, {}, shards, options.get("frames", 12) * episodes)
+
+
+def write_split(folder, records, settings, shards=1, frames=0):
+    """Write records as a finished split; returns its folder."""
     files = []
     for k in range(shards):
         path = folder / f"shard-{k:05d}-of-{shards:05d}.array_record"
-        write_shard(path, records[k * episodes // shards : (k + 1) * episodes // shards])
+        write_shard(path, records[k * len(records) // shards : (k + 1) * len(records) // shards])
         files.append(describe_shard(path))
-    frames = options.get("frames", 12)
-    write_manifest(folder, Manifest(folder.name, tuple(files), {}, frames * episodes))
+    write_manifest(folder, Manifest(folder.name, tuple(files), settings, frames))
     return folder

@@ -179,7 +179,7 @@ def test_a_killed_collection_goes_on(tmp_path, mesh, how):
     assert fingerprints(out) == fingerprints(tmp_path / "calm")
 
 
-def test_workers_are_born_deaf_to_an_interruption(monkeypatch):
+def test_workers_ignore_ctrl_c_from_their_start(monkeypatch):
     class Job:
         run = functools.partial(signal.getsignal, signal.SIGINT)
 

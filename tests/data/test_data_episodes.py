@@ -87,8 +87,10 @@ def test_the_same_episode_gives_the_same_bytes():
 
 
 def test_depth_is_millimetres_and_what_does_not_fit_is_missing():
-    depth = np.array([0.0, 0.0004, 0.0006, 1.2345678, 65.535, 65.536, np.inf, np.nan, -1.0])
-    np.testing.assert_array_equal(to_millimetres(depth), [0, 0, 1, 1235, 65535, 0, 0, 0, 0])
+    depth = np.array([0.0, 0.0004, 0.0006, 1.2345678, 65.534, 65.535, 70, np.inf, np.nan, -1.0])
+    np.testing.assert_array_equal(to_millimetres(depth), [0, 0, 1, 1235, 65534, 0, 0, 0, 0, 0])
+    fine = to_millimetres(np.linspace(65.53, 65.54, 1001))
+    assert 65535 not in fine
 
 
 def test_the_record_is_laid_out_as_documented():

@@ -20,7 +20,7 @@ from pewm_jax.data.importer import (
     planar_actions,
     world_from_recording,
 )
-from pewm_jax.data.recording_folders import read_recording
+from pewm_jax.data.recording_folders import RecordedFrame, read_recording
 from pewm_jax.geometry.cameras import unproject
 
 SIZE = 48
@@ -125,6 +125,45 @@ def test_other_depth_scales_and_float_images(tmp_path, walk):
         np.testing.assert_allclose(seen, walk.depth_THW, atol=6e-4)
 
 
+@pytest.mark.parametrize("scale", [1000.0, 5000.0, 1.0])
+def test_a_saturated_pixel_is_no_measurement_at_any_scale(tmp_path, scale):
+    far = tmp_path / "rec" / "00000.png"
+    far.parent.mkdir()
+    image = np.full((SIZE, SIZE), round(2 * scale), np.uint16)
+    image[:9], image[9:12] = 65535, 65534
+    cv2.imwrite(str(far), image)
+    frames = [RecordedFrame(far, far, np.eye(4))]
+    with pytest.MonkeyPatch.context() as patch:  # the colours are of no interest here
+        patch.setattr("pewm_jax.data.importer._read", read_as)
+        _, depth, _ = _read_images(config(far.parent, tmp_path, depth_scale=scale), frames)
+    assert not depth[0, :9].any()
+    np.testing.assert_allclose(depth[0, 9:12], 65534 / scale)
+    np.testing.assert_allclose(depth[0, 12:], 2)
+
+
+def read_as(path, flags):
+    grey = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return grey if flags == cv2.IMREAD_UNCHANGED else np.zeros((*grey.shape, 3), np.uint8)
+
+
+@pytest.mark.parametrize("scale", [1000.0, 5000.0])
+def test_saturated_and_far_depths_arrive_as_no_measurement(tmp_path, walk, scale):
+    folder = record(tmp_path / "rec", walk, scale=scale)
+    for path in (folder / "depth").iterdir():
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image[:6] = 65535
+        cv2.imwrite(str(path), image)
+    options = {"depth_scale": scale}
+    import_recording(config(folder, tmp_path / "a", **options), lambda _: None)
+    seen = imported(tmp_path / "a").frames().depth_THW
+    assert not seen[:, :6].any()
+    np.testing.assert_allclose(seen[:, 6:], walk.depth_THW[:, 6:], atol=6e-4)
+    import_recording(config(folder, tmp_path / "b", max_depth=3.0005, **options), lambda _: None)
+    near = imported(tmp_path / "b").frames().depth_THW
+    np.testing.assert_array_equal(near, np.where(seen > 3.0, 0, seen))
+    assert ((seen > 3.0).any(), near.max() <= 3.0) == (True, True)
+
+
 def test_pixel_centres_at_half_stay(tmp_path, walk):
     record(tmp_path / "rec", walk)
     half = config(
@@ -150,6 +189,8 @@ def test_recordings_are_added_and_replaced_by_name(tmp_path, walk):
         config(tmp_path / "rec", out, name="a", stride=2, overwrite=True), lambda _: None
     )
     assert [episode.length for episode in EpisodeSource(out / "train")] == [24, 12]
+    listed = EpisodeSource(out / "train").manifest.settings["actions"]
+    assert list(listed.values()) == [True, True]
     collected = split(tmp_path / "collected" / "train")
     before = (collected / "dataset.json").read_bytes()
     with pytest.raises(UserError, match="was made by `collect`"):
@@ -352,6 +393,8 @@ def test_tum_frames_without_a_partner_are_left_out(tmp_path, walk):
     [
         ({"stride": 0}, "stride"),
         ({"depth_scale": 0.0}, "depth-scale"),
+        ({"max_depth": 0.0}, "max-depth"),
+        ({"max_depth": 65.535}, "max-depth.*65.534"),
         ({"size": (0, 4)}, "size"),
         ({"intrinsics": (0.0, 1, 1, 1)}, "fx and fy"),
         ({"split": "../up"}, "split"),

@@ -108,7 +108,7 @@ def test_the_rest_is_given_up_when_it_is_not_wanted_any_more(cluster, tmp_path, 
     made = engines.run(many, many[0].config)
     next(made)
     made.close()
-    assert len(given_up) == engines.AHEAD - 1
+    assert len(given_up) == engines.SHARDS_PER_PROCESSOR - 1
     assert len(list(tmp_path.iterdir())) == 1
     limit = time.monotonic() + 20
     while cluster.available_resources().get("CPU") != 1 and time.monotonic() < limit:
@@ -146,6 +146,15 @@ def test_ctrl_c_ends_the_cluster_that_was_started_and_the_pool_goes_on(tmp_path)
     assert list(tmp_path.glob("train/*.partial")) == []
 
     assert 1 <= there < 200
+
+
+def test_the_code_that_is_compared_is_all_that_makes_episodes():
+    """Machines whose houses differ must not make shards of one dataset."""
+    program = "import sys, pewm_jax.data.make_episode; print(*sys.modules)"
+    modules = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, text=True)
+    names = [name.split(".") for name in modules.split() if name.startswith("pewm_jax.")]
+    chapters = {name[1] for name in names if (ROOT / "pewm_jax" / name[1]).is_dir()}
+    assert chapters == set(engines.CHAPTERS)
 
 
 def test_an_engine_that_cannot_be_used_is_refused_before_anything_is_touched(

@@ -123,6 +123,20 @@ def test_what_is_wrong_is_named(name):
         assert frame is None or first.frame == frame
 
 
+def test_saturated_depth_is_named_with_its_frame_and_what_to_do(monkeypatch):
+    """Records of other writers, or of an older version of ours, may hold the value 65535."""
+    made = changed(depth_THW=put((slice(5, None), slice(4)), 65.535))
+    monkeypatch.setattr(
+        "pewm_jax.data.episodes.to_millimetres",
+        lambda depth: np.rint(depth.astype(np.float64) * 1000).astype(np.uint16),
+    )
+    (found,) = problems(made)
+    assert (found.frame, found.field) == (5, "depth")
+    assert "65535" in found.what
+    assert "import the recording again with --overwrite" in found.what
+    assert ". " not in found.what, "one sentence"
+
+
 @pytest.mark.parametrize("axes", ["opengl", "inverse", "shifted"])
 def test_other_conventions_do_not_pass(axes):
     def change(pose):
