@@ -25,10 +25,14 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax import cli
 from pewm_jax.config import Launch, UserError
-from pewm_jax.training import last_words
 
 HEARTBEAT_S = 20
 """Seconds of silence after which a process counts as dead, and all others end."""
+GONE = (
+    "Another process of this training is gone, or cannot be reached: see what the others say, and "
+    "start all of them again to go on from the last checkpoint."
+)
+"""What a process says when it notices that another is gone."""
 _LEAVE_S = 60
 """Seconds that a process which is done waits for the others to be done too."""
 _COMMUNICATION = ("gloo", "nccl", "unavailable", "deadline", "connect", "coordination", "socket")
@@ -41,8 +45,9 @@ T = TypeVar("T")
 def joined(launch: Launch) -> Iterator[None]:
     """Be one of the processes of a job while this is entered, if the launch asks for it.
 
-    Inside, only the first process prints. An error ends this process at once with its sentence,
-    without waiting for the others, which notice within ``HEARTBEAT_S``.
+    Inside, only the first process prints. An error ends this process at once, with one sentence and
+    the exit code of ``cli.run``; the others notice within ``HEARTBEAT_S``. JAX may write more to
+    standard error, or end this process itself (SIGABRT) when the first process is gone.
 
     Raises:
         UserError: there is nothing to join.
@@ -50,20 +55,16 @@ def joined(launch: Launch) -> Iterator[None]:
     if not launch.distributed:
         yield
         return
-    code: int | None = None
-    with last_words.one_sentence() as said_all:
-        start(launch)
-        with _quiet_but_first():
-            try:
-                yield
-                wait("the end of the training")
-                jax.distributed.shutdown()
-            except BaseException as error:  # noqa: BLE001 - told, whatever it is
-                code = _tell(error)
-                sys.stderr.flush()
-                said_all()
-    if code is not None:
-        os._exit(code)  # else JAX waits for those that wait for this one
+    start(launch)
+    with _quiet_but_first():
+        try:
+            yield
+            wait("the end of the training")
+            jax.distributed.shutdown()
+        except BaseException as error:  # noqa: BLE001 - reported, whatever it is
+            code = _report(error)
+            sys.stderr.flush()
+            os._exit(code)  # a normal exit waits for processes that wait for this one
 
 
 def start(launch: Launch) -> None:
@@ -289,10 +290,10 @@ def _quiet_but_first() -> Iterator[None]:
             os.dup2(before, 1)
 
 
-def _tell(error: BaseException) -> int:
+def _report(error: BaseException) -> int:
     """Print an error as the command line does; returns the exit code."""
     if is_lost(error):
-        error = UserError(last_words.GONE)
+        error = UserError(GONE)
     if not isinstance(error, (UserError, OSError, KeyboardInterrupt)):
         sys.excepthook(type(error), error, error.__traceback__)
         return 1
