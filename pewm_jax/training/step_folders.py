@@ -8,6 +8,20 @@
                        damaged/300/    one that was damaged after it was written; never deleted here
 
 Nothing here knows what a checkpoint holds, and only one process at a time may use it.
+
+Orbax's ``CheckpointManager`` (orbax-checkpoint 0.12.8) was tried for this. It restores these
+checkpoints, and ``AnyPreservationPolicy([LatestN(keep), EveryNSteps(keep_every)])`` keeps what
+``prune`` keeps. It is not used, because
+
+- a manifest of all files cannot be written before the checkpoint has its final name. The last
+  public hook, ``AsyncOptions.post_finalization_callback``, is called before Orbax updates
+  ``_CHECKPOINT_METADATA`` and adds ``commit_success.txt``; ``temporary_path_class`` is deprecated,
+  and a class for it would repeat private code (``AtomicRenameTemporaryPath.finalize``);
+- ``latest_step`` returns a step as soon as ``save`` is called, before anything is on disk, and
+  also the step of a damaged checkpoint: which one counts would still be decided here;
+- old checkpoints are deleted under their own names, so one that was half deleted when the process
+  was killed still counts; ``todelete_subdir`` moves them away, and never deletes them;
+- ``wait_until_finished`` has no timeout, which ``Checkpoints.settle`` needs.
 """
 
 from __future__ import annotations
