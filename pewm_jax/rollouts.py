@@ -1,6 +1,6 @@
 """Chapter 6, the world model as a function: WorldState → WorldState.
 
-    config, params = load("runs/demo")
+    config, params = pewm_jax.load("runs/demo")
     state = start(config, params, frames)             # a few posed RGB-D frames
     state, clip = rollout(config, params, state, actions, jax.random.key(0))
 
@@ -30,8 +30,8 @@ from pewm_jax.models import codec, world_model
 from pewm_jax.types import Array, Camera, Frames, Params, WorldState
 
 
-def load(path: str | Path, *, lazily: bool = False) -> tuple[Config, Params]:
-    """Load a trained world model.
+def load_finished(path: str | Path, *, lazily: bool = False) -> tuple[Config, Params]:
+    """Load the weights of a finished training; ``training.loading.load`` also reads checkpoints.
 
     Args:
         path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``.

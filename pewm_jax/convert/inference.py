@@ -57,7 +57,7 @@ def export(run: Path, dst: Path, *, say: Callable[[str], Any] = print) -> Path:
         raise UserError(f"{run} is not a folder; name a run made by train.py.")
     with output.new_folder(dst) as folder:
         say(f"reading {run} …")
-        config, params = rollouts.load(run)
+        config, params = rollouts.load_finished(run)
         origin = _base(run, config)
         words = weights.metadata(run / runs.WEIGHTS)
         facts = card.Facts(

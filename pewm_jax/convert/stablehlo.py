@@ -83,7 +83,7 @@ def export(
     _require_sensible(run, clips, frames, platforms)
     with output.new_folder(dst) as folder:
         say(f"reading {run} …")
-        config, params = rollouts.load(run)
+        config, params = rollouts.load_finished(run)
         config = dataclasses.replace(config, dit=dataclasses.replace(config.dit, attention="xla"))
         if what == "rollout":
             programs = rollout_programs(config, params, frames or config.data.context, clips)

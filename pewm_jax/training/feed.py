@@ -1,4 +1,4 @@
-"""Batches ready on the devices before they are wanted; each process brings its own rows."""
+"""Batches placed on the devices ahead of time; each process reads its own rows."""
 
 from __future__ import annotations
 
