@@ -1,6 +1,6 @@
 """The friendly calls: a trained world model from its folder, and what it imagines.
 
-    config, params = load("runs/demo")
+    config, params = pewm_jax.load("runs/demo")
     state = start(config, params, frames)             # a few posed RGB-D frames
     state, clip = rollout(config, params, state, actions, jax.random.key(0))
 
@@ -21,15 +21,12 @@ from jax.typing import ArrayLike
 
 from pewm_jax import config as configs
 from pewm_jax import weights, worlds
-from pewm_jax.config import Config, UserError, WorldSettings
+from pewm_jax.config import Config, WorldSettings
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
-from pewm_jax.worlds import start
-
-__all__ = ["UserError", "load", "rollout", "start"]
 
 
-def load(path: str | Path, *, lazily: bool = False) -> tuple[Config, Params]:
-    """Load a trained world model.
+def load_finished(path: str | Path, *, lazily: bool = False) -> tuple[Config, Params]:
+    """Load the weights of a finished training; ``training.loading.load`` also reads checkpoints.
 
     Args:
         path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``.

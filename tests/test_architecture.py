@@ -13,6 +13,7 @@ CHAPTERS = [
     "config",
     "types",
     "tree",
+    "tensor_files",
     "weights",
     "cli",
     "geometry",

@@ -169,7 +169,7 @@ def test_training_needs_converted_weights_and_leaves_them_alone(world, tmp_path,
     config = dataclasses.replace(config, train=dataclasses.replace(train, start=str(start)))
     run = loop.train(config, say=lambda _: None)
 
-    _, trained = rollouts.load(run)
+    _, trained = rollouts.load_finished(run)
     before, after = tree.flatten(params), tree.flatten(trained)
     assert before.keys() == after.keys()
     for path in before:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pewm_jax import weights
+from pewm_jax import tensor_files, weights
 from pewm_jax.config import UserError
 
 PARAMS = {
@@ -94,7 +94,7 @@ def test_tensors_that_were_not_announced_leave_no_file(tmp_path):
     one = np.ones(3, np.float32)
     for tensors in ([("b", one)], [("a", one[:2])], [("a", one), ("a", one)], []):
         with pytest.raises(ValueError, match="announced"):
-            weights.write(tmp_path / "w", {"a": one}, tensors, {})
+            tensor_files.write(tmp_path / "w", {"a": one}, tensors, {})
         assert not list(tmp_path.iterdir())
 
 

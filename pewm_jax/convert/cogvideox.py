@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax import tree, weights
+from pewm_jax import tensor_files, tree, weights
 from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig
 from pewm_jax.convert import assemble, base, files, output, scheduler, transformer, vae
 from pewm_jax.convert.mapping import Entry
@@ -204,8 +204,8 @@ def write_network(config: Any, params: Params, folder: Path) -> None:
     """Write one network in our layout."""
     folder.mkdir(parents=True)
     configuration.save(config, folder / CONFIG)
-    with output.megabytes(f"write {folder.name}", weights.size(tree.flatten(params))) as told:
-        weights.save(folder / WEIGHTS, params, told=told)
+    with output.megabytes(f"write {folder.name}", tensor_files.size(tree.flatten(params))) as told:
+        weights.save(folder / WEIGHTS, params, progress=told)
 
 
 def write_diffusers(
@@ -230,8 +230,8 @@ def write_diffusers(
     specs = assemble.specs(entries, params, dtype)
     path = folder / "diffusion_pytorch_model.safetensors"
     tensors = assemble.write(entries, params, dtype)
-    with output.megabytes(f"write {network.folder}", weights.size(specs)) as told:
-        weights.write(path, specs, tensors, {"format": "pt"}, told)
+    with output.megabytes(f"write {network.folder}", tensor_files.size(specs)) as told:
+        tensor_files.write(path, specs, tensors, {"format": "pt"}, told)
 
 
 def import_pipeline(

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pewm_jax import tree, weights
+from pewm_jax import tensor_files, tree
 from pewm_jax.config import UserError
 from pewm_jax.types import Array
 
@@ -73,7 +73,7 @@ class Files:
     """Tensors in safetensors files, as a ``Source``."""
 
     where: str
-    places: Mapping[str, tuple[Path, weights.Place]]
+    places: Mapping[str, tuple[Path, tensor_files.Place]]
 
     def names(self) -> Iterable[str]:
         """Return the names of all tensors."""
@@ -94,7 +94,7 @@ class Files:
             UserError: the file ends before the tensor does.
         """
         path, place = self.places[name]
-        return weights.read_at(path, place)
+        return tensor_files.read_at(path, place)
 
 
 def open_folder(folder: Path) -> Files:
@@ -153,7 +153,7 @@ def open_file(path: Path) -> Files:
     Raises:
         UserError: it is absent, truncated or damaged.
     """
-    return Files(str(path), {n: (path, p) for n, p in weights.places(path).items()})
+    return Files(str(path), {n: (path, p) for n, p in tensor_files.places(path).items()})
 
 
 def _open_shards(folder: Path, index: Path) -> Files:
@@ -167,9 +167,9 @@ def _open_shards(folder: Path, index: Path) -> Files:
             f"{index} names files that are not there: {tree.listing(absent)}; copy them to "
             f"{folder}."
         )
-    places: dict[str, tuple[Path, weights.Place]] = {}
+    places: dict[str, tuple[Path, tensor_files.Place]] = {}
     for shard in shards:
-        inside = weights.places(folder / shard)
+        inside = tensor_files.places(folder / shard)
         wanted = {name for name, file in table.items() if file == shard}
         if inside.keys() != wanted:
             lacking, extra = wanted - inside.keys(), inside.keys() - wanted

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax import __version__, rollouts, tree, weights
+from pewm_jax import __version__, rollouts, tensor_files, tree, weights
 from pewm_jax import config as configuration
 from pewm_jax.config import Config, UserError
 from pewm_jax.convert import card, files, output
@@ -57,7 +57,7 @@ def export(run: Path, dst: Path, *, say: Callable[[str], Any] = print) -> Path:
         raise UserError(f"{run} is not a folder; name a run made by train.py.")
     with output.new_folder(dst) as folder:
         say(f"reading {run} …")
-        config, params = rollouts.load(run)
+        config, params = rollouts.load_finished(run)
         origin = _base(run, config)
         words = weights.metadata(run / runs.WEIGHTS)
         facts = card.Facts(
@@ -102,7 +102,7 @@ def _write(path: Path, params: Params, words: Mapping[str, str]) -> None:
         for name, leaf in leaves.items():
             yield name, narrow(leaf)
 
-    weights.write(path, like, narrowed(), weights.header(words))
+    tensor_files.write(path, like, narrowed(), tensor_files.header(words))
 
 
 def _base(run: Path, config: Config) -> Path | None:

@@ -83,7 +83,7 @@ def export(
     _require_sensible(run, clips, frames, platforms)
     with output.new_folder(dst) as folder:
         say(f"reading {run} …")
-        config, params = rollouts.load(run)
+        config, params = rollouts.load_finished(run)
         if isinstance(config.model.backbone, DiTConfig):
             anywhere = dataclasses.replace(config.model.backbone, attention="xla")
             config = config.with_model(backbone=anywhere)

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax import tree, weights
+from pewm_jax import tensor_files, tree
 from pewm_jax.config import (
     AttentionConfig,
     ClipConfig,
@@ -170,8 +170,8 @@ def import_world(
                 yield path, np.asarray(leaf).astype(specs[path].dtype, copy=False)
 
     with output.new_folder(dst) as folder:
-        path, words = folder / WEIGHTS, weights.header({"stage": "0"})
-        with output.megabytes(f"write {dst.name}", weights.size(specs)) as told:
-            weights.write(path, specs, tensors(), words, told)
+        path, words = folder / WEIGHTS, tensor_files.header({"stage": "0"})
+        with output.megabytes(f"write {dst.name}", tensor_files.size(specs)) as told:
+            tensor_files.write(path, specs, tensors(), words, told)
         configuration.save(config, folder / CONFIG)
         base.save(folder, record)

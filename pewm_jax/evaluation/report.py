@@ -22,7 +22,7 @@ from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
 from pewm_jax.evaluation.protocol import file_hash, fingerprint
 from pewm_jax.evaluation.scoring import LongRollouts, Scored, roll_long, score_table
-from pewm_jax.rollouts import load
+from pewm_jax.rollouts import load_finished
 
 WEIGHTS = "weights.safetensors"
 TRAINED_ON = "train"
@@ -74,7 +74,7 @@ def evaluate(run: str | Path, *, say: Callable[[str], Any] = aloud, **changes: A
     run = Path(run)
     if not run.is_dir():
         raise UserError(f"{run} does not exist; train a model first, e.g. `python train.py demo`.")
-    config, params = load(run)
+    config, params = load_finished(run)
     trained_on = Path(config.data.path) / TRAINED_ON
     if "memory" not in params:
         raise UserError(

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax import tree, weights
+from pewm_jax import tensor_files, tree
 from pewm_jax.config import EncoderSettings, UserError, kinds
 from pewm_jax.data.dataset import Manifest, read_manifest
 from pewm_jax.data.episodes import Episode
@@ -195,8 +195,8 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
-def _place(path: Path) -> weights.Place:
-    places = weights.places(path)
+def _place(path: Path) -> tensor_files.Place:
+    places = tensor_files.places(path)
     if TENSOR not in places:
         raise UserError(f"{path} holds no {TENSOR}; make the cache again.")
     return places[TENSOR]

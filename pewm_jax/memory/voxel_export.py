@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from pewm_jax import weights
+from pewm_jax import atomic
 from pewm_jax.config import MemorySettings, UserError
 from pewm_jax.memory import voxel_core
 from pewm_jax.models import encoders
@@ -72,8 +72,9 @@ def export(
         triangles = (np.arange(len(points))[:, None, None] * 8 + _TRIANGLES).reshape(-1, 3)
         points = (points[:, None] + corners).reshape(-1, 3)
         colours = np.repeat(colours, 8, axis=0)
-    with weights.aside(path) as file:
-        file.write(write(points.astype(np.float32), colours, triangles))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic.replacing(path) as partial:
+        partial.write_bytes(write(points.astype(np.float32), colours, triangles))
 
 
 def _ply(points_N3: np.ndarray, colours_N3: np.ndarray, triangles: np.ndarray | None) -> bytes:

@@ -1,12 +1,12 @@
 """Checkpoints by Orbax: written in the background, whole or not at all, and checked when read.
 
-One folder per stage. Each checkpoint has four items: ``weights``, what inference uses, complete
-and loadable on its own; ``state``, what training needs besides (the trained parameters and the
-optimizer's moments; frozen leaves are already in ``weights``); ``data``, the position in the data;
-``config``, the experiment. Arrays restore to any mesh, any number of devices and of processes.
+One folder per stage. Each checkpoint has four items: ``weights``, the inference weights, which can
+be loaded alone; ``state``, what else training needs (the trained parameters and the optimizer's
+moments; frozen parameters are in ``weights``); ``data``, the position in the data; ``config``, the
+experiment. Arrays restore to any mesh, any number of devices and of processes.
 
-Orbax writes aside, ``shelf`` seals what it wrote with a manifest of checksums and names it; what
-was damaged since is found by that manifest, set aside, and the checkpoint before it is used.
+Orbax writes into a temporary folder; ``step_folders`` adds a manifest of checksums and renames it.
+A checkpoint that does not match its manifest is set aside, and the one before it is used.
 """
 
 from __future__ import annotations
@@ -35,23 +35,24 @@ from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import TrainState, inference_params
 from pewm_jax.types import Params
 
-WEIGHTS, STATE, DATA, CONFIG = step_folders.WEIGHTS, "state", "data", "config"
+WEIGHTS_ITEM = step_folders.WEIGHTS_ITEM
+STATE_ITEM, DATA_ITEM, CONFIG_ITEM = "state", "data", "config"
 
 _MOMENT_S, _SHARE = 2.0, 0.02
-"""How long ``settle`` waits: seconds, or a share of the time between two saves if that is more."""
+"""How long ``settle`` waits: seconds, or if longer a share of the time between two saves."""
 
 
 class Checkpoints:
     """The checkpoints of one stage of one run; a context manager that waits for writes.
 
-    A damaged newest one is set aside when this is made. Where several processes train together,
-    all of them make this and call its methods in the same order.
+    On construction, damaged checkpoints newer than the newest good one are set aside. All processes
+    of a job construct this, and call its methods in the same order.
 
     Args:
         run: the run's folder.
         config: the experiment, remembered in each checkpoint.
         stage: the stage.
-        say: prints a line, about a damaged checkpoint say.
+        say: prints a line, for example about a damaged checkpoint.
 
     Raises:
         UserError: there were checkpoints, and all are damaged.
@@ -91,7 +92,7 @@ class Checkpoints:
         finally:
             if processes.is_primary():
                 step_folders.clear(self.folder)  # of a write that failed
-            if not self._failed:  # else some threads have not said all yet
+            if not self._failed:  # otherwise some threads may still print
                 self._quiet.end()
 
     def latest(self) -> int | None:
@@ -117,10 +118,10 @@ class Checkpoints:
             "clips": step * settings.batch,
         }
         items = {
-            WEIGHTS: ocp.args.StandardSave(inference_params(self.stage, state)),
-            STATE: ocp.args.StandardSave(_rest(self.stage, state)),
-            DATA: ocp.args.JsonSave(position),
-            CONFIG: ocp.args.JsonSave(configuration.to_dict(self.config)),
+            WEIGHTS_ITEM: ocp.args.StandardSave(inference_params(self.stage, state)),
+            STATE_ITEM: ocp.args.StandardSave(_training_state(self.stage, state)),
+            DATA_ITEM: ocp.args.JsonSave(position),
+            CONFIG_ITEM: ocp.args.JsonSave(configuration.to_dict(self.config)),
         }
         with self._writing():
             self._writer.save(
@@ -147,11 +148,11 @@ class Checkpoints:
                 finished.result()
 
     def settle(self) -> None:
-        """Let a save become whole, within reason; called before each step is told of.
+        """Wait for a save in progress, within limits; called before each step is reported.
 
-        So no step is told of that lies more than one interval beyond the newest whole checkpoint,
-        and that is what a killed training loses at most. A save that is slow for its interval,
-        taking more than a fiftieth of it and more than two seconds, is not waited for any longer.
+        So no reported step lies more than one save interval beyond the newest complete checkpoint:
+        a killed training loses no more than that. Waiting ends after two seconds or a fiftieth of
+        the interval, whichever is longer.
 
         Raises:
             UserError: as ``save``.
@@ -170,12 +171,12 @@ class Checkpoints:
             UserError: there is none, it is of another configuration, or it cannot be read.
         """
         items = {
-            WEIGHTS: ocp.args.StandardRestore(inference_params(self.stage, like)),
-            STATE: ocp.args.StandardRestore(_rest(self.stage, like)),
+            WEIGHTS_ITEM: ocp.args.StandardRestore(inference_params(self.stage, like)),
+            STATE_ITEM: ocp.args.StandardRestore(_training_state(self.stage, like)),
         }
         read = self._read(items)
-        ema, frozen = tree.split(read[WEIGHTS], self.stage.trained)
-        rest = read[STATE]
+        ema, frozen = tree.split(read[WEIGHTS_ITEM], self.stage.trained)
+        rest = read[STATE_ITEM]
         return TrainState(
             params=tree.merge(rest["trained"], frozen),
             ema=ema,
@@ -185,16 +186,15 @@ class Checkpoints:
 
     def restore_weights(self, like: TrainState) -> Params:
         """Read only the inference weights of the newest checkpoint; see ``restore``."""
-        return self._read({WEIGHTS: ocp.args.StandardRestore(inference_params(self.stage, like))})[
-            WEIGHTS
-        ]
+        wanted = ocp.args.StandardRestore(inference_params(self.stage, like))
+        return self._read({WEIGHTS_ITEM: wanted})[WEIGHTS_ITEM]
 
     def publish(self, params: Params) -> None:
-        """Write the newest checkpoint's weights where ``pewm_jax.load`` finds them first.
+        """Write the newest checkpoint's weights to the run's ``weights.safetensors``.
 
         Args:
-            params: those weights, where one process holds all of them. Of several the first reads
-                them from the checkpoint, into its own memory and not a device's.
+            params: those weights. Used where there is one process; of several, the first reads them
+                from the checkpoint into host memory.
 
         Raises:
             UserError: as ``save``.
@@ -210,7 +210,7 @@ class Checkpoints:
         processes.first(write)
 
     def _finish(self, step: int) -> None:
-        """Wait for the background, seal, name and count the checkpoint, and delete old ones."""
+        """Wait for Orbax, add the manifest, rename the checkpoint, and delete old ones."""
         self._writer.wait_until_finished()
         if processes.is_primary():
             step_folders.put(self.folder, step)
@@ -219,7 +219,7 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turn what goes wrong in writing into a sentence that says what is kept."""
+        """Turn errors of writing into a sentence that says which checkpoint is kept."""
         try:
             yield
         except (OSError, ValueError, RuntimeError) as error:
@@ -239,11 +239,11 @@ class Checkpoints:
         return self._latest
 
     def _read(self, items: dict[str, Any]) -> Any:
-        """Read items of the newest checkpoint after making sure that it is of this experiment."""
+        """Read items of the newest checkpoint, if it is of this experiment."""
         self.wait()
         folder = self.folder / str(self._require_step())
         with _reading(folder):
-            there = configuration.from_dict(Config, _read_words(folder / CONFIG))
+            there = configuration.from_dict(Config, _read_json(folder / CONFIG_ITEM))
             wrong = runs.differences(runs.identity(there), runs.identity(self.config))
             if wrong:
                 raise UserError(
@@ -254,7 +254,7 @@ class Checkpoints:
 
 
 def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[Config, Params]:
-    """Read what inference uses of a checkpoint, and nothing else of it.
+    """Read only the inference weights of a checkpoint.
 
     Args:
         folder: the checkpoint, such as ``runs/demo/checkpoints/stage1/200``.
@@ -266,19 +266,19 @@ def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[C
     Raises:
         UserError: what is read is damaged.
     """
-    found = integrity.flaws(folder, (WEIGHTS, DATA, CONFIG))
+    found = integrity.flaws(folder, (WEIGHTS_ITEM, DATA_ITEM, CONFIG_ITEM))
     if found:
         raise UserError(
             f"The checkpoint {folder} is damaged ({tree.listing(found, 2)}): copy it again, or "
             "name another one."
         )
     with _reading(folder):
-        config = configuration.from_dict(Config, _read_words(folder / CONFIG))
-        position = _read_words(folder / DATA)
+        config = configuration.from_dict(Config, _read_json(folder / CONFIG_ITEM))
+        position = _read_json(folder / DATA_ITEM)
     return config, _read_arrays(folder, like(config, position["stage"]))
 
 
-def _read_words(item: Path) -> dict[str, Any]:
+def _read_json(item: Path) -> dict[str, Any]:
     return dict(ocp.JsonCheckpointHandler().restore(epath.Path(item)))
 
 
@@ -287,13 +287,13 @@ def _read_arrays(folder: Path, like: Params) -> Params:
     how = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), like)
     with _reading(folder):
         return ocp.PyTreeCheckpointHandler().restore(
-            epath.Path((folder / WEIGHTS).resolve()),
+            epath.Path((folder / WEIGHTS_ITEM).resolve()),
             args=ocp.args.PyTreeRestore(like, restore_args=how),
         )
 
 
 def _tidied(folder: Path, say: Callable[[str], None]) -> int | None:
-    """Tidy the folder of a stage; returns the step of its newest whole checkpoint."""
+    """Clean up the folder of a stage; returns the step of its newest undamaged checkpoint."""
     folder.mkdir(parents=True, exist_ok=True)
     step_folders.clear(folder)
     return step_folders.newest(folder, say)
@@ -301,7 +301,7 @@ def _tidied(folder: Path, say: Callable[[str], None]) -> int | None:
 
 @contextlib.contextmanager
 def _reading(folder: Path) -> Iterator[None]:
-    """Turn what goes wrong in reading a whole checkpoint into a sentence."""
+    """Turn errors of reading an undamaged checkpoint into a sentence."""
     try:
         yield
     except (ValueError, KeyError, TypeError, OSError) as error:
@@ -316,13 +316,13 @@ def _reading(folder: Path) -> Iterator[None]:
 def _reason(error: BaseException) -> str:
     said = getattr(error, "strerror", None) or str(error)
     full = os.strerror(errno.ENOSPC)
-    if full in said:  # Orbax says so after much else
+    if full in said:  # at the end of a long message of Orbax
         return full
     return " ".join(said.split())[:160]
 
 
-def _rest(stage: Stage, state: TrainState) -> dict[str, Any]:
-    """Return what ``weights`` does not hold."""
+def _training_state(stage: Stage, state: TrainState) -> dict[str, Any]:
+    """Return what training needs besides the inference weights."""
     return {
         "trained": tree.select(state.params, stage.trained),
         "opt_state": state.opt_state,

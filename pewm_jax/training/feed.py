@@ -1,4 +1,4 @@
-"""Batches ready on the devices before they are wanted; each process brings its own rows."""
+"""Batches placed on the devices ahead of time; each process reads its own rows."""
 
 from __future__ import annotations
 
@@ -20,41 +20,39 @@ _POLL_S = 0.2
 
 
 def rows_of(where: Sharding, batch: int) -> slice:
-    """Return the rows of a batch that this process's devices hold, as one slice.
+    """Return the rows of a batch that this process reads: all from its first to its last.
 
     Processes whose devices hold the same rows (they share a clip's tokens or heads) get the same
-    slice. Rows in between that are other processes' are included.
+    slice. Where the mesh interleaves processes, the slice includes rows of others.
 
     Args:
-        where: the placement of the batch.
+        where: the sharding of the batch.
         batch: its size in all processes together.
     """
-    parts = where.addressable_devices_indices_map((batch,)).values()
-    held = [index[0].indices(batch) for index in parts if index is not None]
-    return slice(min(start for start, _, _ in held), max(stop for _, stop, _ in held))
+    held = _held(where, batch)
+    return slice(int(held[0]), int(held[-1]) + 1)
 
 
 def place(clip: Clip, where: Sharding, batch: int) -> Clip:
-    """Make a batch that is spread over all processes of the rows that each of them has.
+    """Make a batch that is spread over all processes from the rows that each of them has.
 
     Args:
         clip: the rows of this process, as ``rows_of`` says.
-        where: the placement of every array.
+        where: the sharding of every array.
         batch: the size of the batch in all processes together.
     """
-    if where.is_fully_addressable:
-        return jax.device_put(clip, where)
-    first = rows_of(where, batch).start
+    held = _held(where, batch)
+    own = held - held[0]
+    if len(own) <= own[-1]:  # JAX takes a process's own rows only, without those in between
+        clip = jax.tree.map(lambda rows: rows[own], clip)
+    shapes = jax.tree.map(lambda rows: (batch, *rows.shape[1:]), clip)
+    return jax.make_array_from_process_local_data(where, clip, shapes)
 
-    def spread(rows: np.ndarray) -> jax.Array:
-        def part(index: tuple[slice, ...] | None) -> np.ndarray:
-            assert index is not None
-            start, stop, _ = index[0].indices(batch)
-            return rows[start - first : stop - first]
 
-        return jax.make_array_from_callback((batch, *rows.shape[1:]), where, part)
-
-    return jax.tree.map(spread, clip)
+def _held(where: Sharding, batch: int) -> np.ndarray:
+    """Return the numbers of the rows on this process's devices, ascending."""
+    parts = where.addressable_devices_indices_map((batch,)).values()
+    return np.unique([row for index in parts if index for row in range(batch)[index[0]]])
 
 
 class Feed:

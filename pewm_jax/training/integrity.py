@@ -1,7 +1,7 @@
-"""Is a folder still what was written? A manifest of its files, by size and SHA-256.
+"""A manifest of a folder's files, by size and SHA-256, to find damage.
 
-A checkpoint is written aside, sealed with a manifest, and only then renamed to its name: a folder
-of that name without a manifest, or with one that does not fit, has been damaged since.
+A checkpoint gets its manifest before it is renamed to its final name. So a folder of that name
+whose manifest is missing or does not match has been damaged since.
 """
 
 from __future__ import annotations
@@ -15,19 +15,21 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from pewm_jax import atomic
+
 MANIFEST = "manifest.json"
 
 LARGE = 2 * 10**9
-"""Bytes from which checking takes seconds and is announced."""
+"""Bytes from which checking takes seconds, and progress is printed."""
 
 _EVERY_S = 10.0
 
 
 def seal(folder: Path) -> None:
-    """Write the manifest of a folder: aside, then renamed, and all of it on disk.
+    """Write the manifest of a folder, and flush the folder to disk.
 
     Args:
-        folder: a folder that is written in full.
+        folder: a folder that is complete.
 
     Raises:
         OSError: the manifest cannot be written.
@@ -37,12 +39,10 @@ def seal(folder: Path) -> None:
         name: {"bytes": paths[name].stat().st_size, "sha256": digest}
         for name, digest in _digests(paths)
     }
-    partial = folder / (MANIFEST + ".partial")
-    with partial.open("w") as file:
+    with atomic.replacing(folder / MANIFEST) as partial, partial.open("w") as file:
         json.dump({"files": files, "sha256": _digest_of(files)}, file, sort_keys=True)
         file.flush()
         os.fsync(file.fileno())
-    partial.replace(folder / MANIFEST)
     for inside in {folder, *(path.parent for path in paths.values())}:
         sync(inside)
 
@@ -57,7 +57,7 @@ def flaws(
     Args:
         folder: a folder that ``seal`` was called on.
         parts: look only at what lies inside these subfolders; by default at everything.
-        say: told how far checking is, where it takes seconds.
+        say: prints progress where checking takes seconds.
 
     Returns:
         What is wrong, such as ``state/d/3f is cut short (10 of 505 bytes)``; empty if nothing is.
@@ -92,7 +92,7 @@ def flaws(
 
 
 def sync(folder: Path) -> None:
-    """Have the disk keep what a folder lists, also through a power cut."""
+    """Flush a folder's list of entries to disk (fsync), so that it survives a power cut."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -150,17 +150,17 @@ def _digest_of(files: Any) -> str:
 
 
 def _progress(label: str, total: int, say: Callable[[str], None]) -> Callable[[int], None]:
-    """Return what is told of bytes that are done, and says so now and then if they are many."""
-    began = told = time.monotonic()
+    """Return a function that counts bytes, and prints progress every ``_EVERY_S`` seconds."""
+    began = printed = time.monotonic()
     done = 0
     if total >= LARGE:
         say(f"{label}: {total / 1e9:.1f} GB …")
 
     def advance(count: int) -> None:
-        nonlocal done, told
+        nonlocal done, printed
         done, now = done + count, time.monotonic()
-        if now - told >= _EVERY_S:
-            told = now
+        if now - printed >= _EVERY_S:
+            printed = now
             rate = done / (now - began)
             left = (total - done) / max(rate, 1.0)
             say(

@@ -1,6 +1,6 @@
-"""Weights to use, of whatever training has left: a finished run, one in mid-training, a checkpoint.
+"""Load a world model from whatever training left: a finished run, an unfinished one, a checkpoint.
 
-Only what inference uses is read: a checkpoint's optimizer state may be gone or damaged.
+Only inference weights are read: a checkpoint's optimizer state may be missing or damaged.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from pathlib import Path
 
 import jax
 
+from pewm_jax import config as configuration
 from pewm_jax import rollouts, weights
 from pewm_jax.config import Config, UserError
-from pewm_jax.models import world_model
 from pewm_jax.training import runs, stages, step_folders
 from pewm_jax.types import Params
 
@@ -36,11 +36,11 @@ def load(path: str | Path) -> tuple[Config, Params]:
         UserError: something is absent or damaged, or the weights do not fit the configuration.
     """
     folder = Path(path)
-    if (folder / step_folders.WEIGHTS).is_dir():
+    if (folder / step_folders.WEIGHTS_ITEM).is_dir():
         return _read(folder)
     newer = _checkpoints(folder)
     if not newer:
-        return rollouts.load(folder)
+        return rollouts.load_finished(folder)
     for number, checkpoint in enumerate(newer):
         try:
             return _read(checkpoint)
@@ -48,16 +48,17 @@ def load(path: str | Path) -> tuple[Config, Params]:
             if number == len(newer) - 1 and not (folder / runs.WEIGHTS).exists():
                 raise
             warnings.warn(f"{error} The one before it is loaded.", stacklevel=2)
-    return rollouts.load(folder)
+    return rollouts.load_finished(folder)
 
 
 def _checkpoints(run: Path) -> list[Path]:
     """Return the checkpoints of a run that are newer than its file of weights, newest first."""
     path = run / runs.WEIGHTS
-    words = weights.metadata(path) if path.exists() else {}
-    have = (int(words.get("stage", 0)), int(words.get("step", 0)))
+    facts = weights.metadata(path) if path.exists() else {}
+    have = (int(facts.get("stage", 0)), int(facts.get("step", 0)))
     found: dict[tuple[int, int], Path] = {}
-    for stage in stages.STAGES:
+    config = configuration.load(run / runs.CONFIG)
+    for stage in stages.all_stages(config):
         folder = step_folders.of(run, stage.name)
         for step in step_folders.steps(folder):
             found[stage.number, step] = folder / str(step)
@@ -65,14 +66,13 @@ def _checkpoints(run: Path) -> list[Path]:
 
 
 def _read(folder: Path) -> tuple[Config, Params]:
-    # Imported here and not above: Orbax takes a moment, and finished runs do without.
+    # Imported here: Orbax takes a second to import, and finished runs do not need it.
     checkpoint = importlib.import_module("pewm_jax.training.checkpoint")
     config, params = checkpoint.read_weights(folder, _shapes)
     return config, params
 
 
 def _shapes(config: Config, number: int) -> Params:
-    """Return the shapes of all weights after some of the training of a stage."""
-    memory = next(stage.memory for stage in stages.STAGES if stage.number == number)
-    init = functools.partial(world_model.init, config, memory=memory)
-    return jax.eval_shape(init, jax.random.key(0))
+    """Return the shapes of a model's weights in a stage."""
+    stage = next(stage for stage in stages.all_stages(config) if stage.number == number)
+    return jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))

@@ -1,4 +1,4 @@
-"""What a training tells: a line of JSON and a TensorBoard event per logged step, and a live view.
+"""The log of a training: a line of JSON and a TensorBoard event per logged step, and a live view.
 
 On a terminal the live view is a progress bar, elsewhere a line every ten seconds.
 """
@@ -19,10 +19,11 @@ import tensorboardX
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from pewm_jax import atomic
 from pewm_jax.training import processes
 
 FLUSH_S = 10
-"""Seconds for which TensorBoard's events may wait to be written; lines of JSON never do."""
+"""Seconds between writes of TensorBoard's events; lines of JSON are written at once."""
 LINE_EVERY_S = 10.0
 """Seconds between lines of the live view where the output is not a terminal."""
 
@@ -30,8 +31,8 @@ LINE_EVERY_S = 10.0
 class MetricsLog:
     """Appends scalars to ``metrics.jsonl`` and to TensorBoard; a context manager.
 
-    What a run logged beyond the step it is resumed from is dropped, so that every step stands
-    there once. Of several processes only the first writes.
+    Lines logged after the step that the run is resumed from are dropped, so that every step has
+    one line. Of several processes only the first writes.
 
     Args:
         run: the run's folder.
@@ -64,7 +65,7 @@ class MetricsLog:
     ) -> None:
         if not self._writes:
             return
-        # What went wrong before says more than that a full disk does not take the last lines.
+        # An error that is being raised matters more than a disk too full for the last lines.
         with contextlib.nullcontext() if error is None else contextlib.suppress(OSError):
             try:
                 self._file.close()
@@ -72,7 +73,7 @@ class MetricsLog:
                 self._events.close()
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Log the scalars of one step; what is not finite is null in JSON, which has no such."""
+        """Log the scalars of one step; NaN and infinity, which JSON lacks, are written as null."""
         if not self._writes:
             return
         finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
@@ -96,13 +97,11 @@ def drop_after(path: Path, stage: int, step: int) -> None:
             continue
         if (entry["stage"], entry["step"]) <= (stage, step):
             kept.append(line + "\n")
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text("".join(kept))
-    partial.replace(path)
+    atomic.write_text(path, "".join(kept))
 
 
 class Pace:
-    """Seconds per step, smoothed; time spent on other things is left out.
+    """Seconds per step, smoothed, without the time spent on other work.
 
     The mean of the first ten steps, from then on a moving average of about as many.
     """
@@ -137,18 +136,18 @@ class LiveView:
     def __init__(self, label: str, total: int, done: int, console: Console | None = None):
         self._console = console or Console(file=sys.stdout, soft_wrap=True, highlight=False)
         self._label, self._total = label, total
-        self._told = time.monotonic()
+        self._printed = time.monotonic()
         self._bar: Progress | None = None
         if self._console.is_terminal:
             self._bar = Progress(
                 TextColumn("{task.description}"),
                 BarColumn(bar_width=20),
                 MofNCompleteColumn(),
-                TextColumn("{task.fields[words]}"),
+                TextColumn("{task.fields[text]}"),
                 console=self._console,
                 refresh_per_second=4,
             )
-            self._task = self._bar.add_task(label, total=total, completed=done, words="")
+            self._task = self._bar.add_task(label, total=total, completed=done, text="")
 
     def __enter__(self) -> Self:
         if self._bar is not None:
@@ -167,15 +166,15 @@ class LiveView:
     def say(self, text: str) -> None:
         """Print a line."""
         self._console.print(text, markup=False)
-        self._told = time.monotonic()
+        self._printed = time.monotonic()
 
     def update(self, step: int, metrics: Mapping[str, float]) -> None:
         """Show a step that is done; the last one is always shown."""
-        words = describe(metrics, (self._total - step) * metrics["step_seconds"])
+        text = describe(metrics, (self._total - step) * metrics["step_seconds"])
         if self._bar is not None:
-            self._bar.update(self._task, completed=step, words=words)
-        elif step == self._total or time.monotonic() - self._told >= LINE_EVERY_S:
-            self.say(f"{self._label} {step}/{self._total} {words}")
+            self._bar.update(self._task, completed=step, text=text)
+        elif step == self._total or time.monotonic() - self._printed >= LINE_EVERY_S:
+            self.say(f"{self._label} {step}/{self._total} {text}")
 
 
 def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
@@ -189,18 +188,18 @@ def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
 
 
 def _work(metrics: Mapping[str, float]) -> str:
-    """Write how hard each device works, and what share of its peak that is where it is known."""
+    """Write the FLOP/s of each device, and the share of its peak (MFU) where that is known."""
     rate = metrics["tflops_per_second_per_device"]
-    words = f"{rate:.1f} TFLOP/s" if rate >= 1 else f"{rate * 1e3:.3g} GFLOP/s"
+    text = f"{rate:.1f} TFLOP/s" if rate >= 1 else f"{rate * 1e3:.3g} GFLOP/s"
     share = f" · MFU {metrics['mfu']:.1%}" if "mfu" in metrics else ""
-    return f"{words}/device{share}"
+    return f"{text}/device{share}"
 
 
 def _counts(metrics: Mapping[str, float]) -> str:
-    """Write what went wrong so far, if anything did."""
+    """Write how many updates were skipped and records were bad, if any."""
     names = {"skipped": "skipped", "bad_records": "bad records"}
     return "".join(
-        f"{words} {metrics[key]:.0f} · " for key, words in names.items() if metrics.get(key)
+        f"{name} {metrics[key]:.0f} · " for key, name in names.items() if metrics.get(key)
     )
 
 

@@ -41,8 +41,8 @@ from pewm_jax.training.step import (
 from pewm_jax.training.watch import Watch
 from pewm_jax.types import Clip, Params
 
-_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
-"""What is wrong where a disk cannot take more."""
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+"""Errors of a disk that takes no more."""
 
 
 def train(
@@ -86,32 +86,32 @@ def train(
         if processes.first(lambda: runs.is_finished(run, config)):
             say(f"{run} is already trained: nothing to do.")
             return run
-        start: Callable[[], Params | None] = functools.partial(
-            starting.named, config, planned[0], say
-        )
-        for stage in starting.left(run, planned):
+        weights: Params | None = None
+        for stage in starting.remaining_stages(run, planned):
             worker = _Worker(
                 config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, say=say
             )
-            trained = worker.train(start)
-            start = functools.partial(_same, trained)
-            if stop.told and stage is not planned[-1]:
+            worker.start, weights = weights, None  # so they are freed once a state is made of them
+            weights = worker.train()
+            if stop.requested and stage is not planned[-1]:
                 raise stop.interrupted(stage.number, stage.settings(config).steps)
     say(f"Trained: {run / runs.WEIGHTS}")
     return run
 
 
-def _same(params: Params) -> Params:
-    return params
-
-
-def _aside(line: str) -> None:
-    """Tell what only this process knows, where the first one shows what all of them know."""
+def _print_error(line: str) -> None:
+    """Print what only this process knows; standard output belongs to the first process."""
     print(line, file=sys.stderr, flush=True)
 
 
 class _Worker:
-    """Turns one stage's state from its first to its last step."""
+    """Trains one stage.
+
+    Attributes:
+        start: weights of the stage before; None to begin with those in ``train.start``, if any.
+    """
+
+    start: Params | None = None
 
     checkpoints: Checkpoints
     view: LiveView
@@ -132,6 +132,7 @@ class _Worker:
         say: Callable[[str], None],
     ):
         self.config, self.stage, self.mesh, self.path = config, stage, mesh, run
+        self.like = abstract_state(config, stage, mesh)
         self.stop, self.bad, self.preview, self.profile = stop, bad, preview, profile
         self.say = say
 
@@ -139,22 +140,21 @@ class _Worker:
     def settings(self) -> StageConfig:
         return self.stage.settings(self.config)
 
-    def train(self, start: Callable[[], Params | None]) -> Params:
+    def train(self) -> Params:
         """Train the stage, or find it done; returns its inference weights."""
         config, stage, run, steps = self.config, self.stage, self.path, self.settings.steps
-        like = abstract_state(config, stage, self.mesh)
         with Checkpoints(run, config, stage, self.say) as self.checkpoints, self._writing():
             self.stop.at_once, self.stop.kept = True, self._kept
             done = self.checkpoints.latest() or 0
             if done >= steps:
-                params = self.checkpoints.restore_weights(like)
+                params = self.checkpoints.restore_weights(self.like)
                 self.checkpoints.publish(params)
                 return params
             with (
                 LiveView(f"stage {stage.number}", steps, done) as self.view,
                 MetricsLog(run, stage.number, done) as log,
             ):
-                self.bad.say = self.view.say if processes.is_primary() else _aside
+                self.bad.say = self.view.say if processes.is_primary() else _print_error
                 self.watch = Watch(
                     config,
                     stage,
@@ -170,21 +170,14 @@ class _Worker:
                     stage,
                     self.preview,
                     say=self.view.say,
-                    unless_told=self.stop.unless_told,
+                    unless_stopped=self.stop.unless_requested,
                 )
-
-                def state_to_start_from() -> TrainState:
-                    if not done:
-                        return initial_state(config, stage, self.mesh, start())
-                    self.view.say(f"stage {stage.number}: going on after step {done}")
-                    return self.checkpoints.restore(like)
-
-                state = self.run(state_to_start_from, done)
+                state = self.run(done)
             params = inference_params(stage, state)
             self.checkpoints.publish(params)
             return params
 
-    def run(self, make_state: Callable[[], TrainState], done: int) -> TrainState:
+    def run(self, done: int) -> TrainState:
         """Do the steps after ``done``, once the first batch is there; returns the last state."""
         config, settings = self.config, self.settings
         cache = starting.features(config, self.stage)
@@ -211,7 +204,7 @@ class _Worker:
         )
         with Feed(iter(batches), where, settings.batch) as feed, closing(traced):
             clip = next(feed)
-            state, step_fn = self._compile(make_state, clip)
+            state, step_fn = self._compile(done, clip)
             if cache is not None:
                 split = Path(config.data.path) / "train"
                 processes.first(
@@ -226,36 +219,46 @@ class _Worker:
                     state, metrics = step_fn(state, clip, key)
                 self.stop.at_once = False
                 if pending is not None:
-                    self._tell(*pending)
+                    self._report(*pending)
                 pending = (step, metrics)
                 self.watch.pace.pause(traced.after(step, metrics))
-                last, told = step == settings.steps, self.stop.due()
-                save = last or told or step % config.train.save_every == 0
-                show = self.samples.due(step) and not told
+                last, stop = step == settings.steps, self.stop.due()
+                save = last or stop or step % config.train.save_every == 0
+                show = self.samples.due(step) and not stop
                 if save or show:
-                    self._tell(step, metrics, state if show else None)
+                    self._report(step, metrics, state if show else None)
                     pending = None
                 if save:
                     self._save(state)
                 if last:
                     break
-                following = None if told else self.stop.unless_told(feed.__next__)
+                following = None if stop else self.stop.unless_requested(feed.__next__)
                 if following is None:
                     self._leave(step, state, pending)
                 clip = following
         return state
 
-    def _compile(self, make_state: Callable[[], TrainState], clip: Clip):
+    def _compile(self, done: int, clip: Clip):
         """Make the state, whose first weights are compiled too, and compile the step."""
         self.view.say(f"stage {self.stage.number}: compiling the training step …")
         began = time.monotonic()
-        state = make_state()
+        state = self._make_state(done)
         step_fn = compile_step(self.config, self.stage, self.mesh, clip)
         took = duration(time.monotonic() - began)
         self.view.say(f"stage {self.stage.number}: compiled the training step in {took}")
         return state, step_fn
 
-    def _tell(self, step: int, metrics: Metrics, shown: TrainState | None = None) -> None:
+    def _make_state(self, done: int) -> TrainState:
+        """Make the state of the stage's start, or read that after ``done`` steps."""
+        if done:
+            self.view.say(f"stage {self.stage.number}: going on after step {done}")
+            return self.checkpoints.restore(self.like)
+        start, self.start = self.start, None
+        if start is None:
+            start = starting.read_weights(self.config, self.stage, self.say)
+        return initial_state(self.config, self.stage, self.mesh, start)
+
+    def _report(self, step: int, metrics: Metrics, shown: TrainState | None = None) -> None:
         """Read a step's metrics; check, show and log them, with samples of the state if given."""
         with self._paused():
             self.checkpoints.settle()
@@ -273,7 +276,7 @@ class _Worker:
     def _leave(self, step: int, state: TrainState, pending: tuple[int, Metrics] | None) -> NoReturn:
         """Save what is not saved yet, and leave."""
         if pending is not None:
-            self._tell(*pending)
+            self._report(*pending)
         self._save(state)
         self.checkpoints.wait()
         raise self.stop.interrupted(self.stage.number, step)
@@ -295,7 +298,7 @@ class _Worker:
         try:
             yield
         except OSError as error:
-            if error.errno not in _DISK:
+            if error.errno not in _DISK_ERRORS:
                 raise
             raise UserError(
                 f"{error.filename or self.path} cannot be written ({error.strerror}); "

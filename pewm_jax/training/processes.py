@@ -1,7 +1,7 @@
-"""The processes of one job: how they find one another, agree, and leave together.
+"""The processes of one job: joining, agreeing on values, and ending together.
 
-All of them run the same program in the same order. The first one writes what is written once; what
-must be the same everywhere is decided by ``agree`` and ``Votes``, never by each for itself.
+All of them run the same program in the same order. Only the first one writes files. Decisions that
+must be the same everywhere are made by ``agree`` and ``Votes``.
 """
 
 from __future__ import annotations
@@ -25,24 +25,29 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax import cli
 from pewm_jax.config import Launch, UserError
-from pewm_jax.training import last_words
 
 HEARTBEAT_S = 20
 """Seconds of silence after which a process counts as dead, and all others end."""
+GONE = (
+    "Another process of this training is gone, or cannot be reached: see what the others say, and "
+    "start all of them again to go on from the last checkpoint."
+)
+"""What a process says when it notices that another is gone."""
 _LEAVE_S = 60
 """Seconds that a process which is done waits for the others to be done too."""
 _COMMUNICATION = ("gloo", "nccl", "unavailable", "deadline", "connect", "coordination", "socket")
-"""Words of the errors that JAX raises when another process is gone."""
+"""Parts of the messages of errors that JAX raises when another process is gone."""
 
 T = TypeVar("T")
 
 
 @contextlib.contextmanager
 def joined(launch: Launch) -> Iterator[None]:
-    """Be one of the processes of a job while this is entered, if the launch asks for it.
+    """Join the processes of a job while this is entered, if the launch asks for it.
 
-    Inside, only the first process prints. An error ends this process at once with its sentence,
-    without waiting for the others, which notice within ``HEARTBEAT_S``.
+    Inside, only the first process prints. An error ends this process at once, with one sentence and
+    the exit code of ``cli.run``; the others notice within ``HEARTBEAT_S``. JAX may write more to
+    standard error, or end this process itself (SIGABRT) when the first process is gone.
 
     Raises:
         UserError: there is nothing to join.
@@ -50,28 +55,24 @@ def joined(launch: Launch) -> Iterator[None]:
     if not launch.distributed:
         yield
         return
-    code: int | None = None
-    with last_words.one_sentence() as said_all:
-        start(launch)
-        with _quiet_but_first():
-            try:
-                yield
-                wait("the end of the training")
-                jax.distributed.shutdown()
-            except BaseException as error:  # noqa: BLE001 - told, whatever it is
-                code = _tell(error)
-                sys.stderr.flush()
-                said_all()
-    if code is not None:
-        os._exit(code)  # else JAX waits for those that wait for this one
+    start(launch)
+    with _quiet_but_first():
+        try:
+            yield
+            wait("the end of the training")
+            jax.distributed.shutdown()
+        except BaseException as error:  # noqa: BLE001 - reported, whatever it is
+            code = _report(error)
+            sys.stderr.flush()
+            os._exit(code)  # a normal exit waits for processes that wait for this one
 
 
 def start(launch: Launch) -> None:
     """Join the other processes of the job, if the launch asks for it; before any device is used.
 
-    Where the launch names no coordinator, JAX finds out from the environment (SLURM, Kubernetes,
-    Cloud TPU, Open MPI). Without ``--distributed`` nothing is tried. Where not all processes have
-    come within ``launch.patience`` seconds, this one says so and ends.
+    If the launch names no coordinator, JAX reads it from the environment (SLURM, Kubernetes, Cloud
+    TPU, Open MPI). If not all processes have joined within ``launch.patience`` seconds, this one
+    prints so and exits. Without ``--distributed`` nothing happens.
 
     Raises:
         UserError: there is nothing to join, or the coordinator's port is taken.
@@ -87,7 +88,7 @@ def start(launch: Launch) -> None:
         }
         if launch.process == 0:
             _require_free(launch.coordinator)
-    # Told to stop, training saves and leaves by itself (``signals``): JAX shall not take SIGTERM.
+    # Training handles SIGTERM itself (``signals``), so JAX must not.
     jax.config.update("jax_enable_preemption_service", False)
     late = threading.Timer(launch.patience, _give_up, (launch,))
     late.daemon = True
@@ -95,7 +96,7 @@ def start(launch: Launch) -> None:
     try:
         jax.distributed.initialize(
             **given,
-            initialization_timeout=launch.patience + 60,  # past our own, which says it better
+            initialization_timeout=launch.patience + 60,  # ``late`` comes first
             heartbeat_timeout_seconds=HEARTBEAT_S,
             shutdown_timeout_seconds=_LEAVE_S,
         )
@@ -110,21 +111,21 @@ def start(launch: Launch) -> None:
 
 
 def is_primary() -> bool:
-    """Tell whether this process is the one that writes logs, pictures and what is not sharded."""
+    """Tell whether this is the first process, which writes logs, pictures and unsharded files."""
     return jax.process_index() == 0
 
 
 def wait(name: str) -> None:
-    """Wait until all processes have come to the place of this name."""
+    """Wait until all processes have reached the barrier of this name."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(name)
 
 
 def agree(value: Any) -> Any:
-    """Return what the first process holds, in all of them.
+    """Return the first process's value in all processes.
 
     Args:
-        value: anything that JSON holds; other processes' values do not count.
+        value: anything that JSON can hold; the values of other processes are ignored.
     """
     if jax.process_count() == 1:
         return value
@@ -135,13 +136,13 @@ def agree(value: Any) -> Any:
 
 
 def first(work: Callable[[], Any]) -> Any:
-    """Do what one process does for all: the first one does it, and all get its result.
+    """Call a function in the first process only, and return its result in all of them.
 
     Args:
-        work: returns something that JSON holds.
+        work: returns something that JSON can hold.
 
     Raises:
-        UserError: what was raised in the first process, in all of them.
+        UserError: in all processes, if the function raised it or ``OSError`` in the first.
     """
     outcome: dict[str, Any] = {}
     if is_primary():
@@ -159,7 +160,7 @@ def first(work: Callable[[], Any]) -> Any:
 
 @contextlib.contextmanager
 def entered_by_first(context: contextlib.AbstractContextManager[Any]) -> Iterator[None]:
-    """Let the first process enter a context for all of them; raises as ``first`` does."""
+    """Enter a context in the first process only; raises as ``first`` does."""
     with contextlib.ExitStack() as held:
 
         def enter() -> None:
@@ -181,13 +182,13 @@ def is_lost(error: BaseException) -> bool:
 
 
 def gather(tree: T) -> T:
-    """Bring arrays that are spread over processes to the first one; called by all.
+    """Gather arrays that are sharded over processes in the first one; called by all.
 
-    Leaf by leaf, so no device holds more than one of them whole. What a process has whole anyway
-    stays as and where it is.
+    Leaf by leaf, so no device holds more than one gathered array. With one process the tree is
+    returned as it is.
 
     Returns:
-        In the first process the same tree with NumPy arrays, in the others one of empty arrays.
+        In the first process the same tree with NumPy arrays, in the others a tree of empty arrays.
     """
     if jax.process_count() == 1:
         return tree
@@ -204,11 +205,11 @@ def gather(tree: T) -> T:
 
 
 class Votes:
-    """What any process was told, known to all of them one vote later, without waiting.
+    """Agree on a stop signal that any process received, one step later and without waiting.
 
     Every process votes once after every step. A vote is a small computation over all devices,
-    queued behind the step; by the time of the next vote its result is there. So all processes
-    learn of a stop signal after the same step, whichever of them it came to.
+    queued behind the step; its result is ready by the next vote. So all processes learn of a signal
+    after the same step.
     """
 
     def __init__(self) -> None:
@@ -221,14 +222,14 @@ class Votes:
         self._largest = jax.jit(jnp.max, out_shardings=NamedSharding(mesh, P()))
 
     def cast(self, number: int | None) -> int | None:
-        """Vote, and return what the vote before this came to.
+        """Vote, and return the result of the previous vote.
 
         Args:
-            number: the signal that came to this process, None without one.
+            number: the signal that this process received, or None.
 
         Returns:
-            The largest number that any process gave, None where none gave any. Where there is but
-            one process, its own, now.
+            The largest number that any process gave, or None. With one process, its own number at
+            once.
         """
         if jax.process_count() == 1:
             return number
@@ -256,7 +257,7 @@ def _require_free(coordinator: str) -> None:
 
 
 def _give_up(launch: Launch) -> NoReturn:
-    """Say that the processes have not met, and end; JAX itself would end with a stack trace."""
+    """Print that the processes have not met, and exit; JAX would print a stack trace."""
     where = f" at {launch.coordinator}" if launch.coordinator else ""
     who = f"process {launch.process} of {launch.processes}" if launch.coordinator else "this one"
     sys.stderr.write(
@@ -272,7 +273,7 @@ def _give_up(launch: Launch) -> NoReturn:
 def _quiet_but_first() -> Iterator[None]:
     """Let only the first process print to standard output, and only from Python.
 
-    (The library that carries messages between CPUs prints there, too.)
+    (Gloo, which carries messages between CPUs, prints there from C++.)
     """
     sys.stdout.flush()
     before, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
@@ -289,10 +290,10 @@ def _quiet_but_first() -> Iterator[None]:
             os.dup2(before, 1)
 
 
-def _tell(error: BaseException) -> int:
+def _report(error: BaseException) -> int:
     """Print an error as the command line does; returns the exit code."""
     if is_lost(error):
-        error = UserError(last_words.GONE)
+        error = UserError(GONE)
     if not isinstance(error, (UserError, OSError, KeyboardInterrupt)):
         sys.excepthook(type(error), error, error.__traceback__)
         return 1

@@ -12,7 +12,7 @@ import jax
 
 FOLDER = "profile"
 SKIPPED = 2
-"""Steps of a start that are not traced: the first ones also load programs and fill caches."""
+"""First steps that are not traced: they also load programs and fill caches."""
 
 
 class Profile:
@@ -24,7 +24,7 @@ class Profile:
         steps: how many steps are traced, 0 for none.
         first: the first step of this start.
         last: the last step of the stage; a trace ends with it at the latest.
-        say: told where the trace is and what opens it.
+        say: prints where the trace is and what opens it.
     """
 
     def __init__(

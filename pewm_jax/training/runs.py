@@ -1,4 +1,4 @@
-"""The folder of a run: which configuration it belongs to, and who is writing to it.
+"""The folder of a run: its configuration, its finished weights, and a lock on it.
 
 ::
 
@@ -7,7 +7,7 @@
               tensorboard/          the same for TensorBoard
               checkpoints/stage1/   by Orbax, see ``checkpoint``
               previews/             sample pictures
-              weights.safetensors   what inference uses, written when a stage is finished
+              weights.safetensors   inference weights, written when a stage is finished
               base.json             which converted checkpoint it started from, if any
 """
 
@@ -20,8 +20,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from pewm_jax import atomic, weights
 from pewm_jax import config as configuration
-from pewm_jax import weights
 from pewm_jax.config import Config, ConfigError, UserError
 from pewm_jax.training import processes, stages
 from pewm_jax.types import Params
@@ -35,14 +35,17 @@ FREE = (
     "data.features",
     "data.workers",
     "data.bad_records",
-    "diffusion.sample_steps",
-    "diffusion.sampler",
-    "diffusion.spacing",
-    "diffusion.steps_offset",
-    "diffusion.stride",
-    "diffusion.set_alpha_to_one",
-    "diffusion.guidance",
-    "diffusion.dynamic_guidance",
+    "model.noise.sample_steps",
+    "model.noise.sampler",
+    "model.noise.spacing",
+    "model.noise.steps_offset",
+    "model.noise.stride",
+    "model.noise.set_alpha_to_one",
+    "model.noise.guidance",
+    "model.noise.dynamic_guidance",
+    "model.noise.sigma_min",
+    "model.noise.sigma_max",
+    "model.noise.rho",
     "train.run",
     "train.save_every",
     "train.keep",
@@ -56,7 +59,7 @@ FREE = (
 )
 """Settings that may change between one start of a run and the next: none alters what is learnt.
 
-(Of kept features the path is free: whatever it names is checked by its hashes when it is opened.)
+``data.features`` is one: the features are checked by their hashes when they are opened.
 """
 
 
@@ -69,7 +72,7 @@ def identity(config: Config) -> dict[str, Any]:
 def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
     """List the settings in which two identities differ, with both values.
 
-    What is free does not count, also where an older identity still holds it.
+    Settings in ``FREE`` are ignored, also in identities written when they were not free yet.
     """
     return [
         f"{name} {there.get(name)} there, {here.get(name)} here"
@@ -87,7 +90,7 @@ def phrase(wrong: list[str]) -> str:
 def check(config: Config) -> Path:
     """Make the run's folder, or make sure that an existing one is of this configuration.
 
-    Nothing is written into it; see ``prepare``.
+    Writes nothing into it; see ``prepare``.
 
     Raises:
         ConfigError: the folder holds training of another configuration.
@@ -118,23 +121,21 @@ def prepare(config: Config) -> Path:
     configuration.save(config, run / CONFIG)
     base = Path(config.train.start) / BASE
     if config.train.start and base.is_file():
-        partial = run / (BASE + ".partial")
-        partial.write_bytes(base.read_bytes())
-        partial.replace(run / BASE)
+        atomic.write_text(run / BASE, base.read_text("utf-8"))
     return run
 
 
 def is_finished(run: Path, config: Config) -> bool:
-    """Tell whether the last planned stage has left its weights, and they are whole."""
+    """Tell whether the weights of the last planned stage are published and undamaged."""
     last = stages.planned(config)[-1]
     return is_published(run, last, last.settings(config).steps)
 
 
 def is_published(run: Path, stage: stages.Stage, step: int) -> bool:
-    """Tell whether the run's file of weights is of this stage and step, and whole."""
+    """Tell whether the run's file of weights is of this stage and step, and undamaged."""
     path = run / WEIGHTS
     try:
-        if not path.exists() or weights.metadata(path) != _words(stage, step):
+        if not path.exists() or weights.metadata(path) != _metadata(stage, step):
             return False
         weights.verify(path)
     except UserError:
@@ -147,17 +148,19 @@ def publish(run: Path, stage: stages.Stage, step: int, params: Params) -> Path:
     path = run / WEIGHTS
     params = processes.gather(params)
     if processes.is_primary():
-        weights.save(path, params, _words(stage, step))
+        for partial in run.glob(f"{WEIGHTS}.*partial"):
+            atomic.remove(partial)  # of a process that was killed
+        weights.save(path, params, _metadata(stage, step))
     return path
 
 
-def _words(stage: stages.Stage, step: int) -> dict[str, str]:
+def _metadata(stage: stages.Stage, step: int) -> dict[str, str]:
     return {"stage": str(stage.number), "step": str(step)}
 
 
 @contextlib.contextmanager
 def alone(run: Path) -> Iterator[None]:
-    """Keep every other training out of the folder; the lock dies with the process.
+    """Lock the folder against other trainings; the lock ends with the process.
 
     Raises:
         UserError: another process is training there.

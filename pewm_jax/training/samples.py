@@ -45,8 +45,8 @@ class Samples:
         config: the experiment.
         stage: the stage.
         preview: makes them; None for none.
-        say: told what is compiled and made.
-        unless_told: does what a stop signal may break off, ``Stop.unless_told``.
+        say: prints what is compiled and made.
+        unless_stopped: does what a stop signal may break off, ``Stop.unless_requested``.
     """
 
     def __init__(
@@ -56,12 +56,12 @@ class Samples:
         preview: Preview | None,
         *,
         say: Callable[[str], Any],
-        unless_told: Callable[[Callable[[], Previewed]], Previewed | None],
+        unless_stopped: Callable[[Callable[[], Previewed]], Previewed | None],
     ):
         self._every = config.train.preview_every
         self._steps = stage.settings(config).steps
         self._number, self._preview = stage.number, preview
-        self._say, self._unless_told = say, unless_told
+        self._say, self._unless_stopped = say, unless_stopped
         self._made = False
 
     def due(self, step: int) -> bool:
@@ -88,7 +88,7 @@ class Samples:
             self._say(f"stage {self._number}: compiling the sampler for pictures …")
         self._made = True
         try:
-            made = self._unless_told(lambda: preview(params, self._number, step))
+            made = self._unless_stopped(lambda: preview(params, self._number, step))
         except (jax.errors.JaxRuntimeError, UserError) as error:
             reason = " ".join(str(error).split())[:160]
             self._say(f"stage {self._number}: no sample pictures of step {step} ({reason})")

@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM: finish the step, save, leave within a grace; and go on from there next time.
+"""Ctrl-C and SIGTERM: finish the step, save, and exit within ``train.grace_s`` seconds.
 
-A signal is noticed at once even while Python is inside a long call of compiled code: the
-interpreter writes its number to a pipe, which a thread reads. That thread keeps the clock, and ends
-the process where the main thread cannot be reached in time.
+Signals are noticed even while Python is inside a long call of compiled code: the interpreter writes
+their numbers to a pipe (``signal.set_wakeup_fd``), which a thread reads. That thread ends the
+process if the main thread has not exited in time.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from typing import NoReturn, Self, TypeVar
 T = TypeVar("T")
 
 LINGER_S = 2.0
-"""How long the main thread may take to leave by itself where there is nothing to save."""
+"""Seconds that the main thread may take to exit where there is nothing to save."""
 MARGIN = 0.05
-"""Share of the grace that is kept for leaving itself."""
+"""Share of the grace period reserved for exiting."""
 ONE_S = 0.1
-"""Signals that follow one another as fast as this are one: a launcher tells a whole group."""
+"""Seconds within which signals count as one: a launcher may signal a process and its group."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """Training was told to stop; what there was to save is saved.
+    """Training was stopped by a signal, and everything is saved.
 
     Attributes:
         exit_code: what a shell expects after the signal: 130 for Ctrl-C, 143 for SIGTERM.
@@ -39,23 +39,24 @@ class Interrupted(KeyboardInterrupt):
         self.exit_code = 128 + number
 
 
-class _LetGo(BaseException):
-    """Raised by a signal in what may be broken off; see ``Stop.unless_told``."""
+class _BrokenOff(BaseException):
+    """Raised by a signal in work that may be interrupted; see ``Stop.unless_requested``."""
 
 
 class Stop:
-    """Takes stop signals while it is entered: the first asks, the second leaves at once.
+    """Handles stop signals while it is entered: the first asks to stop, the second exits at once.
 
     Args:
-        grace_s: seconds after the first signal within which the process has left.
-        agreed: called after every step with the signal that came to this process, if any; returns
-            the one at which all processes of the job stop after this step, if any.
-        alone: whether this is the only process; others would wait for what it breaks off.
+        grace_s: seconds from the first signal to the end of the process.
+        agreed: called after every step with the signal this process received, or None; returns the
+            signal for which all processes stop after this step, or None.
+        alone: whether this is the only process; only then work may be interrupted, since other
+            processes would wait for it.
 
     Attributes:
-        number: the signal that came, None until one does.
-        at_once: set while there is nothing new to save: then the first signal leaves at once.
-        kept: says what is safely on disk, for the last sentence.
+        number: the signal received, None before.
+        at_once: set while there is nothing new to save: then the first signal exits at once.
+        kept: returns a sentence part that says which checkpoint is on disk.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -72,7 +73,7 @@ class Stop:
         self.kept: Callable[[], str] = lambda: "nothing was saved yet"
         self._grace_s, self._agreed, self._alone = grace_s, agreed, alone
         self._breakable = False
-        self._told = False
+        self._requested = False
         self._before: dict[int, object] = {}
         self._asked: float | None = None
         self._deadline: float | None = None
@@ -109,16 +110,16 @@ class Stop:
         """Tell whether training stops after this step; asked once a step by all processes."""
         agreed = self._agreed(self.number)
         if agreed is not None:
-            self.number, self._told = agreed, True
-        return self._told
+            self.number, self._requested = agreed, True
+        return self._requested
 
     @property
-    def told(self) -> bool:
-        """Whether training stops, as far as is known without asking other processes."""
-        return self._told or (self._alone and self.number is not None)
+    def requested(self) -> bool:
+        """Whether training will stop, as far as this process knows without asking others."""
+        return self._requested or (self._alone and self.number is not None)
 
-    def unless_told(self, work: Callable[[], T]) -> T | None:
-        """Do what a signal may break off; returns None where one came, before or meanwhile."""
+    def unless_requested(self, work: Callable[[], T]) -> T | None:
+        """Do work that a signal may interrupt; returns None if one came before or meanwhile."""
         if not self._alone:
             return work()
         try:
@@ -127,11 +128,11 @@ class Stop:
                 return work() if self.number is None else None
             finally:
                 self._breakable = False
-        except _LetGo:
+        except _BrokenOff:
             return None
 
     def interrupted(self, stage: int, step: int) -> Interrupted:
-        """Return the error with which training leaves after a step, once all is saved."""
+        """Return the error that ends training after a step, to be raised once all is saved."""
         return Interrupted(
             f"Stopped after step {step} of stage {stage}; everything is saved: the same command "
             "goes on from there.",
@@ -146,10 +147,10 @@ class Stop:
             raise Interrupted(self._nothing_new(), self.number)
         if self._breakable:
             self._breakable = False
-            raise _LetGo
+            raise _BrokenOff
 
     def _watch(self) -> None:
-        """Keep the clock; runs in a thread of its own."""
+        """Wait for signals and for the deadline; runs in a thread of its own."""
         while True:
             left = None if self._deadline is None else max(self._deadline - time.monotonic(), 0.0)
             ready, _, _ = select.select([self._read], [], [], left)
@@ -169,7 +170,7 @@ class Stop:
                     )
 
     def _ask(self, number: int) -> None:
-        """Start the clock."""
+        """Note the first signal and set the deadline."""
         self.number, self._asked = number, time.monotonic()
         if self.at_once:
             self._deadline = self._asked + LINGER_S
@@ -177,10 +178,10 @@ class Stop:
             self._grant()
 
     def _grant(self) -> None:
-        """Give the time that saving may take, counted from the signal, and say so."""
+        """Set the deadline for saving, counted from the signal, and print it."""
         assert self._asked is not None
         self._deadline = self._asked + self._grace_s * (1 - MARGIN)
-        _tell(
+        _write_line(
             f"Stopping: saves after this step and leaves within {self._grace_s:g} s; once more to "
             "leave without saving."
         )
@@ -191,7 +192,7 @@ class Stop:
         if self.at_once:
             self._leave(self._nothing_new())
         if time.monotonic() < self._asked + self._grace_s * (1 - MARGIN):
-            self._grant()  # the first step was done just when the signal came
+            self._grant()  # the first step ended just when the signal came
             return
         self._leave(
             f"Left before saving was done, for the {self._grace_s:g} s of train.grace_s are over "
@@ -202,11 +203,11 @@ class Stop:
         return f"Stopped with nothing new to save ({self.kept()}); the same command goes on."
 
     def _leave(self, sentence: str) -> NoReturn:
-        _tell(sentence)
+        _write_line(sentence)
         os._exit(128 + (self.number or 0))
 
 
-def _tell(sentence: str) -> None:
+def _write_line(sentence: str) -> None:
     """Write a line to stderr past Python's buffers, whose locks the main thread may hold."""
     show_cursor = "\x1b[?25h" if sys.stderr is not None and sys.stderr.isatty() else ""
     os.write(2, f"{show_cursor}\n{sentence}\n".encode())

@@ -1,4 +1,4 @@
-"""What a training starts from: which stages are left, which weights and features are given."""
+"""What a training starts from: the stages still to train, given weights, kept features."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pewm_jax import rollouts, weights
-from pewm_jax.config import Config, UserError
+from pewm_jax.config import Config, UserError, kinds
 from pewm_jax.memory import feature_cache
 from pewm_jax.training import loading, processes, runs, step_folders
 from pewm_jax.training.stages import Stage
 from pewm_jax.types import Params
 
 
-def left(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
-    """Leave out stages that a later one has built on: its checkpoints hold what they gave."""
+def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    """Return the planned stages from the last one that has a checkpoint.
+
+    Earlier ones are done: the checkpoints of the later stage hold their weights.
+    """
     begun = [
         n for n, stage in enumerate(planned) if step_folders.steps(step_folders.of(run, stage.name))
     ]
@@ -22,30 +25,28 @@ def left(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
 
 
 def require_weights(config: Config) -> None:
-    """Refuse networks that are not trained here and that no converted weights are named for."""
-    frozen = {
-        "codec.kind vae": config.model.codec.kind == "vae",
-        "memory.encoder dinov2": config.model.memory.encoder == "dinov2",
-    }
-    for setting, wanted in frozen.items():
-        if wanted and not config.train.start:
+    """Refuse networks that are never trained, if ``train.start`` names no weights for them."""
+    model = config.model
+    for where, part in (("codec", model.codec), ("memory.encoder", model.memory.encoder)):
+        setting = f"{where} of kind {kinds.of(part).name}"
+        if part.CONVERTED and not config.train.start:
             raise UserError(
                 f"{setting} needs weights that are not trained here: convert a checkpoint "
                 "(python -m pewm_jax.convert --help) and name its folder by train.start."
             )
 
 
-def named(config: Config, stage: Stage, say: Callable[[str], None]) -> Params | None:
-    """Return the weights that the first planned stage starts from, if any are named.
+def read_weights(config: Config, stage: Stage, say: Callable[[str], None]) -> Params | None:
+    """Return the weights in ``train.start``, mapped into memory; None if it is empty.
 
-    Memory blocks that the folder may hold go on learning in stage 2. Before stage 1 they are left
-    out, since they were fitted to another backbone, and said to be.
+    Memory blocks in them are trained further in stage 2. Stage 1 drops them, and says so: they were
+    fitted to another backbone.
     """
     if not config.train.start:
         return None
     file = Path(config.train.start) / runs.WEIGHTS
     params = _given(config)
-    if file.exists():  # else what was read from a checkpoint is compared already
+    if file.exists():  # a checkpoint has been verified while reading
         processes.first(lambda: weights.verify(file))
     if "memory" in params and not stage.memory:
         say(f"{config.train.start}: its memory blocks are left out; stage 2 begins with fresh ones")
@@ -54,22 +55,22 @@ def named(config: Config, stage: Stage, say: Callable[[str], None]) -> Params | 
 
 
 def encoder(config: Config) -> Params:
-    """Return the image encoder's weights as they are given, to compare kept features with."""
-    if config.model.memory.encoder != "dinov2":
+    """Return the image encoder's weights in ``train.start``, to compare kept features with."""
+    if not config.model.memory.encoder.CONVERTED:
         return {}
     return _given(config)["encoder"]
 
 
 def _given(config: Config) -> Params:
-    """Return the weights of the named folder: those of its file, or else of a checkpoint."""
+    """Return the weights in ``train.start``: those of its file, or else of a checkpoint."""
     folder = Path(config.train.start)
     if (folder / runs.WEIGHTS).exists():
-        return rollouts.load(folder, lazily=True)[1]
+        return rollouts.load_finished(folder, lazily=True)[1]
     return loading.load(folder)[1]
 
 
 def features(config: Config, stage: Stage) -> feature_cache.FeatureCache | None:
-    """Open the features that are kept, where the stage needs any; not compared with weights yet."""
+    """Open the kept features if the stage uses any, without comparing them with the weights."""
     if not (config.data.features and stage.memory):
         return None
     return feature_cache.read(Path(config.data.features) / "train")

@@ -1,28 +1,41 @@
-"""The folder of a stage's checkpoints: which are whole, which are kept, what becomes of the others.
+"""The folder of a stage's checkpoints: naming, retention, and setting aside damaged ones.
 
 ::
 
-    checkpoints/stage1/200/            a whole checkpoint: renamed to its number when it was sealed
-                       300.writing/    one being written; worthless once its writer is gone
-                       100.removed/    one being deleted
-                       damaged/300/    one that was damaged after it was written; never deleted here
+    checkpoints/stage1/200/            complete: renamed to its number after its manifest is written
+                       300.writing/    being written; useless once the writing process is gone
+                       100.removed/    being deleted
+                       damaged/300/    damaged after it was written; never deleted here
 
-Nothing here knows what a checkpoint holds, and only one process at a time may use it.
+This module does not know what a checkpoint contains. Only one process at a time may use a folder.
+
+Orbax's ``CheckpointManager`` (orbax-checkpoint 0.12.8) was tried for this. It restores these
+checkpoints, and ``AnyPreservationPolicy([LatestN(keep), EveryNSteps(keep_every)])`` keeps what
+``prune`` keeps. It is not used, because
+
+- a manifest of all files cannot be written before the checkpoint has its final name. The last
+  public hook, ``AsyncOptions.post_finalization_callback``, is called before Orbax updates
+  ``_CHECKPOINT_METADATA`` and adds ``commit_success.txt``; ``temporary_path_class`` is deprecated,
+  and a class for it would repeat private code (``AtomicRenameTemporaryPath.finalize``);
+- ``latest_step`` returns a step as soon as ``save`` is called, before anything is on disk, and
+  also the step of a damaged checkpoint: which one counts would still be decided here;
+- old checkpoints are deleted under their own names, so one that was half deleted when the process
+  was killed still counts; ``todelete_subdir`` moves them away, and never deletes them;
+- ``wait_until_finished`` has no timeout, which ``Checkpoints.settle`` needs.
 """
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from pewm_jax import tree
+from pewm_jax import atomic, tree
 from pewm_jax.config import UserError
 from pewm_jax.training import integrity
 
 FOLDER = "checkpoints"
-WEIGHTS = "weights"
-"""The item of a checkpoint that inference uses."""
+WEIGHTS_ITEM = "weights"
+"""The part of a checkpoint that inference uses, a folder inside it."""
 DAMAGED = "damaged"
 WRITING = ".writing"
 _REMOVED = ".removed"
@@ -34,7 +47,7 @@ def of(run: Path, stage: str) -> Path:
 
 
 def steps(folder: Path) -> list[int]:
-    """Return the numbers of the checkpoints that were once whole, in ascending order."""
+    """Return the steps of the complete checkpoints, damaged or not, in ascending order."""
     if not folder.is_dir():
         return []
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdecimal())
@@ -46,7 +59,7 @@ def writing(folder: Path, step: int) -> Path:
 
 
 def put(folder: Path, step: int) -> None:
-    """Seal a checkpoint that is written in full, and give it its number: now it counts.
+    """Write the manifest of a complete checkpoint, then rename it: from now on it counts.
 
     Raises:
         OSError: that cannot be written.
@@ -68,25 +81,25 @@ def prune(folder: Path, keep: int, keep_every: int) -> None:
         if keep_every == 0 or step % keep_every:
             removed = folder / f"{step}{_REMOVED}"
             (folder / str(step)).rename(removed)
-            shutil.rmtree(removed, ignore_errors=True)
+            atomic.remove(removed)
 
 
 def clear(folder: Path) -> None:
     """Delete what a killed process left half-written or half-deleted."""
     for ending in (WRITING, _REMOVED):
         for path in folder.glob(f"[0-9]*{ending}*"):
-            shutil.rmtree(path, ignore_errors=True)
+            atomic.remove(path)
 
 
 def newest(folder: Path, say: Callable[[str], None]) -> int | None:
-    """Find the newest whole checkpoint, and set aside what is damaged on the way to it.
+    """Find the newest undamaged checkpoint; newer, damaged ones are moved to ``damaged/``.
 
     Args:
         folder: the stage's checkpoints.
-        say: told of each that is set aside.
+        say: called with a sentence for each that is moved.
 
     Returns:
-        Its step, None if there never was one.
+        Its step, None if the folder has no checkpoint.
 
     Raises:
         UserError: all are damaged.
@@ -110,7 +123,7 @@ def newest(folder: Path, say: Callable[[str], None]) -> int | None:
 
 
 def _set_aside(folder: Path, step: int) -> Path:
-    """Move a damaged checkpoint to where it is not counted; returns where it lies now."""
+    """Move a damaged checkpoint to ``damaged/``; returns its new path."""
     damaged = folder / DAMAGED
     damaged.mkdir(exist_ok=True)
     names = (f"{step}" if n == 0 else f"{step}-{n}" for n in range(10**6))

@@ -1,6 +1,6 @@
-"""What training watches for and tells: metrics step by step, what is not finite, how fast it goes.
+"""Checks, shows and logs the metrics of each step: loss and gradient finite, speed, MFU.
 
-Only the first process of a job writes and shows; all of them stop where training must.
+Only the first process of a job writes and shows; all of them stop when a value is not finite.
 """
 
 from __future__ import annotations
@@ -13,13 +13,15 @@ from pathlib import Path
 
 import jax
 
+from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
-from pewm_jax.training import chips, costs, processes
+from pewm_jax.training import chips, processes
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, drop_after
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.step import Metrics
+from pewm_jax.worlds import costs
 
 SKIPPED = "nonfinite.jsonl"
 """In the run's folder: a line for every update that was skipped."""
@@ -34,8 +36,8 @@ class Watch:
         run: the run's folder.
         done: steps of the stage done before.
         devices: how many train.
-        view: where people look.
-        log: where it is kept.
+        view: shows the metrics.
+        log: writes them to files.
         bad: the records that do not decode.
     """
 
@@ -65,7 +67,7 @@ class Watch:
         Args:
             step: its number.
             metrics: what the step returned.
-            kept: says what is safely on disk.
+            kept: returns a sentence part that says which checkpoint is on disk.
 
         Raises:
             UserError: loss or gradient is not finite, and that is not to be skipped.
@@ -98,7 +100,7 @@ class Watch:
     def _not_finite(
         self, step: int, values: Mapping[str, float], skipped: bool, kept: Callable[[], str]
     ) -> None:
-        """Write down what the step learnt from; stop, unless its update was skipped."""
+        """Write down the records of the step's batch; stop, unless its update was skipped."""
         what = f"loss {values['loss']} and gradient norm {values['grad_norm']}"
         self._skipped += skipped
         name = SKIPPED if skipped else f"nonfinite-{self.stage.name}-{step}.json"
@@ -116,9 +118,7 @@ class Watch:
                 with path.open("a") as file:
                     file.write(json.dumps(entry, ensure_ascii=False) + "\n")
             else:
-                partial = path.with_name(path.name + ".partial")
-                partial.write_text(json.dumps(entry, ensure_ascii=False, indent=2) + "\n")
-                partial.replace(path)
+                atomic.write_text(path, json.dumps(entry, ensure_ascii=False, indent=2) + "\n")
         if skipped:
             self.view.say(
                 f"stage {self.stage.number}: step {step} is skipped, {what} are not both finite; "
@@ -133,7 +133,7 @@ class Watch:
         )
 
     def _records(self, step: int) -> dict[str, object]:
-        """Name the records of a step's batch, as far as they can be found out again."""
+        """Return the names of the records in a step's batch, or why they cannot be found."""
         seed, batch = self.stage.data_seed(self.config), self.settings.batch
         try:
             names = loader.records(self.config, "train", seed=seed, batch=batch, step=step - 1)
@@ -142,7 +142,7 @@ class Watch:
         return {"records": names}
 
     def _skipped_before(self, done: int) -> int:
-        """Forget updates skipped after the step that is gone on from; returns how many remain."""
+        """Drop the updates skipped after the step resumed from; returns how many remain."""
         path = self.run / SKIPPED
         if processes.is_primary():
             drop_after(path, self.stage.number, done)
@@ -150,5 +150,5 @@ class Watch:
 
 
 def _number(value: float) -> float | str:
-    """Return a number that JSON has, or its name."""
+    """Return a finite number as it is, others as text: JSON has no NaN and no infinity."""
     return value if math.isfinite(value) else str(value)

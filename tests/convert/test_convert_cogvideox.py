@@ -21,7 +21,7 @@ from transformers import AutoTokenizer, T5EncoderModel
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import weights
+from pewm_jax import tensor_files, weights
 from pewm_jax.convert import assemble, base, cogvideox, files, mapping, widen, world
 from pewm_jax.convert.__main__ import main
 from pewm_jax.models import dit, world_model
@@ -273,7 +273,7 @@ def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
     for i, name in enumerate(spec):
         one = {name: spec[name]}
         pairs = [(name, np.full(layer, i, np.float32))]
-        weights.write(tmp_path / f"m-{i}.safetensors", one, pairs, {})
+        tensor_files.write(tmp_path / f"m-{i}.safetensors", one, pairs, {})
     table = {"weight_map": {name: f"m-{i}.safetensors" for i, name in enumerate(spec)}}
     (tmp_path / "m.safetensors.index.json").write_text(json.dumps(table))
     like = {"w": jax.ShapeDtypeStruct((layers, *layer), np.float32)}
@@ -282,7 +282,7 @@ def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
         params = assemble.read(entries, files.open_folder(tmp_path), like, dtype)
         weights.save(tmp_path / "out" / "w.safetensors", params)
         specs = assemble.specs(entries, params)
-        weights.write(tmp_path / "back", specs, assemble.write(entries, params), {})
+        tensor_files.write(tmp_path / "back", specs, assemble.write(entries, params), {})
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert layers * each < peak < layers * each + 2.5 * (1 << 20)

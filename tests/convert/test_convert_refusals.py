@@ -160,9 +160,9 @@ def class_of(part, file, name):
 
 FAULTS = {
     "missing shard": (drop_shard, "names files that are not there: diffusion_pytorch_model-00001"),
-    "truncated": (cut_short, "is damaged or cut short (it has"),
-    "truncated in its header": (cut_header, "it ends within its header"),
-    "no safetensors": (not_safetensors, "its header is not JSON"),
+    "truncated": (cut_short, "is damaged or cut short (incomplete metadata, file not"),
+    "truncated in its header": (cut_header, "invalid header length"),
+    "no safetensors": (not_safetensors, "invalid JSON in header"),
     "no index": (drop_index, "no *.safetensors.index.json"),
     "broken index": (break_index, "is not valid JSON"),
     "empty index": (empty_index, "has no table weight_map"),

@@ -2,8 +2,6 @@
 
 import json
 import signal
-import subprocess
-import sys
 import time
 
 import jax
@@ -17,7 +15,7 @@ from pewm_jax.config import Launch, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
-from pewm_jax.training import last_words, processes
+from pewm_jax.training import processes
 
 FAKE = {"FAKE": "1"}
 STAGES = ("--train.stage1.batch", 8, "--train.stage2.batch", 8, "--train.save_every", 5)
@@ -83,23 +81,6 @@ def test_one_process_agrees_with_itself():
         processes.first(lambda: (_ for _ in ()).throw(OSError("full")))
 
 
-FATAL = b"F1121 09:46:42.762529    9648 client.h:80] Terminating process because"
-ERROR = b"E1121 09:46:42.762464 9648 coordination_service_agent.cc:289] Polled an error\n"
-
-
-@pytest.mark.parametrize("fatal", [FATAL + b"\n*** Check failure stack trace: ***\n", ERROR])
-def test_pages_of_a_dying_process_become_one_sentence(fatal):
-    told = [b"a warning\n", *fatal.splitlines(keepends=True), b"    @ 0x7fb895c40634\n"]
-    passed = list(last_words.filtered(iter(told)))
-    assert passed == [b"a warning\n", b"error: " + last_words.GONE.encode() + b"\n"]
-
-
-def test_nothing_follows_the_first_error():
-    said = [b"error: the disk is full\n", FATAL, b"error: another\n"]
-    assert list(last_words.filtered(iter(said))) == said[:1]
-    assert list(last_words.filtered(iter([b"E1121 x\n", b"y"]))) == [b"E1121 x\n", b"y"]
-
-
 def run_here(monkeypatch, argv, term_at=0):
     """Run train.py in this process, with one device; returns its exit code."""
     monkeypatch.setattr(cli, "cache_compilation", lambda folder: None)
@@ -145,6 +126,10 @@ def test_a_run_goes_on_with_other_numbers_of_devices_and_processes(
     np.testing.assert_allclose(list(found.values()), list(expected.values()), rtol=1e-5)
 
 
+def test_every_process_places_its_rows_whatever_the_mesh():
+    assert jobs.finish([], processes=2, devices=3, settings={"PLACE": ""}) == ["placed\n", ""]
+
+
 def test_a_signal_to_one_stops_all_after_the_same_step(tmp_path):
     run = tmp_path / "run"
     argv = ["tiny", *STAGES, "--train.stage1.steps", 10_000, "--train.run", run]
@@ -155,10 +140,10 @@ def test_a_signal_to_one_stops_all_after_the_same_step(tmp_path):
     assert codes == [143, 143], errors
     done = len(jobs.metrics(run))
     for told in errors:
-        assert told.endswith(
+        assert (
             f"Stopped after step {done} of stage 1; everything is saved: the same command goes on "
             "from there.\n"
-        )
+        ) in told
     assert (run / "checkpoints" / "stage1" / str(done)).is_dir()
 
 
@@ -171,8 +156,7 @@ def test_what_is_not_finite_stops_all_or_is_skipped_by_all(tmp_path):
         codes, _, errors = job.end()
     assert codes == [2, 2], errors
     for told in errors:
-        assert told.startswith(f"error: Stage 1 stopped at step {step}: loss nan")
-        assert told.count("\n") == 1
+        assert f"error: Stage 1 stopped at step {step}: loss nan" in told
     assert len(json.loads((run / "nonfinite-stage1-4.json").read_text())["records"]) == 8
 
     argv[-1] = run = tmp_path / "skipping"
@@ -182,21 +166,8 @@ def test_what_is_not_finite_stops_all_or_is_skipped_by_all(tmp_path):
     assert [line["skipped"] for line in jobs.metrics(run)] == [0, 0, 0, 1, 1, 1]
 
 
-def test_nothing_follows_the_last_words():
-    code = (
-        "import os, sys\n"
-        "from pewm_jax.training import last_words\n"
-        "with last_words.one_sentence() as said_all:\n"
-        "    print('error: it ends.', file=sys.stderr, flush=True)\n"
-        "    said_all()\n"
-        "os.write(2, b'pages')"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
-    assert done.stderr == b"error: it ends.\n"
-
-
 @pytest.mark.parametrize("killed", [0, 1])
-def test_when_one_is_killed_the_other_ends_with_one_sentence(killed):
+def test_when_one_is_killed_the_other_says_so_and_ends(killed):
     by_slurm = killed == 1  # once by hand, once as JAX finds the processes itself
     with jobs.Job([], processes=2, settings={"MEET": ""}, slurm=by_slurm) as job:
         jobs.wait_for(lambda: "10\n" in job.read(0, 0), job)
@@ -205,8 +176,10 @@ def test_when_one_is_killed_the_other_ends_with_one_sentence(killed):
         codes, outputs, errors = job.end()
     assert time.monotonic() - began < processes.HEARTBEAT_S + 40
     assert codes[killed] == -signal.SIGKILL
-    assert codes[1 - killed] not in (0, 1)
-    assert errors[1 - killed] == f"error: {last_words.GONE}\n"
+    ours = codes[1 - killed] == 2 and f"error: {processes.GONE}\n" in errors[1 - killed]
+    jaxs = codes[1 - killed] == -signal.SIGABRT and "another task died" in errors[1 - killed]
+    # JAX's own thread ends what is left of a job whose first process is gone, if it is the faster.
+    assert ours or (jaxs and killed == 0), errors[1 - killed]
     assert outputs[1] == ""
 
 
@@ -219,5 +192,4 @@ def test_processes_that_do_not_meet_say_so_in_time(process):
     ):
         codes, _, errors = job.end()
     assert codes == [2]
-    assert errors[0].startswith("error: The processes of this training have not met at localhost:")
-    assert errors[0].count("\n") == 1
+    assert "error: The processes of this training have not met at localhost:" in errors[0]

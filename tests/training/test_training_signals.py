@@ -82,7 +82,7 @@ def test_a_second_signal_leaves_at_once():
 def test_what_may_be_broken_off_is_and_all_else_is_not():
     with Stop() as stop:
         stop.at_once = False
-        assert stop.unless_told(lambda: 3) == 3
+        assert stop.unless_requested(lambda: 3) == 3
         assert not stop.due()
         done = []
 
@@ -93,12 +93,12 @@ def test_what_may_be_broken_off_is_and_all_else_is_not():
         tell()
         assert done == ["on"]
         assert stop.due()
-        assert stop.unless_told(lambda: 3) is None
+        assert stop.unless_requested(lambda: 3) is None
     with Stop() as stop:
         stop.at_once = False
-        assert stop.unless_told(tell) is None
+        assert stop.unless_requested(tell) is None
         assert done == ["on"]
-        assert stop.told
+        assert stop.requested
         assert "after step 7 of stage 2" in str(stop.interrupted(2, 7))
         assert stop.interrupted(2, 7).exit_code == 143
 
@@ -117,10 +117,10 @@ def test_of_several_processes_none_breaks_off_and_all_stop_when_agreed():
     with Stop(agreed=lambda _number: next(agreed), alone=False) as stop:
         stop.at_once = False
         os.kill(os.getpid(), signal.SIGINT)
-        assert stop.unless_told(lambda: 3) == 3
-        assert not stop.told
+        assert stop.unless_requested(lambda: 3) == 3
+        assert not stop.requested
         assert not stop.due()
         assert stop.due()
-        assert stop.told
+        assert stop.requested
         assert stop.due()
         assert stop.interrupted(1, 2).exit_code == 143

@@ -2,8 +2,8 @@
 
 By the environment, ``FAKE`` puts the small model of ``training_fakes`` in place of the real one,
 ``PAUSE`` seconds are slept for every batch, ``TERM_AT`` sends the process SIGTERM when it reads
-that batch, ``NAN_AT`` makes the loss of that step NaN, and ``MEET`` has processes meet and do
-nothing else.
+that batch, ``NAN_AT`` makes the loss of that step NaN, ``MEET`` has processes meet and do nothing
+else, and ``PLACE`` has them place batches on meshes of every kind.
 """
 
 import contextlib
@@ -20,9 +20,13 @@ import tempfile
 import time
 from pathlib import Path
 
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
 from pewm_jax import cli
 from pewm_jax.config import Launch
-from pewm_jax.training import processes
+from pewm_jax.training import feed, processes
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -176,6 +180,32 @@ def meet(argv):
             time.sleep(0.01)
 
 
+def place(argv):
+    """Place a batch on meshes of every kind, and check what lies on each device of this process."""
+    launch, _ = cli.take(Launch, argv)
+    with processes.joined(launch):
+        first, second = np.asarray(jax.devices()).reshape(2, -1)
+        count = len(first)
+        interleaved = np.stack([first, second], axis=1).ravel()
+        for devices, split in [
+            ([*first, *second], 2 * count),  # each process has rows of its own
+            ([*first, *second], count),  # one row is on devices of both
+            (interleaved, 2 * count),  # every second row is another process's
+            (interleaved, count),  # all rows are on both
+        ]:
+            mesh = Mesh(np.reshape(devices, (split, -1)), ("data", "tensor"))
+            where = NamedSharding(mesh, PartitionSpec("data"))
+            whole = np.arange(4 * count * 3).reshape(4 * count, 3)
+            rows = feed.rows_of(where, len(whole))
+            placed = feed.place({"x": whole[rows]}, where, len(whole))["x"]
+            assert placed.shape == whole.shape
+            assert placed.sharding == where
+            for part in placed.addressable_shards:
+                np.testing.assert_array_equal(part.data, whole[part.index])
+        print("placed", flush=True)
+        return 0
+
+
 class WithoutTorch(importlib.abc.MetaPathFinder):
     """Finds no torch: where it is installed, TensorBoard's writer loads it, for seconds."""
 
@@ -188,6 +218,8 @@ def main():
     sys.meta_path.insert(0, WithoutTorch())
     if "MEET" in os.environ:
         return cli.run(meet)
+    if "PLACE" in os.environ:
+        return cli.run(place)
     loader = importlib.import_module("pewm_jax.data.loader")
     if "FAKE" in os.environ:
         patch = importlib.import_module("pytest").MonkeyPatch()
