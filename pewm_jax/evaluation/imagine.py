@@ -13,8 +13,9 @@ import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.data import abstract
-from pewm_jax.rollouts import rollout, start
+from pewm_jax.rollouts import rollout
 from pewm_jax.types import Array, Frames, Params, WorldState
+from pewm_jax.worlds import start
 
 METHODS = ("memory", "empty", "copy")
 """With the map; the same weights with an empty map; the last observed frame, repeated."""
