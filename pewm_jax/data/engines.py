@@ -31,6 +31,7 @@ import cv2
 from pewm_jax import atomic
 from pewm_jax.config import UserError
 from pewm_jax.data.dataset import Shard, describe_shard, write_shard
+from pewm_jax.data.interrupts import sigint_ignored, sigint_postponed
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 
 SHARDS_PER_PROCESSOR = 2
@@ -107,7 +108,7 @@ def on_processes(jobs: list[Job], workers: int) -> Generator[tuple[Job, Shard]]:
         min(workers, len(jobs)), multiprocessing.get_context("spawn"), _start_worker
     )
     try:
-        with _sigint_ignored():  # workers are spawned here and inherit it from their first line on
+        with sigint_ignored():  # workers are spawned here and inherit it from their first line on
             futures = {pool.submit(job.run): job for job in jobs}
         for future in concurrent.futures.as_completed(futures):
             yield futures[future], future.result()
@@ -119,19 +120,6 @@ def on_processes(jobs: list[Job], workers: int) -> Generator[tuple[Job, Shard]]:
             for worker in set(multiprocessing.active_children()) - others:
                 worker.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _sigint_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C inside the block; processes spawned in it ignore it for good."""
-    if threading.current_thread() is not threading.main_thread():  # others cannot set signals
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
 
 
 def _start_worker() -> None:
@@ -283,14 +271,14 @@ def cluster(ray: Any, config: CollectConfig, say: Callable[[str], None]) -> Iter
     if not config.address:
         quiet |= {"num_cpus": config.workers or os.cpu_count() or 1, "include_dashboard": False}
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), sigint_postponed():
             # Ray starts programs of its own, which is safe also where JAX has threads.
             warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
-            ray.init(address=config.address or "local", **quiet)
-    except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
-        reason = " ".join(str(error).split()).partition(". ")[0]
-        raise UserError(_no_cluster(config, reason[:160])) from None
-    try:
+            try:
+                ray.init(address=config.address or "local", **quiet)
+            except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+                reason = " ".join(str(error).split()).partition(". ")[0]
+                raise UserError(_no_cluster(config, reason[:160])) from None
         machines = sum(node["Alive"] for node in ray.nodes())
         processors = ray.cluster_resources().get("CPU", 0)
         say(f"ray: {processors:.0f} processors of {machines} machine{'s'[: machines > 1]}.")
