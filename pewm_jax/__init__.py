@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pewm_jax.training.loading import load
     from pewm_jax.types import Camera, Clip, Frames, VoxelMap, WorldState
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _HOME = {
     "Camera": "types",

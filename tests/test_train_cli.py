@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import configs
 import evaluate
 import pewm_jax
 import train
 from pewm_jax import cli
 from pewm_jax import config as configuration
+from pewm_jax import presets as configs
 from pewm_jax.config import Config
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig

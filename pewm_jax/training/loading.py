@@ -6,7 +6,6 @@ Only what inference uses is read: a checkpoint's optimizer state may be gone or 
 from __future__ import annotations
 
 import functools
-import importlib
 import warnings
 from pathlib import Path
 
@@ -66,7 +65,8 @@ def _checkpoints(run: Path) -> list[Path]:
 
 def _read(folder: Path) -> tuple[Config, Params]:
     # Imported here and not above: Orbax takes a moment, and finished runs do without.
-    checkpoint = importlib.import_module("pewm_jax.training.checkpoint")
+    from pewm_jax.training import checkpoint  # noqa: PLC0415
+
     config, params = checkpoint.read_weights(folder, _shapes)
     return config, params
 
