@@ -6,16 +6,22 @@ DATA ?= data/demo
 PRESET ?= demo
 COLLECT ?= --size 48
 BENCH ?= render cogvideox memory dinov2 training
+# What may differ between versions of Python and JAX: networks beside their references, sampling,
+# sharding over simulated devices, a training from the command line that is stopped and goes on.
+NEWEST = tests/parity tests/diffusion tests/training/test_training_sharding.py \
+  tests/training/test_training_loop.py tests/training/test_training_two_stages.py \
+  tests/test_train_cli.py
 
-.PHONY: help demo test lint format bench clean
+.PHONY: help demo test test-newest lint format bench clean
 
 help:
-	@echo "make demo    collect, train, imagine and score; ends with the path of a report page"
-	@echo "make test    the whole test suite"
-	@echo "make lint    ruff (format and rules) and pyright"
-	@echo "make format  let ruff rewrite the files"
-	@echo "make bench   speed, each beside a named peer"
-	@echo "make clean   remove .venv (data/ and runs/ stay)"
+	@echo "make demo         collect, train, imagine and score; ends with the path of a report page"
+	@echo "make test         the whole test suite"
+	@echo "make test-newest  a quick part of it on the newest Python that is there, with the newest JAX"
+	@echo "make lint         ruff (format and rules) and pyright"
+	@echo "make format       let ruff rewrite the files"
+	@echo "make bench        speed, each beside a named peer"
+	@echo "make clean        remove .venv and .venv-newest (data/ and runs/ stay)"
 
 .venv/made:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -42,6 +48,9 @@ demo: .venv/installed
 test: .venv/installed-dev
 	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
+test-newest:
+	@PYTHON="$(PYTHON)" .ci/newest $(NEWEST) $(ARGS)
+
 lint: .venv/installed-dev
 	@.venv/bin/ruff format --check .
 	@.venv/bin/ruff check .
@@ -55,4 +64,4 @@ bench: .venv/installed-dev
 	@for name in $(BENCH); do echo "== $$name"; $(PY) benchmarks/$$name.py || exit 1; done
 
 clean:
-	rm -rf .venv
+	rm -rf .venv .venv-newest

@@ -28,8 +28,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 from record import machine, record, table
 
-import configs
 from pewm_jax import cli, weights
+from pewm_jax import presets as configs
 from pewm_jax.config import Config, DataConfig, StageConfig, to_dict
 from pewm_jax.data import loader
 from pewm_jax.data.__main__ import main as data_command

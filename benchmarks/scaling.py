@@ -17,7 +17,7 @@ from pathlib import Path
 
 from record import machine, record, table
 
-import configs
+from pewm_jax import presets as configs
 from pewm_jax.config import ClipConfig, Config, MeshConfig
 from pewm_jax.scaling import plan, suggest
 from pewm_jax.scaling.footprint import Arranged

@@ -29,8 +29,8 @@ import jax
 import numpy as np
 import record
 
-import configs
 from pewm_jax import cli
+from pewm_jax import presets as configs
 from pewm_jax.config import Config, MeshConfig, UserError
 from pewm_jax.scaling import plan, suggest
 from pewm_jax.scaling.footprint import Arranged

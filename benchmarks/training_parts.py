@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import configs
 from pewm_jax import cli
+from pewm_jax import presets as configs
 from pewm_jax.config import Config
 
 Spans = dict[str, list[tuple[float, float]]]

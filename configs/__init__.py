@@ -1,13 +1,17 @@
 """Experiments: one file each, holding only what differs from the defaults in ``pewm_jax.config``.
 
-A file ``configs/NAME.py`` is a preset for ``python train.py NAME``: its docstring's first line is
-what ``python train.py --help`` says about it, its function ``config()`` returns the settings.
+A file ``configs/NAME.py`` is a preset for ``pewm-jax train NAME``: its docstring's first line is
+what ``pewm-jax train --help`` says about it, its function ``config()`` returns the settings.
+
+The folder is the package ``pewm_jax.presets``, which is a link to it: it is imported by that name
+alone, so that a checkout, an editable install and a wheel hold the same modules.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from types import ModuleType
 
 from pewm_jax.config import Config
 
@@ -19,10 +23,14 @@ def names() -> list[str]:
 
 def describe(name: str) -> str:
     """Return a preset's one-line description."""
-    text = importlib.import_module(f"{__name__}.{name}").__doc__ or ""
-    return text.strip().split("\n")[0]
+    return (_module(name).__doc__ or "").strip().split("\n")[0]
 
 
 def load(name: str) -> Config:
     """Return a preset's settings."""
-    return importlib.import_module(f"{__name__}.{name}").config()
+    return _module(name).config()
+
+
+def _module(name: str) -> ModuleType:
+    # By string, because a preset is any file of the folder: whoever adds one names it nowhere else.
+    return importlib.import_module(f"{__name__}.{name}")

@@ -1,7 +1,7 @@
 """The paper's method on CogVideoX-5b: 9 frames of 512×512, 2.8 billion parameters of memory."""
 
-from configs import pewm_2b
 from pewm_jax.config import Config
+from pewm_jax.presets import pewm_2b
 
 
 def config() -> Config:

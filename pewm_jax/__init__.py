@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pewm_jax.types import Camera, Clip, Control, Frames, VoxelMap, WorldState
     from pewm_jax.worlds import imagine, observe, start
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _HOME = {
     "Camera": "types",

@@ -7,7 +7,6 @@ import dataclasses
 import difflib
 import errno
 import hashlib
-import importlib
 import io
 import json
 import platform
@@ -83,7 +82,7 @@ def parse(
         kind: the frozen dataclass to read.
         argv: the arguments.
         default: what is not given.
-        prog: the command, for the help text.
+        prog: the words that the command was called by, for help and refusals.
         description: the first paragraph of the help text.
 
     Raises:
@@ -111,19 +110,19 @@ def parse(
 
 
 def parse_command(kind: type[T], argv: Sequence[str], prog: str) -> T:
-    """Read the flags of one command of several, such as ``-m pewm_jax.data collect``.
+    """Read the flags of one command of several, such as ``pewm-jax data collect``.
 
     Args:
         kind: the frozen dataclass to read; fields without a default must be given.
         argv: the arguments after the command's name.
-        prog: the command, for the help text.
+        prog: the words that the command was called by, for help and refusals.
 
     Raises:
         ConfigError: what is wrong with them, in one sentence.
     """
     nothing: T = tyro.MISSING_NONPROP  # type: ignore[assignment]
     if _take_config_file(argv, kind)[0] is not None:
-        raise ConfigError(f"--config is not a setting; `python {prog} --help` lists them all.")
+        raise ConfigError(f"--config is not a setting; `{prog} --help` lists them all.")
     try:
         return parse(kind, argv, default=nothing, prog=prog)
     except ConfigError as error:
@@ -136,7 +135,7 @@ def _first_sentence(message: str, kind: str, prog: str) -> str:
     text = next((part for part in parts if part.strip(".")), message)
     text = text.removeprefix(f"Error parsing {kind}: ").removeprefix(f"{kind}: ")
     if text.startswith("Missing from"):
-        text = f"{text}; `python {prog} --help` explains"
+        text = f"{text}; `{prog} --help` explains"
     text = text.removesuffix(" .")
     return text if text.endswith(".") else f"{text}."
 
@@ -219,7 +218,8 @@ def cache_compilation(folder: Path) -> None:
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else [platform.processor()]
     features = next((line for line in lines if line.startswith(("flags", "Features"))), lines[0])
     kind = hashlib.sha256(features.encode()).hexdigest()[:12]
-    jax = importlib.import_module("jax")  # not above: it takes seconds, and refusals need none
+    import jax  # noqa: PLC0415 - not above: it takes seconds, and refusals need none
+
     jax.config.update("jax_compilation_cache_dir", str((folder / ".cache" / kind).resolve()))
 
 
@@ -261,7 +261,7 @@ def _refuse_unknown(flags: Sequence[str], kind: type, prog: str) -> None:
         if not any(spelling in known for spelling in spellings):
             raise ConfigError(
                 f"{flag.split('=')[0]} is not a setting{_nearest(name, known)}; "
-                f"`python {prog} --help` lists them all."
+                f"`{prog} --help` lists them all."
             )
 
 
@@ -305,9 +305,9 @@ def _sentence(box: str, prog: str) -> str:
     for pattern, plain in _PLAIN:
         text = re.sub(pattern, plain, text)
     if text.startswith("Unrecognized"):
-        text += f"; `python {prog} --help` lists the settings"
+        text += f"; `{prog} --help` lists the settings"
     end = "" if text.endswith((".", "!", "?")) else "."
-    return text + end if text else f"The settings cannot be read; see `python {prog} --help`."
+    return text + end if text else f"The settings cannot be read; see `{prog} --help`."
 
 
 def _deep_merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

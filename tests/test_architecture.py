@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+import pewm_jax
+
 ROOT = Path(__file__).parents[1]
 CHAPTERS = [
     "atomic",
@@ -28,53 +30,152 @@ CHAPTERS = [
     "planning",
     "evaluation",
     "convert",
+    "presets",
+    "commands",
+    "__main__",
 ]
 HOMES = {
+    "accelerate": set(),
+    "array_record": {"data/dataset"},
+    "av": {"evaluation/video"},
+    "diffusers": set(),
+    "embreex": {"data/lighting", "data/scenes"},
+    "flatbuffers": set(),
     "flax": {"models"},
+    "grain": {"data"},
+    "optax": {"training"},
     "orbax": {"training/checkpoint"},
-    "embreex": {"data"},
-    "trimesh": {"data", "houses"},
+    "pickle": set(),
     "ray": {"data/engines"},
+    "safetensors": {"weights", "convert"},
+    "scipy": {"data", "houses"},
+    "tensorboardX": {"training/log"},
     "torch": {"convert"},
     "transformers": {"convert"},
-    "diffusers": set(),
-    "pickle": set(),
+    "trimesh": {"data", "houses"},
+    "tyro": {"cli", "config", "convert/commands", "data", "memory/feature_command"},
 }
+"""Libraries and the only places that import them."""
+BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}
+"""Functions whose first argument is the name of a module that they import or look for."""
+ANY_NAME = {"__init__", "presets/__init__", "convert/output"}
+"""Files that import by a name which is not written where it is imported."""
 FILES = sorted((ROOT / "pewm_jax").rglob("*.py"))
+PLACES = {str(path.relative_to(ROOT / "pewm_jax").with_suffix("")): path for path in FILES}
+PLACES |= {f"presets/{path.stem}": path for path in sorted((ROOT / "configs").glob("*.py"))}
+OUTSIDE = sorted(
+    path
+    for path in [*ROOT.glob("*.py"), *ROOT.glob("tests/**/*.py"), *ROOT.glob("benchmarks/*.py")]
+    if path != Path(__file__)
+)
 
 
-def imports(path):
-    for node in ast.walk(ast.parse(path.read_text())):
+def imports(text):
+    """List the modules that a file names for import: at the top, inside functions, by string."""
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             yield from (name.name for name in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, "imports name the whole path"
             yield node.module
             yield from (f"{node.module}.{name.name}" for name in node.names)
+        elif isinstance(node, ast.Call):
+            called = getattr(node.func, "attr", getattr(node.func, "id", None))
+            if called in BY_STRING:
+                yield module_named(node)
 
 
-def chapter(parts):
-    return parts[0].removesuffix(".py")
+def module_named(call):
+    """Return the name of the module in a call of ``BY_STRING``, or "?" where it is computed."""
+    named = [*call.args[:1], *(word.value for word in call.keywords if word.arg == "name")]
+    constant = named and isinstance(named[0], ast.Constant) and isinstance(named[0].value, str)
+    return named[0].value if constant else "?"
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_a_chapter_imports_only_chapters_above_it(path):
-    inside = path.relative_to(ROOT / "pewm_jax")
-    here = chapter(inside.parts)
-    if here == "__init__":
-        pytest.skip("the public surface may name everything")
-    assert here in CHAPTERS, f"{here} is not in the reading order: add it to README and here"
-    for name in imports(path):
-        parts = name.split(".")
-        if parts[0] == "pewm_jax" and len(parts) > 1 and parts[1] in CHAPTERS:
-            assert CHAPTERS.index(parts[1]) <= CHAPTERS.index(here), f"{path} imports {name}"
-        homes = HOMES.get(parts[0])
-        if homes is not None:
-            place = str(inside.with_suffix(""))
-            assert any(place.startswith(home) for home in homes), f"{path} imports {name}"
+def order(chapter):
+    """Return where a chapter stands; the public surface may name everything and so stands last."""
+    return len(CHAPTERS) if chapter == "__init__" else CHAPTERS.index(chapter)
+
+
+def complaints(place, text):
+    """List what a file imports against the rules.
+
+    Args:
+        place: the file, as a path in the package without its suffix.
+        text: its code.
+    """
+    here = place.split("/")[0]
+    for name in imports(text):
+        top, *below = name.split(".")
+        if name == "?" and place not in ANY_NAME:
+            yield "imports by a name that no reader and no checker sees"
+        chapter = below[0] if top == "pewm_jax" and below else ""
+        if chapter in CHAPTERS[order(here) + 1 :]:
+            yield f"imports {name}, a chapter below it"
+        if top in HOMES and not any(place == h or place.startswith(f"{h}/") for h in HOMES[top]):
+            yield f"imports {name}, which only {', '.join(sorted(HOMES[top])) or 'nothing'} may"
+        if top == "configs":
+            yield "imports configs: the presets have one name, pewm_jax.presets"
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_file_imports_only_chapters_above_it_and_libraries_at_home_in_it(place):
+    here = place.split("/")[0]
+    assert here in [*CHAPTERS, "__init__"], f"{here} is not in the reading order: add it there"
+    assert list(complaints(place, PLACES[place].read_text())) == []
+
+
+@pytest.mark.parametrize("path", OUTSIDE, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_presets_have_one_name(path):
+    assert not any(name.split(".")[0] == "configs" for name in imports(path.read_text()))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from pewm_jax.training import loop",
+        "from pewm_jax import training",
+        "import pewm_jax.training.loop as loop",
+        "def f():\n    from pewm_jax.training import loop",
+        "def f():\n    return importlib.import_module('pewm_jax.training.loop')",
+        "import_module(name='pewm_jax.training')",
+        "__import__('pewm_jax.training')",
+        "importlib.import_module(f'pewm_jax.{name}')",
+        "def f():\n    import flax.linen",
+        "importlib.import_module('orbax.checkpoint')",
+        "if TYPE_CHECKING:\n    import torch",
+        "def f():\n    torch = output.convert_extra('torch')",
+        "import configs",
+    ],
+)
+def test_the_rules_see_imports_of_every_kind(line):
+    assert list(complaints("memory/cells", line))
+    assert not list(complaints("memory/cells", "from pewm_jax.models import layers"))
+
+
+def test_the_public_table_names_what_is_defined_there():
+    shown = PLACES["__init__"].read_text()
+    declared = {name for name in imports(shown) if name.startswith("pewm_jax.")}
+    table = {f"pewm_jax.{home}.{name}" for name, home in pewm_jax._HOME.items()}
+    assert table <= declared
+    assert {name for name in declared if name.rsplit(".", 1)[-1] in pewm_jax.__all__} == table
+    assert sorted(pewm_jax._HOME) == pewm_jax.__all__
+    for home in pewm_jax._HOME.values():
+        assert home.split(".")[0] in CHAPTERS[: CHAPTERS.index("presets")]
 
 
 def test_importing_the_package_loads_no_network_code():
     code = "import sys, pewm_jax; assert not {'jax', 'flax', 'orbax'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["rollouts", "training.loop", "evaluation.report", "scaling.plan", "convert.commands"],
+)
+def test_only_what_makes_houses_loads_the_renderer(module):
+    spared = {"trimesh", "embreex", "tensorboardX", "torch", "ray"}
+    code = f"import sys, pewm_jax.{module}; assert not {spared} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 

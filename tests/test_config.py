@@ -3,8 +3,8 @@ import json
 
 import pytest
 
-import configs
 from pewm_jax import config as configuration
+from pewm_jax import presets as configs
 from pewm_jax.config import (
     ActionConfig,
     ClipConfig,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
-import configs
+from pewm_jax import presets as configs
 from pewm_jax.data.scenes import load_scene
 from pewm_jax.houses.generate import generate_house
 

@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import configs
-import evaluate
 import pewm_jax
 import train
-from pewm_jax import cli
+from pewm_jax import cli, presets
 from pewm_jax import config as configuration
-from pewm_jax.config import Config
+from pewm_jax.commands import main as command
+from pewm_jax.config import Config, Launch
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
 from pewm_jax.evaluation import preview
@@ -65,9 +64,9 @@ def refused(capsys, *argv):
 def test_help_lists_every_preset_with_its_description(capsys):
     assert cli.run(train.main, ["--help"]) == 0
     out = capsys.readouterr().out
-    assert {"demo", "tiny"} <= set(configs.names())
-    for name in configs.names():
-        assert re.search(rf"^  {name} +{re.escape(configs.describe(name))}$", out, re.MULTILINE)
+    assert {"demo", "tiny"} <= set(presets.names())
+    for name in presets.names():
+        assert re.search(rf"^  {name} +{re.escape(presets.describe(name))}$", out, re.MULTILINE)
 
 
 def test_help_of_a_preset_documents_every_setting(capsys, monkeypatch):
@@ -88,7 +87,7 @@ def test_flags_override_the_preset_and_the_rest_is_kept(taken):
     argv += ["--memory.cell_m", "1", "1", "2", "--train.preview-every", "5"]
     assert cli.run(train.main, argv) == 0
     ((config, preview),) = taken
-    tiny = configs.load("tiny")
+    tiny = presets.load("tiny")
     assert config.train.stage1.steps == 10
     assert config.data.path == "elsewhere"
     assert config.memory.cell_m == (1.0, 1.0, 2.0)
@@ -109,11 +108,11 @@ def test_a_file_of_settings_lies_over_the_preset_and_under_the_flags(taken, tmp_
     assert cli.run(train.main, argv) == 0
     config = taken[0][0]
     assert (config.train.seed, config.train.stage1.steps) == (7, 4)
-    assert config.train.stage1.batch == configs.load("tiny").train.stage1.batch
+    assert config.train.stage1.batch == presets.load("tiny").train.stage1.batch
 
 
 def test_a_whole_saved_configuration_is_such_a_file_too(taken, tmp_path):
-    saved = dataclasses.replace(configs.load("tiny"), evaluate=Config().evaluate)
+    saved = dataclasses.replace(presets.load("tiny"), evaluate=Config().evaluate)
     configuration.save(saved, tmp_path / "config.json")
     assert cli.run(train.main, ["demo", f"--config={tmp_path / 'config.json'}"]) == 0
     assert taken[0][0] == saved
@@ -184,27 +183,104 @@ def test_a_file_that_cannot_be_used_is_a_sentence(capsys, number, part):
     assert err.count("\n") == 1
 
 
-@pytest.mark.parametrize("command", [train, evaluate])
-def test_the_heavy_parts_are_imported_only_where_an_interruption_is_clean(command):
-    code = (
-        f"import sys, {command.__name__}; assert not {{'jax', 'flax', 'orbax'}} & set(sys.modules)"
+COMMANDS = {
+    "train": ("python train.py", ["train.py"]),
+    "evaluate": ("python evaluate.py", ["evaluate.py"]),
+    "data": ("python -m pewm_jax.data", ["-m", "pewm_jax.data"]),
+    "memory": ("python -m pewm_jax.memory", ["-m", "pewm_jax.memory"]),
+    "convert": ("python -m pewm_jax.convert", ["-m", "pewm_jax.convert"]),
+    "plan": ("pewm-jax plan", ["-m", "pewm_jax", "plan"]),
+}
+"""Each subcommand: the words it is called by without ``pewm-jax``, and how to call it so."""
+INTERRUPTED_AT_JAX = """
+import runpy, sys
+from importlib import abc
+
+class CtrlC(abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name == "jax":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, CtrlC())
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def python(*argv, cwd=ROOT):
+    return subprocess.run(
+        [sys.executable, *map(str, argv)],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+def test_the_command_names_every_subcommand_and_what_it_does(capsys):
+    assert set(command.COMMANDS) == set(COMMANDS)
+    assert command.main(["--help"]) == 0
+    out = capsys.readouterr().out
+    for name, entry in command.COMMANDS.items():
+        assert f"\n  {name:<10}{entry.about}\n" in out
+        assert len(f"  {name:<10}{entry.about}") <= 80
+    assert command.main([]) == 2
+    assert capsys.readouterr().out == out
+    assert command.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"pewm-jax {pewm_jax.__version__}\n"
+
+
+def test_an_unknown_subcommand_is_one_sentence_with_the_nearest(capsys):
+    assert command.main(["trian", "demo"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: There is no command 'trian' (did you mean train?); there is ")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_subcommand_says_the_words_it_was_called_by(name):
+    words, argv = COMMANDS[name]
+    ours, other = python("-m", "pewm_jax", name, "--help"), python(*argv, "--help")
+    for done, called in ((ours, f"pewm-jax {name}"), (other, words)):
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout.startswith(f"usage: {called} ")
+    assert ours.stdout.replace(f"pewm-jax {name}", words).split() == other.stdout.split()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_and_refusals_load_nothing_heavy(name):
+    heavy = {"jax", "flax", "orbax", "trimesh", "embreex", "tensorboardX", "cv2", "scipy"}
+    code = (
+        "import sys\nfrom pewm_jax.commands.main import main\n"
+        f"try: main([{name!r}, '--help'])\nexcept SystemExit: pass\n"
+        f"assert main([{name!r}, '--nothing']) == 2"
+    )
+    done = python("-c", f"{code}\nassert not {heavy} & set(sys.modules), set(sys.modules)")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.startswith("error: ")
 
 
 @pytest.mark.parametrize(
-    ("command", "argv"), [(train, ["tiny", "--train.run", "it"]), (evaluate, ["it"])]
+    "argv", [["train.py", "tiny", "--train.run", "it"], ["evaluate.py", "it"]], ids=lambda a: a[0]
 )
-def test_ctrl_c_during_the_imports_is_told(monkeypatch, tmp_path, capsys, command, argv):
-    def interrupted(_name):
-        raise KeyboardInterrupt
+def test_ctrl_c_during_the_imports_is_told(tmp_path, argv):
+    done = python("-c", INTERRUPTED_AT_JAX, ROOT / argv[0], *argv[1:], cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "Interrupted.\n")
+    assert list(tmp_path.iterdir()) == []
 
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(command.importlib, "import_module", interrupted)
-    monkeypatch.setattr(train.configs, "load", lambda _name: Config())
-    monkeypatch.setattr(train.configs, "describe", lambda _name: "")
-    assert cli.run(command.main, argv) == 130
-    assert capsys.readouterr().err == "Interrupted.\n"
+
+@pytest.mark.parametrize("asked", ["flag", "command"])
+def test_a_plan_is_a_flag_and_a_command(asked, monkeypatch):
+    from pewm_jax.scaling import plan
+
+    shown = []
+    monkeypatch.setattr(plan, "show", lambda *given: shown.append(given))
+    flags = ["pewm_5b", "--devices", "64", "--chip", "h100"]
+    flags = ["train", *flags, "--plan"] if asked == "flag" else ["plan", *flags]
+    assert command.main(flags) == 0
+    assert shown == [(presets.load("pewm_5b"), Launch(plan=True, devices=64, chip="h100"))]
 
 
 def start(*argv, **options):

@@ -1,15 +1,13 @@
-"""The command line of conversion: ``python -m pewm_jax.convert import | export …``."""
+"""The command line of conversion: ``pewm-jax convert``, or ``python -m pewm_jax.convert``."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from pewm_jax import cli
-from pewm_jax.convert import commands
 
-USAGE = """usage: python -m pewm_jax.convert COMMAND SRC DST …
+USAGE = """usage: {prog} COMMAND SRC DST …
 
 commands:
   import cogvideox   a CogVideoX checkpoint in the layout of diffusers → our layout, or with
@@ -20,33 +18,43 @@ commands:
   export stablehlo   a world model → programs that run without this library
 
 Each has --help. DST is made whole or not at all."""
-COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
-    "import cogvideox": (commands.ImportCogVideoX, commands.import_cogvideox),
-    "import dinov2": (commands.ImportDINOv2, commands.import_dinov2),
-    "export diffusers": (commands.ExportDiffusers, commands.export_diffusers),
-    "export inference": (commands.ExportInference, commands.export_inference),
-    "export stablehlo": (commands.ExportStableHLO, commands.export_stablehlo),
-}
+COMMANDS = (
+    "import cogvideox",
+    "import dinov2",
+    "export diffusers",
+    "export inference",
+    "export stablehlo",
+)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0, 2 bad input, 130 interrupted."""
-    return cli.run(_main, argv)
+def main(argv: Sequence[str] | None = None, prog: str = "python -m pewm_jax.convert") -> int:
+    """Run one command.
+
+    Args:
+        argv: the arguments, by default those of the process.
+        prog: the words that it was called by, for help and refusals.
+
+    Returns:
+        The exit code: 0, 2 bad input, 130 interrupted.
+    """
+    return cli.run(lambda given: _main(given, prog), argv)
 
 
-def _main(argv: Sequence[str]) -> int:
+def _main(argv: Sequence[str], prog: str) -> int:
     if not argv or argv[0] in ("-h", "--help"):
-        print(USAGE)
+        print(USAGE.format(prog=prog))
         return 0 if argv else 2
     verb = cli.choose(argv[0], sorted({name.split()[0] for name in COMMANDS}), "command")
     below = [name.split()[1] for name in COMMANDS if name.startswith(f"{verb} ")]
     if len(argv) < 2 or argv[1] in ("-h", "--help"):
-        print(USAGE)
+        print(USAGE.format(prog=prog))
         return 0 if len(argv) > 1 else 2
     command = f"{verb} {cli.choose(argv[1], below, f'command {verb}')}"
-    kind, run = COMMANDS[command]
-    flags = _gather(argv[2:], "--prompt")
-    run(cli.parse_command(kind, flags, f"-m pewm_jax.convert {command}"))
+    # Imported here and not above: help and refusals come at once.
+    from pewm_jax.convert import commands
+
+    kind, run = commands.COMMANDS[command]
+    run(cli.parse_command(kind, _gather(argv[2:], "--prompt"), f"{prog} {command}"))
     return 0
 
 

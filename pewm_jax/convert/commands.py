@@ -1,10 +1,11 @@
-"""The flags of ``python -m pewm_jax.convert`` and what each command does with them."""
+"""The flags of ``pewm-jax convert`` and what each command does with them."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -273,3 +274,13 @@ def export_stablehlo(options: ExportStableHLO) -> None:
         platforms=options.platforms,
         check=options.check,
     )
+
+
+COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
+    "import cogvideox": (ImportCogVideoX, import_cogvideox),
+    "import dinov2": (ImportDINOv2, import_dinov2),
+    "export diffusers": (ExportDiffusers, export_diffusers),
+    "export inference": (ExportInference, export_inference),
+    "export stablehlo": (ExportStableHLO, export_stablehlo),
+}
+"""The flags of each command and what runs it."""

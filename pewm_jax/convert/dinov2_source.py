@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -116,7 +115,7 @@ def open_source(src: Path) -> Source:
 def _unpickled(path: Path) -> Source:
     """Read a state dict that torch saved; nothing in it is executed."""
     try:
-        torch = importlib.import_module("torch")
+        import torch  # noqa: PLC0415 - an extra: only these files need it
     except ImportError:
         raise UserError(
             f"{path} is a torch file, and torch is not installed: pip install 'pewm-jax[convert]'."

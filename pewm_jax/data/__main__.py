@@ -1,22 +1,14 @@
-"""The command line of the data: ``python -m pewm_jax.data collect | import | validate | show``."""
+"""The command line of the data: ``pewm-jax data``, or ``python -m pewm_jax.data``."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import TypeVar
 
 from pewm_jax import cli
 from pewm_jax.config import UserError
-from pewm_jax.data.collect import collect
-from pewm_jax.data.importer import ImportConfig, import_recording
-from pewm_jax.data.make_episode import CollectConfig
-from pewm_jax.data.show import ShowConfig, show
-from pewm_jax.data.validate import ValidateConfig, validate
 
-T = TypeVar("T")
-
-USAGE = """usage: python -m pewm_jax.data COMMAND …
+USAGE = """usage: {prog} COMMAND …
 
 commands:
   collect   walk an agent through houses and write what it sees as episodes
@@ -28,37 +20,55 @@ Each has --help. The format of the files is described in docs/data_format.md."""
 COMMANDS = ("collect", "import", "validate", "show")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0, 1 problems found, 2 bad input, 130 interrupted."""
-    return cli.run(_main, argv)
+def main(argv: Sequence[str] | None = None, prog: str = "python -m pewm_jax.data") -> int:
+    """Run one command.
+
+    Args:
+        argv: the arguments, by default those of the process.
+        prog: the words that it was called by, for help and refusals.
+
+    Returns:
+        The exit code: 0, 1 problems found, 2 bad input, 130 interrupted.
+    """
+    return cli.run(lambda given: _main(given, prog), argv)
 
 
-def _main(argv: Sequence[str]) -> int:
+def _main(argv: Sequence[str], prog: str) -> int:
     if not argv or argv[0] in ("-h", "--help"):
-        print(USAGE)
+        print(USAGE.format(prog=prog))
         return 0 if argv else 2
     command, flags = cli.choose(argv[0], COMMANDS, "command"), argv[1:]
     try:
-        if command == "collect":
-            collect(_parse(CollectConfig, command, flags))
-        elif command == "import":
-            import_recording(_parse(ImportConfig, command, flags))
-        elif command == "show":
-            show(_parse(ShowConfig, command, flags))
-        else:
-            return 1 if validate(_parse(ValidateConfig, command, flags)).problems else 0
+        return _run(command, flags, f"{prog} {command}")
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         raise UserError(f"{where}{error.strerror or error}.") from None
     except KeyboardInterrupt:
         again = "; the same command goes on where it was" if command == "collect" else ""
         raise KeyboardInterrupt(f"Interrupted{again}.") from None
+
+
+def _run(command: str, flags: Sequence[str], prog: str) -> int:
+    """Run one command; returns the exit code."""
+    # Imported here and not above: help comes at once, and only collecting loads the renderer.
+    if command == "collect":
+        from pewm_jax.data.collect import collect
+        from pewm_jax.data.make_episode import CollectConfig
+
+        collect(cli.parse_command(CollectConfig, flags, prog))
+    elif command == "import":
+        from pewm_jax.data.importer import ImportConfig, import_recording
+
+        import_recording(cli.parse_command(ImportConfig, flags, prog))
+    elif command == "show":
+        from pewm_jax.data.show import ShowConfig, show
+
+        show(cli.parse_command(ShowConfig, flags, prog))
+    else:
+        from pewm_jax.data.validate import ValidateConfig, validate
+
+        return 1 if validate(cli.parse_command(ValidateConfig, flags, prog)).problems else 0
     return 0
-
-
-def _parse(kind: type[T], command: str, flags: Sequence[str]) -> T:
-    """Read the flags of one command."""
-    return cli.parse_command(kind, flags, f"-m pewm_jax.data {command}")
 
 
 if __name__ == "__main__":

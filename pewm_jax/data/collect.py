@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data import engines
+from pewm_jax.data import engines, lighting
 from pewm_jax.data.dataset import (
     MANIFEST,
     UNFINISHED,
@@ -41,8 +41,8 @@ def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
         say: receives the lines to show.
 
     Raises:
-        UserError: a mesh that cannot be walked in, a dataset of other settings in the way, a
-            worker process that died, or a cluster that cannot be reached.
+        UserError: a mesh that cannot be walked in, a dataset of other settings in the way, no
+            renderer, a worker process that died, or a cluster that cannot be reached.
     """
     for path in config.scene:
         if not path.is_file():
@@ -57,6 +57,7 @@ def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
         return
     if config.scene and len(config.scene) < len(wanted):
         say(f"fewer meshes ({len(config.scene)}) than splits: the splits share their scenes.")
+    lighting.require_embree()
     engines.require(config)
     jobs: dict[str, list[Job]] = {split: _jobs(config, split) for split in todo}
     done = {split: _prepare(config, split, states[split], jobs[split]) for split in todo}

@@ -6,9 +6,15 @@ of short rays over the hemisphere that meet nothing. All of it is fixed to the w
 
 from __future__ import annotations
 
+import platform
+from typing import TYPE_CHECKING
+
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
+
+from pewm_jax.config import UserError
+
+if TYPE_CHECKING:
+    from embreex.rtcore_scene import EmbreeScene
 
 SUN_3 = np.array([0.35, 0.55, 0.76])
 """Direction towards the soft main light (unit length)."""
@@ -18,8 +24,31 @@ LIFT_M = 0.04
 """Occlusion rays start this far above a surface, so that skirting and frames cast no halos."""
 
 
+def require_embree() -> None:
+    """Refuse to render where Embree is not installed; it has no wheel for every processor.
+
+    Raises:
+        UserError: it cannot be imported.
+    """
+    try:
+        import embreex.rtcore_scene  # noqa: F401, PLC0415 - only what renders needs it
+    except ImportError as error:
+        raise UserError(
+            f"rendering needs embreex, which cannot be imported on this {platform.machine()} "
+            f"machine ({error}): pip install embreex, or collect where it is installed."
+        ) from None
+
+
 def embree(vertices_V3: np.ndarray, faces_F3: np.ndarray) -> EmbreeScene:
-    """Build Embree's acceleration structure over a triangle mesh."""
+    """Build Embree's acceleration structure over a triangle mesh.
+
+    Raises:
+        UserError: Embree is not installed.
+    """
+    require_embree()
+    from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415
+    from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415
+
     scene = EmbreeScene(robust=True)
     vertices = np.ascontiguousarray(vertices_V3, np.float32)
     TriangleMesh(scene, vertices, np.ascontiguousarray(faces_F3, np.int32))

@@ -11,17 +11,19 @@ import functools
 import struct
 import zlib
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import trimesh
-from embreex.rtcore_scene import EmbreeScene
 
 from pewm_jax.config import UserError
 from pewm_jax.data import lighting
 from pewm_jax.data.materials import LEVELS, Textures, pack
 from pewm_jax.data.surfaces import Surface, read_surface
 from pewm_jax.houses.generate import generate_house
+
+if TYPE_CHECKING:
+    from embreex.rtcore_scene import EmbreeScene
 
 _UNREADABLE = (
     ArithmeticError,

@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
-import tensorboardX
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -45,6 +44,9 @@ class MetricsLog:
         self._writes = processes.is_primary()
         if not self._writes:
             return
+        # Imported here and not above: it takes a second, and loads torch where that is installed.
+        import tensorboardX  # noqa: PLC0415
+
         path = run / "metrics.jsonl"
         drop_after(path, stage, step)
         self._file = path.open("a")

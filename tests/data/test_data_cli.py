@@ -12,10 +12,10 @@ import cv2
 import pytest
 from data_world import split
 
-from configs.demo import config as demo
 from pewm_jax.data.__main__ import COMMANDS, main
 from pewm_jax.data.progress import Meter
 from pewm_jax.data.validate import Verdict
+from pewm_jax.presets.demo import config as demo
 
 ROOT = Path(__file__).parents[2]
 
@@ -79,10 +79,11 @@ def test_wrong_arguments_end_in_one_sentence(argv, says, capsys, tmp_path, monke
 
 def test_the_commands_of_the_format_description_fit_together(monkeypatch):
     ran = {command: [] for command in COMMANDS}
-    for name, command in (("collect", "collect"), ("import_recording", "import"), ("show", "show")):
-        monkeypatch.setattr(f"pewm_jax.data.__main__.{name}", ran[command].append)
+    monkeypatch.setattr("pewm_jax.data.collect.collect", ran["collect"].append)
+    monkeypatch.setattr("pewm_jax.data.importer.import_recording", ran["import"].append)
+    monkeypatch.setattr("pewm_jax.data.show.show", ran["show"].append)
     monkeypatch.setattr(
-        "pewm_jax.data.__main__.validate",
+        "pewm_jax.data.validate.validate",
         lambda asked: ran["validate"].append(asked) or Verdict(0, 0, []),
     )
     text = (ROOT / "docs" / "data_format.md").read_text("utf-8")
@@ -138,7 +139,7 @@ def test_an_interruption_says_so(capsys, monkeypatch, tmp_path):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pewm_jax.data.__main__.collect", interrupted)
+    monkeypatch.setattr("pewm_jax.data.collect.collect", interrupted)
     assert main(["collect", str(tmp_path / "x")]) == 130
     assert "goes on where it was" in capsys.readouterr().err
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import training_fakes as fakes
 
-import configs
 from pewm_jax import cli
+from pewm_jax import presets as configs
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import training_fakes as fakes
 
-import configs
+from pewm_jax import presets as configs
 from pewm_jax.config import UserError
 
 

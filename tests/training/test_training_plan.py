@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import training_fakes as fakes
 
-import configs
+from pewm_jax import presets as configs
 from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
 from pewm_jax.scaling import plan, plan_text, predict, suggest
 from pewm_jax.scaling.footprint import Arranged, counts, footprint

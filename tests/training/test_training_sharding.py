@@ -10,7 +10,7 @@ import pytest
 import training_fakes as fakes
 from jax.sharding import PartitionSpec as P
 
-import configs
+from pewm_jax import presets as configs
 from pewm_jax import tree, weights
 from pewm_jax.config import (
     AXES,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import training_fakes as fakes
 
-import configs
+from pewm_jax import presets as configs
 from pewm_jax import tree
 from pewm_jax.config import AXES, ConfigError, DiTConfig
 from pewm_jax.models import world_model

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-import configs
+from pewm_jax import presets as configs
 from pewm_jax import tree
 from pewm_jax.config import DiTConfig
 from pewm_jax.models import world_model

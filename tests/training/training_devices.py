@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 import training_fakes as fakes
 
-import configs
+from pewm_jax import presets as configs
 from pewm_jax import tree
 from pewm_jax.config import MeshConfig
 from pewm_jax.models import world_model

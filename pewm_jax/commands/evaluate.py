@@ -1,0 +1,65 @@
+"""``pewm-jax evaluate``: score a trained run on held-out scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from pewm_jax import cli
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What may differ from the run's own configuration; what is not given stays as it is."""
+
+    data: Path | None = None
+    """Folder of the data set."""
+    split: str | None = None
+    """Folder inside it with the episodes to score."""
+    clips: int | None = None
+    """Clips scored per seed."""
+    seeds: tuple[int, ...] | None = None
+    """Seeds of the sampling noise, e.g. --seeds 0 1 2."""
+    steps: int | None = None
+    """DDIM steps."""
+    chain: int | None = None
+    """Clips generated one after the other in what the table scores."""
+    stride: int | None = None
+    """Recorded actions between two frames of a clip."""
+    videos: int | None = None
+    """Long rollouts shown side by side."""
+    video_clips: int | None = None
+    """Clips generated one after the other in a long rollout."""
+    batch: int | None = None
+    """Clips sampled at once."""
+
+
+def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
+    """Write RUN/report/index.html and print its path.
+
+    Args:
+        argv: the arguments: a run's folder, and what is to differ from its settings.
+        prog: the words that the command was called by, for help and refusals.
+
+    Returns:
+        The exit code.
+    """
+    about = "Score a trained run on held-out scenes and write RUN/report/index.html."
+    asks = bool(argv) and argv[0] in ("-h", "--help")
+    if not asks and (not argv or argv[0].startswith("-")):
+        raise cli.ConfigError(f"Name a run folder first: {prog} runs/demo.")
+    prog = f"{prog} {'RUN' if asks else argv[0]}"
+    flags = ["--help"] if asks else argv[1:]
+    settings = cli.parse(Settings, flags, default=Settings(), prog=prog, description=about)
+    # Imported here and not above: help and refusals come at once, and Ctrl-C is clean meanwhile.
+    from pewm_jax.evaluation import report
+
+    cli.cache_compilation(Path(argv[0]).parent)
+    try:
+        page = report.evaluate(argv[0], **vars(settings))
+    except KeyboardInterrupt:
+        again = "Interrupted; what is scored is kept, run the same command again to go on."
+        raise KeyboardInterrupt(again) from None
+    print(f"report: {page}")
+    return 0

@@ -1,0 +1,71 @@
+"""``pewm-jax memory cache``: the image encoder's features of a data set, computed once."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pewm_jax.config import (
+    DINOv2EncoderConfig,
+    EncoderSettings,
+    PatchColoursConfig,
+    UserError,
+)
+from pewm_jax.data import dataset
+from pewm_jax.memory import feature_build
+from pewm_jax.memory.feature_cache import Dtype
+from pewm_jax.models import dinov2
+from pewm_jax.types import Params
+
+
+@dataclasses.dataclass(frozen=True)
+class CacheConfig:
+    """Compute the image encoder's features of every frame of a data set once, and keep them.
+
+    The same command goes on after an interruption. Features of other encoder weights, other
+    preprocessing or other data are refused when the cache is read.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """A dataset folder, of which every finished split is done, or one split."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """The folder to fill; for a dataset, with a folder per split."""
+    encoder: str = ""
+    """Folder of DINOv2 made by `python -m pewm_jax.convert import dinov2`; empty for the patch
+    colours, which have no weights."""
+    size: int = 518
+    """Side of the square picture that DINOv2 is shown, pixels; `memory.encoder.size` of the
+    experiment."""
+    patch: int = 2
+    """Pixels per patch of the patch colours; `memory.encoder.patch` of the experiment."""
+    dtype: Dtype = "float16"
+    """How features are stored."""
+    batch: int = 16
+    """Frames encoded at once."""
+
+
+def cache(config: CacheConfig) -> None:
+    """Fill the cache of a split, or of every split of a dataset.
+
+    Raises:
+        UserError: the data, the encoder or the folder to fill cannot be used.
+    """
+    if config.batch < 1:
+        raise UserError(f"--batch is {config.batch}: encode at least 1 frame at once.")
+    settings, params = _encoder(config)
+    splits = {config.data: config.out}
+    if not (config.data / dataset.MANIFEST).is_file():
+        splits = {config.data / s: config.out / s for s in dataset.splits(config.data)} or splits
+    for data, out in splits.items():
+        feature_build.build(settings, params, data, out, dtype=config.dtype, batch=config.batch)
+
+
+def _encoder(config: CacheConfig) -> tuple[EncoderSettings, Params]:
+    """Return the settings that an experiment with this encoder has, and its parameters."""
+    if not config.encoder:
+        return PatchColoursConfig(patch=config.patch), {}
+    network, params = dinov2.load(Path(config.encoder))
+    return DINOv2EncoderConfig(size=config.size, network=network), params
