@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from pewm_jax import presets as configs
+from pewm_jax import presets
+from pewm_jax.commands.main import COMMANDS
 from pewm_jax.data.scenes import load_scene
 from pewm_jax.houses.generate import generate_house
 
@@ -87,8 +88,8 @@ def run(arguments, cwd):
 
 
 def small_settings():
-    demo = configs.load("demo")
-    tiny = configs.load("tiny")
+    demo = presets.load("demo")
+    tiny = presets.load("tiny")
     stage = {"steps": 2, "batch": 2, "warmup": 1}
     return {
         "dit": dataclasses.asdict(tiny.dit),
@@ -219,6 +220,12 @@ def test_every_target_of_make_exists():
     assert {"make demo", "make test"} <= set(targets)
     for command in targets:
         run(["make", "-n", *shlex.split(command)[1:]], ROOT)
+
+
+def test_the_readme_names_every_subcommand_of_pewm_jax():
+    (sentence,) = re.findall(r"Away from the repository,[^:]*: ([^.]*)\.", README)
+    named = [word.removeprefix("pewm-jax ") for word in re.findall(r"`([^`]+)`", sentence)]
+    assert sorted(named) == sorted(COMMANDS)
 
 
 def test_every_command_is_covered():
