@@ -12,13 +12,14 @@ import json
 import platform
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
 from pewm_jax import config as configuration
+from pewm_jax import flags as flag_names
 from pewm_jax.config import ConfigError, UserError
 
 T = TypeVar("T")
@@ -75,8 +76,8 @@ def parse(
 ) -> T:
     """Read a configuration from flags such as ``--train.stage1.steps 10``.
 
-    ``--config FILE`` lays a JSON file of settings over the default first. ``--help`` prints every
-    field with its docstring and leaves.
+    ``--config FILE`` lays a JSON file of settings over the default first, and kinds are chosen next
+    (see ``pewm_jax.flags``). ``--help`` prints every field with its docstring and leaves.
 
     Args:
         kind: the frozen dataclass to read.
@@ -91,14 +92,18 @@ def parse(
     file, flags = _take_config_file(argv, kind)
     if file is not None:
         default = overlay(default, file)
-    _refuse_unknown(flags, kind, prog)
+    known: Any = kind
+    if dataclasses.is_dataclass(default):
+        default, flags = flag_names.take_kinds(flag_names.spelled_out(flags, default), default)
+        known = default
+    _refuse_unknown(flags, known, prog)
     if "-h" in flags or "--help" in flags:
         return tyro.cli(
             kind,
             args=["--help"],
             default=default,
             prog=prog,
-            description=description,
+            description=_with_kinds(description, default),
             use_underscores=True,
         )
     told = io.StringIO()
@@ -107,6 +112,14 @@ def parse(
             return tyro.cli(kind, args=flags, default=default, prog=prog, use_underscores=True)
     except SystemExit:
         raise ConfigError(_sentence(told.getvalue(), prog)) from None
+
+
+def _with_kinds(description: str | None, default: Any) -> str | None:
+    """Add to a description which kinds of parts there are."""
+    there = flag_names.kinds_text(default) if isinstance(default, configuration.Config) else ""
+    if not there:
+        return description
+    return f"{description}\nParts of the model of which there are several kinds:\n{there}"
 
 
 def parse_command(kind: type[T], argv: Sequence[str], prog: str) -> T:
@@ -204,8 +217,20 @@ def overlay(default: T, path: Path) -> T:
             f'--config {path} must hold a table such as {{"train": {{"seed": 1}}}}, not '
             f"a {type(values).__name__}."
         )
+    if isinstance(default, configuration.Config):
+        values = configuration.upgrade(values, path.name)
+        default, _ = flag_names.take_kinds(list(_kinds_in(values)), default)
     merged = _deep_merge(configuration.to_dict(default), values)
     return configuration.from_dict(type(default), merged, path.name)
+
+
+def _kinds_in(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
+    """List the kinds that a table names, as flags."""
+    for name, value in values.items():
+        if name == "kind":
+            yield f"{prefix}kind={value}"
+        elif isinstance(value, dict):
+            yield from _kinds_in(value, f"{prefix}{name}.")
 
 
 def cache_compilation(folder: Path) -> None:
@@ -239,7 +264,7 @@ def choose(name: str, known: Sequence[str], what: str) -> str:
 def _take_config_file(argv: Sequence[str], kind: type) -> tuple[Path | None, list[str]]:
     """Take ``--config FILE`` out of the arguments, unless the dataclass has such a field."""
     flags = list(argv)
-    if "--config" in dict(_flags(kind)):
+    if "--config" in dict(flag_names.of(kind)):
         return None, flags
     for index, flag in enumerate(flags):
         if flag.startswith("--config="):
@@ -251,8 +276,8 @@ def _take_config_file(argv: Sequence[str], kind: type) -> tuple[Path | None, lis
     return None, flags
 
 
-def _refuse_unknown(flags: Sequence[str], kind: type, prog: str) -> None:
-    known = [name for name, _ in _flags(kind)]
+def _refuse_unknown(flags: Sequence[str], kind: Any, prog: str) -> None:
+    known = [name for name, _ in flag_names.of(kind)]
     for flag in flags:
         if not flag.startswith("--") or flag == "--help":
             continue
@@ -269,16 +294,6 @@ def _negated(name: str) -> str:
     """Return the flag that ``--a.no_b`` negates."""
     head, dot, last = name[2:].rpartition(".")
     return f"--{head}{dot}{last.removeprefix('no_')}"
-
-
-def _flags(kind: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
-    """List a dataclass's flags with their fields, sections included."""
-    defaults = {f.name: f for f in dataclasses.fields(kind)}
-    for name, field in defaults.items():
-        if dataclasses.is_dataclass(field.default):
-            yield from _flags(field.default, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", field
 
 
 def _nearest(name: str, known: Sequence[str]) -> str:

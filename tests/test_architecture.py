@@ -17,6 +17,7 @@ CHAPTERS = [
     "tree",
     "tensor_files",
     "weights",
+    "flags",
     "cli",
     "geometry",
     "houses",
@@ -24,6 +25,7 @@ CHAPTERS = [
     "models",
     "memory",
     "diffusion",
+    "worlds",
     "rollouts",
     "training",
     "scaling",
@@ -47,7 +49,7 @@ HOMES = {
     "orbax": {"training/checkpoint"},
     "pickle": set(),
     "ray": {"data/engines"},
-    "safetensors": {"weights", "convert"},
+    "safetensors": {"tensor_files", "weights", "convert"},
     "scipy": {"data", "houses"},
     "tensorboardX": {"training/log"},
     "torch": {"convert"},
@@ -58,7 +60,7 @@ HOMES = {
 """Libraries and the only places that import them."""
 BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}
 """Functions whose first argument is the name of a module that they import or look for."""
-ANY_NAME = {"__init__", "presets/__init__", "convert/output"}
+ANY_NAME = {"__init__", "config/kinds", "presets/__init__", "convert/output"}
 """Files that import by a name which is not written where it is imported."""
 FILES = sorted((ROOT / "pewm_jax").rglob("*.py"))
 PLACES = {str(path.relative_to(ROOT / "pewm_jax").with_suffix("")): path for path in FILES}

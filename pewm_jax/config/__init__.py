@@ -24,6 +24,7 @@ from pewm_jax.config.memory import (
     VoxelConfig,
 )
 from pewm_jax.config.mesh import AXES, MeshConfig
+from pewm_jax.config.migrations import upgrade
 from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettings
 from pewm_jax.config.reader import AttentionConfig, ReaderSettings
@@ -99,4 +100,5 @@ __all__ = [
     "register",
     "save",
     "to_dict",
+    "upgrade",
 ]

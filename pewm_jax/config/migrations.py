@@ -26,7 +26,7 @@ def upgrade(values: Values, where: str) -> Values:
     Raises:
         ConfigError: the values are of a newer version than this library knows, or of none.
     """
-    version = values.get("version", 1)
+    version = values.get("version", VERSION if "model" in values else 1)
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise ConfigError(f"{where} says version {version!r}: it must be a whole number from 1.")
     if version > VERSION:
@@ -42,7 +42,10 @@ def upgrade(values: Values, where: str) -> Values:
 
 
 def from_1(values: Values) -> Values:
-    """Gather the model's sections under ``model``, and name the kind of each part."""
+    """Gather the model's sections under ``model``, split into parts of which there are kinds.
+
+    A part that does not say its kind is of the one that was the only one, and is the default now.
+    """
     old = dict(values)
     model: Values = {}
     for name in ("clip", "actions"):
@@ -54,45 +57,44 @@ def from_1(values: Values) -> Values:
     for name in ("image_noise_mean", "image_noise_std"):
         _move(diffusion, name, train, name)
     if diffusion:
-        model["noise"] = {"kind": "ddpm", **diffusion}
+        model["noise"] = diffusion
     if train:
         old["train"] = train
     if "codec" in old:
         model["codec"] = _codec(old.pop("codec"))
     if "dit" in old:
-        model["backbone"] = {"kind": "dit", **old.pop("dit")}
+        model["backbone"] = old.pop("dit")
     if "memory" in old:
         memory = old.pop("memory")
-        clip = model.setdefault("clip", {})
-        _move(memory, "depth", clip, "depth")
+        if "depth" in memory:
+            _move(memory, "depth", model.setdefault("clip", {}), "depth")
         model["memory"] = _memory(memory)
-    return {"version": 2, "model": {"kind": "pewm", **model}, **old}
+    return {"version": 2, "model": model, **old}
 
 
 def _codec(old: Values) -> Values:
-    if old.get("kind", "pixel") == "vae":
+    if old.get("kind") == "vae" or set(old) == {"vae"}:
         return {"kind": "vae", **old.get("vae", {})}
-    kept = {name: value for name, value in old.items() if name != "vae"}
-    return {"kind": "pixel", **kept}
+    return {name: value for name, value in old.items() if name != "vae"}
 
 
 def _memory(old: Values) -> Values:
     """Split what is remembered from its features (``encoder``) and from who reads it."""
-    new: Values = {"kind": old.pop("kind", "voxel")}
-    encoder: Values = {"kind": old.pop("encoder", "patch_colours")}
-    patch, size, network = (old.pop(n, None) for n in ("encoder_patch", "encoder_size", "dinov2"))
-    parts = (
-        {"patch": patch}
-        if encoder["kind"] == "patch_colours"
-        else {"size": size, "network": network}
-    )
-    encoder |= {name: value for name, value in parts.items() if value is not None}
-    reader: Values = {"kind": "attention"}
+    new, encoder, reader = {}, {}, {}
+    kind = old.get("kind", "voxel")
+    _move(old, "kind", new, "kind")
+    _move(old, "encoder", encoder, "kind")
+    _move(old, "encoder_patch", encoder, "patch")
+    _move(old, "encoder_size", encoder, "size")
+    _move(old, "dinov2", encoder, "network")
+    unused = ("patch",) if encoder.get("kind") == "dinov2" else ("size", "network")
+    encoder = {name: value for name, value in encoder.items() if name not in unused}
     for name in ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio"):
         _move(old, name, reader, name)
-    if new["kind"] != "images":
+    if kind != "images":
         old.pop("snapshots", None)
-    return new | old | {"encoder": encoder, "reader": reader}
+    parts = {"encoder": encoder, "reader": reader}
+    return new | old | {name: part for name, part in parts.items() if part}
 
 
 def _move(old: Values, name: str, new: Values, to: str) -> None:

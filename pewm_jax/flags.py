@@ -1,0 +1,144 @@
+"""How the flags of an experiment are called: in short, as they once were, and their kinds.
+
+``--clip.width 64`` is short for ``--model.clip.width 64``. Flags of earlier versions are taken for
+what they are called now. ``--model.memory.kind images`` puts another kind of settings into a
+section; what both kinds have in common is kept.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
+
+from pewm_jax import config as configuration
+from pewm_jax.config import Config, ConfigError, Settings, kinds
+from pewm_jax.config.migrations import RENAMED_FLAGS
+
+T = TypeVar("T")
+
+
+def spelled_out(flags: Sequence[str], default: Any) -> list[str]:
+    """Return flags by their full, present names, where the default is an experiment.
+
+    Args:
+        flags: the arguments.
+        default: the settings that they change.
+    """
+    if not isinstance(default, Config):
+        return list(flags)
+    here = {field.name for field in dataclasses.fields(default)}
+    short = {field.name for field in dataclasses.fields(default.model)} - here
+
+    def full(flag: str) -> str:
+        if not flag.startswith("--"):
+            return flag
+        name = flag[2:]
+        for old, new in RENAMED_FLAGS:
+            whole = name.partition("=")[0] == old
+            if whole or (old.endswith((".", "_")) and name.startswith(old)):
+                return f"--{new}{name.removeprefix(old)}"
+        first = name.replace("=", ".").partition(".")[0].removeprefix("no-").removeprefix("no_")
+        return f"--model.{name}" if first in short else flag
+
+    return [full(flag) for flag in flags]
+
+
+def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
+    """Take ``--SECTION.kind NAME`` out of the arguments.
+
+    Args:
+        flags: the arguments, spelled out.
+        default: the settings that they change.
+
+    Returns:
+        The default with settings of these kinds, and the other arguments.
+
+    Raises:
+        ConfigError: there is no such kind, or its settings do not fit the rest.
+    """
+    rest: list[str] = []
+    queue = list(flags)
+    while queue:
+        flag, equals, value = queue.pop(0).partition("=")
+        path = flag.removeprefix("--").split(".")
+        section = _section(default, path[:-1])
+        if not flag.startswith("--") or path[-1] != "kind" or section is None:
+            rest.append(flag + equals + value)
+            continue
+        if not equals:
+            if not queue:
+                there = ", ".join(kinds.names(section.SECTION))
+                raise ConfigError(f"{flag} needs a value: {there}.")
+            value = queue.pop(0)
+        default = _replaced(default, path[:-1], _as_kind(section, value))
+    return default, rest
+
+
+def of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
+    """List the flags of settings (or of a dataclass) with their fields, sections included."""
+    instance = None if isinstance(settings, type) else settings
+    if isinstance(instance, Settings) and prefix != "--":
+        yield f"{prefix}kind", None
+    for field in dataclasses.fields(settings):
+        value = field.default if instance is None else getattr(instance, field.name)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            yield from of(value, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}", field
+
+
+def kinds_text(default: Any, prefix: str = "") -> str:
+    """Return a line for each section of which there are several kinds, for the help text."""
+    lines = []
+    for field in dataclasses.fields(default):
+        value = getattr(default, field.name)
+        if not dataclasses.is_dataclass(value):
+            continue
+        name = f"{prefix}{field.name}"
+        if isinstance(value, Settings):
+            there = kinds.names(value.SECTION)
+            if len(there) > 1:
+                lines.append(f"  --{name}.kind {{{','.join(there)}}} ({kinds.of(value).name})")
+        below = kinds_text(value, f"{name}.")
+        lines += [below] if below else []
+    return "\n".join(lines)
+
+
+def _section(settings: Any, path: Sequence[str]) -> Any:
+    """Return the settings at a path, if they are of a section that has kinds."""
+    for name in path:
+        if not dataclasses.is_dataclass(settings) or not hasattr(settings, name):
+            return None
+        settings = getattr(settings, name)
+    return settings if path and isinstance(settings, Settings) else None
+
+
+def _as_kind(old: Any, name: str) -> Any:
+    """Return settings of another kind, with what both kinds have in common."""
+    kind = kinds.named(old.SECTION, name)
+    if kind.settings is type(old):
+        return old
+    shared = {field.name for field in dataclasses.fields(kind.settings)}
+    kept = {
+        field.name: getattr(old, field.name)
+        for field in dataclasses.fields(old)
+        if field.name in shared
+    }
+    return kind.settings(**kept)
+
+
+def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
+    """Return settings with what stands at a path replaced."""
+    if not path:
+        return value
+    inner = _replaced(getattr(settings, path[0]), path[1:], value)
+    changes = {path[0]: inner}
+    if isinstance(settings, Config) and path == ["model"]:
+        # Another world has other stages: it begins with its own settings for them.
+        common = configuration.to_dict(settings.train)
+        wanted = {field.name for field in dataclasses.fields(value.TRAIN)}
+        changes["train"] = configuration.from_dict(
+            value.TRAIN, {name: common[name] for name in common.keys() & wanted}, "train"
+        )
+    return dataclasses.replace(settings, **changes)
