@@ -7,6 +7,7 @@ section; what both kinds have in common is kept.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
@@ -120,12 +121,15 @@ def _as_kind(old: Any, name: str) -> Any:
     if kind.settings is type(old):
         return old
     shared = {field.name for field in dataclasses.fields(kind.settings)}
-    kept = {
-        field.name: getattr(old, field.name)
-        for field in dataclasses.fields(old)
-        if field.name in shared
-    }
-    return kind.settings(**kept)
+    new = kind.settings()
+    for field in dataclasses.fields(old):
+        if field.name in shared:
+            changed = configuration.to_dict(new) | {
+                field.name: configuration.to_dict(old)[field.name]
+            }
+            with contextlib.suppress(ConfigError):  # of the same name, but not of the same values
+                new = configuration.from_dict(kind.settings, changed)
+    return new
 
 
 def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
