@@ -1,1 +1,1 @@
-"""Chapter 2, what it saw: scenes, renderer, trajectories, the episode format, import, loader."""
+"""Chapter 2b, what was seen: scenes, renderer, trajectories, episodes, import, loader."""

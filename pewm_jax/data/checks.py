@@ -68,7 +68,7 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
 
 
 def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
-    """Check that depths (T, H, W) look like metres in a place that an agent can be in."""
+    """Check that depths (T, H, W) are plausible in metres and not mostly missing."""
     valid = depth_THW[np.isfinite(depth_THW) & (depth_THW > 0)]
     bad = np.flatnonzero(~np.isfinite(depth_THW).all((1, 2)))
     if len(bad):
@@ -97,7 +97,7 @@ def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
 
 
 def _check_saturation(depth_THW: np.ndarray, where: str) -> list[Problem]:
-    """Check that no stored depth is the saturated value, which is a mark and no distance."""
+    """Check that no stored depth has the saturated value, which marks missing depth."""
     saturated = depth_THW > (SATURATED - 0.5) / MILLIMETRES
     if not saturated.any():
         return []

@@ -17,7 +17,7 @@ import numpy as np
 from pewm_jax.data.episodes import Episode
 
 FLOATING = 0.05
-"""A point floats when it is this much nearer than what the other frame sees."""
+"""A point floats if its depth is smaller than the other frame's by more than this fraction."""
 MOST_FLOATING = 0.08
 """Largest share of floating points, averaged over pairs of frames of one kind, in images of
 ``LIMIT_SIDE`` pixels and more. Smaller ones are mostly edges: right data has up to 3 % at 32
@@ -29,7 +29,7 @@ PAIRS = 6
 FEWEST_PAIRS = 3
 LEAST_OVERLAP = 0.05
 SAMPLES = 4096
-"""Pixels compared per pair, about."""
+"""Pixels compared per pair, approximately."""
 _WIDEST_TURN = np.radians(60)
 
 

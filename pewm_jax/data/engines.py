@@ -70,7 +70,7 @@ class Job:
     indices: range
 
     def run(self) -> Shard:
-        """Write the file, aside and then renamed."""
+        """Make the shard and write its file."""
         write_shard(self.path, (make_episode(self.config, self.split, i) for i in self.indices))
         return describe_shard(self.path)
 
@@ -95,7 +95,7 @@ def run(
 
 
 def on_processes(jobs: list[Job], workers: int) -> Generator[tuple[Job, Shard]]:
-    """Make shards in this process or in several of this machine."""
+    """Make shards in this process or in a pool of processes."""
     if min(workers, len(jobs)) <= 1:
         for job in jobs:
             yield job, job.run()

@@ -66,7 +66,7 @@ def face_light(normals_F3: np.ndarray) -> np.ndarray:
 def occlusion(
     tracer: EmbreeScene, points_P3: np.ndarray, normals_P3: np.ndarray, reach_m: float = 1.2
 ) -> np.ndarray:
-    """Return (P,) in [0, 1]: how open the hemisphere above each point is.
+    """Return the ambient occlusion of points, (P,) in [0, 1]; 1 = nothing within reach.
 
     Args:
         tracer: the scene's rays.

@@ -32,7 +32,7 @@ EPOCHS = 2**31
 
 @dataclasses.dataclass(frozen=True)
 class _Drawn:
-    """A clip and where it comes from: the number of its record, its episode, its frames."""
+    """A clip with the number of its record, the name of its episode and its frames."""
 
     record: int
     name: str
@@ -41,7 +41,7 @@ class _Drawn:
 
 
 class _DrawClip(grain.transforms.RandomMap):
-    """Number of a record → a clip of its episode, or of another's where it does not decode.
+    """Map the number of a record to a clip; an episode that does not decode is replaced.
 
     Args:
         config: as for ``clips``.
@@ -95,7 +95,7 @@ class _DrawClip(grain.transforms.RandomMap):
 
 
 class _DescribeClip(grain.transforms.RandomMap):
-    """Number of a record → the name of the clip that ``_DrawClip`` draws."""
+    """Map the number of a record to the name of the clip that ``_DrawClip`` draws."""
 
     def __init__(self, draw: _DrawClip):
         self.draw = draw

@@ -76,7 +76,7 @@ class CollectConfig:
     workers: int = 0
     """Processes; 0 = as many as there are CPU cores. The result does not depend on it."""
     engine: Literal["processes", "ray"] = "processes"
-    """Who makes the shards: `processes` of this machine, or a `ray` cluster (pip install
+    """What makes the shards: `processes` of this machine, or a `ray` cluster (pip install
     'pewm-jax[ray]'). The result does not depend on it."""
     address: str = ""
     """With `--engine ray`: HOST:PORT of the cluster, or `auto` on one of its machines; empty

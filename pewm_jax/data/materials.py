@@ -1,4 +1,4 @@
-"""Texture images → one flat array of texels with mip levels, sampled bilinearly.
+"""Texture images as one flat array of texels with mip levels, sampled bilinearly.
 
 Colours are multiplied as they are stored (sRGB); nothing is converted to linear light.
 """

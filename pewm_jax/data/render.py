@@ -21,7 +21,7 @@ CHUNK = 1 << 14
 
 @dataclasses.dataclass(frozen=True)
 class Rendered:
-    """What cameras see.
+    """Rendered images.
 
     Attributes:
         rgb_THWC: (T, H, W, 3) uint8, black where nothing is hit.

@@ -1,4 +1,4 @@
-"""Any triangle mesh → a `Scene`: flat arrays ready for casting rays and shading hits.
+"""Scenes: triangle meshes as flat arrays for ray casting and shading.
 
 A scene is built once; colours, texture coordinates and baked light of a triangle are stored as
 one row, affine in the barycentric coordinates of a hit, so that shading gathers once per pixel.
@@ -39,7 +39,7 @@ _UNREADABLE = (
     struct.error,
     zlib.error,
 )
-"""What trimesh's many parsers raise on files that they cannot make sense of."""
+"""Errors that trimesh's parsers raise on files that they cannot read."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Scene:
         return lighting.embree(self.vertices_V3 - self.centre_3, self.faces_F3)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave Embree's structure behind when travelling to another process."""
+        """Pickle without Embree's structure, which other processes build again."""
         return {key: value for key, value in self.__dict__.items() if key != "tracer"}
 
 

@@ -72,7 +72,7 @@ def action_to(pose_3: np.ndarray, after_3: np.ndarray) -> np.ndarray:
 
 
 class _Agent:
-    """An agent in a grid that records what it does, up to a number of frames."""
+    """An agent in a grid; records its poses and actions up to a number of frames."""
 
     def __init__(
         self,
@@ -120,7 +120,7 @@ class _Agent:
         return np.all(is_free(self.grid, points), axis=-1)
 
     def ahead(self, yaw: float | np.ndarray, length_m: float | None = None) -> np.ndarray:
-        """Return (..., 2) points one step (or so far) away in these directions."""
+        """Return (..., 2) points in these directions, one step or ``length_m`` away."""
         length = self.config.step_m if length_m is None else length_m
         return self.pose[:2] + length * np.stack([np.cos(yaw), np.sin(yaw)], -1)
 

@@ -84,7 +84,7 @@ def validate(config: ValidateConfig, say: Callable[[str], None] = print) -> Verd
 
 
 def _files(path: Path) -> tuple[list[Path], list[Problem]]:
-    """List the files of all splits under a path, and what is wrong with them as files."""
+    """Return the files of all splits under a path, and the problems of the files themselves."""
     inside = splits(path) if path.is_dir() and not (path / MANIFEST).is_file() else []
     files: list[Path] = []
     problems = _unfinished(path) if inside else []
@@ -96,7 +96,7 @@ def _files(path: Path) -> tuple[list[Path], list[Problem]]:
 
 
 def _unfinished(path: Path) -> list[Problem]:
-    """Name the splits inside a dataset folder that hold data and are not read."""
+    """Return a problem for every split of a dataset that holds data but is unfinished."""
     begun = {
         file.parent for mark in ("*.array_record", UNFINISHED) for file in path.glob(f"*/{mark}")
     }
@@ -120,7 +120,7 @@ def _check_hashes(folder: Path, manifest: Manifest) -> list[Problem]:
 
 
 def _check_record(file: Path, index: int) -> tuple[int, list[Problem]]:
-    """Return the number of frames of a record and what is wrong with it."""
+    """Return the number of frames of a record and its problems."""
     where = f"{file}, record {index}"
     try:
         episode = read_episode(read_record(file, index), where)

@@ -1,4 +1,4 @@
-"""Actions → poses, and back.
+"""Planar actions: poses from actions, actions from poses, several actions as one.
 
 An action is (dx, dy, dyaw) in the agent's body frame: metres forward, metres to the left,
 radians counter-clockwise; the agent first moves, then turns. Discrete actions are rows of a
@@ -79,7 +79,7 @@ def integrate(world_from_camera: Array, actions_T3: Array) -> Array:
 
 
 def compose(actions_S3: np.ndarray) -> np.ndarray:
-    """Return the single actions that do what several actions in a row do.
+    """Compose consecutive planar actions into single ones.
 
     Args:
         actions_S3: (..., S, 3) planar actions, carried out one after the other.

@@ -1,4 +1,4 @@
-"""Plücker embedding of cameras, and its way down to the latent rate.
+"""Plücker embedding of cameras, per pixel and per latent cell.
 
 The paper's Eq. 1 adds the translation to the direction; a direction is not moved by translation,
 and CameraCtrl's code, which the paper follows, does not add it: d = R K⁻¹ (u + ½, v + ½, 1),
@@ -30,7 +30,7 @@ def plucker(camera: Camera, height: int, width: int) -> Array:
 
 
 def fold_frames(frames_TX: Array, temporal: int) -> Array:
-    """Give each latent frame the list of frames it covers.
+    """Group frames by the latent frame that covers them.
 
     Frame 0 is repeated ``temporal`` times (the latent of the first frame covers it alone), then
     every ``temporal`` frames belong to one latent: (..., T, X) → (..., t, temporal, X) on the

@@ -1,4 +1,4 @@
-"""Whether an agent can walk through a furnished plan into every room."""
+"""Check that an agent can walk into every room of a furnished house."""
 
 from __future__ import annotations
 

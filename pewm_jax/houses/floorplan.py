@@ -22,7 +22,7 @@ Rect = tuple[float, float, float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Opening:
-    """A hole in one wall of a room.
+    """A doorway or a window in one wall of a room.
 
     Attributes:
         side: wall it is in: 0 south (y low), 1 east, 2 north, 3 west.

@@ -1,4 +1,4 @@
-"""A seed → a furnished house of 3 to 8 rooms, as a trimesh scene.
+"""Generate a furnished house of 3 to 8 rooms from a seed, as a trimesh scene.
 
 The scene is z-up with its floor at z = 0, in metres. Its bytes depend on the seed alone.
 """
