@@ -22,9 +22,7 @@ class PerceptronConfig(BackboneSettings):
     depth: int = 2
     width: int = 32
 
-    @property
-    def places(self):
-        return Places(self.depth, self.width, self.width)
+    places = property(lambda self: Places(self.depth, self.width, self.width))
 
 
 def init(config, key, in_channels, out_channels):
@@ -37,9 +35,7 @@ def init(config, key, in_channels, out_channels):
 def apply(config, params, x_BthwC, time_B, conditioning, readers):
     x = backbones.joined(x_BthwC, conditioning)
     tokens = x.reshape(len(x), -1, x.shape[-1]) @ params["into"].astype(x.dtype)
-    time = layers.sinusoid(time_B, config.width)[:, None]
-    if conditioning.modulation_BtE is not None:
-        time = time + conditioning.modulation_BtE
+    time = layers.sinusoid(time_B, config.width)[:, None] + conditioning.modulation_BtE
     per_token = jnp.repeat(time, tokens.shape[1] // time.shape[1], 1)
 
     def block(tokens, layer):

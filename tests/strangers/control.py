@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,8 @@ SHARDING = ((r"control/project", P(None, "fsdp")),)
 
 @dataclasses.dataclass(frozen=True)
 class PushConfig(ControlSettings):
+    MODULATES: ClassVar[bool] = True
+
     width: int = 3
 
 

@@ -36,9 +36,7 @@ def remember(model, memory, frames, features_ThwF, valid_T=None):
 def tokens(model, memory, camera):
     missing = model.memory.tokens - len(memory[2])
     assert missing >= 0
-    features, points, valid = (
-        jnp.pad(x, [(0, missing)] + [(0, 0)] * (x.ndim - 1)) for x in memory
-    )
+    features, points, valid = (jnp.pad(x, [(0, missing)] + [(0, 0)] * (x.ndim - 1)) for x in memory)
     return MapTokens(features, points, valid)
 
 

@@ -1,7 +1,6 @@
 """Run in a process of its own with eight simulated devices: prints as JSON what was measured."""
 
 import dataclasses
-import functools
 import json
 import math
 
@@ -31,7 +30,7 @@ from tests.strangers.memory import NewestConfig
 from tests.strangers.noise import CosineConfig
 
 
-def experiment(mesh=MeshConfig(), run="runs/strangers", batch=8, width=32) -> Config:
+def experiment(mesh=None, run="runs/strangers", batch=8, width=32) -> Config:
     stage = StageConfig(steps=2, batch=batch, warmup=1)
     return Config(
         model=ModelConfig(
@@ -46,7 +45,12 @@ def experiment(mesh=MeshConfig(), run="runs/strangers", batch=8, width=32) -> Co
         ),
         data=DataConfig(context=3),
         train=TrainConfig(
-            run=run, stage1=stage, stage2=stage, mesh=mesh, preview_every=0, save_every=1
+            run=run,
+            stage1=stage,
+            stage2=stage,
+            mesh=mesh or MeshConfig(),
+            preview_every=0,
+            save_every=1,
         ),
     )
 
@@ -86,7 +90,10 @@ def losses(mesh, devices):
             found.append(float(metrics["loss"]))
         start = jax.device_get(state.params)
         up = state.params["backbone"]["blocks"]["up"]
-        split = {"spec": str(up.sharding.spec), "part": up.addressable_shards[0].data.size / up.size}
+        split = {
+            "spec": str(up.sharding.spec),
+            "part": up.addressable_shards[0].data.size / up.size,
+        }
     return found, split
 
 
@@ -111,4 +118,4 @@ def main():
 
 
 if __name__ == "__main__":
-    functools.partial(main)()
+    main()
