@@ -6,7 +6,6 @@ Only inference weights are read: a checkpoint's optimizer state may be missing o
 from __future__ import annotations
 
 import functools
-import importlib
 import warnings
 from pathlib import Path
 
@@ -66,9 +65,9 @@ def _checkpoints(run: Path) -> list[Path]:
 
 def _read(folder: Path) -> tuple[Config, Params]:
     # Imported here: Orbax takes a second to import, and finished runs do not need it.
-    checkpoint = importlib.import_module("pewm_jax.training.checkpoint")
-    config, params = checkpoint.read_weights(folder, _shapes)
-    return config, params
+    from pewm_jax.training import checkpoint  # noqa: PLC0415
+
+    return checkpoint.read_weights(folder, _shapes)
 
 
 def _shapes(config: Config, number: int) -> Params:
