@@ -33,7 +33,7 @@ from pewm_jax import cli
 from pewm_jax import presets as configs
 from pewm_jax.config import Config, MeshConfig, UserError
 from pewm_jax.scaling import plan, suggest
-from pewm_jax.scaling.footprint import Arranged
+from pewm_jax.scaling.footprint import MeshSizes
 from pewm_jax.training import chips, costs, sharding, stages, step
 from pewm_jax.types import Clip
 
@@ -73,7 +73,7 @@ def random_clip(config: Config, stage: stages.Stage) -> Clip:
 
 def predicted(config: Config, stage: stages.Stage, chip: chips.Chip) -> dict[str, float]:
     """Return what the sums on paper, which ``--plan`` prints, say of one device."""
-    choice = suggest.weigh(config, stage, Arranged(), chip)
+    choice = suggest.assess(config, stage, MeshSizes(), chip)
     return {
         "predicted_s": choice.time.step_s,
         "predicted_mfu": choice.time.mfu,

@@ -1,4 +1,4 @@
-"""A model: all that inference needs to know, and nothing else."""
+"""The model: all settings that inference needs, and no others."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from pewm_jax.config.training import TrainConfig, TrainSettings
 
 
 class WorldSettings(Settings):
-    """What the settings of every world say; ``pewm_jax.worlds`` says what a world does.
+    """Settings that every world has; see ``pewm_jax.worlds`` for its functions.
 
     Attributes:
-        TRAIN: its training settings: ``TrainSettings`` with a ``StageConfig`` for each stage, named
-            as ``pewm_jax.worlds.stages`` names them.
-        dtype: compute precision, in which frozen weights are kept too.
+        TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
+            for each of the world's stages, named as the stage.
+        dtype: precision of computation and of frozen weights.
     """
 
     SECTION: ClassVar[str] = "world"
@@ -32,27 +32,26 @@ class WorldSettings(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig(WorldSettings):
-    """A video diffusion model with a memory (PEWM): what it imagines and how it is built."""
+    """A video diffusion model with a memory (PEWM)."""
 
     TRAIN: ClassVar[type[TrainSettings]] = TrainConfig
 
     clip: ClipConfig = ClipConfig()
-    """The shape of a clip."""
+    """Shape of a clip."""
     actions: ActionConfig = ActionConfig()
-    """What an action does."""
+    """Effect of an action."""
     codec: CodecSettings = PixelConfig()
-    """Pixels to latents."""
+    """Codec: pixels to latents and back."""
     backbone: BackboneSettings = DiTConfig()
-    """The denoiser."""
+    """Backbone: the denoiser."""
     control: ControlSettings = CameraConfig()
-    """What steers it."""
+    """Control: what steers a clip."""
     memory: MemorySettings = VoxelConfig()
-    """What is remembered, as which features, and how it is read."""
+    """Memory: what is remembered, as which features, and how it is read."""
     noise: NoiseSettings = DDPMConfig()
-    """Noise, target, sampler."""
+    """Noise, prediction target, sampler."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Compute precision; master weights of what trains stay float32, frozen weights are kept in
-    this precision."""
+    """Precision of computation and of frozen weights; weights in training stay float32."""
 
     @property
     def latent_shape(self) -> tuple[int, int, int]:
@@ -66,11 +65,11 @@ class ModelConfig(WorldSettings):
 
     @property
     def in_channels(self) -> int:
-        """Channels that go into the denoiser: noisy latents, observed latents, the control's."""
+        """Input channels of the denoiser: noisy latents, observed latents, the control's."""
         return 2 * self.codec.channels + self.control.channels(self)
 
     def __post_init__(self):
-        """Validate what spans several sections."""
+        """Validate settings that depend on each other."""
         parts: tuple[Any, ...] = (self.backbone, self.codec, self.control, self.memory, self.noise)
         for part in parts:
             part.check(self)

@@ -1,7 +1,7 @@
-"""Continuous noise σ with preconditioning (Karras et al. 2022, arXiv 2206.00364).
+"""EDM: continuous noise σ with preconditioning (Karras et al. 2022, arXiv 2206.00364).
 
-The network F sees c_in x and log σ / 4; clean latents are c_skip x + c_out F (its Eq. 7 and Table
-1), so that input and target have unit variance at every σ.
+The network F gets c_in x and log σ / 4. Clean latents are c_skip x + c_out F (Eq. 7 and Table 1
+there), so input and target have unit variance at every σ.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def to_x0(config: EDMConfig, prediction: Array, x_t: Array, time_B: Array) -> Ar
 
 
 def levels(config: EDMConfig) -> np.ndarray:
-    """Return (sample_steps,) σ from sigma_max to sigma_min (its Eq. 5)."""
+    """Return (sample_steps,) σ from sigma_max to sigma_min (Eq. 5 of the paper)."""
     high, low = config.sigma_max ** (1 / config.rho), config.sigma_min ** (1 / config.rho)
     share = np.linspace(0, 1, config.sample_steps)
     return (high + share * (low - high)) ** config.rho

@@ -1,6 +1,6 @@
-"""Where a video token is: rotary angles, fixed sinusoids and a learned table.
+"""Positions of video tokens: rotary angles, fixed sinusoids, a learned table.
 
-All of it is computed on the host while tracing, from the configuration and the token grid.
+All are computed on the host while tracing, from the configuration and the token grid.
 Reference: ``get_3d_rotary_pos_embed``, ``get_resize_crop_region_for_grid``,
 ``get_3d_sincos_pos_embed`` and ``CogVideoXPatchEmbed`` of diffusers.
 """
@@ -27,7 +27,7 @@ def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
         shape: (B, t, h, w, C) of the latents.
 
     Raises:
-        UserError: in one sentence, for every illegal size.
+        UserError: the network cannot take latents of this size.
     """
     if len(shape) != 5:
         raise UserError(f"The latents have shape {tuple(shape)}: give (batch, t, h, w, channels).")
@@ -63,16 +63,16 @@ def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
 
 
 def sample_tokens(config: DiTConfig) -> int:
-    """Return the number of video tokens at the sample size."""
+    """Return the number of video tokens at the size that the network was trained for."""
     rows, columns = config.sample_height // config.patch, config.sample_width // config.patch
     return config.sample_latents // config.patch_t * rows * columns
 
 
 def takes_learned(config: DiTConfig, grid: Grid) -> bool:
-    """Tell whether a token grid is given the learned table; if it is of other frames, say so.
+    """Tell whether the learned table is used for a token grid; warn if it cannot be.
 
-    The table is for one number of frames; as in the reference, any other gets the fixed sinusoid in
-    its place.
+    The table is for one number of frames. As in the reference, other numbers of frames get the
+    fixed sinusoid instead.
     """
     if config.positions != "rope_learned":
         return False
@@ -140,9 +140,9 @@ def rope_angles(
 
 
 def joint_angles(config: DiTConfig, grid: Grid, length: int) -> np.ndarray | None:
-    """Return (length + t·h·w, head_dim/2) angles of text (0: not turned) and video tokens.
+    """Return (length + t·h·w, head_dim/2) rotary angles of text tokens (0) and video tokens.
 
-    None where the network turns nothing.
+    None if the network has no rotary embedding.
     """
     if config.positions == "sincos":
         return None
@@ -151,7 +151,7 @@ def joint_angles(config: DiTConfig, grid: Grid, length: int) -> np.ndarray | Non
 
 
 def sincos_table(config: DiTConfig, grid: Grid) -> np.ndarray:
-    """Return (t·h·w, D): 1/4 of the channels say the time, 3/8 the column, 3/8 the row."""
+    """Return (t·h·w, D): 1/4 of the channels encode the time, 3/8 the column, 3/8 the row."""
     frames, rows, columns = (np.arange(n) for n in grid)
     places = (
         frames / config.temporal_interpolation,

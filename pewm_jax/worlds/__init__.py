@@ -1,21 +1,21 @@
-"""Chapter 6, worlds: what is imagined next, whatever it is imagined by.
+"""Chapter 6, worlds: what is imagined next.
 
-A world is driven the same way whatever it is made of. All three are pure: jit them with the model
-static, vmap them over states, controls and keys. ::
+Every world is driven by the same three functions, whatever networks it has. They are pure: jit them
+with the model static, vmap them over states, controls and keys. ::
 
     state = start(model, params, frames)                        # a few posed RGB-D frames
-    state = observe(model, params, state, frames)               # more of them, half-way
+    state = observe(model, params, state, frames)               # more real frames, later
     state, frames = imagine(model, params, state, control, key) # what will be seen
 
 A world is a ``WorldSettings`` and a module (or object) with these three functions and
 
     init(model, key) -> params               all parameters
-    stages(model) -> (Stage, …)              how it is trained: ``worlds.stages``
+    stages(model) -> (Stage, …)              how it is trained, see ``worlds.stages``
     sharding(model) -> rules                 path of a parameter → the mesh axes of its last axes
-    split_heads(model, stage) -> {name: n}   what ``train.mesh.tensor`` must divide
-    costs(config, stage, share) -> {part: Costs}
+    split_heads(model, stage) -> {name: n}   numbers that ``train.mesh.tensor`` must divide
+    costs(config, stage, share) -> {part: Costs}   see ``models.costs``
 
-``worlds.pewm`` is the first of them.
+``worlds.pewm`` is an example.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pewm_jax.worlds.stages import Stage
 
 
 def model_of(config: Config | WorldSettings) -> Any:
-    """Return the model's settings, also where a whole experiment's are given."""
+    """Return the model's settings, from a whole experiment's if those are given."""
     return config.model if isinstance(config, Config) else config
 
 
@@ -36,7 +36,7 @@ def start(model: Config | WorldSettings, params: Params, frames: Frames) -> Worl
     """Begin a world from a few posed RGB-D frames.
 
     Args:
-        model: the model's settings, or an experiment's, of which they are taken.
+        model: the model's settings, or an experiment's, which contain them.
         params: the world model's parameters; those of the image encoder are used, if it has any.
         frames: S ≥ 1 frames (S, H, W, …), uint8 or float colours; all are remembered, the last one
             is the present.
@@ -54,7 +54,7 @@ def start(model: Config | WorldSettings, params: Params, frames: Frames) -> Worl
 def observe(
     model: Config | WorldSettings, params: Params, state: WorldState, frames: Frames
 ) -> WorldState:
-    """Take in real frames: they are remembered, and the last one becomes the present.
+    """Remember real frames; the last one becomes the present.
 
     Args:
         model: as for ``start``.
@@ -63,7 +63,7 @@ def observe(
         frames: S ≥ 1 frames, as for ``start``.
 
     Raises:
-        UserError: as ``start``.
+        UserError: as for ``start``.
     """
     model = model_of(model)
     return functions(model).observe(model, params, state, frames)
@@ -85,22 +85,22 @@ def imagine(
         model: as for ``start``; static under jit.
         params: the world model's parameters.
         state: from ``start``, ``observe`` or an earlier ``imagine``.
-        control: what is done, for any number n ≥ 1 of frames: (n,) discrete actions (0 forward,
-            1 turn left, 2 turn right), (n, 3) continuous ones (dx, dy, dyaw: metres forward, metres
-            left, radians counter-clockwise), a ``Camera`` (n,) for each frame to imagine (six
-            degrees of freedom), or a ``Control`` with (n,) cameras and (n, A) actions.
+        control: n ≥ 1 steps, any number: (n,) discrete actions (0 forward, 1 turn left, 2 turn
+            right); (n, 3) continuous ones (dx, dy, dyaw: metres forward, metres left, radians
+            counter-clockwise); a ``Camera`` (n,) for the frames to imagine (six degrees of
+            freedom); or a ``Control`` with (n,) cameras and (n, A) actions.
         key: randomness of the sampling noise.
-        remember: whether what is imagined is remembered. Without, states share the memory that
-            they came from: cheap for comparing many controls.
+        remember: whether the imagined frames are remembered. If not, all resulting states share
+            the memory they started from, which makes comparing many controls cheap.
         memory: False ignores what is remembered (the empty-memory baseline).
 
     Returns:
         ``(state, frames)``: the world after the last frame, and the n imagined frames, colours
-        float32 in [−1, 1], depth in metres. Clips are imagined whole; of the last one, what was
-        not asked for is dropped.
+        float32 in [−1, 1], depth in metres. Whole clips are imagined; surplus frames of the last
+        one are dropped.
 
     Raises:
-        UserError: the control has another form, or no frames.
+        UserError: the control is empty or has none of these forms.
     """
     model = model_of(model)
     return functions(model).imagine(
@@ -109,12 +109,12 @@ def imagine(
 
 
 def init(model: WorldSettings, key: Array) -> Params:
-    """Return random parameters of all of a world's networks."""
+    """Return random parameters for all networks of a world."""
     return functions(model).init(model, key)
 
 
 def stages(model: WorldSettings) -> tuple[Stage, ...]:
-    """Return how a world is trained, stage by stage, in order."""
+    """Return the stages of a world's training, in order."""
     return functions(model).stages(model)
 
 

@@ -1,4 +1,4 @@
-"""What people give to steer a world, brought into one form: cameras, and actions where known."""
+"""User input that steers a world, converted to one form: cameras, and actions if known."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def control_of(model: ModelConfig, present: Camera, control: Any) -> Control:
     """Return (n,) cameras of the frames to imagine, and the (n, A) actions that lead to them.
 
     Args:
-        model: says what a discrete action does.
+        model: defines what a discrete action does.
         present: (1,) the camera of the present frame.
         control: actions, a ``Camera`` or a ``Control``; see ``worlds.imagine``.
 
     Raises:
-        UserError: it has another form, or no frames, or a discrete action is not known (under jit,
-            vmap and grad values are unknown and not checked).
+        UserError: the control is empty, has none of these forms, or holds an unknown discrete
+            action (under jit, vmap and grad the values of actions are not checked).
     """
     if isinstance(control, Control):
         count = _require_cameras(control.camera)
@@ -59,7 +59,7 @@ def _as_arrays(camera: Camera) -> Camera:
 
 
 def _require_cameras(camera: Camera) -> int:
-    """Refuse cameras that are no sequence; returns how many there are."""
+    """Return the number of cameras, or refuse arrays that are not a sequence of cameras."""
     poses, intrinsics = camera.world_from_camera.shape, camera.intrinsics_4.shape
     count = poses[0] if len(poses) == 3 else 0
     if count < 1 or poses != (count, 4, 4) or intrinsics != (count, 4):
@@ -71,7 +71,7 @@ def _require_cameras(camera: Camera) -> int:
 
 
 def _require_known(actions: Array) -> None:
-    """Refuse discrete actions outside the table, which a lookup would clamp to the last row."""
+    """Refuse unknown discrete actions, which a table lookup would clamp to the last row."""
     if isinstance(actions, Tracer) or not jnp.issubdtype(actions.dtype, jnp.integer):
         return
     wrong = sorted({int(a) for a in np.ravel(actions)} - set(range(len(action_geometry.NAMES))))
