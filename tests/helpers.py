@@ -21,7 +21,6 @@ from pewm_jax.geometry import cameras
 from pewm_jax.models import world_model
 from pewm_jax.types import Camera, Frames
 
-
 TINY = ModelConfig(
     clip=ClipConfig(frames=9, height=16, width=24),
     codec=PixelConfig(spatial=4),

@@ -6,13 +6,13 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from pewm_jax.models.codec import signal_from_rgb
 
 from pewm_jax.config import MemoryConfig
 from pewm_jax.data.__main__ import main
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import cells, features, voxel_map
-from pewm_jax.models.codec import signal_from_rgb
 from pewm_jax.types import Camera, Frames
 
 RECORDING = Path(__file__).parents[3] / "shared" / "data" / "icl_livingroom"
