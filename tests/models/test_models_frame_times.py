@@ -11,7 +11,7 @@ from pewm_jax.models import backbones, dit, world_model
 from pewm_jax.models.backbones import Conditioning, Readers
 from pewm_jax.models.memory_block import MemoryBlock
 from pewm_jax.models.token_layout import TokenLayout
-from tests.helpers import TINY, init_world, randomise, tiny_model, with_reader
+from tests.helpers import TINY, init_world, randomise, with_reader
 from tests.models.test_models_dit import CONFIG, inputs, random_params
 from tests.models.test_models_world_model import setup as world
 
@@ -117,7 +117,7 @@ def memory_block():
     video, camera = draw(0, 2, FRAMES * PATCHES, WIDTH), draw(1, 2, FRAMES * PATCHES, 4)
     memory = draw(2, 2, 7, reader.width)
     rest = camera, memory, jnp.ones((2, 7), bool), None
-    params = randomise(block.init(jax.random.key(0), video, draw(3, 2, TIME), *rest))
+    params = randomise(jax.jit(block.init)(jax.random.key(0), video, draw(3, 2, TIME), *rest))
     return block, params, video, rest, reader.width
 
 
@@ -149,8 +149,8 @@ def test_the_memory_block_takes_a_time_for_each_frame():
 def test_a_world_with_memory_takes_a_time_for_each_latent_frame(positions, patch_t):
     _, conditioning, tokens, noisy, times = world(positions)
     backbone = dataclasses.replace(TINY.backbone, patch_t=patch_t)
-    model = tiny_model(backbone=backbone)
-    model = with_reader(model, positions=positions, heads=8)
+    read = with_reader(TINY, positions=positions, heads=8)  # a token has up to 8 cameras
+    model = dataclasses.replace(read, backbone=backbone)
     params = randomise(init_world(model))
 
     @jax.jit
