@@ -63,13 +63,19 @@ def from_1(values: Values) -> Values:
     if "codec" in old:
         model["codec"] = _codec(old.pop("codec"))
     if "dit" in old:
-        model["backbone"] = old.pop("dit")
+        model["backbone"] = _backbone(old.pop("dit"))
     if "memory" in old:
         memory = old.pop("memory")
         if "depth" in memory:
             _move(memory, "depth", model.setdefault("clip", {}), "depth")
         model["memory"] = _memory(memory)
     return {"version": 2, "model": model, **old}
+
+
+def _backbone(old: Values) -> Values:
+    """State what a table of learned positions did for other numbers of frames."""
+    table = {"learned": "reference"} if old.get("positions") == "rope_learned" else {}
+    return table | old
 
 
 def _codec(old: Values) -> Values:

@@ -40,6 +40,7 @@ def shrunken(name):
     config = published(name)
     small = {"layers": 2, "heads": 2, "head_dim": 32, "text_dim": 24, "text_length": LENGTH}
     small |= {"time_dim": 48, "ofs_dim": 48 if config.ofs_dim else 0}
+    small |= {"learned": "reference"} if config.positions == "rope_learned" else {}
     return dataclasses.replace(config, **small, **(OLDER if config.patch_t == 1 else {}))
 
 
