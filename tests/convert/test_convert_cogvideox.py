@@ -22,9 +22,10 @@ from transformers import AutoTokenizer, T5EncoderModel
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import tensor_files, weights
-from pewm_jax.convert import assemble, base, cogvideox, files, mapping, widen, world
+from pewm_jax.convert import assemble, base, cogvideox, mapping, sources, widen, world
 from pewm_jax.convert.__main__ import main
-from pewm_jax.models import dit, world_model
+from pewm_jax.models import dit, readers, world_model
+from pewm_jax.models.backbones import Conditioning
 from pewm_jax.types import Camera, MapTokens
 
 WORLD = ["--rgbd", "--camera", "--memory", "--frames", "9", "--height", "32", "--width", "32"]
@@ -158,7 +159,7 @@ def test_prompts_are_encoded_as_the_pipeline_does(imported, images, widened):
     for prompt, tokens in zip(("a room", ""), stored, strict=True):
         np.testing.assert_allclose(tokens, reference(prompt), atol=1e-6)
     config, params = pewm_jax.load(widened)
-    assert config.dit.prompt == "stored"
+    assert config.model.backbone.prompt == "stored"
     expected = reference("a room with a chair")
     np.testing.assert_allclose(params["text"]["prompt_LC"], expected, atol=1e-6)
     assert not np.allclose(expected, stored[0])
@@ -171,21 +172,23 @@ def inputs(config, plan):
     def normal(*shape):
         return jnp.asarray(rng.normal(size=shape), jnp.float32)
 
-    frames, height, width = world.codec.latent_shape(config)
+    model = config.model
+    frames, height, width = model.latent_shape
     noisy, first = (normal(2, frames, height, width, plan.new.out_channels) for _ in range(2))
-    rays = normal(2, frames, height, width, world_model.camera_channels(config))
-    pose = jnp.broadcast_to(jnp.eye(4), (2, config.clip.frames, 4, 4))
-    camera = Camera(jnp.full((2, config.clip.frames, 4), 16.0), pose)
-    text_BLC = normal(2, config.dit.text_length, config.dit.text_dim)
-    conditioning = world_model.Conditioning(first, rays, camera, text_BLC)
+    rays = normal(2, frames, height, width, model.control.channels(model))
+    pose = jnp.broadcast_to(jnp.eye(4), (2, model.clip.frames, 4, 4))
+    camera = Camera(jnp.full((2, model.clip.frames, 4), 16.0), pose)
+    text_BLC = normal(2, *model.backbone.text_shape)
+    given = Conditioning(jnp.concatenate([first, rays], -1), None, text_BLC)
+    conditioning = world_model.ClipConditioning(given, camera, rays)
     points = normal(2, 24, 3) + jnp.array([0.0, 0.0, 3.0])
-    features = 9 * normal(2, 24, world_model.feature_channels(config))
+    features = 9 * normal(2, 24, model.memory.encoder.channels)
     tokens = MapTokens(features, points, jnp.ones((2, 24), bool))
     split = plan.old.out_channels
     video = noisy[..., :split]
     if plan.old.in_channels > split:
         video = jnp.concatenate([video, first[..., :split]], -1)
-    video = jnp.concatenate([video[:, :1]] * (-frames % config.dit.patch_t) + [video], 1)
+    video = jnp.concatenate([video[:, :1]] * (-frames % model.backbone.patch_t) + [video], 1)
     return noisy, conditioning, tokens, video
 
 
@@ -198,7 +201,7 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     source = {k: v.numpy() for k, v in pipelines.dit(variant).state_dict().items()}
     old = network.config(dict(pipelines.dit(variant).config), variant)
     params = assemble.read(
-        network.entries(old), files.Arrays(source, variant), network.like(old), "float32"
+        network.entries(old), sources.Arrays(source, variant), network.like(old), "float32"
     )
     vae = cogvideox.VAE.config(dict(pipelines.vae().config), "vae")
     config = world.config_of(
@@ -206,17 +209,20 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
             {"_class_name": "CogVideoXDDIMScheduler", **pipelines.SCHEDULER}
         ), (9, 32, 32), "float32",
     )  # fmt: skip
-    config = dataclasses.replace(config, memory=dataclasses.replace(config.memory, positions=kind))
-    plan = widen.plan(old, 4, world_model.camera_channels(config))
+    cameras = config.model.codec.temporal * old.patch_t
+    memory = config.model.memory
+    reader = dataclasses.replace(memory.reader, positions=kind, heads=cameras)
+    config = config.with_model(memory=dataclasses.replace(memory, reader=reader))
+    plan = widen.plan(old, 4, config.model.control.channels(config.model))
     wide = {
         "backbone": widen.widen(plan, params),
-        "memory": jax.jit(lambda: world_model.init_memory(config, jax.random.key(0)))(),
+        "memory": jax.jit(lambda: readers.init(config.model, jax.random.key(0)))(),
     }
     noisy, conditioning, tokens, video = inputs(config, plan)
     times = jnp.array([999, 40])
     apply = jax.jit(world_model.apply, static_argnums=0)
-    got = apply(config, wide, noisy, conditioning, times, tokens)[..., : old.out_channels]
-    want = jax.jit(dit.apply, static_argnums=0)(old, params, video, conditioning.text_BLC, times)
+    got = apply(config.model, wide, noisy, conditioning, times, tokens)[..., : old.out_channels]
+    want = jax.jit(dit.apply, static_argnums=0)(old, params, video, conditioning.given.tokens_BLC, times)
     want = want[:, -got.shape[1] :]
     assert np.abs(want).max() > 0.1
     assert np.abs(got - want).max() <= 1e-6 * np.abs(want).max()
@@ -259,10 +265,11 @@ def test_settings_of_the_world_model_can_be_given(images, tmp_path):
     dst = tmp_path / "dst"
     run("import", "cogvideox", images, dst, *WORLD, "--config", settings, "--dtype", "bfloat16")
     config, params = pewm_jax.load(dst)
-    assert (config.memory.tokens, config.clip.height) == (32, 32)
-    assert config.train.dtype == "bfloat16"
+    assert (config.model.memory.tokens, config.model.clip.height) == (32, 32)
+    assert config.model.memory.reader.heads == 4
+    assert config.model.dtype == "bfloat16"
     assert {leaf.dtype.name for leaf in jax.tree.leaves(params)} == {"bfloat16"}
-    assert config.diffusion.target == "v"
+    assert config.model.noise.target == "v"
 
 
 def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
@@ -279,7 +286,7 @@ def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
     like = {"w": jax.ShapeDtypeStruct((layers, *layer), np.float32)}
     for dtype, each in (("float32", 1 << 20), ("bfloat16", 1 << 19)):
         tracemalloc.start()
-        params = assemble.read(entries, files.open_folder(tmp_path), like, dtype)
+        params = assemble.read(entries, sources.open_folder(tmp_path), like, dtype)
         weights.save(tmp_path / "out" / "w.safetensors", params)
         specs = assemble.specs(entries, params)
         tensor_files.write(tmp_path / "back", specs, assemble.write(entries, params), {})
