@@ -21,7 +21,8 @@ from transformers import AutoTokenizer, T5EncoderModel
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import tensor_files, weights
+from pewm_jax import presets, tensor_files, weights
+from pewm_jax.config import published
 from pewm_jax.convert import assemble, base, cogvideox, mapping, sources, widen, world
 from pewm_jax.convert.__main__ import main
 from pewm_jax.models import dit, readers, world_model
@@ -222,7 +223,9 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     times = jnp.array([999, 40])
     apply = jax.jit(world_model.apply, static_argnums=0)
     got = apply(config.model, wide, noisy, conditioning, times, tokens)[..., : old.out_channels]
-    want = jax.jit(dit.apply, static_argnums=0)(old, params, video, conditioning.given.tokens_BLC, times)
+    want = jax.jit(dit.apply, static_argnums=0)(
+        old, params, video, conditioning.given.tokens_BLC, times
+    )
     want = want[:, -got.shape[1] :]
     assert np.abs(want).max() > 0.1
     assert np.abs(got - want).max() <= 1e-6 * np.abs(want).max()
@@ -270,6 +273,66 @@ def test_settings_of_the_world_model_can_be_given(images, tmp_path):
     assert config.model.dtype == "bfloat16"
     assert {leaf.dtype.name for leaf in jax.tree.leaves(params)} == {"bfloat16"}
     assert config.model.noise.target == "v"
+
+
+def without(settings, *names):
+    """Settings as a table, less what the checkpoint decides."""
+    return {k: v for k, v in configuration.to_dict(settings).items() if k not in names}
+
+
+@pytest.mark.parametrize(("variant", "billions"), [("2b", 0.94), ("5b", 2.84)])
+def test_an_imported_checkpoint_starts_from_the_preset_of_its_size(variant, billions):
+    """All but the features of the map, which come with --encoder."""
+    preset = presets.load(f"pewm_{variant}")
+    noise = preset.model.noise
+    backbone, codec = published(variant), preset.model.codec
+    made = world.config_of(backbone, codec, noise, (None, None, None), "bfloat16")
+    assert without(made.train, "run") == without(preset.train, "run")
+    assert (made.data, made.evaluate) == (preset.data, preset.evaluate)
+    assert without(made.model, "memory", "backbone") == without(preset.model, "memory", "backbone")
+    assert without(made.model.backbone, "prompt") == without(preset.model.backbone, "prompt")
+    assert without(made.model.memory, "encoder") == without(preset.model.memory, "encoder")
+    assert configuration.kinds.of(made.model.memory.encoder).name == "patch_colours"
+    encoder = preset.model.memory.encoder
+    made = world.config_of(backbone, codec, noise, (None,) * 3, "bfloat16", encoder=encoder)
+    assert made.model.memory == preset.model.memory
+    blocks = jax.eval_shape(lambda: readers.init(made.model, jax.random.key(0)))
+    count = sum(leaf.size for leaf in jax.tree.leaves(blocks))
+    assert abs(count / 1e9 - billions) < 0.01
+
+
+def test_an_imported_world_has_the_paper_s_training_and_small_blocks(widened):
+    config, params = pewm_jax.load(widened)
+    assert config.train.run == "runs/dst"
+    assert (config.train.stage1.learning_rate, config.train.stage1.steps) == (1e-4, 20_000)
+    assert config.model.backbone.remat
+    backbone, reader = config.model.backbone, config.model.memory.reader
+    assert (reader.heads, reader.head_dim) == (backbone.heads, backbone.head_dim)
+    assert set(params) == {"backbone", "memory", "codec", "text"}
+
+
+@pytest.mark.parametrize("learned", ["interpolate", "drop", "reference"])
+def test_learned_positions_are_for_other_clips_by_choice(images, tmp_path, learned, capsys):
+    small = ["--rgbd", "--camera", "--frames", "17"]
+    square = ["--height", "32", "--width", "32"]
+    wide = square if learned == "reference" else ["--height", "32", "--width", "48"]
+    dst = tmp_path / "dst"
+    argv = ["import", "cogvideox", images, dst, *small, *wide]
+    assert main([str(word) for word in argv]) == 2
+    assert "--positions" in capsys.readouterr().err
+    run(*argv, "--positions", learned)
+    config, params = pewm_jax.load(dst)
+    assert config.model.backbone.learned == learned
+    assert json.loads((dst / "config.json").read_text())["model"]["backbone"]["learned"] == learned
+    shape = (1, *config.model.latent_shape, config.model.in_channels)
+    backbone = dataclasses.replace(config.model.backbone, in_channels=shape[-1], out_channels=8)
+    text = jnp.zeros((1, *backbone.text_shape))
+    apply = jax.jit(dit.apply, static_argnums=0)
+    out = apply(backbone, params["backbone"], jnp.ones(shape), text, jnp.array([3]))
+    assert np.isfinite(out).all()
+    run("export", "diffusers", dst, tmp_path / "back")
+    back = CogVideoXTransformer3DModel.from_pretrained(tmp_path / "back/transformer")
+    require_equal(back, pipelines.dit("5b-I2V"))
 
 
 def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
