@@ -105,7 +105,9 @@ def _memory(old: Values) -> Values:
     _move(old, "encoder_patch", encoder, "patch")
     _move(old, "encoder_size", encoder, "size")
     _move(old, "dinov2", encoder, "network")
-    unused = ("patch",) if encoder.get("kind") == "dinov2" else ("size", "network")
+    unused = {"dinov2": ("patch",), "patch_colours": ("size", "network")}.get(
+        encoder.get("kind", ""), ()
+    )
     encoder = {name: value for name, value in encoder.items() if name not in unused}
     for name in ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio"):
         _move(old, name, reader, name)
@@ -130,6 +132,8 @@ RENAMED_FLAGS = (
     ("codec.vae.", "model.codec."),
     ("train.dtype", "model.dtype"),
     ("memory.depth", "model.clip.depth"),
+    ("memory.no_depth", "model.clip.no_depth"),
+    ("memory.encoder", "model.memory.encoder.kind"),
     ("memory.dinov2.", "model.memory.encoder.network."),
     ("memory.encoder_patch", "model.memory.encoder.patch"),
     ("memory.encoder_size", "model.memory.encoder.size"),
