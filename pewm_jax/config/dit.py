@@ -10,6 +10,8 @@ from pewm_jax.config.errors import ConfigError, require, require_positive
 
 Positions = Literal["rope_integer", "rope_crop", "rope_learned", "sincos"]
 """How a video token says where it is; see ``DiTConfig.positions``."""
+Learned = Literal["exact", "interpolate", "drop", "reference"]
+"""What a learned table of positions does for other sizes; see ``DiTConfig.learned``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +47,13 @@ class DiTConfig(BackboneSettings):
     """Feed-forward width over model width."""
     positions: Positions = "rope_integer"
     """`rope_integer`: rotary, positions 0, 1, 2 … (CogVideoX 1.5). `rope_crop`: rotary, the token
-    grid stretched over the sample size's (5b). `rope_learned`: that and a learned table (5b-I2V),
-    for the sample size alone; other numbers of frames get the sinusoid in its place. `sincos`: a
-    fixed sinusoid added to the tokens (2b)."""
+    grid stretched over the sample size's (5b). `rope_learned`: that and a learned table (5b-I2V)
+    of the sample size; see `learned`. `sincos`: a fixed sinusoid added to the tokens (2b)."""
+    learned: Learned = "exact"
+    """The table of `rope_learned` at other sizes than the sample's. `exact`: they are refused.
+    `interpolate`: it is resized to the token grid, linearly in time, rows and columns. `drop`: it
+    is not used at any size, the rotary embedding alone says positions. `reference`: as diffusers
+    does, other numbers of frames get a fixed sinusoid in its place, other sizes are refused."""
     sample_height: int = 0
     """Latent rows that the network was trained for; 0 where positions do not ask (rope_integer:
     a bound when not 0)."""
@@ -150,6 +156,11 @@ class DiTConfig(BackboneSettings):
                 "was trained for (CogVideoX: 60 × 90 latents of 49 frames).",
             )
         learned = self.positions == "rope_learned"
+        require(
+            learned or self.learned == "exact",
+            f"backbone.learned is {self.learned}: only positions rope_learned have a table that "
+            "is learned; leave it at exact.",
+        )
         require(
             not learned or (self.sample_height % self.patch == self.sample_width % self.patch == 0),
             f"backbone.sample_height × sample_width {self.sample_height}×{self.sample_width}: "

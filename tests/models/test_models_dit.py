@@ -197,19 +197,13 @@ def small(name):
         ("5b", (0, 4, 6, 16), "no size may be 0"),
         ("5b", (3, 4, 6, 32), "32 channels and this network takes 16"),
         ("5b-I2V", (3, 4, 6, 16), "16 channels and this network takes 32"),
-        ("5b-I2V", (3, 6, 6, 32), "a table for latents of 4×6"),
+        ("5b-I2V", (3, 6, 6, 32), "a table for latents of 3×4×6"),
         ("1.5-5B", (3, 4, 6, 16), "repeat the first latent frame 1 times"),
         ("1.5-5B", (2, 4, 8, 16), "larger than the 4×6"),
     ],
 )
 def test_illegal_latents_are_refused_in_a_sentence(name, shape, says):
     assert says in refused(small(name), shape)
-
-
-@pytest.mark.parametrize(("frames", "told"), [(3, False), (2, True)])
-def test_learned_positions_of_another_number_of_frames_are_told(frames, told, caplog):
-    assert positions.takes_learned(small("5b-I2V"), (frames, 2, 3)) != told
-    assert ("the fixed sinusoid takes their place" in caplog.text) == told
 
 
 def test_text_and_ofs_that_do_not_fit_are_refused():
