@@ -8,47 +8,68 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import (
+    AttentionConfig,
     ClipConfig,
-    CodecConfig,
     Config,
-    DiffusionConfig,
+    DDPMConfig,
     DiTConfig,
-    MemoryConfig,
+    ModelConfig,
+    PixelConfig,
+    VoxelConfig,
 )
 from pewm_jax.geometry import cameras
 from pewm_jax.models import world_model
 from pewm_jax.types import Camera, Frames
 
 
+TINY = ModelConfig(
+    clip=ClipConfig(frames=9, height=16, width=24),
+    codec=PixelConfig(spatial=4),
+    backbone=DiTConfig(
+        layers=2, heads=2, head_dim=16, patch=2, text_length=3, text_dim=8, time_dim=16
+    ),
+    memory=VoxelConfig(
+        cell_m=(0.5, 0.5, 0.5),
+        cells=(24, 24, 8),
+        capacity=2048,
+        tokens=32,
+        reader=AttentionConfig(heads=4, head_dim=8),
+    ),
+    noise=DDPMConfig(sample_steps=3),
+)
+"""A model of two blocks, for 9 frames of 16 × 24 pixels."""
+
+
 def tiny_config(**sections) -> Config:
-    config = Config(
-        clip=ClipConfig(frames=9, height=16, width=24),
-        codec=CodecConfig(spatial=4),
-        dit=DiTConfig(
-            layers=2, heads=2, head_dim=16, patch=2, text_length=3, text_dim=8, time_dim=16
-        ),
-        memory=MemoryConfig(
-            cell_m=(0.5, 0.5, 0.5),
-            cells=(24, 24, 8),
-            capacity=2048,
-            tokens=32,
-            encoder_patch=2,
-            heads=4,
-            head_dim=8,
-        ),
-        diffusion=DiffusionConfig(sample_steps=3),
-    )
-    return dataclasses.replace(config, **sections)
+    """Return a tiny experiment; sections are the model's, or data, train and evaluate."""
+    of_model = {field.name for field in dataclasses.fields(ModelConfig)} & sections.keys()
+    model = tiny_model(**{name: sections.pop(name) for name in of_model})
+    return Config(model=model, **sections)
+
+
+def tiny_model(**sections) -> ModelConfig:
+    """Return a tiny model with other sections: ``tiny_model(noise=…)``."""
+    return dataclasses.replace(TINY, **sections)
+
+
+def with_reader(model: ModelConfig, **changes) -> ModelConfig:
+    """Return a model whose reader of the memory has other settings."""
+    reader = dataclasses.replace(model.memory.reader, **changes)
+    return dataclasses.replace(model, memory=dataclasses.replace(model.memory, reader=reader))
 
 
 @functools.partial(jax.jit, static_argnums=0, static_argnames="memory")
-def _init(config, key, *, memory):
-    return world_model.init(config, key, memory=memory)
+def _init(model, key, *, memory):
+    return world_model.init(model, key, memory=memory)
 
 
 def init_world(config, key=None, *, memory=True):
-    """Initialise as the library does, compiled: several times faster than step by step."""
-    return _init(config, jax.random.key(0) if key is None else key, memory=memory)
+    """Initialise as the library does, compiled: several times faster than step by step.
+
+    Takes a model or an experiment.
+    """
+    model = config.model if isinstance(config, Config) else config
+    return _init(model, jax.random.key(0) if key is None else key, memory=memory)
 
 
 def randomise(params, seed=0, scale=0.2):
