@@ -31,7 +31,7 @@ import optax
 import record
 
 from pewm_jax import cli
-from pewm_jax.config import DiffusionConfig, DiTConfig, UserError, VAEConfig, published
+from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig, published
 from pewm_jax.diffusion import sampler, schedule
 from pewm_jax.models import dit, vae
 
@@ -174,7 +174,7 @@ def autoencoder(setting: Setting) -> Any:
 
 def measure_clip(setting: Setting) -> dict[str, float]:
     """Time one clip: encode its first frame, sample without guidance, decode; one program."""
-    config = DiffusionConfig(sample_steps=setting.steps, target="v", snr_shift=3.0)
+    config = DDPMConfig(sample_steps=setting.steps, target="v", snr_shift=3.0)
     noise, text = inputs(setting, 1)
     params, codec = backbone(setting, setting.dtype), autoencoder(setting)
     frame = jnp.zeros((1, 1, setting.pixels, setting.pixels, 3), setting.dtype)
