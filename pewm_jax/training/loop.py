@@ -209,7 +209,7 @@ class _Worker:
                 split = Path(config.data.path) / "train"
                 processes.first(
                     lambda: feature_cache.require_fresh(
-                        cache, config.model.memory, starting.encoder(config), split
+                        cache, config.model.memory.encoder, starting.encoder(config), split
                     )
                 )
             self.watch.pace = Pace(time.monotonic())

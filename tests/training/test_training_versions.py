@@ -45,19 +45,25 @@ MEMORIES = {
     "images": ImagesConfig,
     "none": NoMemoryConfig,
 }
+READER = ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio")
 RENAMED = {
     "train.dtype": "model.dtype",
+    "clip.": "model.clip.",
+    "actions.": "model.actions.",
+    "codec.vae.": "model.codec.",
+    "codec.": "model.codec.",
+    "dit.": "model.backbone.",
     "memory.depth": "model.clip.depth",
     "memory.encoder": "model.memory.encoder.kind",
-    "diffusion.image_noise_mean": "train.image_noise_mean",
-    "diffusion.image_noise_std": "train.image_noise_std",
-} | {
-    f"memory.{name}": f"model.memory.reader.{name}"
-    for name in ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio")
+    "memory.encoder_": "model.memory.encoder.",
+    "memory.dinov2.": "model.memory.encoder.network.",
+    **{f"memory.{name}": f"model.memory.reader.{name}" for name in READER},
+    "memory.": "model.memory.",
+    "diffusion.image_noise_": "train.image_noise_",
+    "diffusion.": "model.noise.",
 }
-SECTIONS = {"dit": "model.backbone", "diffusion": "model.noise"} | {
-    name: f"model.{name}" for name in ("clip", "actions", "codec", "memory")
-}
+"""What a setting was called → how it is called now; the first that fits counts. Names that end in a
+dot or a line stand for all that begin so."""
 
 
 def written(name="finished"):
@@ -81,26 +87,23 @@ def with_leaf(values, path, leaf):
     return {**values, first: with_leaf(values[first], rest, leaf) if rest else leaf}
 
 
-def now_called(path, kinds):
+def now_called(path, memory, encoder, codec):
     """Return where a setting of version 1 is now; None where what it says is not used."""
-    memory, encoder, codec = kinds
-    if path in RENAMED:
-        return RENAMED[path]
-    if path == "memory.snapshots" and memory != "images":
+    unused = {
+        "memory.snapshots": memory != "images",
+        "memory.encoder_patch": encoder == "dinov2",
+        "memory.encoder_size": encoder != "dinov2",
+        "memory.dinov2": encoder != "dinov2",
+        "codec.vae": codec != "vae",
+        "codec.spatial": codec == "vae",
+        "codec.temporal": codec == "vae",
+    }
+    if any(unused[name] for name in unused if path == name or path.startswith(f"{name}.")):
         return None
-    if path == "memory.encoder_patch":
-        return None if encoder == "dinov2" else "model.memory.encoder.patch"
-    if path == "memory.encoder_size" or path.startswith("memory.dinov2."):
-        last = path.removeprefix("memory.").removeprefix("encoder_")
-        there = f"model.memory.encoder.{last.replace('dinov2', 'network')}"
-        return there if encoder == "dinov2" else None
-    if path.startswith("codec."):
-        inside = path.startswith("codec.vae.")
-        if path != "codec.kind" and inside != (codec == "vae"):
-            return None
-        return f"model.codec.{path.removeprefix('codec.').removeprefix('vae.')}"
-    section, _, rest = path.partition(".")
-    return f"{SECTIONS.get(section, section)}.{rest}"
+    for old, new in RENAMED.items():
+        if path == old or (old.endswith((".", "_")) and path.startswith(old)):
+            return f"{new}{path.removeprefix(old)}"
+    return path
 
 
 @pytest.mark.parametrize("codec", ["pixel", "vae"])
@@ -113,7 +116,7 @@ def test_every_value_moves_to_its_place_and_none_is_lost_or_invented(memory, enc
     before = flat(configuration.upgrade(values, "here"))
     arrived = {"version"}
     for path in flat(values):
-        there = now_called(path, (memory, encoder, codec))
+        there = now_called(path, memory, encoder, codec)
         if path in ("codec.kind", "memory.kind", "memory.encoder"):
             assert before[there] == flat(values)[path]
             arrived.add(there)
