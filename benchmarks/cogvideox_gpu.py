@@ -30,7 +30,7 @@ import numpy as np
 import optax
 import record
 
-from pewm_jax import cli
+from pewm_jax import atomic, cli
 from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig, published
 from pewm_jax.diffusion import sampler, schedule
 from pewm_jax.models import dit, vae
@@ -293,9 +293,7 @@ def main(argv: Sequence[str]) -> int | None:
             print(f"{name} failed; the messages are above, and the other parts go on.")
             continue
         done[name] = json.loads(run.stdout.splitlines()[-1])
-        partial = options.state.with_name(options.state.name + ".partial")
-        partial.write_text(json.dumps(done, indent=2))
-        partial.replace(options.state)
+        atomic.write_text(options.state, json.dumps(done, indent=2))
     text = f"## CogVideoX-2b, bf16, one clip of 9 × 512 × 512\n\n{record.machine('jax')}\n\n"
     text += report(done)
     print(text)

@@ -28,7 +28,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from record import machine, record, table
 
-from pewm_jax import cli, weights
+from pewm_jax import atomic, cli, weights
 from pewm_jax import presets as configs
 from pewm_jax.config import (
     Config,
@@ -192,9 +192,7 @@ def file_of(out: Path, variant: Variant, seed: int) -> Path:
 
 def keep(path: Path, result: Result) -> Result:
     """Write a result aside, then rename it."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(result, indent=1) + "\n")
-    partial.replace(path)
+    atomic.write_text(path, json.dumps(result, indent=1) + "\n")
     return result
 
 

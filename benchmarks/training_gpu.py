@@ -29,7 +29,7 @@ import jax
 import numpy as np
 import record
 
-from pewm_jax import cli
+from pewm_jax import atomic, cli
 from pewm_jax import presets as configs
 from pewm_jax.config import Config, MeshConfig, UserError
 from pewm_jax.data import abstract
@@ -209,9 +209,7 @@ def complete(done: dict[str, dict[str, Any]], options: argparse.Namespace) -> bo
                     full.add(number)
                     continue
                 done[name] = found
-                partial = options.state.with_name(options.state.name + ".partial")
-                partial.write_text(json.dumps(done, indent=2))
-                partial.replace(options.state)
+                atomic.write_text(options.state, json.dumps(done, indent=2))
             if FULL in done.get(name, {}):
                 full.add(number)
     return True

@@ -14,7 +14,8 @@ import training_fakes as fakes
 from pewm_jax import presets as configs
 from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
 from pewm_jax.data import abstract
-from pewm_jax.models.costs import SPLIT
+from pewm_jax.models import vae_codec
+from pewm_jax.models.costs import SPLIT, Share
 from pewm_jax.scaling import plan, plan_text, predict, suggest
 from pewm_jax.scaling.footprint import Arranged, counts, footprint
 from pewm_jax.training import chips
@@ -136,6 +137,18 @@ def test_the_vae_holds_a_chunk_of_a_long_clip():
         for frames in (9, 49)
     )
     assert long < 2 * nine
+
+
+def test_the_vae_works_clip_by_clip_and_streams_all_clips_in_their_precision():
+    model = configs.load("pewm_2b").model
+    one = vae_codec.costs(model, Share(clips=1, wide=2))
+    four, wide = (vae_codec.costs(model, Share(clips=n, wide=w)) for n, w in ((4, 2), (1, 4)))
+    assert (four.held, four.streamed) == (one.held, 4 * one.streamed)
+    assert (wide.held, wide.streamed) == (2 * one.held, 2 * one.streamed)
+    assert one.products == four.products == wide.products
+    pixels = 9 * 512 * 512 * 128  # the widest array of a clip
+    assert one.streamed > 2 * 2 * pixels
+    assert one.held > 2 * 2 * pixels
 
 
 def test_numbers_are_written_as_people_do():
