@@ -95,7 +95,7 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
 
 def _gather(config: Config, episodes: Sequence[Episode], long: LongRollouts, index: int) -> _Shown:
     choice = long.scored.choices[index]
-    context, truth, _ = load_clip(config, episodes, choice)
+    context, truth, _ = load_clip(config, episodes, choice, cameras=True)
     seen, _ = seen_masks(truth, context)
     made = {
         method: (long.kept[method]["rgb"][index], long.kept[method]["depth"][index])

@@ -15,7 +15,7 @@ from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.evaluation.images import psnr, unit_colours
 from pewm_jax.evaluation.imagine import Imagination, aloud
 from pewm_jax.evaluation.pictures import as_bytes, farthest, grid, save_png
-from pewm_jax.evaluation.protocol import choose, load_clip, stack
+from pewm_jax.evaluation.protocol import choose, load_clip, needs_cameras, stack
 from pewm_jax.evaluation.video import encode_h264, side_by_side
 from pewm_jax.training.samples import IMAGINED, Preview, Previewed
 from pewm_jax.training.stages import Stage
@@ -28,8 +28,8 @@ SPLIT, CLIPS, SHOWN = "validation", 8, 3
 def make_preview(config: Config, run: Path, say: Callable[[str], Any] = aloud) -> Preview | None:
     """Prepare previews for a training run, where its data can be previewed.
 
-    A training needs no previews: without validation data, or where that cannot be replayed (too
-    short, or moved in ways that are not upright), one line says so and there are none.
+    A training needs no previews: without validation data, or where that is too
+    short, one line says so and there are none.
 
     Args:
         config: the experiment; clips come from ``data.path``/validation.
@@ -48,23 +48,26 @@ def make_preview(config: Config, run: Path, say: Callable[[str], Any] = aloud) -
     try:
         episodes = EpisodeSource(Path(config.data.path) / SPLIT)
         choices = choose(config, episodes, CLIPS, 1)
-        clips = [load_clip(config, episodes, choice) for choice in choices]
+        cameras = needs_cameras(episodes, choices)
+        clips = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
     except UserError as error:
         say(f"no previews of this training: {error}")
         return None
     context = stack([clip[0] for clip in clips], CLIPS)
-    actions = stack([clip[2] for clip in clips], CLIPS)
+    control = stack([clip[2] for clip in clips], CLIPS)
     seeds = np.stack([np.zeros(CLIPS, int), np.arange(CLIPS)], -1)
     models: dict[str, Imagination] = {}
 
     def preview(params: Params, stage: Stage, step: int) -> Previewed:
         if stage.name not in models:
-            models[stage.name] = Imagination(config, params, CLIPS, config.data.context)
+            models[stage.name] = Imagination(
+                config, params, CLIPS, config.data.context, cameras=cameras
+            )
         variants = {"memory": True, "empty": False} if stage.memory else {"model": False}
         made: dict[str, Frames] = {}
         for name, memory in variants.items():
             _, _, made[name] = models[stage.name].run(
-                context, actions, seeds, memory=memory, params=params
+                context, control, seeds, memory=memory, params=params
             )
         name = f"{stage.name}-{step:06d}"
         shown = clips[:SHOWN]
@@ -80,8 +83,8 @@ def make_preview(config: Config, run: Path, say: Callable[[str], Any] = aloud) -
     return preview
 
 
-_Loaded = tuple[Frames, Frames, np.ndarray]
-"""Context, true frames and actions of a clip, as ``protocol.load_clip`` gives them."""
+_Loaded = tuple[Frames, Frames, Any]
+"""Context, true frames and control of a clip, as ``protocol.load_clip`` gives them."""
 
 
 def _score(clips: Sequence[_Loaded], frames: Frames) -> float:
