@@ -1,4 +1,4 @@
-"""The ICL-NUIM living room, recorded by hand in six degrees of freedom, is rolled out by cameras."""
+"""The ICL-NUIM living room, recorded by hand in six degrees of freedom, is driven by cameras."""
 
 import dataclasses
 from pathlib import Path
