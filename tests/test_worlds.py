@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -212,9 +213,9 @@ CAMERA = random_camera(np.random.default_rng(0), 3)
         ([], "no actions; give at least one"),
         (np.zeros((0, 3)), "no actions; give at least one"),
         (0, "no actions; give at least one"),
-        (np.zeros((3, 2), np.float32), r"of shape \(3, 2\); give \(3,\) integers or \(3, 3\)"),
-        (np.zeros((3,), np.float32), r"of shape \(3,\); give"),
-        ([0, 5], r"discrete actions \[5\]; there is 0 forward"),
+        (np.zeros((3, 2), np.float32), "of shape (3, 2); give (3,) integers or (3, 3)"),
+        (np.zeros((3,), np.float32), "of shape (3,); give"),
+        ([0, 5], "discrete actions [5]; there is 0 forward"),
         (jax.tree.map(lambda x: x[:0], CAMERA), "a camera for each of n ≥ 1"),
         (jax.tree.map(lambda x: x[0], CAMERA), "a camera for each of n ≥ 1"),
         (Camera(CAMERA.intrinsics_4[:2], CAMERA.world_from_camera), "a camera for each of n ≥ 1"),
@@ -223,10 +224,9 @@ CAMERA = random_camera(np.random.default_rng(0), 3)
     ],
 )
 def test_controls_of_another_form_are_refused_in_a_sentence(params, state, control, says):
-    with pytest.raises(UserError, match=says if "\\" in says else None) as caught:
+    with pytest.raises(UserError, match=re.escape(says)) as caught:
         worlds.imagine(MODEL, params, state, control, KEY)
     told = str(caught.value)
-    assert "\\" in says or says in told
     assert told.startswith("imagine() got ")
     assert told.endswith(".")
     assert "\n" not in told

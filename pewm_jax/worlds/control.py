@@ -27,7 +27,7 @@ def control_of(model: ModelConfig, present: Camera, control: Any) -> Control:
     """
     if isinstance(control, Control):
         count = _require_cameras(control.camera)
-        actions = control.actions_TA
+        actions = None if control.actions_TA is None else jnp.asarray(control.actions_TA)
         if actions is not None and (actions.ndim != 2 or len(actions) != count):
             raise UserError(
                 f"imagine() got {count} cameras and actions of shape {actions.shape}; give "
