@@ -177,7 +177,10 @@ def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, pa
         (["tiny", "--memory.cell_m", "1", "2"], "'--model.memory.cell_m'. Expected 3 values"),
         (["tiny", "--memory.kind", "image"], "There is no memory of kind 'image'; there is images"),
         (["tiny", "--clip.frames", "8"], "clip.frames is 8: the codec folds every 4 frames"),
-        (["tiny", "--clip.height", "20"], "backbone.patch = 8; change the clip's size or the patch"),
+        (
+            ["tiny", "--clip.height", "20"],
+            "backbone.patch = 8; change the clip's size or the patch",
+        ),
         (["tiny", "stray"], "stray; `python train.py tiny --help` lists the settings."),
         (["tiny", "--config"], "--config needs the name of a JSON file"),
         (["tiny", "--config", "none.json"], "none.json cannot be read"),
