@@ -9,9 +9,14 @@ from pewm_jax.config.kinds import Settings
 
 
 class ControlSettings(Settings):
-    """What the settings of every control say; ``pewm_jax.models.controls`` says what it does."""
+    """What the settings of every control say; ``pewm_jax.models.controls`` says what it does.
+
+    Attributes:
+        MODULATES: whether it adds to the time embedding of each latent frame.
+    """
 
     SECTION: ClassVar[str] = "control"
+    MODULATES: ClassVar[bool] = False
 
     def channels(self, model: Any) -> int:
         """Return the channels, at the latent rate, that it joins to the denoiser's input.

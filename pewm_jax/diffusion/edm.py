@@ -85,5 +85,6 @@ def sample(config: EDMConfig, denoise: Denoiser, noise: Array, key: Array | None
             moved = jnp.where(then > 0, better, moved)
         return moved.astype(x.dtype), None
 
-    out, _ = jax.lax.scan(step, noise * sigmas[0], (jnp.asarray(sigmas), jnp.asarray(after)))
+    start = (noise * sigmas[0]).astype(noise.dtype)
+    out, _ = jax.lax.scan(step, start, (jnp.asarray(sigmas), jnp.asarray(after)))
     return out

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.evaluation.images import psnr, unit_colours
@@ -17,6 +18,7 @@ from pewm_jax.evaluation.pictures import as_bytes, farthest, grid, save_png
 from pewm_jax.evaluation.protocol import choose, load_clip, stack
 from pewm_jax.evaluation.video import encode_h264, side_by_side
 from pewm_jax.training.samples import IMAGINED, Preview, Previewed
+from pewm_jax.training.stages import Stage
 from pewm_jax.types import Frames, Params
 
 SPLIT, CLIPS, SHOWN = "validation", 8, 3
@@ -36,10 +38,10 @@ def make_preview(config: Config, run: Path, say: Callable[[str], Any] = aloud) -
 
     Returns:
         ``preview(params, stage, step)``: imagines the clips with the current weights, measures
-        their PSNR with its map and with an empty map (stage 1: of the model, which has none), and
-        writes ``previews/stage2-000250.png`` with rows truth, with its map, empty map and
-        ``previews/stage2-000250.mp4``, the same side by side. It is compiled once per stage. None
-        where there is nothing to preview.
+        their PSNR with its map and with an empty map (of a stage without memory, such as PEWM's
+        stage 1: of the model, which has none), and writes ``previews/stage2-000250.png`` with rows
+        truth, with its map, empty map and ``previews/stage2-000250.mp4``, the same side by side. It
+        is compiled once per stage. None where there is nothing to preview.
     """
     quick = dataclasses.replace(config.evaluate, split=SPLIT, batch=CLIPS)
     config = dataclasses.replace(config, evaluate=quick)
@@ -53,20 +55,20 @@ def make_preview(config: Config, run: Path, say: Callable[[str], Any] = aloud) -
     context = stack([clip[0] for clip in clips], CLIPS)
     actions = stack([clip[2] for clip in clips], CLIPS)
     seeds = np.stack([np.zeros(CLIPS, int), np.arange(CLIPS)], -1)
-    models: dict[int, Imagination] = {}
+    models: dict[str, Imagination] = {}
 
-    def preview(params: Params, stage: int, step: int) -> Previewed:
-        if stage not in models:
-            models[stage] = Imagination(config, params, CLIPS, config.data.context)
-        variants = {"model": False} if stage == 1 else {"memory": True, "empty": False}
+    def preview(params: Params, stage: Stage, step: int) -> Previewed:
+        if stage.name not in models:
+            models[stage.name] = Imagination(config, params, CLIPS, config.data.context)
+        variants = {"memory": True, "empty": False} if stage.memory else {"model": False}
         made: dict[str, Frames] = {}
         for name, memory in variants.items():
-            _, _, made[name] = models[stage].run(
+            _, _, made[name] = models[stage.name].run(
                 context, actions, seeds, memory=memory, params=params
             )
-        name = f"stage{stage}-{step:06d}"
+        name = f"{stage.name}-{step:06d}"
         shown = clips[:SHOWN]
-        picture = _picture(shown, made, f"stage {stage}, step {step}")
+        picture = _picture(shown, made, f"{stage.title}, step {step}")
         return Previewed(
             (
                 save_png(run / "previews" / f"{name}.png", picture),
@@ -124,9 +126,8 @@ def _save_video(
         where = f"{title}, clip {index + 1} of {len(clips)}"
         footers = [f"{where}: {f'imagined {time}' if time else 'observed'}" for time in times]
         pictures += side_by_side(columns, footers, far_m=farthest(true), cell=192)
-    aside = path.with_name(path.name + ".partial")
-    aside.write_bytes(encode_h264(pictures))
-    aside.replace(path)
+    with atomic.replacing(path) as partial:
+        partial.write_bytes(encode_h264(pictures))
     return path
 
 

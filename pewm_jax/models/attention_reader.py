@@ -13,7 +13,16 @@ from jax.sharding import PartitionSpec as P
 from pewm_jax.config import AttentionConfig, ModelConfig, NoMemoryConfig
 from pewm_jax.models import layers
 from pewm_jax.models.backbones import Readers
-from pewm_jax.models.costs import FLOAT, SPLIT, Costs, Product, Share, text_tokens, video_tokens
+from pewm_jax.models.costs import (
+    FLOAT,
+    SPLIT,
+    Costs,
+    Product,
+    Share,
+    text_tokens,
+    video_times,
+    video_tokens,
+)
 from pewm_jax.models.dit import patchify
 from pewm_jax.models.memory_block import MemoryBlock
 from pewm_jax.models.memory_geometry import Sightings, patch_pixels, sightings, sinusoid_3d
@@ -180,7 +189,7 @@ def _products(model: ModelConfig, video: int, again: float) -> tuple[Product, ..
     camera = depth * video * width * (width + width // 2)
     mixed = depth * video * width * (2 * inner + place + 2 * config.mlp_ratio * width)
     keys = depth * 2 * tokens * inner * inner
-    modulation = depth * places.time * (4 * width + 2 * inner)
+    modulation = video_times(model) * depth * places.time * (4 * width + 2 * inner)
     attention = depth * video * _seen(model) * (2 * inner + place)
     ends = video * _ray_channels(model) * (width // 2) + tokens * token_channels(model) * inner
     return (

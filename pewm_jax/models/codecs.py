@@ -6,7 +6,7 @@ A codec is a ``CodecSettings`` and a module (or object) with
     encode(settings, params, video_BTHWC, *, condition=False) -> latents_BthwC
     decode(settings, params, latents_BthwC) -> video_BTHWC
     SHARDING                                                         rules over ``codec/…`` paths
-    costs(model) -> Costs                                            see ``models.costs``
+    costs(model, share) -> Costs                                     see ``models.costs``
 
 and keeps the frame rule q·k + 1 frames → k + 1 latent frames. Colour and depth are encoded
 separately and their channels concatenated, as the paper does with the VAE, which sees depth as a

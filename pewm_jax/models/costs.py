@@ -103,6 +103,12 @@ def video_tokens(model: ModelConfig) -> tuple[int, int]:
     return -(-t // places.patch_t), (h // places.patch) * (w // places.patch)
 
 
+def video_times(model: ModelConfig) -> int:
+    """Return how many time embeddings the video tokens of a clip have: one, or one per frame."""
+    apart = model.control.MODULATES or getattr(model.noise, "per_frame", False)
+    return video_tokens(model)[0] if apart else 1
+
+
 def text_tokens(model: ModelConfig) -> int:
     """Return how many text tokens a clip has."""
     return model.backbone.text_shape[0] if model.backbone.text_shape else 0

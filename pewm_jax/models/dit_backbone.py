@@ -10,7 +10,16 @@ from jax.sharding import PartitionSpec as P
 from pewm_jax.config import DiTConfig, ModelConfig
 from pewm_jax.models import backbones, blocked_attention, dit
 from pewm_jax.models.backbones import Conditioning, Readers
-from pewm_jax.models.costs import FLOAT, SPLIT, Costs, Product, Share, text_tokens, video_tokens
+from pewm_jax.models.costs import (
+    FLOAT,
+    SPLIT,
+    Costs,
+    Product,
+    Share,
+    text_tokens,
+    video_times,
+    video_tokens,
+)
 from pewm_jax.types import Array, Params
 
 WHOLE = P()
@@ -147,7 +156,9 @@ def _products(config: DiTConfig, model: ModelConfig, *, trained: bool) -> tuple[
     both, one = 1.0 + trained, float(trained)
 
     per_token = (4 + 2 * config.mlp_ratio) * width * width
-    modulation = depth * 12 * width * time
+    frames = video_times(model)
+    times = frames + (frames > 1)  # the text has one of its own
+    modulation = times * depth * 12 * width * time
     recomputed = again + 0.5  # the logits, from their normaliser
     attention = depth * 2 * joint**2 * width
     ends_in = (joint - text) * cell * model.in_channels * width
@@ -159,6 +170,6 @@ def _products(config: DiTConfig, model: ModelConfig, *, trained: bool) -> tuple[
         Product("backbone", "attention", attention, 2.0, recomputed, SPLIT),
         Product("backbone", "linear", ends_in, one),
         Product("backbone", "linear", time * time * (2 if config.ofs_dim else 1), 2 * one),
-        Product("backbone", "linear", 2 * width * time, 2 * one, 0.0, ("tensor",)),
+        Product("backbone", "linear", times * 2 * width * time, 2 * one, 0.0, ("tensor",)),
         Product("backbone", "linear", out, both, 0.0, ("context",)),
     )

@@ -93,7 +93,7 @@ def traffic(config: Config, stage: Stage, mesh: Arranged) -> dict[tuple[str, str
     """Return the bytes that a device sends in a step, by kind and axis of the mesh.
 
     Per step: a block's weights are gathered for the forward and again for the backward pass, once
-    more where it repeats the forward pass (``dit.remat``) in 16 bits, since XLA does not see then
+    more where it repeats the forward pass (``backbone.remat``) in 16 bits, since XLA does not see then
     that both are the same (``fsdp``); gradients are added up and scattered; copies of the weights
     add up theirs (``data``). Per block and pass: what its two, with memory four, last products give
     is added up over ``tensor``; keys and values are gathered over ``context`` and their gradients

@@ -68,8 +68,7 @@ def _read(folder: Path) -> tuple[Config, Params]:
     # Imported here: Orbax takes a second to import, and finished runs do not need it.
     from pewm_jax.training import checkpoint  # noqa: PLC0415
 
-    config, params = checkpoint.read_weights(folder, _shapes)
-    return config, params
+    return checkpoint.read_weights(folder, _shapes)
 
 
 def _shapes(config: Config, number: int) -> Params:

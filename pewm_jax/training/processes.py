@@ -184,8 +184,7 @@ def is_lost(error: BaseException) -> bool:
 def gather(tree: T) -> T:
     """Gather arrays that are sharded over processes in the first one; called by all.
 
-    Leaf by leaf, so no device holds more than one gathered array. With one process the tree is
-    returned as it is.
+    Leaf by leaf, so no device holds more than one gathered array.
 
     Returns:
         In the first process the same tree with NumPy arrays, in the others a tree of empty arrays.
@@ -271,10 +270,7 @@ def _give_up(launch: Launch) -> NoReturn:
 
 @contextlib.contextmanager
 def _quiet_but_first() -> Iterator[None]:
-    """Let only the first process print to standard output, and only from Python.
-
-    (Gloo, which carries messages between CPUs, prints there from C++.)
-    """
+    """Let only the first process print to standard output, and not from C++, as Gloo does."""
     sys.stdout.flush()
     before, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 1)

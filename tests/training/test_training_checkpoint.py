@@ -10,10 +10,10 @@ import training_fakes as fakes
 
 from pewm_jax import tree
 from pewm_jax.config import UserError
-from pewm_jax.training import checkpoint, sharding, stages, step, step_folders
+from pewm_jax.training import checkpoint, runs, sharding, step, step_folders
 from pewm_jax.training.checkpoint import Checkpoints
 
-ONE, TWO = stages.STAGES
+ONE, TWO = fakes.STAGES
 
 
 def train(config, stage, run, steps, every=1):
@@ -156,3 +156,10 @@ def test_a_full_disk_is_a_sentence_that_says_which_checkpoint_is_kept(
         with pytest.raises(UserError, match=r"No space left .* that of step 2 is kept"):
             (checkpoints.save(state), checkpoints.wait())
         assert checkpoints.latest() == 2
+
+
+def test_what_a_killed_process_left_beside_the_weights_is_removed(tmp_path):
+    for name in ("weights.safetensors.partial", "weights.safetensors.123.partial"):
+        (tmp_path / name).touch()
+    runs.publish(tmp_path, ONE, 3, {"kernel": np.ones(2)})
+    assert [path.name for path in tmp_path.iterdir()] == [runs.WEIGHTS]

@@ -8,6 +8,7 @@ import training_fakes as fakes
 
 from pewm_jax.config import ConfigError, StageConfig
 from pewm_jax.training import optimizer, stages
+from pewm_jax.worlds import pewm
 
 PARAMS = {"backbone": {"dense": {"kernel": jnp.full((4, 4), 2.0), "bias": jnp.full((4,), 2.0)}}}
 
@@ -33,7 +34,7 @@ def test_short_stages_have_a_usable_rate_at_every_step(decay, steps, warmup):
 
 def test_only_matrices_decay():
     config = fakes.with_train(fakes.config(), weight_decay=0.1)
-    adam = optimizer.make(config, stages.STAGES[0])
+    adam = optimizer.make(config, pewm.STAGES[0])
     still = jax.tree.map(jnp.zeros_like, PARAMS)
     updates, _ = adam.update(still, adam.init(PARAMS), PARAMS)
     dense = updates["backbone"]["dense"]
@@ -43,7 +44,7 @@ def test_only_matrices_decay():
 
 def test_gradients_beyond_the_norm_are_scaled_down_together():
     config = fakes.config(clip_norm=1.0)
-    adam = optimizer.make(config, stages.STAGES[0])
+    adam = optimizer.make(config, pewm.STAGES[0])
     rng = np.random.default_rng(0)
     small = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), PARAMS)
     norm = np.sqrt(sum(np.sum(np.square(leaf)) for leaf in jax.tree.leaves(small)))
@@ -56,7 +57,7 @@ def test_gradients_beyond_the_norm_are_scaled_down_together():
 
 def test_frozen_leaves_have_no_moments_no_update_and_no_say_in_the_clipping():
     params = {"backbone": {"kernel": jnp.ones((2, 2))}, "memory": {"kernel": jnp.ones((3, 3))}}
-    adam = optimizer.make(fakes.config(clip_norm=1.0), stages.STAGES[1])
+    adam = optimizer.make(fakes.config(clip_norm=1.0), pewm.STAGES[1])
     state = adam.init(params)
     assert {leaf.shape for leaf in jax.tree.leaves(state)} == {(), (3, 3)}
     quiet = jax.tree.map(lambda leaf: 0.1 * leaf, params)

@@ -1,0 +1,43 @@
+"""A stranger's control: actions added to the time embedding of the latent frames they lead to."""
+
+import dataclasses
+import sys
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
+
+from pewm_jax.config import ControlSettings, register
+from pewm_jax.models.backbones import Conditioning
+from pewm_jax.models.costs import Costs, Product
+
+SHARDING = ((r"control/project", P(None, "fsdp")),)
+
+
+@dataclasses.dataclass(frozen=True)
+class PushConfig(ControlSettings):
+    MODULATES: ClassVar[bool] = True
+
+    width: int = 3
+
+
+def init(model, key):
+    shape = (model.codec.temporal * model.control.width, model.backbone.places.time)
+    return {"project": 0.1 * jax.random.normal(key, shape)}
+
+
+def condition(model, params, observed, control):
+    t = model.latent_shape[0]
+    actions = control.actions_TA.reshape(len(control.actions_TA), t - 1, -1)
+    led = actions @ params["project"]
+    return Conditioning(modulation_BtE=jnp.pad(led, ((0, 0), (1, 0), (0, 0))))
+
+
+def costs(model, share, *, trained):
+    steps = (model.latent_shape[0] - 1) * model.codec.temporal
+    macs = steps * model.control.width * model.backbone.places.time
+    return Costs(products=(Product("control", "linear", macs, float(trained)),))
+
+
+register("control", "push", PushConfig, sys.modules[__name__])
