@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import AttentionConfig, ModelConfig, NoMemoryConfig
+from pewm_jax.config import AttentionConfig, ModelConfig
 from pewm_jax.models import layers
 from pewm_jax.models.backbones import Readers
 from pewm_jax.models.costs import (
@@ -82,8 +82,7 @@ def _embeddings(model: ModelConfig) -> tuple[layers.nn.Dense, layers.nn.Dense]:
 
 def _block(model: ModelConfig, layout: TokenLayout) -> MemoryBlock:
     grid = max(model.clip.height, model.clip.width) // patch_pixels(model)
-    always = isinstance(model.memory, NoMemoryConfig)
-    return MemoryBlock(_settings(model), grid, layout, always)
+    return MemoryBlock(_settings(model), grid, layout, always=not model.memory.REMEMBERS)
 
 
 def init(model: ModelConfig, key: Array) -> Params:

@@ -129,6 +129,9 @@ def measured(model: ModelConfig, depth_BTHW: Array) -> Array:
     channel is one pixel, as the pixel codec's are, that is 0 or 1; other latents count by the share
     of their pixels.
     """
+    own = getattr(functions(model.codec), "measured", None)
+    if own is not None:
+        return own(model.codec, depth_BTHW)
     valid = (depth_BTHW > 0).astype(jnp.float32)[..., None]
     share = fold(valid, model.codec.spatial, model.codec.temporal)
     return share if model.codec.PIXELWISE else share.mean(-1, keepdims=True)

@@ -105,7 +105,7 @@ def video_tokens(model: ModelConfig) -> tuple[int, int]:
 
 def video_times(model: ModelConfig) -> int:
     """Return how many time embeddings the video tokens of a clip have: one, or one per frame."""
-    apart = model.control.MODULATES or getattr(model.noise, "per_frame", False)
+    apart = model.control.MODULATES or model.noise.per_frame
     return video_tokens(model)[0] if apart else 1
 
 

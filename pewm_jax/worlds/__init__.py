@@ -6,6 +6,7 @@ static, vmap them over states, controls and keys. ::
     state = start(model, params, frames)                        # a few posed RGB-D frames
     state = observe(model, params, state, frames)               # more of them, half-way
     state, frames = imagine(model, params, state, control, key) # what will be seen
+    state, frames = imagine_many(model, params, state, controls, keys)  # many candidates
 
 A world is a ``WorldSettings`` and a module (or object) with these three functions and
 
@@ -20,7 +21,10 @@ A world is a ``WorldSettings`` and a module (or object) with these three functio
 
 from __future__ import annotations
 
+import functools
 from typing import Any
+
+import jax
 
 from pewm_jax.config import Config, WorldSettings, functions
 from pewm_jax.types import Array, Frames, Params, WorldState
@@ -90,8 +94,8 @@ def imagine(
             left, radians counter-clockwise), a ``Camera`` (n,) for each frame to imagine (six
             degrees of freedom), or a ``Control`` with (n,) cameras and (n, A) actions.
         key: randomness of the sampling noise.
-        remember: whether what is imagined is remembered. Without, states share the memory that
-            they came from: cheap for comparing many controls.
+        remember: whether what is imagined is remembered. Without, the state keeps the memory that
+            it had; ``imagine_many`` compares many controls so.
         memory: False ignores what is remembered (the empty-memory baseline).
 
     Returns:
@@ -108,16 +112,47 @@ def imagine(
     )
 
 
-def init(model: WorldSettings, key: Array) -> Params:
+def imagine_many(
+    model: Config | WorldSettings,
+    params: Params,
+    state: WorldState,
+    controls: Any,
+    keys: Array,
+    *,
+    memory: bool = True,
+) -> tuple[WorldState, Frames]:
+    """Imagine K candidates from one state, remembering none of them.
+
+    Args:
+        model: as for ``start``.
+        params: the world model's parameters.
+        state: the world so far; all candidates read its one memory.
+        controls: as for ``imagine``, with a leading axis K.
+        keys: (K,) randomness of each; equal keys draw equal noise.
+        memory: see ``imagine``.
+
+    Returns:
+        ``(state, frames)``: K present frames with the one memory of before, which is not copied,
+        and (K, n) imagined frames.
+    """
+    one = functools.partial(imagine, model, remember=False, memory=memory)
+    shared = WorldState(0, None)  # type: ignore[arg-type]
+    return jax.vmap(one, (None, None, 0, 0), (shared, 0))(params, state, controls, keys)
+
+
+def init(model: Config | WorldSettings, key: Array) -> Params:
     """Return random parameters of all of a world's networks."""
+    model = model_of(model)
     return functions(model).init(model, key)
 
 
-def stages(model: WorldSettings) -> tuple[Stage, ...]:
+def stages(model: Config | WorldSettings) -> tuple[Stage, ...]:
     """Return how a world is trained, stage by stage, in order."""
+    model = model_of(model)
     return functions(model).stages(model)
 
 
-def sharding(model: WorldSettings) -> tuple[tuple[str, Any], ...]:
+def sharding(model: Config | WorldSettings) -> tuple[tuple[str, Any], ...]:
     """Return the rules from paths of parameters to the mesh axes of their last axes."""
+    model = model_of(model)
     return functions(model).sharding(model)

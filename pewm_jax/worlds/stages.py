@@ -34,6 +34,8 @@ class Stage:
         init: ``init(model, key) -> params``, all the parameters that the stage needs.
         loss: what it minimises.
         memory: whether clips' context is read, and so the image features that may be kept of it.
+        rates: (pattern, factor) over the paths of what trains, the first match wins: the learning
+            rate there is so many times that of the stage; where none matches, it is the stage's.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Stage:
     init: Callable[[Any, Array], Params]
     loss: Loss
     memory: bool = False
+    rates: tuple[tuple[str, float], ...] = ()
 
     @property
     def title(self) -> str:
