@@ -234,7 +234,7 @@ def init(config: DiTConfig, key: Array) -> Params:
     """
     if not (config.in_channels and config.out_channels):
         raise UserError(
-            "dit.in_channels and dit.out_channels are 0, which leaves them to the world model: "
+            "in_channels and out_channels are 0, which leaves them to the world model: "
             "set both to build the transformer alone (CogVideoX: 16 and 16)."
         )
     ends_key, blocks_key = jax.random.split(key)
