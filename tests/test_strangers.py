@@ -92,8 +92,8 @@ def test_a_control_that_needs_actions_says_so():
     camera = random_camera(rng, 3, 16, 16)
     with pytest.raises(UserError, match=r"control \(push\) is steered by actions of 3 numbers"):
         pewm_jax.imagine(config, params, state, camera, jax.random.key(0))
+    control = Control(camera, np.zeros((3, 7), np.float32))
     with pytest.raises(UserError, match="got actions of 7 numbers"):
-        control = Control(camera, np.zeros((3, 7), np.float32))
         pewm_jax.imagine(config, params, state, control, jax.random.key(0))
     clip = dataclasses.replace(strangers.clip(config), actions_TA=None)
     stage = worlds.stages(config)[0]

@@ -234,8 +234,8 @@ def init(config: DiTConfig, key: Array) -> Params:
     """
     if not (config.in_channels and config.out_channels):
         raise UserError(
-            "backbone.in_channels and backbone.out_channels are 0, which leaves them to the world "
-            "model: set both to build the transformer alone (CogVideoX: 16 and 16)."
+            "in_channels and out_channels are 0, which leaves them to the world model: "
+            "set both to build the transformer alone (CogVideoX: 16 and 16)."
         )
     ends_key, blocks_key = jax.random.split(key)
     cells = config.patch_t * config.patch**2

@@ -7,6 +7,8 @@ enter the norm that is clipped. (``optax.masked`` alone would pass raw gradients
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -71,7 +73,7 @@ def _rates(stage: Stage) -> optax.GradientTransformation:
     """Multiply updates by the stage's factors for their paths."""
     rules = (*stage.rates, (r".*", 1.0))
 
-    def scaled(updates: Params, params: Params | None = None) -> Params:
+    def scaled(updates: Any, params: Any = None) -> Any:
         del params
         factors = tree.assign(rules, updates, f"learning rates of {stage.name}")
         return jax.tree.map(lambda update, factor: update * factor, updates, factors)
