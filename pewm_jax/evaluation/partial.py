@@ -9,12 +9,13 @@ counts as not done.
 
 from __future__ import annotations
 
-import os
 import shutil
 import zipfile
 from pathlib import Path
 
 import numpy as np
+
+from pewm_jax import atomic
 
 
 class Partials:
@@ -45,8 +46,6 @@ class Partials:
     def put(self, name: str, **arrays: np.ndarray) -> dict[str, np.ndarray]:
         """Keep a finished piece and return it."""
         path = self.folder / f"{name}.npz"
-        aside = path.with_name(f"{path.name}.{os.getpid()}.partial")
-        with aside.open("wb") as file:
+        with atomic.replacing(path) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
-        aside.replace(path)
         return arrays

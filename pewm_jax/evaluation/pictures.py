@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from pewm_jax import atomic
 from pewm_jax.types import Frames
 
 INK, PAPER, QUIET = (28, 32, 40), (255, 255, 255), (112, 118, 130)
@@ -118,11 +119,10 @@ def png(image_HWC: np.ndarray) -> bytes:
 
 
 def save_png(path: Path, image_HWC: np.ndarray) -> Path:
-    """Write a PNG aside, then rename it into place."""
+    """Write a PNG, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".partial")
-    aside.write_bytes(png(image_HWC))
-    aside.replace(path)
+    with atomic.replacing(path) as partial:
+        partial.write_bytes(png(image_HWC))
     return path
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 
+from pewm_jax import atomic
 from pewm_jax.config import Config, UserError, kinds, to_dict
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import statistics
@@ -120,9 +121,9 @@ def evaluate(run: str | Path, *, say: Callable[[str], Any] = aloud, **changes: A
     (folder / METRICS).unlink(missing_ok=True)
     save_png(folder / STRIP, gallery.strip)
     page = render(metrics, gallery)
-    _write(folder / PAGE, page)
+    atomic.write_text(folder / PAGE, page)
     metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()
-    _write(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")
+    atomic.write_text(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")
     say(verdict(metrics["margin"]["seen"]["psnr"], "seen before"))
     say(verdict(metrics["margin"]["unseen"]["psnr"], "never seen"))
     return folder / PAGE
@@ -246,10 +247,3 @@ def _version() -> str:
         return metadata.version("pewm-jax")
     except metadata.PackageNotFoundError:
         return "not installed"
-
-
-def _write(path: Path, text: str) -> None:
-    """Write text aside, then rename."""
-    aside = path.with_name(path.name + ".partial")
-    aside.write_text(text, "utf-8")
-    aside.replace(path)
