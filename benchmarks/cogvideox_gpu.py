@@ -30,8 +30,8 @@ import numpy as np
 import optax
 import record
 
-from pewm_jax import cli
-from pewm_jax.config import DiffusionConfig, DiTConfig, UserError, VAEConfig, published
+from pewm_jax import atomic, cli
+from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig, published
 from pewm_jax.diffusion import sampler, schedule
 from pewm_jax.models import dit, vae
 
@@ -174,7 +174,7 @@ def autoencoder(setting: Setting) -> Any:
 
 def measure_clip(setting: Setting) -> dict[str, float]:
     """Time one clip: encode its first frame, sample without guidance, decode; one program."""
-    config = DiffusionConfig(sample_steps=setting.steps, target="v", snr_shift=3.0)
+    config = DDPMConfig(sample_steps=setting.steps, target="v", snr_shift=3.0)
     noise, text = inputs(setting, 1)
     params, codec = backbone(setting, setting.dtype), autoencoder(setting)
     frame = jnp.zeros((1, 1, setting.pixels, setting.pixels, 3), setting.dtype)
@@ -293,9 +293,7 @@ def main(argv: Sequence[str]) -> int | None:
             print(f"{name} failed; the messages are above, and the other parts go on.")
             continue
         done[name] = json.loads(run.stdout.splitlines()[-1])
-        partial = options.state.with_name(options.state.name + ".partial")
-        partial.write_text(json.dumps(done, indent=2))
-        partial.replace(options.state)
+        atomic.write_text(options.state, json.dumps(done, indent=2))
     text = f"## CogVideoX-2b, bf16, one clip of 9 × 512 × 512\n\n{record.machine('jax')}\n\n"
     text += report(done)
     print(text)

@@ -28,9 +28,20 @@ import numpy as np
 from PIL import Image, ImageDraw
 from record import machine, record, table
 
-from pewm_jax import cli, weights
+from pewm_jax import atomic, cli, weights
 from pewm_jax import presets as configs
-from pewm_jax.config import Config, DataConfig, StageConfig, to_dict
+from pewm_jax.config import (
+    Config,
+    DataConfig,
+    ImagesConfig,
+    Map2DConfig,
+    MemorySettings,
+    NoMemoryConfig,
+    PointsConfig,
+    StageConfig,
+    VoxelConfig,
+    to_dict,
+)
 from pewm_jax.data import loader
 from pewm_jax.data.__main__ import main as data_command
 from pewm_jax.data.dataset import EpisodeSource
@@ -42,19 +53,28 @@ from pewm_jax.evaluation.seen import seen_masks_batch
 from pewm_jax.evaluation.statistics import scores
 from pewm_jax.training import sharding
 from pewm_jax.training.feed import Feed
-from pewm_jax.training.stages import STAGES, Stage
+from pewm_jax.training.stages import Stage
 from pewm_jax.training.state import inference_params
 from pewm_jax.training.step import compile_step, initial_state, stage_key
 from pewm_jax.types import Frames, Params
+from pewm_jax.worlds.pewm import STAGES
 
-KINDS = ("voxel", "images", "map2d", "points")
+MEMORIES: dict[str, type[MemorySettings]] = {
+    "voxel": VoxelConfig,
+    "images": ImagesConfig,
+    "map2d": Map2DConfig,
+    "points": PointsConfig,
+    "none": NoMemoryConfig,
+}
+KINDS = tuple(kind for kind in MEMORIES if kind != "none")
 POSITIONS = ("projective", "sinusoid")
 VARIANTS = (*itertools.product(KINDS, POSITIONS), ("none", "projective"))
 """Memory and position scheme; without a memory nothing has a position."""
 BEFORE = ("stage 1", "")
 """The backbone that all variants of a seed start from."""
 BACKBONE = {"layers": 3, "heads": 4, "time_dim": 128}
-MEMORY = {"heads": 8, "head_dim": 16, "tokens": 256, "looks": 64, "snapshots": 7}
+READER = {"heads": 8, "head_dim": 16, "looks": 64}
+TOKENS, SNAPSHOTS = 256, 7
 """What is smaller than in the demo; seven snapshots of 6 × 6 patches are 252 tokens."""
 SMOKE = (("voxel", "projective"), ("images", "sinusoid"), ("none", "projective"))
 NAME = "memory_learning"
@@ -66,17 +86,22 @@ def settings(options: argparse.Namespace, variant: Variant, seed: int) -> Config
     """Return the demo's settings, smaller, with another memory."""
     config = configs.load("demo")
     kind, positions = variant if variant != BEFORE else ("none", "projective")
-    memory = {"kind": kind, "positions": positions} | MEMORY
+    model = config.model
+    reader = dataclasses.replace(model.memory.reader, positions=positions, **READER)
+    shared = {f.name: getattr(model.memory, f.name) for f in dataclasses.fields(MemorySettings)}
+    shared |= {"tokens": TOKENS, "reader": reader}
+    shared |= {"snapshots": SNAPSHOTS} if kind == "images" else {}
     stage = StageConfig(batch=options.batch, learning_rate=1e-3, warmup=20, steps=options.steps1)
     second = dataclasses.replace(stage, learning_rate=2e-3, steps=options.steps2)
     train = {"stage1": stage, "stage2": second, "seed": seed, "ema": 0.95}
     evaluate = {"clips": options.clips, "batch": min(options.clips, 16)}
-    clip = {"frames": options.frames}
+    config = config.with_model(
+        clip=dataclasses.replace(model.clip, frames=options.frames),
+        backbone=dataclasses.replace(model.backbone, **BACKBONE),
+        memory=MEMORIES[kind](**shared),
+    )
     return dataclasses.replace(
         config,
-        clip=dataclasses.replace(config.clip, **clip),
-        dit=dataclasses.replace(config.dit, **BACKBONE),
-        memory=dataclasses.replace(config.memory, **memory),
         data=DataConfig(path=str(options.data), context=options.context),
         train=dataclasses.replace(config.train, **train),
         evaluate=dataclasses.replace(config.evaluate, **evaluate),
@@ -86,9 +111,7 @@ def settings(options: argparse.Namespace, variant: Variant, seed: int) -> Config
 def train(config: Config, stage: Stage, start: Params | None, label: str) -> tuple[Params, int]:
     """Train one stage; returns its inference weights and how many of them it trained."""
     mesh, chosen = sharding.make_mesh(jax.devices()[:1]), stage.settings(config)
-    batches = loader.clips(
-        config, "train", seed=config.train.seed + stage.number, batch=chosen.batch
-    )
+    batches = loader.clips(config, "train", seed=stage.data_seed(config), batch=chosen.batch)
     key = jax.device_put(stage_key(config, stage), sharding.replicated(mesh))
     with Feed(iter(batches), sharding.of_batch(mesh)) as feed:
         clip = next(feed)
@@ -169,9 +192,7 @@ def file_of(out: Path, variant: Variant, seed: int) -> Path:
 
 def keep(path: Path, result: Result) -> Result:
     """Write a result aside, then rename it."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(result, indent=1) + "\n")
-    partial.replace(path)
+    atomic.write_text(path, json.dumps(result, indent=1) + "\n")
     return result
 
 

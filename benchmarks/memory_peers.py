@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import MemorySettings, VoxelConfig
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, ray_directions
 from pewm_jax.memory import voxel_frames, voxel_map
 from pewm_jax.types import Camera, Frames
 
 T, SIZE, PATCHES, CHANNELS = 9, 512, 37, 384
-CONFIG = MemoryConfig(cell_m=(0.25, 0.25, 1.0), cells=(256, 256, 32), capacity=4096)
+CONFIG = VoxelConfig(cell_m=(0.25, 0.25, 1.0), cells=(256, 256, 32), capacity=4096)
 NUMPY_SHARE = 16
 """NumPy is timed on this fraction of one frame."""
 
@@ -53,7 +53,7 @@ def room(noise_m: float, seed: int = 0) -> Frames:
     return Frames(np.zeros((T, 1, 1, 3), np.float32), depth.astype(np.float32), camera)
 
 
-def slots(config: MemoryConfig, frames: Frames) -> np.ndarray:
+def slots(config: MemorySettings, frames: Frames) -> np.ndarray:
     """Return (T, H, W) int64: the slot of every pixel; V − 1 is never occupied here."""
     voxels = voxel_map.empty(config, np.zeros(3), 1)
     frames = jax.tree.map(jnp.asarray, frames)

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
+from pewm_jax import atomic
+
 sys.path.append(str(Path(__file__).parents[1]))  # train.py lies beside the library
 RESULTS = Path(__file__).with_name("RESULTS.md")
 HEAD = """# Results of the benchmarks
@@ -49,6 +51,4 @@ def record(name: str, text: str, path: Path = RESULTS) -> None:
         whole = before + section + rest.split(end, 1)[1]
     else:
         whole = whole.rstrip("\n") + f"\n\n{section}\n"
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(whole, "utf-8")
-    partial.replace(path)
+    atomic.write_text(path, whole)

@@ -49,11 +49,9 @@ def long_clip() -> Config:
     config = configs.load("pewm_5b")
     mesh = MeshConfig(fsdp=16, context=4)
     stage = dataclasses.replace(config.train.stage2, batch=16)
-    return dataclasses.replace(
-        config,
-        clip=ClipConfig(frames=49, height=480, width=720),
-        train=dataclasses.replace(config.train, mesh=mesh, stage1=stage, stage2=stage),
-    )
+    config = config.with_model(clip=ClipConfig(frames=49, height=480, width=720))
+    train = dataclasses.replace(config.train, mesh=mesh, stage1=stage, stage2=stage)
+    return dataclasses.replace(config, train=train)
 
 
 def cases(quick: bool) -> Iterator[tuple[str, Config, int]]:
@@ -84,7 +82,7 @@ def row(label: str, config: Config, stage: Stage, count: int, chip: chips.Chip) 
         str(stage.number),
         f"{count} × {chip.name}",
         arranged(choice),
-        f"{size(choice.memory.peak)}, {size(one.peak)}",
+        f"{size(choice.footprint.peak)}, {size(one.peak)}",
         f"{size(compiled.peak)} ({size(compiled.expected.peak)})",
         "yes" if one.fits else "**no**",
         f"{work(choice.time.hardware_flops)} ({work(compiled.program.flops)})",

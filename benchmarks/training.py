@@ -41,7 +41,11 @@ STEPS = 36
 PROCESSES = (1, 2, 4)
 BATCH = 8
 """Clips per step of all processes together."""
-SMALL = ("--dit.heads", "4", "--dit.head_dim", "32", "--dit.layers", "4")
+SMALL = (
+    *("--model.backbone.layers", "4"),
+    *("--model.backbone.heads", "4"),
+    *("--model.backbone.head_dim", "32"),
+)
 """What makes the smallest preset heavy enough for a step to be worth sharing."""
 
 
@@ -264,7 +268,7 @@ def main(argv: Sequence[str]) -> None:
         loop: dict[str, Any] = {}
         data = folder
         if {"loop", "input"} & set(options.only):
-            data = gather(folder, config.clip.width, 32, 10)
+            data = gather(folder, config.model.clip.width, 32, 10)
             print(f"training {options.preset} for {options.steps} steps of each stage …")
             loop = measure_loop(folder, options.preset, data, options.steps)
         if "input" in options.only:
@@ -275,7 +279,7 @@ def main(argv: Sequence[str]) -> None:
             texts.append(report_loop(loop, config))
         if "processes" in options.only:
             print("training on 1, 2 and 4 processes …")
-            data = gather(folder, configs.load("tiny").clip.width, 8)
+            data = gather(folder, configs.load("tiny").model.clip.width, 8)
             texts.append(report_processes(measure_processes(folder, data, 30)))
     text = "\n\n".join(texts)
     print(f"\n{text}")

@@ -29,13 +29,16 @@ import jax
 import numpy as np
 import record
 
-from pewm_jax import cli
+from pewm_jax import atomic, cli
 from pewm_jax import presets as configs
 from pewm_jax.config import Config, MeshConfig, UserError
-from pewm_jax.scaling import plan, suggest
+from pewm_jax.data import abstract
+from pewm_jax.scaling import suggest
 from pewm_jax.scaling.footprint import MeshSizes
-from pewm_jax.training import chips, costs, sharding, stages, step
+from pewm_jax.training import chips, sharding, stages, step
 from pewm_jax.types import Clip
+from pewm_jax.worlds import costs
+from pewm_jax.worlds.pewm import STAGES
 
 NAME = "training_gpu"
 BATCHES = (1, 2, 4, 8, 16, 32)
@@ -64,11 +67,12 @@ def random_clip(config: Config, stage: stages.Stage) -> Clip:
         if leaf.shape[-2:] == (4, 4):
             return np.broadcast_to(np.eye(4, dtype=leaf.dtype), leaf.shape).copy()
         if leaf.shape[-1] == 4:
-            half = config.clip.width / 2
+            half = config.model.clip.width / 2
             return np.full(leaf.shape, half, leaf.dtype)
         return rng.uniform(1, 4, leaf.shape).astype(leaf.dtype)
 
-    return jax.tree.map(draw, plan.abstract_clip(config, stage))
+    batch = stage.settings(config).batch
+    return jax.tree.map(draw, abstract.clip(config, batch, features=stage.memory))
 
 
 def predicted(config: Config, stage: stages.Stage, chip: chips.Chip) -> dict[str, float]:
@@ -77,13 +81,13 @@ def predicted(config: Config, stage: stages.Stage, chip: chips.Chip) -> dict[str
     return {
         "predicted_s": choice.time.step_s,
         "predicted_mfu": choice.time.mfu,
-        "predicted_gb": choice.memory.peak / 1e9,
+        "predicted_gb": choice.footprint.peak / 1e9,
     }
 
 
 def measure(preset: str, number: int, batch: int, repeats: int) -> dict[str, Any]:
     """Time one stage's step for one batch in this process."""
-    stage = stages.STAGES[number - 1]
+    stage = STAGES[number - 1]
     config, device = setting(preset, stage, batch), jax.local_devices()[0]
     chip = chips.find(device.device_kind) or chips.named("h200")
     found: dict[str, Any] = {"batch": batch, **predicted(config, stage, chip)}
@@ -139,7 +143,7 @@ def in_a_process(number: int, batch: int, options: argparse.Namespace) -> dict[s
     if run.returncode == 0:
         return json.loads(run.stdout.splitlines()[-1])
     if "RESOURCE_EXHAUSTED" in run.stderr or "out of memory" in run.stderr.lower():
-        stage = stages.STAGES[number - 1]
+        stage = STAGES[number - 1]
         config = setting(options.preset, stage, batch)
         return {"batch": batch, FULL: True, **predicted(config, stage, chips.named("h200"))}
     print(run.stderr[-2000:])
@@ -205,9 +209,7 @@ def complete(done: dict[str, dict[str, Any]], options: argparse.Namespace) -> bo
                     full.add(number)
                     continue
                 done[name] = found
-                partial = options.state.with_name(options.state.name + ".partial")
-                partial.write_text(json.dumps(done, indent=2))
-                partial.replace(options.state)
+                atomic.write_text(options.state, json.dumps(done, indent=2))
             if FULL in done.get(name, {}):
                 full.add(number)
     return True

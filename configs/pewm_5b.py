@@ -6,4 +6,4 @@ from pewm_jax.presets import pewm_2b
 
 def config() -> Config:
     """Return the settings of ``pewm_2b`` with the larger backbone."""
-    return pewm_2b.config("5b")
+    return pewm_2b.on("5b")

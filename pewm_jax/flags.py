@@ -7,13 +7,12 @@ settings that both kinds have are kept.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 from pewm_jax import config as configuration
-from pewm_jax.config import Config, ConfigError, Settings, kinds
+from pewm_jax.config import Config, ConfigError, Settings, kinds, serialize
 from pewm_jax.config.migrations import RENAMED_FLAGS
 
 T = TypeVar("T")
@@ -34,13 +33,13 @@ def spelled_out(flags: Sequence[str], default: Any) -> list[str]:
     def full(flag: str) -> str:
         if not flag.startswith("--"):
             return flag
-        name = flag[2:]
+        name, equals, value = flag[2:].partition("=")
+        name = name.replace("-", "_")
         for old, new in RENAMED_FLAGS:
-            exact = name.partition("=")[0] == old
-            if exact or (old.endswith((".", "_")) and name.startswith(old)):
-                return f"--{new}{name.removeprefix(old)}"
-        first = name.replace("=", ".").partition(".")[0].removeprefix("no-").removeprefix("no_")
-        return f"--model.{name}" if first in short else flag
+            if name == old or (old.endswith((".", "_")) and name.startswith(old)):
+                return f"--{new}{name.removeprefix(old)}{equals}{value}"
+        first = name.partition(".")[0].removeprefix("no_")
+        return f"--model.{name}{equals}{value}" if first in short else flag
 
     return [full(flag) for flag in flags]
 
@@ -53,10 +52,11 @@ def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
         default: the settings that they change.
 
     Returns:
-        The default with settings of the chosen kinds, and the other arguments.
+        The default with settings of the chosen kinds, which need not fit each other yet, and the
+        other arguments.
 
     Raises:
-        ConfigError: there is no such kind, or its settings do not fit the rest.
+        ConfigError: there is no such kind.
     """
     rest: list[str] = []
     queue = list(flags)
@@ -116,20 +116,14 @@ def _section(settings: Any, path: Sequence[str]) -> Any:
 
 
 def _as_kind(old: Any, name: str) -> Any:
-    """Return settings of another kind, keeping the values of fields that both kinds have."""
+    """Return settings of another kind, keeping what both kinds have, without validation."""
     kind = kinds.named(old.SECTION, name)
     if kind.settings is type(old):
         return old
-    shared = {field.name for field in dataclasses.fields(kind.settings)}
-    new = kind.settings()
-    for field in dataclasses.fields(old):
-        if field.name in shared:
-            changed = configuration.to_dict(new) | {
-                field.name: configuration.to_dict(old)[field.name]
-            }
-            with contextlib.suppress(ConfigError):  # same name, but other values are allowed
-                new = configuration.from_dict(kind.settings, changed)
-    return new
+    values = {field.name: getattr(old, field.name) for field in dataclasses.fields(old)}
+    both = values.keys() & {field.name for field in dataclasses.fields(kind.settings)}
+    shared = {name for name in both if serialize.accepts(kind.settings, name, values[name])}
+    return _unchecked(kind.settings(), {name: values[name] for name in shared})
 
 
 def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
@@ -145,4 +139,13 @@ def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
         changes["train"] = configuration.from_dict(
             value.TRAIN, {name: common[name] for name in common.keys() & wanted}, "train"
         )
-    return dataclasses.replace(settings, **changes)
+    return _unchecked(settings, changes)
+
+
+def _unchecked(settings: Any, changes: dict[str, Any]) -> Any:
+    """Return changed settings, not validated: the flags that follow may be what makes them fit."""
+    new = object.__new__(type(settings))
+    for field in dataclasses.fields(settings):
+        value = changes.get(field.name, getattr(settings, field.name))
+        object.__setattr__(new, field.name, value)
+    return new

@@ -1,38 +1,64 @@
+"""Settings: refused in a sentence when built, to JSON and back, and from earlier versions."""
+
+import ast
 import dataclasses
+import inspect
 import json
+from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pewm_jax import config as configuration
-from pewm_jax import presets as configs
+from pewm_jax import presets
 from pewm_jax.config import (
     ActionConfig,
+    AttentionConfig,
     ClipConfig,
-    CodecConfig,
     Config,
     ConfigError,
     DataConfig,
-    DiffusionConfig,
+    DDPMConfig,
+    DINOv2EncoderConfig,
     DiTConfig,
+    EDMConfig,
     EvalConfig,
-    MemoryConfig,
+    FlowConfig,
+    ImagesConfig,
+    ModelConfig,
+    PatchColoursConfig,
+    PixelConfig,
+    Settings,
     StageConfig,
     TrainConfig,
+    VAEConfig,
+    VoxelConfig,
+    kinds,
 )
 
+VERSION_1 = Path(__file__).parent / "version_1"
+"""Settings as they were written before there were versions."""
 
-@pytest.mark.parametrize("name", configs.names())
+
+@pytest.mark.parametrize("name", presets.names())
 def test_every_preset_goes_to_json_and_back(name, tmp_path):
-    config = configs.load(name)
+    config = presets.load(name)
     configuration.save(config, tmp_path / "config.json")
     assert configuration.load(tmp_path / "config.json") == config
-    assert configs.describe(name)
+    assert presets.describe(name)
+
+
+def model_of(memory, codec=None):
+    return ModelConfig(memory=memory, codec=codec or PixelConfig())
 
 
 @pytest.mark.parametrize(
     ("build", "sentence"),
     [
-        (lambda: ClipConfig(frames=8), "use 9"),
+        (lambda: ClipConfig(frames=1), "use 9"),
+        (lambda: ModelConfig(clip=ClipConfig(frames=8)), r"use 4k \+ 1 frames \(5, 9, …\)"),
+        (lambda: ModelConfig(ClipConfig(frames=13), codec=VAEConfig()), r"8k \+ 1"),
         (lambda: ClipConfig(near_m=5, far_m=2), "below far"),
         (lambda: ClipConfig(height=0), "at least 12 pixels"),
         (lambda: ClipConfig(width=11), "window of 11"),
@@ -40,23 +66,23 @@ def test_every_preset_goes_to_json_and_back(name, tmp_path):
         (lambda: ActionConfig(turn_deg=0), "degrees"),
         (lambda: DiTConfig(head_dim=20), "multiple of 16"),
         (lambda: DiTConfig(layers=0), "at least 1"),
-        (lambda: MemoryConfig(tokens=99, capacity=10), "raise capacity"),
-        (lambda: Config(memory=MemoryConfig(heads=2)), "use at least 4 heads"),
+        (lambda: VoxelConfig(tokens=99, capacity=10), "raise capacity"),
+        (lambda: model_of(VoxelConfig(reader=AttentionConfig(heads=2))), "use at least 4 heads"),
         (
-            lambda: Config(codec=CodecConfig(temporal=8), memory=MemoryConfig(heads=6)),
+            lambda: model_of(VoxelConfig(reader=AttentionConfig(heads=6)), PixelConfig(temporal=8)),
             "use at least 8 heads",
         ),
-        (lambda: MemoryConfig(head_dim=6), "multiple of 8"),
-        (lambda: MemoryConfig(cell_m=(0.1, 0.0, 1.0)), "positive"),
-        (lambda: MemoryConfig(cells=(4096, 4096, 256)), "numbered"),
-        (lambda: DiffusionConfig(sample_steps=0), "use 1 to"),
-        (lambda: DiffusionConfig(beta_start=0.5), "start < end"),
+        (lambda: AttentionConfig(head_dim=6), "multiple of 8"),
+        (lambda: VoxelConfig(cell_m=(0.1, 0.0, 1.0)), "positive"),
+        (lambda: VoxelConfig(cells=(4096, 4096, 256)), "numbered"),
+        (lambda: DDPMConfig(sample_steps=0), "use 1 to"),
+        (lambda: DDPMConfig(beta_start=0.5), "start < end"),
         (lambda: DataConfig(stride_min=3, stride_max=2), "min ≤ max"),
         (lambda: DataConfig(context=0), "at least 1"),
         (lambda: DataConfig(workers=-1), "data.workers is -1"),
-        (lambda: DiffusionConfig(train_steps=1, sample_steps=1), "at least 2 noise levels"),
-        (lambda: DiffusionConfig(max_weight=0), "max_weight must be above 0"),
-        (lambda: DiffusionConfig(image_noise_std=-1), "image_noise_std must be at least 0"),
+        (lambda: DDPMConfig(train_steps=1, sample_steps=1), "at least 2 noise levels"),
+        (lambda: DDPMConfig(max_weight=0), "max_weight must be above 0"),
+        (lambda: TrainConfig(image_noise_std=-1), "train.image_noise_std is -1: use 0"),
         (lambda: StageConfig(learning_rate=0), "above 0"),
         (lambda: StageConfig(warmup=-1), "warmup is -1"),
         (lambda: TrainConfig(seed=-1), "train.seed is -1"),
@@ -67,7 +93,13 @@ def test_every_preset_goes_to_json_and_back(name, tmp_path):
         (lambda: TrainConfig(clip_norm=0), "above 0"),
         (lambda: EvalConfig(seeds=()), "at least one seed"),
         (lambda: EvalConfig(seeds=(0, -1)), "0 or positive"),
-        (lambda: Config(clip=ClipConfig(height=20)), "multiples of"),
+        (lambda: ModelConfig(clip=ClipConfig(height=20)), "multiples of"),
+        (lambda: model_of(ImagesConfig(snapshots=9, tokens=8)), "raise tokens or lower snapshots"),
+        (lambda: model_of(VoxelConfig(encoder=PatchColoursConfig(patch=5))), "does not divide"),
+        (lambda: DINOv2EncoderConfig(size=500), "use a multiple of memory.encoder.network.patch"),
+        (lambda: EDMConfig(sigma_min=2, sigma_max=1), "0 < min < max"),
+        (lambda: FlowConfig(shift=0), "noise.shift is 0"),
+        (lambda: Config(version=1), "leave it out"),
     ],
 )
 def test_settings_that_cannot_work_are_refused_with_the_fix(build, sentence):
@@ -76,32 +108,23 @@ def test_settings_that_cannot_work_are_refused_with_the_fix(build, sentence):
 
 
 SIZES = {
-    CodecConfig: ("codec", ("spatial", "temporal")),
+    PixelConfig: ("codec", "spatial temporal"),
     DiTConfig: (
-        "dit",
-        (
-            [
-                "layers",
-                "heads",
-                "head_dim",
-                "patch",
-                "text_length",
-                "text_dim",
-                "time_dim",
-                "mlp_ratio",
-            ]
-        ),
+        "backbone",
+        "layers heads head_dim patch text_length text_dim time_dim mlp_ratio",
     ),
-    MemoryConfig: (
-        "memory",
-        (["tokens", "looks", "encoder_patch", "heads", "head_dim", "mlp_ratio"]),
-    ),
+    VoxelConfig: ("memory", "tokens"),
+    ImagesConfig: ("memory", "snapshots"),
+    AttentionConfig: ("memory.reader", "looks heads head_dim mlp_ratio"),
+    PatchColoursConfig: ("memory.encoder", "patch"),
+    EDMConfig: ("noise", "sample_steps"),
+    FlowConfig: ("noise", "sample_steps"),
 }
 
 
 @pytest.mark.parametrize("value", [0, -16])
 @pytest.mark.parametrize(
-    ("kind", "name"), [(kind, name) for kind, (_, names) in SIZES.items() for name in names]
+    ("kind", "name"), [(kind, name) for kind, (_, names) in SIZES.items() for name in names.split()]
 )
 def test_sizes_below_one_are_refused_by_name(kind, name, value):
     with pytest.raises(ConfigError, match=f"{SIZES[kind][0]}.{name} is {value}: use at least 1"):
@@ -109,8 +132,12 @@ def test_sizes_below_one_are_refused_by_name(kind, name, value):
 
 
 def test_what_the_checks_must_not_refuse():
-    Config(memory=MemoryConfig(heads=2, positions="sinusoid"))
-    Config(clip=ClipConfig(height=16, width=16), train=TrainConfig(stage2=StageConfig(steps=0)))
+    model_of(VoxelConfig(reader=AttentionConfig(heads=2, positions="sinusoid")))
+    Config(model=ModelConfig(clip=ClipConfig(height=16, width=16)))
+    Config(train=TrainConfig(stage2=StageConfig(steps=0)))
+    model_of(VoxelConfig(reader=AttentionConfig(heads=1)), PixelConfig(temporal=1))
+    seven = VoxelConfig(reader=AttentionConfig(heads=7))
+    ModelConfig(clip=ClipConfig(frames=8), codec=PixelConfig(temporal=7), memory=seven)
 
 
 @pytest.mark.parametrize(
@@ -118,12 +145,26 @@ def test_what_the_checks_must_not_refuse():
     [
         ({"clipp": {}}, "no setting clipp"),
         ({"clip": {"framez": 9}}, "no setting framez; it has"),
-        ({"clip": {"frames": "nine"}}, "config.json.clip.frames must be int"),
+        ({"clip": {"frames": "nine"}}, "config.json.model.clip.frames must be int"),
         ({"clip": {"frames": True}}, "must be int"),
         ({"clip": 3}, "table of settings"),
         ({"diffusion": {"target": "x1"}}, "choose one of"),
         ({"memory": {"cells": [1, 2]}}, "needs 3 values"),
         ({"memory": {"cells": 7}}, "must be a list"),
+        *(
+            ({name: 3}, f"{name} must be a table of settings")
+            for name in ("model", "clip", "codec", "dit", "memory", "diffusion", "data", "train")
+        ),
+        ({"model": {"backbone": {"depth": 4}}}, "config.json.model.backbone has no setting depth"),
+        ({"model": {"backbone": 4}}, "config.json.model.backbone must be a table of settings"),
+        ({"model": {"noise": {"kind": "none"}}}, "noise.kind: There is no noise of kind 'none'"),
+        ({"model": {"memory": {"kind": 3}}}, "there is images, map2d, none, points, voxel"),
+        ({"model": {"memory": {"reader": {"kind": "?"}}}}, "memory.reader.kind: There is no"),
+        ({"train": {"stage3": {}}}, "config.json.train has no setting stage3"),
+        ({"codec": {"kind": "vae", "vae": 3}}, "codec.vae must be a table"),
+        ({"version": 3}, "of version 3, .* versions up to 2: install a newer pewm_jax"),
+        *(({"version": v}, "must be a whole number from 1") for v in (0, -1, "2", 2.0, True, None)),
+        ({"version": 2, "dit": {}}, "no setting dit"),
     ],
 )
 def test_a_wrong_file_is_refused_by_name(change, sentence, tmp_path):
@@ -151,15 +192,121 @@ def test_integers_are_welcome_where_floats_are_asked():
     assert configuration.from_dict(ActionConfig, {"step_m": 1}) == ActionConfig(step_m=1.0)
 
 
+def ours(section):
+    """The kinds of a section that come with the library."""
+    found = [kinds.named(section, name) for name in kinds.names(section)]
+    return [kind for kind in found if kind.settings.__module__.startswith("pewm_jax.")]
+
+
+SECTIONS = ("world", "backbone", "codec", "control", "encoder", "reader", "memory", "noise")
+KINDS = [kind for section in SECTIONS for kind in ours(section)]
+
+
 def test_every_setting_is_documented():
     """`--help` shows the docstring below each field, so every field needs one."""
-    import ast
-    import inspect
-
-    for kind in (Config, *(f.default.__class__ for f in dataclasses.fields(Config))):
+    sections = (f.default.__class__ for f in dataclasses.fields(Config) if f.name != "version")
+    for kind in {Config, TrainConfig, ClipConfig, *sections, *(kind.settings for kind in KINDS)}:
         body = ast.parse(inspect.getsource(kind)).body[0].body
         for index, node in enumerate(body):
-            if isinstance(node, ast.AnnAssign):
+            if isinstance(node, ast.AnnAssign) and "ClassVar" not in ast.unparse(node.annotation):
                 after = body[index + 1]
                 documented = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
                 assert documented, f"{kind.__name__}.{node.target.id}"
+
+
+def there_and_back(settings_, base):
+    """Through JSON as a file holds it."""
+    return configuration.from_dict(base, json.loads(json.dumps(configuration.to_dict(settings_))))
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: f"{kind.section}-{kind.name}")
+def test_every_kind_goes_to_json_and_back_by_its_name(kind):
+    table = configuration.to_dict(kind.settings())
+    assert table["kind"] == kind.name
+    base = next(c for c in kind.settings.__mro__ if c.__dict__.get("SECTION") == kind.section)
+    assert issubclass(base, Settings)
+    assert there_and_back(kind.settings(), base) == kind.settings()
+    assert there_and_back(kind.settings(), kind.settings) == kind.settings()
+
+
+def some(section):
+    return st.sampled_from([kind.settings for kind in ours(section)])
+
+
+@st.composite
+def experiments(draw):
+    """An experiment of kinds of every section, with a few settings of each drawn."""
+    names = {"backbone", "codec", "control", "noise"}
+    parts = {name: draw(some(name))() for name in sorted(names)}
+    steps = dataclasses.replace(parts["noise"], sample_steps=draw(st.integers(1, 50)))
+    reader = dataclasses.replace(draw(some("reader"))(), heads=draw(st.integers(4, 9)))
+    memory = dataclasses.replace(
+        draw(some("memory"))(),
+        cell_m=draw(st.tuples(*[st.floats(0.1, 2)] * 3)),
+        encoder=draw(some("encoder"))(),
+        reader=reader,
+    )
+    model = ModelConfig(**{**parts, "noise": steps}, memory=memory)
+    train = TrainConfig(
+        ema=draw(st.floats(0, 0.999)), fresh=tuple(draw(st.lists(st.sampled_from("abc"))))
+    )
+    return Config(model=model, train=train)
+
+
+@settings(max_examples=50, deadline=None)
+@given(experiments())
+def test_every_combination_of_kinds_goes_to_json_and_back(config):
+    assert there_and_back(config, Config) == config
+
+
+def test_a_section_without_a_kind_is_of_the_usual_one():
+    read = configuration.from_dict(Config, {"model": {"memory": {"tokens": 7}, "noise": {}}})
+    assert read.model.memory == VoxelConfig(tokens=7)
+    assert read.model.noise == DDPMConfig()
+
+
+def test_what_is_written_says_its_version(tmp_path):
+    configuration.save(Config(), tmp_path / "config.json")
+    assert json.loads((tmp_path / "config.json").read_text())["version"] == configuration.VERSION
+
+
+def test_an_earlier_version_s_preset_is_the_preset():
+    assert configuration.load(VERSION_1 / "pewm_2b.json") == presets.load("pewm_2b")
+
+
+def test_every_setting_of_an_earlier_version_finds_its_place():
+    read = configuration.load(VERSION_1 / "images.json")
+    tiny = presets.load("tiny")
+    memory = tiny.model.memory
+    assert read == dataclasses.replace(
+        tiny.with_model(
+            clip=dataclasses.replace(tiny.model.clip, depth=False),
+            memory=ImagesConfig(
+                cell_m=memory.cell_m,
+                cells=memory.cells,
+                capacity=memory.capacity,
+                tokens=memory.tokens,
+                snapshots=3,
+                reader=dataclasses.replace(memory.reader, positions="sinusoid"),
+            ),
+            dtype="bfloat16",
+        ),
+        train=dataclasses.replace(tiny.train, image_noise_mean=-2.0, image_noise_std=0.25),
+    )
+
+
+def test_an_upgrade_leaves_what_it_was_given_as_it_was():
+    values = json.loads((VERSION_1 / "images.json").read_text())
+    before = json.dumps(values)
+    configuration.upgrade(values, "config.json")
+    assert json.dumps(values) == before
+
+
+def test_a_learned_table_of_an_earlier_version_does_what_it_did():
+    table = {"positions": "rope_learned", "sample_height": 4, "sample_width": 4}
+    read = configuration.from_dict(Config, {"dit": {**table, "sample_frames": 9}})
+    assert read.model.backbone.learned == "reference"
+    now = {"kind": "dit", **table, "sample_frames": 9}
+    assert configuration.from_dict(Config, {"model": {"backbone": now}}).model.backbone.learned == (
+        "exact"
+    )

@@ -8,26 +8,25 @@ import numpy as np
 import pytest
 
 from pewm_jax import config as configs
-from pewm_jax import rollouts, tree, weights
+from pewm_jax import rollouts, tree, weights, worlds
 from pewm_jax.config import (
-    CodecConfig,
+    AttentionConfig,
     ConfigError,
     DataConfig,
-    DiffusionConfig,
+    DDPMConfig,
     DINOv2Config,
+    DINOv2EncoderConfig,
     DiTConfig,
-    MemoryConfig,
     StageConfig,
     TrainConfig,
     UserError,
     VAEConfig,
+    VoxelConfig,
 )
 from pewm_jax.data import loader
-from pewm_jax.diffusion import objective
-from pewm_jax.memory import features
-from pewm_jax.models import codec, world_model
+from pewm_jax.models import codecs, encoders, signals, world_model
 from pewm_jax.training import loop
-from pewm_jax.types import Clip
+from pewm_jax.types import Clip, Control
 from tests.helpers import random_frames, randomise, tiny_config
 
 VAE = VAEConfig(widths=(8, 8, 8), resnets=1, groups=4, latent_channels=4, sample_height=16)
@@ -35,18 +34,17 @@ STAGE = StageConfig(steps=2, batch=2, warmup=1)
 
 
 def full_config(**sections):
-    memory = MemoryConfig(
+    memory = VoxelConfig(
         cell_m=(0.5, 0.5, 0.5),
         cells=(16, 16, 8),
         capacity=256,
         tokens=16,
-        heads=8,
-        head_dim=8,
-        encoder="dinov2",
-        encoder_size=28,
-        dinov2=DINOv2Config(layers=1, heads=2, width=16, pretrained_size=28),
+        encoder=DINOv2EncoderConfig(
+            size=28, network=DINOv2Config(layers=1, heads=2, width=16, pretrained_size=28)
+        ),
+        reader=AttentionConfig(heads=8, head_dim=8),
     )
-    dit = DiTConfig(
+    backbone = DiTConfig(
         layers=1,
         heads=2,
         head_dim=16,
@@ -58,10 +56,10 @@ def full_config(**sections):
     )
     return tiny_config(
         **{
-            "codec": CodecConfig(kind="vae", spatial=4, temporal=4, vae=VAE),
-            "dit": dit,
+            "codec": VAE,
+            "backbone": backbone,
             "memory": memory,
-            "diffusion": DiffusionConfig(sample_steps=2, target="v"),
+            "noise": DDPMConfig(sample_steps=2, target="v"),
             **sections,
         }
     )
@@ -70,7 +68,7 @@ def full_config(**sections):
 @pytest.fixture(scope="module")
 def world():
     config = full_config()
-    params = jax.jit(lambda key: world_model.init(config, key))(jax.random.key(0))
+    params = jax.jit(lambda key: world_model.init(config.model, key))(jax.random.key(0))
     return config, randomise(params, scale=0.1)
 
 
@@ -80,7 +78,11 @@ def clips(config, split="train", *, seed, batch, start_step=0, **_):
     while True:
         rng = np.random.default_rng([seed, start_step])
         drawn = [
-            Clip(random_frames(rng, config.clip.frames), random_frames(rng, 2), np.ones(2, bool))
+            Clip(
+                random_frames(rng, config.model.clip.frames),
+                random_frames(rng, 2),
+                np.ones(2, bool),
+            )
             for _ in range(batch)
         ]
         yield jax.tree.map(lambda *x: np.stack(x), *drawn)
@@ -90,8 +92,8 @@ def clips(config, split="train", *, seed, batch, start_step=0, **_):
 def test_it_has_every_part_and_rolls_out(world):
     config, params = world
     assert set(params) == {"backbone", "memory", "codec", "encoder", "text"}
-    state = rollouts.start(config, params, random_frames(np.random.default_rng(0), 2))
-    assert state.map.features_VF.shape[-1] == config.memory.dinov2.width
+    state = worlds.start(config, params, random_frames(np.random.default_rng(0), 2))
+    assert state.map.features_VF.shape[-1] == config.model.memory.encoder.network.width
     roll = jax.jit(rollouts.rollout, static_argnums=0)
     after, frames = roll(config, params, state, jnp.zeros(8, jnp.int32), jax.random.key(0))
     assert frames.rgb_THWC.shape == (8, 16, 24, 3)
@@ -102,32 +104,31 @@ def test_it_has_every_part_and_rolls_out(world):
 
 def test_text_and_encoder_matter_and_depth_goes_through_the_vae(world):
     config, params = world
+    model = config.model
     frames = random_frames(np.random.default_rng(1), 9)
-    batch = jax.tree.map(lambda x: x[None], objective.as_signal(frames))
-    said = world_model.condition(
-        config, params, batch.rgb_THWC[:, 0], batch.depth_THW[:, 0], batch.camera
-    )
-    np.testing.assert_array_equal(said.text_BLC[0], params["text"]["prompt_LC"])
-    latents = codec.encode_rgbd(config, params, batch.rgb_THWC, batch.depth_THW)
+    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], signals.as_signal(frames))
+    observed = jax.tree.map(lambda x: x[:, :1], batch)
+    said = world_model.condition(model, params, observed, Control(batch.camera)).given
+    np.testing.assert_array_equal(said.tokens_BLC[0], params["text"]["prompt_LC"])
+    latents = codecs.encode_rgbd(model, params, batch.rgb_THWC, batch.depth_THW)
     assert latents.shape == (1, 3, 4, 6, 8)
-    grey = codec.signal_from_depth(config.clip, batch.depth_THW)[..., None].repeat(3, -1)
-    alone = codec.encode(config.codec, params["codec"], grey)
+    grey = signals.signal_from_depth(model.clip, batch.depth_THW)[..., None].repeat(3, -1)
+    alone = codecs.encode(model.codec, params["codec"], grey)
     np.testing.assert_allclose(latents[..., 4:], alone, atol=1e-5)
-    rgb, depth = codec.decode_rgbd(config, params, latents)
+    rgb, depth = codecs.decode_rgbd(model, params, latents)
     assert rgb.shape == (1, 9, 16, 24, 3)
     assert depth.shape == (1, 9, 16, 24)
-    one = features.encode(config.memory, params["encoder"], frames.rgb_THWC / 127.5 - 1)
+    one = encoders.encode(model.memory.encoder, params["encoder"], frames.rgb_THWC / 127.5 - 1)
     assert one.shape == (9, 2, 2, 16)
 
 
 def test_only_an_inverting_vae_divides_the_image_latents_by_its_factor(world):
-    config, params = world
+    _, params = world
     image = np.random.default_rng(2).uniform(-1, 1, (1, 1, 16, 24, 3)).astype(np.float32)
     for inverts, power in ((False, 0), (True, 2)):
-        vae = dataclasses.replace(VAE, invert_scale_latents=inverts)
-        settings = dataclasses.replace(config.codec, vae=vae)
-        plain = codec.encode(settings, params["codec"], image)
-        shown = codec.encode(settings, params["codec"], image, condition=True)
+        settings = dataclasses.replace(VAE, invert_scale_latents=inverts)
+        plain = codecs.encode(settings, params["codec"], image)
+        shown = codecs.encode(settings, params["codec"], image, condition=True)
         np.testing.assert_allclose(shown * VAE.scaling_factor**power, plain, rtol=1e-5, atol=1e-6)
 
 
@@ -136,7 +137,7 @@ def test_unmeasured_depth_weighs_nothing(world):
     depth = np.ones((1, 9, 16, 24), np.float32)
     depth[:, 1:5, :4, :4] = 0
     depth[:, 5:, :4, :2] = 0
-    share = np.asarray(codec.measured(config, depth))
+    share = np.asarray(codecs.measured(config.model, depth))
     assert share.shape == (1, 3, 4, 6, 1)
     assert share[0, 1, 0, 0, 0] == 0
     assert share[0, 2, 0, 0, 0] == 0.5
@@ -144,13 +145,11 @@ def test_unmeasured_depth_weighs_nothing(world):
 
 
 def test_frames_that_decode_to_another_number_are_refused():
-    clip = dataclasses.replace(full_config().clip, frames=13)
+    clip = dataclasses.replace(full_config().model.clip, frames=13)
     with pytest.raises(ConfigError, match=r"8k \+ 1"):
         full_config(clip=clip)
-    with pytest.raises(ConfigError, match=r"codec\.spatial 4"):
-        full_config(codec=CodecConfig(kind="vae", spatial=8, vae=VAE))
     with pytest.raises(UserError, match=r"2 latents decode to 8 frames.*5 frames were expected"):
-        codec.decode(full_config().codec, {}, jnp.zeros((1, 2, 4, 6, 4)))
+        codecs.decode(VAE, {}, jnp.zeros((1, 2, 4, 6, 4)))
 
 
 def test_training_needs_converted_weights_and_leaves_them_alone(world, tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """Every command and the example of README.md are run, in a small copy of the user's folder."""
 
-import dataclasses
 import importlib.util
 import json
 import os
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax.commands.main import COMMANDS
 from pewm_jax.data.scenes import load_scene
@@ -28,9 +28,9 @@ STEPS = 3
 SMALLER = {
     "python -m pewm_jax.data collect ": COLLECT,
     "python train.py demo": ["--config", "small.json"],
-    "python train.py demo --config world/config.json": shlex.split(
+    "python train.py world": shlex.split(
         "--train.stage1.steps 1 --train.stage1.batch 2 --train.stage2.steps 0 "
-        "--train.preview_every 0"
+        "--train.preview_every 0 --train.mesh.fsdp 1"
     ),
     "python -m pewm_jax.convert import cogvideox CogVideoX-2b world": shlex.split(
         "--height 48 --width 48 --config small_memory.json"
@@ -91,10 +91,13 @@ def small_settings():
     demo = presets.load("demo")
     tiny = presets.load("tiny")
     stage = {"steps": 2, "batch": 2, "warmup": 1}
+    reader = {"looks": 32, "heads": 4, "head_dim": 8}
     return {
-        "dit": dataclasses.asdict(tiny.dit),
-        "memory": {"tokens": 64, "looks": 32, "heads": 4, "head_dim": 8, "cells": [32, 32, 16]},
-        "diffusion": {"snr_shift": demo.diffusion.snr_shift, "sample_steps": 2},
+        "model": {
+            "backbone": configuration.to_dict(tiny.model.backbone),
+            "memory": {"tokens": 64, "cells": [32, 32, 16], "reader": reader},
+            "noise": {"snr_shift": demo.model.noise.snr_shift, "sample_steps": 2},
+        },
         "data": {"context": 4},
         "train": {"stage1": stage, "stage2": stage, "preview_every": 2},
     }
@@ -128,8 +131,8 @@ def save_checkpoints(path):
         hidden_size=16, num_hidden_layers=1, num_attention_heads=2, image_size=28
     )
     Dinov2Model(network).save_pretrained(path / "dinov2-small")
-    memory = {"tokens": 32, "looks": 16, "capacity": 256, "encoder_size": 28, "cells": [16, 16, 4]}
-    (path / "small_memory.json").write_text(json.dumps({"memory": memory}))
+    memory = {"tokens": 32, "capacity": 256, "cells": [16, 16, 4], "encoder": {"size": 28}}
+    (path / "small_memory.json").write_text(json.dumps({"model": {"memory": memory}}))
 
 
 def test_the_commands_and_then_the_example_work_as_written(folder):
@@ -210,8 +213,9 @@ def test_commands_inside_of_sentences_are_run_too_and_smaller():
     longer = smaller("python train.py demo --train.stage2.steps 2000 --train.run runs/longer")
     assert longer[:4] == ["train.py", "demo", "--train.stage2.steps", str(STEPS)]
     assert longer[4:] == ["--train.run", "runs/longer", "--config", "small.json"]
-    world = smaller("python train.py demo --config world/config.json")
+    world = smaller("python train.py world --data.path data/mine")
     assert "small.json" not in world
+    assert "--train.mesh.fsdp" in world
     assert smaller("python train.py demo --help") == ["train.py", "demo", "--help"]
 
 

@@ -90,10 +90,35 @@ def test_flags_override_the_preset_and_the_rest_is_kept(taken):
     tiny = presets.load("tiny")
     assert config.train.stage1.steps == 10
     assert config.data.path == "elsewhere"
-    assert config.memory.cell_m == (1.0, 1.0, 2.0)
-    assert config.dit == tiny.dit
+    assert config.model.memory.cell_m == (1.0, 1.0, 2.0)
+    assert config.model.backbone == tiny.model.backbone
     assert config.train.stage2 == tiny.train.stage2
     assert preview == ("preview", Path("runs/tiny"))
+
+
+def test_a_folder_of_weights_stands_for_its_settings_and_trains_from_them(taken, tmp_path, capsys):
+    """A run's own folder goes on with it, starting from what it started from."""
+    tiny = presets.load("tiny")
+    for folder in ("world", "runs/tiny"):
+        Path(folder).mkdir(parents=True)
+        configuration.save(tiny, tmp_path / folder / "config.json")
+    assert cli.run(train.main, ["world", "--train.stage1.steps", "4"]) == 0
+    config = taken.pop()[0]
+    assert config.train.start == "world"
+    assert config.train.stage1.steps == 4
+    assert config.model == tiny.model
+    assert cli.run(train.main, ["world", "--train.start", "other"]) == 0
+    assert taken.pop()[0].train.start == "other"
+    assert cli.run(train.main, ["runs/tiny"]) == 0
+    assert taken.pop()[0] == tiny
+    Path("demo").mkdir()
+    configuration.save(tiny, tmp_path / "demo" / "config.json")
+    assert cli.run(train.main, ["demo"]) == 0
+    assert taken.pop()[0] == presets.load("demo")
+    (tmp_path / "world" / "config.json").write_text("{")
+    assert "config.json is not valid JSON" in refused(capsys, "world")
+    (tmp_path / "world" / "config.json").unlink()
+    assert "no preset 'world'" in refused(capsys, "world")
 
 
 def test_no_pictures_are_prepared_where_none_are_wanted(taken):
@@ -122,10 +147,12 @@ def test_a_whole_saved_configuration_is_such_a_file_too(taken, tmp_path):
     ("text", "part"),
     [
         ('{"train": {"sede": 1}}', "train has no setting sede"),
-        ('{"dit": {"layers": "four"}}', "dit.layers must be int, got 'four'"),
+        ('{"dit": {"layers": "four"}}', "model.backbone.layers must be int, got 'four'"),
+        ('{"model": {"backbone": {"layers": "4"}}}', "backbone.layers must be int, got '4'"),
+        ('{"version": 99}', "install a newer pewm_jax"),
         ('{"train": {"seed": 1}', "is not valid JSON"),
         ("[1]", "must hold a table"),
-        ('{"clip": {"frames": 8}}', "use 9"),
+        ('{"clip": {"frames": 8}}', "use 4k + 1 frames"),
     ],
 )
 def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, part):
@@ -146,10 +173,14 @@ def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, pa
         (["tiny", "--train.seed", "abc"], "--train.seed needs a whole number, got 'abc'."),
         (["tiny", "--train.ema", "abc"], "--train.ema needs a number, got 'abc'."),
         (["tiny", "--train.seed"], "Missing value for argument '--train.seed'"),
-        (["tiny", "--diffusion.target", "x1"], "Expected one of ('x0', 'v', 'eps')"),
-        (["tiny", "--memory.cell_m", "1", "2"], "'--memory.cell_m'. Expected 3 values"),
-        (["tiny", "--clip.frames", "8"], "clip.frames is 8: a clip has 4k + 1 frames"),
-        (["tiny", "--clip.height", "20"], "dit.patch = 8; change the clip's size or the patch"),
+        (["tiny", "--noise.target", "x1"], "Expected one of ('x0', 'v', 'eps')"),
+        (["tiny", "--memory.cell_m", "1", "2"], "'--model.memory.cell_m'. Expected 3 values"),
+        (["tiny", "--memory.kind", "image"], "There is no memory of kind 'image'; there is images"),
+        (["tiny", "--clip.frames", "8"], "clip.frames is 8: the codec folds every 4 frames"),
+        (
+            ["tiny", "--clip.height", "20"],
+            "backbone.patch = 8; change the clip's size or the patch",
+        ),
         (["tiny", "stray"], "stray; `python train.py tiny --help` lists the settings."),
         (["tiny", "--config"], "--config needs the name of a JSON file"),
         (["tiny", "--config", "none.json"], "none.json cannot be read"),
@@ -351,10 +382,10 @@ def test_training_real_episodes_stopped_by_ctrl_c_and_started_again(data, tmp_pa
     code, out, err = finish(start(*argv))
     assert (code, out, err) == (0, f"{run} is already trained: nothing to do.\n", "")
 
-    code, out, err = finish(start(*argv, "--dit.layers", "1"))
+    code, out, err = finish(start(*argv, "--backbone.layers", "1"))
     assert code == 2
     assert err.count("\n") == 1
-    assert "dit.layers 2 there, 1 here" in err
+    assert "model.backbone.layers 2 there, 1 here" in err
 
 
 def test_told_to_end_while_it_compiles_then_trained_without_a_record_that_is_damaged(

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 from pewm_jax import cli, presets
+from pewm_jax import config as configuration
 from pewm_jax.config import Config, Launch
 
 USAGE = """usage: {prog} PRESET [--config FILE.json] [--SETTING VALUE …]
 
 Presets:
 {presets}
+  FOLDER       made by `pewm-jax convert import`: the settings in it, starting from its weights
 
 Beside the settings there are
 {launch}
@@ -78,7 +82,7 @@ def plan(argv: Sequence[str], prog: str = "pewm-jax plan") -> int:
 
 
 def _usage(prog: str, examples: Sequence[str], launch: str, more: str) -> str:
-    lines = [f"  {name:<10}{presets.describe(name)}" for name in presets.names()]
+    lines = [f"  {name:<12} {presets.describe(name)}" for name in presets.names()]
     return USAGE.format(
         prog=prog,
         presets="\n".join(lines),
@@ -97,15 +101,30 @@ def _read(argv: Sequence[str], prog: str) -> tuple[Config, Launch]:
     known = presets.names()
     if not argv or argv[0].startswith("-"):
         raise cli.ConfigError(f"Name a preset first: {prog} {known[0]} ({', '.join(known)}).")
-    name = cli.choose(argv[0], known, "preset")
+    name, folder = argv[0], Path(argv[0])
     launch, argv = cli.take(Launch, argv)
-    default = presets.load(name)
+    if name not in known and (folder / "config.json").is_file():
+        default, about = _settings_in(folder), f"The settings in {folder}."
+    else:
+        default = presets.load(cli.choose(name, known, "preset"))
+        about = presets.describe(name)
     config = cli.parse(
         type(default),
         argv[1:],
         default=default,
         prog=f"{prog} {name}",
-        description=f"{presets.describe(name)} Settings also come from --config FILE.json. "
+        description=f"{about} Settings also come from --config FILE.json. "
         f"Beside these settings:\n{cli.list_flags(Launch)}",
     )
     return config, launch
+
+
+def _settings_in(folder: Path) -> Config:
+    """Return the settings in a folder of weights, to start from those weights.
+
+    A run's own folder starts from what it started from: the same command goes on with it.
+    """
+    config = configuration.load(folder / "config.json")
+    if Path(config.train.run).resolve() == folder.resolve():
+        return config
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, start=str(folder)))

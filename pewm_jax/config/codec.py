@@ -40,6 +40,10 @@ class CodecSettings(Settings):
         """Return the number of latent frames for a number of frames."""
         return (count - 1) // self.temporal + 1
 
+    def latent_shape(self, clip: Any) -> tuple[int, int, int]:
+        """Return (t, h, w) of the latents of a ``ClipConfig``'s clip."""
+        return self.frames(clip.frames), clip.height // self.spatial, clip.width // self.spatial
+
     def check(self, model: Any) -> None:
         """Refuse clips that cannot be folded."""
         clip, q, s = model.clip, self.temporal, self.spatial

@@ -13,10 +13,12 @@ class ControlSettings(Settings):
 
     Attributes:
         MODULATES: whether it adds to the time embedding of each latent frame.
+        actions: A, the numbers of an action that it needs; 0 where cameras are enough.
     """
 
     SECTION: ClassVar[str] = "control"
     MODULATES: ClassVar[bool] = False
+    actions: Any = 0
 
     def channels(self, model: Any) -> int:
         """Return the number of channels, at the latent rate, that it adds to the denoiser's input.

@@ -10,6 +10,8 @@ from pewm_jax.config.errors import ConfigError, require, require_positive
 
 Positions = Literal["rope_integer", "rope_crop", "rope_learned", "sincos"]
 """How positions are encoded; see ``DiTConfig.positions``."""
+Learned = Literal["exact", "interpolate", "drop", "reference"]
+"""How a learned table is used for other sizes; see ``DiTConfig.learned``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +47,14 @@ class DiTConfig(BackboneSettings):
     """Feed-forward width over model width."""
     positions: Positions = "rope_integer"
     """`rope_integer`: rotary, positions 0, 1, 2 … (CogVideoX 1.5). `rope_crop`: rotary, with the
-    token grid stretched to the sample size's (5b). `rope_learned`: the same and a learned table
-    for the sample size (5b-I2V); other numbers of frames get a sinusoid instead of the table.
-    `sincos`: a fixed sinusoid added to the tokens (2b)."""
+    token grid stretched to the sample size's (5b). `rope_learned`: the same and a learned table for
+    the sample size (5b-I2V); see `learned`. `sincos`: a fixed sinusoid added to the tokens (2b)."""
+    learned: Learned = "exact"
+    """How the table of `rope_learned` is used for sizes other than the sample's. `exact`: other
+    sizes are refused. `interpolate`: the table is resized linearly in time, rows and columns.
+    `drop`: the table is not used at any size, only the rotary embedding. `reference`: as in
+    diffusers, other numbers of frames get a fixed sinusoid instead, and other heights or widths are
+    refused."""
     sample_height: int = 0
     """Latent rows that the network was trained for; 0 if positions do not depend on it. With
     rope_integer, a value above 0 is an upper bound."""
@@ -150,6 +157,11 @@ class DiTConfig(BackboneSettings):
                 "was trained for (CogVideoX: 60 × 90 latents of 49 frames).",
             )
         learned = self.positions == "rope_learned"
+        require(
+            learned or self.learned == "exact",
+            f"backbone.learned is {self.learned}: only positions rope_learned have a table that "
+            "is learned; leave it at exact.",
+        )
         require(
             not learned or (self.sample_height % self.patch == self.sample_width % self.patch == 0),
             f"backbone.sample_height × sample_width {self.sample_height}×{self.sample_width}: "

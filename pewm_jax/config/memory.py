@@ -22,6 +22,9 @@ class MemorySettings(Settings):
 
     SECTION: ClassVar[str] = "memory"
     KEEPS_FEATURES: ClassVar[bool] = True
+    """Whether it keeps the encoder's features; else the first three of a point are its colour."""
+    REMEMBERS: ClassVar[bool] = True
+    """Whether it ever holds anything."""
 
     cell_m: tuple[float, float, float] = (0.25, 0.25, 1.0)
     """Size of a map cell along x, y, z (z is up), metres; the default is the paper's."""
@@ -104,3 +107,4 @@ class NoMemoryConfig(MemorySettings):
     """No memory; the reader exists with its parameters, but has nothing to read."""
 
     KEEPS_FEATURES: ClassVar[bool] = False
+    REMEMBERS: ClassVar[bool] = False

@@ -10,7 +10,7 @@ import copy
 from collections.abc import Callable
 from typing import Any
 
-from pewm_jax.config.errors import ConfigError
+from pewm_jax.config.errors import ConfigError, require
 from pewm_jax.config.experiment import VERSION
 
 Values = dict[str, Any]
@@ -36,16 +36,18 @@ def upgrade(values: Values, where: str) -> Values:
         )
     values = copy.deepcopy(values)
     for number in range(version, VERSION):
-        values = MIGRATIONS[number](values)
+        values = MIGRATIONS[number](values, where)
         values["version"] = number + 1
     return values
 
 
-def from_1(values: Values) -> Values:
+def from_1(values: Values, where: str) -> Values:
     """Move the model's sections under ``model`` and split them into parts with kinds.
 
     Parts that had only one kind in version 1 get no ``kind``: it is the default now.
     """
+    _require_tables(values, where, "codec", "dit", "memory", "diffusion", "train")
+    _require_tables(values.get("codec", {}), f"{where}.codec", "vae")
     old = dict(values)
     model: Values = {}
     for name in ("clip", "actions"):
@@ -63,13 +65,29 @@ def from_1(values: Values) -> Values:
     if "codec" in old:
         model["codec"] = _codec(old.pop("codec"))
     if "dit" in old:
-        model["backbone"] = old.pop("dit")
+        model["backbone"] = _backbone(old.pop("dit"))
     if "memory" in old:
         memory = old.pop("memory")
         if "depth" in memory:
             _move(memory, "depth", model.setdefault("clip", {}), "depth")
         model["memory"] = _memory(memory)
     return {"version": 2, "model": model, **old}
+
+
+def _require_tables(values: Values, where: str, *names: str) -> None:
+    """Refuse anything but tables in sections whose settings move."""
+    for name in names:
+        found = values.get(name, {})
+        require(
+            isinstance(found, dict),
+            f"{where}.{name} must be a table of settings, got {type(found).__name__}.",
+        )
+
+
+def _backbone(old: Values) -> Values:
+    """State what a table of learned positions did for other numbers of frames."""
+    table = {"learned": "reference"} if old.get("positions") == "rope_learned" else {}
+    return table | old
 
 
 def _codec(old: Values) -> Values:
@@ -87,7 +105,9 @@ def _memory(old: Values) -> Values:
     _move(old, "encoder_patch", encoder, "patch")
     _move(old, "encoder_size", encoder, "size")
     _move(old, "dinov2", encoder, "network")
-    unused = ("patch",) if encoder.get("kind") == "dinov2" else ("size", "network")
+    unused = {"dinov2": ("patch",), "patch_colours": ("size", "network")}.get(
+        encoder.get("kind", ""), ()
+    )
     encoder = {name: value for name, value in encoder.items() if name not in unused}
     for name in ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio"):
         _move(old, name, reader, name)
@@ -102,7 +122,7 @@ def _move(old: Values, name: str, new: Values, to: str) -> None:
         new[to] = old.pop(name)
 
 
-MIGRATIONS: dict[int, Callable[[Values], Values]] = {1: from_1}
+MIGRATIONS: dict[int, Callable[[Values, str], Values]] = {1: from_1}
 """Version → the function that upgrades its values to the next version."""
 
 RENAMED_FLAGS = (
@@ -112,6 +132,8 @@ RENAMED_FLAGS = (
     ("codec.vae.", "model.codec."),
     ("train.dtype", "model.dtype"),
     ("memory.depth", "model.clip.depth"),
+    ("memory.no_depth", "model.clip.no_depth"),
+    ("memory.encoder", "model.memory.encoder.kind"),
     ("memory.dinov2.", "model.memory.encoder.network."),
     ("memory.encoder_patch", "model.memory.encoder.patch"),
     ("memory.encoder_size", "model.memory.encoder.size"),

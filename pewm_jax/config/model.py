@@ -56,12 +56,7 @@ class ModelConfig(WorldSettings):
     @property
     def latent_shape(self) -> tuple[int, int, int]:
         """(t, h, w) of one clip's latents."""
-        clip, codec = self.clip, self.codec
-        return (
-            codec.frames(clip.frames),
-            clip.height // codec.spatial,
-            clip.width // codec.spatial,
-        )
+        return self.codec.latent_shape(self.clip)
 
     @property
     def in_channels(self) -> int:

@@ -14,10 +14,12 @@ class NoiseSettings(Settings):
 
     Attributes:
         guidance: classifier-free guidance on the memory; 1 is off.
+        per_frame: whether training draws a time for every latent frame.
     """
 
     SECTION: ClassVar[str] = "noise"
     guidance: Any = 1.0
+    per_frame: Any = False
 
 
 @dataclasses.dataclass(frozen=True)

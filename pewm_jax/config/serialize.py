@@ -108,6 +108,26 @@ def _coerce(hint: Any, value: Any, where: str) -> Any:
     return value
 
 
+def accepts(kind: type, name: str, value: Any) -> bool:
+    """Tell whether a setting of a kind can have a value, by its type alone.
+
+    Args:
+        kind: the dataclass of settings.
+        name: of the field.
+        value: for it, plain or a dataclass.
+    """
+    hint = typing.get_type_hints(kind)[name]
+    if hint is Any:
+        return True
+    if dataclasses.is_dataclass(value):
+        return isinstance(value, hint)
+    try:
+        _coerce(hint, value, name)
+    except ConfigError:
+        return False
+    return True
+
+
 def _coerce_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     """Check a list against the element types of a tuple."""
     require(isinstance(value, (list, tuple)), f"{where} must be a list, got {value!r}.")

@@ -15,8 +15,8 @@ import numpy as np
 
 from pewm_jax import tree
 from pewm_jax.config import UserError
-from pewm_jax.convert.files import Source
 from pewm_jax.convert.mapping import Entry
+from pewm_jax.convert.sources import Source
 from pewm_jax.types import Array, Params
 
 FLOATS = ("float32", "bfloat16", "float16")
@@ -25,7 +25,7 @@ STORED = (*FLOATS, "float64")
 """The dtypes weights may come in; a table that a network has computed can be float64."""
 
 _LISTED = 200
-"""Names in a message: those who wrote the file need all of them."""
+"""Most names that a message lists: whoever wrote the file needs all of them."""
 
 
 def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...]]:
@@ -100,7 +100,7 @@ def read(
     source: Source,
     like: Params,
     dtype: str | None = None,
-    told: Callable[[int], None] = lambda _: None,
+    progress: Callable[[int], None] = lambda _: None,
 ) -> Params:
     """Read foreign tensors into our tree, one by one into leaves allocated beforehand.
 
@@ -112,7 +112,7 @@ def read(
         like: our tree, abstract (``jax.eval_shape``) or not: paths and shapes.
         dtype: of the result, one of ``FLOATS``; by default the stored one (of several in one
             leaf, the dtype that holds them all).
-        told: called with the bytes read after every tensor.
+        progress: called after every tensor with the bytes just read.
 
     Returns:
         Nested dictionaries of NumPy arrays.
@@ -127,7 +127,7 @@ def read(
         tensor = source.read(entry.theirs)
         place = leaves[entry.path] if entry.layer is None else leaves[entry.path][entry.layer]
         _cast(entry.turn.ours(tensor), place, f"{source.where}: {entry.theirs}")
-        told(tensor.nbytes)
+        progress(tensor.nbytes)
         del tensor  # before the next one is read
     return tree.unflatten(leaves)
 

@@ -1,7 +1,7 @@
 """``base.json``: what converted weights were made from, so that they can be made into it again.
 
-It holds the three settings files of the original pipeline word by word, its licence as far as the
-folder says it, and the prompts that were encoded.
+It holds the three settings files of the original pipeline unchanged, its licence if the folder
+states one, and the prompts that were encoded.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from pewm_jax.config import UserError
-from pewm_jax.convert import files, output
+from pewm_jax.convert import output, sources
 
 BASE = "base.json"
 """The file's name, beside ``config.json`` or the folders of the networks."""
 PARTS = ("transformer", "vae", "scheduler")
-UNSAID = "not stated in the folder it came from; ask where you got it before you pass it on"
+UNSTATED = "not stated in the folder it came from; ask where you got it before you pass it on"
 _CARD = re.compile(r"^(license|license_name|license_link):\s*(\S.*)$", re.MULTILINE)
 
 
@@ -38,7 +38,7 @@ def describe(
     index = src / "model_index.json"
     return {
         **{part: settings[part] for part in PARTS},
-        "model_index": files.read_json(index) if index.is_file() else None,
+        "model_index": sources.read_json(index) if index.is_file() else None,
         "name": src.resolve().name,
         "licence": licence(src),
         "prompts": list(prompts),
@@ -51,18 +51,18 @@ def licence(src: Path) -> str:
     card = src / "README.md"
     if card.is_file():
         head = card.read_text(encoding="utf-8", errors="replace").split("\n---", 1)[0]
-        said = dict(_CARD.findall(head))
-        words = [said[key].strip("'\" ") for key in ("license_name", "license") if key in said]
-        link = said.get("license_link")
-        if words:
-            return words[0] + (f" ({link})" if link else "")
+        stated = dict(_CARD.findall(head))
+        names = [stated[key].strip("'\" ") for key in ("license_name", "license") if key in stated]
+        link = stated.get("license_link")
+        if names:
+            return names[0] + (f" ({link})" if link else "")
     for name in ("LICENSE", "LICENSE.txt", "LICENSE.md"):
         if (src / name).is_file():
             text = (src / name).read_text(encoding="utf-8", errors="replace")
             lines = [line.strip(" #") for line in text.splitlines() if line.strip(" #")]
             if lines:
                 return f"{lines[0]} (see the file {name} of the original)"
-    return UNSAID
+    return UNSTATED
 
 
 def load(folder: Path) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def load(folder: Path) -> dict[str, Any]:
             f"{path} does not exist, so what these weights were made from is unknown; name the "
             "imported folder with --base."
         )
-    values = files.read_json(path)
+    values = sources.read_json(path)
     lacking = [part for part in PARTS if not isinstance(values.get(part), dict)]
     if lacking:
         raise UserError(f"{path} lacks {', '.join(lacking)}; copy it again from the import.")

@@ -24,7 +24,7 @@ import numpy as np
 from pewm_jax import config as configuration
 from pewm_jax import tensor_files, tree, weights
 from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig
-from pewm_jax.convert import assemble, base, files, output, scheduler, transformer, vae
+from pewm_jax.convert import assemble, base, output, scheduler, sources, transformer, vae
 from pewm_jax.convert.mapping import Entry
 from pewm_jax.models import dit as dit_model
 from pewm_jax.models import vae as vae_model
@@ -131,7 +131,7 @@ def require_pipeline(src: Path) -> None:
     if not src.is_dir():
         raise UserError(f"{src} is not a folder; give a diffusers pipeline's folder.")
     if (src / "model_index.json").is_file():
-        files.read_config(src / "model_index.json", PIPELINES)
+        sources.read_config(src / "model_index.json", PIPELINES)
     known = (TRANSFORMER.folder, VAE.folder, "text_encoder")
     found = [*src.glob("*.safetensors"), *src.glob("*/*.safetensors")]
     unused = [str(path.relative_to(src)) for path in found if path.parent.name not in known]
@@ -144,22 +144,22 @@ def require_pipeline(src: Path) -> None:
 
 def settings(network: Network, folder: Path) -> dict[str, Any]:
     """Read a network's settings as diffusers wrote them."""
-    return files.read_config(files.component(folder, network.folder) / CONFIG, [network.theirs])
+    return sources.read_config(sources.component(folder, network.folder) / CONFIG, [network.theirs])
 
 
 def scheduler_settings(folder: Path) -> dict[str, Any]:
     """Read the scheduler's settings as diffusers wrote them."""
-    path = files.component(folder, "scheduler") / "scheduler_config.json"
-    return files.read_config(path, sorted(scheduler.CLASSES))
+    path = sources.component(folder, "scheduler") / "scheduler_config.json"
+    return sources.read_config(path, sorted(scheduler.CLASSES))
 
 
 def _read(network: Network, folder: Path, dtype: str | None) -> tuple[Any, Params]:
-    inside = files.component(folder, network.folder)
+    inside = sources.component(folder, network.folder)
     config = network.config(settings(network, folder), str(inside / CONFIG))
-    entries, source = network.entries(config), files.open_folder(inside)
+    entries, source = network.entries(config), sources.open_folder(inside)
     total = sum(place.size for _, place in source.places.values())
-    with output.megabytes(f"read {network.folder}", total) as told:
-        return config, assemble.read(entries, source, network.like(config), dtype, told)
+    with output.megabytes(f"read {network.folder}", total) as progress:
+        return config, assemble.read(entries, source, network.like(config), dtype, progress)
 
 
 def stored_specs(
@@ -167,7 +167,7 @@ def stored_specs(
 ) -> dict[str, jax.ShapeDtypeStruct]:
     """Return shape and dtype of every leaf that reading a network will give, by path."""
     config = network.config(settings(network, folder), network.folder)
-    source = files.open_folder(files.component(folder, network.folder))
+    source = sources.open_folder(sources.component(folder, network.folder))
     entries, like = network.entries(config), network.like(config)
     assemble.require(entries, source, like)
     return assemble.leaf_specs(entries, source, like, dtype)
@@ -204,8 +204,9 @@ def write_network(config: Any, params: Params, folder: Path) -> None:
     """Write one network in our layout."""
     folder.mkdir(parents=True)
     configuration.save(config, folder / CONFIG)
-    with output.megabytes(f"write {folder.name}", tensor_files.size(tree.flatten(params))) as told:
-        weights.save(folder / WEIGHTS, params, progress=told)
+    size = tensor_files.size(tree.flatten(params))
+    with output.megabytes(f"write {folder.name}", size) as progress:
+        weights.save(folder / WEIGHTS, params, progress=progress)
 
 
 def write_diffusers(
@@ -219,7 +220,7 @@ def write_diffusers(
 
     Args:
         network: which.
-        values: its settings in diffusers' words.
+        values: its settings as diffusers names them.
         params: our parameters.
         folder: to make.
         dtype: of the tensors; by default that of the parameters.
@@ -230,8 +231,8 @@ def write_diffusers(
     specs = assemble.specs(entries, params, dtype)
     path = folder / "diffusion_pytorch_model.safetensors"
     tensors = assemble.write(entries, params, dtype)
-    with output.megabytes(f"write {network.folder}", tensor_files.size(specs)) as told:
-        tensor_files.write(path, specs, tensors, {"format": "pt"}, told)
+    with output.megabytes(f"write {network.folder}", tensor_files.size(specs)) as progress:
+        tensor_files.write(path, specs, tensors, {"format": "pt"}, progress)
 
 
 def import_pipeline(

@@ -20,6 +20,7 @@ from pewm_jax.config import (
     UserError,
     VAEConfig,
 )
+from pewm_jax.config.dit import Learned
 from pewm_jax.convert import (
     base,
     cogvideox,
@@ -44,9 +45,10 @@ class ImportCogVideoX:
 
     With --rgbd --camera the patch embedding and the output layer are widened for a world model:
     depth, the observed frame and the camera come in, depth comes out; --memory adds the blocks
-    that read the map. The result is a folder that `pewm_jax.load` and `train.py --train.start`
-    read; until it is trained, the colours it makes are those of the original. Without these flags
-    the networks are only brought into our layout.
+    that read the map. The result is a folder that `pewm_jax.load` reads and that is trained by its
+    name (`pewm-jax train DST`), with the settings of the presets pewm_2b and pewm_5b. Until then
+    the colours it makes are those of the original. Without these flags the networks are only
+    brought into our layout.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -66,6 +68,10 @@ class ImportCogVideoX:
     """Add memory blocks, which change nothing until they are trained."""
     frames: int | None = None
     """Frames of the world model's clips: 8k + 1; by default 9, or the size of learned positions."""
+    positions: Learned | None = None
+    """What learned positions (5b-I2V) do for clips of other sizes than 49 × 480 × 720:
+    `interpolate` resizes their table, `drop` leaves it out, `reference` puts a fixed sinusoid in
+    its place for other numbers of frames, `exact` refuses. By default `exact`."""
     height: int | None = None
     """Height of its images in pixels; by default 512, or the size of learned positions."""
     width: int | None = None
@@ -95,7 +101,7 @@ class ImportCogVideoX:
             return
         if self.memory:
             raise ConfigError("--memory was given without --rgbd --camera; add them.")
-        for name in ("frames", "height", "width", "encoder", "config"):
+        for name in ("frames", "height", "width", "positions", "encoder", "config"):
             if getattr(self, name) is not None:
                 raise ConfigError(f"--{name} is of a world model; add --rgbd --camera.")
 
@@ -181,18 +187,19 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
     settings["scheduler"] = cogvideox.scheduler_settings(src)
     dit = TRANSFORMER.config(settings["transformer"], str(src / "transformer/config.json"))
     vae = VAE.config(settings["vae"], str(src / "vae/config.json"))
-    diffusion = cogvideox.read_scheduler(src)
-    for network in (TRANSFORMER, VAE):  # what is wrong with the files is said before hours of work
+    noise = cogvideox.read_scheduler(src)
+    for network in (TRANSFORMER, VAE):  # damaged files are refused before hours of work
         cogvideox.stored_specs(network, src, options.dtype)
-    config, encoder = _world(options, dit, vae, diffusion) if options.rgbd else (None, None)
+    config, encoder = _world(options, dit, vae, noise) if options.rgbd else (None, None)
     prompts = text.encode(src, options.prompt, dit.text_length, dit.text_dim)
     record = base.describe(src, settings, list(prompts), options.dtype)
     if config is None:
         cogvideox.import_pipeline(src, dst, options.dtype, prompts, record)
     else:
         prompt = next(iter(prompts.values()), None)
-        told: Literal["zeros", "stored"] = "zeros" if prompt is None else "stored"
-        config = config.with_model(backbone=dataclasses.replace(config.model.backbone, prompt=told))
+        tokens: Literal["zeros", "stored"] = "zeros" if prompt is None else "stored"
+        backbone = dataclasses.replace(config.model.backbone, prompt=tokens)
+        config = config.with_model(backbone=backbone)
         world.import_world(
             src,
             dst,
@@ -204,11 +211,11 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
             dtype=options.dtype,
             seed=options.seed,
         )
-    print(f"{dst}: {_said(options, prompts)}; licence of the original: {record['licence']}")
+    print(f"{dst}: {_summary(options, prompts)}; licence of the original: {record['licence']}")
 
 
 def _world(
-    options: ImportCogVideoX, dit: DiTConfig, vae: VAEConfig, diffusion: DDPMConfig
+    options: ImportCogVideoX, dit: DiTConfig, vae: VAEConfig, noise: DDPMConfig
 ) -> tuple[Config, Params | None]:
     """Return the settings of the world model, and its image encoder if it has one.
 
@@ -216,20 +223,46 @@ def _world(
         UserError: settings that cannot work, or an encoder that is asked for and not given.
     """
     size = (options.frames, options.height, options.width)
-    config = world.config_of(dit, vae, diffusion, size, _stored_dtype(options))
+    network, params = dinov2_model.load(options.encoder) if options.encoder else (None, None)
+    config = world.config_of(
+        _with_positions(dit, options.positions),
+        vae,
+        noise,
+        size,
+        _stored_dtype(options),
+        run=options.dst.name,
+        encoder=DINOv2EncoderConfig(network=network) if network else None,
+    )
     config = cli.overlay(config, options.config) if options.config else config
     world.require_size(config)
-    if options.encoder:
-        network, params = dinov2_model.load(options.encoder)
-        encoder = DINOv2EncoderConfig(network=network)
-        memory = dataclasses.replace(config.model.memory, encoder=encoder)
-        return config.with_model(memory=memory), params
-    if config.model.memory.encoder.CONVERTED:
+    kept = config.model.memory.encoder
+    if network and not (isinstance(kept, DINOv2EncoderConfig) and kept.network == network):
+        raise UserError(
+            f"{options.config} sets memory.encoder to another one than {options.encoder} of "
+            "--encoder; leave out one of the two."
+        )
+    if kept.CONVERTED and params is None:
         raise UserError(
             "memory.encoder of kind dinov2 needs its weights; name the folder of `import dinov2` "
             "with --encoder."
         )
-    return config, None
+    return config, params
+
+
+def _with_positions(dit: DiTConfig, learned: Learned | None) -> DiTConfig:
+    """Return a transformer with a choice for its learned positions.
+
+    Raises:
+        UserError: it has none.
+    """
+    if learned is None:
+        return dit
+    if dit.positions != "rope_learned":
+        raise UserError(
+            "--positions is about a table of learned positions, and this transformer has none "
+            "(only 5b-I2V has); leave it out."
+        )
+    return dataclasses.replace(dit, learned=learned)
 
 
 def _stored_dtype(options: ImportCogVideoX) -> str:
@@ -238,7 +271,7 @@ def _stored_dtype(options: ImportCogVideoX) -> str:
     return specs["proj_out/kernel"].dtype.name
 
 
-def _said(options: ImportCogVideoX, prompts: dict[str, np.ndarray]) -> str:
+def _summary(options: ImportCogVideoX, prompts: dict[str, np.ndarray]) -> str:
     what = "CogVideoX in our layout"
     if options.rgbd:
         what = "a world model" + " with memory blocks" * options.memory

@@ -1,9 +1,9 @@
 """DINOv2's weights in: from ``transformers``, or from the original repository's state dict.
 
-A ``transformers`` folder says by its ``config.json`` what it holds. A state dict of the original
-repository (``dinov2_vits14_pretrain.pth`` and its like, or the same tensors as safetensors) says
-it by its shapes: every published model has heads of 64 channels. Both fill the same tree; the
-network follows ``transformers`` in how position embeddings are interpolated (see
+A ``transformers`` folder has its settings in ``config.json``. For a state dict of the original
+repository (such as ``dinov2_vits14_pretrain.pth``, or the same tensors as safetensors) they follow
+from the tensors' shapes: every published model has heads of 64 channels. Both fill the same tree;
+the network follows ``transformers`` in how position embeddings are interpolated (see
 ``pewm_jax.models.dinov2``).
 
 The mask token, which only pretraining uses, and an image classifier's last layer are left behind;
@@ -13,7 +13,6 @@ every other tensor must be used.
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,15 +24,15 @@ from pewm_jax import config as configuration
 from pewm_jax import tree, weights
 from pewm_jax.config import DINOv2Config, UserError
 from pewm_jax.config.dinov2 import HEAD_DIM
-from pewm_jax.convert import assemble, files
-from pewm_jax.convert.dinov2_source import in_transformers_words, open_source
-from pewm_jax.convert.files import Source
+from pewm_jax.convert import assemble, output, sources
+from pewm_jax.convert.dinov2_source import open_source, with_transformers_names
 from pewm_jax.convert.mapping import LINEAR, SAME, Entry, Turn
+from pewm_jax.convert.sources import Source
 from pewm_jax.models import dinov2
 from pewm_jax.types import Params
 
 _FIXED = {"hidden_act": "gelu", "num_channels": 3, "qkv_bias": True}
-"""Settings that only this value is implemented of."""
+"""Settings of which only this value is implemented."""
 _NO_MATTER = frozenset(
     [
         "architectures",
@@ -229,10 +228,10 @@ def read(src: Path | str, dtype: str | None = None) -> tuple[DINOv2Config, Param
             torch is needed and absent.
     """
     src = Path(src)
-    told = src / "config.json"
-    source = in_transformers_words(open_source(src))
-    if told.is_file():
-        config = config_from_transformers(files.read_json(told), str(told))
+    settings = src / "config.json"
+    source = with_transformers_names(open_source(src))
+    if settings.is_file():
+        config = config_from_transformers(sources.read_json(settings), str(settings))
     else:
         config = config_from_shapes(source)
     return config, assemble.read(entries(config), source, _like(config), dtype)
@@ -241,23 +240,14 @@ def read(src: Path | str, dtype: str | None = None) -> tuple[DINOv2Config, Param
 def write(config: DINOv2Config, params: Params, dst: Path | str) -> None:
     """Write a folder {config.json, weights.safetensors} that ``dinov2.load`` reads.
 
-    It is written aside and renamed.
-
     Raises:
         UserError: ``dst`` exists.
     """
     dst = Path(dst)
-    _refuse_existing(dst)
     weights.check(params, _like(config), "the tree to be written")
-    partial = dst.with_name(dst.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        weights.save(partial / "weights.safetensors", params, {"network": "dinov2"})
-        configuration.save(config, partial / "config.json")
-        partial.rename(dst)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with output.new_folder(dst) as folder:
+        weights.save(folder / "weights.safetensors", params, {"network": "dinov2"})
+        configuration.save(config, folder / "config.json")
 
 
 def convert(
@@ -277,7 +267,7 @@ def convert(
     Raises:
         UserError: ``src`` cannot be read, or ``dst`` exists.
     """
-    _refuse_existing(Path(dst))
+    output.refuse_existing(Path(dst))
     config, params = read(src, dtype)
     write(config, params, dst)
     leaves = jax.tree.leaves(params)
@@ -301,8 +291,3 @@ def _number(values: Mapping[str, Any], name: str, default: int, where: str) -> i
     if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
         raise UserError(f"{where} has {name} {value!r}; it should be a whole number.")
     return int(value)
-
-
-def _refuse_existing(dst: Path) -> None:
-    if dst.exists():
-        raise UserError(f"{dst} exists; name a new folder, or remove it first.")

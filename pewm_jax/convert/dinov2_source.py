@@ -1,4 +1,4 @@
-"""Where DINOv2's tensors lie, under ``transformers``' names whatever names the file has."""
+"""DINOv2's tensors in a file or folder of any layout, under ``transformers``' names."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 
 from pewm_jax import tree
 from pewm_jax.config import UserError
-from pewm_jax.convert import files
-from pewm_jax.convert.files import Source
+from pewm_jax.convert import sources
+from pewm_jax.convert.sources import Source
 from pewm_jax.types import Array
 
 _LEFT_BEHIND = re.compile(r"(embeddings\.)?mask_token|classifier\.(weight|bias)")
@@ -30,7 +30,8 @@ _HUB = (
     (r"blocks\.(\d+)\.mlp\.w3\.(\w+)", r"encoder.layer.\1.mlp.weights_out.\2"),
     (r"norm\.(\w+)", r"layernorm.\1"),
 )
-"""The original repository's names in ``transformers``' words, all but the fused qkv."""
+"""The original repository's names, as patterns, and those of ``transformers``; the fused q, k and v
+are split apart from these."""
 _HUB_QKV = re.compile(r"blocks\.(\d+)\.attn\.qkv\.(\w+)")
 _PICKLED = (".pth", ".pt", ".bin")
 
@@ -74,7 +75,7 @@ class Renamed:
         return whole if of == 1 else whole[part * rows : (part + 1) * rows]
 
 
-def in_transformers_words(source: Source) -> Source:
+def with_transformers_names(source: Source) -> Source:
     """Return DINOv2's tensors under ``transformers``' names, without those left behind."""
     views: dict[str, tuple[str, int, int]] = {}
     for theirs in source.names():
@@ -86,9 +87,9 @@ def in_transformers_words(source: Source) -> Source:
             for part, what in enumerate(("query", "key", "value")):
                 views[f"{stem}.{what}.{qkv[2]}"] = (theirs, part, 3)
             continue
-        for pattern, words in _HUB:
+        for pattern, renamed in _HUB:
             if hub := re.fullmatch(pattern, name):
-                name = hub.expand(words)
+                name = hub.expand(renamed)
                 break
         views[name] = (theirs, 0, 1)
     return Renamed(source, views)
@@ -98,7 +99,7 @@ def open_source(src: Path) -> Source:
     """Open a file or a folder, whatever it holds."""
     if src.is_dir():
         if any(src.glob("*.safetensors")):
-            return files.open_folder(src)
+            return sources.open_folder(src)
         pickled = [path for path in sorted(src.iterdir()) if path.suffix in _PICKLED]
         if len(pickled) != 1:
             what = f"several: {tree.listing(p.name for p in pickled)}" if pickled else "none"
@@ -109,7 +110,7 @@ def open_source(src: Path) -> Source:
         src = pickled[0]
     if not src.is_file():
         raise UserError(f"{src} does not exist; give a transformers folder or a DINOv2 state dict.")
-    return _unpickled(src) if src.suffix in _PICKLED else files.open_file(src)
+    return _unpickled(src) if src.suffix in _PICKLED else sources.open_file(src)
 
 
 def _unpickled(path: Path) -> Source:
@@ -131,7 +132,7 @@ def _unpickled(path: Path) -> Source:
         isinstance(name, str) and isinstance(value, torch.Tensor) for name, value in found.items()
     ):
         raise UserError(f"{path} is not a plain table of names and tensors, a state dict.")
-    return files.Arrays({name: _to_numpy(torch, x) for name, x in found.items()}, str(path))
+    return sources.Arrays({name: _to_numpy(torch, x) for name, x in found.items()}, str(path))
 
 
 def _to_numpy(torch: Any, tensor: Any) -> np.ndarray:

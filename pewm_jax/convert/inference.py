@@ -26,7 +26,7 @@ import numpy as np
 from pewm_jax import __version__, rollouts, tensor_files, tree, weights
 from pewm_jax import config as configuration
 from pewm_jax.config import Config, UserError
-from pewm_jax.convert import card, files, output
+from pewm_jax.convert import card, output, sources
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.evaluation.report import METRICS
 from pewm_jax.training import runs
@@ -45,7 +45,7 @@ def export(run: Path, dst: Path, *, say: Callable[[str], Any] = print) -> Path:
     Args:
         run: a run folder made by ``train.py`` (or a converted checkpoint in the same form).
         dst: the folder to make.
-        say: told what happens.
+        say: called with a line on each step.
 
     Returns:
         ``dst``.
@@ -59,20 +59,20 @@ def export(run: Path, dst: Path, *, say: Callable[[str], Any] = print) -> Path:
         say(f"reading {run} …")
         config, params = rollouts.load_finished(run)
         origin = _base(run, config)
-        words = weights.metadata(run / runs.WEIGHTS)
+        metadata = weights.metadata(run / runs.WEIGHTS)
         facts = card.Facts(
             name=dst.name,
             version=__version__,
             config=config,
             params=params,
-            stage=words.get("stage"),
-            step=words.get("step"),
-            base=files.read_json(origin) if origin else None,
+            stage=metadata.get("stage"),
+            step=metadata.get("step"),
+            base=sources.read_json(origin) if origin else None,
             metrics=_metrics(run),
         )
         total = sum(np.size(leaf) for leaf in jax.tree.leaves(params))
         say(f"writing {total / 1e6:.1f} million parameters in bfloat16 …")
-        _write(folder / runs.WEIGHTS, params, {**words, "dtype": "bfloat16"})
+        _write(folder / runs.WEIGHTS, params, {**metadata, "dtype": "bfloat16"})
         configuration.save(config, folder / runs.CONFIG)
         if origin:
             shutil.copyfile(origin, folder / runs.BASE)
@@ -87,7 +87,7 @@ def narrow(leaf: Any) -> np.ndarray:
     return array.astype(jnp.bfloat16) if jnp.issubdtype(array.dtype, jnp.floating) else array
 
 
-def _write(path: Path, params: Params, words: Mapping[str, str]) -> None:
+def _write(path: Path, params: Params, metadata: Mapping[str, str]) -> None:
     """Write the weights leaf by leaf, so that no second copy of them is held."""
     leaves = tree.flatten(params)
     like = {
@@ -102,7 +102,7 @@ def _write(path: Path, params: Params, words: Mapping[str, str]) -> None:
         for name, leaf in leaves.items():
             yield name, narrow(leaf)
 
-    tensor_files.write(path, like, narrowed(), tensor_files.header(words))
+    tensor_files.write(path, like, narrowed(), tensor_files.header(metadata))
 
 
 def _base(run: Path, config: Config) -> Path | None:

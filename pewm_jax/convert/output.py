@@ -1,15 +1,15 @@
-"""Folders that are made whole or not at all, and libraries that only conversion needs."""
+"""Folders that are made whole or not at all, progress, and libraries that only conversion needs."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import json
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from pewm_jax import atomic
 from pewm_jax.config import UserError
 from pewm_jax.data.progress import Meter
 
@@ -34,30 +34,32 @@ def new_folder(dst: Path) -> Iterator[Path]:
         UserError: ``dst`` exists.
     """
     refuse_existing(dst)
-    partial = dst.with_name(f".{dst.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a command that was killed
-    partial.mkdir(parents=True)
-    try:
+    with atomic.replacing(dst) as partial:
+        partial.mkdir(parents=True)
         yield partial
-        partial.rename(dst)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
 
 
 @contextlib.contextmanager
 def megabytes(label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show progress over so many bytes; yields what is to be called with the bytes done."""
+    """Show progress in megabytes.
+
+    Args:
+        label: what is being done.
+        total: bytes of all of it.
+
+    Yields:
+        A function to call with the number of bytes just done.
+    """
     done = 0
     with Meter(label, -(-total // _MEGABYTE), "MiB") as meter:
 
-        def told(count: int) -> None:
+        def advance(count: int) -> None:
             nonlocal done
             before, done = done, done + count
             if whole := done // _MEGABYTE - before // _MEGABYTE:
                 meter.advance(whole)
 
-        yield told
+        yield advance
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
@@ -66,7 +68,7 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
 
 
 def convert_extra(name: str) -> Any:
-    """Import a library of the optional dependencies.
+    """Import a library of the extra ``convert``.
 
     Raises:
         UserError: it is not installed.

@@ -35,7 +35,13 @@ import numpy as np
 from pewm_jax import __version__, rollouts, tree
 from pewm_jax.config import Config, DiTConfig, UserError
 from pewm_jax.convert import output, standalone
-from pewm_jax.convert.programs import Arrays, Program, denoise_program, lower, rollout_programs
+from pewm_jax.convert.stablehlo_programs import (
+    Arrays,
+    Program,
+    denoise_program,
+    lower,
+    rollout_programs,
+)
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.training import runs
 from pewm_jax.types import Params
@@ -71,7 +77,7 @@ def export(
         platforms: of ``PLATFORMS``; those that a program cannot be lowered for are left out.
         check: run the programs on the CPU, in a fresh process from which this library cannot be
             imported, and compare with the library. For a large model this takes long.
-        say: told what happens.
+        say: called with a line on each step.
 
     Returns:
         ``dst``.

@@ -13,7 +13,7 @@ import numpy as np
 
 from pewm_jax import tree
 from pewm_jax.config import UserError
-from pewm_jax.convert import files, output
+from pewm_jax.convert import output, sources
 
 
 def encode(src: Path, prompts: Sequence[str], length: int, width: int) -> dict[str, np.ndarray]:
@@ -32,31 +32,31 @@ def encode(src: Path, prompts: Sequence[str], length: int, width: int) -> dict[s
         UserError: only one of the two folders, a file that cannot be used, another width, or the
             libraries are not installed.
     """
-    encoder, words = src / "text_encoder", src / "tokenizer"
-    there = [folder.is_dir() for folder in (encoder, words)]
+    encoder, tokenizer = src / "text_encoder", src / "tokenizer"
+    there = [folder.is_dir() for folder in (encoder, tokenizer)]
     if not any(there):
         return {}
     if not all(there):
-        lone, other = (encoder, words) if there[0] else (words, encoder)
+        lone, other = (encoder, tokenizer) if there[0] else (tokenizer, encoder)
         raise UserError(f"{lone} is there and {other} is not; copy both, or neither of them.")
-    values = files.read_config(encoder / "config.json", ["t5"], "model_type")
+    values = sources.read_config(encoder / "config.json", ["t5"], "model_type")
     if values.get("d_model") != width:
         raise UserError(
             f"{encoder}/config.json says d_model {values.get('d_model')} and the transformer takes "
             f"text of {width} channels; they are not of the same pipeline."
         )
-    files.open_folder(encoder)  # complete and whole, or a sentence
-    return _encode(encoder, words, prompts, length)
+    sources.open_folder(encoder)  # complete and whole, or a sentence
+    return _encode(encoder, tokenizer, prompts, length)
 
 
 def _encode(
-    encoder: Path, words: Path, prompts: Sequence[str], length: int
+    encoder: Path, tokenizer: Path, prompts: Sequence[str], length: int
 ) -> dict[str, np.ndarray]:
     torch, transformers = output.convert_extra("torch"), output.convert_extra("transformers")
     try:
-        tokenizer = transformers.AutoTokenizer.from_pretrained(words, local_files_only=True)
+        tokenize = transformers.AutoTokenizer.from_pretrained(tokenizer, local_files_only=True)
     except (OSError, ValueError, KeyError, TypeError, ImportError, AttributeError) as error:
-        raise UserError(f"{words} cannot be read as a tokenizer ({_first(error)}).") from None
+        raise UserError(f"{tokenizer} cannot be read as a tokenizer ({_first(error)}).") from None
     try:
         model, report = transformers.T5EncoderModel.from_pretrained(
             encoder, local_files_only=True, dtype="auto", output_loading_info=True
@@ -72,7 +72,7 @@ def _encode(
     out: dict[str, np.ndarray] = {}
     with torch.inference_mode():
         for prompt in prompts:
-            ids = tokenizer(
+            ids = tokenize(
                 prompt,
                 padding="max_length",
                 max_length=length,

@@ -136,7 +136,9 @@ def config_to_diffusers(config: DiTConfig) -> dict[str, Any]:
         UserError: a setting that CogVideoX does not have.
     """
     if config.mlp_ratio != 4:
-        raise UserError(f"dit.mlp_ratio is {config.mlp_ratio}; CogVideoX has 4 and nothing else.")
+        raise UserError(
+            f"backbone.mlp_ratio is {config.mlp_ratio}; CogVideoX has 4 and nothing else."
+        )
     newer = config.positions == "rope_integer"
     return {
         "_class_name": CLASS,

@@ -132,22 +132,22 @@ def _theirs(path: str) -> str:
 def _coerce(key: str, value: Any) -> Any:
     """Check one of their settings against the kind of our field's default; lists become tuples."""
     default: Any = getattr(VAEConfig(), _FIELDS[key])
-    turn: Any
+    as_type: Any
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if isinstance(default, bool):
-        fits, turn = isinstance(value, bool), bool
+        fits, as_type = isinstance(value, bool), bool
     elif isinstance(default, tuple):
         fits = isinstance(value, (list, tuple)) and all(type(item) is int for item in value)
-        turn = tuple
+        as_type = tuple
     elif isinstance(default, int):
-        fits, turn = number and value == int(value), int
+        fits, as_type = number and value == int(value), int
     else:
-        fits, turn = number, float
+        fits, as_type = number, float
     if not fits:
         raise UserError(
             f"the VAE's config.json has {key} = {value!r}, where a value like {default!r} belongs."
         )
-    return turn(value)
+    return as_type(value)
 
 
 def _require(key: str, value: Any, fits: bool, allowed: Any) -> None:

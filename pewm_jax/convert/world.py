@@ -17,15 +17,14 @@ import numpy as np
 from pewm_jax import config as configuration
 from pewm_jax import tensor_files, tree
 from pewm_jax.config import (
-    AttentionConfig,
     ClipConfig,
     Config,
     DDPMConfig,
     DiTConfig,
-    ModelConfig,
+    EncoderSettings,
     UserError,
     VAEConfig,
-    VoxelConfig,
+    paper,
 )
 from pewm_jax.convert import base, cogvideox, output, widen
 from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS
@@ -36,45 +35,46 @@ from pewm_jax.types import Array, Params
 def config_of(
     dit: DiTConfig,
     vae: VAEConfig,
-    diffusion: DDPMConfig,
+    noise: DDPMConfig,
     size: tuple[int | None, int | None, int | None],
     dtype: str | None,
+    *,
+    run: str = "world",
+    encoder: EncoderSettings | None = None,
 ) -> Config:
     """Return the settings of the world model around a video model.
 
-    Its memory blocks attend with as many heads, as wide, as the transformer.
+    Training and memory are those of the presets ``pewm_2b`` and ``pewm_5b``; clip, codec, backbone
+    and noise are the checkpoint's. Memory blocks are no wider than the transformer asks for.
 
     Args:
         dit: the video model's transformer.
         vae: its VAE.
-        diffusion: its scheduler.
-        size: frames, height and width of a clip; None for the paper's 9 × 512 × 512, or, where
-            positions are learned for one size, for that size.
+        noise: its scheduler.
+        size: frames, height and width of a clip; None for the paper's 9 × 512 × 512, or for the
+            size that learned positions are for, where they are used at no other.
         dtype: of the weights: 16 bits are computed in bfloat16.
+        run: name of the experiment, for the folder of its runs.
+        encoder: the image features that the map keeps, by default the colours of patches.
 
     Raises:
         ConfigError: a size that the network cannot take.
     """
-    usual = (9, 512, 512)
-    if dit.positions == "rope_learned":
+    usual = dataclasses.astuple(paper.CLIP)[:3]
+    if dit.positions == "rope_learned" and dit.learned in ("exact", "reference"):
         scale = vae.spatial
         usual = (dit.sample_frames, dit.sample_height * scale, dit.sample_width * scale)
     frames, height, width = (
         value if given is None else given for given, value in zip(size, usual, strict=True)
     )
-    return Config(
-        model=ModelConfig(
-            clip=ClipConfig(frames=frames, height=height, width=width),
-            codec=vae,
-            backbone=dataclasses.replace(dit, in_channels=0, out_channels=0),
-            memory=VoxelConfig(
-                reader=AttentionConfig(
-                    heads=max(dit.heads, vae.temporal * dit.patch_t), head_dim=dit.head_dim
-                )
-            ),
-            noise=diffusion,
-            dtype="float32" if dtype in (None, "float32") else "bfloat16",
-        )
+    return paper.experiment(
+        dit,
+        vae,
+        noise,
+        run=run,
+        clip=ClipConfig(frames=frames, height=height, width=width),
+        encoder=encoder,
+        dtype="float32" if dtype in (None, "float32") else "bfloat16",
     )
 
 
@@ -170,8 +170,8 @@ def import_world(
                 yield path, np.asarray(leaf).astype(specs[path].dtype, copy=False)
 
     with output.new_folder(dst) as folder:
-        path, words = folder / WEIGHTS, tensor_files.header({"stage": "0"})
-        with output.megabytes(f"write {dst.name}", tensor_files.size(specs)) as told:
-            tensor_files.write(path, specs, tensors(), words, told)
+        header = tensor_files.header({"stage": "0"})
+        with output.megabytes(f"write {dst.name}", tensor_files.size(specs)) as progress:
+            tensor_files.write(folder / WEIGHTS, specs, tensors(), header, progress)
         configuration.save(config, folder / CONFIG)
         base.save(folder, record)

@@ -69,9 +69,8 @@ def sample(config: EDMConfig, denoise: Denoiser, noise: Array, key: Array | None
     """Follow the probability-flow ODE dx/dσ = (x − x0)/σ by Euler's or Heun's method (Alg. 1)."""
     del key
     sigmas = np.asarray(levels(config), np.float32)
-    after = np.append(sigmas[1:], np.float32(0))
 
-    def slope(x: Array, sigma: Array) -> Array:
+    def slope(x: Array, sigma: Array | float) -> Array:
         x0 = denoise(x, jnp.full((x.shape[0],), sigma), jnp.float32(config.guidance))
         return (x - x0) / sigma
 
@@ -80,10 +79,9 @@ def sample(config: EDMConfig, denoise: Denoiser, noise: Array, key: Array | None
         first = slope(x, now)
         moved = x + (then - now) * first
         if config.sampler == "heun":
-            second = slope(moved, jnp.maximum(then, config.sigma_min))
-            better = x + (then - now) * (first + second) / 2
-            moved = jnp.where(then > 0, better, moved)
+            moved = x + (then - now) * (first + slope(moved, then)) / 2
         return moved.astype(x.dtype), None
 
-    out, _ = jax.lax.scan(step, noise * sigmas[0], (jnp.asarray(sigmas), jnp.asarray(after)))
-    return out
+    start = (noise * sigmas[0]).astype(noise.dtype)
+    x, _ = jax.lax.scan(step, start, (jnp.asarray(sigmas[:-1]), jnp.asarray(sigmas[1:])))
+    return (x - sigmas[-1] * slope(x, sigmas[-1])).astype(noise.dtype)  # Euler's, to σ = 0

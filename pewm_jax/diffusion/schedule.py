@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import DDPMConfig
+from pewm_jax.diffusion.noise import spread
 from pewm_jax.types import Array
 
 
@@ -28,12 +29,11 @@ def alphas_cumprod(config: DDPMConfig) -> np.ndarray:
 
 
 def _coefficients(config: DDPMConfig, timesteps_B: Array, ndim: int) -> tuple[Array, Array]:
-    """Return √ᾱ and √(1 − ᾱ) of shape (B, 1, …)."""
+    """Return √ᾱ and √(1 − ᾱ) of shape (B, 1, …), or (B, t, 1, …)."""
     alphas = alphas_cumprod(config)
-    shape = (-1,) + (1,) * (ndim - 1)
-    signal = jnp.asarray(np.sqrt(alphas), jnp.float32)[timesteps_B].reshape(shape)
-    noise = jnp.asarray(np.sqrt(1 - alphas), jnp.float32)[timesteps_B].reshape(shape)
-    return signal, noise
+    signal = jnp.asarray(np.sqrt(alphas), jnp.float32)[timesteps_B]
+    noise = jnp.asarray(np.sqrt(1 - alphas), jnp.float32)[timesteps_B]
+    return spread(signal, ndim), spread(noise, ndim)
 
 
 def add_noise(config: DDPMConfig, x0: Array, noise: Array, timesteps_B: Array) -> Array:

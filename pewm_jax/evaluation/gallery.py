@@ -101,7 +101,7 @@ def _gather(
     config: Config, episodes: Sequence[Episode], long: LongRollouts, index: int
 ) -> _Rollout:
     choice = long.scored.choices[index]
-    context, truth, _ = load_clip(config, episodes, choice)
+    context, truth, _ = load_clip(config, episodes, choice, cameras=True)
     seen, _ = seen_masks(truth, context)
     imagined = {
         method: (long.kept[method]["rgb"][index], long.kept[method]["depth"][index])

@@ -14,7 +14,7 @@ import numpy as np
 from pewm_jax.config import Config
 from pewm_jax.data import abstract
 from pewm_jax.rollouts import rollout
-from pewm_jax.types import Array, Frames, Params, WorldState
+from pewm_jax.types import Array, Camera, Frames, Params, WorldState
 from pewm_jax.worlds import start
 
 METHODS = ("memory", "empty", "copy")
@@ -34,6 +34,7 @@ class Imagination:
         params: weights.
         batch: clips sampled at once.
         context: number of observed frames that a state starts from.
+        cameras: whether clips are driven by cameras (six degrees of freedom) instead of actions.
         say: shows a line: what is being compiled, and how long it took.
     """
 
@@ -44,7 +45,10 @@ class Imagination:
         batch: int,
         context: int,
         say: Callable[[str], Any] = print_now,
+        *,
+        cameras: bool = False,
     ):
+        self.cameras = cameras
         self.config, self.batch, self.context = config, batch, context
         self.params = jax.tree.map(jnp.asarray, params)
         self._say = say
@@ -67,23 +71,24 @@ class Imagination:
                 (self.params, self._abstract_context()),
                 self._say,
             )
-        actions = jax.ShapeDtypeStruct(
-            (self.batch, self.config.model.clip.frames - 1, 3), jnp.float32
-        )
+        length = self.config.model.clip.frames - 1
+        control = abstract.array(self.batch, length, 3)
+        if self.cameras:
+            control = abstract.camera(self.batch, length)
         keys = jax.eval_shape(clip_keys, jax.ShapeDtypeStruct((self.batch, 2), jnp.uint32))
         for memory in memories:
             self._clip[memory] = _compile(
                 f"the sampler with {'its' if memory else 'an empty'} map "
                 f"({self.config.model.noise.sample_steps} steps, {self.batch} clips at once)",
                 jax.vmap(functools.partial(rollout, self.config, memory=memory), (None, 0, 0, 0)),
-                (self.params, states, actions, keys),
+                (self.params, states, control, keys),
                 self._say,
             )
 
     def run(
         self,
         context: Frames,
-        actions_BN3: np.ndarray,
+        control: Array | Camera,
         seeds_B2: np.ndarray,
         *,
         memory: bool,
@@ -93,7 +98,8 @@ class Imagination:
 
         Args:
             context: (B, S) observed frames, the present last, colours uint8.
-            actions_BN3: actions that lead from the present frame through the N frames.
+            control: the way from the present frame through the N frames: (B, N, 3) actions, or
+                (B, N) cameras.
             seeds_B2: sampling seed and clip number; equal numbers give equal noise, in any batch,
                 with or without the map.
             memory: whether to use the map or an empty one.
@@ -109,9 +115,11 @@ class Imagination:
         keys = clip_keys(jnp.asarray(seeds_B2, jnp.uint32))
         per_clip = self.config.model.clip.frames - 1
         made = []
-        for index in range(actions_BN3.shape[1] // per_clip):
-            part = jnp.asarray(actions_BN3[:, index * per_clip : (index + 1) * per_clip])
-            now = jax.vmap(jax.random.fold_in, (0, None))(keys, index)
+        control = jax.tree.map(jnp.asarray, control)
+        count = jax.tree.leaves(control)[0].shape[1]
+        for first_frame in range(0, count, per_clip):
+            part = jax.tree.map(lambda x, at=first_frame: x[:, at : at + per_clip], control)
+            now = jax.vmap(jax.random.fold_in, (0, None))(keys, first_frame // per_clip)
             state, frames = self._clip[memory](params, state, part, now)
             made.append(jax.device_get(frames))
         return first, state, jax.tree.map(lambda *parts: np.concatenate(parts, 1), *made)

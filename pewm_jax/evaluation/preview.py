@@ -15,9 +15,10 @@ from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.evaluation.images import psnr, unit_colours
 from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.pictures import as_bytes, farthest, grid, save_png
-from pewm_jax.evaluation.protocol import choose, load_clip, stack
+from pewm_jax.evaluation.protocol import choose, load_clip, needs_cameras, stack
 from pewm_jax.evaluation.video import encode_h264, side_by_side
 from pewm_jax.training.samples import IMAGINED, Preview, Previewed
+from pewm_jax.training.stages import Stage
 from pewm_jax.types import Frames, Params
 
 SPLIT, CLIPS, SHOWN = "validation", 8, 3
@@ -29,8 +30,8 @@ def make_preview(
 ) -> Preview | None:
     """Prepare previews for a training run, if its data allows any.
 
-    Previews are optional. Without validation data, or if it cannot be replayed (too short, or
-    camera motion that is not upright), a line is shown and there are no previews.
+    Previews are optional. Without validation data, or if it is too short, a line says so and there
+    are no previews.
 
     Args:
         config: the experiment; clips come from ``data.path``/validation.
@@ -39,37 +40,40 @@ def make_preview(
 
     Returns:
         ``preview(params, stage, step)``. It imagines the clips with the current weights and
-        measures their PSNR: with its map and with an empty map, or in stage 1 of the model without
-        memory. It writes ``previews/stage2-000250.png`` with rows truth, with its map, empty map,
-        and ``previews/stage2-000250.mp4``, the same side by side. It is compiled once per stage.
-        None if there is nothing to preview.
+        measures their PSNR: with its map and with an empty map, or, in a stage without memory (such
+        as PEWM's stage 1), of the model without one. It writes ``previews/stage2-000250.png`` with
+        rows truth, with its map, empty map, and ``previews/stage2-000250.mp4``, the same side by
+        side. It is compiled once per stage. None if there is nothing to preview.
     """
     quick = dataclasses.replace(config.evaluate, split=SPLIT, batch=CLIPS)
     config = dataclasses.replace(config, evaluate=quick)
     try:
         episodes = EpisodeSource(Path(config.data.path) / SPLIT)
         choices = choose(config, episodes, CLIPS, 1)
-        clips = [load_clip(config, episodes, choice) for choice in choices]
+        cameras = needs_cameras(episodes, choices)
+        clips = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
     except UserError as error:
         say(f"no previews of this training: {error}")
         return None
     context = stack([clip[0] for clip in clips], CLIPS)
-    actions = stack([clip[2] for clip in clips], CLIPS)
+    control = stack([clip[2] for clip in clips], CLIPS)
     seeds = np.stack([np.zeros(CLIPS, int), np.arange(CLIPS)], -1)
-    models: dict[int, Imagination] = {}
+    models: dict[str, Imagination] = {}
 
-    def preview(params: Params, stage: int, step: int) -> Previewed:
-        if stage not in models:
-            models[stage] = Imagination(config, params, CLIPS, config.data.context)
-        variants = {"model": False} if stage == 1 else {"memory": True, "empty": False}
+    def preview(params: Params, stage: Stage, step: int) -> Previewed:
+        if stage.name not in models:
+            models[stage.name] = Imagination(
+                config, params, CLIPS, config.data.context, cameras=cameras
+            )
+        variants = {"memory": True, "empty": False} if stage.memory else {"model": False}
         made: dict[str, Frames] = {}
         for name, memory in variants.items():
-            _, _, made[name] = models[stage].run(
-                context, actions, seeds, memory=memory, params=params
+            _, _, made[name] = models[stage.name].run(
+                context, control, seeds, memory=memory, params=params
             )
-        name = f"stage{stage}-{step:06d}"
+        name = f"{stage.name}-{step:06d}"
         shown = clips[:SHOWN]
-        picture = _picture(shown, made, f"stage {stage}, step {step}")
+        picture = _picture(shown, made, f"{stage.title}, step {step}")
         return Previewed(
             (
                 save_png(run / "previews" / f"{name}.png", picture),
@@ -81,8 +85,8 @@ def make_preview(
     return preview
 
 
-_Loaded = tuple[Frames, Frames, np.ndarray]
-"""Context, true frames and actions of a clip, as returned by ``protocol.load_clip``."""
+_Loaded = tuple[Frames, Frames, Any]
+"""Context, true frames and control of a clip, as returned by ``protocol.load_clip``."""
 
 
 def _score(clips: Sequence[_Loaded], frames: Frames) -> float:

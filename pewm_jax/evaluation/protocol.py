@@ -21,7 +21,7 @@ from pewm_jax.config import Config, UserError, to_dict
 from pewm_jax.data.clips import choose_context
 from pewm_jax.data.episodes import Episode
 from pewm_jax.geometry.actions import PLANAR, actions_between, continuous, integrate
-from pewm_jax.types import Frames
+from pewm_jax.types import Array, Camera, Frames
 
 VERSION = 1
 """Increase it whenever the same settings would give other scores."""
@@ -116,14 +116,32 @@ def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) 
     return [choice for _, choice in ranked[:clips]]
 
 
+def needs_cameras(episodes: Sequence[Episode], choices: Sequence[ClipChoice]) -> bool:
+    """Tell whether clips must be driven by cameras: some motion is not upright (by hand, say)."""
+    for choice in choices:
+        episode = episodes[choice.episode]
+        poses = episode.world_from_camera[[choice.start, *choice.targets_N]]
+        replayed = np.asarray(integrate(poses[0], np.asarray(actions_between(poses))))
+        if np.abs(replayed - poses).max() > POSE_TOLERANCE:
+            return True
+    return False
+
+
 def load_clip(
-    config: Config, episodes: Sequence[Episode], choice: ClipChoice
-) -> tuple[Frames, Frames, np.ndarray]:
+    config: Config, episodes: Sequence[Episode], choice: ClipChoice, *, cameras: bool = False
+) -> tuple[Frames, Frames, Array | Camera]:
     """Read one chosen clip.
 
+    Args:
+        config: the experiment.
+        episodes: held-out episodes.
+        choice: the clip.
+        cameras: whether it is driven by the recorded cameras, in six degrees of freedom, and not
+            by actions (``needs_cameras``).
+
     Returns:
-        ``(context, targets, actions_N3)``: S context frames, N true frames, and the N actions
-        that lead from the present through them, composed from the recorded poses.
+        ``(context, targets, control)``: S context frames, N true frames, and what leads from the
+        present through them: (N, 3) actions composed from the recorded poses, or (N,) cameras.
 
     Raises:
         UserError: the recorded actions or the upright motion of poses do not lead to the
@@ -139,6 +157,8 @@ def load_clip(
             f"episode {choice.name} has frames of {height}×{width} and this model was trained on "
             f"{size[0]}×{size[1]}: collect or import the data at the model's size."
         )
+    if cameras:
+        return context, targets, targets.camera
     poses = np.concatenate(
         [context.camera.world_from_camera[-1:], targets.camera.world_from_camera]
     )

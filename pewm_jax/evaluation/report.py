@@ -21,8 +21,14 @@ from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.page import render, verdict
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
-from pewm_jax.evaluation.protocol import file_hash, fingerprint
-from pewm_jax.evaluation.scoring import LongRollouts, Scored, roll_long, score_table
+from pewm_jax.evaluation.protocol import choose, file_hash, fingerprint, needs_cameras
+from pewm_jax.evaluation.scoring import (
+    LongRollouts,
+    Scored,
+    long_choices,
+    roll_long,
+    score_table,
+)
 from pewm_jax.rollouts import load_finished
 
 WEIGHTS = "weights.safetensors"
@@ -93,11 +99,18 @@ def evaluate(run: str | Path, *, say: Callable[[str], Any] = print_now, **change
         return folder / PAGE
     folder.mkdir(parents=True, exist_ok=True)
     partials = Partials(folder / "partial", weights_hash, name)
-    model = Imagination(config, params, config.evaluate.batch, config.data.context, say)
+    clips = list(long_choices(config, episodes)[0])
+    clips += choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
+    cameras = needs_cameras(episodes, clips)
+    model = Imagination(
+        config, params, config.evaluate.batch, config.data.context, say, cameras=cameras
+    )
     scored = score_table(config, episodes, model, partials, say)
     long = roll_long(config, episodes, model, partials, say)
     say("drawing the report …")
     metrics = measure(config, scored, long)
+    if cameras:
+        metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
     metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {
         "weights_sha256": weights_hash,
         "dataset_sha256": data_hash,

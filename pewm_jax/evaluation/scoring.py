@@ -69,7 +69,7 @@ class LongRollouts:
 class _Batch:
     context: Frames
     targets: Frames
-    actions_BN3: np.ndarray
+    control: Any
     numbers_B: np.ndarray
     seen: Any
     unseen: Any
@@ -84,16 +84,21 @@ class _Batch:
 
 
 def _load(
-    config: Config, episodes: Sequence[Episode], choices: Sequence[ClipChoice], first: int
+    config: Config,
+    episodes: Sequence[Episode],
+    choices: Sequence[ClipChoice],
+    first: int,
+    *,
+    cameras: bool,
 ) -> _Batch:
     size = config.evaluate.batch
-    parts = [load_clip(config, episodes, choice) for choice in choices]
+    parts = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
     context = stack([part[0] for part in parts], size)
     targets = stack([part[1] for part in parts], size)
-    actions = stack([part[2] for part in parts], size)
+    control = stack([part[2] for part in parts], size)
     seen, unseen = seen_masks_batch(targets, context)
     return _Batch(
-        context, targets, actions, first + np.arange(size), seen, unseen, real=len(choices)
+        context, targets, control, first + np.arange(size), seen, unseen, real=len(choices)
     )
 
 
@@ -136,7 +141,7 @@ def score_table(
         for method, seed, first in todo:
             if loaded is None or loaded[0] != first:
                 chosen = choices[first : first + config.evaluate.batch]
-                loaded = first, _load(config, episodes, chosen, first)
+                loaded = first, _load(config, episodes, chosen, first, cameras=model.cameras)
             batch = loaded[1]
             frames = _imagine(model, batch, method, seed)[2]
             piece = partials.put(
@@ -160,9 +165,9 @@ def score_table(
 
 def _imagine(model: Imagination, batch: _Batch, method: str, seed: int) -> tuple[Any, Any, Frames]:
     if method == "copy":
-        return None, None, copy_last(batch.context, batch.actions_BN3.shape[1])
+        return None, None, copy_last(batch.context, batch.targets.depth_THW.shape[1])
     first, last, frames = model.run(
-        batch.context, batch.actions_BN3, batch.seeds(seed), memory=method == "memory"
+        batch.context, batch.control, batch.seeds(seed), memory=method == "memory"
     )
     if not all(np.isfinite(leaf).all() for leaf in (frames.rgb_THWC, frames.depth_THW)):
         raise UserError(
@@ -207,7 +212,7 @@ def roll_long(
     todo = [m for m in METHODS if (p := pieces[m]) is None or len(p["rgb"]) < shown]
     if todo:
         model.prepare(sorted({method == "memory" for method in todo if method != "copy"}))
-        batch = _load(config, episodes, choices, 0)
+        batch = _load(config, episodes, choices, 0, cameras=model.cameras)
         count = chain * (config.model.clip.frames - 1)
         with Meter("long rollouts", len(todo) * count * batch.real, "frames") as meter:
             for method in todo:

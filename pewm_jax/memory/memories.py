@@ -16,9 +16,10 @@ points       a coloured point per 3D cell, no features    point cloud (ablation 
 ============ ============================================ =====================================
 
 A memory is a ``MemorySettings`` and a module (or object) with the functions ``empty``,
-``remember``, ``tokens`` and ``to_points``, as they are called below. All memories are pytrees of
-static size. Their tokens have the same shapes, so a reader has the same parameters with any of
-them. The functions are pure and handle one world: jit and vmap them.
+``remember``, ``tokens`` and ``to_points``, as they are called below, and optionally ``render``, if
+it can show more than its points. All memories are pytrees of static size. Their tokens have the
+same shapes, so a reader has the same parameters with any of them. The functions are pure and handle
+one world: jit and vmap them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import ModelConfig, PointsConfig, functions
+from pewm_jax.config import ModelConfig, functions
 from pewm_jax.memory import rendering
 from pewm_jax.models import encoders
 from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
@@ -97,6 +98,9 @@ def render(
         height: height of the images, pixels.
         width: width of the images, pixels.
     """
+    own = getattr(functions(model.memory), "render", None)
+    if own is not None:
+        return own(model, memory, camera, height, width)
     return rendering.splat(*to_points(model, memory), camera, height, width)
 
 
@@ -131,6 +135,6 @@ def from_context(
 def colours(model: ModelConfig, features_VF: Array) -> np.ndarray:
     """Return (V, 3) colours in [−1, 1] in which the memory's points are drawn."""
     values = np.asarray(features_VF)
-    if isinstance(model.memory, PointsConfig) or not len(values):
+    if not model.memory.KEEPS_FEATURES or not len(values):
         return values[..., :3]
     return encoders.colours(model.memory.encoder, values)

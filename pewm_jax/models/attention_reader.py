@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import AttentionConfig, ModelConfig, NoMemoryConfig
+from pewm_jax.config import AttentionConfig, CameraConfig, ModelConfig
 from pewm_jax.models import layers
 from pewm_jax.models.backbones import Readers
 from pewm_jax.models.costs import (
@@ -65,7 +65,7 @@ def _settings(model: ModelConfig) -> AttentionConfig:
 def _ray_channels(model: ModelConfig) -> int:
     """Return the channels of the rays of one video token."""
     places = model.backbone.places
-    return 6 * model.codec.temporal * places.patch**2 * places.patch_t
+    return CameraConfig().channels(model) * places.patch**2 * places.patch_t
 
 
 def _embeddings(model: ModelConfig) -> tuple[layers.nn.Dense, layers.nn.Dense]:
@@ -82,8 +82,7 @@ def _embeddings(model: ModelConfig) -> tuple[layers.nn.Dense, layers.nn.Dense]:
 
 def _block(model: ModelConfig, layout: TokenLayout) -> MemoryBlock:
     grid = max(model.clip.height, model.clip.width) // patch_pixels(model)
-    always = isinstance(model.memory, NoMemoryConfig)
-    return MemoryBlock(_settings(model), grid, layout, always)
+    return MemoryBlock(_settings(model), grid, layout, always=not model.memory.REMEMBERS)
 
 
 def init(model: ModelConfig, key: Array) -> Params:

@@ -6,7 +6,7 @@ A codec is a ``CodecSettings`` and a module (or object) with
     encode(settings, params, video_BTHWC, *, condition=False) -> latents_BthwC
     decode(settings, params, latents_BthwC) -> video_BTHWC
     SHARDING                                                         rules over ``codec/…`` paths
-    costs(model) -> Costs                                            see ``models.costs``
+    costs(model, share) -> Costs                                     see ``models.costs``
 
 and obeys the frame rule: q·k + 1 frames become k + 1 latent frames. Colour and depth are encoded
 separately and their channels concatenated, as in the paper. The VAE sees depth as a grey image
@@ -129,6 +129,9 @@ def measured(model: ModelConfig, depth_BTHW: Array) -> Array:
     one pixel, as in the pixel codec, the share is 0 or 1. Otherwise it is the mean over the
     latent's pixels.
     """
+    own = getattr(functions(model.codec), "measured", None)
+    if own is not None:
+        return own(model.codec, depth_BTHW)
     valid = (depth_BTHW > 0).astype(jnp.float32)[..., None]
     share = fold(valid, model.codec.spatial, model.codec.temporal)
     return share if model.codec.PIXELWISE else share.mean(-1, keepdims=True)

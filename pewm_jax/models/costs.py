@@ -104,7 +104,7 @@ def video_tokens(model: ModelConfig) -> tuple[int, int]:
 
 def video_times(model: ModelConfig) -> int:
     """Return the number of time embeddings of a clip: 1, or one per token in time."""
-    apart = model.control.MODULATES or getattr(model.noise, "per_frame", False)
+    apart = model.control.MODULATES or model.noise.per_frame
     return video_tokens(model)[0] if apart else 1
 
 

@@ -234,7 +234,7 @@ def init(config: DiTConfig, key: Array) -> Params:
     """
     if not (config.in_channels and config.out_channels):
         raise UserError(
-            "dit.in_channels and dit.out_channels are 0, which leaves them to the world model: "
+            "in_channels and out_channels are 0, which leaves them to the world model: "
             "set both to build the transformer alone (CogVideoX: 16 and 16)."
         )
     ends_key, blocks_key = jax.random.split(key)
@@ -312,10 +312,7 @@ def apply(
     tokens, time = embedded
     if modulation_BtE is not None or time.ndim == 3:
         time = _frame_times(time, modulation_BtE)
-    if positions.takes_learned(config, grid):
-        tokens += params["positions"].astype(dtype)
-    elif config.positions in {"sincos", "rope_learned"}:
-        tokens = tokens.at[:, length:].add(positions.sincos_table(config, grid).astype(dtype))
+    tokens = positions.add(config, tokens, params.get("positions"), grid)
     angles = positions.joint_angles(config, grid, length)
     layout = layout_of(config, latents_BthwC.shape, length)
     tokens = placement.constrain(layout.arrange(tokens), "batch", "tokens")
@@ -374,7 +371,8 @@ def _require_inputs(
             f"The text has shape {tuple(text.shape)}: give (batch {latents.shape[0]}, tokens, "
             f"{config.text_dim} channels)."
         )
-    if config.positions == "rope_learned" and text.shape[1] != config.text_length:
+    table = config.positions == "rope_learned" and config.learned != "drop"
+    if table and text.shape[1] != config.text_length:
         raise UserError(
             f"The text has {text.shape[1]} tokens: this network's learned positions are for "
             f"{config.text_length}; pad the prompt to that."

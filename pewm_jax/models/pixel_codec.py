@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import ModelConfig, PixelConfig
 from pewm_jax.geometry.plucker import fold_frames
-from pewm_jax.models.costs import Costs
+from pewm_jax.models.costs import Costs, Share
 from pewm_jax.types import Array, Params
 
 SHARDING = ()
@@ -24,9 +24,9 @@ def init(config: PixelConfig, key: Array) -> Params:
     return {}
 
 
-def costs(model: ModelConfig) -> Costs:
+def costs(model: ModelConfig, share: Share) -> Costs:
     """Return the costs, which are negligible."""
-    del model
+    del model, share
     return Costs()
 
 

@@ -1,22 +1,23 @@
 """Positions of video tokens: rotary angles, fixed sinusoids, a learned table.
 
-All are computed on the host while tracing, from the configuration and the token grid.
-Reference: ``get_3d_rotary_pos_embed``, ``get_resize_crop_region_for_grid``,
+Angles and sinusoids are computed on the host while tracing, from the configuration and the token
+grid. Reference: ``get_3d_rotary_pos_embed``, ``get_resize_crop_region_for_grid``,
 ``get_3d_sincos_pos_embed`` and ``CogVideoXPatchEmbed`` of diffusers.
 """
 
 from __future__ import annotations
 
-import logging
+import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import DiTConfig, UserError
+from pewm_jax.types import Array
 
 Grid = tuple[int, int, int]
 """Tokens along time, height and width."""
-
-_log = logging.getLogger(__name__)
 
 
 def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
@@ -47,12 +48,7 @@ def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
             "(and drop as many from the result), or choose another number of frames."
         )
     rows, columns = config.sample_height, config.sample_width
-    if config.positions == "rope_learned" and (height, width) != (rows, columns):
-        raise UserError(
-            f"This network's learned positions are a table for latents of {rows}×{columns}, "
-            f"not {height}×{width}: use that size, or a network without learned positions "
-            "(5b, 1.5-5B-I2V)."
-        )
+    _require_table(config, frames, height, width)
     bounded = config.positions == "rope_integer" and rows > 0 and columns > 0
     if bounded and (height // patch > rows // patch or width // patch > columns // patch):
         raise UserError(
@@ -62,28 +58,71 @@ def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
     return frames // patch_t, height // patch, width // patch
 
 
+def _require_table(config: DiTConfig, frames: int, height: int, width: int) -> None:
+    """Refuse latents that a learned table is not for, unless another choice was made."""
+    if config.positions != "rope_learned" or config.learned in ("interpolate", "drop"):
+        return
+    table = (config.sample_latents, config.sample_height, config.sample_width)
+    if (height, width) != table[1:] or (config.learned == "exact" and frames != table[0]):
+        raise UserError(
+            f"This network's learned positions are a table for latents of {_size(table)} (time, "
+            f"rows, columns), not {_size((frames, height, width))}: use that size, or set "
+            "backbone.learned to interpolate or drop (when importing: --positions)."
+        )
+
+
+def _size(sizes: tuple[int, ...]) -> str:
+    return "×".join(map(str, sizes))
+
+
+def sample_grid(config: DiTConfig) -> Grid:
+    """Return the token grid of the sample size."""
+    rows, columns = config.sample_height // config.patch, config.sample_width // config.patch
+    return config.sample_latents // config.patch_t, rows, columns
+
+
 def sample_tokens(config: DiTConfig) -> int:
     """Return the number of video tokens at the size that the network was trained for."""
-    rows, columns = config.sample_height // config.patch, config.sample_width // config.patch
-    return config.sample_latents // config.patch_t * rows * columns
+    return math.prod(sample_grid(config))
 
 
-def takes_learned(config: DiTConfig, grid: Grid) -> bool:
-    """Tell whether the learned table is used for a token grid; warn if it cannot be.
+def add(config: DiTConfig, tokens_BND: Array, table_ND: Array | None, grid: Grid) -> Array:
+    """Add the positions that are not rotary to text and video tokens: a table or a sinusoid.
 
-    The table is for one number of frames. As in the reference, other numbers of frames get the
-    fixed sinusoid instead.
+    Args:
+        config: the transformer.
+        tokens_BND: (B, L + t·h·w, D) text tokens, then video tokens.
+        table_ND: (L + N, D) the learned table of the sample size, if there is one.
+        grid: t, h, w.
     """
-    if config.positions != "rope_learned":
-        return False
-    frames = config.temporal * (grid[0] - 1) + 1
-    if frames != config.sample_frames:
-        _log.warning(
-            "this network's learned positions are for %d frames, not %d: as in the reference the "
-            "fixed sinusoid takes their place, and it was not trained with that.",
-            *(config.sample_frames, frames),
-        )
-    return frames == config.sample_frames
+    length, dtype = tokens_BND.shape[1] - math.prod(grid), tokens_BND.dtype
+    if config.positions == "rope_learned" and config.learned != "drop":
+        assert table_ND is not None, "rope_learned comes with a table"
+        if config.learned != "reference" or _of_sample_frames(config, grid):
+            return tokens_BND + resized(config, table_ND, grid).astype(dtype)
+    elif config.positions != "sincos":
+        return tokens_BND
+    return tokens_BND.at[:, length:].add(sincos_table(config, grid).astype(dtype))
+
+
+def _of_sample_frames(config: DiTConfig, grid: Grid) -> bool:
+    """Tell whether the reference takes a token grid for one of the sample's frames."""
+    return config.temporal * (grid[0] - 1) + 1 == config.sample_frames
+
+
+def resized(config: DiTConfig, table_ND: Array, grid: Grid) -> Array:
+    """Return the learned table, its video part resized to a grid: (L + t·h·w, D).
+
+    Linear in time, rows and columns, cell centres to cell centres (half a cell from the edges);
+    for its own grid it is returned as it is.
+    """
+    own = sample_grid(config)
+    if grid == own:
+        return table_ND
+    length, width = len(table_ND) - math.prod(own), table_ND.shape[1]
+    video = table_ND[length:].reshape(*own, width)
+    video = jax.image.resize(video, (*grid, width), "linear", antialias=False)
+    return jnp.concatenate([table_ND[:length], video.reshape(-1, width)])
 
 
 def crop_region(grid: tuple[int, int], base: tuple[int, int]) -> tuple[tuple[int, int], ...]:

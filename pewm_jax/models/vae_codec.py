@@ -8,7 +8,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import ModelConfig, VAEConfig
 from pewm_jax.models import vae
-from pewm_jax.models.costs import Costs, Product
+from pewm_jax.models.costs import Costs, Product, Share
 from pewm_jax.models.vae_shapes import layout
 from pewm_jax.types import Array, Params
 
@@ -49,7 +49,7 @@ def _scale(config: VAEConfig, *, condition: bool) -> float:
     return 1 / factor if condition and config.invert_scale_latents else factor
 
 
-def costs(model: ModelConfig) -> Costs:
+def costs(model: ModelConfig, share: Share) -> Costs:
     """Return the costs of encoding colour and depth, of the clip and of its first frame."""
     config, clip = model.codec, model.clip
     assert isinstance(config, VAEConfig)
@@ -59,8 +59,12 @@ def costs(model: ModelConfig) -> Costs:
     chunk = clip.height * clip.width * min(at_once, clip.frames)
     return Costs(
         products=(Product("codec", "convolution", 2 * macs),),
-        streamed=PASSES * pixels * config.widths[0],
-        held=HELD * 2 * chunk * config.widths[0],  # colour and depth
+        streamed=PASSES * share.clips * pixels * config.widths[0] * share.activation_bytes,
+        held=HELD
+        * 2
+        * chunk
+        * config.widths[0]
+        * share.activation_bytes,  # colour and depth, of one clip
     )
 
 

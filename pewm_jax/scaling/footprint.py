@@ -121,8 +121,9 @@ def _one_block(params: Params) -> int:
     for name, part in params.items():
         if name in ("codec", "encoder", "text"):
             continue
-        blocks = part.get("blocks", part)
-        layers = jax.tree.leaves(blocks)[0].shape[0] if "blocks" in part else 1
+        stacked = isinstance(part, dict) and "blocks" in part
+        blocks = part["blocks"] if stacked else part
+        layers = jax.tree.leaves(blocks)[0].shape[0] if stacked else 1
         total += _count(blocks) // layers
     return total
 

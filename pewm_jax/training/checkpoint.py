@@ -113,7 +113,7 @@ class Checkpoints:
         position = {
             "stage": self.stage.number,
             "step": step,
-            "seed": self.config.train.seed + self.stage.number,
+            "seed": self.stage.data_seed(self.config),
             "batch": settings.batch,
             "clips": step * settings.batch,
         }

@@ -20,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from pewm_jax import atomic
 from pewm_jax.training import processes
+from pewm_jax.training.stages import Stage
 
 FLUSH_S = 10
 """Seconds between writes of TensorBoard's events; lines of JSON are written at once."""
@@ -35,12 +36,12 @@ class MetricsLog:
 
     Args:
         run: the run's folder.
-        stage: number of the stage about to be trained.
+        stage: the stage about to be trained.
         step: steps of it that are done.
     """
 
-    def __init__(self, run: Path, stage: int, step: int):
-        self._stage = stage
+    def __init__(self, run: Path, stage: Stage, step: int):
+        self._stage = stage.number
         self._writes = processes.is_primary()
         if not self._writes:
             return
@@ -48,10 +49,10 @@ class MetricsLog:
         import tensorboardX  # noqa: PLC0415
 
         path = run / "metrics.jsonl"
-        drop_after(path, stage, step)
+        drop_after(path, stage.number, step)
         self._file = path.open("a")
         self._events = tensorboardX.SummaryWriter(
-            str(run / "tensorboard" / f"stage{stage}"),
+            str(run / "tensorboard" / stage.name),
             purge_step=step + 1 if step else None,
             flush_secs=FLUSH_S,
         )
@@ -88,7 +89,7 @@ class MetricsLog:
 
 
 def drop_after(path: Path, stage: int, step: int) -> None:
-    """Drop the lines of a log that come after a step of a stage, and a half-written last line."""
+    """Drop a log's lines after a step of a stage (its number), and a half-written last line."""
     if not path.exists():
         return
     kept = []

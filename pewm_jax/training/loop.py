@@ -94,7 +94,7 @@ def train(
             worker.start, weights = weights, None  # so they are freed once a state is made of them
             weights = worker.train()
             if stop.requested and stage is not planned[-1]:
-                raise stop.interrupted(stage.number, stage.settings(config).steps)
+                raise stop.interrupted(stage.title, stage.settings(config).steps)
     say(f"Trained: {run / runs.WEIGHTS}")
     return run
 
@@ -151,8 +151,8 @@ class _Worker:
                 self.checkpoints.publish(params)
                 return params
             with (
-                LiveView(f"stage {stage.number}", steps, done) as self.view,
-                MetricsLog(run, stage.number, done) as log,
+                LiveView(stage.title, steps, done) as self.view,
+                MetricsLog(run, stage, done) as log,
             ):
                 self.bad.say = self.view.say if processes.is_primary() else _print_error
                 self.watch = Watch(
@@ -196,7 +196,7 @@ class _Worker:
         key = jax.jit(make_key, out_shardings=sharding.replicated(self.mesh))()
         traced = Profile(
             self.path,
-            self.stage.name,
+            self.stage,
             steps=self.profile if processes.is_primary() else 0,
             first=done + 1,
             last=settings.steps,
@@ -209,7 +209,7 @@ class _Worker:
                 split = Path(config.data.path) / "train"
                 processes.first(
                     lambda: feature_cache.require_fresh(
-                        cache, config.model.memory, starting.encoder(config), split
+                        cache, config.model.memory.encoder, starting.encoder(config), split
                     )
                 )
             self.watch.pace = Pace(time.monotonic())
@@ -240,18 +240,18 @@ class _Worker:
 
     def _compile(self, done: int, clip: Clip):
         """Make the state, whose first weights are compiled too, and compile the step."""
-        self.view.say(f"stage {self.stage.number}: compiling the training step …")
+        self.view.say(f"{self.stage.title}: compiling the training step …")
         began = time.monotonic()
         state = self._make_state(done)
         step_fn = compile_step(self.config, self.stage, self.mesh, clip)
         took = duration(time.monotonic() - began)
-        self.view.say(f"stage {self.stage.number}: compiled the training step in {took}")
+        self.view.say(f"{self.stage.title}: compiled the training step in {took}")
         return state, step_fn
 
     def _make_state(self, done: int) -> TrainState:
         """Make the state of the stage's start, or read that after ``done`` steps."""
         if done:
-            self.view.say(f"stage {self.stage.number}: going on after step {done}")
+            self.view.say(f"{self.stage.title}: going on after step {done}")
             return self.checkpoints.restore(self.like)
         start, self.start = self.start, None
         if start is None:
@@ -279,14 +279,15 @@ class _Worker:
             self._report(*pending)
         self._save(state)
         self.checkpoints.wait()
-        raise self.stop.interrupted(self.stage.number, step)
+        raise self.stop.interrupted(self.stage.title, step)
 
     def _kept(self) -> str:
         """Say what is safely on disk."""
-        step, number = self.checkpoints.latest(), self.stage.number
+        step, title = self.checkpoints.latest(), self.stage.title
         if step is not None:
-            return f"stage {number}'s checkpoint of step {step} is intact"
-        return "nothing was saved yet" if number == 1 else f"of stage {number} nothing is saved yet"
+            return f"{title}'s checkpoint of step {step} is intact"
+        first = self.stage.number == 1
+        return "nothing was saved yet" if first else f"of {title} nothing is saved yet"
 
     def _kept_in_the_end(self) -> str:
         self.checkpoints.wait()

@@ -10,6 +10,8 @@ from typing import Any
 
 import jax
 
+from pewm_jax.training.stages import Stage
+
 FOLDER = "profile"
 SKIPPED = 2
 """First steps that are not traced: they also load programs and fill caches."""
@@ -20,7 +22,7 @@ class Profile:
 
     Args:
         run: the run's folder; the trace goes to ``profile/stage1`` inside.
-        stage: name of the stage.
+        stage: the stage.
         steps: how many steps are traced, 0 for none.
         first: the first step of this start.
         last: the last step of the stage; a trace ends with it at the latest.
@@ -30,14 +32,14 @@ class Profile:
     def __init__(
         self,
         run: Path,
-        stage: str,
+        stage: Stage,
         *,
         steps: int,
         first: int,
         last: int,
         say: Callable[[str], Any],
     ):
-        self.folder = run / FOLDER / stage
+        self.folder = run / FOLDER / stage.name
         begin = max(min(first + SKIPPED, last - steps + 1), first)
         self._steps = range(begin, min(begin + steps, last + 1))
         self._stage, self._say = stage, say
@@ -75,8 +77,7 @@ class Profile:
         jax.profiler.stop_trace()
         made = sorted(self.folder.rglob("*.trace.json.gz"), key=lambda p: p.stat().st_mtime)
         drop = f", or drop {made[-1]} on https://ui.perfetto.dev" if made else ""
-        stage = self._stage.replace("stage", "stage ")
         self._say(
-            f"{stage}: traced {self._traced} step{'s'[: self._traced != 1]}; open with "
+            f"{self._stage.title}: traced {self._traced} step{'s'[: self._traced != 1]}; open with "
             f"`tensorboard --logdir {self.folder}` (and the xprof plugin){drop}"
         )

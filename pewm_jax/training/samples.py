@@ -18,7 +18,7 @@ from pewm_jax.training.stages import Stage
 from pewm_jax.types import Params
 
 IMAGINED = {"model": "model", "memory": "with its map", "empty": "empty map"}
-"""Who imagines: stage 1's model, stage 2's with its map, and the same weights with an empty one."""
+"""Who imagines: a model without a memory, one with its map, the same weights with an empty map."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,8 +34,8 @@ class Previewed:
     psnr: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
-Preview = Callable[[Params, int, int], Previewed]
-"""Called with inference weights, stage number and step; writes samples and measures them."""
+Preview = Callable[[Params, Stage, int], Previewed]
+"""Called with inference weights, stage and step; writes samples and measures them."""
 
 
 class Samples:
@@ -60,7 +60,7 @@ class Samples:
     ):
         self._every = config.train.preview_every
         self._steps = stage.settings(config).steps
-        self._number, self._preview = stage.number, preview
+        self._stage, self._preview = stage, preview
         self._say, self._unless_stopped = say, unless_stopped
         self._made = False
 
@@ -85,17 +85,17 @@ class Samples:
         if preview is None or not processes.is_primary():
             return {}
         if not self._made:
-            self._say(f"stage {self._number}: compiling the sampler for pictures …")
+            self._say(f"{self._stage.title}: compiling the sampler for pictures …")
         self._made = True
         try:
-            made = self._unless_stopped(lambda: preview(params, self._number, step))
+            made = self._unless_stopped(lambda: preview(params, self._stage, step))
         except (jax.errors.JaxRuntimeError, UserError) as error:
             reason = " ".join(str(error).split())[:160]
-            self._say(f"stage {self._number}: no sample pictures of step {step} ({reason})")
+            self._say(f"{self._stage.title}: no sample pictures of step {step} ({reason})")
             return {}
         if made is None:
             return {}
         scores = ", ".join(f"{IMAGINED[name]} {value:.1f} dB" for name, value in made.psnr.items())
         files = f"sample pictures {' and '.join(map(str, made.files))}"
-        self._say(f"stage {self._number}: {f'{scores}; {files}' if scores else files}")
+        self._say(f"{self._stage.title}: {f'{scores}; {files}' if scores else files}")
         return {f"psnr_{name}": value for name, value in made.psnr.items()}

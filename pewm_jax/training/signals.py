@@ -131,10 +131,10 @@ class Stop:
         except _BrokenOff:
             return None
 
-    def interrupted(self, stage: int, step: int) -> Interrupted:
+    def interrupted(self, stage: str, step: int) -> Interrupted:
         """Return the error that ends training after a step, to be raised once all is saved."""
         return Interrupted(
-            f"Stopped after step {step} of stage {stage}; everything is saved: the same command "
+            f"Stopped after step {step} of {stage}; everything is saved: the same command "
             "goes on from there.",
             self.number or 0,
         )

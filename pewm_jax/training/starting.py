@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import jax
+
 from pewm_jax import rollouts, weights
-from pewm_jax.config import Config, UserError, kinds
+from pewm_jax.config import Config, Settings, UserError, kinds
 from pewm_jax.memory import feature_cache
 from pewm_jax.training import loading, processes, runs, step_folders
-from pewm_jax.training.stages import Stage
+from pewm_jax.training.stages import Stage, all_stages
 from pewm_jax.types import Params
 
 
@@ -26,21 +30,29 @@ def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]
 
 def require_weights(config: Config) -> None:
     """Refuse networks that are never trained, if ``train.start`` names no weights for them."""
-    model = config.model
-    for where, part in (("codec", model.codec), ("memory.encoder", model.memory.encoder)):
-        setting = f"{where} of kind {kinds.of(part).name}"
-        if part.CONVERTED and not config.train.start:
+    for where, part in _parts(config.model):
+        if getattr(part, "CONVERTED", False) and not config.train.start:
             raise UserError(
-                f"{setting} needs weights that are not trained here: convert a checkpoint "
-                "(python -m pewm_jax.convert --help) and name its folder by train.start."
+                f"{where} of kind {kinds.of(part).name} needs weights that are not trained here: "
+                "convert a checkpoint (python -m pewm_jax.convert --help) and name its folder by "
+                "train.start."
             )
+
+
+def _parts(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Settings]]:
+    """List the parts that a model is put together of, and their parts, by their settings' names."""
+    for field in dataclasses.fields(settings):  # type: ignore[arg-type]
+        part = getattr(settings, field.name)
+        if isinstance(part, Settings):
+            yield f"{prefix}{field.name}", part
+            yield from _parts(part, f"{prefix}{field.name}.")
 
 
 def read_weights(config: Config, stage: Stage, say: Callable[[str], None]) -> Params | None:
     """Return the weights in ``train.start``, mapped into memory; None if it is empty.
 
-    Memory blocks in them are trained further in stage 2. Stage 1 drops them, and says so: they were
-    fitted to another backbone.
+    What only later stages have is dropped, which is said: PEWM's memory blocks are trained further
+    where stage 2 is the first, and not after stage 1, which makes another backbone than theirs.
     """
     if not config.train.start:
         return None
@@ -48,10 +60,24 @@ def read_weights(config: Config, stage: Stage, say: Callable[[str], None]) -> Pa
     params = _given(config)
     if file.exists():  # a checkpoint has been verified while reading
         processes.first(lambda: weights.verify(file))
-    if "memory" in params and not stage.memory:
-        say(f"{config.train.start}: its memory blocks are left out; stage 2 begins with fresh ones")
-        params = {name: part for name, part in params.items() if name != "memory"}
+    for later in _later(config, stage):
+        extra = (_shapes(config, later).keys() - _shapes(config, stage).keys()) & params.keys()
+        if extra:
+            say(
+                f"{config.train.start}: its {' and '.join(sorted(extra))} blocks are left out; "
+                f"{later.title} begins with fresh ones"
+            )
+        params = {name: part for name, part in params.items() if name not in extra}
     return params
+
+
+def _later(config: Config, stage: Stage) -> list[Stage]:
+    return [one for one in all_stages(config) if one.number > stage.number]
+
+
+def _shapes(config: Config, stage: Stage) -> Params:
+    """Return the shapes of all parameters of a stage."""
+    return jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
 
 
 def encoder(config: Config) -> Params:

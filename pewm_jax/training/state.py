@@ -71,11 +71,6 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
     )
 
 
-def _frozen_dtype(config: Config) -> str:
-    """Return the dtype that frozen weights are kept in: that of the model's computation."""
-    return getattr(config.model, "dtype", "float32")
-
-
 def require_start(config: Config, stage: Stage, start: Any, like: Params) -> None:
     """Insist that weights are those that a stage can start from.
 

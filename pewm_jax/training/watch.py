@@ -121,12 +121,12 @@ class Watch:
                 atomic.write_text(path, json.dumps(entry, ensure_ascii=False, indent=2) + "\n")
         if skipped:
             self.view.say(
-                f"stage {self.stage.number}: step {step} is skipped, {what} are not both finite; "
+                f"{self.stage.title}: step {step} is skipped, {what} are not both finite; "
                 f"{path} names its records"
             )
             return
         raise UserError(
-            f"Stage {self.stage.number} stopped at step {step}: {what} are not both finite "
+            f"{self.stage.title.capitalize()} stopped at step {step}: {what} are not both finite "
             f"({kept()}); {path} names the batch's records: skip such steps with "
             "--train.on_nonfinite skip, or train again in another --train.run with a lower "
             f"--train.{self.stage.name}.learning_rate."

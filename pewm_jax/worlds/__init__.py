@@ -6,6 +6,7 @@ with the model static, vmap them over states, controls and keys. ::
     state = start(model, params, frames)                        # a few posed RGB-D frames
     state = observe(model, params, state, frames)               # more real frames, later
     state, frames = imagine(model, params, state, control, key) # what will be seen
+    state, frames = imagine_many(model, params, state, controls, keys)  # many candidates
 
 A world is a ``WorldSettings`` and a module (or object) with these three functions and
 
@@ -20,7 +21,10 @@ A world is a ``WorldSettings`` and a module (or object) with these three functio
 
 from __future__ import annotations
 
+import functools
 from typing import Any
+
+import jax
 
 from pewm_jax.config import Config, WorldSettings, functions
 from pewm_jax.types import Array, Frames, Params, WorldState
@@ -90,8 +94,8 @@ def imagine(
             counter-clockwise); a ``Camera`` (n,) for the frames to imagine (six degrees of
             freedom); or a ``Control`` with (n,) cameras and (n, A) actions.
         key: randomness of the sampling noise.
-        remember: whether the imagined frames are remembered. If not, all resulting states share
-            the memory they started from, which makes comparing many controls cheap.
+        remember: whether the imagined frames are remembered. If not, the state keeps the memory
+            that it had; ``imagine_many`` uses this to compare many controls.
         memory: False ignores what is remembered (the empty-memory baseline).
 
     Returns:
@@ -108,16 +112,47 @@ def imagine(
     )
 
 
-def init(model: WorldSettings, key: Array) -> Params:
+def imagine_many(
+    model: Config | WorldSettings,
+    params: Params,
+    state: WorldState,
+    controls: Any,
+    keys: Array,
+    *,
+    memory: bool = True,
+) -> tuple[WorldState, Frames]:
+    """Imagine K candidate controls from one state, without remembering any.
+
+    Args:
+        model: as for ``start``.
+        params: the world model's parameters.
+        state: the world so far; all candidates share its memory.
+        controls: as for ``imagine``, with a leading axis K.
+        keys: (K,) randomness of each candidate; equal keys give equal noise.
+        memory: see ``imagine``.
+
+    Returns:
+        ``(state, frames)``: K present frames with the shared memory, which is not copied, and
+        (K, n) imagined frames.
+    """
+    candidate = functools.partial(imagine, model, remember=False, memory=memory)
+    shared = WorldState(0, None)  # type: ignore[arg-type]
+    return jax.vmap(candidate, (None, None, 0, 0), (shared, 0))(params, state, controls, keys)
+
+
+def init(model: Config | WorldSettings, key: Array) -> Params:
     """Return random parameters for all networks of a world."""
+    model = model_of(model)
     return functions(model).init(model, key)
 
 
-def stages(model: WorldSettings) -> tuple[Stage, ...]:
+def stages(model: Config | WorldSettings) -> tuple[Stage, ...]:
     """Return the stages of a world's training, in order."""
+    model = model_of(model)
     return functions(model).stages(model)
 
 
-def sharding(model: WorldSettings) -> tuple[tuple[str, Any], ...]:
+def sharding(model: Config | WorldSettings) -> tuple[tuple[str, Any], ...]:
     """Return the rules from paths of parameters to the mesh axes of their last axes."""
+    model = model_of(model)
     return functions(model).sharding(model)

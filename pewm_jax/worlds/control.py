@@ -8,13 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from pewm_jax.config import ModelConfig, UserError
+from pewm_jax.config import ModelConfig, UserError, kinds
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.types import Array, Camera, Control
 
 
 def control_of(model: ModelConfig, present: Camera, control: Any) -> Control:
     """Return (n,) cameras of the frames to imagine, and the (n, A) actions that lead to them.
+
+    Of a ``Control`` the present frame is not a part here, in contrast to those of training.
 
     Args:
         model: defines what a discrete action does.
@@ -25,9 +27,43 @@ def control_of(model: ModelConfig, present: Camera, control: Any) -> Control:
         UserError: the control is empty, has none of these forms, or holds an unknown discrete
             action (under jit, vmap and grad the values of actions are not checked).
     """
+    found = _in_one_form(model, present, control)
+    require_actions(model, found.actions_TA, "imagine()")
+    return found
+
+
+def require_actions(model: ModelConfig, actions_TA: Array | None, who: str) -> None:
+    """Refuse what lacks the actions that the model's control needs, or has others.
+
+    Args:
+        model: the model.
+        actions_TA: (..., T, A) actions, or None.
+        who: where they came in, for the message.
+
+    Raises:
+        UserError: they are absent, or of another width.
+    """
+    wanted = model.control.actions
+    if not wanted:
+        return
+    if actions_TA is None:
+        raise UserError(
+            f"{who} got cameras without actions, and this model's control "
+            f"({kinds.of(model.control).name}) is steered by actions of {wanted} numbers: give "
+            "actions, or a Control with both."
+        )
+    if actions_TA.shape[-1] != wanted:
+        raise UserError(
+            f"{who} got actions of {actions_TA.shape[-1]} numbers, and this model's control "
+            f"({kinds.of(model.control).name}) takes {wanted}: give those it was trained with."
+        )
+
+
+def _in_one_form(model: ModelConfig, present: Camera, control: Any) -> Control:
+    """Return cameras, and actions where there are any; see ``control_of``."""
     if isinstance(control, Control):
         count = _require_cameras(control.camera)
-        actions = control.actions_TA
+        actions = None if control.actions_TA is None else jnp.asarray(control.actions_TA)
         if actions is not None and (actions.ndim != 2 or len(actions) != count):
             raise UserError(
                 f"imagine() got {count} cameras and actions of shape {actions.shape}; give "

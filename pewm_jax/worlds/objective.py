@@ -13,6 +13,7 @@ from pewm_jax.memory import memories
 from pewm_jax.models import codecs, encoders, placement, world_model
 from pewm_jax.models.signals import as_signal, signal_from_rgb
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, MapTokens, Params
+from pewm_jax.worlds.control import require_actions
 
 
 def clip_tokens(model: ModelConfig, params: Params, clip: Clip) -> MapTokens:
@@ -83,6 +84,7 @@ def loss(
     observed = Frames(
         first[:, None], frames.depth_THW[:, :1], jax.tree.map(lambda x: x[:, :1], frames.camera)
     )
+    require_actions(model, clip.actions_TA, "the loss")
     control = Control(frames.camera, clip.actions_TA)
     conditioning = world_model.condition(model, params, observed, control)
     tokens = clip_tokens(model, params, clip) if memory else None

@@ -102,10 +102,14 @@ def imagine(
     clips = -(-count // length)
     missing = clips * length - count
 
-    def cut(x: Array) -> Array:
-        """(n, …) → (clips, T − 1, …), padded by repeating the last row."""
-        filled = jnp.concatenate([x, jnp.repeat(x[-1:], missing, 0)]) if missing else x
+    def cut(x: Array, still: Array) -> Array:
+        """(n, …) → (clips, T − 1, …); where frames are missing the agent stands still."""
+        filled = jnp.concatenate([x, jnp.repeat(still, missing, 0)]) if missing else x
         return filled.reshape(clips, length, *x.shape[1:])
+
+    chunks = Control(jax.tree.map(lambda x: cut(x, x[-1:]), asked.camera))
+    if asked.actions_TA is not None:
+        chunks = Control(chunks.camera, cut(asked.actions_TA, jnp.zeros_like(asked.actions_TA[:1])))
 
     wanted = jnp.arange(clips * length).reshape(clips, length) < count if missing else None
 
@@ -115,7 +119,7 @@ def imagine(
             model, params, state, chunk, clip_key, remember=remember, memory=memory, valid_T=valid
         )
 
-    inputs = (jax.tree.map(cut, asked), jax.random.split(key, clips), wanted)
+    inputs = (chunks, jax.random.split(key, clips), wanted)
     state, frames = jax.lax.scan(step, state, inputs)
     return state, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], frames)
 

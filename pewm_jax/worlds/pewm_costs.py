@@ -21,7 +21,7 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     found = {
         "backbone": functions(model.backbone).costs(model, share, trained=trained),
         "control": functions(model.control).costs(model, share, trained=trained),
-        "codec": functions(model.codec).costs(model),
+        "codec": functions(model.codec).costs(model, share),
     }
     if stage.memory:
         found["memory"] = functions(model.memory.reader).costs(model, share)

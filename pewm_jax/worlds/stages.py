@@ -35,6 +35,8 @@ class Stage:
         init: ``init(model, key) -> params``, all the parameters that the stage needs.
         loss: what it minimises.
         memory: whether it reads the clips' context, and so may use cached image features.
+        rates: (pattern, factor) over the paths of trained parameters, the first match wins: the
+            learning rate there is the stage's times the factor; elsewhere it is the stage's.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Stage:
     init: Callable[[Any, Array], Params]
     loss: Loss
     memory: bool = False
+    rates: tuple[tuple[str, float], ...] = ()
 
     @property
     def title(self) -> str:

@@ -21,10 +21,12 @@ from transformers import AutoTokenizer, T5EncoderModel
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import tensor_files, weights
-from pewm_jax.convert import assemble, base, cogvideox, files, mapping, widen, world
+from pewm_jax import presets, tensor_files, weights
+from pewm_jax.config import published
+from pewm_jax.convert import assemble, base, cogvideox, mapping, sources, widen, world
 from pewm_jax.convert.__main__ import main
-from pewm_jax.models import dit, world_model
+from pewm_jax.models import dit, readers, world_model
+from pewm_jax.models.backbones import Conditioning
 from pewm_jax.types import Camera, MapTokens
 
 WORLD = ["--rgbd", "--camera", "--memory", "--frames", "9", "--height", "32", "--width", "32"]
@@ -158,7 +160,7 @@ def test_prompts_are_encoded_as_the_pipeline_does(imported, images, widened):
     for prompt, tokens in zip(("a room", ""), stored, strict=True):
         np.testing.assert_allclose(tokens, reference(prompt), atol=1e-6)
     config, params = pewm_jax.load(widened)
-    assert config.dit.prompt == "stored"
+    assert config.model.backbone.prompt == "stored"
     expected = reference("a room with a chair")
     np.testing.assert_allclose(params["text"]["prompt_LC"], expected, atol=1e-6)
     assert not np.allclose(expected, stored[0])
@@ -171,21 +173,23 @@ def inputs(config, plan):
     def normal(*shape):
         return jnp.asarray(rng.normal(size=shape), jnp.float32)
 
-    frames, height, width = world.codec.latent_shape(config)
+    model = config.model
+    frames, height, width = model.latent_shape
     noisy, first = (normal(2, frames, height, width, plan.new.out_channels) for _ in range(2))
-    rays = normal(2, frames, height, width, world_model.camera_channels(config))
-    pose = jnp.broadcast_to(jnp.eye(4), (2, config.clip.frames, 4, 4))
-    camera = Camera(jnp.full((2, config.clip.frames, 4), 16.0), pose)
-    text_BLC = normal(2, config.dit.text_length, config.dit.text_dim)
-    conditioning = world_model.Conditioning(first, rays, camera, text_BLC)
+    rays = normal(2, frames, height, width, model.control.channels(model))
+    pose = jnp.broadcast_to(jnp.eye(4), (2, model.clip.frames, 4, 4))
+    camera = Camera(jnp.full((2, model.clip.frames, 4), 16.0), pose)
+    text_BLC = normal(2, *model.backbone.text_shape)
+    given = Conditioning(jnp.concatenate([first, rays], -1), None, text_BLC)
+    conditioning = world_model.ClipConditioning(given, camera, rays)
     points = normal(2, 24, 3) + jnp.array([0.0, 0.0, 3.0])
-    features = 9 * normal(2, 24, world_model.feature_channels(config))
+    features = 9 * normal(2, 24, model.memory.encoder.channels)
     tokens = MapTokens(features, points, jnp.ones((2, 24), bool))
     split = plan.old.out_channels
     video = noisy[..., :split]
     if plan.old.in_channels > split:
         video = jnp.concatenate([video, first[..., :split]], -1)
-    video = jnp.concatenate([video[:, :1]] * (-frames % config.dit.patch_t) + [video], 1)
+    video = jnp.concatenate([video[:, :1]] * (-frames % model.backbone.patch_t) + [video], 1)
     return noisy, conditioning, tokens, video
 
 
@@ -198,7 +202,7 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     source = {k: v.numpy() for k, v in pipelines.dit(variant).state_dict().items()}
     old = network.config(dict(pipelines.dit(variant).config), variant)
     params = assemble.read(
-        network.entries(old), files.Arrays(source, variant), network.like(old), "float32"
+        network.entries(old), sources.Arrays(source, variant), network.like(old), "float32"
     )
     vae = cogvideox.VAE.config(dict(pipelines.vae().config), "vae")
     config = world.config_of(
@@ -206,17 +210,22 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
             {"_class_name": "CogVideoXDDIMScheduler", **pipelines.SCHEDULER}
         ), (9, 32, 32), "float32",
     )  # fmt: skip
-    config = dataclasses.replace(config, memory=dataclasses.replace(config.memory, positions=kind))
-    plan = widen.plan(old, 4, world_model.camera_channels(config))
+    cameras = config.model.codec.temporal * old.patch_t
+    memory = config.model.memory
+    reader = dataclasses.replace(memory.reader, positions=kind, heads=cameras)
+    config = config.with_model(memory=dataclasses.replace(memory, reader=reader))
+    plan = widen.plan(old, 4, config.model.control.channels(config.model))
     wide = {
         "backbone": widen.widen(plan, params),
-        "memory": jax.jit(lambda: world_model.init_memory(config, jax.random.key(0)))(),
+        "memory": jax.jit(lambda: readers.init(config.model, jax.random.key(0)))(),
     }
     noisy, conditioning, tokens, video = inputs(config, plan)
     times = jnp.array([999, 40])
     apply = jax.jit(world_model.apply, static_argnums=0)
-    got = apply(config, wide, noisy, conditioning, times, tokens)[..., : old.out_channels]
-    want = jax.jit(dit.apply, static_argnums=0)(old, params, video, conditioning.text_BLC, times)
+    got = apply(config.model, wide, noisy, conditioning, times, tokens)[..., : old.out_channels]
+    want = jax.jit(dit.apply, static_argnums=0)(
+        old, params, video, conditioning.given.tokens_BLC, times
+    )
     want = want[:, -got.shape[1] :]
     assert np.abs(want).max() > 0.1
     assert np.abs(got - want).max() <= 1e-6 * np.abs(want).max()
@@ -259,10 +268,71 @@ def test_settings_of_the_world_model_can_be_given(images, tmp_path):
     dst = tmp_path / "dst"
     run("import", "cogvideox", images, dst, *WORLD, "--config", settings, "--dtype", "bfloat16")
     config, params = pewm_jax.load(dst)
-    assert (config.memory.tokens, config.clip.height) == (32, 32)
-    assert config.train.dtype == "bfloat16"
+    assert (config.model.memory.tokens, config.model.clip.height) == (32, 32)
+    assert config.model.memory.reader.heads == 4
+    assert config.model.dtype == "bfloat16"
     assert {leaf.dtype.name for leaf in jax.tree.leaves(params)} == {"bfloat16"}
-    assert config.diffusion.target == "v"
+    assert config.model.noise.target == "v"
+
+
+def without(settings, *names):
+    """Settings as a table, less what the checkpoint decides."""
+    return {k: v for k, v in configuration.to_dict(settings).items() if k not in names}
+
+
+@pytest.mark.parametrize(("variant", "billions"), [("2b", 0.94), ("5b", 2.84)])
+def test_an_imported_checkpoint_starts_from_the_preset_of_its_size(variant, billions):
+    """All but the features of the map, which come with --encoder."""
+    preset = presets.load(f"pewm_{variant}")
+    noise = preset.model.noise
+    backbone, codec = published(variant), preset.model.codec
+    made = world.config_of(backbone, codec, noise, (None, None, None), "bfloat16")
+    assert without(made.train, "run") == without(preset.train, "run")
+    assert (made.data, made.evaluate) == (preset.data, preset.evaluate)
+    assert without(made.model, "memory", "backbone") == without(preset.model, "memory", "backbone")
+    assert without(made.model.backbone, "prompt") == without(preset.model.backbone, "prompt")
+    assert without(made.model.memory, "encoder") == without(preset.model.memory, "encoder")
+    assert configuration.kinds.of(made.model.memory.encoder).name == "patch_colours"
+    encoder = preset.model.memory.encoder
+    made = world.config_of(backbone, codec, noise, (None,) * 3, "bfloat16", encoder=encoder)
+    assert made.model.memory == preset.model.memory
+    blocks = jax.eval_shape(lambda: readers.init(made.model, jax.random.key(0)))
+    count = sum(leaf.size for leaf in jax.tree.leaves(blocks))
+    assert abs(count / 1e9 - billions) < 0.01
+
+
+def test_an_imported_world_has_the_paper_s_training_and_small_blocks(widened):
+    config, params = pewm_jax.load(widened)
+    assert config.train.run == "runs/dst"
+    assert (config.train.stage1.learning_rate, config.train.stage1.steps) == (1e-4, 20_000)
+    assert config.model.backbone.remat
+    backbone, reader = config.model.backbone, config.model.memory.reader
+    assert (reader.heads, reader.head_dim) == (backbone.heads, backbone.head_dim)
+    assert set(params) == {"backbone", "memory", "codec", "text"}
+
+
+@pytest.mark.parametrize("learned", ["interpolate", "drop", "reference"])
+def test_learned_positions_are_for_other_clips_by_choice(images, tmp_path, learned, capsys):
+    small = ["--rgbd", "--camera", "--frames", "17"]
+    square = ["--height", "32", "--width", "32"]
+    wide = square if learned == "reference" else ["--height", "32", "--width", "48"]
+    dst = tmp_path / "dst"
+    argv = ["import", "cogvideox", images, dst, *small, *wide]
+    assert main([str(word) for word in argv]) == 2
+    assert "--positions" in capsys.readouterr().err
+    run(*argv, "--positions", learned)
+    config, params = pewm_jax.load(dst)
+    assert config.model.backbone.learned == learned
+    assert json.loads((dst / "config.json").read_text())["model"]["backbone"]["learned"] == learned
+    shape = (1, *config.model.latent_shape, config.model.in_channels)
+    backbone = dataclasses.replace(config.model.backbone, in_channels=shape[-1], out_channels=8)
+    text = jnp.zeros((1, *backbone.text_shape))
+    apply = jax.jit(dit.apply, static_argnums=0)
+    out = apply(backbone, params["backbone"], jnp.ones(shape), text, jnp.array([3]))
+    assert np.isfinite(out).all()
+    run("export", "diffusers", dst, tmp_path / "back")
+    back = CogVideoXTransformer3DModel.from_pretrained(tmp_path / "back/transformer")
+    require_equal(back, pipelines.dit("5b-I2V"))
 
 
 def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
@@ -279,7 +349,7 @@ def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
     like = {"w": jax.ShapeDtypeStruct((layers, *layer), np.float32)}
     for dtype, each in (("float32", 1 << 20), ("bfloat16", 1 << 19)):
         tracemalloc.start()
-        params = assemble.read(entries, files.open_folder(tmp_path), like, dtype)
+        params = assemble.read(entries, sources.open_folder(tmp_path), like, dtype)
         weights.save(tmp_path / "out" / "w.safetensors", params)
         specs = assemble.specs(entries, params)
         tensor_files.write(tmp_path / "back", specs, assemble.write(entries, params), {})

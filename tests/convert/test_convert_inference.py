@@ -9,17 +9,17 @@ import pytest
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import tree, weights
-from pewm_jax.config import ClipConfig, DiffusionConfig, UserError
+from pewm_jax import tree, weights, worlds
+from pewm_jax.config import ClipConfig, DDPMConfig, UserError
 from pewm_jax.convert import inference
 from pewm_jax.evaluation.page import MASK_NAMES, METHOD_NAMES, METRIC_NAMES
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.models import world_model
-from pewm_jax.training import runs, stages
+from pewm_jax.training import runs
 from tests.helpers import random_frames, tiny_config
 
 CONFIG = tiny_config(
-    clip=ClipConfig(frames=5, height=16, width=16), diffusion=DiffusionConfig(sample_steps=1)
+    clip=ClipConfig(frames=5, height=16, width=16), noise=DDPMConfig(sample_steps=1)
 )
 METRICS = {
     "protocol": {
@@ -42,7 +42,7 @@ METRICS = {
 
 @pytest.fixture(scope="module")
 def params():
-    like = jax.eval_shape(lambda key: world_model.init(CONFIG, key), jax.random.key(0))
+    like = jax.eval_shape(lambda key: world_model.init(CONFIG.model, key), jax.random.key(0))
     rng = np.random.default_rng(0)
     return jax.tree.map(lambda x: rng.normal(0, 0.2, x.shape).astype(np.float32), like)
 
@@ -52,7 +52,7 @@ def run(params, tmp_path):
     folder = tmp_path / "runs" / "mine"
     folder.mkdir(parents=True)
     configuration.save(CONFIG, folder / runs.CONFIG)
-    runs.publish(folder, stages.STAGES[1], 7, params)
+    runs.publish(folder, worlds.stages(CONFIG.model)[1], 7, params)
     return folder
 
 
@@ -74,8 +74,8 @@ def test_every_leaf_is_there_in_bfloat16_and_the_world_rolls_on(run, params, tmp
         np.testing.assert_array_equal(leaf, want[name].astype(jnp.bfloat16), name)
     half = (run / runs.WEIGHTS).stat().st_size * 0.55
     assert (tmp_path / "small" / runs.WEIGHTS).stat().st_size < half
-    words = weights.metadata(tmp_path / "small" / runs.WEIGHTS)
-    assert words == {"stage": "2", "step": "7", "dtype": "bfloat16"}
+    metadata = weights.metadata(tmp_path / "small" / runs.WEIGHTS)
+    assert metadata == {"stage": "2", "step": "7", "dtype": "bfloat16"}
     assert "| 2 | 7 |" in card
     assert "a memory of kind `voxel`" in card
 

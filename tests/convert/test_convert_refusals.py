@@ -231,6 +231,8 @@ def test_a_failure_in_the_middle_leaves_nothing(src, capsys):
         (["--rgbd", "--camera", "--frames", "13"], "8k + 1"),
         (["--rgbd", "--camera", "--height", "40"], "multiples of"),
         (["--rgbd", "--camera", "--prompt", "a", "b"], "a world model takes one"),
+        (["--positions", "drop"], "--positions is of a world model"),
+        (["--rgbd", "--camera", "--positions", "drop"], "this transformer has none"),
         (["--dtype", "float8"], "float8"),
         (["--memmory"], "did you mean --memory?"),
         (["--rgbd", "--camera", "--config", "absent.json"], "cannot be read"),

@@ -1,6 +1,6 @@
 import pytest
 
-from pewm_jax.config import DiffusionConfig, UserError
+from pewm_jax.config import DDPMConfig, UserError
 from pewm_jax.convert import scheduler
 
 PUBLISHED = {  # CogVideoX-2b's file
@@ -24,7 +24,7 @@ PUBLISHED = {  # CogVideoX-2b's file
 
 
 def test_the_published_settings_become_ours():
-    assert scheduler.config_from_diffusers(PUBLISHED) == DiffusionConfig(
+    assert scheduler.config_from_diffusers(PUBLISHED) == DDPMConfig(
         snr_shift=3.0, target="v", sample_steps=50, stride="fixed"
     )
 

@@ -12,19 +12,19 @@ import pytest
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import tree
-from pewm_jax.config import ClipConfig, DiffusionConfig, MemoryConfig, UserError
-from pewm_jax.convert import programs, stablehlo
+from pewm_jax import tree, worlds
+from pewm_jax.config import AttentionConfig, ClipConfig, DDPMConfig, UserError, VoxelConfig
+from pewm_jax.convert import stablehlo, stablehlo_programs
 from pewm_jax.models import world_model
-from pewm_jax.training import runs, stages
+from pewm_jax.training import runs
 from tests.helpers import random_frames, tiny_config
 
 CONFIG = tiny_config(
     clip=ClipConfig(frames=5, height=16, width=16),
-    memory=MemoryConfig(
-        cells=(16, 16, 8), capacity=128, tokens=8, encoder_patch=2, heads=4, head_dim=8
+    memory=VoxelConfig(
+        cells=(16, 16, 8), capacity=128, tokens=8, reader=AttentionConfig(heads=4, head_dim=8)
     ),
-    diffusion=DiffusionConfig(sample_steps=1, sampler="dpm"),
+    noise=DDPMConfig(sample_steps=1, sampler="dpm"),
 )
 ALONE = (
     "import runpy, sys; sys.modules.update(pewm_jax=None, flax=None); "
@@ -38,7 +38,7 @@ serialises = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def params():
-    like = jax.eval_shape(lambda key: world_model.init(CONFIG, key), jax.random.key(0))
+    like = jax.eval_shape(lambda key: world_model.init(CONFIG.model, key), jax.random.key(0))
     rng = np.random.default_rng(0)
     return jax.tree.map(lambda x: rng.normal(0, 0.2, x.shape).astype(np.float32), like)
 
@@ -48,7 +48,7 @@ def run(params, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "mine"
     folder.mkdir()
     configuration.save(CONFIG, folder / runs.CONFIG)
-    runs.publish(folder, stages.STAGES[1], 7, params)
+    runs.publish(folder, worlds.stages(CONFIG.model)[1], 7, params)
     return folder
 
 
@@ -72,7 +72,7 @@ def test_a_rollout_runs_without_the_library_and_equals_it(run, params, tmp_path)
     signature = json.loads((dst / "signature.json").read_text())
     for entry in signature["programs"].values():
         assert entry["platforms"] == ["cpu", "cuda", "tpu"]
-    assert signature["discrete_actions"]["forward"] == [CONFIG.actions.step_m, 0.0, 0.0]
+    assert signature["discrete_actions"]["forward"] == [CONFIG.model.actions.step_m, 0.0, 0.0]
 
     frames = random_frames(np.random.default_rng(0), 3, 16, 16)
     moves = np.random.default_rng(1).normal(0, 0.1, (8, 3)).astype(np.float32)
@@ -105,9 +105,9 @@ def test_a_denoise_step_is_checked_in_a_fresh_process(run, params, tmp_path):
     said = []
     stablehlo.export(run, tmp_path / "step", what="denoise", platforms=["cpu"], say=said.append)
     assert any("largest difference" in line for line in said)
-    program = programs.denoise_program(CONFIG, params)
+    program = stablehlo_programs.denoise_program(CONFIG, params)
     assert {"noisy_BthwC", "timesteps_B", "tokens/valid_M"} <= program.inputs.keys()
-    bare = programs.denoise_program(CONFIG, {"backbone": params["backbone"]})
+    bare = stablehlo_programs.denoise_program(CONFIG, {"backbone": params["backbone"]})
     assert not any(name.startswith("tokens") for name in bare.inputs)
 
     other = jax.tree.map(lambda x: x * 1.5, params)
@@ -141,10 +141,10 @@ def test_platforms_that_a_program_cannot_be_lowered_for_are_left_out():
         return {"y": jax.lax.platform_dependent(inputs["x"], cpu=jnp.sin)}
 
     shape = {"x": jax.ShapeDtypeStruct((2,), jnp.float32)}
-    program = programs.Program("", only_cpu, shape)
-    assert programs.lower(program, {}, ["cpu", "tpu"]).platforms == ("cpu",)
+    program = stablehlo_programs.Program("", only_cpu, shape)
+    assert stablehlo_programs.lower(program, {}, ["cpu", "tpu"]).platforms == ("cpu",)
     with pytest.raises(UserError, match="cannot be lowered for tpu"):
-        programs.lower(program, {}, ["tpu"])
+        stablehlo_programs.lower(program, {}, ["tpu"])
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from data_world import arrays, split, write_split
 
-from pewm_jax.config import ClipConfig, Config, DataConfig, UserError
+from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, UserError
 from pewm_jax.data import clips, loader
 from pewm_jax.data.checks import check_episode
 from pewm_jax.data.episodes import read_episode, write_episode
@@ -27,7 +27,7 @@ def episode(**options):
 
 def config(path="", **data):
     return Config(
-        clip=ClipConfig(frames=T, height=16, width=16),
+        model=ModelConfig(clip=ClipConfig(frames=T, height=16, width=16)),
         data=DataConfig(path=str(path), **{"context": 3, **data}),
     )
 

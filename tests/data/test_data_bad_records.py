@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from data_world import split
 
-from pewm_jax.config import ClipConfig, Config, DataConfig, UserError
+from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.data.dataset import (
@@ -27,7 +27,7 @@ SHARD = "shard-00000-of-00002.array_record"
 
 def config(root, **data):
     return Config(
-        clip=ClipConfig(frames=5, height=16, width=16),
+        model=ModelConfig(clip=ClipConfig(frames=5, height=16, width=16)),
         data=DataConfig(path=str(root), **{"stride_max": 3, "context": 6, **data}),
     )
 

@@ -92,7 +92,7 @@ def test_the_commands_of_the_format_description_fit_together(monkeypatch):
     assert all(ran.values())
     folders = [made.out for made in ran["collect"] + ran["import"]]
     assert len(set(folders)) == len(folders)  # an import is refused where a collection lies
-    assert {made.size for made in ran["collect"]} == {demo().clip.width}
+    assert {made.size for made in ran["collect"]} == {demo().model.clip.width}
 
 
 def test_what_the_system_refuses_ends_in_one_sentence(capsys, tmp_path):

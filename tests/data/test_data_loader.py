@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 
 import jax
@@ -12,7 +11,15 @@ from data_world import split
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import ActionConfig, ClipConfig, Config, ConfigError, DataConfig, UserError
+from pewm_jax.config import (
+    ActionConfig,
+    ClipConfig,
+    Config,
+    ConfigError,
+    DataConfig,
+    ModelConfig,
+    UserError,
+)
 from pewm_jax.data import clips as clipping
 from pewm_jax.data import loader
 from pewm_jax.data.dataset import EpisodeSource
@@ -21,7 +28,7 @@ from pewm_jax.geometry.cameras import unproject
 
 def config(path="", **data):
     return Config(
-        clip=ClipConfig(frames=5, height=16, width=16),
+        model=ModelConfig(clip=ClipConfig(frames=5, height=16, width=16)),
         data=DataConfig(path=str(path), **{"stride_max": 3, "context": 6, **data}),
     )
 
@@ -156,8 +163,8 @@ def test_a_certain_clip_is_always_the_same(folder):
 
 def test_what_does_not_fit_is_refused_before_training(folder):
     with pytest.raises(UserError, match="16×16 pixels, the configuration wants 64×64"):
-        loader.clips(dataclasses.replace(config(folder), clip=ClipConfig()), seed=0, batch=2)
-    long = dataclasses.replace(config(folder), clip=ClipConfig(frames=25, height=16, width=16))
+        loader.clips(config(folder).with_model(clip=ClipConfig()), seed=0, batch=2)
+    long = config(folder).with_model(clip=ClipConfig(frames=25, height=16, width=16))
     with pytest.raises(UserError, match="has 24 frames, a clip of 25 frames at stride 1 needs 25"):
         loader.clips(long, seed=0, batch=2)
     with pytest.raises(UserError, match="does not exist"):
@@ -169,5 +176,5 @@ def test_actions_other_than_the_collected_ones_are_refused(tmp_path, name, made)
     split(tmp_path / "train", frames=24, info={"step_m": 0.25, "turn_deg": 30.0, name: made})
     with pytest.raises(ConfigError, match=rf"set --actions\.{name} {made:g}\.$"):
         loader.clips(config(tmp_path), seed=0, batch=2)
-    fits = dataclasses.replace(config(tmp_path), actions=ActionConfig(**{name: made}))
+    fits = config(tmp_path).with_model(actions=ActionConfig(**{name: made}))
     assert next(loader.clips(fits, seed=0, batch=2)).frames.rgb_THWC.shape[0] == 2

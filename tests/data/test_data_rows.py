@@ -7,7 +7,7 @@ from data_world import split
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import ClipConfig, Config, DataConfig
+from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig
 from pewm_jax.data import loader
 
 BATCH = 6
@@ -18,7 +18,9 @@ def config(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
     split(root / "train", episodes=4, frames=16)
     clip = ClipConfig(frames=5, height=16, width=16)
-    return Config(clip=clip, data=DataConfig(path=str(root), stride_max=3, context=3))
+    return Config(
+        model=ModelConfig(clip=clip), data=DataConfig(path=str(root), stride_max=3, context=3)
+    )
 
 
 @given(st.integers(0, BATCH - 1), st.integers(1, BATCH), st.integers(0, 9))

@@ -5,25 +5,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import ConfigError, DiffusionConfig
-from pewm_jax.diffusion import objective, sampler, schedule
+from pewm_jax.config import ConfigError, DDPMConfig, TrainConfig
+from pewm_jax.diffusion import sampler, schedule
 from pewm_jax.models import world_model
-from pewm_jax.types import Clip
-from tests.helpers import init_world, random_frames, randomise, tiny_config
+from pewm_jax.models.signals import as_signal
+from pewm_jax.types import Clip, Control
+from pewm_jax.worlds import objective, pewm
+from tests.helpers import TINY, init_world, random_frames, randomise, tiny_model
 
 
 def test_the_schedule_ends_in_pure_noise_and_falls():
-    alphas = schedule.alphas_cumprod(DiffusionConfig())
+    alphas = schedule.alphas_cumprod(DDPMConfig())
     assert alphas[-1] == 0
     assert np.all(np.diff(alphas) < 0)
     assert 0.99 < alphas[0] < 1
-    shifted = schedule.alphas_cumprod(DiffusionConfig(snr_shift=3.0))
+    shifted = schedule.alphas_cumprod(DDPMConfig(snr_shift=3.0))
     assert np.all(shifted[1:-1] < alphas[1:-1]), "a shift above 1 means more noise"
 
 
 @pytest.mark.parametrize("kind", ["x0", "v", "eps"])
 def test_every_target_leads_back_to_x0(kind):
-    config = DiffusionConfig(target=kind, zero_terminal_snr=kind != "eps")
+    config = DDPMConfig(target=kind, zero_terminal_snr=kind != "eps")
     rng = np.random.default_rng(0)
     x0, noise = rng.normal(size=(2, 5, 3)).astype(np.float32)
     times = jnp.array([0, 3, 500, 900, 999])
@@ -33,7 +35,7 @@ def test_every_target_leads_back_to_x0(kind):
 
 
 def test_weighted_x0_error_equals_v_error():
-    config = DiffusionConfig(max_weight=1e9)
+    config = DDPMConfig(max_weight=1e9)
     rng = np.random.default_rng(0)
     x0, noise, guess = rng.normal(size=(3, 4, 6)).astype(np.float32)
     times = jnp.array([100, 400, 700, 999])
@@ -48,12 +50,12 @@ def test_weighted_x0_error_equals_v_error():
 
 def test_epsilon_with_zero_terminal_snr_is_refused():
     with pytest.raises(ConfigError, match="use v or x0"):
-        DiffusionConfig(target="eps")
+        DDPMConfig(target="eps")
 
 
 @pytest.mark.parametrize("steps", [1, 7, 50])
 def test_ddim_with_a_perfect_denoiser_finds_the_truth(steps):
-    config = DiffusionConfig(sample_steps=steps)
+    config = DDPMConfig(sample_steps=steps)
     x0 = np.random.default_rng(0).normal(size=(2, 3)).astype(np.float32)
     noise = jax.random.normal(jax.random.key(0), (2, 3))
     out = jax.jit(lambda n: sampler.ddim(config, lambda _x, _t: jnp.asarray(x0), n))(noise)
@@ -62,7 +64,7 @@ def test_ddim_with_a_perfect_denoiser_finds_the_truth(steps):
 
 def test_ddim_keeps_the_noise_of_its_path():
     """With the exact x0 known, every intermediate x_t is add_noise(x0, the same noise)."""
-    config = DiffusionConfig(sample_steps=10)
+    config = DDPMConfig(sample_steps=10)
     x0 = jnp.full((1, 4), 0.5)
     noise = jax.random.normal(jax.random.key(1), (1, 4))
     seen = []
@@ -79,24 +81,24 @@ def test_ddim_keeps_the_noise_of_its_path():
 
 
 def test_steps_trail():
-    steps = schedule.timesteps(DiffusionConfig(sample_steps=10))
+    steps = schedule.timesteps(DDPMConfig(sample_steps=10))
     np.testing.assert_array_equal(steps, np.arange(999, 0, -100))
 
 
 def test_every_number_of_steps_is_exactly_that_many_and_starts_at_pure_noise():
     for count in range(1, 1001):
-        steps = schedule.timesteps(DiffusionConfig(sample_steps=count))
+        steps = schedule.timesteps(DDPMConfig(sample_steps=count))
         assert len(steps) == count
         assert steps[0] == 999
         assert steps[-1] >= 0
         assert np.all(np.diff(steps) < 0), count
 
 
-def make_clip(config, seed=0, batch=2, context=3):
+def make_clip(seed=0, batch=2, context=3):
     rng = np.random.default_rng(seed)
     clips = [
         Clip(
-            random_frames(rng, config.clip.frames),
+            random_frames(rng, TINY.clip.frames),
             random_frames(rng, context),
             np.arange(context) > 0,
         )
@@ -105,71 +107,70 @@ def make_clip(config, seed=0, batch=2, context=3):
     return jax.tree.map(lambda *x: np.stack(x), *clips)
 
 
+sample = jax.jit(pewm.sample, static_argnums=0)
+
+
+def conditioning_of(model, params, clip):
+    """What the clips' first frames and cameras say."""
+    frames = jax.tree.map(jnp.asarray, as_signal(clip.frames))
+    observed = jax.tree.map(lambda x: x[:, :1], frames)
+    return world_model.condition(model, params, observed, Control(frames.camera))
+
+
 @pytest.mark.parametrize("kind", ["x0", "v"])
 def test_the_loss_is_finite_and_stage_1_ignores_the_memory(kind):
-    config = tiny_config(diffusion=DiffusionConfig(target=kind))
-    clip, key = make_clip(config), jax.random.key(0)
-    params = randomise(init_world(config, key))
+    model, train = tiny_model(noise=DDPMConfig(target=kind)), TrainConfig()
+    clip, key = make_clip(), jax.random.key(0)
+    params = randomise(init_world(model, key))
     other = dataclasses.replace(clip, context=jax.tree.map(np.zeros_like, clip.context))
-    loss = jax.jit(objective.loss, static_argnums=0, static_argnames="memory")
-    stage1 = [float(loss(config, params, c, key, memory=False)[0]) for c in (clip, other)]
-    stage2 = [float(loss(config, params, c, key, memory=True)[0]) for c in (clip, other)]
+    loss = jax.jit(objective.loss, static_argnums=(0, 1), static_argnames="memory")
+    stage1 = [float(loss(model, train, params, c, key, memory=False)[0]) for c in (clip, other)]
+    stage2 = [float(loss(model, train, params, c, key, memory=True)[0]) for c in (clip, other)]
     assert np.isfinite(stage1 + stage2).all()
     assert stage1[0] == stage1[1]
     assert stage2[0] != stage2[1]
 
 
 def test_pixels_without_depth_do_not_train_depth():
-    config = tiny_config()
-    clip, key = make_clip(config), jax.random.key(0)
-    params = randomise(init_world(config, key, memory=False))
+    clip, key = make_clip(), jax.random.key(0)
+    params = randomise(init_world(TINY, key, memory=False))
+    loss = jax.jit(objective.without_memory, static_argnums=(0, 1))
     blank = dataclasses.replace(
         clip, frames=dataclasses.replace(clip.frames, depth_THW=clip.frames.depth_THW * 0)
     )
-    _, parts = objective.loss(config, params, blank, key, memory=False)
+    _, parts = loss(TINY, TrainConfig(), params, blank, key)
     assert float(parts["loss_depth"]) == 0
-    _, parts = objective.loss(config, params, clip, key, memory=False)
+    _, parts = loss(TINY, TrainConfig(), params, clip, key)
     assert float(parts["loss_depth"]) > 0
 
 
 def test_invalid_context_frames_are_not_remembered():
-    config = tiny_config()
-    clip = make_clip(config)
-    tokens = objective.clip_tokens(config, {}, clip)
+    clip = make_clip()
+    tokens = objective.clip_tokens(TINY, {}, clip)
     changed = np.array(clip.context.rgb_THWC)
     changed[:, 0] = 255 - changed[:, 0]
     context = dataclasses.replace(clip.context, rgb_THWC=changed)
-    again = objective.clip_tokens(config, {}, dataclasses.replace(clip, context=context))
+    again = objective.clip_tokens(TINY, {}, dataclasses.replace(clip, context=context))
     np.testing.assert_array_equal(tokens.features_MF, again.features_MF)
     assert tokens.valid_M.any()
 
 
 def test_guidance_interpolates_between_with_and_without_map():
-    config = tiny_config()
-    clip, key = make_clip(config), jax.random.key(0)
-    params = randomise(init_world(config, key))
-    frames = objective.as_signal(clip.frames)
-    conditioning = world_model.condition(
-        config,
-        params,
-        frames.rgb_THWC[:, 0],
-        frames.depth_THW[:, 0],
-        jax.tree.map(jnp.asarray, frames.camera),
-    )
-    tokens = objective.clip_tokens(config, params, clip)
+    clip, key = make_clip(), jax.random.key(0)
+    params = randomise(init_world(TINY, key))
+    conditioning = conditioning_of(TINY, params, clip)
+    tokens = objective.clip_tokens(TINY, params, clip)
     noise = jax.random.normal(key, (2, 3, 4, 6, 256))
 
     def run(guidance, tokens, **more):
-        diffusion = dataclasses.replace(config.diffusion, guidance=guidance, sample_steps=1, **more)
-        return sampler.sample(
-            dataclasses.replace(config, diffusion=diffusion), params, conditioning, tokens, noise
-        )
+        settings = dataclasses.replace(TINY.noise, guidance=guidance, sample_steps=1, **more)
+        return sample(tiny_model(noise=settings), params, conditioning, tokens, noise)
 
     with_map, without = run(1.0, tokens), run(1.0, None)
     np.testing.assert_allclose(run(0.0, tokens), without, atol=1e-5)
     np.testing.assert_allclose(run(3.0, tokens), without + 3 * (with_map - without), atol=1e-3)
     assert np.abs(with_map - without).max() > 1e-4
-    settings = DiffusionConfig(sample_steps=1, guidance=3.0, dynamic_guidance=True)
+    settings = DDPMConfig(sample_steps=1, guidance=3.0, dynamic_guidance=True)
     (weight,) = schedule.guidance(settings)
     assert 1 <= weight <= 4
     swung = run(3.0, tokens, dynamic_guidance=True)
@@ -180,7 +181,7 @@ def test_guidance_interpolates_between_with_and_without_map():
 @pytest.mark.parametrize("target", ["x0", "v", "eps"])
 def test_the_sampler_finds_the_mean_of_a_gaussian_whatever_the_network_predicts(kind, target):
     """For data N(m, s²) the best prediction is known: both samplers end in that distribution."""
-    config = DiffusionConfig(
+    config = DDPMConfig(
         target=target, sampler=kind, sample_steps=200, zero_terminal_snr=target != "eps"
     )
     mean, spread = 0.7, 0.2
@@ -204,7 +205,7 @@ def test_the_sampler_finds_the_mean_of_a_gaussian_whatever_the_network_predicts(
 
 
 def test_dpm_draws_its_noise_from_the_key_or_takes_it():
-    config = DiffusionConfig(sample_steps=4)
+    config = DDPMConfig(sample_steps=4)
     start, key = jax.random.normal(jax.random.key(0), (2, 3)), jax.random.key(1)
     steps = jnp.stack([jax.random.normal(jax.random.fold_in(key, k), (2, 3)) for k in range(4)])
 
@@ -223,10 +224,10 @@ def test_dpm_draws_its_noise_from_the_key_or_takes_it():
 @pytest.mark.parametrize("more", [{}, {"key": jax.random.key(0), "step_noise": np.zeros((4, 2))}])
 def test_dpm_needs_a_key_or_noise(more):
     with pytest.raises(ValueError, match="give it a key"):
-        sampler.dpm(DiffusionConfig(sample_steps=4), lambda x, _t: x, jnp.zeros((2,)), **more)
+        sampler.dpm(DDPMConfig(sample_steps=4), lambda x, _t: x, jnp.zeros((2,)), **more)
     with pytest.raises(ValueError, match=r"it needs \(4, 2\)"):
         sampler.dpm(
-            DiffusionConfig(sample_steps=4),
+            DDPMConfig(sample_steps=4),
             lambda x, _t: x,
             jnp.zeros((2,)),
             step_noise=np.zeros((3, 2)),
@@ -234,7 +235,7 @@ def test_dpm_needs_a_key_or_noise(more):
 
 
 def test_the_sample_has_the_precision_of_the_noise():
-    config, start = DiffusionConfig(sample_steps=4), jnp.ones((1, 2), jnp.bfloat16)
+    config, start = DDPMConfig(sample_steps=4), jnp.ones((1, 2), jnp.bfloat16)
     for out in (
         sampler.ddim(config, lambda x, _t: jnp.tanh(x), start),
         sampler.dpm(config, lambda x, _t: jnp.tanh(x), start, jax.random.key(0)),
@@ -244,7 +245,7 @@ def test_the_sample_has_the_precision_of_the_noise():
 
 def test_a_fixed_stride_differs_only_where_the_steps_do_not_divide():
     def path(steps, stride):
-        config = DiffusionConfig(sample_steps=steps, stride=stride)
+        config = DDPMConfig(sample_steps=steps, stride=stride)
         return sampler.ddim(config, lambda x, _t: jnp.tanh(x), jnp.ones((1, 2)))
 
     np.testing.assert_array_equal(path(10, "next"), path(10, "fixed"))
@@ -252,20 +253,14 @@ def test_a_fixed_stride_differs_only_where_the_steps_do_not_divide():
 
 
 def test_the_world_model_samples_by_dpm_with_its_own_noise():
-    config = tiny_config(diffusion=DiffusionConfig(sampler="dpm", sample_steps=2))
-    clip, key = make_clip(config, batch=1), jax.random.key(0)
-    params = randomise(init_world(config, key, memory=False))
-    frames = objective.as_signal(clip.frames)
-    camera = jax.tree.map(jnp.asarray, frames.camera)
-    first = (frames.rgb_THWC[:, 0], frames.depth_THW[:, 0])
-    conditioning = world_model.condition(config, params, *first, camera)
+    model = tiny_model(noise=DDPMConfig(sampler="dpm", sample_steps=2))
+    clip, key = make_clip(batch=1), jax.random.key(0)
+    params = randomise(init_world(model, key, memory=False))
+    conditioning = conditioning_of(model, params, clip)
     noise = jax.random.normal(key, (1, 3, 4, 6, 256))
-    draw = [
-        sampler.sample(config, params, conditioning, None, noise, jax.random.key(k))
-        for k in (0, 0, 1)
-    ]
+    draw = [sample(model, params, conditioning, None, noise, jax.random.key(k)) for k in (0, 0, 1)]
     np.testing.assert_array_equal(draw[0], draw[1])
     assert np.isfinite(draw[0]).all()
     assert np.abs(draw[0] - draw[2]).max() > 1e-3
     with pytest.raises(ValueError, match="give it a key"):
-        sampler.sample(config, params, conditioning, None, noise)
+        sample(model, params, conditioning, None, noise)

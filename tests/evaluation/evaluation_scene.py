@@ -7,14 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import (
+    ActionConfig,
+    AttentionConfig,
     ClipConfig,
     Config,
     DataConfig,
-    DiffusionConfig,
+    DDPMConfig,
     DiTConfig,
     EvalConfig,
-    MemoryConfig,
+    ModelConfig,
     TrainConfig,
+    VoxelConfig,
 )
 from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
@@ -29,17 +32,20 @@ def tiny(tmp, **evaluate):
     """A configuration small enough to sample in a second."""
     settings = {"clips": 4, "seeds": (0, 1), "videos": 1, "video_clips": 2, "batch": 2}
     return Config(
-        clip=ClipConfig(frames=5, height=SIZE, width=SIZE),
-        dit=DiTConfig(layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16),
-        memory=MemoryConfig(
-            cell_m=(0.25, 0.25, 0.25),
-            cells=(32, 32, 8),
-            capacity=256,
-            tokens=16,
-            heads=4,
-            head_dim=8,
+        model=ModelConfig(
+            clip=ClipConfig(frames=5, height=SIZE, width=SIZE),
+            backbone=DiTConfig(
+                layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16
+            ),
+            memory=VoxelConfig(
+                cell_m=(0.25, 0.25, 0.25),
+                cells=(32, 32, 8),
+                capacity=256,
+                tokens=16,
+                reader=AttentionConfig(heads=4, head_dim=8),
+            ),
+            noise=DDPMConfig(sample_steps=2),
         ),
-        diffusion=DiffusionConfig(sample_steps=2),
         data=DataConfig(path=str(tmp / "data"), context=6),
         train=TrainConfig(run=str(tmp / "run")),
         evaluate=EvalConfig(**{**settings, **evaluate}),
@@ -70,7 +76,7 @@ def record(index, length=24, size=SIZE, scene=None, nod=0.0):
     """One episode of the room; from frame 14 on the camera is pitched by ``nod`` radians."""
     ids = walk(length, index)
     pose = pose_from_yaw(np.array([-0.5, 0.1 * index, 1.25]), 0.4 * index)
-    moves = discrete_table(Config().actions)[ids]
+    moves = discrete_table(ActionConfig())[ids]
     poses = np.asarray(integrate(pose, moves))
     if nod:
         cos, sin = np.cos(nod), np.sin(nod)
@@ -108,9 +114,9 @@ def knowing_rollout(config, params, state, actions, key, *, memory=True, late=0)
     intrinsics = state.frame.camera.intrinsics_4[0]
     poses = integrate(pose, actions)
     shown = poses[1 - late : poses.shape[0] - late]
-    colour, depth = jax.vmap(lambda p: look(p, intrinsics, params["offset"], config.clip.height))(
-        shown
-    )
+    colour, depth = jax.vmap(
+        lambda p: look(p, intrinsics, params["offset"], config.model.clip.height)
+    )(shown)
     noise = jax.random.uniform(key, colour.shape)
     rgb = 2 * (colour if memory else noise) - 1
     camera = Camera(jnp.broadcast_to(intrinsics, (len(poses) - 1, 4)), poses[1:])

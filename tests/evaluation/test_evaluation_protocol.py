@@ -47,7 +47,7 @@ def test_context_is_the_past_and_ends_in_the_present(start, count):
 @given(clips=st.integers(1, 20), chain=st.integers(1, 2), stride=st.integers(1, 2))
 def test_choices_are_distinct_and_on_the_way_back(episodes, tmp_path_factory, clips, chain, stride):
     config = tiny(tmp_path_factory.getbasetemp(), stride=stride)
-    length = chain * (config.clip.frames - 1) * stride
+    length = chain * (config.model.clip.frames - 1) * stride
     if length > 23:
         return
     choices = choose(config, episodes, clips, chain)
@@ -119,9 +119,7 @@ def test_fingerprint_names_what_the_numbers_depend_on(tmp_path):
     more_seeds = dataclasses.replace(
         config, evaluate=dataclasses.replace(config.evaluate, seeds=(0, 1, 2, 3))
     )
-    steps = dataclasses.replace(
-        config, diffusion=dataclasses.replace(config.diffusion, sample_steps=3)
-    )
+    steps = config.with_model(noise=dataclasses.replace(config.model.noise, sample_steps=3))
     context = dataclasses.replace(config, data=dataclasses.replace(config.data, context=5))
     assert fingerprint(more_seeds, "w", "d") == base
     others = [

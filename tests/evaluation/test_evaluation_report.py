@@ -28,6 +28,7 @@ from pewm_jax.evaluation.imagine import Imagination
 from pewm_jax.evaluation.page import introduction, number, verdict
 from pewm_jax.models import world_model
 from pewm_jax.types import Frames
+from pewm_jax.worlds.pewm import STAGES
 
 ROOT = Path(__file__).parents[2]
 
@@ -71,7 +72,9 @@ def run(tmp_path_factory, compile_once):
     folder = base / "run"
     folder.mkdir()
     configs.save(config, folder / "config.json")
-    params = jax.jit(lambda key: world_model.init(config, key, memory=True))(jax.random.key(0))
+    params = jax.jit(lambda key: world_model.init(config.model, key, memory=True))(
+        jax.random.key(0)
+    )
     weights.save(folder / "weights.safetensors", params)
     report.evaluate(folder, say=lambda _: None)
     return folder
@@ -234,7 +237,7 @@ def test_weights_that_do_not_fit_are_refused(copied, command, capsys):
     assert "weights.safetensors" in refused(command, [str(copied)], capsys)
     weights.save(path, whole)
     settings = json.loads((copied / "config.json").read_text())
-    settings["dit"]["layers"] = 3
+    settings["model"]["backbone"]["layers"] = 3
     (copied / "config.json").write_text(json.dumps(settings))
     assert "weights.safetensors" in refused(command, [str(copied)], capsys)
 
@@ -265,7 +268,7 @@ def test_weights_that_diverged_are_refused(copied):
         report.evaluate(copied, say=lambda _: None)
 
 
-@pytest.mark.parametrize(("stage", "rows"), [(1, 2), (2, 3)])
+@pytest.mark.parametrize(("stage", "rows"), [(STAGES[0], 2), (STAGES[1], 3)])
 def test_previews_show_each_method(run, tmp_path, stage, rows, monkeypatch):
     monkeypatch.setattr(preview, "CLIPS", 2)  # the batch that was compiled for the report
     config = configs.load(run / "config.json")
@@ -275,12 +278,12 @@ def test_previews_show_each_method(run, tmp_path, stage, rows, monkeypatch):
         Imagination, "prepare", lambda self, m: (compiled.append(self), prepare(self, m))[1]
     )
     params = weights.load(run / "weights.safetensors")
-    if stage == 1:
+    if not stage.memory:
         params = {"backbone": params["backbone"]}
     draw = preview.make_preview(config, tmp_path)
     made = draw(params, stage, 250)
     folder = tmp_path / "previews"
-    path, video = folder / f"stage{stage}-000250.png", folder / f"stage{stage}-000250.mp4"
+    path, video = folder / f"{stage.name}-000250.png", folder / f"{stage.name}-000250.mp4"
     assert made.files == (path, video)
     with Image.open(path) as picture:
         height = picture.height
@@ -294,10 +297,10 @@ def test_previews_show_each_method(run, tmp_path, stage, rows, monkeypatch):
         (stream,) = container.streams.video
         assert stream.codec_context.name == "h264"
         frames = sum(1 for _ in container.decode(stream))
-        assert frames == 2 * config.clip.frames
+        assert frames == 2 * config.model.clip.frames
         assert stream.width == 8 + rows * (192 + 8)
-    names = {1: {"model"}, 2: {"memory", "empty"}}
-    assert set(made.psnr) == names[stage]
+    names = {"stage1": {"model"}, "stage2": {"memory", "empty"}}
+    assert set(made.psnr) == names[stage.name]
     assert all(0 < value < 60 for value in made.psnr.values())
 
 
@@ -315,7 +318,7 @@ def test_previews_measure_what_is_shown(run, tmp_path, monkeypatch):
         return None, None, Frames(rgb, np.stack([f.depth_THW for f in frames]), None)
 
     monkeypatch.setattr(Imagination, "run", imagined)
-    made = preview.make_preview(config, tmp_path)({}, 2, 3)
+    made = preview.make_preview(config, tmp_path)({}, STAGES[1], 3)
     truth = np.stack([clip[1].rgb_THWC for clip in true]).astype(float)
     wrong = np.where(truth > 99, truth - 16, 99)
     errors = ((truth - wrong) ** 2).mean((2, 3, 4)) / 255**2

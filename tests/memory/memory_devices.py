@@ -15,11 +15,11 @@ import jax
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import VoxelConfig
 from pewm_jax.memory import voxel_map
 from tests.helpers import random_frames
 
-CONFIG = MemoryConfig(cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8), capacity=300, tokens=8)
+CONFIG = VoxelConfig(cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8), capacity=300, tokens=8)
 BATCH = 8
 
 

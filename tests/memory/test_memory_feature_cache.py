@@ -7,16 +7,21 @@ import numpy as np
 import pytest
 
 from pewm_jax import weights
-from pewm_jax.config import DINOv2Config, MemoryConfig, UserError, save
+from pewm_jax.config import (
+    DINOv2Config,
+    DINOv2EncoderConfig,
+    PatchColoursConfig,
+    UserError,
+    save,
+)
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.memory import __main__ as command
 from pewm_jax.memory import feature_build, feature_cache
-from pewm_jax.memory import features as image_features
-from pewm_jax.models import codec, dinov2
+from pewm_jax.models import dinov2, encoders, signals
 from tests.data import data_world
 
 NETWORK = DINOv2Config(layers=1, heads=1, width=8, pretrained_size=28)
-CONFIG = MemoryConfig(encoder="dinov2", dinov2=NETWORK, encoder_size=28)
+CONFIG = DINOv2EncoderConfig(size=28, network=NETWORK)
 
 
 def quiet(_line):
@@ -43,9 +48,9 @@ def cache(params, data, tmp_path_factory):
 
 
 def test_what_is_read_is_what_the_encoder_makes(cache, params, data):
-    encode = jax.jit(image_features.encode, static_argnums=0)
+    encode = jax.jit(encoders.encode, static_argnums=0)
     for episode in EpisodeSource(data):
-        rgb = codec.signal_from_rgb(episode.frames().rgb_THWC)
+        rgb = signals.signal_from_rgb(episode.frames().rgb_THWC)
         want = np.asarray(encode(CONFIG, params, rgb))
         chosen = [5, 0, 5, 6]
         got = feature_cache.features(cache, episode, chosen)
@@ -99,14 +104,14 @@ def test_a_stale_cache_is_refused_and_says_why(cache, params, data, tmp_path):
     moved = {**params, "cls_token": params["cls_token"] + 1e-3}
     with pytest.raises(UserError, match="stale: it was made with other encoder weights"):
         feature_cache.open_cache(path, CONFIG, moved, data)
-    larger = dataclasses.replace(CONFIG, encoder_size=42)
+    larger = dataclasses.replace(CONFIG, size=42)
     with pytest.raises(UserError, match=r"other preprocessing \({'size': 28}, now {'size': 42}\)"):
         feature_cache.open_cache(path, larger, params, data)
     with pytest.raises(UserError, match="another encoder"):
-        feature_cache.open_cache(path, MemoryConfig(), {}, data)
+        feature_cache.open_cache(path, PatchColoursConfig(), {}, data)
     other = dataclasses.replace(NETWORK, antialias=True)
     with pytest.raises(UserError, match=r"another network \({'antialias': False}, now {'antialia"):
-        feature_cache.open_cache(path, dataclasses.replace(CONFIG, dinov2=other), params, data)
+        feature_cache.open_cache(path, dataclasses.replace(CONFIG, network=other), params, data)
     elsewhere = data_world.split(tmp_path / "train", episodes=3, frames=8)
     with pytest.raises(UserError, match="made with other data"):
         feature_cache.open_cache(path, CONFIG, params, elsewhere)
@@ -167,7 +172,7 @@ def test_the_command_fills_every_split_with_either_encoder(cache, params, data, 
     made = feature_cache.open_cache(tmp_path / "c" / "train", CONFIG, params, data)
     assert made.files == cache.files
     assert command.main(["cache", str(data), str(tmp_path / "colours"), "--patch", "4"]) == 0
-    colours = MemoryConfig(encoder_patch=4)
+    colours = PatchColoursConfig(patch=4)
     made = feature_cache.open_cache(tmp_path / "colours", colours, {}, data)
     assert feature_cache.features(made, "episode-2", [3]).shape == (1, 4, 4, 6)
 

@@ -7,12 +7,13 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import VoxelConfig
 from pewm_jax.data.__main__ import main
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry import cameras
-from pewm_jax.memory import cells, features, voxel_map
-from pewm_jax.models.codec import signal_from_rgb
+from pewm_jax.memory import cells, voxel_map
+from pewm_jax.models import encoders
+from pewm_jax.models.signals import signal_from_rgb
 from pewm_jax.types import Camera, Frames
 
 RECORDING = Path(__file__).parents[3] / "shared" / "data" / "icl_livingroom"
@@ -32,18 +33,17 @@ def episode(tmp_path_factory):
 
 
 def build(episode, cell):
-    config = MemoryConfig(
+    config = VoxelConfig(
         cell_m=(cell,) * 3,
         cells=(int(12 / cell), int(12 / cell), int(6 / cell)),
         capacity=60_000,
         tokens=16,
-        encoder_patch=2,
     )
     seen = episode.frames(range(21))
     frames = Frames(signal_from_rgb(seen.rgb_THWC), seen.depth_THW, seen.camera)
     centre = np.asarray(seen.camera.world_from_camera)[0, :3, 3]
     insert = jax.jit(voxel_map.insert_frames, static_argnums=0)
-    patches = features.encode(config, {}, frames.rgb_THWC)
+    patches = encoders.encode(config.encoder, {}, frames.rgb_THWC)
     voxels = insert(config, voxel_map.empty(config, centre, 6), frames, patches)
     assert int(voxels.dropped) == 0
     assert int(voxels.outside) == 0
@@ -72,7 +72,7 @@ def agreement(episode, cell, bin_px, shift=0.0):
     pose[:3, 3] += shift * pose[:3, 0]
     camera = Camera(later.camera.intrinsics_4[0], pose)
     uv, z = (np.asarray(x) for x in cameras.project(points[valid], camera))
-    colours = np.asarray(features.colours(values[valid]))
+    colours = np.asarray(encoders.colours(config.encoder, values[valid]))
     mapped, mapped_colour = nearest_in_bins(uv, z, colours, later.depth_THW.shape[1:], bin_px)
     grid = cameras.pixel_grid(*later.depth_THW.shape[1:]).reshape(-1, 2)
     rgb = np.asarray(signal_from_rgb(later.rgb_THWC[0])).reshape(-1, 3)

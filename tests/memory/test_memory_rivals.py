@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import itertools
 import math
-import typing
 
 import jax
 import jax.numpy as jnp
@@ -13,22 +12,42 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import ConfigError, MemoryConfig
+from pewm_jax.config import (
+    ConfigError,
+    ImagesConfig,
+    Map2DConfig,
+    NoMemoryConfig,
+    PointsConfig,
+    VoxelConfig,
+    kinds,
+)
 from pewm_jax.geometry import cameras
-from pewm_jax.memory import cells, features, images, map2d, memories, points, voxel_map
-from pewm_jax.models import world_model
+from pewm_jax.memory import cells, images, map2d, memories, points, voxel_map
+from pewm_jax.models import encoders, world_model
 from pewm_jax.types import Camera, Frames
-from tests.helpers import random_camera, random_frames, tiny_config
+from tests.helpers import TINY, random_camera, random_frames, tiny_model, with_reader
 
-KINDS = typing.get_args(typing.get_type_hints(MemoryConfig)["kind"])
+KINDS = {
+    "voxel": VoxelConfig,
+    "images": ImagesConfig,
+    "map2d": Map2DConfig,
+    "points": PointsConfig,
+    "none": NoMemoryConfig,
+}
 SEEDS = st.integers(0, 100_000)
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
 
 
-def config_of(kind, **changes):
-    config = tiny_config()
-    settings = {"kind": kind, "snapshots": 3, "looks": 8} | changes
-    return dataclasses.replace(config, memory=dataclasses.replace(config.memory, **settings))
+def test_every_kind_of_memory_is_tested():
+    assert set(kinds.names("memory")) == set(KINDS)
+
+
+def model_of(kind, positions="projective", **changes):
+    """The tiny model with another memory."""
+    model = with_reader(TINY, looks=8, positions=positions)
+    settings = {f.name: getattr(model.memory, f.name) for f in dataclasses.fields(model.memory)}
+    settings |= {"snapshots": 3} if kind == "images" else {}
+    return tiny_model(memory=KINDS[kind](**settings | changes))
 
 
 def scene(seed=0, count=4):
@@ -38,16 +57,16 @@ def scene(seed=0, count=4):
 
 
 def encoded(frames):
-    return features.patch_colours(frames.rgb_THWC, 2)
+    return encoders.encode(TINY.memory.encoder, {}, frames.rgb_THWC)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def seen(config, frames, valid_T):
+def seen(model, frames, valid_T):
     """The memory of some frames and its tokens for cameras elsewhere."""
-    memory = memories.empty(config, frames.camera.world_from_camera[0, :3, 3])
-    memory = memories.remember(config, memory, frames, encoded(frames), valid_T)
+    memory = memories.empty(model, frames.camera.world_from_camera[0, :3, 3])
+    memory = memories.remember(model, memory, frames, encoded(frames), valid_T)
     camera = jax.tree.map(jnp.asarray, random_camera(np.random.default_rng(9), 5))
-    return memory, memories.tokens(config, memory, camera)
+    return memory, memories.tokens(model, memory, camera)
 
 
 ALL = np.ones(4, bool)
@@ -55,10 +74,10 @@ ALL = np.ones(4, bool)
 
 @EVERY_KIND
 def test_tokens_of_every_memory_have_the_same_shapes_and_blank_masked_ones(kind):
-    config = config_of(kind)
-    _, tokens = seen(config, scene(), ALL)
-    count = config.memory.tokens
-    assert tokens.features_MF.shape == (count, world_model.feature_channels(config))
+    model = model_of(kind)
+    _, tokens = seen(model, scene(), ALL)
+    count = model.memory.tokens
+    assert tokens.features_MF.shape == (count, model.memory.encoder.channels)
     assert tokens.points_world_M3.shape == (count, 3)
     assert tokens.valid_M.shape == (count,)
     assert tokens.valid_M.dtype == bool
@@ -72,7 +91,7 @@ def test_tokens_of_every_memory_have_the_same_shapes_and_blank_masked_ones(kind)
 @pytest.mark.parametrize("positions", ["projective", "sinusoid"])
 def test_every_memory_costs_the_same_parameters(kind, positions):
     def shapes(kind):
-        make = functools.partial(world_model.init, config_of(kind, positions=positions))
+        make = functools.partial(world_model.init, model_of(kind, positions=positions))
         return jax.tree.map(lambda x: x.shape, jax.eval_shape(make, jax.random.key(0)))
 
     assert shapes(kind) == shapes("voxel")
@@ -80,28 +99,26 @@ def test_every_memory_costs_the_same_parameters(kind, positions):
 
 @EVERY_KIND
 def test_nothing_is_remembered_of_invalid_frames_and_of_pixels_without_depth(kind):
-    config, frames = config_of(kind), scene()
+    model, frames = model_of(kind), scene()
     blank = dataclasses.replace(frames, depth_THW=jnp.zeros_like(frames.depth_THW))
     for given_frames, valid in ((frames, ~ALL), (blank, ALL)):
-        _, tokens = seen(config, given_frames, valid)
+        _, tokens = seen(model, given_frames, valid)
         assert not tokens.valid_M.any()
     some = np.array([True, False, True, False])
     other = jax.tree.map(
         lambda x: jnp.where(some.reshape(-1, *[1] * (x.ndim - 1)), x, x * 0.7), frames
     )
-    for a, b in zip(
-        *(jax.tree.leaves(seen(config, f, some)) for f in (frames, other)), strict=True
-    ):
+    for a, b in zip(*(jax.tree.leaves(seen(model, f, some)) for f in (frames, other)), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 @EVERY_KIND
 def test_a_memory_keeps_its_structure_so_that_a_rollout_can_carry_it(kind):
-    config, frames = config_of(kind), scene()
-    before = jax.eval_shape(lambda: memories.empty(config, jnp.zeros(3)))
+    model, frames = model_of(kind), scene()
+    before = jax.eval_shape(lambda: memories.empty(model, jnp.zeros(3)))
     after = jax.eval_shape(
         lambda: memories.remember(
-            config, memories.empty(config, jnp.zeros(3)), frames, encoded(frames)
+            model, memories.empty(model, jnp.zeros(3)), frames, encoded(frames)
         )
     )
     assert jax.tree.structure(before) == jax.tree.structure(after)
@@ -110,22 +127,22 @@ def test_a_memory_keeps_its_structure_so_that_a_rollout_can_carry_it(kind):
 
 @EVERY_KIND
 def test_batched_memories_equal_single_ones(kind):
-    config = config_of(kind)
+    model = model_of(kind)
     worlds = [scene(seed) for seed in range(2)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
-    many = jax.jit(jax.vmap(lambda frames: seen(config, frames, ALL)[1]))(stacked)
+    many = jax.jit(jax.vmap(lambda frames: seen(model, frames, ALL)[1]))(stacked)
     for index, frames in enumerate(worlds):
-        alone = seen(config, frames, ALL)[1]
+        alone = seen(model, frames, ALL)[1]
         for a, b in zip(jax.tree.leaves(many), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[index], b, atol=1e-5)
 
 
 @EVERY_KIND
 def test_every_memory_can_be_drawn(kind):
-    config = config_of(kind)
-    memory, _ = seen(config, scene(), ALL)
-    places, values, valid = memories.to_points(config, memory)
-    shades = memories.colours(config, values)
+    model = model_of(kind)
+    memory, _ = seen(model, scene(), ALL)
+    places, values, valid = memories.to_points(model, memory)
+    shades = memories.colours(model, values)
     assert shades.shape == places.shape == (len(valid), 3)
     assert np.abs(np.asarray(shades)).max() <= 1 + 1e-6
     assert bool(valid.any()) == (kind != "none")
@@ -152,41 +169,41 @@ def test_greedy_cover_is_what_it_says(seed, count):
 
 
 def test_snapshots_stand_where_their_patches_show_and_repetition_adds_none():
-    config = config_of("images")
+    model = model_of("images")
     frames = scene(count=4)
-    _, tokens = seen(config, frames, ALL)
-    rows, columns = images.patch_grid(config)
-    assert rows * columns * 3 <= config.memory.tokens
+    _, tokens = seen(model, frames, ALL)
+    rows, columns = images.patch_grid(model)
+    assert rows * columns * 3 <= model.memory.tokens
     size = np.array([24 / columns, 16 / rows])
     uv, z = cameras.project(tokens.points_world_M3[None], frames.camera)
     patch = np.floor(np.asarray(uv) / size)
-    index = np.arange(config.memory.tokens) % (rows * columns)
+    index = np.arange(model.memory.tokens) % (rows * columns)
     home = np.stack([index % columns, index // columns], -1)
     at_home = ((patch == home).all(-1) & (np.asarray(z) > 0)).any(0)
     assert at_home[np.asarray(tokens.valid_M)].all()
     twice = jax.tree.map(lambda x: jnp.concatenate([x[:2], x[:2]]), frames)
-    kept, _ = seen(config, twice, ALL)
+    kept, _ = seen(model, twice, ALL)
     assert int(kept.valid_KP.any(1).sum()) <= 2
 
 
 def test_snapshots_chosen_over_time_stay_the_best_of_what_was_kept():
-    config, frames = config_of("images", snapshots=2), scene(count=4)
-    memory = memories.empty(config, frames.camera.world_from_camera[0, :3, 3])
+    model, frames = model_of("images", snapshots=2), scene(count=4)
+    memory = memories.empty(model, frames.camera.world_from_camera[0, :3, 3])
     more = jax.jit(memories.remember, static_argnums=0)
     covered = []
     for index in range(4):
         one = jax.tree.map(lambda x, i=index: x[i : i + 1], frames)
-        memory = more(config, memory, one, encoded(one))
+        memory = more(model, memory, one, encoded(one))
         covered.append(len(np.unique(memory.cell_KC)) - 1)
     assert covered == sorted(covered)
-    at_once, _ = seen(config, frames, ALL)
+    at_once, _ = seen(model, frames, ALL)
     assert covered[-1] >= (1 - 1 / math.e) * (len(np.unique(at_once.cell_KC)) - 1)
     assert int(memory.dropped) > 0
 
 
-def cloud_of(config, places, rgb, valid, cloud=None):
-    cloud = points.empty(config, np.zeros(3)) if cloud is None else cloud
-    return insert_points(config, cloud, places, rgb, valid)
+def cloud_of(model, places, rgb, valid, cloud=None):
+    cloud = points.empty(model, np.zeros(3)) if cloud is None else cloud
+    return insert_points(model.memory, cloud, places, rgb, valid)
 
 
 insert_points = jax.jit(points.insert, static_argnums=0)
@@ -203,7 +220,8 @@ def random_points(seed, count=40):
 @given(seed=SEEDS)
 @settings(max_examples=20, deadline=None)
 def test_a_point_is_the_mean_of_its_cell_however_the_points_come(seed):
-    config = MemoryConfig(cell_m=(1, 0.5, 2), cells=(4, 8, 2), capacity=64, tokens=4)
+    model = model_of("points", cell_m=(1, 0.5, 2), cells=(4, 8, 2), capacity=64, tokens=4)
+    config = model.memory
     places, rgb, valid = random_points(seed)
     origin = np.asarray(cells.origin(config, np.zeros(3)))
     expected, outside = {}, 0
@@ -215,10 +233,10 @@ def test_a_point_is_the_mean_of_its_cell_however_the_points_come(seed):
         if ok and inside:
             expected.setdefault(tuple(index), []).append(np.concatenate([place, colour]))
     order = np.random.default_rng(seed + 1).permutation(len(places))
-    half = cloud_of(config, places[order[:20]], rgb[order[:20]], valid[order[:20]])
-    both = cloud_of(config, places[order[20:]], rgb[order[20:]], valid[order[20:]], half)
-    for cloud in (cloud_of(config, places, rgb, valid), both):
-        where, values, there = (np.asarray(x) for x in points.to_points(cloud, 6))
+    half = cloud_of(model, places[order[:20]], rgb[order[:20]], valid[order[:20]])
+    both = cloud_of(model, places[order[20:]], rgb[order[20:]], valid[order[20:]], half)
+    for cloud in (cloud_of(model, places, rgb, valid), both):
+        where, values, there = (np.asarray(x) for x in points.to_points(model, cloud))
         assert int(cloud.outside) == outside
         assert int(cloud.occupied) == there.sum() == len(expected)
         found = {
@@ -233,27 +251,27 @@ def test_a_point_is_the_mean_of_its_cell_however_the_points_come(seed):
 
 
 def test_points_that_do_not_fit_are_counted_and_the_earlier_ones_stay():
-    config = MemoryConfig(cell_m=(1, 1, 1), cells=(8, 1, 1), capacity=3, tokens=3)
+    model = model_of("points", cell_m=(1, 1, 1), cells=(8, 1, 1), capacity=3, tokens=3)
     line = np.array([[x + 0.5, 0, 0] for x in range(-4, 4)], np.float32)
     rgb, valid = np.zeros((8, 3), np.float32), np.ones(8, bool)
-    cloud = cloud_of(config, line[4:6], rgb[4:6], valid[4:6])
-    cloud = cloud_of(config, line, rgb, valid, cloud)
+    cloud = cloud_of(model, line[4:6], rgb[4:6], valid[4:6])
+    cloud = cloud_of(model, line, rgb, valid, cloud)
     np.testing.assert_array_equal(cloud.cell_V, [0, 4, 5])
     assert (int(cloud.occupied), int(cloud.dropped)) == (3, 5)
     np.testing.assert_array_equal(cloud.sums_V7[:, 0], [1, 2, 2])
 
 
 def test_the_map_from_above_is_the_maximum_over_the_height():
-    config = config_of("map2d", cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8))
+    model = model_of("map2d", cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8))
     frames = scene()
-    above, tokens = seen(config, frames, ALL)
+    above, tokens = seen(model, frames, ALL)
     centre = np.asarray(frames.camera.world_from_camera[0, :3, 3])
-    flat = map2d.flattened(config.memory)
-    places, values, valid = (np.asarray(x) for x in memories.to_points(config, above))
+    flat = map2d.flattened(model.memory)
+    places, values, valid = (np.asarray(x) for x in memories.to_points(model, above))
     np.testing.assert_allclose(places[valid, 2], centre[2], atol=1e-5)
     assert np.asarray(tokens.valid_M).any()
 
-    tall = dataclasses.replace(config.memory, cells=(24, 24, 16))
+    tall = dataclasses.replace(model.memory, cells=(24, 24, 16))
     voxels = voxel_map.empty(tall, centre, 6)
     voxels = voxel_map.insert_frames(tall, voxels, frames, encoded(frames))
     where, parts, there = (np.asarray(x) for x in voxel_map.to_points(tall, voxels))
@@ -284,4 +302,4 @@ def test_in_view_first_then_near():
 
 def test_more_snapshots_than_tokens_are_refused():
     with pytest.raises(ConfigError, match=r"memory\.snapshots 9 exceeds memory\.tokens 8"):
-        MemoryConfig(kind="images", snapshots=9, tokens=8)
+        ImagesConfig(snapshots=9, tokens=8)

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import MemoryConfig, UserError
+from pewm_jax.config import UserError, VoxelConfig
 from pewm_jax.memory import voxel_map
 from tests.helpers import rigid
 
-CONFIG = MemoryConfig(cell_m=(0.25, 0.25, 0.5), cells=(24, 24, 8), capacity=400, tokens=4)
+CONFIG = VoxelConfig(cell_m=(0.25, 0.25, 0.5), cells=(24, 24, 8), capacity=400, tokens=4)
 SEEDS = st.integers(0, 100_000)
 insert, erase, copy, move, paste, merge = (
     jax.jit(f, static_argnums=0)

@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from pewm_jax import weights
-from pewm_jax.config import MemoryConfig, UserError
+from pewm_jax.config import UserError, VoxelConfig
 from pewm_jax.memory import voxel_map
 
-CONFIG = MemoryConfig(cell_m=(0.25, 0.25, 0.5), cells=(24, 24, 8), capacity=60, tokens=4)
+CONFIG = VoxelConfig(cell_m=(0.25, 0.25, 0.5), cells=(24, 24, 8), capacity=60, tokens=4)
 
 
 def a_map(channels=6, dtype=jnp.float32, count=80):

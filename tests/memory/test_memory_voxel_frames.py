@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import MemoryConfig
+from pewm_jax.config import VoxelConfig
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import cells, voxel_frames, voxel_map
 from pewm_jax.types import Frames
 from tests.helpers import random_camera
 
-CONFIG = MemoryConfig(cell_m=(0.5, 0.5, 1.0), cells=(40, 40, 12), capacity=700, tokens=8)
+CONFIG = VoxelConfig(cell_m=(0.5, 0.5, 1.0), cells=(40, 40, 12), capacity=700, tokens=8)
 T, H, W, F = 3, 32, 48, 5
 SEEDS = st.integers(0, 100_000)
 insert_frames = jax.jit(voxel_map.insert_frames, static_argnums=0)

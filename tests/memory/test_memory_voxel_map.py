@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
 from pewm_jax.geometry import cameras
-from pewm_jax.memory import features, voxel_map
+from pewm_jax.memory import voxel_map
+from pewm_jax.models import encoders
 from pewm_jax.types import Camera, Frames
-from tests.helpers import random_frames, tiny_config
+from tests.helpers import TINY, random_frames
 
-CONFIG = dataclasses.replace(tiny_config().memory, cell_m=(0.5, 0.25, 1.0), cells=(6, 8, 3))
+CONFIG = dataclasses.replace(TINY.memory, cell_m=(0.5, 0.25, 1.0), cells=(6, 8, 3))
 insert = jax.jit(voxel_map.insert, static_argnums=0)
 insert_frames = jax.jit(voxel_map.insert_frames, static_argnums=0)
 merge = jax.jit(voxel_map.merge, static_argnums=0)
@@ -218,7 +219,7 @@ def test_batched_maps_equal_single_ones():
 
 
 def test_every_point_of_a_frame_is_within_half_a_cell_of_its_centre():
-    config = tiny_config().memory
+    config = TINY.memory
     rng = np.random.default_rng(0)
     frames = random_frames(rng, 2)
     frames = Frames(rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW, frames.camera)
@@ -227,7 +228,7 @@ def test_every_point_of_a_frame_is_within_half_a_cell_of_its_centre():
         config,
         voxels,
         frames,
-        features.encode(config, {}, frames.rgb_THWC),
+        encoders.encode(config.encoder, {}, frames.rgb_THWC),
         np.array([True, False]),
     )
     points = np.asarray(
@@ -246,12 +247,12 @@ def test_every_point_of_a_frame_is_within_half_a_cell_of_its_centre():
 
 
 def test_pixels_without_depth_leave_no_trace():
-    config = tiny_config().memory
+    config = TINY.memory
     rng = np.random.default_rng(0)
     frames = random_frames(rng, 1)
     blank = Frames(rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW * 0, frames.camera)
     voxels = voxel_map.empty(config, np.zeros(3), 6)
-    patches = features.encode(config, {}, blank.rgb_THWC)
+    patches = encoders.encode(config.encoder, {}, blank.rgb_THWC)
     voxels = insert_frames(config, voxels, blank, patches)
     assert int(voxels.occupied) == 0
 
@@ -265,9 +266,7 @@ def test_maps_of_one_world_share_their_cells():
 
 
 def test_tokens_are_in_view_first_then_nearest():
-    config = dataclasses.replace(
-        tiny_config().memory, cell_m=(0.5, 0.5, 0.5), cells=(40, 40, 8), tokens=3
-    )
+    config = dataclasses.replace(TINY.memory, cell_m=(0.5, 0.5, 0.5), cells=(40, 40, 8), tokens=3)
     ahead = [[4.25, 0.25, 0.25], [2.25, 0.25, 0.25]]
     behind = [[-0.75, 0.25, 0.25], [-5.25, 0.25, 0.25]]
     points = np.array([behind[1], ahead[0], behind[0], ahead[1]], np.float32)
@@ -294,11 +293,11 @@ def test_the_grid_is_never_allocated_with_features():
 
 
 def test_patch_colours_keep_both_ends_of_the_range():
-    config = tiny_config().memory
+    config = TINY.memory
     rgb = np.full((1, 4, 4, 3), 0.5, np.float32)
     rgb[:, :, 2:] = -1.0
-    patches = np.asarray(features.encode(config, {}, rgb))
+    patches = np.asarray(encoders.encode(config.encoder, {}, rgb))
     assert patches.shape == (1, 2, 2, 6)
     np.testing.assert_allclose(patches[0, 0, 0], [0.5] * 3 + [-0.5] * 3, atol=1e-6)
     both = np.maximum(patches[0, 0, 0], patches[0, 0, 1])
-    np.testing.assert_allclose(features.colours(both), -0.25, atol=1e-6)
+    np.testing.assert_allclose(encoders.colours(config.encoder, both), -0.25, atol=1e-6)

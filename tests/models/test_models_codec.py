@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import ClipConfig, CodecConfig
-from pewm_jax.models import codec
-from tests.helpers import tiny_config
+from pewm_jax.config import ClipConfig, PixelConfig
+from pewm_jax.models import codecs, signals
+from tests.helpers import TINY
 
 
 @settings(max_examples=15, deadline=None)
@@ -17,52 +17,51 @@ from tests.helpers import tiny_config
     c=st.integers(1, 3),
 )
 def test_decode_inverts_encode(k, h, w, s, c):
-    config = CodecConfig(spatial=s)
+    config = PixelConfig(spatial=s)
     video = np.random.default_rng(k).normal(size=(2, 4 * k + 1, h * s, w * s, c))
-    latents = codec.encode(config, {}, video.astype(np.float32))
+    latents = codecs.encode(config, {}, video.astype(np.float32))
     assert latents.shape == (2, k + 1, h, w, 4 * s * s * c)
-    np.testing.assert_allclose(codec.decode(config, {}, latents), video, atol=1e-6)
+    np.testing.assert_allclose(codecs.decode(config, {}, latents), video, atol=1e-6)
 
 
 def test_a_latent_frame_holds_only_its_own_frames():
-    config = CodecConfig()
+    config = PixelConfig()
     video = np.zeros((1, 9, 8, 8, 1), np.float32)
     video[:, 5] = 1
-    changed = np.abs(np.asarray(codec.encode(config, {}, video))).sum((0, 2, 3, 4)) > 0
+    changed = np.abs(np.asarray(codecs.encode(config, {}, video))).sum((0, 2, 3, 4)) > 0
     np.testing.assert_array_equal(changed, [False, False, True])
 
 
 def test_a_frame_count_that_cannot_be_folded_is_refused():
     with pytest.raises(ValueError, match="4k \\+ 1"):
-        codec.encode(CodecConfig(), {}, np.zeros((1, 8, 8, 8, 3), np.float32))
+        codecs.encode(PixelConfig(), {}, np.zeros((1, 8, 8, 8, 3), np.float32))
 
 
 @pytest.mark.parametrize("scale", ["linear", "log"])
 def test_depth_maps_to_the_signal_range_and_back(scale):
     config = ClipConfig(near_m=0.2, far_m=8.0, depth_scale=scale)
     depth = np.linspace(0.2, 8.0, 50, dtype=np.float32)
-    signal = codec.signal_from_depth(config, depth)
+    signal = signals.signal_from_depth(config, depth)
     np.testing.assert_allclose([signal[0], signal[-1]], [-1, 1], atol=1e-6)
     assert np.all(np.diff(signal) > 0)
-    np.testing.assert_allclose(codec.depth_from_signal(config, signal), depth, rtol=1e-4)
-    clipped = codec.signal_from_depth(config, np.array([0.0, 99.0], np.float32))
+    np.testing.assert_allclose(signals.depth_from_signal(config, signal), depth, rtol=1e-4)
+    clipped = signals.signal_from_depth(config, np.array([0.0, 99.0], np.float32))
     np.testing.assert_allclose(clipped, [-1, 1], atol=1e-6)
 
 
 def test_colours_survive_the_way_there_and_back():
     every = np.arange(256, dtype=np.uint8)
-    np.testing.assert_array_equal(codec.rgb_from_signal(codec.signal_from_rgb(every)), every)
+    np.testing.assert_array_equal(signals.rgb_from_signal(signals.signal_from_rgb(every)), every)
 
 
 def test_rgbd_is_encoded_separately_and_concatenated():
-    config = tiny_config()
     rng = np.random.default_rng(0)
     rgb = rng.uniform(-1, 1, (1, 9, 16, 24, 3)).astype(np.float32)
     depth = rng.uniform(0.2, 8, (1, 9, 16, 24)).astype(np.float32)
-    latents = codec.encode_rgbd(config, {}, rgb, depth)
-    other = codec.encode_rgbd(config, {}, rgb, depth * 0.5)
-    split = codec.rgb_channels(config)
+    latents = codecs.encode_rgbd(TINY, {}, rgb, depth)
+    other = codecs.encode_rgbd(TINY, {}, rgb, depth * 0.5)
+    split = TINY.codec.rgb_channels
     np.testing.assert_array_equal(latents[..., :split], other[..., :split])
-    rgb_back, depth_back = codec.decode_rgbd(config, {}, latents)
+    rgb_back, depth_back = codecs.decode_rgbd(TINY, {}, latents)
     np.testing.assert_allclose(rgb_back, rgb, atol=1e-6)
     np.testing.assert_allclose(depth_back, depth, rtol=1e-4)

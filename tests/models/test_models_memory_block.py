@@ -10,14 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax import rollouts
-from pewm_jax.diffusion import objective
+from pewm_jax import rollouts, worlds
+from pewm_jax.config import NoMemoryConfig, TrainConfig, VoxelConfig
 from pewm_jax.geometry.cameras import project
-from pewm_jax.models import codec, world_model
+from pewm_jax.models import world_model
 from pewm_jax.models.memory_block import MemoryBlock, masked_attention
 from pewm_jax.models.memory_geometry import sightings, sinusoid_3d
-from pewm_jax.types import Camera, Clip, MapTokens
-from tests.helpers import random_camera, random_frames, randomise, rigid, tiny_config
+from pewm_jax.models.signals import as_signal
+from pewm_jax.models.token_layout import TokenLayout
+from pewm_jax.types import Camera, Clip, Control, Frames, MapTokens
+from pewm_jax.worlds import objective
+from tests.helpers import TINY, random_camera, random_frames, randomise, rigid, with_reader
 
 BOTH = pytest.mark.parametrize("positions", ["projective", "sinusoid"])
 VALID = 15
@@ -25,26 +28,29 @@ VALID = 15
 apply = jax.jit(world_model.apply, static_argnums=0)
 
 
-def config_of(**changes):
-    config = tiny_config()
-    return dataclasses.replace(config, memory=dataclasses.replace(config.memory, **changes))
+def model_of(depth=True, kind=VoxelConfig, **changes):
+    """The tiny model with another reader; perhaps without depth, or with another memory."""
+    model = with_reader(TINY, **changes)
+    values = {field.name: getattr(model.memory, field.name) for field in dataclasses.fields(kind)}
+    clip = dataclasses.replace(model.clip, depth=depth)
+    return dataclasses.replace(model, clip=clip, memory=kind(**values))
 
 
 @functools.cache
 def inputs(seed=0):
     """Conditioning, tokens, noisy latents and times of two clips, and a model's parameters."""
-    config = tiny_config()
     rng = np.random.default_rng(seed)
     camera = jax.tree.map(lambda x: jnp.asarray(np.stack([x, x[::-1]])), random_camera(rng, 9))
-    rgb = jnp.asarray(rng.uniform(-1, 1, (2, 16, 24, 3)), jnp.float32)
-    depth = jnp.asarray(rng.uniform(0.5, 4, (2, 16, 24)), jnp.float32)
-    conditioning = world_model.condition(config, {}, rgb, depth, camera)
+    rgb = jnp.asarray(rng.uniform(-1, 1, (2, 1, 16, 24, 3)), jnp.float32)
+    depth = jnp.asarray(rng.uniform(0.5, 4, (2, 1, 16, 24)), jnp.float32)
+    observed = Frames(rgb, depth, jax.tree.map(lambda x: x[:, :1], camera))
+    conditioning = world_model.condition(TINY, {}, observed, Control(camera))
     tokens = MapTokens(
         jnp.asarray(rng.normal(size=(2, 20, 6)), jnp.float32),
         jnp.asarray(rng.uniform(-3, 3, (2, 20, 3)), jnp.float32),
         jnp.asarray(np.arange(20) < VALID)[None].repeat(2, 0),
     )
-    shape = (2, *codec.latent_shape(config), codec.latent_channels(config))
+    shape = (2, *TINY.latent_shape, TINY.codec.channels)
     return conditioning, tokens, jnp.asarray(rng.normal(size=shape), jnp.float32)
 
 
@@ -54,14 +60,14 @@ TIMES = jnp.array([5, 700])
 @functools.cache
 def weights(positions):
     init = jax.jit(world_model.init, static_argnums=0)
-    return randomise(init(config_of(positions=positions), jax.random.key(0)))
+    return randomise(init(model_of(positions=positions), jax.random.key(0)))
 
 
 def predict(positions, tokens, conditioning=None, **changes):
     first, _, noisy = inputs()
-    config = config_of(positions=positions, **changes)
+    model = model_of(positions=positions, **changes)
     conditioning = first if conditioning is None else conditioning
-    return apply(config, weights(positions), noisy, conditioning, TIMES, tokens)
+    return apply(model, weights(positions), noisy, conditioning, TIMES, tokens)
 
 
 def dense(p, x):
@@ -101,14 +107,15 @@ def equation_2(p, video, time, camera, memory, valid, count):
 
 
 def test_the_block_is_equation_2():
-    config = config_of(positions="sinusoid")
+    model = model_of(positions="sinusoid")
+    reader, width = model.memory.reader, model.backbone.width
     rng = np.random.default_rng(0)
-    count, inner = config.memory.heads, config.memory.heads * config.memory.head_dim
-    video, time = rng.normal(size=(2, 6, config.dit.width)), rng.normal(size=(2, 16))
+    count, inner = reader.heads, reader.width
+    video, time = rng.normal(size=(2, 6, width)), rng.normal(size=(2, 16))
     camera, memory = rng.normal(size=(2, 6, 9)), rng.normal(size=(2, 7, inner))
     valid = np.arange(7) < np.array([[4], [7]])
     arrays = [jnp.asarray(x, jnp.float32) for x in (video, time, camera, memory)]
-    block = MemoryBlock(config)
+    block = MemoryBlock(reader, 3, TokenLayout(1, 3, 1, 6))
     fresh = jax.jit(block.init, static_argnums=6)(jax.random.key(0), *arrays, valid, None)
     run = jax.jit(block.apply, static_argnums=6)
     np.testing.assert_array_equal(run(fresh, *arrays, valid, None), arrays[0])
@@ -152,26 +159,26 @@ def test_masked_tokens_may_hold_anything(positions):
 
 
 @functools.cache
-def lone_block(positions, kind="voxel"):
+def lone_block(positions, kind=VoxelConfig):
     """One block and what goes into it; returns the gradient of its output's squares."""
-    config = config_of(positions=positions, kind=kind)
+    model = model_of(positions=positions, kind=kind)
+    reader, width = model.memory.reader, model.backbone.width
     conditioning, tokens, _ = inputs()
     rng = np.random.default_rng(1)
-    count, inner = 3 * 2 * 3, config.memory.heads * config.memory.head_dim
-    video, time = rng.normal(size=(2, count, config.dit.width)), rng.normal(size=(2, 16))
+    count, inner = 3 * 2 * 3, reader.width
+    video, time = rng.normal(size=(2, count, width)), rng.normal(size=(2, 16))
     video, time = jnp.asarray(video, jnp.float32), jnp.asarray(time, jnp.float32)
     camera = jnp.zeros((2, count, 16))
     mix = jnp.asarray(rng.normal(size=(60 + 6, inner)), jnp.float32)
     params = jax.tree.map(lambda x: x[0], weights(positions)["memory"]["blocks"])
 
     def total(params, features, points, valid):
-        seen, place = None, sinusoid_3d(config, conditioning.camera, points)
+        seen, place = None, sinusoid_3d(model, reader, conditioning.camera, points)
         if positions == "projective":
-            seen = sightings(config, conditioning.camera, points, valid)
+            seen = sightings(model, reader, conditioning.camera, points, valid)
         memory = jnp.concatenate([features, place], -1) @ mix
-        out = MemoryBlock(config).apply(
-            {"params": params}, video, time, camera, memory, valid, seen
-        )
+        block = MemoryBlock(reader, 3, TokenLayout(1, 3, 3, 6), kind is NoMemoryConfig)
+        out = block.apply({"params": params}, video, time, camera, memory, valid, seen)
         return (out**2).sum()
 
     gradient = jax.jit(jax.grad(total, (0, 1, 2)))
@@ -193,7 +200,7 @@ def test_masked_tokens_have_no_gradient_and_an_empty_map_a_finite_one(positions)
 @BOTH
 def test_without_a_memory_the_block_still_learns_its_feed_forward(positions):
     valid = inputs()[1].valid_M
-    by_params, *by_tokens = lone_block(positions, "none")(jnp.zeros_like(valid))
+    by_params, *by_tokens = lone_block(positions, NoMemoryConfig)(jnp.zeros_like(valid))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(by_params))
     assert np.abs(by_params["ff"]["up"]["kernel"]).max() > 0
     for leaf in (by_params["attention"]["to_k"]["kernel"], *by_tokens):
@@ -245,7 +252,8 @@ def test_sinusoids_count_from_the_first_camera_or_from_the_world():
     moved = Camera(camera.intrinsics_4, motion @ camera.world_from_camera)
     moved_points = points @ motion[:3, :3].T + motion[:3, 3]
     place = {
-        name: functools.partial(sinusoid_3d, config_of(frame=name)) for name in ("camera", "world")
+        name: functools.partial(sinusoid_3d, TINY, model_of(frame=name).memory.reader)
+        for name in ("camera", "world")
     }
     base = {name: place[name](camera, points) for name in place}
     np.testing.assert_allclose(place["camera"](moved, moved_points), base["camera"], atol=1e-3)
@@ -258,39 +266,39 @@ def test_sinusoids_count_from_the_first_camera_or_from_the_world():
 
 def test_a_denoiser_without_depth_neither_sees_nor_makes_any():
     conditioning, tokens, noisy = inputs()
-    config = config_of(depth=False)
-    split = codec.rgb_channels(config)
+    model = model_of(depth=False)
+    split = model.codec.rgb_channels
     base = predict("projective", tokens, depth=False)
     np.testing.assert_array_equal(base[..., split:], 0)
     assert np.abs(base[..., :split]).max() > 0.1
-    for field, array in (("first", conditioning.first_BthwC), ("noisy", noisy)):
-        other = array.at[..., split:].add(1.0)
-        changed = dataclasses.replace(conditioning, first_BthwC=other)
-        out = apply(
-            config,
-            weights("projective"),
-            other if field == "noisy" else noisy,
-            changed if field == "first" else conditioning,
-            TIMES,
-            tokens,
-        )
-        np.testing.assert_array_equal(out, base)
+    out = apply(
+        model, weights("projective"), noisy.at[..., split:].add(1.0), conditioning, TIMES, tokens
+    )
+    np.testing.assert_array_equal(out, base)
+    frames = jax.tree.map(jnp.asarray, random_frames(np.random.default_rng(0), 9))
+    batch = jax.tree.map(lambda x: x[None], as_signal(frames))
+    given = []
+    for depth in (batch.depth_THW, batch.depth_THW + 1):
+        observed = jax.tree.map(lambda x: x[:, :1], dataclasses.replace(batch, depth_THW=depth))
+        given.append(world_model.condition(model, {}, observed, Control(batch.camera)).given)
+    jax.tree.map(np.testing.assert_array_equal, *given)
+    assert np.abs(given[0].joined_BthwC[..., :split]).max() > 0.1
 
 
 def test_without_depth_training_weighs_colour_alone_and_rollouts_add_nothing_to_the_map():
-    config = config_of(depth=False)
+    model = model_of(depth=False)
     params = weights("projective")
     frames = random_frames(np.random.default_rng(0), 9)
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], Clip(frames, frames, np.ones(9, bool)))
     total, parts = jax.jit(
-        lambda p: objective.loss(config, p, batch, jax.random.key(0), memory=False)
+        lambda p: objective.loss(model, TrainConfig(), p, batch, jax.random.key(0), memory=False)
     )(params)
     assert total == parts["loss_rgb"]
-    state = jax.jit(rollouts.start, static_argnums=0)(config, params, frames)
+    state = jax.jit(worlds.start, static_argnums=0)(model, params, frames)
     roll = jax.jit(rollouts.rollout, static_argnums=0)
-    after, made = roll(config, params, state, jnp.zeros(8, jnp.int32), jax.random.key(0))
+    after, made = roll(model, params, state, jnp.zeros(8, jnp.int32), jax.random.key(0))
     np.testing.assert_array_equal(made.depth_THW, 0)
     for a, b in zip(jax.tree.leaves(after.map), jax.tree.leaves(state.map), strict=True):
         np.testing.assert_array_equal(a, b)
-    tokens = jax.jit(objective.clip_tokens, static_argnums=0)(config, params, batch)
+    tokens = jax.jit(objective.clip_tokens, static_argnums=0)(model, params, batch)
     assert np.asarray(tokens.valid_M).any()

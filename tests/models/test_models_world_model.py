@@ -5,92 +5,85 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.models import codec, world_model
-from pewm_jax.types import Camera, MapTokens
-from tests.helpers import init_world, random_camera, randomise, rigid, tiny_config
+from pewm_jax.models import world_model
+from pewm_jax.types import Camera, Control, Frames, MapTokens
+from tests.helpers import TINY, init_world, random_camera, randomise, rigid, with_reader
 
 
 def setup(positions="projective", seed=0):
-    config = tiny_config()
-    config = dataclasses.replace(
-        config, memory=dataclasses.replace(config.memory, positions=positions)
-    )
+    model = with_reader(TINY, positions=positions)
     rng = np.random.default_rng(seed)
     camera = random_camera(rng, 9)
     camera = jax.tree.map(lambda x: jnp.asarray(np.stack([x, x[::-1]])), camera)
-    conditioning = world_model.condition(
-        config,
-        {},
-        jnp.asarray(rng.uniform(-1, 1, (2, 16, 24, 3)), jnp.float32),
-        jnp.asarray(rng.uniform(0.5, 4, (2, 16, 24)), jnp.float32),
-        camera,
+    observed = Frames(
+        jnp.asarray(rng.uniform(-1, 1, (2, 1, 16, 24, 3)), jnp.float32),
+        jnp.asarray(rng.uniform(0.5, 4, (2, 1, 16, 24)), jnp.float32),
+        jax.tree.map(lambda x: x[:, :1], camera),
     )
+    conditioning = world_model.condition(model, {}, observed, Control(camera))
     tokens = MapTokens(
         jnp.asarray(rng.normal(size=(2, 20, 6)), jnp.float32),
         jnp.asarray(rng.uniform(-3, 3, (2, 20, 3)), jnp.float32),
         jnp.asarray(np.arange(20) < 15)[None].repeat(2, 0),
     )
-    shape = (2, *codec.latent_shape(config), codec.latent_channels(config))
+    shape = (2, *model.latent_shape, model.codec.channels)
     noisy = jnp.asarray(rng.normal(size=shape), jnp.float32)
-    return config, conditioning, tokens, noisy, jnp.array([5, 700])
+    return model, conditioning, tokens, noisy, jnp.array([5, 700])
 
 
+apply = jax.jit(world_model.apply, static_argnums=0)
 BOTH = pytest.mark.parametrize("positions", ["projective", "sinusoid"])
 
 
 @BOTH
 def test_fresh_memory_blocks_are_exactly_the_identity(positions):
-    config, conditioning, tokens, noisy, times = setup(positions)
-    params = init_world(config)
+    model, conditioning, tokens, noisy, times = setup(positions)
+    params = init_world(model)
     params["backbone"] = randomise(params["backbone"])
-    stage1 = world_model.apply(config, params, noisy, conditioning, times)
-    stage2 = world_model.apply(config, params, noisy, conditioning, times, tokens)
+    stage1 = apply(model, params, noisy, conditioning, times)
+    stage2 = apply(model, params, noisy, conditioning, times, tokens)
     assert np.abs(stage1).max() > 0.1
     np.testing.assert_array_equal(stage1, stage2)
 
 
 @BOTH
 def test_an_empty_map_contributes_nothing_and_has_finite_gradients(positions):
-    config, conditioning, tokens, noisy, times = setup(positions)
-    params = randomise(init_world(config, jax.random.key(0)))
-    without = world_model.apply(config, params, noisy, conditioning, times)
+    model, conditioning, tokens, noisy, times = setup(positions)
+    params = randomise(init_world(model, jax.random.key(0)))
+    without = apply(model, params, noisy, conditioning, times)
     empty = dataclasses.replace(tokens, valid_M=jnp.zeros_like(tokens.valid_M))
-    np.testing.assert_array_equal(
-        world_model.apply(config, params, noisy, conditioning, times, empty), without
-    )
-    full = world_model.apply(config, params, noisy, conditioning, times, tokens)
+    np.testing.assert_array_equal(apply(model, params, noisy, conditioning, times, empty), without)
+    full = apply(model, params, noisy, conditioning, times, tokens)
     assert np.abs(full - without).max() > 1e-3
 
     def total(params, tokens):
-        return (world_model.apply(config, params, noisy, conditioning, times, tokens) ** 2).sum()
+        return (apply(model, params, noisy, conditioning, times, tokens) ** 2).sum()
 
-    grads = jax.grad(total)(params, empty)
+    grads = jax.jit(jax.grad(total))(params, empty)
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(grads))
 
 
 @BOTH
 def test_masked_tokens_contribute_nothing(positions):
-    config, conditioning, tokens, noisy, times = setup(positions)
-    params = randomise(init_world(config, jax.random.key(0)))
-    base = world_model.apply(config, params, noisy, conditioning, times, tokens)
+    model, conditioning, tokens, noisy, times = setup(positions)
+    params = randomise(init_world(model, jax.random.key(0)))
+    base = apply(model, params, noisy, conditioning, times, tokens)
     other = dataclasses.replace(
         tokens,
         features_MF=tokens.features_MF.at[:, 15:].set(50.0),
         points_world_M3=tokens.points_world_M3.at[:, 15:].add(0.5),
     )
-    np.testing.assert_array_equal(
-        world_model.apply(config, params, noisy, conditioning, times, other), base
-    )
+    np.testing.assert_array_equal(apply(model, params, noisy, conditioning, times, other), base)
     seen = dataclasses.replace(tokens, features_MF=tokens.features_MF.at[:, :15].add(1.0))
-    changed = world_model.apply(config, params, noisy, conditioning, times, seen)
+    changed = apply(model, params, noisy, conditioning, times, seen)
     assert np.abs(changed - base).max() > 1e-4
 
 
 @BOTH
 def test_moving_cameras_and_map_together_changes_nothing(positions):
-    config, conditioning, tokens, noisy, times = setup(positions)
-    params = randomise(init_world(config, jax.random.key(0)))
-    base = world_model.apply(config, params, noisy, conditioning, times, tokens)
+    model, conditioning, tokens, noisy, times = setup(positions)
+    params = randomise(init_world(model, jax.random.key(0)))
+    base = apply(model, params, noisy, conditioning, times, tokens)
     motion = rigid(np.random.default_rng(3))
     camera = conditioning.camera
     moved = dataclasses.replace(
@@ -98,25 +91,24 @@ def test_moving_cameras_and_map_together_changes_nothing(positions):
     )
     points = tokens.points_world_M3 @ motion[:3, :3].T + motion[:3, 3]
     moved_tokens = dataclasses.replace(tokens, points_world_M3=points)
-    again = world_model.apply(config, params, noisy, moved, times, moved_tokens)
+    again = apply(model, params, noisy, moved, times, moved_tokens)
     np.testing.assert_allclose(again, base, atol=5e-3 * float(np.abs(base).max()))
-    alone = world_model.apply(config, params, noisy, conditioning, times, moved_tokens)
+    alone = apply(model, params, noisy, conditioning, times, moved_tokens)
     assert np.abs(alone - base).max() > 1e-2 * np.abs(base).max()
 
 
 def test_each_latent_frame_looks_through_its_own_cameras():
-    config, conditioning, tokens, noisy, times = setup()
-    params = randomise(init_world(config, jax.random.key(0), memory=True))
+    model, conditioning, tokens, noisy, times = setup()
+    params = randomise(init_world(model, jax.random.key(0), memory=True))
     # One memory layer and no attention between frames would be needed to read this off the
     # output, so ask the geometry: only latent frame 2 (frames 5 to 8) may change with frame 6.
     from pewm_jax.models.memory_geometry import sightings
 
     camera = conditioning.camera
-    seen = sightings(config, camera, tokens.points_world_M3, tokens.valid_M)
+    seen = sightings(model, model.memory.reader, camera, tokens.points_world_M3, tokens.valid_M)
     poses = camera.world_from_camera.at[:, 6, :3, 3].add(0.3)
-    other = sightings(
-        config, Camera(camera.intrinsics_4, poses), tokens.points_world_M3, tokens.valid_M
-    )
+    moved = Camera(camera.intrinsics_4, poses)
+    other = sightings(model, model.memory.reader, moved, tokens.points_world_M3, tokens.valid_M)
     changed = np.abs(seen.place_tqJ3 - other.place_tqJ3).max((0, 3, 4)) > 1e-6
     expected = np.zeros((3, 4), bool)
     expected[2, 1] = True
@@ -140,13 +132,20 @@ def test_a_head_peaks_at_the_patch_a_cell_projects_into():
 
 
 def test_conditioning_channels_matter_and_only_the_first_latent_frame_is_clean():
-    config, conditioning, _, noisy, times = setup()
-    first = np.asarray(conditioning.first_BthwC)
+    model, conditioning, _, noisy, times = setup()
+    joined = conditioning.given.joined_BthwC
+    channels = model.codec.channels
+    assert joined.shape[-1] == model.in_channels - channels
+    first, rays = np.split(np.asarray(joined), [channels], -1)
+    np.testing.assert_array_equal(rays, conditioning.rays_BthwC)
     assert np.abs(first[:, 0]).max() > 0
     np.testing.assert_array_equal(first[:, 1:], 0)
-    params = randomise(init_world(config, jax.random.key(0), memory=False))
-    base = world_model.apply(config, params, noisy, conditioning, times)
-    for field in ("first_BthwC", "rays_BthwC"):
-        other = dataclasses.replace(conditioning, **{field: getattr(conditioning, field) * 0.5})
-        out = world_model.apply(config, params, noisy, other, times)
-        assert np.abs(out - base).max() > 1e-4, field
+    params = randomise(init_world(model, jax.random.key(0), memory=False))
+    base = apply(model, params, noisy, conditioning, times)
+    for name, part in (("first", slice(channels)), ("rays", slice(channels, None))):
+        halved = dataclasses.replace(
+            conditioning.given, joined_BthwC=joined.at[..., part].multiply(0.5)
+        )
+        other = dataclasses.replace(conditioning, given=halved)
+        out = apply(model, params, noisy, other, times)
+        assert np.abs(out - base).max() > 1e-4, name

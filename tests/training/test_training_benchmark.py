@@ -135,4 +135,4 @@ def test_a_part_that_fails_is_told_and_the_others_are_ended(benchmark, tmp_path)
 
 def test_the_settings_of_the_benchmark_exist(benchmark):
     config = cli.parse(Config, benchmark.SMALL, default=configs.load("tiny"), prog="train.py tiny")
-    assert config.dit.layers == 4
+    assert config.model.backbone.layers == 4

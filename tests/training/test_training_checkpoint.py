@@ -10,10 +10,10 @@ import training_fakes as fakes
 
 from pewm_jax import tree
 from pewm_jax.config import UserError
-from pewm_jax.training import checkpoint, runs, sharding, stages, step, step_folders
+from pewm_jax.training import checkpoint, runs, sharding, step, step_folders
 from pewm_jax.training.checkpoint import Checkpoints
 
-ONE, TWO = stages.STAGES
+ONE, TWO = fakes.STAGES
 
 
 def train(config, stage, run, steps, every=1):

@@ -159,7 +159,7 @@ def test_with_no_whole_checkpoint_left_a_sentence_asks_what_to_do(run, trained):
 def test_checkpoints_damaged_again_and_again_are_all_kept_aside(run):
     for expected in ({"4"}, {"4", "4-1"}):
         cut(newest(run) / "manifest.json")
-        with Checkpoints(run, config(run), loop.stages.STAGES[0], lambda _: None) as checkpoints:
+        with Checkpoints(run, config(run), fakes.STAGES[0], lambda _: None) as checkpoints:
             assert checkpoints.latest() == 2
         assert {path.name for path in (newest(run).parent / "damaged").iterdir()} == expected
         shutil.copytree(newest(run).parent / "damaged" / "4", newest(run))

@@ -7,11 +7,11 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import ClipConfig, ConfigError, UserError
+from pewm_jax.config import ClipConfig, ConfigError, PatchColoursConfig, UserError
 from pewm_jax.data import loader
-from pewm_jax.diffusion import objective
 from pewm_jax.memory import feature_build, feature_cache
 from pewm_jax.training import loop, runs, stages, starting
+from pewm_jax.worlds import objective, pewm
 from tests.data import data_world
 from tests.helpers import tiny_config
 
@@ -25,7 +25,9 @@ def config(tmp_path_factory):
     paths = {"path": str(root / "data"), "features": str(root / "features"), "context": 6}
     tiny = dataclasses.replace(tiny, data=dataclasses.replace(tiny.data, **paths))
     train, kept = root / "data" / "train", root / "features" / "train"
-    feature_build.build(tiny.memory, {}, train, kept, dtype="float32", say=lambda _: None)
+    feature_build.build(
+        tiny.model.memory.encoder, {}, train, kept, dtype="float32", say=lambda _: None
+    )
     return tiny
 
 
@@ -35,40 +37,40 @@ def batch(config, cache):
 
 
 def test_the_map_of_kept_features_is_the_map_of_computed_ones(config):
-    cache = starting.features(config, stages.STAGES[1])
+    cache = starting.features(config, pewm.STAGES[1])
     kept, plain = batch(config, cache), batch(config, None)
     assert not kept.context_valid_S.all(), "the test should see slots without a frame"
     assert kept.context_features_ShwF.shape == (3, 6, 8, 12, 6)
     assert plain.context_features_ShwF is None
     tokens = jax.jit(objective.clip_tokens, static_argnums=0)
-    got, want = tokens(config, {}, kept), tokens(config, {}, plain)
+    got, want = tokens(config.model, {}, kept), tokens(config.model, {}, plain)
     assert np.asarray(want.valid_M).any(1).all()
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), got, want)
     scaled = dataclasses.replace(kept, context_features_ShwF=2 * kept.context_features_ShwF)
-    features = tokens(config, {}, scaled).features_MF
+    features = tokens(config.model, {}, scaled).features_MF
     np.testing.assert_allclose(features, 2 * np.asarray(want.features_MF), atol=1e-6)
 
 
 def test_features_are_opened_only_where_a_map_is_built(config):
-    assert starting.features(config, stages.STAGES[0]) is None
+    assert starting.features(config, pewm.STAGES[0]) is None
     none = dataclasses.replace(config, data=dataclasses.replace(config.data, features=""))
-    assert starting.features(none, stages.STAGES[1]) is None
+    assert starting.features(none, pewm.STAGES[1]) is None
     absent = dataclasses.replace(config, data=dataclasses.replace(config.data, features="absent"))
     with pytest.raises(UserError, match=r"absent/train is no cache; make it with"):
-        starting.features(absent, stages.STAGES[1])
+        starting.features(absent, pewm.STAGES[1])
 
 
 def test_training_on_stale_features_is_refused(config, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "compile_step", lambda *_: None)
-    other = dataclasses.replace(config.memory, encoder_patch=4)
+    other = dataclasses.replace(config.model.memory, encoder=PatchColoursConfig(patch=4))
     train = dataclasses.replace(config.train, run=str(tmp_path / "run"))
     train = dataclasses.replace(
         train,
         stage1=dataclasses.replace(train.stage1, steps=1, batch=2),
         stage2=dataclasses.replace(train.stage2, steps=1, batch=2),
     )
-    stale = dataclasses.replace(config, memory=other, train=train)
-    monkeypatch.setattr(stages, "planned", lambda _: [stages.STAGES[1]])
+    stale = dataclasses.replace(config.with_model(memory=other), train=train)
+    monkeypatch.setattr(stages, "planned", lambda _: [pewm.STAGES[1]])
     monkeypatch.setattr(loop, "initial_state", fake_state)
     with pytest.raises(UserError, match=r"stale: it was made with other preprocessing"):
         loop.train(stale, say=lambda _: None)

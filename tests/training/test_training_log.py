@@ -7,7 +7,9 @@ import pytest
 from rich.console import Console
 
 from pewm_jax.training import log
+from pewm_jax.worlds.pewm import STAGES
 
+ONE, TWO = STAGES
 METRICS = {
     "loss": 0.5,
     "learning_rate": 1e-3,
@@ -24,15 +26,15 @@ def lines(path):
 
 def test_what_was_logged_beyond_the_restored_step_is_dropped(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    with log.MetricsLog(tmp_path, 1, 0) as out:
+    with log.MetricsLog(tmp_path, ONE, 0) as out:
         for step in (1, 2, 3):
             out.write(step, METRICS)
-    with log.MetricsLog(tmp_path, 2, 0) as out:
+    with log.MetricsLog(tmp_path, TWO, 0) as out:
         for step in (1, 2, 3):
             out.write(step, METRICS)
     with path.open("a") as file:
         file.write('{"stage": 2, "st')
-    with log.MetricsLog(tmp_path, 2, 2) as out:
+    with log.MetricsLog(tmp_path, TWO, 2) as out:
         assert lines(path) == [(1, 1), (1, 2), (1, 3), (2, 1), (2, 2)]
         out.write(3, METRICS)
     assert lines(path)[-1] == (2, 3)
@@ -45,7 +47,7 @@ def test_a_line_is_json_whatever_the_values(tmp_path):
     def refuse(name):
         raise ValueError(name)
 
-    with log.MetricsLog(tmp_path, 1, 0) as out:
+    with log.MetricsLog(tmp_path, ONE, 0) as out:
         out.write(1, METRICS | {"loss": float("nan"), "grad_norm": float("inf")})
     (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
     entry = json.loads(line, parse_constant=refuse)
@@ -53,11 +55,11 @@ def test_a_line_is_json_whatever_the_values(tmp_path):
 
 
 def test_tensorboard_files_are_written_per_stage(tmp_path):
-    for stage in (1, 2):
+    for stage in (ONE, TWO):
         with log.MetricsLog(tmp_path, stage, 0) as out:
             out.write(1, METRICS)
-    for stage in (1, 2):
-        (events,) = (tmp_path / "tensorboard" / f"stage{stage}").glob("events.*")
+    for name in ("stage1", "stage2"):
+        (events,) = (tmp_path / "tensorboard" / name).glob("events.*")
         assert b"clips_per_second" in events.read_bytes()
 
 

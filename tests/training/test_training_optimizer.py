@@ -1,5 +1,7 @@
 """The learning rate, the clipping, the decay, and who pays for moments."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import training_fakes as fakes
 
 from pewm_jax.config import ConfigError, StageConfig
 from pewm_jax.training import optimizer, stages
+from pewm_jax.worlds import pewm
 
 PARAMS = {"backbone": {"dense": {"kernel": jnp.full((4, 4), 2.0), "bias": jnp.full((4,), 2.0)}}}
 
@@ -33,7 +36,7 @@ def test_short_stages_have_a_usable_rate_at_every_step(decay, steps, warmup):
 
 def test_only_matrices_decay():
     config = fakes.with_train(fakes.config(), weight_decay=0.1)
-    adam = optimizer.make(config, stages.STAGES[0])
+    adam = optimizer.make(config, pewm.STAGES[0])
     still = jax.tree.map(jnp.zeros_like, PARAMS)
     updates, _ = adam.update(still, adam.init(PARAMS), PARAMS)
     dense = updates["backbone"]["dense"]
@@ -43,7 +46,7 @@ def test_only_matrices_decay():
 
 def test_gradients_beyond_the_norm_are_scaled_down_together():
     config = fakes.config(clip_norm=1.0)
-    adam = optimizer.make(config, stages.STAGES[0])
+    adam = optimizer.make(config, pewm.STAGES[0])
     rng = np.random.default_rng(0)
     small = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), PARAMS)
     norm = np.sqrt(sum(np.sum(np.square(leaf)) for leaf in jax.tree.leaves(small)))
@@ -56,7 +59,7 @@ def test_gradients_beyond_the_norm_are_scaled_down_together():
 
 def test_frozen_leaves_have_no_moments_no_update_and_no_say_in_the_clipping():
     params = {"backbone": {"kernel": jnp.ones((2, 2))}, "memory": {"kernel": jnp.ones((3, 3))}}
-    adam = optimizer.make(fakes.config(clip_norm=1.0), stages.STAGES[1])
+    adam = optimizer.make(fakes.config(clip_norm=1.0), pewm.STAGES[1])
     state = adam.init(params)
     assert {leaf.shape for leaf in jax.tree.leaves(state)} == {(), (3, 3)}
     quiet = jax.tree.map(lambda leaf: 0.1 * leaf, params)
@@ -66,6 +69,19 @@ def test_frozen_leaves_have_no_moments_no_update_and_no_say_in_the_clipping():
         np.testing.assert_array_equal(updates["backbone"]["kernel"], 0)
         moments = sorted(float(leaf.max()) for leaf in jax.tree.leaves(after) if leaf.ndim)
         np.testing.assert_allclose(moments, [0.001 * 0.01, 0.1 * 0.1], rtol=1e-5)
+
+
+def test_a_stage_may_learn_faster_at_some_paths():
+    stage = dataclasses.replace(pewm.STAGES[0], rates=((r".*/bias", 10.0),))
+    config = fakes.config()
+    gradients = jax.tree.map(lambda leaf: 0.1 * leaf, PARAMS)
+    plain, fast = (optimizer.make(config, s) for s in (pewm.STAGES[0], stage))
+    one, ten = (
+        adam.update(gradients, adam.init(PARAMS), PARAMS)[0]["backbone"]["dense"]
+        for adam in (plain, fast)
+    )
+    np.testing.assert_allclose(ten["bias"], 10 * one["bias"], rtol=1e-6)
+    np.testing.assert_array_equal(ten["kernel"], one["kernel"])
 
 
 def test_nothing_to_train_is_refused_and_empty_stages_are_skipped():

@@ -13,9 +13,14 @@ import training_fakes as fakes
 
 from pewm_jax import presets as configs
 from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
+from pewm_jax.data import abstract
+from pewm_jax.models import vae_codec
+from pewm_jax.models.costs import SPLIT, Share
 from pewm_jax.scaling import plan, plan_text, predict, suggest
 from pewm_jax.scaling.footprint import MeshSizes, counts, footprint
-from pewm_jax.training import chips, costs, stages
+from pewm_jax.training import chips
+from pewm_jax.worlds import costs
+from pewm_jax.worlds.pewm import STAGES
 
 ROOT = Path(__file__).parents[2]
 H200 = chips.named("h200")
@@ -64,11 +69,11 @@ def test_too_few_devices_in_use_already_are_named():
         plan.virtual(len(jax.devices()) + 1)
 
 
-@pytest.mark.parametrize("stage", stages.STAGES)
+@pytest.mark.parametrize("stage", STAGES)
 def test_an_abstract_batch_is_like_a_real_one(stage):
     tiny = configs.load("tiny")
     real = fakes.clip(tiny, stage.settings(tiny).batch, 0)
-    like = plan.abstract_clip(tiny, stage)
+    like = abstract.clip(tiny, stage.settings(tiny).batch, features=stage.memory)
     assert jax.tree.structure(like) == jax.tree.structure(real)
     for a, b in zip(jax.tree.leaves(like), jax.tree.leaves(real), strict=True):
         assert (a.shape, a.dtype) == (np.shape(b), np.asarray(b).dtype)
@@ -76,7 +81,7 @@ def test_an_abstract_batch_is_like_a_real_one(stage):
 
 def test_the_presets_have_the_parameters_that_they_state():
     small, large = (configs.load(name) for name in ("pewm_2b", "pewm_5b"))
-    stage1, stage2 = stages.STAGES
+    stage1, stage2 = STAGES
     assert counts(small, stage1).trained.count == pytest.approx(1.69e9, rel=0.01)
     assert counts(small, stage2).trained.count == pytest.approx(0.94e9, rel=0.01)
     assert counts(large, stage1).trained.count == pytest.approx(5.57e9, rel=0.01)
@@ -88,28 +93,28 @@ def test_the_presets_have_the_parameters_that_they_state():
 def test_the_presets_fit_on_h200_in_both_stages(name, devices):
     config = configs.load(name)
     mesh = MeshSizes(*config.train.mesh.shape(devices))
-    for stage in stages.STAGES:
+    for stage in STAGES:
         choice = suggest.assess(config, stage, mesh, H200)
-        assert choice.fits, (stage.number, choice.memory)
+        assert choice.fits, (stage.number, choice.footprint)
         assert 0.2 < choice.time.mfu < 0.65
 
 
 def test_every_suggestion_uses_all_devices_and_shares_batch_and_heads():
     config = configs.load("pewm_2b")
-    stage = stages.STAGES[1]
+    stage = STAGES[1]
     ranked = suggest.rank(config, stage, 64, H200)
     assert len(ranked) == len({choice.mesh for choice in ranked}) > 10
     for choice in ranked:
         mesh = choice.mesh
         assert mesh.devices == 64
         assert config.train.stage2.batch % mesh.batch == 0
-        assert config.dit.heads % mesh.tensor == 0
+        assert config.model.backbone.heads % mesh.tensor == 0
     fits = [choice.fits for choice in ranked]
     assert fits == sorted(fits, reverse=True)
 
 
 def test_more_devices_need_less_memory_each_and_do_less_work_each():
-    config, stage = configs.load("pewm_5b"), stages.STAGES[0]
+    config, stage = configs.load("pewm_5b"), STAGES[0]
     few, many = (MeshSizes(fsdp=n) for n in (8, 64))
     for wide in (2, 4):
         held = [
@@ -122,10 +127,10 @@ def test_more_devices_need_less_memory_each_and_do_less_work_each():
 
 
 def test_the_vae_holds_a_chunk_of_a_long_clip():
-    config, stage, mesh = configs.load("pewm_5b"), stages.STAGES[0], MeshSizes(fsdp=256)
+    config, stage, mesh = configs.load("pewm_5b"), STAGES[0], MeshSizes(fsdp=256)
     nine, long = (
         footprint(
-            dataclasses.replace(config, clip=dataclasses.replace(config.clip, frames=frames)),
+            config.with_model(clip=dataclasses.replace(config.model.clip, frames=frames)),
             stage,
             mesh,
             activation_bytes=2,
@@ -134,6 +139,20 @@ def test_the_vae_holds_a_chunk_of_a_long_clip():
         for frames in (9, 49)
     )
     assert long < 2 * nine
+
+
+def test_the_vae_works_clip_by_clip_and_streams_all_clips_in_their_precision():
+    model = configs.load("pewm_2b").model
+    one = vae_codec.costs(model, Share(clips=1, activation_bytes=2))
+    four, wide = (
+        vae_codec.costs(model, Share(clips=n, activation_bytes=w)) for n, w in ((4, 2), (1, 4))
+    )
+    assert (four.held, four.streamed) == (one.held, 4 * one.streamed)
+    assert (wide.held, wide.streamed) == (2 * one.held, 2 * one.streamed)
+    assert one.products == four.products == wide.products
+    pixels = 9 * 512 * 512 * 128  # the widest array of a clip
+    assert one.streamed > 2 * 2 * pixels
+    assert one.held > 2 * 2 * pixels
 
 
 def test_numbers_are_written_as_people_do():
@@ -151,9 +170,9 @@ def test_links_beyond_an_island_are_shared_by_those_who_use_them():
 
 def test_training_flops_count_gradients_only_where_they_are_needed():
     config = configs.load("tiny")
-    first, second = (costs.products(config, stage) for stage in stages.STAGES)
+    first, second = (costs.products(config, stage) for stage in STAGES)
     blocks = (p for one in (first, second) for p in one if p.part == "backbone")
-    linear = [p for p in blocks if p.kind == "linear" and p.axes == costs.SPLIT]
+    linear = [p for p in blocks if p.kind == "linear" and p.axes == SPLIT]
     assert [p.backward for p in linear] == [2.0, 1.0]
     assert all(p.part == "backbone" for p in first)
     assert {p.part for p in second} == {"backbone", "memory"}

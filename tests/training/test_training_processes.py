@@ -92,7 +92,7 @@ def test_two_processes_of_two_devices_compute_the_losses_of_one(tmp_path, monkey
     data = tmp_path / "data"
     collect(CollectConfig(out=data, train=2, validation=0, test=0, frames=24, size=16, workers=1))
     argv = ["tiny", "--data.path", data, "--train.stage1.steps", 20, "--train.stage1.batch", 4]
-    argv += ["--train.stage2.steps", 0, "--dit.layers", 1]
+    argv += ["--train.stage2.steps", 0, "--model.backbone.layers", 1]
     argv += ["--train.save_every", 20]
     one, two = tmp_path / "one", tmp_path / "two"
     assert run_here(monkeypatch, [*argv, "--train.run", one]) == 0

@@ -14,16 +14,17 @@ from pewm_jax import presets as configs
 from pewm_jax import tree, weights
 from pewm_jax.config import (
     AXES,
-    CodecConfig,
     ConfigError,
     DINOv2Config,
+    DINOv2EncoderConfig,
     MeshConfig,
     VAEConfig,
     published,
 )
-from pewm_jax.training import sharding, stages, state
+from pewm_jax.training import sharding, state
+from pewm_jax.worlds.pewm import STAGES
 
-ONE, TWO = stages.STAGES
+ONE, TWO = STAGES
 MESH = jax.sharding.AbstractMesh((1, 4, 2, 1), AXES)
 
 
@@ -31,7 +32,7 @@ def large():
     """All networks there are, in published form but for size."""
     tiny = configs.load("tiny")
     vae = VAEConfig(widths=(8, 8, 8, 8), groups=4, resnets=1)
-    encoder = DINOv2Config(layers=2, heads=2, width=32, registers=4)
+    network = DINOv2Config(layers=2, heads=2, width=32, registers=4)
     backbone = dataclasses.replace(
         published("1.5-5B-I2V"),
         layers=2,
@@ -45,14 +46,22 @@ def large():
         in_channels=0,
         out_channels=0,
     )
-    return dataclasses.replace(
-        tiny,
-        clip=dataclasses.replace(tiny.clip, frames=9, height=32, width=32),
-        codec=CodecConfig(kind="vae", spatial=8, temporal=4, vae=vae),
-        dit=backbone,
-        memory=dataclasses.replace(tiny.memory, heads=8, encoder="dinov2", dinov2=encoder),
-        train=dataclasses.replace(tiny.train, start="somewhere", dtype="bfloat16"),
+    memory = dataclasses.replace(
+        tiny.model.memory,
+        encoder=DINOv2EncoderConfig(network=network),
+        reader=dataclasses.replace(tiny.model.memory.reader, heads=8),
     )
+    config = tiny.with_model(
+        clip=dataclasses.replace(tiny.model.clip, frames=9, height=32, width=32),
+        codec=vae,
+        backbone=backbone,
+        memory=memory,
+        dtype="bfloat16",
+    )
+    return dataclasses.replace(config, train=dataclasses.replace(tiny.train, start="somewhere"))
+
+
+LARGE = large().model
 
 
 @functools.cache
@@ -60,9 +69,9 @@ def shapes(stage):
     return jax.eval_shape(functools.partial(state.create, large(), stage), jax.random.key(0))
 
 
-@pytest.mark.parametrize("stage", stages.STAGES)
+@pytest.mark.parametrize("stage", STAGES)
 def test_every_leaf_of_every_network_has_its_place(stage):
-    placed = tree.flatten(sharding.of_state(MESH, shapes(stage)))
+    placed = tree.flatten(sharding.of_state(LARGE, MESH, shapes(stage)))
     for path, leaf in tree.flatten(shapes(stage)).items():
         spec = placed[path].spec
         assert len(spec) <= len(leaf.shape), path
@@ -73,7 +82,9 @@ def test_every_leaf_of_every_network_has_its_place(stage):
 
 
 def test_average_and_moments_lie_with_their_parameter():
-    placed = {p: s.spec for p, s in tree.flatten(sharding.of_state(MESH, shapes(ONE))).items()}
+    placed = {
+        p: s.spec for p, s in tree.flatten(sharding.of_state(LARGE, MESH, shapes(ONE))).items()
+    }
     name = "backbone/blocks/ff/up/kernel"
     assert placed[f"params/{name}"] == P(None, "fsdp", "tensor")
     alike = [spec for path, spec in placed.items() if path.endswith(name)]
@@ -86,16 +97,16 @@ def test_average_and_moments_lie_with_their_parameter():
 def test_a_leaf_that_no_rule_knows_is_refused(part):
     alien = tree.unflatten({"step": 0, f"params/{part}/alien/kernel": 0})
     with pytest.raises(tree.TreeError, match=rf"sharding rules matches params/{part}/alien"):
-        sharding.of_state(MESH, alien)
+        sharding.of_state(LARGE, MESH, alien)
 
 
 def test_an_axis_that_does_not_divide_is_left_out_and_named():
     name = "backbone/blocks/to_q/kernel"
     like = tree.unflatten({f"params/{name}": jax.ShapeDtypeStruct((3, 6, 8), jnp.float32)})
-    assert tree.flatten(sharding.of_state(MESH, like))[f"params/{name}"].spec == P(
+    assert tree.flatten(sharding.of_state(LARGE, MESH, like))[f"params/{name}"].spec == P(
         None, None, "tensor"
     )
-    assert sharding.left_out(MESH, like) == {f"params/{name}": ("fsdp",)}
+    assert sharding.left_out(LARGE, MESH, like) == {f"params/{name}": ("fsdp",)}
 
 
 def test_frozen_weights_are_kept_in_half_precision_and_trained_ones_in_full():
@@ -109,7 +120,9 @@ def test_frozen_weights_are_kept_in_half_precision_and_trained_ones_in_full():
 def test_heads_that_tensor_cannot_share_are_refused():
     config = fakes.config()
     mesh = jax.sharding.AbstractMesh(MeshConfig(tensor=5).shape(5), AXES)
-    with pytest.raises(ConfigError, match=r"mesh\.tensor is 5, which does not divide dit\.heads"):
+    with pytest.raises(
+        ConfigError, match=r"mesh\.tensor is 5, which does not divide backbone\.heads"
+    ):
         sharding.require_divisible(config, ONE, mesh)
 
 

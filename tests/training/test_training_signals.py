@@ -99,8 +99,8 @@ def test_what_may_be_broken_off_is_and_all_else_is_not():
         assert stop.unless_requested(tell) is None
         assert done == ["on"]
         assert stop.requested
-        assert "after step 7 of stage 2" in str(stop.interrupted(2, 7))
-        assert stop.interrupted(2, 7).exit_code == 143
+        assert "after step 7 of stage 2" in str(stop.interrupted("stage 2", 7))
+        assert stop.interrupted("stage 2", 7).exit_code == 143
 
 
 def test_before_the_first_step_the_first_signal_is_the_end():
@@ -123,4 +123,4 @@ def test_of_several_processes_none_breaks_off_and_all_stop_when_agreed():
         assert stop.due()
         assert stop.requested
         assert stop.due()
-        assert stop.interrupted(1, 2).exit_code == 143
+        assert stop.interrupted("stage 1", 2).exit_code == 143

@@ -14,8 +14,10 @@ from pewm_jax import tree
 from pewm_jax.config import AXES, ConfigError, DiTConfig
 from pewm_jax.models import world_model
 from pewm_jax.training import optimizer, sharding, stages, state, step
+from pewm_jax.worlds import pewm
 
-ONE, TWO = stages.STAGES
+ONE, TWO = fakes.STAGES
+REAL = pewm.STAGES[1]
 
 
 def run(config, stage, steps, start=None):
@@ -109,37 +111,39 @@ def test_a_batch_that_devices_cannot_share_is_refused(fake_model):
 
 
 def test_every_leaf_of_the_state_needs_a_sharding_rule(monkeypatch):
-    monkeypatch.setattr(sharding, "STATE_RULES", sharding.STATE_RULES[:1])
+    model = configs.load("tiny").model
+    first = pewm.sharding(model)[:1]
+    monkeypatch.setattr(pewm, "sharding", lambda model: first)
     with pytest.raises(tree.TreeError, match="sharding rules matches params/w"):
-        sharding.of_state(sharding.make_mesh(), {"step": 0, "params": {"w": 0}})
+        sharding.of_state(model, sharding.make_mesh(), {"step": 0, "params": {"w": 0}})
 
 
 def test_freezing_the_backbone_makes_the_step_of_the_real_model_cheaper():
     small = configs.load("tiny")
     wide = DiTConfig(layers=1, heads=16, head_dim=32, text_length=1, text_dim=8, time_dim=16)
-    config = dataclasses.replace(small, dit=wide)
+    config = small.with_model(backbone=wide)
     clip, mesh = fakes.clip(config, 2, 0), sharding.make_mesh(jax.devices()[:1])
 
     def flops(stage):
         return step.lower_step(config, stage, mesh, clip).cost_analysis()["flops"]
 
-    everything = dataclasses.replace(TWO, rules=((r".*", stages.TRAIN),))
-    assert flops(TWO) < 0.85 * flops(everything)
+    everything = dataclasses.replace(REAL, rules=((r".*", stages.TRAIN),))
+    assert flops(REAL) < 0.85 * flops(everything)
 
 
 def test_the_stages_cover_the_parameters_of_the_real_model():
-    make = functools.partial(world_model.init, configs.load("tiny"), memory=True)
+    make = functools.partial(world_model.init, configs.load("tiny").model, memory=True)
     params = jax.eval_shape(make, jax.random.key(0))
-    assert set(tree.select(params, TWO.trained)) == {"memory"}
-    labels = tree.flatten(TWO.labels(params))
+    assert set(tree.select(params, REAL.trained)) == {"memory"}
+    labels = tree.flatten(REAL.labels(params))
     assert {p for p, label in labels.items() if label == stages.TRAIN} == {
         p for p in labels if p.startswith("memory/")
     }
     with pytest.raises(tree.TreeError, match="rules of stage2 matches stranger"):
-        TWO.labels({**params, "stranger": 0})
-    assert set(tree.exclude(params, TWO.trained)) == {"backbone"}
+        REAL.labels({**params, "stranger": 0})
+    assert set(tree.exclude(params, REAL.trained)) == {"backbone"}
     assert (
-        tree.mismatches(tree.select(params, ONE.trained), tree.exclude(params, TWO.trained)) == []
+        tree.mismatches(tree.select(params, ONE.trained), tree.exclude(params, REAL.trained)) == []
     )
     decayed = tree.flatten(tree.assign(optimizer.DECAYED, params))
     assert any(decayed.values())

@@ -13,9 +13,10 @@ from pewm_jax.config import DiTConfig
 from pewm_jax.models import world_model
 from pewm_jax.training import sharding, stages, step
 from pewm_jax.types import Clip
-from tests.helpers import init_world, random_frames, randomise
+from pewm_jax.worlds.pewm import STAGES
+from tests.helpers import init_world, random_frames, randomise, with_reader
 
-TWO = stages.STAGES[1]
+TWO = STAGES[1]
 EVERYTHING = dataclasses.replace(TWO, rules=((r".*", stages.TRAIN),))
 
 
@@ -23,16 +24,14 @@ def small():
     """A backbone that is large beside its memory blocks, as CogVideoX beside the paper's."""
     config = configs.load("tiny")
     wide = DiTConfig(layers=1, heads=16, head_dim=32, text_length=1, text_dim=8, time_dim=16)
-    return dataclasses.replace(
-        config, dit=wide, memory=dataclasses.replace(config.memory, mlp_ratio=1)
-    )
+    return config.with_model(backbone=wide, memory=with_reader(config.model, mlp_ratio=1).memory)
 
 
 CONFIG = small()
 CLIP = jax.tree.map(
     lambda x: np.stack([x, x]),
     Clip(
-        random_frames(np.random.default_rng(0), CONFIG.clip.frames, 16, 16),
+        random_frames(np.random.default_rng(0), CONFIG.model.clip.frames, 16, 16),
         random_frames(np.random.default_rng(1), CONFIG.data.context, 16, 16),
         np.ones(CONFIG.data.context, bool),
     ),
@@ -44,7 +43,7 @@ def one_device():
 
 
 def parameters(config):
-    return jax.eval_shape(functools.partial(world_model.init, config), jax.random.key(0))
+    return jax.eval_shape(functools.partial(world_model.init, config.model), jax.random.key(0))
 
 
 def compiled(stage):
@@ -85,7 +84,7 @@ def test_frozen_leaves_stay_bit_identical_and_only_trained_ones_have_moments(sta
     assert all("backbone/" not in path for path in moments)
 
 
-@pytest.mark.parametrize("stage", stages.STAGES, ids=lambda stage: stage.name)
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
 def test_every_leaf_has_a_rule_and_one_without_fails(stage):
     params = parameters(CONFIG)
     if not stage.memory:

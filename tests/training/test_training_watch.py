@@ -16,10 +16,10 @@ import training_fakes as fakes
 from pewm_jax import weights
 from pewm_jax.config import UserError
 from pewm_jax.data import loader
-from pewm_jax.training import chips, costs, loop, optimizer, samples, step, watch
+from pewm_jax.training import chips, loop, optimizer, samples, step, watch
 from pewm_jax.training.sharding import make_mesh
 from pewm_jax.training.signals import Interrupted
-from pewm_jax.training.stages import STAGES
+from pewm_jax.worlds import costs
 
 BAD = 5
 """The step whose batch makes everything NaN."""
@@ -27,8 +27,8 @@ BAD = 5
 
 @pytest.fixture
 def nan_at_5(fake_model, monkeypatch):
+    fakes.install(monkeypatch, fakes.loss_of_depth)
     monkeypatch.setattr(loader, "clips", fakes.without_depth_at(BAD))
-    monkeypatch.setattr(fakes.objective, "loss", fakes.loss_of_depth)
 
 
 def lines(path):
@@ -51,9 +51,8 @@ def test_stopping_writes_the_step_and_the_records_and_names_the_file(nan_at_5, t
     assert not list(tmp_path.glob("*.partial"))
 
 
-def test_a_skipped_update_leaves_all_but_the_step_as_it_was(fake_model, monkeypatch):
-    monkeypatch.setattr(fakes.objective, "loss", fakes.loss_of_depth)
-    stage, config = STAGES[1], fakes.config(on_nonfinite="skip")
+def test_a_skipped_update_leaves_all_but_the_step_as_it_was(fake_model):
+    stage, config = fakes.replaced(fakes.loss_of_depth)[1], fakes.config(on_nonfinite="skip")
     mesh = make_mesh(jax.devices()[:1])
     key = step.stage_key(config, stage)
     good = fakes.clip(config, 8, 0)
@@ -97,7 +96,7 @@ def test_skipping_goes_on_counts_and_names_the_records(nan_at_5, tmp_path):
 @pytest.mark.parametrize("last", [4, 6])
 def test_the_count_goes_on_right_after_a_kill(nan_at_5, tmp_path, last):
     def die(_params, stage, number):
-        if (stage, number) == (1, last):
+        if (stage.number, number) == (1, last):
             raise RuntimeError("power cut")
         return samples.Previewed(())
 
@@ -139,7 +138,7 @@ def test_utilisation_is_told_where_the_chip_is_known(fake_model, tmp_path, monke
         rate = entry["tflops_per_second_per_device"] * 1e12
         assert entry["mfu"] == pytest.approx(rate / chips.CHIPS[0].flops)
         per_step = rate * entry["step_seconds"] * jax.device_count()
-        assert per_step == pytest.approx(8 * costs.flops_per_clip(fakes.config(), STAGES[0]))
+        assert per_step == pytest.approx(8 * costs.flops_per_clip(fakes.config(), fakes.STAGES[0]))
         assert entry["clips_per_second"] == pytest.approx(8 / entry["step_seconds"])
 
 
@@ -165,7 +164,9 @@ def test_the_first_steps_are_traced_only_where_there_are_no_others(
     seen, ended, told = [], [], []
     monkeypatch.setattr(jax.profiler, "start_trace", seen.append)
     monkeypatch.setattr(jax.profiler, "stop_trace", lambda: ended.append(now))
-    profile = loop.Profile(tmp_path, "stage1", steps=steps, first=first, last=last, say=told.append)
+    profile = loop.Profile(
+        tmp_path, fakes.STAGES[0], steps=steps, first=first, last=last, say=told.append
+    )
     annotated = []
     monkeypatch.setattr(
         jax.profiler,
@@ -187,7 +188,7 @@ def test_a_trace_that_is_broken_off_counts_what_it_holds(monkeypatch, tmp_path):
     monkeypatch.setattr(jax.profiler, "start_trace", lambda _folder: None)
     monkeypatch.setattr(jax.profiler, "stop_trace", lambda: None)
     told = []
-    profile = loop.Profile(tmp_path, "stage1", steps=5, first=1, last=9, say=told.append)
+    profile = loop.Profile(tmp_path, fakes.STAGES[0], steps=5, first=1, last=9, say=told.append)
     with profile.around(3):
         pass
     profile.close()
@@ -200,7 +201,7 @@ def test_what_a_preview_measures_stands_in_its_steps_line(fake_model, tmp_path, 
     monkeypatch.setattr(loop.LiveView, "say", lambda _view, text: told.append(text))
 
     def preview(_params, stage, number):
-        psnr = {"model": 12.5} if stage == 1 else {"memory": 15.25, "empty": 13.0 + number}
+        psnr = {"model": 12.5} if stage.number == 1 else {"memory": 15.25, "empty": 13.0 + number}
         return samples.Previewed((Path("a.png"), Path("a.mp4")), psnr)
 
     train(fakes.config(tmp_path, preview_every=4, log_every=5), preview=preview)

@@ -30,9 +30,10 @@ from pewm_jax import presets as configs
 from pewm_jax import tree
 from pewm_jax.config import MeshConfig
 from pewm_jax.models import world_model
-from pewm_jax.training import sharding, stages, step
+from pewm_jax.training import sharding, step
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.state import create
+from pewm_jax.worlds.pewm import STAGES
 from tests.helpers import random_camera
 
 STEPS = 20
@@ -64,7 +65,7 @@ def clip(config, seed):
 
 def backbone(config):
     """Weights that stage 2 starts from, whose output is not zero."""
-    make = functools.partial(world_model.init, config, memory=False)
+    make = functools.partial(world_model.init, config.model, memory=False)
     rng = np.random.default_rng(0)
     return jax.tree.map(
         lambda x: rng.normal(0, 0.1, x.shape).astype(np.float32),
@@ -120,11 +121,12 @@ def main(folder: Path) -> None:
     config = configs.load("tiny")
     for name in ("stage1", "stage2"):
         config = fakes.with_stage(config, name, batch=8, steps=STEPS)
-    wide = dataclasses.replace(config, dit=dataclasses.replace(config.dit, heads=8, head_dim=32))
+    wider = dataclasses.replace(config.model.backbone, heads=8, head_dim=32)
+    wide = config.with_model(backbone=wider)
     fsdp = sharding.make_mesh(arranged=MESHES["fsdp 8"])
-    out = {"losses": {}, "rows": {}, "moved": {}, "fresh": fresh(wide, stages.STAGES[0], fsdp)}
+    out = {"losses": {}, "rows": {}, "moved": {}, "fresh": fresh(wide, STAGES[0], fsdp)}
     states, meshes = {}, {}
-    for stage, start in zip(stages.STAGES, (None, backbone(config)), strict=True):
+    for stage, start in zip(STAGES, (None, backbone(config)), strict=True):
         first = sharding.make_mesh(jax.devices()[:1], MESHES["one"])
         begun = jax.tree.map(np.asarray, step.initial_state(config, stage, first, start))
         for name, arranged in MESHES.items():
@@ -135,7 +137,7 @@ def main(folder: Path) -> None:
             if (stage.number, name) == (2, "tensor 2 fsdp 4"):  # from host memory, part by part
                 state = step.initial_state(config, stage, mesh, start)
             else:
-                state = jax.device_put(begun, sharding.of_state(mesh, begun))
+                state = jax.device_put(begun, sharding.of_state(config.model, mesh, begun))
             losses, states[name], rows, moved = run(config, stage, mesh, state)
             label = f"{stage.name} {name}"
             out["losses"][label], out["rows"][label], out["moved"][label] = losses, rows, moved

@@ -1,27 +1,27 @@
 """A world model of four small arrays, and random clips: what the trainer needs, in milliseconds."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import ClipConfig, Config, DataConfig, StageConfig, TrainConfig
+from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, StageConfig, TrainConfig
 from pewm_jax.data import loader
-from pewm_jax.diffusion import objective
-from pewm_jax.models import world_model
 from pewm_jax.training import sharding
 from pewm_jax.types import Camera, Clip, Frames
+from pewm_jax.worlds import pewm
 
 SIZE = 16
 
 
-def config(run="runs/fake", *, stage1=6, stage2=6, **train) -> Config:
+def config(run="runs/fake", *, stage1=6, stage2=6, dtype="float32", **train) -> Config:
     settings = {"batch": 8, "warmup": 2, "learning_rate": 1e-2}
     train = {"save_every": 3, "log_every": 1, "preview_every": 0, "ema": 0.5} | train
     return Config(
-        clip=ClipConfig(frames=5, height=SIZE, width=SIZE),
+        model=ModelConfig(clip=ClipConfig(frames=5, height=SIZE, width=SIZE), dtype=dtype),
         data=DataConfig(context=1),
         train=TrainConfig(
             run=str(run),
@@ -42,17 +42,19 @@ def with_train(config: Config, **changes) -> Config:
 
 
 def clip(config: Config, batch: int, seed: int) -> Clip:
-    rng = np.random.default_rng(seed)
+    rng, size = np.random.default_rng(seed), config.model.clip
 
     def frames(count):
-        shape = (batch, count, config.clip.height, config.clip.width)
+        shape = (batch, count, size.height, size.width)
         pose = np.broadcast_to(np.eye(4, dtype=np.float32), (batch, count, 4, 4))
         camera = Camera(np.full((batch, count, 4), 4, np.float32), pose)
         rgb = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
         return Frames(rgb, rng.uniform(1, 4, shape).astype(np.float32), camera)
 
     context = config.data.context
-    return Clip(frames(config.clip.frames), frames(context), np.ones((batch, context), bool))
+    actions = np.zeros((batch, size.frames - 1, 3), np.float32)
+    valid = np.ones((batch, context), bool)
+    return Clip(frames(size.frames), frames(context), valid, actions_TA=actions)
 
 
 def clips(config, split="train", *, seed, batch, start_step=0, features=None, rows=None, bad=None):
@@ -69,7 +71,7 @@ def records(config, split="train", *, seed, batch, step):
     return [f"record {1000 * seed + step}-{row}" for row in range(batch)]
 
 
-def init(config, key, *, memory=True):
+def init(model, key, *, memory=True):
     k1, k2 = jax.random.split(key)
     params = {
         "backbone": {"kernel": jax.random.normal(k1, (3, 3)) / 2, "bias": jnp.full((3,), 0.1)}
@@ -79,7 +81,7 @@ def init(config, key, *, memory=True):
     return params
 
 
-def loss(config, params, clip, key, *, memory):
+def loss(model, train, params, clip, key, *, memory):
     rgb = jnp.asarray(clip.frames.rgb_THWC, jnp.float32) / 255
     noisy = rgb + 0.1 * jax.random.normal(key, rgb.shape)
     out = noisy @ params["backbone"]["kernel"] + params["backbone"]["bias"]
@@ -105,19 +107,34 @@ def without_depth_at(bad):
     return poisoned
 
 
-def loss_of_depth(config, params, clip, key, *, memory):
-    value, metrics = loss(config, params, clip, key, memory=memory)
+def loss_of_depth(model, train, params, clip, key, *, memory):
+    value, metrics = loss(model, train, params, clip, key, memory=memory)
     return value * jnp.where(jnp.isnan(clip.frames.depth_THW).any(), jnp.nan, 1.0), metrics
 
 
-def install(patch):
+def replaced(loss):
+    """Return PEWM's stages with the small model and some loss."""
+    return tuple(
+        dataclasses.replace(
+            stage,
+            init=functools.partial(init, memory=stage.memory),
+            loss=functools.partial(loss, memory=stage.memory),
+        )
+        for stage in pewm.STAGES
+    )
+
+
+STAGES = replaced(loss)
+RULES = ((r"(backbone|memory)/(kernel|bias|gate)", sharding.WHOLE),)
+
+
+def install(patch, loss=loss):
     """Put the small model and its clips in place of the real ones."""
-    patch.setattr(world_model, "init", init)
-    patch.setattr(objective, "loss", loss)
+    real = pewm.sharding
+    patch.setattr(pewm, "STAGES", replaced(loss))
+    patch.setattr(pewm, "sharding", lambda model: (*RULES, *real(model)))
     patch.setattr(loader, "clips", clips)
     patch.setattr(loader, "records", records)
-    fake = r"(params|ema|opt_state/.+)/(backbone|memory)/(kernel|bias|gate)"
-    patch.setattr(sharding, "STATE_RULES", ((fake, sharding.WHOLE), *sharding.STATE_RULES))
 
 
 @pytest.fixture

@@ -3,36 +3,36 @@
 Prints, for each, what the compiled program does and needs and what the sums on paper say, as JSON.
 """
 
-import dataclasses
 import json
 import sys
 from typing import Literal
 
 from pewm_jax.config import (
+    AttentionConfig,
     ClipConfig,
-    CodecConfig,
     Config,
     DataConfig,
     DINOv2Config,
+    DINOv2EncoderConfig,
     DiTConfig,
-    MemoryConfig,
     MeshConfig,
+    ModelConfig,
+    PatchColoursConfig,
+    PixelConfig,
     StageConfig,
     TrainConfig,
     VAEConfig,
+    VoxelConfig,
 )
 from pewm_jax.scaling import hlo, plan, predict
 from pewm_jax.scaling.footprint import MeshSizes
-from pewm_jax.training import costs, stages
+from pewm_jax.worlds import costs
+from pewm_jax.worlds.pewm import STAGES
 
+DINOV2 = DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56)
 ENCODERS = {
-    "codec": CodecConfig(
-        kind="vae",
-        spatial=8,
-        temporal=4,
-        vae=VAEConfig(widths=(16, 16, 32, 32), groups=16, resnets=1),
-    ),
-    "encoder": "dinov2",
+    "codec": VAEConfig(widths=(16, 16, 32, 32), groups=16, resnets=1),
+    "encoder": DINOv2EncoderConfig(size=56, network=DINOV2),
 }
 FSDP = MeshConfig(fsdp=8)
 TENSOR = MeshConfig(fsdp=4, tensor=2)
@@ -62,37 +62,38 @@ def experiment(
     dtype: Literal["float32", "bfloat16"] = "float32",
     mesh=None,
     codec=None,
-    encoder: Literal["patch_colours", "dinov2"] = "patch_colours",
+    encoder=None,
 ):
     """Return a small experiment."""
     stage = StageConfig(batch=batch)
+    reader = AttentionConfig(heads=8, head_dim=16, mlp_ratio=mlp, positions="sinusoid")
+    memory = VoxelConfig(tokens=tokens, encoder=encoder or PatchColoursConfig(), reader=reader)
+    backbone = DiTConfig(
+        layers=layers,
+        heads=heads,
+        head_dim=32,
+        text_length=16,
+        text_dim=64,
+        time_dim=64,
+        remat=remat,
+    )
     return Config(
-        clip=ClipConfig(frames=9, height=size, width=size),
-        codec=codec or CodecConfig(spatial=2),
-        dit=DiTConfig(
-            layers=layers, heads=heads, head_dim=32, text_length=16, text_dim=64, time_dim=64
-        ),
-        memory=MemoryConfig(
-            tokens=tokens,
-            heads=8,
-            head_dim=16,
-            mlp_ratio=mlp,
-            positions="sinusoid",
-            encoder=encoder,
-            encoder_size=56,
-            dinov2=DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56),
+        model=ModelConfig(
+            clip=ClipConfig(frames=9, height=size, width=size),
+            codec=codec or PixelConfig(spatial=2),
+            backbone=backbone,
+            memory=memory,
+            dtype=dtype,
         ),
         data=DataConfig(context=2),
-        train=TrainConfig(stage1=stage, stage2=stage, dtype=dtype, mesh=mesh or MeshConfig()),
+        train=TrainConfig(stage1=stage, stage2=stage, mesh=mesh or MeshConfig()),
     )
 
 
 def measure(number, settings, devices):
     """Compile a variant; returns what was counted and what was expected."""
-    remat = settings.pop("remat", True)
     config = experiment(**settings)
-    config = dataclasses.replace(config, dit=dataclasses.replace(config.dit, remat=remat))
-    stage = stages.STAGES[number - 1]
+    stage = STAGES[number - 1]
     used = devices if "mesh" in settings else devices[:1]
     compiled = plan.compile_stage(config, stage, used)
     mesh = MeshSizes(*config.train.mesh.shape(len(used)))

@@ -226,7 +226,7 @@ def main():
         fakes = importlib.import_module("training_fakes")
         fakes.install(patch)
         if "NAN_AT" in os.environ:
-            patch.setattr(fakes.objective, "loss", fakes.loss_of_depth)
+            fakes.install(patch, fakes.loss_of_depth)
             patch.setattr(loader, "clips", fakes.without_depth_at(int(os.environ["NAN_AT"])))
     loader.clips = told_at(
         loader.clips, int(os.environ.get("TERM_AT", "0")), float(os.environ.get("PAUSE", "0"))

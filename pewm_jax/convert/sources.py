@@ -1,4 +1,4 @@
-"""Foreign weights as they lie on disk: one safetensors file, or shards and their index.
+"""Where foreign tensors are read from: one safetensors file, shards with an index, or memory.
 
 Headers are read at once and checked against the files' sizes; tensors are read one by one, when
 asked for, so that nothing holds more than one of them.
@@ -241,10 +241,10 @@ def component(folder: Path, name: str) -> Path:
 
 
 def _precision(path: Path) -> str:
-    """Return the word of a file that tells one of several precisions, or nothing.
+    """Return the part of a file's name that says its precision, or nothing.
 
     It is ``fp16`` in ``model.fp16.safetensors``, ``model.fp16-00001-of-00002.safetensors`` and
     ``model.safetensors.index.fp16.json``.
     """
-    words = path.name.split("-00", 1)[0].split(".")[1:]
-    return ".".join(word for word in words if word not in {"safetensors", "index", "json"})
+    parts = path.name.split("-00", 1)[0].split(".")[1:]
+    return ".".join(part for part in parts if part not in {"safetensors", "index", "json"})

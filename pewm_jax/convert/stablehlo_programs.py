@@ -1,4 +1,4 @@
-"""What of a world model runs on its own: functions of flat named arrays, and their lowering."""
+"""The programs of a StableHLO export: functions of flat named arrays, and how they are lowered."""
 
 from __future__ import annotations
 
@@ -94,13 +94,13 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
 
     camera = abstract.camera(batch, clip.frames)
     observed = abstract.frames(batch, 1, height=clip.height, width=clip.width, colours=jnp.float32)
-    told = jax.eval_shape(
+    conditioning = jax.eval_shape(
         lambda p, observed, camera: world_model.condition(model, p, observed, Control(camera)),
         params,
         observed,
         camera,
     )
-    parts = {"conditioning": told}
+    parts = {"conditioning": conditioning}
     if "memory" in params:
 
         def read(c: Camera) -> Any:

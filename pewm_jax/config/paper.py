@@ -1,0 +1,99 @@
+"""The paper's settings around a video model: what presets and imported checkpoints share.
+
+PEWM, arXiv 2505.05495.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from pewm_jax.config.clip import ClipConfig
+from pewm_jax.config.codec import CodecSettings
+from pewm_jax.config.dit import DiTConfig
+from pewm_jax.config.encoder import EncoderSettings, PatchColoursConfig
+from pewm_jax.config.experiment import Config
+from pewm_jax.config.memory import VoxelConfig
+from pewm_jax.config.mesh import MeshConfig
+from pewm_jax.config.model import ModelConfig
+from pewm_jax.config.noise import NoiseSettings
+from pewm_jax.config.reader import AttentionConfig
+from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
+
+CLIP = ClipConfig(frames=9, height=512, width=512)
+"""The paper's clip."""
+READER = AttentionConfig(positions="sinusoid", heads=16, head_dim=64, mlp_ratio=2)
+"""The paper's positions; 0.94 billion parameters of memory blocks on 2b ("nearly 1 B"), 2.8 on
+5b."""
+STAGE = StageConfig(steps=20_000, batch=256, learning_rate=1e-4, warmup=500, decay="constant")
+"""Adam, learning rate 1e-4 after a linear warm-up; 256 clips, so that 8, 64 and 256 devices share
+them evenly."""
+
+
+def experiment(
+    backbone: DiTConfig,
+    codec: CodecSettings,
+    noise: NoiseSettings,
+    *,
+    run: str,
+    clip: ClipConfig = CLIP,
+    encoder: EncoderSettings | None = None,
+    dtype: Literal["float32", "bfloat16"] = "bfloat16",
+) -> Config:
+    """Return the settings with which a video model becomes the paper's world model.
+
+    As the paper trains: stage 1 fine-tunes the backbone to colour with depth and to cameras, stage
+    2 trains the memory blocks alone; Adam, learning rate 1e-4 after a linear warm-up, gradients
+    clipped at norm 1, bfloat16. The map has 256 × 256 × 32 cells of 0.25 × 0.25 × 1 m, read through
+    positions relative to the clip's first camera. What the paper does not say is chosen: 512 cells
+    per clip, 16 frames of context, the size of a memory block (see ``READER``), 256 clips per step;
+    weights split over 8 devices, a node of GPUs, and copied beyond.
+
+    Args:
+        backbone: the video model's transformer.
+        codec: its autoencoder.
+        noise: its schedule and sampler.
+        run: name of the experiment, for the folder of its runs.
+        clip: the shape of a clip.
+        encoder: the image features that the map keeps, by default the colours of patches.
+        dtype: compute precision.
+
+    Raises:
+        ConfigError: the parts do not fit together.
+    """
+    return Config(
+        model=ModelConfig(
+            clip=clip,
+            codec=codec,
+            # Channels are left to follow codec and control: 88 in, 32 out with CogVideoX's VAE.
+            backbone=dataclasses.replace(backbone, in_channels=0, out_channels=0, remat=True),
+            memory=VoxelConfig(
+                cell_m=(0.25, 0.25, 1.0),
+                cells=(256, 256, 32),
+                capacity=8192,
+                tokens=512,
+                encoder=encoder or PatchColoursConfig(),
+                reader=reader_for(backbone),
+            ),
+            noise=noise,
+            dtype=dtype,
+        ),
+        data=DataConfig(path="data/pewm", context=16),
+        train=TrainConfig(
+            run=f"runs/{run}",
+            stage1=STAGE,
+            stage2=STAGE,
+            ema=0.9995,
+            save_every=250,
+            keep_every=5000,
+            preview_every=1000,
+            mesh=MeshConfig(fsdp=8),
+        ),
+        evaluate=EvalConfig(clips=256, batch=8),
+    )
+
+
+def reader_for(backbone: DiTConfig) -> AttentionConfig:
+    """Return the settings of memory blocks: the paper's, but no wider than a small transformer."""
+    head_dim = min(READER.head_dim, max(8, backbone.head_dim // 8 * 8))
+    return dataclasses.replace(READER, heads=min(READER.heads, backbone.heads), head_dim=head_dim)

@@ -1,0 +1,68 @@
+"""EDM and flow matching beside EDMEulerScheduler and FlowMatchEulerDiscreteScheduler."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax.config import EDMConfig, FlowConfig
+from pewm_jax.diffusion import noise
+
+torch = pytest.importorskip("torch")
+diffusers = pytest.importorskip("diffusers")
+
+START = np.random.default_rng(0).normal(size=(2, 3, 4)).astype(np.float32)
+
+
+def network(x, told, xp):
+    """Stand in for the network F: smooth, and different at every level."""
+    return xp.tanh(0.7 * x) + 0.3 * xp.cos(3 * x + told)
+
+
+def our_path(config):
+    """What the network is shown and told, and x0 of each step; and the sample."""
+
+    def denoise(x, times, _weight):
+        shown, told = noise.shown(config, x, times)
+        told = noise.spread(told, x.ndim)
+        return noise.to_x0(config, network(shown, told, jnp), x, times)
+
+    return np.asarray(jax.jit(lambda x: noise.sample(config, denoise, x))(START))
+
+
+@pytest.mark.parametrize("steps", [1, 2, 18])
+@pytest.mark.parametrize("settings", [(0.002, 80.0, 0.5, 7.0), (0.03, 30.0, 1.0, 3.0)], ids=str)
+def test_edm_equals_the_reference(steps, settings):
+    least, most, data, rho = settings
+    theirs = diffusers.EDMEulerScheduler(sigma_min=least, sigma_max=most, sigma_data=data, rho=rho)
+    config = EDMConfig(
+        sigma_min=least, sigma_max=most, sigma_data=data, rho=rho, sample_steps=steps
+    )
+    theirs.set_timesteps(steps)
+    np.testing.assert_allclose(noise.levels(config), theirs.sigmas[:-1].numpy(), rtol=1e-5)
+    x = torch.from_numpy(START) * theirs.sigmas[0]
+    for i, t in enumerate(theirs.timesteps):
+        shown = theirs.scale_model_input(x, t)
+        ours, told = noise.shown(config, x.numpy(), theirs.sigmas[i].numpy()[None].repeat(2))
+        np.testing.assert_allclose(ours, shown.numpy(), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(told, float(t), rtol=1e-5, atol=1e-6)
+        x = theirs.step(network(shown, t, torch), t, x, return_dict=False)[0]
+    got = our_path(config)
+    assert np.abs(got - x.numpy()).max() <= 1e-5 * max(1, np.abs(x.numpy()).max(), most / 20)
+
+
+@pytest.mark.parametrize("steps", [1, 4, 20])
+@pytest.mark.parametrize("shift", [1.0, 3.0])
+def test_flow_equals_the_reference(steps, shift):
+    theirs = diffusers.FlowMatchEulerDiscreteScheduler(shift=shift)
+    # As the pipelines ask for their times; left alone, this scheduler shifts twice.
+    theirs.set_timesteps(sigmas=np.linspace(1, 1 / steps, steps))
+    config = FlowConfig(shift=shift, sample_steps=steps)
+    np.testing.assert_allclose(noise.levels(config), theirs.sigmas[:-1].numpy(), rtol=1e-5)
+    _, told = noise.shown(config, START, jnp.asarray(noise.levels(config)))
+    np.testing.assert_allclose(told, theirs.timesteps.numpy(), rtol=1e-5)
+    x = torch.from_numpy(START)
+    for t in theirs.timesteps:
+        x = theirs.step(network(x, t, torch), t, x, return_dict=False)[0]
+    got = our_path(config)
+    assert np.abs(got - x.numpy()).max() <= 1e-5 * max(1, np.abs(x.numpy()).max())

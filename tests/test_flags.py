@@ -1,0 +1,202 @@
+"""Flags of an experiment: in short, by the names they once had, and with kinds of parts."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from pewm_jax import cli, flags, presets
+from pewm_jax import config as configuration
+from pewm_jax.config import (
+    Config,
+    ConfigError,
+    DINOv2EncoderConfig,
+    EDMConfig,
+    FlowConfig,
+    ImagesConfig,
+    VAEConfig,
+    kinds,
+)
+
+TINY = presets.load("tiny")
+VERSION_1 = Path(__file__).parent / "version_1"
+
+
+def parse(*argv, default=TINY):
+    return cli.parse(Config, [str(word) for word in argv], default=default, prog="python train.py")
+
+
+def leaves(table, prefix=""):
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"
+
+
+def test_the_model_s_settings_have_short_names():
+    world = ("--model.kind", "--version")
+    full = [name for name, _ in flags.of(TINY) if name.startswith("--model.") and name not in world]
+    short = [name.replace("--model.", "--") for name in full]
+    assert len(full) > 50
+    assert flags.spelled_out(short, TINY) == full
+    assert flags.spelled_out(full, TINY) == full
+    other = [name for name, _ in flags.of(TINY) if not name.startswith("--model.") or name in world]
+    assert flags.spelled_out(other, TINY) == other
+
+
+def test_a_short_name_a_full_one_and_one_with_hyphens_set_the_same():
+    want = TINY.with_model(clip=dataclasses.replace(TINY.model.clip, near_m=0.5))
+    for flag in ("clip.near_m", "model.clip.near_m", "clip.near-m", "model.clip.near-m"):
+        assert parse(f"--{flag}", 0.5) == want
+        assert parse(f"--{flag}=0.5") == want
+    assert parse("--dtype", "bfloat16") == TINY.with_model(dtype="bfloat16")
+    assert not parse("--clip.no_depth").model.clip.depth
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (["--dit.layers", 3], ["--model.backbone.layers", 3]),
+        (["--dit.remat"], ["--model.backbone.remat"]),
+        (["--diffusion.sample_steps", 4], ["--model.noise.sample_steps", 4]),
+        (["--diffusion.image_noise_std=0.1"], ["--train.image_noise_std", 0.1]),
+        (["--train.dtype", "bfloat16"], ["--model.dtype", "bfloat16"]),
+        (["--memory.heads", 5], ["--model.memory.reader.heads", 5]),
+        (["--memory.head-dim", 16], ["--model.memory.reader.head_dim", 16]),
+        (["--memory.positions", "sinusoid"], ["--model.memory.reader.positions", "sinusoid"]),
+        (["--memory.encoder_patch", 4], ["--model.memory.encoder.patch", 4]),
+        (["--memory.encoder", "dinov2"], ["--model.memory.encoder.kind", "dinov2"]),
+        (["--memory.no_depth"], ["--model.clip.no_depth"]),
+        (["--memory.tokens", 8], ["--model.memory.tokens", 8]),
+        (["--actions.step_m", 2], ["--model.actions.step_m", 2]),
+    ],
+)
+def test_old_names_set_what_they_set(old, new):
+    assert parse(*old) == parse(*new) != TINY
+
+
+def test_every_flag_of_an_earlier_version_is_one_now():
+    preset = presets.load("pewm_2b")
+    old = [f"--{name}" for name in leaves(json.loads((VERSION_1 / "pewm_2b.json").read_text()))]
+    now = set(flags.spelled_out(old, preset))
+    known = {name for name, _ in flags.of(preset)}
+    of_other_kinds = {
+        "--model.codec.spatial",
+        "--model.memory.snapshots",
+        "--model.memory.encoder.patch",
+    }
+    assert now - known == of_other_kinds
+    assert len(now) > 90
+
+
+@pytest.mark.parametrize("section", ["codec", "memory", "noise", "memory.encoder"])
+def test_every_kind_can_be_put_into_its_section(section):
+    part = section.rsplit(".", 1)[-1]
+    for name in kinds.names(part):
+        found = parse(f"--{section}.kind", name, default=Config()).model
+        for step in section.split("."):
+            found = getattr(found, step)
+        assert kinds.of(found).name == name
+
+
+def test_another_kind_keeps_what_both_have_and_takes_settings_of_its_own():
+    memory = parse("--memory.kind", "images", "--memory.snapshots", 3, "--memory.tokens=9")
+    memory = memory.model.memory
+    before = TINY.model.memory
+    assert isinstance(memory, ImagesConfig)
+    assert (memory.snapshots, memory.tokens) == (3, 9)
+    assert (memory.cell_m, memory.capacity) == (before.cell_m, before.capacity)
+    assert (memory.reader, memory.encoder) == (before.reader, before.encoder)
+    noise = parse("--model.noise.kind=flow", "--noise.shift", 3).model.noise
+    assert noise == FlowConfig(shift=3.0, sample_steps=TINY.model.noise.sample_steps)
+    assert parse("--memory.kind", "voxel") == TINY
+    few = parse("--memory.kind", "images", "--memory.snapshots", 2, "--memory.tokens", 2).model
+    assert (few.memory.snapshots, few.memory.tokens) == (2, 2)
+    edm = parse("--noise.kind", "edm").model.noise
+    assert edm == EDMConfig(sample_steps=TINY.model.noise.sample_steps)
+
+
+@pytest.mark.parametrize(
+    ("argv", "sentence"),
+    [
+        (["--memory.kind", "image"], "no memory of kind 'image'; there is images, map2d, none"),
+        (["--memory.kind"], "--model.memory.kind needs a value: images, map2d"),
+        (["--memory.snapshots", 3], "--model.memory.snapshots is not a setting"),
+        (["--memory.reader.kind", "?"], "no reader of kind"),
+        (["--clip.kind", "x"], "--model.clip.kind is not a setting"),
+        (["--backbone.layer", 3], r"did you mean --model.backbone.layers\?"),
+        (["--codec.kind", "vae"], "use 8k . 1 frames"),
+        (["--codec.kind", "vae", "--clip.frames", 9, "--clip.height", 20], "multiples of"),
+    ],
+)
+def test_wrong_kinds_and_names_are_refused(argv, sentence):
+    with pytest.raises(ConfigError, match=sentence) as refusal:
+        parse(*argv)
+    assert "\n" not in str(refusal.value)
+
+
+def test_the_help_names_the_kinds(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        parse("--memory.kind", "images", "--help")
+    out = " ".join(capsys.readouterr().out.split())
+    assert "several kinds" in out
+    for section in ("model.codec", "model.memory", "model.memory.encoder", "model.noise"):
+        there = ",".join(kinds.names(section.rsplit(".", 1)[-1]))
+        assert f"--{section}.kind {{{there}}}" in out
+    assert "(images)" in out
+    assert "--model.memory.snapshots" in out
+
+
+@pytest.mark.parametrize(
+    ("table", "argv"),
+    [
+        ({"dit": {"layers": 3}, "train": {"dtype": "bfloat16"}},
+         ["--backbone.layers", 3, "--dtype", "bfloat16"]),
+        ({"memory": {"heads": 5, "encoder_patch": 4}},
+         ["--memory.reader.heads", 5, "--memory.encoder.patch", 4]),
+        ({"memory": {"kind": "images", "snapshots": 3}},
+         ["--memory.kind", "images", "--memory.snapshots", 3]),
+        ({"model": {"memory": {"kind": "images", "snapshots": 3}}, "train": {"seed": 3}},
+         ["--memory.kind", "images", "--memory.snapshots", 3, "--train.seed", 3]),
+        ({"version": 2, "model": {"noise": {"kind": "flow", "shift": 2}}},
+         ["--noise.kind", "flow", "--noise.shift", 2]),
+        ({"model": {"memory": {"encoder": {"kind": "dinov2", "size": 28}}}},
+         ["--memory.encoder.kind", "dinov2", "--memory.encoder.size", 28]),
+        ({"version": 1, "diffusion": {"image_noise_std": 0.1}}, ["--train.image_noise_std", 0.1]),
+    ],
+)  # fmt: skip
+def test_a_file_of_settings_old_or_new_does_what_flags_do(table, argv, tmp_path):
+    file = tmp_path / "mine.json"
+    file.write_text(json.dumps(table))
+    assert parse("--config", file) == parse(*argv) != TINY
+    assert parse("--train.seed", 9, f"--config={file}") == parse(*argv, "--train.seed", 9)
+
+
+def test_a_setting_of_another_kind_in_an_old_file_is_not_passed_over(tmp_path):
+    file = tmp_path / "mine.json"
+    file.write_text('{"memory": {"encoder_size": 28}}')
+    with pytest.raises(ConfigError, match="encoder has no setting size"):
+        parse("--config", file)
+    dino = TINY.with_model(
+        memory=dataclasses.replace(TINY.model.memory, encoder=DINOv2EncoderConfig())
+    )
+    assert parse("--config", file, default=dino).model.memory.encoder.size == 28
+
+
+@pytest.mark.parametrize("name", ["images", "pewm_2b"])
+def test_a_whole_file_of_an_earlier_version_takes_the_place_of_any_preset(name):
+    file = VERSION_1 / f"{name}.json"
+    assert parse("--config", file, default=presets.load("demo")) == configuration.load(file)
+
+
+def test_a_kind_may_need_another_setting_to_fit(tmp_path):
+    """The VAE does not fit the five frames of `tiny`; with nine it does, whatever comes first."""
+    kind, frames = ["--codec.kind", "vae"], ["--clip.frames", 9]
+    assert isinstance(parse(*kind, *frames).model.codec, VAEConfig)
+    assert parse(*frames, *kind) == parse(*kind, *frames)
+    file = tmp_path / "mine.json"
+    file.write_text('{"model": {"codec": {"kind": "vae"}, "clip": {"frames": 9}}}')
+    assert parse("--config", file) == parse(*kind, *frames)
