@@ -23,9 +23,9 @@ from pewm_jax.models.costs import (
     video_times,
     video_tokens,
 )
-from pewm_jax.models.dit import patchify
 from pewm_jax.models.memory_block import MemoryBlock
 from pewm_jax.models.memory_geometry import Sightings, patch_pixels, sightings, sinusoid_3d
+from pewm_jax.models.patches import patchify
 from pewm_jax.models.token_layout import TokenLayout
 from pewm_jax.types import Array, Camera, MapTokens, Params
 

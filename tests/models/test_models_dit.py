@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.config import PUBLISHED, ConfigError, DiTConfig, UserError, published
-from pewm_jax.models import dit, layers, positions, world_model
+from pewm_jax.models import dit, dit_block, layers, patches, positions, world_model
 from pewm_jax.models.token_layout import TokenLayout
 from tests.helpers import TINY, init_world, randomise
 from tests.models.test_models_world_model import setup as world
@@ -42,9 +42,11 @@ run = jax.jit(dit.apply, static_argnums=0, static_argnames="expert")
 )
 def test_unpatchify_inverts_patchify(t, h, w, p, p_t, c):
     latents = np.random.default_rng(0).normal(size=(2, t * p_t, h * p, w * p, c))
-    tokens = dit.patchify(latents, p, p_t)
+    tokens = patches.patchify(latents, p, p_t)
     assert tokens.shape == (2, t * h * w, c * p_t * p * p)
-    np.testing.assert_array_equal(dit.unpatchify(tokens, t * p_t, h * p, w * p, p, p_t), latents)
+    np.testing.assert_array_equal(
+        patches.unpatchify(tokens, t * p_t, h * p, w * p, p, p_t), latents
+    )
 
 
 def test_a_fresh_network_predicts_zero():
@@ -80,16 +82,16 @@ def plain_loop(params, latents, text, times):
     """The same network without scan."""
     ends = dit.Ends(CONFIG, 7, jnp.dtype("float32"))
     rest = {"params": {k: v for k, v in params.items() if k != "blocks"}}
-    patches = dit.patchify(latents, 2)
+    patches = patches.patchify(latents, 2)
     tokens, time = ends.apply(rest, patches, text, times, times, method="embed")
     length = CONFIG.text_length
     angles = positions.joint_angles(CONFIG, (3, 2, 3), length)
     layout = TokenLayout(parts=1, text=length, frames=3, patches=6)
     for i in range(CONFIG.layers):
         layer = jax.tree.map(lambda x, i=i: x[i], params["blocks"])
-        tokens = dit.Block(CONFIG).apply({"params": layer}, tokens, time, angles, layout)
+        tokens = dit_block.Block(CONFIG).apply({"params": layer}, tokens, time, angles, layout)
     out = ends.apply(rest, tokens[:, length:], time, method="project")
-    return dit.unpatchify(out, 3, 4, 6, 2)
+    return patches.unpatchify(out, 3, 4, 6, 2)
 
 
 def test_scan_and_remat_equal_a_plain_loop():

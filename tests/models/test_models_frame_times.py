@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.models import backbones, dit, world_model
+from pewm_jax.models import backbones, dit, dit_block, world_model
 from pewm_jax.models.backbones import Conditioning, Readers
 from pewm_jax.models.memory_block import MemoryBlock
 from pewm_jax.models.token_layout import TokenLayout
@@ -81,7 +81,7 @@ def test_a_reader_and_the_last_layer_are_told_of_each_frame_its_own(config, fram
 def test_a_block_modulates_the_tokens_of_each_frame_by_its_own_time(parts):
     """The first row of times is the text's."""
     layout = TokenLayout(parts=parts, text=4, frames=FRAMES, patches=PATCHES)
-    norm = dit.LayerNormZero()
+    norm = dit_block.LayerNormZero()
     tokens = layout.arrange(draw(0, 2, 4 + FRAMES * PATCHES, WIDTH))
     times = draw(1, 2, 1 + FRAMES, TIME)
     params = randomise(norm.init(jax.random.key(0), tokens, times, layout))
