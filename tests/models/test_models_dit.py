@@ -82,8 +82,8 @@ def plain_loop(params, latents, text, times):
     """The same network without scan."""
     ends = dit.Ends(CONFIG, 7, jnp.dtype("float32"))
     rest = {"params": {k: v for k, v in params.items() if k != "blocks"}}
-    patches = patches.patchify(latents, 2)
-    tokens, time = ends.apply(rest, patches, text, times, times, method="embed")
+    tokens = patches.patchify(latents, 2)
+    tokens, time = ends.apply(rest, tokens, text, times, times, method="embed")
     length = CONFIG.text_length
     angles = positions.joint_angles(CONFIG, (3, 2, 3), length)
     layout = TokenLayout(parts=1, text=length, frames=3, patches=6)
