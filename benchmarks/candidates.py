@@ -42,9 +42,10 @@ def measure(preset: str, candidates: int, actions: int, runs: int) -> dict[bool,
     keys = jax.random.split(jax.random.key(1), candidates)
     compiled, seconds = {}, {True: [], False: []}
     for remember in seconds:
-        imagine = functools.partial(worlds.imagine, model, remember=remember)
-        over = jax.jit(jax.vmap(imagine, (None, None, 0, 0)))
-        compiled[remember] = over.lower(params, state, moves, keys).compile()
+        many = functools.partial(worlds.imagine_many, model)
+        if remember:
+            many = jax.vmap(functools.partial(worlds.imagine, model), (None, None, 0, 0))
+        compiled[remember] = jax.jit(many).lower(params, state, moves, keys).compile()
         jax.block_until_ready(compiled[remember](params, state, moves, keys))
     for _ in range(runs):
         for remember, imagine in compiled.items():

@@ -20,7 +20,7 @@ from record import machine, record, table
 from pewm_jax import presets as configs
 from pewm_jax.config import ClipConfig, Config, MeshConfig
 from pewm_jax.scaling import plan, suggest
-from pewm_jax.scaling.footprint import Arranged
+from pewm_jax.scaling.footprint import MeshSizes
 from pewm_jax.scaling.plan_text import arranged, rate, size, work
 from pewm_jax.training import chips, stages
 from pewm_jax.training.log import duration
@@ -72,8 +72,8 @@ def row(label: str, config: Config, stage: Stage, count: int, chip: chips.Chip) 
     """Plan one case; returns its line of the table."""
     print(f"{label}, stage {stage.number}, {count} × {chip.name}: compiling …", flush=True)
     compiled = plan.compile_stage(config, stage, plan.virtual(count))
-    mesh = Arranged(*config.train.mesh.shape(count))
-    choice = suggest.weigh(config, stage, mesh, chip)
+    mesh = MeshSizes(*config.train.mesh.shape(count))
+    choice = suggest.assess(config, stage, mesh, chip)
     best = suggest.rank(config, stage, count, chip)
     one = plan.Plan(config, stage, chip, choice, compiled, tuple(best[:1]))
     print(f"  compiled in {compiled.seconds:.0f} s: {size(one.peak)}", flush=True)

@@ -34,7 +34,7 @@ from pewm_jax import presets as configs
 from pewm_jax.config import Config, MeshConfig, UserError
 from pewm_jax.data import abstract
 from pewm_jax.scaling import suggest
-from pewm_jax.scaling.footprint import Arranged
+from pewm_jax.scaling.footprint import MeshSizes
 from pewm_jax.training import chips, sharding, stages, step
 from pewm_jax.types import Clip
 from pewm_jax.worlds import costs
@@ -77,7 +77,7 @@ def random_clip(config: Config, stage: stages.Stage) -> Clip:
 
 def predicted(config: Config, stage: stages.Stage, chip: chips.Chip) -> dict[str, float]:
     """Return what the sums on paper, which ``--plan`` prints, say of one device."""
-    choice = suggest.weigh(config, stage, Arranged(), chip)
+    choice = suggest.assess(config, stage, MeshSizes(), chip)
     return {
         "predicted_s": choice.time.step_s,
         "predicted_mfu": choice.time.mfu,

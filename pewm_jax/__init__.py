@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pewm_jax.rollouts import rollout
     from pewm_jax.training.loading import load
     from pewm_jax.types import Camera, Clip, Control, Frames, VoxelMap, WorldState
-    from pewm_jax.worlds import imagine, observe, start
+    from pewm_jax.worlds import imagine, imagine_many, observe, start
 
 __version__ = "0.2.0.dev0"
 
@@ -40,6 +40,7 @@ _HOME = {
     "WorldState": "types",
     "integrate": "geometry.actions",
     "imagine": "worlds",
+    "imagine_many": "worlds",
     "intrinsics_from_fov": "geometry.cameras",
     "load": "training.loading",
     "observe": "worlds",
@@ -61,6 +62,7 @@ __all__ = [
     "VoxelMap",
     "WorldState",
     "imagine",
+    "imagine_many",
     "integrate",
     "intrinsics_from_fov",
     "load",

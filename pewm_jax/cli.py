@@ -31,15 +31,15 @@ _PLAIN = (
 
 
 def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:
-    """Run a command and turn what goes wrong into an exit code and one sentence on stderr.
+    """Run a command; turn errors into an exit code and one sentence on stderr.
 
     Args:
         main: the command; takes the arguments and returns an exit code (None is 0).
         argv: the arguments, by default those of the process.
 
     Returns:
-        0, or 2 for bad input and for files that cannot be used,
-        or 130 (or an ``exit_code`` the error carries) for an interruption.
+        0; 2 for bad input and for files that cannot be used; 130, or the error's ``exit_code``,
+        for an interruption.
     """
     try:
         return main(sys.argv[1:] if argv is None else argv) or 0
@@ -55,14 +55,14 @@ def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None 
 
 
 def _file_sentence(error: OSError) -> str:
-    """Say which file could not be used, why, and what helps."""
+    """Return a sentence: which file could not be used, why, and what to do."""
     where = f"{error.filename}: " if error.filename else ""
     if error.errno in {errno.ENOSPC, errno.EDQUOT}:
         fix = "free some space there"
     elif error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
         fix = "allow access to it or name another folder"
     else:
-        fix = "see to that"
+        fix = "fix that"
     return f"{where}{error.strerror or error}; {fix}, then run the same command again."
 
 
@@ -76,14 +76,15 @@ def parse(
 ) -> T:
     """Read a configuration from flags such as ``--train.stage1.steps 10``.
 
-    ``--config FILE`` lays a JSON file of settings over the default first, and kinds are chosen next
-    (see ``pewm_jax.flags``). ``--help`` prints every field with its docstring and leaves.
+    First ``--config FILE`` overrides the defaults with a JSON file of settings, then kinds are
+    chosen (see ``pewm_jax.flags``), then flags are read. ``--help`` prints every field with its
+    docstring and exits.
 
     Args:
         kind: the frozen dataclass to read.
         argv: the arguments.
-        default: what is not given.
-        prog: the words that the command was called by, for help and refusals.
+        default: the settings if no flags are given.
+        prog: the command as the user typed it, for help and error messages.
         description: the first paragraph of the help text.
 
     Raises:
@@ -106,32 +107,32 @@ def parse(
             description=_with_kinds(description, default),
             use_underscores=True,
         )
-    told = io.StringIO()
+    output = io.StringIO()
     try:
-        with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
+        with contextlib.redirect_stderr(output), contextlib.redirect_stdout(output):
             return tyro.cli(kind, args=flags, default=default, prog=prog, use_underscores=True)
     except SystemExit:
-        raise ConfigError(_sentence(told.getvalue(), prog)) from None
+        raise ConfigError(_sentence(output.getvalue(), prog)) from None
 
 
 def _with_kinds(description: str | None, default: Any) -> str | None:
-    """Add to a description which kinds of parts there are."""
-    there = flag_names.kinds_text(default) if isinstance(default, configuration.Config) else ""
-    if not there:
+    """Append the list of kinds of parts to a description."""
+    kinds = flag_names.kinds_text(default) if isinstance(default, configuration.Config) else ""
+    if not kinds:
         return description
-    return f"{description}\n\nParts of the model of which there are several kinds:\n{there}"
+    return f"{description}\n\nParts of the model of which there are several kinds:\n{kinds}"
 
 
 def parse_command(kind: type[T], argv: Sequence[str], prog: str) -> T:
-    """Read the flags of one command of several, such as ``pewm-jax data collect``.
+    """Read the flags of a subcommand such as ``pewm-jax data collect``.
 
     Args:
         kind: the frozen dataclass to read; fields without a default must be given.
         argv: the arguments after the command's name.
-        prog: the words that the command was called by, for help and refusals.
+        prog: the command as the user typed it, for help and error messages.
 
     Raises:
-        ConfigError: what is wrong with them, in one sentence.
+        ConfigError: the arguments cannot be read.
     """
     nothing: T = tyro.MISSING_NONPROP  # type: ignore[assignment]
     if _take_config_file(argv, kind)[0] is not None:
@@ -143,7 +144,7 @@ def parse_command(kind: type[T], argv: Sequence[str], prog: str) -> T:
 
 
 def _first_sentence(message: str, kind: str, prog: str) -> str:
-    """Keep the statement of the parser's message: no rules, no repeated help."""
+    """Extract the first statement of the parser's message, without its frame and help."""
     parts = [part.strip() for part in re.split(r"-{5,}", message)]
     text = next((part for part in parts if part.strip(".")), message)
     text = text.removeprefix(f"Error parsing {kind}: ").removeprefix(f"{kind}: ")
@@ -154,14 +155,14 @@ def _first_sentence(message: str, kind: str, prog: str) -> str:
 
 
 def take(kind: type[T], argv: Sequence[str]) -> tuple[T, list[str]]:
-    """Take the flags of a flat dataclass of bools, numbers and words out of the arguments.
+    """Take the flags of a flat dataclass of bools, numbers and strings out of the arguments.
 
     Args:
         kind: the frozen dataclass.
         argv: the arguments.
 
     Returns:
-        The flags that are its fields, and all other arguments.
+        The dataclass, and all other arguments.
 
     Raises:
         ConfigError: a flag without its value, or a value that is refused.
@@ -201,7 +202,7 @@ def list_flags(kind: type) -> str:
 
 
 def overlay(default: T, path: Path) -> T:
-    """Lay the settings in a JSON file, nested like the configuration, over a default.
+    """Override a default with the settings of a JSON file, nested like the configuration.
 
     Raises:
         ConfigError: the file is absent, not JSON, or holds settings that do not exist or fit.
@@ -241,16 +242,16 @@ def _kinds_in(values: dict[str, Any], *path: str) -> Iterator[tuple[tuple[str, .
 
 
 def cache_compilation(folder: Path) -> None:
-    """Keep compiled programs in a folder, so that the next start need not compile them again.
+    """Make JAX cache compiled programs in a folder, so that the next start is faster.
 
-    Programs are kept apart by the processor's features, because they are compiled for them. Call
-    it from command lines only: it sets a global option of JAX.
+    There is one cache per set of processor features, for which programs are compiled. Call this
+    from command lines only: it sets a global option of JAX.
     """
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else [platform.processor()]
     features = next((line for line in lines if line.startswith(("flags", "Features"))), lines[0])
     kind = hashlib.sha256(features.encode()).hexdigest()[:12]
-    import jax  # noqa: PLC0415 - not above: it takes seconds, and refusals need none
+    import jax  # noqa: PLC0415 - takes seconds, and refusals do not need it
 
     jax.config.update("jax_compilation_cache_dir", str((folder / ".cache" / kind).resolve()))
 
@@ -259,7 +260,7 @@ def choose(name: str, known: Sequence[str], what: str) -> str:
     """Return ``name`` if it is known.
 
     Raises:
-        ConfigError: it is not; the message names the nearest and all others.
+        ConfigError: it is not known; the message lists the known names, and the nearest first.
     """
     if name in known:
         return name
@@ -298,13 +299,13 @@ def _refuse_unknown(flags: Sequence[str], kind: Any, prog: str) -> None:
 
 
 def _negated(name: str) -> str:
-    """Return the flag that ``--a.no_b`` negates."""
+    """Return the flag that ``--a.no_b`` negates: ``--a.b``."""
     head, dot, last = name[2:].rpartition(".")
     return f"--{head}{dot}{last.removeprefix('no_')}"
 
 
 def _nearest(name: str, known: Sequence[str]) -> str:
-    """Suggest a flag of the same last word, or else the one spelled most alike."""
+    """Suggest a flag with the same last part, or else with the most similar spelling."""
     last = name.rsplit(".", 1)[-1].lstrip("-")
     close = [flag for flag in known if flag.rsplit(".", 1)[-1].lstrip("-") == last]
     close = close or difflib.get_close_matches(name, known, 1, 0.5)
@@ -312,12 +313,12 @@ def _nearest(name: str, known: Sequence[str]) -> str:
 
 
 def _sentence(box: str, prog: str) -> str:
-    """Take the message out of the frame that the parser draws around it."""
+    """Extract the message from the frame that the parser draws around it."""
     lines = []
     for line in box.splitlines()[1:]:
-        words = line.strip(" │|")
-        if words.strip(_RULE):
-            lines.append(words)
+        content = line.strip(" │|")
+        if content.strip(_RULE):
+            lines.append(content)
         elif lines:
             break
     text = " ".join(lines).strip()

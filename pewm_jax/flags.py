@@ -1,8 +1,8 @@
-"""How the flags of an experiment are called: in short, as they once were, and their kinds.
+"""Names of an experiment's flags: short forms, old names, and flags that choose kinds.
 
-``--clip.width 64`` is short for ``--model.clip.width 64``. Flags of earlier versions are taken for
-what they are called now. ``--model.memory.kind images`` puts another kind of settings into a
-section; what both kinds have in common is kept.
+``--clip.width 64`` is short for ``--model.clip.width 64``. Names from earlier versions are
+accepted. ``--model.memory.kind images`` replaces a section's settings by those of another kind;
+settings that both kinds have are kept.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 def spelled_out(flags: Sequence[str], default: Any) -> list[str]:
-    """Return flags by their full, present names, where the default is an experiment.
+    """Return flags by their full, current names, if the default is an experiment.
 
     Args:
         flags: the arguments.
@@ -27,8 +27,8 @@ def spelled_out(flags: Sequence[str], default: Any) -> list[str]:
     """
     if not isinstance(default, Config):
         return list(flags)
-    here = {field.name for field in dataclasses.fields(default)}
-    short = {field.name for field in dataclasses.fields(default.model)} - here
+    sections = {field.name for field in dataclasses.fields(default)}
+    short = {field.name for field in dataclasses.fields(default.model)} - sections
 
     def full(flag: str) -> str:
         if not flag.startswith("--"):
@@ -52,12 +52,12 @@ def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
     """Take ``--SECTION.kind NAME`` out of the arguments.
 
     Args:
-        flags: the arguments, spelled out.
+        flags: the arguments, by their full names.
         default: the settings that they change.
 
     Returns:
-        The default with settings of these kinds, which need not fit each other yet, and the other
-        arguments.
+        The default with settings of the chosen kinds, which need not fit each other yet, and the
+        other arguments.
 
     Raises:
         ConfigError: there is no such kind, or a flag lacks its value.
@@ -104,7 +104,7 @@ def with_kind(default: T, path: Sequence[str], name: str) -> T:
 
 
 def of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
-    """List the flags of settings (or of a dataclass) with their fields, sections included."""
+    """Yield the flags of settings (or of a dataclass type), nested ones too, with their fields."""
     instance = None if isinstance(settings, type) else settings
     if isinstance(instance, Settings) and prefix != "--":
         yield f"{prefix}kind", None
@@ -117,7 +117,7 @@ def of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
 
 
 def kinds_text(default: Any, prefix: str = "") -> str:
-    """Return a line for each section of which there are several kinds, for the help text."""
+    """Return one line for each section that has several kinds, for the help text."""
     lines = []
     for field in dataclasses.fields(default):
         value = getattr(default, field.name)
@@ -125,16 +125,16 @@ def kinds_text(default: Any, prefix: str = "") -> str:
             continue
         name = f"{prefix}{field.name}"
         if isinstance(value, Settings):
-            there = kinds.names(value.SECTION)
-            if len(there) > 1:
-                lines.append(f"  --{name}.kind {{{','.join(there)}}} ({kinds.of(value).name})")
+            known = kinds.names(value.SECTION)
+            if len(known) > 1:
+                lines.append(f"  --{name}.kind {{{','.join(known)}}} ({kinds.of(value).name})")
         below = kinds_text(value, f"{name}.")
         lines += [below] if below else []
     return "\n".join(lines)
 
 
 def _section(settings: Any, path: Sequence[str]) -> Any:
-    """Return the settings at a path, if they are of a section that has kinds."""
+    """Return the settings at a path if their section has kinds, else None."""
     for name in path:
         if not dataclasses.is_dataclass(settings) or not hasattr(settings, name):
             return None
@@ -143,7 +143,7 @@ def _section(settings: Any, path: Sequence[str]) -> Any:
 
 
 def _as_kind(old: Any, name: str) -> Any:
-    """Return settings of another kind, with what both kinds have in common; not validated."""
+    """Return settings of another kind, keeping what both kinds have, without validation."""
     kind = kinds.named(old.SECTION, name)
     if kind.settings is type(old):
         return old
@@ -160,13 +160,13 @@ def _as_kind(old: Any, name: str) -> Any:
 
 
 def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
-    """Return settings with what stands at a path replaced."""
+    """Return settings with the value at a path replaced."""
     if not path:
         return value
     inner = _replaced(getattr(settings, path[0]), path[1:], value)
     changes = {path[0]: inner}
     if isinstance(settings, Config) and list(path) == ["model"]:
-        # Another world has other stages: it begins with its own settings for them.
+        # Another world has other stages, which start with their default settings.
         common = configuration.to_dict(settings.train)
         wanted = {field.name for field in dataclasses.fields(value.TRAIN)}
         changes["train"] = configuration.from_dict(

@@ -1,9 +1,9 @@
-"""Choose leaves of a parameter tree by regular expressions over their paths, strictly.
+"""Strict selection of leaves in parameter trees, by regular expressions over their paths.
 
-A leaf's path is its keys joined by slashes: ``{"memory": {"gate": x}}`` holds ``memory/gate``.
-A pattern must match a whole path (``re.fullmatch``). What trains, what decays, what is placed
-where and what is converted are all said this way, and nothing is guessed: a leaf that no pattern
-covers, or a pattern that covers no leaf, is an error that lists them.
+A leaf's path is its keys joined by slashes: ``{"memory": {"gate": x}}`` holds ``memory/gate``. A
+pattern must match a whole path (``re.fullmatch``). Trained parameters, weight decay, sharding and
+conversion are all chosen this way. A leaf that no pattern matches, or a pattern that matches no
+leaf, is an error that lists them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LISTED = 8
 
 
 class TreeError(UserError):
-    """Paths and patterns, or two trees, that do not fit; the message lists what is left over."""
+    """Paths and patterns, or two trees, do not match; the message lists the differences."""
 
 
 def flatten(tree: Any) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def flatten(tree: Any) -> dict[str, Any]:
 
 
 def unflatten(leaves: Mapping[str, Any]) -> Params:
-    """Turn ``{path: leaf}`` into nested dictionaries, the inverse of ``flatten`` on them.
+    """Turn ``{path: leaf}`` into nested dictionaries; the inverse of ``flatten``.
 
     Raises:
         TreeError: a path is both a leaf and a branch.
@@ -88,9 +88,9 @@ def assign(rules: Sequence[tuple[str, T]], tree: Any, what: str = "rules") -> An
 
 
 def split(tree: Params, patterns: Sequence[str]) -> tuple[Params, Params]:
-    """Split nested dictionaries into what the patterns match and the rest.
+    """Split nested dictionaries into the leaves that patterns match and the others.
 
-    Both halves keep their paths; ``merge`` puts them together again.
+    Both halves keep their paths; ``merge`` joins them again.
 
     Raises:
         TreeError: a pattern that matches no leaf.
@@ -118,7 +118,7 @@ def exclude(tree: Params, patterns: Sequence[str]) -> Params:
 
 
 def merge(*trees: Params) -> Params:
-    """Join nested dictionaries that share no leaf, the inverse of ``split``.
+    """Join nested dictionaries that have no leaf in common; the inverse of ``split``.
 
     Raises:
         TreeError: leaves that occur in more than one tree.
@@ -134,7 +134,7 @@ def merge(*trees: Params) -> Params:
 
 
 def mismatches(tree: Any, like: Any) -> list[str]:
-    """List how a tree differs from another in paths and shapes; empty when they fit."""
+    """List the differences between two trees in paths and shapes; empty if there are none."""
     have, want = flatten(tree), flatten(like)
     out = [f"{path} is missing" for path in want if path not in have]
     out += [f"{path} is unexpected" for path in have if path not in want]
@@ -146,10 +146,10 @@ def mismatches(tree: Any, like: Any) -> list[str]:
 
 
 def require_like(tree: Any, like: Any, what: str) -> None:
-    """Insist that a tree has the paths and shapes of another.
+    """Refuse a tree that has other paths or shapes than another.
 
     Raises:
-        TreeError: with the list of differences, prefixed by ``what``.
+        TreeError: they differ; the message names ``what`` and lists the differences.
     """
     wrong = mismatches(tree, like)
     if wrong:
@@ -157,7 +157,7 @@ def require_like(tree: Any, like: Any, what: str) -> None:
 
 
 def listing(items: Iterable[str], most: int = _LISTED) -> str:
-    """Join a few items for a message and count the others."""
+    """Join up to ``most`` items for a message, and count the others."""
     items = sorted(items)
     more = len(items) - most
     return ", ".join(items[:most]) + (f" and {more} more" if more > 0 else "")

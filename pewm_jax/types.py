@@ -1,10 +1,10 @@
-"""The pytrees that travel through the library, and the letters in their names.
+"""The library's data types (pytrees), and the letters that name array axes.
 
 Letters: B batch, T frames, S context frames, H W pixels, t h w latent grid, C channels,
 N video tokens, M map tokens, L text tokens, D width, K heads, V map slots, F map features,
-A numbers of an action, X Y Z voxels.
+A components of an action, X Y Z voxels.
 
-Conventions, stated once:
+Conventions, used everywhere:
 
 * Camera axes are OpenCV's (x right, y down, z forward). ``world_from_camera`` is a 4×4 rigid
   transform in metres. The world is gravity-aligned with z up.
@@ -68,11 +68,11 @@ class Frames:
 @_pytree
 @dataclasses.dataclass(frozen=True)
 class Control:
-    """What steers a clip, any leading shape before T.
+    """Input that steers a clip, any leading shape before T.
 
     Attributes:
-        camera: cameras of leading shape (..., T), of the observed frame and of those to imagine.
-        actions_TA: (..., T − 1, A) actions, or None where only cameras are known.
+        camera: cameras of leading shape (..., T): the observed frame's, then those to imagine.
+        actions_TA: (..., T − 1, A) actions, or None if only cameras are known.
     """
 
     camera: Camera
@@ -82,18 +82,18 @@ class Control:
 @_pytree
 @dataclasses.dataclass(frozen=True)
 class Clip:
-    """One training example or a batch of them: what is to be imagined and what was seen before.
+    """A training example, or a batch: frames to imagine, and frames seen before.
 
     Attributes:
         frames: T frames; frame 0 is observed, the others are to be generated.
         context: S earlier frames of the same episode, from which the memory is built.
-        context_valid_S: (..., S) bool, False where the episode had no more earlier frames.
-        context_features_ShwF: (..., S, h, w, F) the image encoder's features of the context, where
-            they were computed beforehand (``pewm_jax.memory.feature_cache``), else None.
+        context_valid_S: (..., S) bool, False for padding, if the episode has fewer earlier frames.
+        context_features_ShwF: (..., S, h, w, F) the image encoder's features of the context, if
+            they are cached (``pewm_jax.memory.feature_cache``), else None.
         actions_TA: (..., T − 1, A) float32, action k leads from frame k to frame k + 1 of the clip;
-            None where none were recorded (hand-held cameras). A = 3 is a planar action.
+            None if none were recorded (hand-held cameras). A = 3 is a planar action.
         voxels_TXYZ: (..., T, X, Y, Z) integer class ids of the cells around the agent at each
-            frame, None where none were recorded.
+            frame, None if none were recorded.
     """
 
     frames: Frames
@@ -110,12 +110,12 @@ class VoxelMap:
     """A sparse voxel feature map with static capacity (see ``pewm_jax.memory.voxel_map``).
 
     Attributes:
-        cell_of_slot_V: (V,) int32, the cells held, in increasing order; free slots, last, hold the
+        cell_of_slot_V: (V,) int32, cell numbers in increasing order; free slots, last, hold the
             number of cells of the grid.
-        features_VF: (V, F) float, per-cell maximum, −inf where the slot is free.
+        features_VF: (V, F) float, maximum per cell, −inf in free slots.
         origin_3: (3,) float32, world position of the grid's lower corner, metres.
         occupied: () int32, number of slots in use.
-        dropped: () int32, cells seen but not kept because the capacity was full (per insertion).
+        dropped: () int32, cells that did not fit into the capacity, summed over insertions.
         outside: () int32, points that fell outside the grid's extent.
     """
 
@@ -130,7 +130,7 @@ class VoxelMap:
 @_pytree
 @dataclasses.dataclass(frozen=True)
 class MapTokens:
-    """A fixed number of occupied cells, as the denoiser attends to them.
+    """A fixed number of occupied cells, to which the denoiser attends.
 
     Attributes:
         features_MF: (..., M, F) cell features, 0 where masked.
@@ -146,12 +146,12 @@ class MapTokens:
 @_pytree
 @dataclasses.dataclass(frozen=True)
 class WorldState:
-    """All that a rollout carries from one clip to the next.
+    """The state that a rollout carries from one clip to the next.
 
     Attributes:
         frame: the last frame, T = 1, rgb float32 in [−1, 1].
-        map: everything seen or imagined so far: a ``VoxelMap``, or another of
-            ``pewm_jax.memory.memories`` by ``memory.kind``.
+        map: the memory of everything seen or imagined so far: a ``VoxelMap``, or another kind
+            (see ``pewm_jax.memory.memories``).
     """
 
     frame: Frames

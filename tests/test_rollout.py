@@ -16,6 +16,7 @@ from tests.helpers import init_world, random_frames, randomise, tiny_config
 CONFIG = tiny_config()
 MODEL = CONFIG.model
 roll = jax.jit(rollouts.rollout, static_argnums=0, static_argnames="memory")
+start = jax.jit(worlds.start, static_argnums=0)
 ACTIONS = jnp.asarray([0, 0, 1, 0, 2, 0, 0, 1] * 2)
 
 
@@ -25,7 +26,7 @@ def params():
 
 
 def a_state(params, seed=0, count=3):
-    return worlds.start(CONFIG, params, random_frames(np.random.default_rng(seed), count))
+    return start(CONFIG, params, random_frames(np.random.default_rng(seed), count))
 
 
 def test_frames_come_one_per_action_along_the_integrated_poses(params):

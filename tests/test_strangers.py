@@ -3,6 +3,7 @@
 Nothing of the package names them: they are registered where they are defined (tests/strangers/).
 """
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -16,7 +17,7 @@ import pytest
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import flags, tree, worlds
-from pewm_jax.config import Config
+from pewm_jax.config import Config, UserError
 from pewm_jax.data import loader
 from pewm_jax.training import loop
 from pewm_jax.types import Control
@@ -81,6 +82,38 @@ def test_they_train_save_load_and_imagine(tmp_path, monkeypatch):
     other = Control(control.camera, -actions)  # only the actions steer, and they do
     _, turned = pewm_jax.imagine(loaded, params, state, other, jax.random.key(0))
     assert not np.array_equal(turned.rgb_THWC, frames.rgb_THWC)
+
+
+def test_a_control_that_needs_actions_says_so():
+    config = strangers.experiment()
+    params = worlds.init(config, jax.random.key(0))
+    rng = np.random.default_rng(0)
+    state = pewm_jax.start(config, params, random_frames(rng, 3, 16, 16))
+    camera = random_camera(rng, 3, 16, 16)
+    with pytest.raises(UserError, match=r"control \(push\) is steered by actions of 3 numbers"):
+        pewm_jax.imagine(config, params, state, camera, jax.random.key(0))
+    control = Control(camera, np.zeros((3, 7), np.float32))
+    with pytest.raises(UserError, match="got actions of 7 numbers"):
+        pewm_jax.imagine(config, params, state, control, jax.random.key(0))
+    clip = dataclasses.replace(strangers.clip(config), actions_TA=None)
+    stage = worlds.stages(config)[0]
+    with pytest.raises(UserError, match="the loss got cameras without actions"):
+        stage.loss(config.model, config.train, params, clip, jax.random.key(0))
+
+
+def test_many_candidates_share_one_memory():
+    config = strangers.experiment()
+    params = worlds.init(config, jax.random.key(0))
+    rng = np.random.default_rng(0)
+    state = pewm_jax.start(config, params, random_frames(rng, 3, 16, 16))
+    keys = jax.random.split(jax.random.key(1), 4)
+    actions = rng.normal(0, 0.3, (4, 3, 3)).astype(np.float32)
+    after, frames = pewm_jax.imagine_many(config, params, state, actions, keys)
+    assert frames.depth_THW.shape == (4, 3, 16, 16)
+    assert after.frame.depth_THW.shape == (4, 1, 16, 16)
+    jax.tree.map(np.testing.assert_array_equal, after.map, state.map)
+    _, alone = pewm_jax.imagine(config, params, state, actions[2], keys[2])
+    np.testing.assert_allclose(frames.rgb_THWC[2], alone.rgb_THWC, atol=1e-5)
 
 
 def test_eight_devices_by_their_own_rules_give_the_losses_of_one(measured):

@@ -202,7 +202,7 @@ def test_an_interruption_is_told_and_exits_as_shells_expect(capsys):
 
 @pytest.mark.parametrize(
     ("number", "part"),
-    [(errno.ENOSPC, "free some space"), (errno.EACCES, "allow access"), (errno.EIO, "see to that")],
+    [(errno.ENOSPC, "free some space"), (errno.EACCES, "allow access"), (errno.EIO, "fix that")],
 )
 def test_a_file_that_cannot_be_used_is_a_sentence(capsys, number, part):
     def broken(_argv):

@@ -29,6 +29,7 @@ KEY = jax.random.key(1)
 MOVES = jnp.asarray(
     np.random.default_rng(4).uniform((-0.1, -0.1, -0.3), (0.4, 0.1, 0.3), (8, 3)), jnp.float32
 )
+start, observe = (jax.jit(act, static_argnums=0) for act in (worlds.start, worlds.observe))
 imagine = jax.jit(worlds.imagine, static_argnums=0, static_argnames=("remember", "memory"))
 
 
@@ -48,7 +49,7 @@ def seen(seed=0, count=3):
 
 @pytest.fixture(scope="module")
 def state(params):
-    return worlds.start(MODEL, params, seen())
+    return start(MODEL, params, seen())
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +63,7 @@ def still(moves):
     return jnp.zeros((LENGTH, 3)).at[: len(moves)].set(moves)
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def remembered(model, memory, frames):
     features = encoders.encode(model.memory.encoder, {}, frames.rgb_THWC)
     return memories.remember(model, memory, frames, features)
@@ -98,7 +100,7 @@ def test_only_what_was_asked_for_is_remembered(params, state, count):
 def test_every_memory_remembers_only_what_was_asked_for(kind):
     model = dataclasses.replace(MODEL, memory=model_of(kind).memory)
     params = randomise(init_world(model, memory=False))
-    state = worlds.start(model, params, seen())
+    state = start(model, params, seen())
     after, frames = imagine(model, params, state, MOVES[:2], KEY)
     expected = remembered(model, state.map, frames)
     for a, b in zip(jax.tree.leaves(after.map), jax.tree.leaves(expected), strict=True):
@@ -156,8 +158,8 @@ def test_observing_later_is_observing_at_the_start(params, kind):
     model = dataclasses.replace(MODEL, memory=model_of(kind).memory)
     frames = round_trip()
     first, rest = (jax.tree.map(lambda x, s=s: x[s], frames) for s in (slice(1), slice(1, None)))
-    at_once = worlds.start(model, params, frames)
-    later = worlds.observe(model, params, worlds.start(model, params, first), rest)
+    at_once = start(model, params, frames)
+    later = observe(model, params, start(model, params, first), rest)
     equal(later.frame, at_once.frame)
     for a, b in zip(jax.tree.leaves(later.map), jax.tree.leaves(at_once.map), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)
@@ -166,7 +168,7 @@ def test_observing_later_is_observing_at_the_start(params, kind):
 def test_what_is_observed_half_way_is_the_present_and_changes_what_is_imagined(params, two_clips):
     after, _ = two_clips
     real = seen(5, 2)
-    there = worlds.observe(MODEL, params, after, real)
+    there = observe(MODEL, params, after, real)
     equal(there.frame.depth_THW[0], real.depth_THW[-1])
     equal(there.frame.camera, jax.tree.map(lambda x: x[-1:], real.camera))
     assert int(there.map.occupied) > int(after.map.occupied)
@@ -177,10 +179,10 @@ def test_what_is_observed_half_way_is_the_present_and_changes_what_is_imagined(p
 
 def test_observe_imagine_and_start_are_jitted_and_take_an_experiment_too(params, state):
     config = Config(model=MODEL)
-    started = jax.jit(worlds.start, static_argnums=0)(config, params, seen())
+    started = worlds.start(config, params, seen())
     for a, b in zip(jax.tree.leaves(started), jax.tree.leaves(state), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
-    observed = jax.jit(worlds.observe, static_argnums=0)(config, params, state, seen(5, 2))
+    observed = observe(config, params, state, seen(5, 2))
     expected = worlds.observe(MODEL, params, state, seen(5, 2))
     for a, b in zip(jax.tree.leaves(observed), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)

@@ -1,7 +1,7 @@
 """Every setting of the library: frozen dataclasses, validated when built, to and from JSON.
 
-A field's docstring is its ``--help`` text. A value that cannot work is refused when the
-configuration is built, with a sentence that names the fix; nothing is checked deeper down.
+A field's docstring is its ``--help`` text. Values that cannot work are refused when a configuration
+is built, in a sentence that names the fix; other code does not check them again.
 """
 
 from pewm_jax.config.backbone import BackboneSettings, Places

@@ -1,4 +1,4 @@
-"""What the settings of every denoiser say."""
+"""Settings that every backbone has."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pewm_jax.config.kinds import Settings
 
 @dataclasses.dataclass(frozen=True)
 class Places:
-    """Where in a backbone a memory reader runs, and what it finds there.
+    """Where a memory reader runs in a backbone, and the sizes it needs to know.
 
     Attributes:
-        count: how often it runs; its parameters are stacked over that.
+        count: how often it runs; its parameters are stacked along this axis.
         width: D, channels of the hidden video tokens (B, N, D).
         time: E, channels of the time embedding (B, E).
-        patch: latent cells per token, each way.
+        patch: latent cells per token, along height and along width.
         patch_t: latent frames per token.
     """
 
@@ -29,14 +29,14 @@ class Places:
 
 
 class BackboneSettings(Settings):
-    """What the settings of every backbone say; ``pewm_jax.models.backbones`` says what it does.
+    """Settings that every backbone has; see ``pewm_jax.models.backbones`` for its functions.
 
     Attributes:
         places: where a memory reader runs.
-        text_shape: (length, channels) of the text tokens that it takes; None where it takes none.
-        stores_prompt: whether a prompt's embedding is kept with the weights.
-        split_heads: what ``train.mesh.tensor`` must divide.
-        remat: whether the backward pass computes activations anew.
+        text_shape: (length, channels) of its text tokens; None if it takes none.
+        stores_prompt: whether a prompt's embedding is stored with the weights.
+        split_heads: a number that ``train.mesh.tensor`` must divide.
+        remat: whether the backward pass recomputes activations.
     """
 
     SECTION: ClassVar[str] = "backbone"

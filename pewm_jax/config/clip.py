@@ -1,4 +1,4 @@
-"""The shape of what is imagined at once, and what an action does."""
+"""The shape of a clip, and the effect of an action."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Literal
 from pewm_jax.config.errors import require
 
 SMALLEST = 12
-"""Fewest pixels of a clip's side: the evaluation's SSIM slides a window of 11 over the image."""
+"""Smallest side of a clip in pixels: the evaluation's SSIM slides a window of 11 over the image."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ClipConfig:
-    """The shape of what is imagined at once."""
+    """The shape of a clip: the frames that are imagined at once."""
 
     frames: int = 9
-    """Frames of a clip: the first is observed, the rest are generated. The codec folds the others
-    in time: with `codec.temporal` 4 there are 4k + 1."""
+    """Frames of a clip: the first is observed, the rest are generated. The codec folds them in
+    time: with `codec.temporal` 4, use 4k + 1 frames."""
     height: int = 64
     """Image height in pixels."""
     width: int = 64
@@ -29,7 +29,7 @@ class ClipConfig:
     depth_scale: Literal["linear", "log"] = "log"
     """How metres map to [−1, 1] between near and far."""
     depth: bool = True
-    """Whether the denoiser sees and makes depth; without it only observed frames are remembered."""
+    """Whether the denoiser generates depth; without it only observed frames can be remembered."""
 
     def __post_init__(self):
         """Validate."""

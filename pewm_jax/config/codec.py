@@ -1,4 +1,4 @@
-"""How pixels become latents and back."""
+"""Codecs: how pixels become latents and back."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from pewm_jax.config.kinds import Settings
 
 
 class CodecSettings(Settings):
-    """What the settings of every codec say; ``pewm_jax.models.codecs`` says what a codec does.
+    """Settings that every codec has; see ``pewm_jax.models.codecs`` for its functions.
 
     Attributes:
-        spatial: pixels per latent cell, each way.
+        spatial: pixels per latent cell, along height and along width.
         temporal: frames per latent frame after the first: q·k + 1 frames become k + 1.
         rgb_channels: latent channels of colour.
         depth_channels: latent channels of depth.
-        DEPTH_AS_GREY: whether depth is encoded as a grey picture of three channels, not of one.
+        DEPTH_AS_GREY: whether depth is encoded as a grey image of three channels, not as one.
         PIXELWISE: whether each latent channel of depth is one pixel of one frame.
-        CONVERTED: whether the weights are not trained here but come from ``train.start``.
+        CONVERTED: whether the weights are frozen and come from ``train.start``.
     """
 
     SECTION: ClassVar[str] = "codec"
@@ -37,8 +37,12 @@ class CodecSettings(Settings):
         return self.rgb_channels + self.depth_channels
 
     def frames(self, count: int) -> int:
-        """Return the latent frames of a number of frames."""
+        """Return the number of latent frames for a number of frames."""
         return (count - 1) // self.temporal + 1
+
+    def latent_shape(self, clip: Any) -> tuple[int, int, int]:
+        """Return (t, h, w) of the latents of a ``ClipConfig``'s clip."""
+        return self.frames(clip.frames), clip.height // self.spatial, clip.width // self.spatial
 
     def check(self, model: Any) -> None:
         """Refuse clips that cannot be folded."""
@@ -62,7 +66,7 @@ class PixelConfig(CodecSettings):
     PIXELWISE: ClassVar[bool] = True
 
     spatial: int = 4
-    """Pixels per latent cell, each way."""
+    """Pixels per latent cell, along height and along width."""
     temporal: int = 4
     """Frames per latent frame after the first."""
 

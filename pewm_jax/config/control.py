@@ -1,4 +1,4 @@
-"""What steers a clip."""
+"""Controls: what steers a clip."""
 
 from __future__ import annotations
 
@@ -9,20 +9,22 @@ from pewm_jax.config.kinds import Settings
 
 
 class ControlSettings(Settings):
-    """What the settings of every control say; ``pewm_jax.models.controls`` says what it does.
+    """Settings that every control has; see ``pewm_jax.models.controls`` for its functions.
 
     Attributes:
         MODULATES: whether it adds to the time embedding of each latent frame.
+        actions: A, the numbers of an action that it needs; 0 where cameras are enough.
     """
 
     SECTION: ClassVar[str] = "control"
     MODULATES: ClassVar[bool] = False
+    actions: Any = 0
 
     def channels(self, model: Any) -> int:
-        """Return the channels, at the latent rate, that it joins to the denoiser's input.
+        """Return the number of channels, at the latent rate, that it adds to the denoiser's input.
 
         Args:
-            model: the ``ModelConfig`` that it is part of.
+            model: the ``ModelConfig`` that these settings are part of.
         """
         del model
         return 0
@@ -30,8 +32,8 @@ class ControlSettings(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class CameraConfig(ControlSettings):
-    """Cameras steer: their Plücker rays are joined to the denoiser's input (the paper)."""
+    """Control by cameras (the paper): their Plücker rays are concatenated to the input."""
 
     def channels(self, model: Any) -> int:
-        """Six Plücker coordinates for each of the frames of a latent frame."""
+        """Return six Plücker coordinates for each frame of a latent frame."""
         return 6 * model.codec.temporal

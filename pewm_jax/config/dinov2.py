@@ -22,25 +22,25 @@ class DINOv2Config:
     width: int = 384
     """Model width D: the number of features of a patch."""
     patch: int = 14
-    """Pixels per patch, each way."""
+    """Pixels per patch, along height and along width."""
     pretrained_size: int = 518
-    """Pixels per side of the images whose patches the stored position embeddings belong to; for
-    other sizes they are interpolated."""
+    """Side in pixels of the images that the stored position embeddings are for; they are
+    interpolated for other sizes."""
     mlp_ratio: int = 4
-    """Feed-forward width over model width (SwiGLU keeps two thirds of it)."""
+    """Feed-forward width over model width (SwiGLU uses two thirds of it)."""
     swiglu: bool = False
     """Gated feed-forward, as in ViT-g."""
     registers: int = 0
     """Register tokens beside the class token: 0, or 4 in the models with registers."""
     antialias: bool = False
-    """Whether position embeddings are filtered when they are interpolated to fewer patches: the
-    reference does so in its model with registers, and only there."""
+    """Whether interpolating position embeddings to fewer patches uses antialiasing, as the
+    reference does in its models with registers only."""
     epsilon: float = 1e-6
     """Added to the variance in layer norms."""
 
     @property
     def grid(self) -> int:
-        """Stored position embeddings per side."""
+        """Stored position embeddings along each side."""
         return self.pretrained_size // self.patch
 
     @property

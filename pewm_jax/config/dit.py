@@ -1,4 +1,4 @@
-"""The diffusion transformer."""
+"""The diffusion transformer's settings, and CogVideoX's published ones."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pewm_jax.config.backbone import BackboneSettings, Places
 from pewm_jax.config.errors import ConfigError, require, require_positive
 
 Positions = Literal["rope_integer", "rope_crop", "rope_learned", "sincos"]
-"""How a video token says where it is; see ``DiTConfig.positions``."""
+"""How positions are encoded; see ``DiTConfig.positions``."""
 Learned = Literal["exact", "interpolate", "drop", "reference"]
-"""What a learned table of positions does for other sizes; see ``DiTConfig.learned``."""
+"""How a learned table is used for other sizes; see ``DiTConfig.learned``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DiTConfig(BackboneSettings):
-    """The diffusion transformer in CogVideoX's form; ``published`` gives CogVideoX's own."""
+    """A diffusion transformer in CogVideoX's form; see ``published`` for CogVideoX's settings."""
 
     layers: int = 4
     """Transformer blocks."""
@@ -24,21 +24,21 @@ class DiTConfig(BackboneSettings):
     """Attention heads."""
     head_dim: int = 32
     """Width of a head; a multiple of 16 (the rotary embedding splits it 1/4, 3/8, 3/8). With
-    positions `sincos` heads × head_dim is what must be a multiple of 16."""
+    positions `sincos`, heads × head_dim must be a multiple of 16 instead."""
     patch: int = 2
-    """Latent cells per token, each way."""
+    """Latent cells per token, along height and along width."""
     patch_t: int = 1
     """Latent frames per token: 2 in CogVideoX 1.5, else 1."""
     in_channels: int = 0
-    """Latent channels that go in; 0 for what the codec and the conditioning need."""
+    """Input channels; 0 takes the number from codec and conditioning."""
     out_channels: int = 0
-    """Latent channels that come out; 0 for what the codec needs."""
+    """Output channels; 0 takes the number from the codec."""
     text_length: int = 4
-    """Text tokens; with no prompt they are zeros, so that the text path learns a constant."""
+    """Number of text tokens; without a prompt they are zeros, so the text path is a constant."""
     text_dim: int = 32
     """Channels of a text token."""
     prompt: Literal["zeros", "stored"] = "zeros"
-    """The text tokens: `zeros`, or a prompt's embedding `stored` with converted weights."""
+    """Which text tokens: `zeros`, or a prompt's embedding that is `stored` with the weights."""
     time_dim: int = 192
     """Width of the time embedding."""
     ofs_dim: int = 0
@@ -46,30 +46,31 @@ class DiTConfig(BackboneSettings):
     mlp_ratio: int = 4
     """Feed-forward width over model width."""
     positions: Positions = "rope_integer"
-    """`rope_integer`: rotary, positions 0, 1, 2 … (CogVideoX 1.5). `rope_crop`: rotary, the token
-    grid stretched over the sample size's (5b). `rope_learned`: that and a learned table (5b-I2V)
-    of the sample size; see `learned`. `sincos`: a fixed sinusoid added to the tokens (2b)."""
+    """`rope_integer`: rotary, positions 0, 1, 2 … (CogVideoX 1.5). `rope_crop`: rotary, with the
+    token grid stretched to the sample size's (5b). `rope_learned`: the same and a learned table for
+    the sample size (5b-I2V); see `learned`. `sincos`: a fixed sinusoid added to the tokens (2b)."""
     learned: Learned = "exact"
-    """The table of `rope_learned` at other sizes than the sample's. `exact`: they are refused.
-    `interpolate`: it is resized to the token grid, linearly in time, rows and columns. `drop`: it
-    is not used at any size, the rotary embedding alone says positions. `reference`: as diffusers
-    does, other numbers of frames get a fixed sinusoid in its place, other sizes are refused."""
+    """How the table of `rope_learned` is used for sizes other than the sample's. `exact`: other
+    sizes are refused. `interpolate`: the table is resized linearly in time, rows and columns.
+    `drop`: the table is not used at any size, only the rotary embedding. `reference`: as in
+    diffusers, other numbers of frames get a fixed sinusoid instead, and other heights or widths are
+    refused."""
     sample_height: int = 0
-    """Latent rows that the network was trained for; 0 where positions do not ask (rope_integer:
-    a bound when not 0)."""
+    """Latent rows that the network was trained for; 0 if positions do not depend on it. With
+    rope_integer, a value above 0 is an upper bound."""
     sample_width: int = 0
-    """Latent columns that the network was trained for; like sample_height."""
+    """Latent columns that the network was trained for; as sample_height."""
     sample_frames: int = 0
-    """Video frames (not latent frames) that the network was trained for; rope_learned asks."""
+    """Video frames (not latent frames) that the network was trained for; used by rope_learned."""
     temporal: int = 4
-    """Video frames per latent frame after the first; only reads sample_frames."""
+    """Video frames per latent frame after the first; converts sample_frames to latent frames."""
     spatial_interpolation: float = 1.875
-    """Divisor of the rows and columns in `sincos`."""
+    """Divisor of row and column positions in `sincos`."""
     temporal_interpolation: float = 1.0
-    """Divisor of the latent frames in `sincos`."""
+    """Divisor of time positions in `sincos`."""
     attention: Literal["auto", "xla", "cudnn"] = "auto"
-    """Who computes attention: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `xla` runs
-    anywhere, `auto` takes cudnn where it works."""
+    """The attention kernel: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `xla` runs
+    anywhere, `auto` uses cudnn if it can."""
     remat: bool = False
     """Recompute activations in the backward pass: less memory, about a third more time."""
 
@@ -85,12 +86,12 @@ class DiTConfig(BackboneSettings):
 
     @property
     def stores_prompt(self) -> bool:
-        """Whether a prompt's embedding is kept with the weights."""
+        """Whether a prompt's embedding is stored with the weights."""
         return self.prompt == "stored"
 
     @property
     def split_heads(self) -> int:
-        """What ``train.mesh.tensor`` must divide."""
+        """The number that ``train.mesh.tensor`` must divide."""
         return self.heads
 
     @property
@@ -100,11 +101,11 @@ class DiTConfig(BackboneSettings):
 
     @property
     def sample_latents(self) -> int:
-        """Latent frames of ``sample_frames`` video frames."""
+        """Number of latent frames of ``sample_frames`` video frames."""
         return (self.sample_frames - 1) // self.temporal + 1
 
     def check(self, model: Any) -> None:
-        """Refuse latents that do not split into patches, and channels that are not the model's."""
+        """Refuse latents that do not split into patches, and channels that do not fit."""
         super().check(model)
         wanted = {"in_channels": model.in_channels, "out_channels": model.codec.channels}
         for name, value in wanted.items():
@@ -145,13 +146,13 @@ class DiTConfig(BackboneSettings):
 
     def _require_sample(self) -> None:
         """Validate the sizes that some kinds of positions need."""
-        asked = {"rope_crop": 2, "rope_learned": 3}.get(self.positions, 0)
+        needed = {"rope_crop": 2, "rope_learned": 3}.get(self.positions, 0)
         names = ("sample_height", "sample_width", "sample_frames")
         for index, name in enumerate(names):
             value = getattr(self, name)
             require(value >= 0, f"backbone.{name} is {value}: use 0 or more.")
             require(
-                index >= asked or value > 0,
+                index >= needed or value > 0,
                 f"backbone.{name} is 0: positions {self.positions} need the size that the network "
                 "was trained for (CogVideoX: 60 × 90 latents of 49 frames).",
             )

@@ -1,4 +1,4 @@
-"""The image features that a memory keeps."""
+"""Image encoders, whose features a memory keeps."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pewm_jax.config.kinds import Settings
 
 
 class EncoderSettings(Settings):
-    """What the settings of every image encoder say; see ``pewm_jax.models.encoders``.
+    """Settings that every image encoder has; see ``pewm_jax.models.encoders`` for its functions.
 
     Attributes:
-        channels: F, features of a patch.
-        CONVERTED: whether the weights are not trained here but come from ``train.start``, so that
-            it is large, and sees one clip after the other.
+        channels: F, number of features of a patch.
+        CONVERTED: whether the weights are frozen and come from ``train.start``. Such encoders are
+            large, and run clip by clip.
     """
 
     SECTION: ClassVar[str] = "encoder"
@@ -33,7 +33,7 @@ class PatchColoursConfig(EncoderSettings):
     """The mean colour of each patch and its negative: six features, no weights."""
 
     patch: int = 2
-    """Pixels per patch, each way."""
+    """Pixels per patch, along height and along width."""
 
     channels: ClassVar[int] = 6
 
@@ -42,7 +42,7 @@ class PatchColoursConfig(EncoderSettings):
         return clip.height // self.patch, clip.width // self.patch
 
     def check(self, model: Any) -> None:
-        """Refuse pictures that do not split into patches."""
+        """Refuse images that do not split into patches."""
         clip = model.clip
         require(
             clip.height % self.patch == 0 and clip.width % self.patch == 0,
@@ -62,18 +62,18 @@ class DINOv2EncoderConfig(EncoderSettings):
     CONVERTED: ClassVar[bool] = True
 
     size: int = 518
-    """Side of the square picture that the network is shown, pixels; a multiple of its patch. 518
-    gives 37 × 37 features."""
+    """Side in pixels of the square that images are resized to; a multiple of the patch. 518 gives
+    37 × 37 patches."""
     network: DINOv2Config = DINOv2Config()
     """The network."""
 
     @property
     def channels(self) -> int:
-        """Features of a patch: the network's width."""
+        """Number of features of a patch: the network's width."""
         return self.network.width
 
     def grid(self, clip: Any) -> tuple[int, int]:
-        """Return the rows and columns of patches that any frame has: it is resized."""
+        """Return the rows and columns of patches, equal for all frames, which are resized."""
         del clip
         return self.size // self.network.patch, self.size // self.network.patch
 

@@ -1,4 +1,4 @@
-"""How a setting, or any other input of a user's, is refused: in one sentence."""
+"""Errors that refuse a setting, or other user input, in one sentence."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def require(condition: bool, sentence: str) -> None:
 
 
 def require_positive(section: Any, where: str, *names: str) -> None:
-    """Refuse sizes and counts below 1, each by its own name."""
+    """Refuse sizes and counts below 1; the message names the field."""
     for name in names:
         value = getattr(section, name)
         require(value >= 1, f"{where}.{name} is {value}: use at least 1.")

@@ -1,4 +1,4 @@
-"""One experiment, from pixels to scores: all sections together."""
+"""One experiment: the settings of model, data, training and evaluation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.training import DataConfig, EvalConfig, TrainConfig, TrainSettings
 
 VERSION = 2
-"""The version of ``config.json`` that is written; ``migrations`` reads the earlier ones."""
+"""The version of ``config.json`` that is written; ``migrations`` upgrades earlier ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,9 +19,9 @@ class Config:
     """One experiment, from pixels to scores."""
 
     version: int = VERSION
-    """Version of the settings' names; set by the library."""
+    """Version of the format; set by the library."""
     model: Any = dataclasses.field(default=ModelConfig(), metadata={"kinds": WorldSettings})
-    """The world model: all that inference needs; some ``WorldSettings``."""
+    """The world model: all settings that inference needs."""
     data: DataConfig = DataConfig()
     """What training reads."""
     train: TrainSettings = TrainConfig()
@@ -34,7 +34,7 @@ class Config:
         return dataclasses.replace(self, model=dataclasses.replace(self.model, **changes))
 
     def __post_init__(self):
-        """Validate what spans several sections."""
+        """Validate settings that depend on each other."""
         require(
             self.version == VERSION,
             f"version is {self.version}: this library writes version {VERSION}; leave it out.",

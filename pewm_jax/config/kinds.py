@@ -1,15 +1,16 @@
-"""What may stand in a section of a model: kinds of settings, and where their functions are.
+"""The registry of kinds: which settings a section of a model may hold, and their functions.
 
-A model is put together of parts (a backbone, a codec, a control, a memory with its encoder and
-reader, a noise). Of each part there are several kinds. A kind is a frozen dataclass of settings and
-a module (or any object) with its functions; ``register`` is the one line that makes it known::
+A model consists of parts (a backbone, a codec, a control, a memory with its encoder and reader, a
+noise). Each part comes in several kinds. A kind is a frozen dataclass of settings and a module (or
+any object) with its functions. One call makes it known::
 
     register("backbone", "mine", MyConfig, my_module)
 
-From then on it is chosen by its settings' type: ``functions(settings).apply(settings, …)``. In JSON
-a section says its kind by name: ``{"backbone": {"kind": "mine", "layers": 4}}``. Which functions
-each part has is said in ``pewm_jax.models.backbones``, ``codecs``, ``controls``, ``readers``,
-``encoders``, in ``pewm_jax.memory.memories``, ``pewm_jax.diffusion.noise`` and ``pewm_jax.worlds``.
+From then on its functions are found by the type of the settings:
+``functions(settings).apply(settings, …)``. In JSON, a section names its kind:
+``{"backbone": {"kind": "mine", "layers": 4}}``. The functions of each part are documented in
+``pewm_jax.models`` (``backbones``, ``codecs``, ``controls``, ``readers``, ``encoders``),
+``pewm_jax.memory.memories``, ``pewm_jax.diffusion.noise`` and ``pewm_jax.worlds``.
 
 When a name is not known, the modules of the entry-point group ``pewm_jax.kinds`` are imported, by
 which installed packages register kinds of theirs.
@@ -26,22 +27,22 @@ from pewm_jax.config.errors import ConfigError
 
 
 class Settings:
-    """What the settings of every kind of part have in common.
+    """Base class of the settings of all kinds.
 
     Attributes:
-        SECTION: the section of a model that they stand in.
+        SECTION: the section of a model that they belong to.
     """
 
     SECTION: ClassVar[str] = ""
 
     def check(self, model: Any) -> None:
-        """Refuse a model that these settings do not fit into; called when one is built.
+        """Refuse a model that these settings do not fit into; called when a model is built.
 
         Args:
             model: the ``ModelConfig`` that they are part of.
 
         Raises:
-            ConfigError: in one sentence.
+            ConfigError: they do not fit.
         """
 
 
@@ -51,10 +52,10 @@ class Kind:
 
     Attributes:
         section: the part, such as ``backbone``.
-        name: how JSON and flags call it.
+        name: its name in JSON and flags.
         settings: its frozen dataclass, a subclass of the section's settings.
-        where: the module of its functions by name, imported when first used, so that reading
-            settings loads no networks; or an object that has the functions.
+        where: the name of the module with its functions, imported when first used, so that
+            reading settings loads no networks; or an object with the functions.
     """
 
     section: str
@@ -79,9 +80,9 @@ def register(section: str, name: str, settings: type, where: Any) -> None:
 
     Args:
         section: the part of a model, such as ``backbone``.
-        name: of the kind, as JSON and flags call it.
+        name: the kind's name in JSON and flags.
         settings: a frozen dataclass, subclass of the section's settings.
-        where: a module's name, or a module or other object that has the functions.
+        where: the name of the module with its functions, or a module or other object.
 
     Raises:
         ConfigError: the settings are no frozen dataclass or of another section, or the name is
@@ -123,8 +124,8 @@ def named(section: str, name: str) -> Kind:
     """Return a kind by its name; installed packages are asked for one that is not known.
 
     Raises:
-        ConfigError: there is none; the message lists those there are, and the modules of entry
-            points that could not be imported.
+        ConfigError: there is no such kind; the message lists the known ones, and the modules of
+            entry points that could not be imported.
     """
     failed: list[str] = []
     if isinstance(name, str):  # a table read from JSON may hold anything
@@ -177,7 +178,7 @@ def imported(name: str, what: str) -> Any:
 
 
 def of(settings: Any) -> Kind:
-    """Return the kind of some settings, by their type.
+    """Return the kind that settings are of, by their type.
 
     Raises:
         ConfigError: their type is not registered.
@@ -193,7 +194,7 @@ def of(settings: Any) -> Kind:
 
 
 def functions(settings: Any) -> Any:
-    """Return the module or object with the functions for some settings, by their type.
+    """Return the module or object with the functions for settings, chosen by their type.
 
     Raises:
         ConfigError: their type is not registered, or the module cannot be imported.

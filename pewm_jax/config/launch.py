@@ -1,4 +1,4 @@
-"""How a training is launched, apart from what it is: flags that no configuration file keeps."""
+"""Flags that say how a training is launched; they are not stored in its configuration."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ def is_address(text: str) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Launch:
-    """The flags of ``train.py`` beside the settings; their help texts are in the metadata.
+    """The flags of ``train.py`` that are not settings; their help texts are in the metadata.
 
     Attributes:
         distributed: join the other processes of the job.
-        coordinator: address of process 0, empty for what JAX finds out.
-        processes: how many there are, 0 for what JAX finds out.
-        process: the number of this one, −1 for what JAX finds out.
-        patience: seconds to wait for the others.
-        plan: compile for other hardware and say what it would take, in place of training.
+        coordinator: address of process 0; if empty, JAX detects it.
+        processes: number of processes; if 0, JAX detects it.
+        process: number of this process; if −1, JAX detects it.
+        patience: seconds to wait for the other processes.
+        plan: do not train, but compile for other hardware and print what training would take.
         devices: devices to plan for.
         chip: kind of device to plan for.
         profile: steps to trace.
     """
 
     distributed: bool = _flag(
-        False, "join the other processes of this job (SLURM, Kubernetes, TPU: found by JAX)"
+        False, "join the other processes of this job (JAX detects SLURM, Kubernetes and TPU)"
     )
-    coordinator: str = _flag("", "HOST:PORT of process 0, where JAX cannot find it out")
-    processes: int = _flag(0, "number of processes, where JAX cannot find it out")
-    process: int = _flag(-1, "number of this process, where JAX cannot find it out")
-    patience: int = _flag(60, "with --distributed: seconds to wait until all processes are there")
-    plan: bool = _flag(False, "do not train: compile the step and print what it would take")
+    coordinator: str = _flag("", "HOST:PORT of process 0, if JAX cannot detect it")
+    processes: int = _flag(0, "number of processes, if JAX cannot detect it")
+    process: int = _flag(-1, "number of this process, if JAX cannot detect it")
+    patience: int = _flag(60, "with --distributed: seconds to wait for all processes")
+    plan: bool = _flag(False, "do not train: compile the step and print what training would take")
     devices: int = _flag(8, "with --plan: how many devices")
     chip: str = _flag("h200", "with --plan: h100, h200, b200, v5p or v6e")
-    profile: int = _flag(0, "trace this many steps, for TensorBoard's profile and for Perfetto")
+    profile: int = _flag(0, "profile this many steps, for TensorBoard and Perfetto")
 
     def __post_init__(self):
         """Validate."""
@@ -62,7 +62,7 @@ class Launch:
         require(
             all(given) or not any(given),
             "--coordinator, --processes and --process go together: give all three, or none and "
-            "let JAX find them out.",
+            "let JAX detect them.",
         )
         require(
             self.distributed or not any(given),

@@ -1,4 +1,4 @@
-"""What is remembered."""
+"""Memories: what is remembered, as which features, and how it is read."""
 
 from __future__ import annotations
 
@@ -14,20 +14,27 @@ from pewm_jax.config.reader import AttentionConfig, ReaderSettings
 
 @dataclasses.dataclass(frozen=True)
 class MemorySettings(Settings):
-    """What the settings of every memory say; ``pewm_jax.memory.memories`` says what it does."""
+    """Settings that every memory has; see ``pewm_jax.memory.memories`` for its functions.
+
+    Attributes:
+        KEEPS_FEATURES: whether it keeps features of the image encoder.
+    """
 
     SECTION: ClassVar[str] = "memory"
     KEEPS_FEATURES: ClassVar[bool] = True
+    """Whether it keeps the encoder's features; else the first three of a point are its colour."""
+    REMEMBERS: ClassVar[bool] = True
+    """Whether it ever holds anything."""
 
     cell_m: tuple[float, float, float] = (0.25, 0.25, 1.0)
     """Size of a map cell along x, y, z (z is up), metres; the default is the paper's."""
     cells: tuple[int, int, int] = (128, 128, 16)
-    """Cells of the grid along x, y, z; the extent in metres is cells × cell size, and costs
-    nothing."""
+    """Cells of the grid along x, y, z; the extent in metres is cells × cell size. A larger extent
+    needs no more memory."""
     capacity: int = 4096
-    """Occupied cells a map can hold; what does not fit is counted."""
+    """Occupied cells that a map can hold; cells that do not fit are dropped and counted."""
     tokens: int = 512
-    """Map tokens that condition one clip, in view and nearest first."""
+    """Map tokens that condition one clip: those in view, nearest first."""
     encoder: EncoderSettings = PatchColoursConfig()
     """The image features that are kept."""
     reader: ReaderSettings = AttentionConfig()
@@ -35,11 +42,11 @@ class MemorySettings(Settings):
 
     @property
     def extent_m(self) -> float:
-        """The grid's longest side, metres."""
+        """The longest side of the grid in metres."""
         return max(size * count for size, count in zip(self.cell_m, self.cells, strict=True))
 
     def check(self, model: Any) -> None:
-        """Refuse what encoder and reader cannot do."""
+        """Refuse a model that the encoder or the reader does not fit."""
         self.encoder.check(model)
         self.reader.check(model)
 
@@ -67,7 +74,7 @@ class VoxelConfig(MemorySettings):
 
 @dataclasses.dataclass(frozen=True)
 class Map2DConfig(MemorySettings):
-    """The same, seen from above: a cell reaches from the floor to the ceiling."""
+    """The feature map seen from above: a cell reaches from the floor to the ceiling."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +86,7 @@ class PointsConfig(MemorySettings):
 
 @dataclasses.dataclass(frozen=True)
 class ImagesConfig(MemorySettings):
-    """A few snapshots that together show what was seen."""
+    """A few snapshots that together cover what was seen."""
 
     snapshots: int = 8
     """Frames that are kept; together they have at most `tokens` patches."""
@@ -97,6 +104,7 @@ class ImagesConfig(MemorySettings):
 
 @dataclasses.dataclass(frozen=True)
 class NoMemoryConfig(MemorySettings):
-    """Nothing is remembered; the reader keeps its parameters and finds nothing."""
+    """No memory; the reader exists with its parameters, but has nothing to read."""
 
     KEEPS_FEATURES: ClassVar[bool] = False
+    REMEMBERS: ClassVar[bool] = False

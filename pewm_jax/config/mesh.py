@@ -1,4 +1,4 @@
-"""How devices are arranged."""
+"""The device mesh: how devices are arranged."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import math
 from pewm_jax.config.errors import ConfigError, require
 
 AXES = ("data", "fsdp", "tensor", "context")
-"""The mesh's axes, slowest to change first: neighbours in the last ones talk most."""
+"""The mesh axes, outermost first; devices along the last ones communicate most."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MeshConfig:
-    """How devices are arranged: how many along each axis. Their product is all devices."""
+    """The number of devices along each mesh axis; their product is the number of devices."""
 
     data: int = 0
-    """Copies of the weights, each with its part of the batch; 0 for all devices that the other
-    axes leave over."""
+    """Copies of the weights, each with its part of the batch (data parallelism); 0 uses all devices
+    that the other axes leave."""
     fsdp: int = 1
     """Parts that the weights and the batch are split into (fully sharded data parallelism)."""
     tensor: int = 1
@@ -36,7 +36,7 @@ class MeshConfig:
         """Return the sizes along ``AXES`` for a number of devices.
 
         Raises:
-            ConfigError: they cannot be arranged so.
+            ConfigError: the sizes do not multiply to the number of devices.
         """
         rest = math.prod((self.fsdp, self.tensor, self.context))
         data = self.data or max(devices // rest, 1)

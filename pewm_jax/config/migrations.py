@@ -1,7 +1,7 @@
-"""Settings written by earlier versions of this library, brought up to the present one.
+"""Upgrades of settings that earlier versions of this library wrote.
 
-``config.json`` says its version; files from before there was one are version 1. Each version has
-one function that turns its values into those of the next.
+``config.json`` states its version; files without one are version 1. For each version, one function
+turns its values into those of the next.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ Kinds = Mapping[str, Any]
 
 
 def upgrade(values: Values, where: str, under: Kinds | None = None) -> Values:
-    """Bring a configuration's plain values to the present version.
+    """Upgrade the plain values of a configuration to the current version.
 
     Args:
         values: nested plain values, as read from JSON; they are not changed.
-        where: name of the file in the error message.
+        where: name of the file, for error messages.
         under: kinds of the settings that the values are laid over, which a section that does not
             say its own is of; by default those that were the default in the values' version.
 
     Raises:
-        ConfigError: the values are of a newer version than this library knows, or of none.
+        ConfigError: the version is not a number, or newer than this library knows.
     """
     version = values.get("version", VERSION if "model" in values else 1)
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
@@ -46,7 +46,7 @@ def upgrade(values: Values, where: str, under: Kinds | None = None) -> Values:
 
 
 def from_1(values: Values, where: str, under: Kinds) -> Values:
-    """Gather the model's sections under ``model``, split into parts of which there are kinds.
+    """Move the model's sections under ``model`` and split them into parts with kinds.
 
     Version 1 held the settings of all kinds side by side, and used those of one: what is of the
     others is dropped. A part that does not say its kind is of that which lies under, or of the one
@@ -107,7 +107,7 @@ def _codec(old: Values, under: Kinds) -> Values:
 
 
 def _memory(old: Values, under: Kinds) -> Values:
-    """Split what is remembered from its features (``encoder``) and from who reads it."""
+    """Split memory settings into memory, ``encoder`` and ``reader``."""
     new, encoder, reader = {}, {}, {}
     kind = old.get("kind", under.get("memory", "voxel"))
     _move(old, "kind", new, "kind")
@@ -132,7 +132,7 @@ def _move(old: Values, name: str, new: Values, to: str) -> None:
 
 
 MIGRATIONS: dict[int, Callable[[Values, str, Kinds], Values]] = {1: from_1}
-"""Version → the function that leads to the next."""
+"""Version → the function that upgrades its values to the next version."""
 
 RENAMED_FLAGS = (
     ("dit.", "model.backbone."),
@@ -151,5 +151,5 @@ RENAMED_FLAGS = (
         for name in ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio")
     ),
 )
-"""How flags were called in version 1 → how they are called now; the first match counts. An entry
-that ends in a dot stands for all that begins so."""
+"""Names of flags in version 1 → their names now; the first match counts. An entry that ends in a
+dot or an underscore is a prefix."""

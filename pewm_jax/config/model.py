@@ -1,4 +1,4 @@
-"""A model: all that inference needs to know, and nothing else."""
+"""The model: all settings that inference needs, and no others."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from pewm_jax.config.training import TrainConfig, TrainSettings
 
 
 class WorldSettings(Settings):
-    """What the settings of every world say; ``pewm_jax.worlds`` says what a world does.
+    """Settings that every world has; see ``pewm_jax.worlds`` for its functions.
 
     Attributes:
-        TRAIN: its training settings: ``TrainSettings`` with a ``StageConfig`` for each stage, named
-            as ``pewm_jax.worlds.stages`` names them.
-        dtype: compute precision, in which frozen weights are kept too.
+        TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
+            for each of the world's stages, named as the stage.
+        dtype: precision of computation and of frozen weights.
     """
 
     SECTION: ClassVar[str] = "world"
@@ -33,45 +33,39 @@ class WorldSettings(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig(WorldSettings):
-    """A video diffusion model with a memory (PEWM): what it imagines and how it is built."""
+    """A video diffusion model with a memory (PEWM)."""
 
     TRAIN: ClassVar[type[TrainSettings]] = TrainConfig
 
     clip: ClipConfig = ClipConfig()
-    """The shape of a clip."""
+    """Shape of a clip."""
     actions: ActionConfig = ActionConfig()
-    """What an action does."""
+    """Effect of an action."""
     codec: CodecSettings = PixelConfig()
-    """Pixels to latents."""
+    """Codec: pixels to latents and back."""
     backbone: BackboneSettings = DiTConfig()
-    """The denoiser."""
+    """Backbone: the denoiser."""
     control: ControlSettings = CameraConfig()
-    """What steers it."""
+    """Control: what steers a clip."""
     memory: MemorySettings = VoxelConfig()
-    """What is remembered, as which features, and how it is read."""
+    """Memory: what is remembered, as which features, and how it is read."""
     noise: NoiseSettings = DDPMConfig()
-    """Noise, target, sampler."""
+    """Noise, prediction target, sampler."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Compute precision; master weights of what trains stay float32, frozen weights are kept in
-    this precision."""
+    """Precision of computation and of frozen weights; weights in training stay float32."""
 
     @property
     def latent_shape(self) -> tuple[int, int, int]:
         """(t, h, w) of one clip's latents."""
-        clip, codec = self.clip, self.codec
-        return (
-            codec.frames(clip.frames),
-            clip.height // codec.spatial,
-            clip.width // codec.spatial,
-        )
+        return self.codec.latent_shape(self.clip)
 
     @property
     def in_channels(self) -> int:
-        """Channels that go into the denoiser: noisy latents, observed latents, the control's."""
+        """Input channels of the denoiser: noisy latents, observed latents, the control's."""
         return 2 * self.codec.channels + self.control.channels(self)
 
     def __post_init__(self):
-        """Validate what stands in each section, and what spans several."""
+        """Validate what is in each section, and settings that depend on each other."""
         require_section(self, "world", "model")
         for name, kind in (("clip", ClipConfig), ("actions", ActionConfig)):
             found = getattr(self, name)

@@ -1,4 +1,4 @@
-"""How latents are corrupted, what the network predicts, and how a sample is drawn."""
+"""Noise: how latents are corrupted, what the network predicts, how samples are drawn."""
 
 from __future__ import annotations
 
@@ -10,19 +10,21 @@ from pewm_jax.config.kinds import Settings
 
 
 class NoiseSettings(Settings):
-    """What the settings of every noise say; ``pewm_jax.diffusion.noise`` says what it does.
+    """Settings that every noise has; see ``pewm_jax.diffusion.noise`` for its functions.
 
     Attributes:
         guidance: classifier-free guidance on the memory; 1 is off.
+        per_frame: whether training draws a time for every latent frame.
     """
 
     SECTION: ClassVar[str] = "noise"
     guidance: Any = 1.0
+    per_frame: Any = False
 
 
 @dataclasses.dataclass(frozen=True)
 class DDPMConfig(NoiseSettings):
-    """Discrete noise levels ᾱ (CogVideoX's): schedule, prediction target and sampler."""
+    """Discrete noise levels ᾱ, as in CogVideoX: schedule, prediction target and sampler."""
 
     train_steps: int = 1000
     """Noise levels of the schedule."""
@@ -43,20 +45,20 @@ class DDPMConfig(NoiseSettings):
     sampler: Literal["ddim", "dpm"] = "ddim"
     """`ddim`: deterministic (η = 0). `dpm`: DPM-Solver++ (2M) with fresh noise at every step."""
     spacing: Literal["trailing", "leading", "linspace"] = "trailing"
-    """Which noise levels are visited. Only trailing begins at pure noise for every step count."""
+    """Which noise levels are visited. Only trailing starts at pure noise for any sample_steps."""
     steps_offset: int = 0
-    """Added to every visited level of leading spacing."""
+    """Number added to every visited level, with leading spacing."""
     stride: Literal["next", "fixed"] = "next"
-    """Where a step leads: to the next visited level, or train_steps // sample_steps levels down,
-    as CogVideoX's schedulers do. The two differ only where sample_steps does not divide
-    train_steps, and there a fixed stride misses the levels the denoiser is told."""
+    """Where a step leads: to the `next` visited level, or by a `fixed` train_steps // sample_steps
+    levels down, as in CogVideoX's schedulers. They differ only if sample_steps does not divide
+    train_steps; then a fixed stride does not land on the levels that the denoiser gets."""
     set_alpha_to_one: bool = True
-    """End the last step at a clean sample; False: at noise level 0, which is almost clean."""
+    """Whether the last step ends at a clean sample, or at noise level 0, which is almost clean."""
     guidance: float = 1.0
     """Classifier-free guidance on the memory: 1 = off, above 1 pushes away from 'no memory'."""
     dynamic_guidance: bool = False
-    """Let the guidance vary with the level, 1 + g (1 − cos(π ((N − t) / N)⁵)) / 2 after N =
-    sample_steps and the training level t, as CogVideoX's pipelines do."""
+    """Vary the guidance with the training level t, as CogVideoX's pipelines do:
+    1 + g (1 − cos(π ((N − t) / N)⁵)) / 2 with N = sample_steps."""
 
     def __post_init__(self):
         """Validate."""
@@ -99,19 +101,19 @@ class EDMConfig(NoiseSettings):
     sigma_data: float = 0.5
     """Standard deviation of clean latents."""
     sigma_min: float = 0.002
-    """Least noise of sampling."""
+    """Smallest σ in sampling."""
     sigma_max: float = 80.0
-    """Most noise of sampling."""
+    """Largest σ in sampling."""
     rho: float = 7.0
-    """How the sampler's steps crowd towards little noise."""
+    """Exponent of the sampler's steps; larger values place more of them at small σ."""
     log_mean: float = -1.2
     """Mean of log σ in training."""
     log_std: float = 1.2
-    """Spread of log σ in training."""
+    """Standard deviation of log σ in training."""
     sample_steps: int = 18
     """Steps of the sampler."""
     sampler: Literal["euler", "heun"] = "euler"
-    """`euler`: one evaluation of the denoiser per step. `heun`: two, and second order."""
+    """`euler`: first order, one evaluation of the denoiser per step. `heun`: second order, two."""
     guidance: float = 1.0
     """Classifier-free guidance on the memory: 1 = off, above 1 pushes away from 'no memory'."""
 
@@ -133,17 +135,17 @@ class EDMConfig(NoiseSettings):
 class FlowConfig(NoiseSettings):
     """Flow matching on straight paths: x_t = (1 − t) x0 + t ε, velocity ε − x0 (arXiv 2210.02747).
 
-    A time may be given for every latent frame (diffusion forcing, arXiv 2407.01392).
+    Each latent frame may have its own time (diffusion forcing, arXiv 2407.01392).
     """
 
     shift: float = 1.0
     """Time shift s: t → s t / (1 + (s − 1) t); above 1 spends more steps near pure noise."""
     times: Literal["uniform", "logit_normal"] = "uniform"
-    """How training draws times."""
+    """Distribution of times in training."""
     per_frame: bool = False
-    """Whether training draws a time for every latent frame, not one for a clip."""
+    """Whether training draws one time per latent frame instead of one per clip."""
     scale: float = 1000.0
-    """What the network is told is this times t."""
+    """Factor of t in the network's time input."""
     sample_steps: int = 10
     """Steps of the sampler, by Euler's method."""
     guidance: float = 1.0

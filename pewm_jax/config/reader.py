@@ -1,4 +1,4 @@
-"""How the denoiser reads the memory."""
+"""Memory readers: how the denoiser reads the memory."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pewm_jax.config.kinds import Settings
 
 
 class ReaderSettings(Settings):
-    """What the settings of every reader say; ``pewm_jax.models.readers`` says what it does.
+    """Settings that every reader has; see ``pewm_jax.models.readers`` for its functions.
 
     Attributes:
-        split_heads: what ``train.mesh.tensor`` must divide.
+        split_heads: a number that ``train.mesh.tensor`` must divide.
     """
 
     SECTION: ClassVar[str] = "reader"
@@ -25,12 +25,12 @@ class AttentionConfig(ReaderSettings):
     """Cross-attention from video tokens to map tokens, after every block of the backbone."""
 
     positions: Literal["projective", "sinusoid"] = "projective"
-    """How attention knows where a cell is: `projective` (seen through each frame's camera) or
-    `sinusoid` (the paper: 3D sinusoid of the position)."""
+    """How cell positions are encoded: `projective` (image coordinates in each frame's camera) or
+    `sinusoid` (the paper's 3D sinusoid of the position)."""
     frame: Literal["camera", "world"] = "camera"
-    """Where a `sinusoid` counts positions from: the clip's first camera, or the world's origin."""
+    """The frame of `sinusoid` positions: the clip's first camera, or the world."""
     looks: int = 128
-    """Map tokens that each frame's camera looks at, with projective positions."""
+    """Map tokens that each camera attends to, with projective positions."""
     heads: int = 6
     """Attention heads."""
     head_dim: int = 32
@@ -40,7 +40,7 @@ class AttentionConfig(ReaderSettings):
 
     @property
     def split_heads(self) -> int:
-        """What ``train.mesh.tensor`` must divide."""
+        """The number that ``train.mesh.tensor`` must divide."""
         return self.heads
 
     @property
@@ -49,7 +49,7 @@ class AttentionConfig(ReaderSettings):
         return self.heads * self.head_dim
 
     def check(self, model: Any) -> None:
-        """Refuse fewer heads than a token has cameras."""
+        """Refuse fewer heads than there are cameras per token."""
         cameras = model.codec.temporal * model.backbone.places.patch_t
         require(
             self.positions == "sinusoid" or self.heads >= cameras,

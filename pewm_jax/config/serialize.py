@@ -1,4 +1,4 @@
-"""Configurations to and from plain values and JSON, strictly."""
+"""Strict conversion of configurations to and from plain values and JSON."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T = TypeVar("T")
 def to_dict(config: Any) -> dict[str, Any]:
     """Turn a configuration into plain dictionaries, lists, numbers and strings.
 
-    Settings of which there are several kinds say theirs by name under ``kind``.
+    Settings that come in kinds get an entry ``kind`` with the kind's name.
     """
     out: dict[str, Any] = {"kind": kinds.of(config).name} if _has_kinds(type(config)) else {}
     for field in dataclasses.fields(config):
@@ -34,12 +34,12 @@ def from_dict(kind: type[T], values: dict[str, Any], where: str = "config") -> T
 
     Args:
         kind: the dataclass to build, e.g. ``Config``, or the base of several kinds of settings.
-        values: nested plain values; absent fields take their defaults. Of a ``Config``, those of
-            an earlier version are brought up to this one.
+        values: nested plain values; absent fields take their defaults. Values of a ``Config`` of
+            an earlier version are upgraded.
         where: name of this place in error messages.
 
     Raises:
-        ConfigError: a key that does not exist, a value of the wrong type, or one that is refused.
+        ConfigError: a key does not exist, or a value has the wrong type or is refused.
     """
     if not isinstance(values, dict):
         raise ConfigError(f"{where} must be a table of settings, got {type(values).__name__}.")
@@ -60,7 +60,7 @@ def from_dict(kind: type[T], values: dict[str, Any], where: str = "config") -> T
         hint = fields[name].metadata.get("kinds", hints[name])
         usual = type(fields[name].default)
         if isinstance(value, dict) and "kind" not in value and _has_kinds(usual):
-            hint = usual  # a section that does not say its kind has the usual
+            hint = usual  # a section without a kind is of the default one
         built[name] = _coerce(hint, value, f"{where}.{name}")
     if issubclass(kind, Config):
         built = _with_training(built, values, where)
@@ -77,7 +77,7 @@ def needed(kind: type) -> list[str]:
 
 
 def _with_training(built: dict[str, Any], values: dict[str, Any], where: str) -> dict[str, Any]:
-    """Build the section ``train`` with the stages of the model's world."""
+    """Build the section ``train``, whose stages depend on the model."""
     stages = built.get("model", Config().model).TRAIN
     return built | {"train": from_dict(stages, values.get("train", {}), f"{where}.train")}
 
@@ -100,7 +100,7 @@ def _named(base: type, values: dict[str, Any], where: str) -> type:
 def _coerce(hint: Any, value: Any, where: str) -> Any:
     """Check one plain value against a type hint; lists become tuples."""
     if dataclasses.is_dataclass(hint) or _has_kinds(hint):
-        if hint is TrainSettings:  # which stages it has, the model says; see ``_with_training``
+        if hint is TrainSettings:  # its stages depend on the model, see ``_with_training``
             return value
         return from_dict(typing.cast("type", hint), value, where)
     args = typing.get_args(hint)
@@ -147,7 +147,7 @@ def _coerce_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, .
 
 
 def save(config: Any, path: Path) -> None:
-    """Write a configuration as JSON, aside and then renamed."""
+    """Write a configuration as JSON, atomically."""
     atomic.write_text(path, json.dumps(to_dict(config), indent=2) + "\n")
 
 
@@ -155,8 +155,7 @@ def load(path: Path, kind: type[T] = Config) -> T:
     """Read a configuration from JSON.
 
     Raises:
-        ConfigError: the file is absent or unreadable, is not JSON, or holds settings that do not
-            fit.
+        ConfigError: the file is absent or unreadable, or holds no valid settings.
     """
     try:
         values = json.loads(path.read_text())

@@ -1,4 +1,4 @@
-"""What training reads, how it learns, and how the result is scored."""
+"""Settings of data, training and evaluation."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from pewm_jax.config.mesh import MeshConfig
 
 @dataclasses.dataclass(frozen=True)
 class DataConfig:
-    """What training reads."""
+    """The data that training reads."""
 
     path: str = "data/demo"
-    """Folder made by `python -m pewm_jax.data collect` or `import` (with train/ inside)."""
+    """Data folder made by `python -m pewm_jax.data collect` or `import`; it contains train/."""
     stride_min: int = 1
     """Smallest number of actions between two frames of a clip."""
     stride_max: int = 3
     """Largest number of actions between two frames of a clip."""
     context: int = 24
-    """Earlier frames of the same episode given to the memory."""
+    """Earlier frames of the same episode that fill the memory."""
     features: str = ""
-    """Folder of image features made by `python -m pewm_jax.memory cache` of `data.path`; empty
-    computes them at every step."""
+    """Folder of cached image features of `data.path`, made by `python -m pewm_jax.memory cache`; if
+    empty, they are computed at every step."""
     workers: int = 0
-    """Threads that read and decode ahead of training; 0 means one."""
+    """Threads that read and decode data ahead of training; 0 means one."""
     bad_records: int = 0
-    """Records that may fail to decode before training stops; each is named, and skipped. Of several
-    processes, each counts those that it reads."""
+    """Records that may fail to decode before training stops; each is reported and skipped. Every
+    process counts its own."""
 
     def __post_init__(self):
         """Validate."""
@@ -66,47 +66,46 @@ class StageConfig:
 
 @dataclasses.dataclass(frozen=True)
 class TrainSettings:
-    """How a model learns, whatever its stages; each world adds a ``StageConfig`` for each stage."""
+    """Settings of all trainings; each world adds a ``StageConfig`` for each of its stages."""
 
     run: str = "runs/demo"
-    """Folder of this run: checkpoints, logs, pictures, report."""
+    """Folder of this run: checkpoints, logs, images, report."""
     start: str = ""
-    """Folder that training starts from, made by `python -m pewm_jax.convert import … --rgbd
-    --camera` or an earlier run; empty starts from random weights. What the first stage does not
-    train or need, as the memory blocks of stage 1, is left out and begins fresh later."""
+    """Folder with weights to start from, made by `python -m pewm_jax.convert import … --rgbd
+    --camera` or an earlier run; if empty, weights are random. Weights that the first stage does not
+    use, such as memory blocks in stage 1, are not loaded and start afresh later."""
     weight_decay: float = 0.0
     """Decoupled weight decay on matrices."""
     clip_norm: float = 1.0
     """Gradient norm above which gradients are scaled down."""
     ema: float = 0.995
-    """Decay of the exponential moving average that inference uses."""
+    """Decay of the exponential moving average of the weights, which inference uses."""
     seed: int = 0
     """Seed of weights, noise and data order."""
     save_every: int = 100
     """Steps between checkpoints."""
     keep: int = 2
-    """Newest checkpoints kept."""
+    """Number of newest checkpoints that are kept."""
     keep_every: int = 0
-    """Checkpoints at multiples of this many steps are kept for ever; 0 for none."""
+    """Checkpoints at multiples of this many steps are never deleted; 0 for none."""
     log_every: int = 10
     """Steps between log lines."""
     preview_every: int = 250
-    """Steps between sample pictures; 0 for none."""
+    """Steps between sample images; 0 for none."""
     mesh: MeshConfig = MeshConfig()
-    """How devices are arranged; may change between one start of a run and the next."""
+    """How devices are arranged; may differ each time a run is resumed."""
     fresh: tuple[str, ...] = (r"memory/.*",)
-    """Paths (regular expressions) of leaves that the weights a stage starts from may lack; those
-    begin at random."""
+    """Parameter paths (regular expressions) that may be missing from the weights a stage starts
+    from; these parameters start at random."""
     image_noise_mean: float = -3.0
-    """Mean of log σ of the noise put on the observed first frame."""
+    """Mean of log σ of the noise added to the observed first frame."""
     image_noise_std: float = 0.5
-    """Spread of log σ of the noise put on the observed first frame."""
+    """Standard deviation of log σ of the noise added to the observed first frame."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
-    """What a loss or gradient that is not finite does: `stop` the training, or `skip` that update
-    and count it."""
+    """If a loss or gradient is not finite: `stop` training, or `skip` the update and count it."""
     grace_s: float = 30.0
-    """Seconds after Ctrl-C or SIGTERM within which training has saved and left; 30 is what
-    Kubernetes and SLURM wait before they kill."""
+    """Seconds after Ctrl-C or SIGTERM within which training must save and exit; Kubernetes and
+    SLURM kill a process after 30."""
 
     def __post_init__(self):
         """Validate."""
@@ -136,12 +135,12 @@ class TrainSettings:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig(TrainSettings):
-    """How the model learns: two stages, as the paper trains."""
+    """Training of PEWM in two stages, as in the paper."""
 
     stage1: StageConfig = StageConfig()
     """The backbone learns without memory: domain, camera control, RGB-D."""
     stage2: StageConfig = StageConfig()
-    """Only the memory blocks learn; all else stays bit-identical."""
+    """Only the memory blocks learn; all other weights stay bit-identical."""
 
     def __post_init__(self):
         """Validate."""
@@ -156,14 +155,14 @@ class TrainConfig(TrainSettings):
 
 @dataclasses.dataclass(frozen=True)
 class EvalConfig:
-    """What is measured on held-out scenes."""
+    """Evaluation on held-out scenes."""
 
     split: str = "revisit"
     """Folder inside data.path with the held-out revisit episodes."""
     clips: int = 48
     """Clips scored per seed."""
     chain: int = 1
-    """Clips generated one after the other from one start in what the table scores."""
+    """Clips generated one after the other from each start, for the table of scores."""
     stride: int = 1
     """Recorded actions between two frames of a scored clip."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -171,7 +170,7 @@ class EvalConfig:
     videos: int = 4
     """Long rollouts shown side by side in the report."""
     video_clips: int = 4
-    """Clips generated one after the other in a long rollout (long rollouts show drift)."""
+    """Clips generated one after the other in a long rollout; long rollouts reveal drift."""
     batch: int = 16
     """Clips sampled at once."""
 

@@ -1,4 +1,4 @@
-"""The video autoencoder in CogVideoX's form."""
+"""The video autoencoder's settings, and CogVideoX's published ones."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from pewm_jax.config.errors import ConfigError, require, require_positive
 class VAEConfig(CodecSettings):
     """The video autoencoder in CogVideoX's form: causal 3D convolutions, encoded in chunks.
 
-    The defaults are the published sizes; ``VAEConfig.published`` names the variants. Its weights
-    come from a converted checkpoint.
+    The defaults are the published sizes; ``VAEConfig.published`` returns the variants. Weights come
+    from a converted checkpoint.
     """
 
     DEPTH_AS_GREY: ClassVar[bool] = True
     CONVERTED: ClassVar[bool] = True
 
     in_channels: int = 3
-    """Channels of a frame that goes in."""
+    """Channels of an input frame."""
     out_channels: int = 3
-    """Channels of a frame that comes out."""
+    """Channels of an output frame."""
     latent_channels: int = 16
     """Channels of a latent."""
     widths: tuple[int, ...] = (128, 256, 256, 512)
-    """Channels of each level, from pixels inwards; each level but the last halves height and
+    """Channels of each level of the encoder, in order; each level but the last halves height and
     width."""
     resnets: int = 3
     """Residual blocks per level of the encoder; the decoder has one more."""
@@ -42,30 +42,30 @@ class VAEConfig(CodecSettings):
     sample_width: int = 720
     """Width that the weights were trained for; half of it is the width of a tile."""
     scaling_factor: float = 1.15258426
-    """Latents times this have unit variance: the diffusion model's input. Applied by the codec,
-    not by ``encode`` and ``decode``."""
+    """Factor that gives latents unit variance for the diffusion model. The codec applies it;
+    ``vae.encode`` and ``vae.decode`` do not."""
     invert_scale_latents: bool = False
-    """Whether a conditioning image's latents are divided by the factor, not multiplied: the
-    published 1.5-5B-I2V."""
+    """Whether the latents of a conditioning image are divided by the factor instead of multiplied,
+    as in the published 1.5-5B-I2V."""
     tiling: bool = False
-    """Work in overlapping tiles of space when a frame is larger than a tile: less memory, and a
-    slightly different result."""
+    """Process frames larger than a tile in overlapping tiles: less memory, and a slightly different
+    result."""
     tile_height: int = 0
     """Height of a tile in pixels; 0 is half of ``sample_height``."""
     tile_width: int = 0
     """Width of a tile in pixels; 0 is half of ``sample_width``."""
     tile_overlap_height: float = 1 / 6
-    """Share of a tile's height that overlaps with the next."""
+    """Share of a tile's height that overlaps with the next tile."""
     tile_overlap_width: float = 1 / 5
-    """Share of a tile's width that overlaps with the next."""
+    """Share of a tile's width that overlaps with the next tile."""
     convolution: Literal["auto", "taps", "volume", "winograd"] = "auto"
-    """`volume`: 3D convolutions; `taps`: the same as sums of 2D convolutions over time, faster on
-    XLA's CPU backend; `winograd`: half as many of those; `auto`: on CPU `winograd` in float32 and
-    `taps` in fewer bits, elsewhere `volume`."""
+    """`volume`: 3D convolutions; `taps`: the same as sums of 2D convolutions, faster on XLA's CPU
+    backend; `winograd`: half as many 2D convolutions; `auto`: on a CPU `winograd` in float32 and
+    `taps` in 16 bits, elsewhere `volume`."""
 
     @property
     def spatial(self) -> int:
-        """Pixels per latent cell, each way."""
+        """Pixels per latent cell, along height and along width."""
         return 2 ** (len(self.widths) - 1)
 
     @property
@@ -75,11 +75,11 @@ class VAEConfig(CodecSettings):
 
     @property
     def depth_channels(self) -> int:
-        """Latent channels of depth, encoded as a grey picture."""
+        """Latent channels of depth, which is encoded as a grey image."""
         return self.latent_channels
 
     def check(self, model: Any) -> None:
-        """Refuse clips that cannot be folded, or not be unfolded again."""
+        """Refuse clips that cannot be encoded, or decode to another number of frames."""
         super().check(model)
         require(
             self.frames(model.clip.frames) % 2 == 1,
@@ -163,4 +163,4 @@ _SCALES = {
     "1.5-5B": (0.7, False),
     "1.5-5B-I2V": (0.7, True),
 }
-"""What tells the published autoencoders apart: scaling factor, and whether images invert it."""
+"""Variant → scaling factor, and whether images are divided by it."""

@@ -1,1 +1,1 @@
-"""The last chapter, other people's weights in, ours out."""
+"""Conversion of weights: other people's in, ours out."""

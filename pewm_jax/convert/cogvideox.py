@@ -220,7 +220,7 @@ def write_diffusers(
 
     Args:
         network: which.
-        values: its settings in diffusers' words.
+        values: its settings as diffusers names them.
         params: our parameters.
         folder: to make.
         dtype: of the tensors; by default that of the parameters.

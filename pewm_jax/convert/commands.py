@@ -45,9 +45,10 @@ class ImportCogVideoX:
 
     With --rgbd --camera the patch embedding and the output layer are widened for a world model:
     depth, the observed frame and the camera come in, depth comes out; --memory adds the blocks
-    that read the map. The result is a folder that `pewm_jax.load` and `train.py --train.start`
-    read; until it is trained, the colours it makes are those of the original. Without these flags
-    the networks are only brought into our layout.
+    that read the map. The result is a folder that `pewm_jax.load` reads and that is trained by its
+    name (`pewm-jax train DST`), with the settings of the presets pewm_2b and pewm_5b. Until then
+    the colours it makes are those of the original. Without these flags the networks are only
+    brought into our layout.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -187,7 +188,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
     dit = TRANSFORMER.config(settings["transformer"], str(src / "transformer/config.json"))
     vae = VAE.config(settings["vae"], str(src / "vae/config.json"))
     noise = cogvideox.read_scheduler(src)
-    for network in (TRANSFORMER, VAE):  # what is wrong with the files is said before hours of work
+    for network in (TRANSFORMER, VAE):  # damaged files are refused before hours of work
         cogvideox.stored_specs(network, src, options.dtype)
     config, encoder = _world(options, dit, vae, noise) if options.rgbd else (None, None)
     prompts = text.encode(src, options.prompt, dit.text_length, dit.text_dim)

@@ -46,7 +46,7 @@ def clip(config: Config, batch: int, *, features: bool = False, actions: bool = 
         frames(batch, context, **pixels),
         array(batch, context, dtype=np.bool_),
         kept,
-        array(batch, size.frames - 1, ACTION) if actions else None,
+        array(batch, size.frames - 1, config.model.control.actions or ACTION) if actions else None,
     )
 
 

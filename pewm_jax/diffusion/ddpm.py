@@ -1,4 +1,4 @@
-"""Discrete noise levels ᾱ as CogVideoX has them: the functions that ``noise`` calls."""
+"""DDPM: discrete noise levels ᾱ, as in CogVideoX."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ sample = sampler.sample
 
 
 def draw(config: DDPMConfig, key: Array, batch: int, frames: int) -> Array:
-    """Draw (B,) levels, all equally often."""
+    """Draw (B,) levels uniformly."""
     del frames
     return jax.random.randint(key, (batch,), 0, config.train_steps)
 
 
 def shown(config: DDPMConfig, x_t: Array, time_B: Array) -> tuple[Array, Array]:
-    """Return x_t as it is, and the level."""
+    """Return x_t unchanged, and the level."""
     del config
     return x_t, time_B
 

@@ -1,7 +1,7 @@
-"""Continuous noise σ with preconditioning (Karras et al. 2022, arXiv 2206.00364).
+"""EDM: continuous noise σ with preconditioning (Karras et al. 2022, arXiv 2206.00364).
 
-The network F sees c_in x and log σ / 4; clean latents are c_skip x + c_out F (its Eq. 7 and Table
-1), so that input and target have unit variance at every σ.
+The network F gets c_in x and log σ / 4. Clean latents are c_skip x + c_out F (Eq. 7 and Table 1
+there), so input and target have unit variance at every σ.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def to_x0(config: EDMConfig, prediction: Array, x_t: Array, time_B: Array) -> Ar
 
 
 def levels(config: EDMConfig) -> np.ndarray:
-    """Return (sample_steps,) σ from sigma_max to sigma_min (its Eq. 5)."""
+    """Return (sample_steps,) σ from sigma_max to sigma_min (Eq. 5 of the paper)."""
     high, low = config.sigma_max ** (1 / config.rho), config.sigma_min ** (1 / config.rho)
     share = np.linspace(0, 1, config.sample_steps)
     return (high + share * (low - high)) ** config.rho
@@ -69,9 +69,8 @@ def sample(config: EDMConfig, denoise: Denoiser, noise: Array, key: Array | None
     """Follow the probability-flow ODE dx/dσ = (x − x0)/σ by Euler's or Heun's method (Alg. 1)."""
     del key
     sigmas = np.asarray(levels(config), np.float32)
-    after = np.append(sigmas[1:], np.float32(0))
 
-    def slope(x: Array, sigma: Array) -> Array:
+    def slope(x: Array, sigma: Array | float) -> Array:
         x0 = denoise(x, jnp.full((x.shape[0],), sigma), jnp.float32(config.guidance))
         return (x - x0) / sigma
 
@@ -80,11 +79,9 @@ def sample(config: EDMConfig, denoise: Denoiser, noise: Array, key: Array | None
         first = slope(x, now)
         moved = x + (then - now) * first
         if config.sampler == "heun":
-            second = slope(moved, jnp.maximum(then, config.sigma_min))
-            better = x + (then - now) * (first + second) / 2
-            moved = jnp.where(then > 0, better, moved)
+            moved = x + (then - now) * (first + slope(moved, then)) / 2
         return moved.astype(x.dtype), None
 
     start = (noise * sigmas[0]).astype(noise.dtype)
-    out, _ = jax.lax.scan(step, start, (jnp.asarray(sigmas), jnp.asarray(after)))
-    return out
+    x, _ = jax.lax.scan(step, start, (jnp.asarray(sigmas[:-1]), jnp.asarray(sigmas[1:])))
+    return (x - sigmas[-1] * slope(x, sigmas[-1])).astype(noise.dtype)  # Euler's, to σ = 0

@@ -35,7 +35,7 @@ def corrupt(config: FlowConfig, x0: Array, noise: Array, time_B: Array) -> Array
 
 
 def shown(config: FlowConfig, x_t: Array, time_B: Array) -> tuple[Array, Array]:
-    """Return x_t as it is, and the time in the network's units."""
+    """Return x_t unchanged, and the time in the network's units."""
     return x_t, time_B * config.scale
 
 

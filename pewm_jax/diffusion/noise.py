@@ -1,8 +1,8 @@
 """Noise: every kind behind one interface, chosen by the type of its settings.
 
-A noise is a ``NoiseSettings`` and a module (or object) with the functions below: how clean latents
-are corrupted at a time, what the network is shown and told then, what it is asked for, how its
-answer becomes x0, what an error weighs, and which levels a sampler visits.
+A noise is a ``NoiseSettings`` and a module (or object) with the functions below. They corrupt clean
+latents at a given time, prepare the network's inputs, define its target and the weight of its
+error, turn its prediction into x0, and sample.
 
 ======= ==================== ==================================== =========================
 kind    time                 x_t                                  target
@@ -12,8 +12,7 @@ edm     σ                    x0 + σ ε                             (x0 − c_s
 flow    t in [0, 1]          (1 − t) x0 + t ε                     ε − x0
 ======= ==================== ==================================== =========================
 
-A time is one number for a clip, (B,), or, where the kind allows it, one for each latent frame,
-(B, t).
+A time is one number per clip, (B,), or one per latent frame, (B, t), if the kind allows it.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from pewm_jax.config import NoiseSettings, functions
 from pewm_jax.types import Array
 
 Denoiser: TypeAlias = Callable[[Array, Array, Array], Array]
-"""``(x_t, time_B, weight) -> x0``; the weight is that of guidance at this step."""
+"""``(x_t, time_B, weight) -> x0``; the last argument is the weight of guidance at this step."""
 
 
 def draw(config: NoiseSettings, key: Array, batch: int, frames: int) -> Array:
@@ -36,27 +35,27 @@ def draw(config: NoiseSettings, key: Array, batch: int, frames: int) -> Array:
 
 
 def corrupt(config: NoiseSettings, x0: Array, noise: Array, time_B: Array) -> Array:
-    """Return x_t of clean latents (B, t, …) and standard normal noise."""
+    """Return x_t, made from clean latents (B, t, …) and standard normal noise."""
     return functions(config).corrupt(config, x0, noise, time_B)
 
 
 def shown(config: NoiseSettings, x_t: Array, time_B: Array) -> tuple[Array, Array]:
-    """Return what the network is shown for x_t, and the time that it is told."""
+    """Return the network's inputs: x_t as it is preconditioned, and the time in its units."""
     return functions(config).shown(config, x_t, time_B)
 
 
 def target(config: NoiseSettings, x0: Array, noise: Array, time_B: Array) -> Array:
-    """Return what the network is asked for."""
+    """Return the target of the network's prediction."""
     return functions(config).target(config, x0, noise, time_B)
 
 
 def weight(config: NoiseSettings, time_B: Array) -> Array:
-    """Return what the squared error of the target weighs, of the shape of the times."""
+    """Return the loss weight of the squared error, in the shape of the times."""
     return functions(config).weight(config, time_B)
 
 
 def to_x0(config: NoiseSettings, prediction: Array, x_t: Array, time_B: Array) -> Array:
-    """Turn the network's answer into clean latents."""
+    """Turn the network's prediction into clean latents."""
     return functions(config).to_x0(config, prediction, x_t, time_B)
 
 
@@ -74,7 +73,7 @@ def sample(
         config: the noise and its sampler.
         denoise: ``(x_t, time_B, weight) -> x0``.
         noise: (B, t, …) standard normal start.
-        key: randomness of the steps, where the sampler draws any.
+        key: randomness of the steps, if the sampler draws noise.
     """
     return functions(config).sample(config, denoise, noise, key)
 

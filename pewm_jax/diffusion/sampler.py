@@ -1,4 +1,4 @@
-"""Sampling under ``lax.scan``: DDIM and DPM-Solver++ (2M, SDE), as CogVideoX's schedulers step."""
+"""Samplers under ``lax.scan``: DDIM and SDE-DPM-Solver++ (2M), as in CogVideoX's schedulers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pewm_jax.diffusion import solver
 from pewm_jax.types import Array
 
 Denoiser: TypeAlias = Callable[[Array, Array], Array]
-"""``(x_t, timesteps_B) -> x0``; ``schedule.to_x0`` turns a v or an ε into it."""
+"""``(x_t, timesteps_B) -> x0``; ``schedule.to_x0`` converts predictions of v or ε."""
 
 
 def ddim(config: DDPMConfig, denoise: Denoiser, noise: Array, *, every_step: bool = False) -> Array:
@@ -57,7 +57,8 @@ def dpm(
         (B, …) the sample.
 
     Raises:
-        ValueError: not exactly one of key and step_noise is given, or the latter's shape is wrong.
+        ValueError: both or neither of key and step_noise are given, or step_noise has a wrong
+            shape.
     """
     if (key is None) == (step_noise is None):
         raise ValueError("dpm() draws fresh noise at every step: give it a key, or step_noise.")
@@ -83,8 +84,8 @@ def sample(
 
     Args:
         config: schedule, sampler and steps.
-        denoise: ``(x_t, timesteps_B, weight) -> x0``; the weight is that of guidance, see
-            ``schedule.guidance``.
+        denoise: ``(x_t, timesteps_B, weight) -> x0``; the last is the weight of guidance (see
+            ``schedule.guidance``).
         noise: (B, …) standard normal start.
         key: randomness of the steps; only the sampler dpm needs it.
 
@@ -102,12 +103,12 @@ def sample(
 
 
 def _plain(denoise: Denoiser) -> Callable[[Array, Array, Array], Array]:
-    """Give a denoiser the third argument, the weight of guidance, which it does not use."""
+    """Make a denoiser accept, and ignore, the weight of guidance."""
     return lambda x, timesteps, _weight: denoise(x, timesteps)
 
 
 def _draw(key: Array, like: Array) -> Callable[[Array], Array]:
-    """Return step number → standard normal noise."""
+    """Return a function from a step's number to its standard normal noise."""
     return lambda k: jax.random.normal(jax.random.fold_in(key, k), like.shape, like.dtype)
 
 
@@ -119,7 +120,7 @@ def _follow(
     *,
     every_step: bool = False,
 ) -> Array:
-    """Scan the update of ``solver`` over its rows; ``fresh`` gives the noise of step k, if any."""
+    """Scan the update of ``solver`` over its rows; ``fresh(k)`` is the noise added at step k."""
 
     def step(carry, inputs):
         x, earlier = carry

@@ -1,7 +1,7 @@
-"""The noise schedule, the three prediction targets, and the levels a sampler visits.
+"""The DDPM noise schedule, the three prediction targets, and the levels a sampler visits.
 
-CogVideoX's: scaled-linear betas, optional SNR shift, rescaled to zero terminal SNR
-(Lin et al. 2023, arXiv 2305.08891, Alg. 1), computed in float64.
+The schedule is CogVideoX's: scaled-linear betas, an optional SNR shift, rescaled to zero terminal
+SNR (Lin et al. 2023, arXiv 2305.08891, Alg. 1). It is computed in float64.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import DDPMConfig
+from pewm_jax.diffusion.noise import spread
 from pewm_jax.types import Array
 
 
@@ -28,12 +29,11 @@ def alphas_cumprod(config: DDPMConfig) -> np.ndarray:
 
 
 def _coefficients(config: DDPMConfig, timesteps_B: Array, ndim: int) -> tuple[Array, Array]:
-    """Return √ᾱ and √(1 − ᾱ) of shape (B, 1, …)."""
+    """Return √ᾱ and √(1 − ᾱ) of shape (B, 1, …), or (B, t, 1, …)."""
     alphas = alphas_cumprod(config)
-    shape = (-1,) + (1,) * (ndim - 1)
-    signal = jnp.asarray(np.sqrt(alphas), jnp.float32)[timesteps_B].reshape(shape)
-    noise = jnp.asarray(np.sqrt(1 - alphas), jnp.float32)[timesteps_B].reshape(shape)
-    return signal, noise
+    signal = jnp.asarray(np.sqrt(alphas), jnp.float32)[timesteps_B]
+    noise = jnp.asarray(np.sqrt(1 - alphas), jnp.float32)[timesteps_B]
+    return spread(signal, ndim), spread(noise, ndim)
 
 
 def add_noise(config: DDPMConfig, x0: Array, noise: Array, timesteps_B: Array) -> Array:
@@ -43,7 +43,7 @@ def add_noise(config: DDPMConfig, x0: Array, noise: Array, timesteps_B: Array) -
 
 
 def target(config: DDPMConfig, x0: Array, noise: Array, timesteps_B: Array) -> Array:
-    """Return what the network is asked for: x0, ε, or v = √ᾱ ε − √(1 − ᾱ) x0."""
+    """Return the target of the prediction: x0, ε, or v = √ᾱ ε − √(1 − ᾱ) x0."""
     a, b = _coefficients(config, timesteps_B, x0.ndim)
     return {"x0": x0, "eps": noise, "v": a * noise - b * x0}[config.target]
 
@@ -55,7 +55,7 @@ def to_x0(
     timesteps_B: Array,
     kind: Literal["x0", "v", "eps"] | None = None,
 ) -> Array:
-    """Turn a prediction into x0 (kind: the configured target if not given)."""
+    """Turn a prediction of ``kind`` (by default the configured target) into x0."""
     a, b = _coefficients(config, timesteps_B, x_t.ndim)
     kind = kind or config.target
     if kind == "x0":
@@ -66,7 +66,7 @@ def to_x0(
 
 
 def x0_weight(config: DDPMConfig, timesteps_B: Array) -> Array:
-    """Return (B,) min(1 / (1 − ᾱ), max_weight): the squared error of x0 becomes that of v."""
+    """Return (B,) min(1 / (1 − ᾱ), max_weight): weights that turn errors of x0 into those of v."""
     alphas = alphas_cumprod(config)
     weight = np.minimum(1 / (1 - alphas), config.max_weight)
     return jnp.asarray(weight, jnp.float32)[timesteps_B]
@@ -75,8 +75,8 @@ def x0_weight(config: DDPMConfig, timesteps_B: Array) -> Array:
 def timesteps(config: DDPMConfig) -> np.ndarray:
     """Return (sample_steps,) int32 visited levels, descending (Lin et al. 2023, Table 2).
 
-    Trailing spacing begins at the last training level. It is always as many levels as asked; the
-    reference's range of floats has one more, a level of −1, for 62 of 1000 counts.
+    Trailing spacing begins at the last training level. The result always has ``sample_steps``
+    levels. (In the reference, rounding adds a further level, −1, for 62 of 1000 counts.)
     """
     count, total = config.sample_steps, config.train_steps
     if config.spacing == "linspace":
@@ -89,11 +89,12 @@ def timesteps(config: DDPMConfig) -> np.ndarray:
 
 
 def guidance(config: DDPMConfig) -> np.ndarray:
-    """Return (sample_steps,) the weight of guidance at every visited level.
+    """Return the (sample_steps,) weights of guidance at the visited levels.
 
-    Constant, or with ``dynamic_guidance`` CogVideoX's 1 + g (1 − cos(π ((N − t) / N)⁵)) / 2
-    (``diffusers/pipelines/cogvideo/pipeline_cogvideox.py``): N counts sampling steps and t
-    training levels, so the weight swings between 1 and 1 + g from step to step, as there.
+    They are constant or, with ``dynamic_guidance``, CogVideoX's
+    1 + g (1 − cos(π ((N − t) / N)⁵)) / 2
+    (``diffusers/pipelines/cogvideo/pipeline_cogvideox.py``). There, as here, N counts sampling
+    steps but t is a training level, so the weight jumps between 1 and 1 + g from step to step.
     """
     count = config.sample_steps
     if not config.dynamic_guidance:

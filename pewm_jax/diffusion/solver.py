@@ -1,10 +1,10 @@
-"""What one sampling step does, as numbers: both samplers are the same update.
+"""The coefficients of a sampling step; DDIM and DPM-Solver++ share one update rule.
 
     x ← keep · x + add · ((1 + mix) · x0 − mix · x0 of the step before) + spread · fresh noise
 
-The four coefficients depend on the noise levels alone, so they are computed once, in float64,
-before anything is traced; the levels of zero and of full signal, where log-SNR is infinite, need
-no special case under ``lax.scan``. References: ``scheduling_ddim_cogvideox.py`` and
+The four coefficients depend only on the noise levels. They are computed once, in float64, before
+tracing. Levels without signal or without noise, where log-SNR is infinite, therefore need no
+special case under ``lax.scan``. References: ``scheduling_ddim_cogvideox.py`` and
 ``scheduling_dpm_cogvideox.py`` in ``diffusers/schedulers/``.
 """
 
@@ -26,7 +26,7 @@ class Steps:
     """The coefficients of every sampling step, or of one.
 
     Attributes:
-        timestep: (steps,) int32 level that the denoiser is told.
+        timestep: (steps,) int32 noise level given to the denoiser.
         keep: (steps,) weight of the present sample.
         add: (steps,) weight of the clean sample.
         mix: (steps,) how far the clean sample is extrapolated from the step before.
@@ -53,10 +53,10 @@ def steps(config: DDPMConfig) -> Steps:
 
 
 def signal_power(config: DDPMConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (steps,) ᾱ of each visited level, of the level it leads to, and of the one before.
+    """Return (steps,) ᾱ of each visited level, of the next one, and of the previous one.
 
-    The level before is NaN where a step must be of first order: at the first step, and at the
-    last, which leaves the schedule.
+    The previous one is NaN where a step must be of first order: at the first step, and at the last
+    one, which leaves the schedule.
     """
     alphas = schedule.alphas_cumprod(config)
     levels = schedule.timesteps(config)
@@ -83,7 +83,7 @@ def _ddim(now: np.ndarray, after: np.ndarray, _before: np.ndarray) -> Rows:
 def _dpm(now: np.ndarray, after: np.ndarray, before: np.ndarray) -> Rows:
     """SDE-DPM-Solver++ (2M) (Lu et al. 2022, arXiv 2211.01095).
 
-    With h the rise of log-SNR/2, exp(−h) is written as a ratio that is finite where ᾱ is 0 or 1.
+    With h the increase of log-SNR/2, exp(−h) is written as a ratio that is finite for ᾱ = 0 and 1.
     """
     decay = np.sqrt(now * (1 - after) / (after * (1 - now)))
     keep = np.sqrt((1 - after) / (1 - now)) * decay
@@ -96,5 +96,5 @@ def _dpm(now: np.ndarray, after: np.ndarray, before: np.ndarray) -> Rows:
 
 
 def _rise(low: float, high: float) -> float:
-    """Return by how much log-SNR/2 grows between two levels."""
+    """Return the increase of log-SNR/2 between two levels."""
     return 0.5 * (np.log(high / (1 - high)) - np.log(low / (1 - low)))

@@ -1,1 +1,1 @@
-"""Chapter 9, how good it is: images, seen-before masks, protocol, scores, report."""
+"""Chapter 9, how good it is: protocol, image errors, seen-before masks, scores, report."""

@@ -1,4 +1,4 @@
-"""The report's pictures and videos, made from long rollouts that were kept."""
+"""The report's images and videos, drawn from stored long rollouts."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from pewm_jax.memory import memories
 from pewm_jax.types import Frames
 
 ABOVE_CAMERA_M = 0.4
-"""Map cells higher than this above the camera are left out when looking from above."""
+"""Map cells higher than this above the camera are left out of the view from above."""
 CAPTIONS = {"memory": "with its map", "empty": "empty map"}
-"""How pictures name the methods."""
+"""Names of the methods in images."""
 HOLD = 4
-"""Video frames for which the observed picture stands still."""
+"""Video frames for which the observed image is held."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Gallery:
-    """Everything to look at.
+    """The images and videos of a report.
 
     Attributes:
-        videos: (caption, MP4) of each long rollout shown.
-        strip: still pictures of one of them: truth, with its map, empty map.
-        strip_note: which rollout that is and when its pictures were taken.
-        masks: the same true pictures with never-seen pixels greyed out.
-        above: the map from above before and after that rollout.
+        videos: (caption, MP4) of each long rollout.
+        strip: frames of one rollout in rows: truth, with its map, empty map.
+        strip_note: which rollout and which frames they are.
+        masks: the same true frames with never-seen pixels greyed out.
+        above: the map from above, before and after that rollout.
     """
 
     videos: list[tuple[str, bytes]]
@@ -54,54 +54,60 @@ class Gallery:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Shown:
+class _Rollout:
+    """A long rollout, with the true frames and its methods' (colours, depth)."""
+
     choice: ClipChoice
     context: Frames
     truth: Frames
     seen_THW: np.ndarray
-    made: dict[str, tuple[np.ndarray, np.ndarray]]
+    imagined: dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts) -> Gallery:
-    """Draw the pictures and encode the videos.
+    """Draw the images and encode the videos.
 
-    The stills show the rollout with the most pixels seen before: chosen by geometry alone, never
-    by how well a method did.
+    The images show the rollout with the most pixels seen before. This choice depends on geometry
+    alone, never on how well a method did.
     """
     shown = [_gather(config, episodes, long, index) for index in range(long.shown)]
     best = max(range(len(shown)), key=lambda index: float(shown[index].seen_THW.mean()))
-    some = shown[best]
-    count = len(some.truth.depth_THW)
+    rollout = shown[best]
+    count = len(rollout.truth.depth_THW)
     steps = np.unique(np.round(np.linspace(0, count, 8)).astype(int))
     names = ["observed" if step == 0 else f"step {step}" for step in steps]
-    truth = _with_present(some.context, as_bytes(some.truth.rgb_THWC))
+    truth = _with_present(rollout.context, as_bytes(rollout.truth.rgb_THWC))
     rows = [("truth", [truth[step] for step in steps])]
-    for method, (rgb, _) in some.made.items():
-        rows.append((CAPTIONS[method], [_with_present(some.context, rgb)[step] for step in steps]))
-    seen = np.concatenate([np.ones_like(some.seen_THW[:1]), some.seen_THW])
+    for method, (rgb, _) in rollout.imagined.items():
+        rows.append(
+            (CAPTIONS[method], [_with_present(rollout.context, rgb)[step] for step in steps])
+        )
+    seen = np.concatenate([np.ones_like(rollout.seen_THW[:1]), rollout.seen_THW])
     masked = [dim(enlarge(truth[step], 128), _enlarge_mask(seen[step], 128)) for step in steps]
     return Gallery(
         videos=[_video(config, long, item) for item in shown],
         strip=grid(rows, names),
         strip_note=(
-            f"Episode {some.choice.name} from frame {some.choice.start}; steps "
+            f"Episode {rollout.choice.name} from frame {rollout.choice.start}; steps "
             f"{', '.join(str(step) for step in steps[1:])} of {count}. Of the {long.shown} "
             "rollouts shown above it is the one with the most pixels seen before."
         ),
         masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
-        above=_above(config, long, best, some),
+        above=_above(config, long, best, rollout),
     )
 
 
-def _gather(config: Config, episodes: Sequence[Episode], long: LongRollouts, index: int) -> _Shown:
+def _gather(
+    config: Config, episodes: Sequence[Episode], long: LongRollouts, index: int
+) -> _Rollout:
     choice = long.scored.choices[index]
     context, truth, _ = load_clip(config, episodes, choice, cameras=True)
     seen, _ = seen_masks(truth, context)
-    made = {
+    imagined = {
         method: (long.kept[method]["rgb"][index], long.kept[method]["depth"][index])
         for method in CAPTIONS
     }
-    return _Shown(choice, context, truth, np.asarray(seen), made)
+    return _Rollout(choice, context, truth, np.asarray(seen), imagined)
 
 
 def _with_present(context: Frames, rgb_THWC: np.ndarray) -> np.ndarray:
@@ -116,10 +122,10 @@ def _enlarge_mask(mask_HW: np.ndarray, width: int) -> np.ndarray:
     return big[np.round(rows).astype(int)][:, np.round(columns).astype(int)]
 
 
-def _video(config: Config, long: LongRollouts, item: _Shown) -> tuple[str, bytes]:
+def _video(config: Config, long: LongRollouts, item: _Rollout) -> tuple[str, bytes]:
     depth0 = np.asarray(item.context.depth_THW[-1:])
     columns = [("truth", as_bytes(item.truth.rgb_THWC), item.truth.depth_THW)]
-    columns += [(CAPTIONS[method], rgb, depth) for method, (rgb, depth) in item.made.items()]
+    columns += [(CAPTIONS[method], rgb, depth) for method, (rgb, depth) in item.imagined.items()]
     columns = [
         (name, _with_present(item.context, rgb), np.concatenate([depth0, depth]))
         for name, rgb, depth in columns
@@ -140,7 +146,7 @@ def _video(config: Config, long: LongRollouts, item: _Shown) -> tuple[str, bytes
     return caption, encode_h264([pictures[0]] * (HOLD - 1) + pictures)
 
 
-def _above(config: Config, long: LongRollouts, index: int, item: _Shown) -> np.ndarray:
+def _above(config: Config, long: LongRollouts, index: int, item: _Rollout) -> np.ndarray:
     """Draw the map before and after a rollout side by side, to one scale."""
     kept = long.kept["memory"]
     poses = np.asarray(item.context.camera.world_from_camera)

@@ -1,8 +1,8 @@
-"""How far one image is from another: PSNR, SSIM, depth error, whole or under a mask.
+"""Image errors under masks: PSNR, SSIM, depth error.
 
-Scores are kept as *sums under masks* (``error_sums``) until the very end, so that one pass over
-the samples yields every table: per clip, per frame index, per mask, in any grouping. Colours are
-compared in [0, 1] (the networks' [−1, 1] is shifted and clipped first).
+Errors are stored as *sums under masks* (``error_sums``) until the end, so one pass over the samples
+yields every table: per clip, per frame index, per mask, in any grouping. Colours are compared in
+[0, 1], after the networks' [−1, 1] is shifted and clipped.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from pewm_jax.types import Array, Frames
 WINDOW, SIGMA = 11, 1.5
 """SSIM's Gaussian window and its standard deviation, pixels (Wang et al. 2004)."""
 PSNR_CEILING = 100.0
-"""Decibels given to images that are equal, so that averages stay finite."""
+"""PSNR of equal images, in decibels, which keeps averages finite."""
 MASKS = ("seen", "unseen", "all")
 """Which pixels: seen before, never seen, all of them."""
 SUMS = ("squared", "colours", "ssim", "windows", "depth_abs", "depth_rel", "depths")
-"""What ``error_sums`` adds up, in order."""
+"""The sums that ``error_sums`` returns, in order."""
 
 
 def unit_colours(rgb: Array) -> Array:
-    """Bring colours to float32 in [0, 1] from uint8 or from float in [−1, 1], clipped."""
+    """Convert colours, uint8 or float in [−1, 1], to float32 in [0, 1], clipped."""
     rgb = jnp.asarray(rgb)
     if rgb.dtype == jnp.uint8:
         return rgb.astype(jnp.float32) / 255
@@ -82,7 +82,7 @@ def ssim_map(a_HWC: Array, b_HWC: Array) -> Array:
 
 
 def error_sums(predicted: Frames, true: Frames, seen_THW: Array, unseen_THW: Array) -> Array:
-    """Add up the errors of imagined frames under each mask.
+    """Sum the errors of imagined frames under each mask.
 
     Args:
         predicted: T imagined frames.
@@ -92,8 +92,8 @@ def error_sums(predicted: Frames, true: Frames, seen_THW: Array, unseen_THW: Arr
 
     Returns:
         (T, 3, 7): for every frame and every mask of ``MASKS`` the sums of ``SUMS``. SSIM counts
-        pixels whose window lies inside the image; depth counts pixels that have a true depth
-        and a predicted one (an agent that copies a hole predicts nothing there).
+        pixels whose window lies inside the image. Depth counts pixels with both a true and a
+        predicted depth (a copied frame may have holes).
     """
     guess, truth = unit_colours(predicted.rgb_THWC), unit_colours(true.rgb_THWC)
     squared_THW = ((guess - truth) ** 2).sum(-1)

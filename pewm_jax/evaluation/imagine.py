@@ -1,4 +1,4 @@
-"""Run the model over batches of chosen clips, compiled ahead and said aloud."""
+"""Run the model on batches of chosen clips, compiled ahead of time."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from pewm_jax.types import Array, Camera, Frames, Params, WorldState
 from pewm_jax.worlds import start
 
 METHODS = ("memory", "empty", "copy")
-"""With the map; the same weights with an empty map; the last observed frame, repeated."""
+"""The model with its map; with an empty map; the last observed frame, repeated."""
 
 
-def aloud(line: str) -> None:
-    """Print a line at once, also where output is not a terminal."""
+def print_now(line: str) -> None:
+    """Print a line without buffering, even if the output is not a terminal."""
     print(line, flush=True)
 
 
 class Imagination:
-    """A model for batches of clips of one size; each part is compiled when first needed.
+    """A model that imagines batches of clips of one size; functions are compiled when first needed.
 
     Args:
         config: static.
         params: weights.
         batch: clips sampled at once.
-        context: frames a state is started from.
-        cameras: whether clips are driven by cameras, in six degrees of freedom, and not by actions.
-        say: told what is being compiled and how long it took.
+        context: number of observed frames that a state starts from.
+        cameras: whether clips are driven by cameras (six degrees of freedom) instead of actions.
+        say: shows a line: what is being compiled, and how long it took.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Imagination:
         params: Params,
         batch: int,
         context: int,
-        say: Callable[[str], Any] = aloud,
+        say: Callable[[str], Any] = print_now,
         *,
         cameras: bool = False,
     ):
@@ -56,9 +56,9 @@ class Imagination:
         self._clip: dict[bool, Callable[..., tuple[WorldState, Frames]]] = {}
 
     def prepare(self, memories: Iterable[bool]) -> None:
-        """Compile the start, and the sampler with (True) or without (False) its map.
+        """Compile ``start``, and the sampler with (True) or without (False) its map.
 
-        Nothing is compiled twice, and nothing at all where no variant is asked for.
+        Nothing is compiled twice, and nothing if no variant is given.
         """
         memories = [memory for memory in memories if memory not in self._clip]
         if not memories:
@@ -98,11 +98,11 @@ class Imagination:
 
         Args:
             context: (B, S) observed frames, the present last, colours uint8.
-            control: what leads from the present through the N frames: (B, N, 3) actions, or (B, N)
-                cameras.
-            seeds_B2: sampling seed and clip number; equal ones draw equal noise, whatever the
-                batch and whether or not the map is used.
-            memory: use the map, or the same weights with an empty one.
+            control: the way from the present frame through the N frames: (B, N, 3) actions, or
+                (B, N) cameras.
+            seeds_B2: sampling seed and clip number; equal numbers give equal noise, in any batch,
+                with or without the map.
+            memory: whether to use the map or an empty one.
             params: other weights of the same shapes.
 
         Returns:
@@ -138,7 +138,7 @@ def clip_keys(seeds_B2: Array) -> Array:
 
 
 def copy_last(context: Frames, count: int) -> Frames:
-    """Repeat the present frame of every clip: the forecast that nothing will change."""
+    """Repeat the present frame of every clip: the baseline that nothing changes."""
     return jax.tree.map(lambda array: np.repeat(np.asarray(array)[:, -1:], count, 1), context)
 
 

@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing else: pictures and videos are inside it."""
+"""The report as one self-contained HTML page with embedded images and videos."""
 
 from __future__ import annotations
 
@@ -52,21 +52,21 @@ PLACES = {
     "how it does in new ones)",
     None: "places that the model may have been trained on (its training data is not there to tell)",
 }
-"""By ``held_out`` of the protocol."""
+"""A phrase for each value of ``held_out`` in the protocol."""
 METHOD_NAMES = {
     "memory": "with its map",
     "empty": "same weights, empty map",
     "copy": "copying the last frame",
 }
-"""How the page names the methods."""
+"""Names of the methods on the page."""
 CLUSTERS = {
     "scene": "clustered by scene, because clips of one scene show the same rooms",
     "episode": "clustered by episode: all clips are of one scene, and how much other scenes would "
     "differ cannot be said",
 }
-"""What a standard error covers, by ``clustered_by`` of the protocol."""
+"""A phrase for each value of ``clustered_by`` in the protocol: what a standard error covers."""
 MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
-"""How the page names the masks."""
+"""Names of the masks on the page."""
 METRIC_NAMES = {
     "psnr": ("PSNR, dB ↑", 2),
     "ssim": ("SSIM ↑", 3),
@@ -77,7 +77,7 @@ METRIC_NAMES = {
 
 
 def number(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
-    """Write ``mean ± stderr`` of an entry, or a dash."""
+    """Format an entry as ``mean ± stderr``, or as a dash."""
     if entry["mean"] is None:
         return "–"
     text = f"{entry['mean']:{'+' if sign else ''}.{digits}f}"
@@ -85,7 +85,7 @@ def number(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
 
 
 def verdict(entry: Mapping[str, Any], where: str) -> str:
-    """Say in a sentence what the map changes (PSNR of memory minus empty)."""
+    """Return a sentence on what the map changes (PSNR of memory minus empty)."""
     mean, stderr = entry["mean"], entry["stderr"]
     if mean is None:
         return f"No clip has enough pixels {where} to compare."
@@ -104,7 +104,7 @@ def verdict(entry: Mapping[str, Any], where: str) -> str:
 
 
 def introduction(protocol: Mapping[str, Any]) -> str:
-    """Say what was done, and whether the places were new to the model."""
+    """Return a paragraph: what was done, and whether the places were new to the model."""
     places = PLACES[protocol["held_out"]].format(
         shared=len(protocol["trained_scenes"]), scenes=len(protocol["scene_names"])
     )
@@ -117,11 +117,11 @@ def embed(kind: str, content: bytes) -> str:
 
 
 def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
-    """Write the page.
+    """Return the page as HTML.
 
     Args:
-        metrics: what ``metrics.json`` holds.
-        gallery: pictures and videos.
+        metrics: the content of ``metrics.json``.
+        gallery: images and videos.
     """
     seen = verdict(metrics["margin"]["seen"]["psnr"], "seen before")
     unseen = verdict(metrics["margin"]["unseen"]["psnr"], "never seen")
@@ -222,12 +222,14 @@ def _lines(per_frame: Mapping[str, Any], mask: str, metric: str) -> list[Line]:
 
 def _curves(metrics: Mapping[str, Any]) -> str:
     label = "imagined frame"
-    here, far = metrics["per_frame"], metrics["long"]["per_frame"]
+    clips, rollouts = metrics["per_frame"], metrics["long"]["per_frame"]
     charts = [
-        chart("PSNR, pixels seen before", label, _lines(here, "seen", "psnr"), unit="dB"),
-        chart("PSNR, pixels never seen", label, _lines(here, "unseen", "psnr"), unit="dB"),
-        chart("Depth error, seen before", label, _lines(here, "seen", "depth_mae"), unit="m"),
-        chart("Long rollouts: PSNR, seen before", label, _lines(far, "seen", "psnr"), unit="dB"),
+        chart("PSNR, pixels seen before", label, _lines(clips, "seen", "psnr"), unit="dB"),
+        chart("PSNR, pixels never seen", label, _lines(clips, "unseen", "psnr"), unit="dB"),
+        chart("Depth error, seen before", label, _lines(clips, "seen", "depth_mae"), unit="m"),
+        chart(
+            "Long rollouts: PSNR, seen before", label, _lines(rollouts, "seen", "psnr"), unit="dB"
+        ),
     ]
     keys = "".join(
         f'<span class="key" style="background:{COLOURS[method]}"></span>{label}'

@@ -1,29 +1,29 @@
-"""Scores that survive an interruption: one small file per finished piece of work.
+"""Partial scores, which survive an interruption: one small file per finished piece of work.
 
-Pieces lie in ``WEIGHTS/FINGERPRINT/``, named by the hash of the weights and by the fingerprint of
-weights and protocol, so that none can be mistaken for another's. Opening the folder drops pieces of
-other weights; those of other protocols stay, so that a quick look with fewer clips does not cost
-the scores of the full report. A piece is written aside and renamed, and one that does not read
-counts as not done.
+Files are in ``WEIGHTS/FINGERPRINT/``: the hash of the weights, and the fingerprint of weights and
+protocol. Opening the folder deletes the files of other weights. Files of other protocols stay, so a
+quick look with fewer clips does not discard the scores of the full report. Files are written
+atomically; an unreadable one counts as not done.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from pewm_jax import atomic
+
 
 class Partials:
     """Named sets of arrays of one evaluation.
 
     Args:
-        folder: where all partial results of a report lie.
-        weights: hash of the weights; pieces of other weights are deleted.
-        fingerprint: of weights and protocol.
+        folder: the folder of all partial results of a report.
+        weights: hash of the weights; results of other weights are deleted.
+        fingerprint: fingerprint of weights and protocol.
     """
 
     def __init__(self, folder: Path, weights: str, fingerprint: str):
@@ -43,10 +43,8 @@ class Partials:
             return None
 
     def put(self, name: str, **arrays: np.ndarray) -> dict[str, np.ndarray]:
-        """Keep a finished piece and return it."""
+        """Store a finished piece and return it."""
         path = self.folder / f"{name}.npz"
-        aside = path.with_name(f"{path.name}.{os.getpid()}.partial")
-        with aside.open("wb") as file:
+        with atomic.replacing(path) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
-        aside.replace(path)
         return arrays

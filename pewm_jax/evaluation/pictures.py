@@ -1,4 +1,4 @@
-"""Pictures of frames: enlarged, captioned, laid out in strips, and the map from above."""
+"""Drawing: captioned grids of frames, depth in colours, and the map from above."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from pewm_jax import atomic
 from pewm_jax.types import Frames
 
 INK, PAPER, QUIET = (28, 32, 40), (255, 255, 255), (112, 118, 130)
@@ -20,34 +21,34 @@ INK, PAPER, QUIET = (28, 32, 40), (255, 255, 255), (112, 118, 130)
 
 @functools.cache
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Return Pillow's own font, so that every machine draws the same."""
+    """Return Pillow's built-in font, which is the same on every machine."""
     return ImageFont.load_default(size)
 
 
 def as_bytes(rgb: np.ndarray) -> np.ndarray:
-    """Return colours as uint8 from uint8 or from float in [−1, 1], clipped."""
+    """Convert colours, uint8 or float in [−1, 1], to uint8, clipped."""
     if rgb.dtype == np.uint8:
         return rgb
     return np.rint((np.clip(rgb.astype(np.float32), -1, 1) + 1) * 127.5).astype(np.uint8)
 
 
 def enlarge(image_HWC: np.ndarray, width: int) -> np.ndarray:
-    """Return a uint8 picture enlarged (cubic) to a width, its shape kept."""
+    """Resize a uint8 image (cubic) to a width, keeping its aspect ratio."""
     height = round(image_HWC.shape[0] * width / image_HWC.shape[1])
     return cv2.resize(image_HWC, (width, height), interpolation=cv2.INTER_CUBIC)
 
 
 def depth_colours(depth_HW: np.ndarray, far_m: float) -> np.ndarray:
-    """Colour depth from near (bright) to far (dark); grey where there is none."""
+    """Return depth as colours from near (bright) to far (dark); missing depth is grey."""
     share = 1 - np.clip(depth_HW / far_m, 0, 1)
     bgr = cv2.applyColorMap(np.rint(share * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     return np.where((depth_HW > 0)[..., None], bgr[..., ::-1], np.uint8(128))
 
 
-def dim(image_HWC: np.ndarray, kept_HW: np.ndarray) -> np.ndarray:
-    """Grey out the pixels of a uint8 picture that are not kept."""
+def dim(image_HWC: np.ndarray, mask_HW: np.ndarray) -> np.ndarray:
+    """Grey out the pixels of a uint8 image outside a mask."""
     grey = image_HWC.mean(-1, keepdims=True) * 0.25 + 170
-    return np.where(kept_HW[..., None], image_HWC, grey).astype(np.uint8)
+    return np.where(mask_HW[..., None], image_HWC, grey).astype(np.uint8)
 
 
 def write(
@@ -71,7 +72,7 @@ def grid(
     cell: int = 128,
     gap: int = 6,
 ) -> np.ndarray:
-    """Lay pictures out in a captioned grid.
+    """Arrange images in a captioned grid.
 
     Args:
         rows: caption and pictures (uint8, any size of one shape) of each row.
@@ -118,11 +119,10 @@ def png(image_HWC: np.ndarray) -> bytes:
 
 
 def save_png(path: Path, image_HWC: np.ndarray) -> Path:
-    """Write a PNG aside, then rename it into place."""
+    """Write a PNG file atomically; its folder is created."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".partial")
-    aside.write_bytes(png(image_HWC))
-    aside.replace(path)
+    with atomic.replacing(path) as partial:
+        partial.write_bytes(png(image_HWC))
     return path
 
 
@@ -137,7 +137,7 @@ def from_above(
     bounds: tuple[np.ndarray, np.ndarray] | None = None,
     width: int = 520,
 ) -> np.ndarray:
-    """Draw a map's cells from above, lower ones first, with the agent's path.
+    """Draw a map's cells from above, lower cells first, with the agent's path.
 
     Args:
         points_world_P3: centres of the occupied cells, metres; the ceiling already removed.
@@ -147,7 +147,7 @@ def from_above(
         heading: yaw of the last camera, radians.
         title: caption.
         bounds: lowest and highest (x, y) to show; all points by default.
-        width: of the picture, pixels.
+        width: width of the image, pixels.
     """
     low, high = bounds if bounds is not None else map_bounds(points_world_P3, path_T3)
     scale = (width - 32) / max(high[0] - low[0], 1e-6)
@@ -180,12 +180,12 @@ def from_above(
 
 
 def map_bounds(*points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest (x, y) of sets of points, half a metre added around."""
-    flat = np.concatenate([np.asarray(some)[:, :2] for some in points])
+    """Return the lowest and highest (x, y) of sets of points, with a margin of half a metre."""
+    flat = np.concatenate([np.asarray(cloud)[:, :2] for cloud in points])
     return flat.min(0) - 0.5, flat.max(0) + 0.5
 
 
 def farthest(frames: Frames) -> float:
-    """Return a depth, metres, that nearly all of the frames' pixels are below."""
+    """Return the 98th percentile of the frames' depth, metres."""
     depth = np.asarray(frames.depth_THW)
     return float(np.quantile(depth[depth > 0], 0.98)) if (depth > 0).any() else 1.0

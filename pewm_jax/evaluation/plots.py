@@ -1,4 +1,4 @@
-"""Line charts as plain SVG: no library, no script, legible on light and dark pages."""
+"""Line charts as plain SVG, without scripts, legible on light and dark pages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from html import escape
 
 COLOURS = {"memory": "#1f6feb", "empty": "#e8731a", "copy": "#8a8f98"}
-"""One colour per method, everywhere; distinct for the colour-blind."""
+"""The colour of each method; distinguishable for the colour-blind."""
 WIDTH, HEIGHT = 440, 280
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 36, 44
 
@@ -20,7 +20,7 @@ class Line:
     Attributes:
         name: for the legend.
         colour: any CSS colour.
-        values: one per x, None where there is none.
+        values: one per x, None if missing.
         errors: half height of the band around the curve, or None.
     """
 
@@ -49,7 +49,7 @@ def chart(title: str, x_label: str, lines: Sequence[Line], *, unit: str = "") ->
         unit: of the values, shown in the title.
 
     Returns:
-        An ``<svg>`` element, or a sentence where there is nothing to draw.
+        An ``<svg>`` element, or a sentence if there is nothing to draw.
     """
     tops = [v + (e or 0) for line in lines for v, e in _pairs(line) if v is not None]
     lows = [v - (e or 0) for line in lines for v, e in _pairs(line) if v is not None]
@@ -94,7 +94,7 @@ def _pairs(line: Line) -> list[tuple[float | None, float | None]]:
 
 
 def _curve(line: Line, x, y) -> list[str]:
-    """Draw the band, then the curve, each broken where values are missing."""
+    """Return the band and the curve, interrupted at missing values."""
     parts, run = [], []
     known = [(i, v, e or 0) for i, (v, e) in enumerate(_pairs(line)) if v is not None]
     runs: list[list[tuple[int, float, float]]] = []

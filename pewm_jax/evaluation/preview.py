@@ -1,4 +1,4 @@
-"""Samples during training: the same few held-out clips, imagined anew each time, and measured."""
+"""Previews during training: a few fixed held-out clips, imagined and scored at intervals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.evaluation.images import psnr, unit_colours
-from pewm_jax.evaluation.imagine import Imagination, aloud
+from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.pictures import as_bytes, farthest, grid, save_png
 from pewm_jax.evaluation.protocol import choose, load_clip, needs_cameras, stack
 from pewm_jax.evaluation.video import encode_h264, side_by_side
@@ -22,26 +22,28 @@ from pewm_jax.training.stages import Stage
 from pewm_jax.types import Frames, Params
 
 SPLIT, CLIPS, SHOWN = "validation", 8, 3
-"""Where previews come from, how many clips are measured, and how many of them are shown."""
+"""The split of previews, the number of clips scored, and the number of clips shown."""
 
 
-def make_preview(config: Config, run: Path, say: Callable[[str], Any] = aloud) -> Preview | None:
-    """Prepare previews for a training run, where its data can be previewed.
+def make_preview(
+    config: Config, run: Path, say: Callable[[str], Any] = print_now
+) -> Preview | None:
+    """Prepare previews for a training run, if its data allows any.
 
-    A training needs no previews: without validation data, or where that is too
-    short, one line says so and there are none.
+    Previews are optional. Without validation data, or if it is too short, a line says so and there
+    are no previews.
 
     Args:
         config: the experiment; clips come from ``data.path``/validation.
-        run: its folder; pictures and videos go to ``previews/`` inside.
-        say: told why there are no previews.
+        run: the run's folder; images and videos go to its folder ``previews/``.
+        say: shows a line that says why there are no previews.
 
     Returns:
-        ``preview(params, stage, step)``: imagines the clips with the current weights, measures
-        their PSNR with its map and with an empty map (of a stage without memory, such as PEWM's
-        stage 1: of the model, which has none), and writes ``previews/stage2-000250.png`` with rows
-        truth, with its map, empty map and ``previews/stage2-000250.mp4``, the same side by side. It
-        is compiled once per stage. None where there is nothing to preview.
+        ``preview(params, stage, step)``. It imagines the clips with the current weights and
+        measures their PSNR: with its map and with an empty map, or, in a stage without memory (such
+        as PEWM's stage 1), of the model without one. It writes ``previews/stage2-000250.png`` with
+        rows truth, with its map, empty map, and ``previews/stage2-000250.mp4``, the same side by
+        side. It is compiled once per stage. None if there is nothing to preview.
     """
     quick = dataclasses.replace(config.evaluate, split=SPLIT, batch=CLIPS)
     config = dataclasses.replace(config, evaluate=quick)
@@ -84,7 +86,7 @@ def make_preview(config: Config, run: Path, say: Callable[[str], Any] = aloud) -
 
 
 _Loaded = tuple[Frames, Frames, Any]
-"""Context, true frames and control of a clip, as ``protocol.load_clip`` gives them."""
+"""Context, true frames and control of a clip, as returned by ``protocol.load_clip``."""
 
 
 def _score(clips: Sequence[_Loaded], frames: Frames) -> float:
@@ -95,7 +97,7 @@ def _score(clips: Sequence[_Loaded], frames: Frames) -> float:
 
 
 def _picture(clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str) -> np.ndarray:
-    """Lay out the frames of every clip: a row of the truth, a row of each variant."""
+    """Arrange the frames of every clip: a row for the truth, a row for each variant."""
     rows = []
     for index, (seen, true, _) in enumerate(clips):
         present = seen.rgb_THWC[-1]
@@ -112,7 +114,7 @@ def _picture(clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str) -
 def _save_video(
     path: Path, clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str
 ) -> Path:
-    """Write the clips one after the other, truth and variants side by side; aside, then renamed."""
+    """Write a video, atomically: clip after clip, truth and variants side by side."""
     pictures = []
     for index, (seen, true, _) in enumerate(clips):
         columns = [

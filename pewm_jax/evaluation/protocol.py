@@ -1,8 +1,8 @@
-"""What exactly is scored: which clips, from which start, with what context and which actions.
+"""The evaluation protocol: which clips are scored, with what context and which actions.
 
-Nothing here is random. Clips start on the way back of every held-out episode, where the agent
-sees places again; their context is thinned the same way for every method; the recorded motion
-drives the model. ``fingerprint`` names a protocol and its weights: equal names, equal numbers.
+Nothing here is random. Clips start on the way back of every held-out episode, where the agent sees
+places again. Their context is thinned in the same way for every method, and the recorded motion
+drives the model. Equal ``fingerprint`` of protocol and weights means equal scores.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from pewm_jax.geometry.actions import PLANAR, actions_between, continuous, integ
 from pewm_jax.types import Array, Camera, Frames
 
 VERSION = 1
-"""Raised whenever the same settings would give other numbers."""
+"""Increase it whenever the same settings would give other scores."""
 POSE_TOLERANCE = 2e-3
-"""How far poses integrated from actions may be from the recorded ones (metres, matrix entries)."""
+"""Largest difference between integrated and recorded poses (metres, matrix entries)."""
 T = TypeVar("T")
 
 
@@ -38,10 +38,10 @@ class ClipChoice:
         episode: index of the episode.
         name: its name.
         scene: where it was recorded.
-        start: the frame that is the present; all earlier ones may be context.
-        context_S: (S,) frames given to ``rollout.start``, oldest first, the present last. Where
-            an episode has fewer, the oldest is repeated, which leaves the map as it is.
-        targets_N: (N,) frames to be imagined.
+        start: the present frame; all earlier ones may be context.
+        context_S: (S,) frames given to ``worlds.start``, oldest first, the present last. If an
+            episode has fewer, the oldest is repeated, which does not change the map.
+        targets_N: (N,) frames to imagine.
     """
 
     episode: int
@@ -53,30 +53,30 @@ class ClipChoice:
 
 
 def context_frames(start: int, count: int) -> tuple[int, ...]:
-    """Return ``count`` frames spread over the past as in training, the present (start) last."""
+    """Return ``count`` frames spread over the past as in training, with ``start`` last."""
     spread = choose_context(start, count)
     padded = np.concatenate([np.repeat(spread[:1], count - len(spread)), spread])
     return tuple(int(index) for index in padded)
 
 
 def way_back(episode: Episode) -> int:
-    """Return the frame where the way back begins: as recorded, else the middle."""
+    """Return the frame where the way back begins: the recorded one, or else the middle."""
     frame = episode.info.get("return_frame")
     return episode.length // 2 if frame is None else int(frame)
 
 
 def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) -> list[ClipChoice]:
-    """Choose what to imagine: starts spread evenly over the way back of every episode.
+    """Choose the clips to imagine: starts spread evenly over every episode's way back.
 
     Args:
-        config: ``clip.frames``, ``data.context`` and ``evaluate.stride`` are read.
+        config: gives ``clip.frames``, ``data.context`` and ``evaluate.stride``.
         episodes: held-out episodes.
-        clips: how many to choose at most; fewer if the episodes have fewer distinct starts.
+        clips: the most clips to choose; fewer if the episodes have fewer distinct starts.
         chain: clips generated one after the other from each start.
 
     Returns:
-        The choices, first starts of all episodes first, so that any leading part of the list
-        covers as many episodes as it can.
+        The choices: the first start of every episode, then every second start, and so on. Any
+        leading part of the list thus covers as many episodes as possible.
 
     Raises:
         UserError: no episode is long enough.
@@ -197,10 +197,10 @@ def file_hash(path: Path) -> str:
 
 
 def fingerprint(config: Config, weights: str, dataset: str) -> str:
-    """Name everything that the numbers depend on, except which seeds were run.
+    """Return a hash of everything that the scores depend on, except the choice of seeds.
 
     Args:
-        config: the run's configuration with the evaluation's overrides.
+        config: the run's configuration, with overrides for the evaluation.
         weights: sha256 of the weights.
         dataset: sha256 of the data set's index.
     """

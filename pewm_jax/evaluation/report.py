@@ -1,4 +1,4 @@
-"""A run folder in, ``report/`` out: metrics.json, index.html and strip.png."""
+"""The report of a trained run: ``report/`` with metrics.json, index.html and strip.png."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from typing import Any
 
 import jax
 
+from pewm_jax import atomic
 from pewm_jax.config import Config, UserError, kinds, to_dict
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import statistics
 from pewm_jax.evaluation.gallery import make_gallery
-from pewm_jax.evaluation.imagine import Imagination, aloud
+from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.page import render, verdict
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
@@ -32,9 +33,9 @@ from pewm_jax.rollouts import load_finished
 
 WEIGHTS = "weights.safetensors"
 TRAINED_ON = "train"
-"""The split that ``training`` reads."""
+"""The split that training reads."""
 REPORT_VERSION = 2
-"""Raised whenever the same scores would give another report."""
+"""Increase it whenever the same scores would give another report."""
 PAGE, METRICS, STRIP = "index.html", "metrics.json", "strip.png"
 
 
@@ -42,12 +43,12 @@ def override(config: Config, **changes: Any) -> Config:
     """Return the configuration with some of the evaluation's settings changed.
 
     Args:
-        config: the run's.
-        changes: fields of ``EvalConfig``, and ``steps`` (DDIM steps) and ``data`` (folder of the
-            data set). None leaves a setting as it is.
+        config: the run's configuration.
+        changes: fields of ``EvalConfig``, ``steps`` (of the sampler) and ``data`` (folder of the
+            data set). None keeps a setting.
 
     Raises:
-        ConfigError: a value that cannot work.
+        ConfigError: a value cannot work.
     """
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
@@ -60,16 +61,16 @@ def override(config: Config, **changes: Any) -> Config:
     return dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, **changes))
 
 
-def evaluate(run: str | Path, *, say: Callable[[str], Any] = aloud, **changes: Any) -> Path:
+def evaluate(run: str | Path, *, say: Callable[[str], Any] = print_now, **changes: Any) -> Path:
     """Score a trained run and write its report.
 
-    What was scored before an interruption is kept and not done again; a report that is complete
-    for these weights and this protocol is left as it is.
+    After an interruption, finished scores are reused. A report that is complete for these weights
+    and this protocol is not written again.
 
     Args:
         run: a run folder made by ``train.py``.
-        say: told what happens.
-        changes: as ``override``.
+        say: shows a progress line.
+        changes: as for ``override``.
 
     Returns:
         The path of the page.
@@ -120,16 +121,16 @@ def evaluate(run: str | Path, *, say: Callable[[str], Any] = aloud, **changes: A
     (folder / METRICS).unlink(missing_ok=True)
     save_png(folder / STRIP, gallery.strip)
     page = render(metrics, gallery)
-    _write(folder / PAGE, page)
+    atomic.write_text(folder / PAGE, page)
     metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()
-    _write(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")
+    atomic.write_text(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")
     say(verdict(metrics["margin"]["seen"]["psnr"], "seen before"))
     say(verdict(metrics["margin"]["unseen"]["psnr"], "never seen"))
     return folder / PAGE
 
 
 def is_complete(folder: Path, config: Config, name: str) -> bool:
-    """Tell whether a report folder holds the whole report of a fingerprint, seeds and videos."""
+    """Tell whether a folder holds the complete report for a fingerprint, seeds and videos."""
     try:
         metrics = json.loads((folder / METRICS).read_text("utf-8"))
         protocol = metrics["protocol"]
@@ -146,15 +147,15 @@ def is_complete(folder: Path, config: Config, name: str) -> bool:
 
 
 def held_out(scenes: Sequence[str], trained_on: Path) -> dict[str, Any]:
-    """Tell whether the model was trained in the scenes it is scored in, by their names.
+    """Tell whether the model was trained in the scenes it is scored in; compares names.
 
     Args:
         scenes: names of the scenes scored.
         trained_on: folder of the split the run was trained on.
 
     Returns:
-        ``held_out``: True where no scene is shared, False where some are, None where the training
-        data is not there (any more) to tell; ``trained_scenes``: those scored that are shared.
+        ``held_out``: True if no scene is shared, False if some are, None if the training data is
+        not available; ``trained_scenes``: the scored scenes that are shared.
     """
     try:
         source = EpisodeSource(trained_on)
@@ -166,29 +167,31 @@ def held_out(scenes: Sequence[str], trained_on: Path) -> dict[str, Any]:
 
 
 def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
-    """Turn errors into everything that ``metrics.json`` holds, but for hashes.
+    """Turn errors into the content of ``metrics.json``, except for hashes.
 
     Returns:
         ``protocol``; ``results[method][mask][metric] = {mean, stderr, n}``;
         ``margin[mask][metric]``, memory minus empty; ``per_frame[method][mask][metric]``; ``long``
         with ``results``, ``margin`` and ``per_frame`` of long rollouts.
     """
-    far = long.scored
+    rollouts = long.scored
     return {
         "protocol": protocol_of(config, scored, long),
         "results": statistics.table(scored.sums, scored.clusters),
         "margin": statistics.margin(scored.sums["memory"], scored.sums["empty"], scored.clusters),
         "per_frame": statistics.per_frame(scored.sums, scored.clusters),
         "long": {
-            "results": statistics.table(far.sums, far.clusters),
-            "margin": statistics.margin(far.sums["memory"], far.sums["empty"], far.clusters),
-            "per_frame": statistics.per_frame(far.sums, far.clusters),
+            "results": statistics.table(rollouts.sums, rollouts.clusters),
+            "margin": statistics.margin(
+                rollouts.sums["memory"], rollouts.sums["empty"], rollouts.clusters
+            ),
+            "per_frame": statistics.per_frame(rollouts.sums, rollouts.clusters),
         },
     }
 
 
 def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
-    """State what was measured, completely enough to be repeated."""
+    """Describe the measurement completely enough to repeat it."""
     clip, choices = config.model.clip, scored.choices
     scenes = sorted({choice.scene for choice in choices + long.scored.choices})
     return {
@@ -246,10 +249,3 @@ def _version() -> str:
         return metadata.version("pewm-jax")
     except metadata.PackageNotFoundError:
         return "not installed"
-
-
-def _write(path: Path, text: str) -> None:
-    """Write text aside, then rename."""
-    aside = path.with_name(path.name + ".partial")
-    aside.write_text(text, "utf-8")
-    aside.replace(path)

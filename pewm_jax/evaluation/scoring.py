@@ -1,8 +1,9 @@
-"""Imagine every chosen clip with every method and add up the errors, resumably."""
+"""Scoring: imagine every chosen clip with every method and sum the errors; can be resumed."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation.images import error_sums_batch, unit_colours
-from pewm_jax.evaluation.imagine import METHODS, Imagination, aloud, copy_last
+from pewm_jax.evaluation.imagine import METHODS, Imagination, copy_last, print_now
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, stack
 from pewm_jax.evaluation.seen import seen_masks_batch
@@ -35,24 +36,24 @@ class Scored:
 
     @property
     def clustered_by(self) -> str:
-        """What standard errors are clustered by: ``scene``, or ``episode`` if all share one."""
+        """How standard errors are clustered: ``scene``, or ``episode`` if there is one scene."""
         return "scene" if len({choice.scene for choice in self.choices}) > 1 else "episode"
 
     @property
     def clusters(self) -> np.ndarray:
-        """(C,) the number of the cluster of every clip: clips of one cluster share rooms."""
+        """(C,) the cluster number of every clip; clips of one cluster show the same rooms."""
         names = [getattr(choice, self.clustered_by) for choice in self.choices]
         return np.unique(names, return_inverse=True)[1]
 
 
 @dataclasses.dataclass(frozen=True)
 class LongRollouts:
-    """Long rollouts, scored, and the first few of them kept to be shown.
+    """Scored long rollouts; the frames of the first few are stored, to be shown.
 
     Attributes:
         scored: errors over all of them.
         chain: clips generated one after the other.
-        shown: how many are kept.
+        shown: number of rollouts whose frames are stored.
         kept: per method ``rgb`` (shown, N, H, W, 3) uint8 and ``depth`` (shown, N, H, W) metres;
             for ``memory`` also the map at the start and the end: ``first_points``,
             ``first_features``, ``first_valid``, and the same with ``last``.
@@ -106,15 +107,15 @@ def score_table(
     episodes: Sequence[Episode],
     model: Imagination,
     partials: Partials,
-    say: Callable[[str], Any] = aloud,
+    say: Callable[[str], Any] = print_now,
 ) -> Scored:
-    """Score ``evaluate.clips`` clips of ``evaluate.chain`` with every method and seed.
+    """Score ``evaluate.clips`` choices, chains of ``evaluate.chain`` clips, by method and seed.
 
-    Pieces that ``partials`` already holds are not done again.
+    Pieces that ``partials`` already holds are reused.
 
     Raises:
-        UserError: no episode is long enough, or the data disagrees with itself or the model, or
-            the model makes values that are not finite.
+        UserError: no episode is long enough, the data is inconsistent or does not fit the model,
+            or the model's output is not finite.
     """
     choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
     starts = range(0, len(choices), config.evaluate.batch)
@@ -139,8 +140,8 @@ def score_table(
         loaded: tuple[int, _Batch] | None = None
         for method, seed, first in todo:
             if loaded is None or loaded[0] != first:
-                some = choices[first : first + config.evaluate.batch]
-                loaded = first, _load(config, episodes, some, first, cameras=model.cameras)
+                chosen = choices[first : first + config.evaluate.batch]
+                loaded = first, _load(config, episodes, chosen, first, cameras=model.cameras)
             batch = loaded[1]
             frames = _imagine(model, batch, method, seed)[2]
             piece = partials.put(
@@ -177,11 +178,11 @@ def _imagine(model: Imagination, batch: _Batch, method: str, seed: int) -> tuple
 
 
 def long_choices(config: Config, episodes: Sequence[Episode]) -> tuple[list[ClipChoice], int]:
-    """Choose one long rollout per episode from where its way back begins.
+    """Choose one long rollout per episode, from the start of its way back.
 
     Returns:
-        ``(choices, chain)``: at most one batch, and the clips per rollout:
-        ``evaluate.video_clips`` or the most that the episodes have room for.
+        ``(choices, chain)``: at most one batch of choices, and the number of clips per rollout:
+        ``evaluate.video_clips``, or fewer if the episodes are too short.
     """
     count = min(config.evaluate.batch, len(episodes))
     for chain in range(config.evaluate.video_clips, 1, -1):
@@ -197,12 +198,12 @@ def roll_long(
     episodes: Sequence[Episode],
     model: Imagination,
     partials: Partials,
-    say: Callable[[str], Any] = aloud,
+    say: Callable[[str], Any] = print_now,
 ) -> LongRollouts:
-    """Make long rollouts with every method (first seed), score all, keep the first few.
+    """Make long rollouts with every method (first seed), score all, store the first few.
 
     Raises:
-        UserError: as ``score_table``.
+        UserError: as for ``score_table``.
     """
     choices, chain = long_choices(config, episodes)
     shown = min(config.evaluate.videos, len(choices))
@@ -234,8 +235,9 @@ def roll_long(
 
 
 def _map_points(config: Config, maps: Any, shown: int, when: str) -> dict[str, np.ndarray]:
-    some = jax.tree.map(lambda leaf: leaf[:shown], maps)
-    points, features, valid = jax.vmap(lambda one: memories.to_points(config.model, one))(some)
+    maps = jax.tree.map(lambda leaf: leaf[:shown], maps)
+    to_points = functools.partial(memories.to_points, config.model)
+    points, features, valid = jax.vmap(to_points)(maps)
     return {
         f"{when}_points": np.asarray(points),
         f"{when}_features": np.asarray(features),

@@ -1,7 +1,7 @@
-"""Which pixels of a frame show surfaces that earlier frames have already seen.
+"""Seen-before masks: which pixels of a frame show surfaces that earlier frames have seen.
 
-Exact up to the sampling of the images: a pixel's true point in space is projected into each
-earlier frame and compared with that frame's true depth. No network is involved.
+The masks are exact up to the sampling of the images: a pixel's true point in space is projected
+into each earlier frame and compared with that frame's true depth. No network is involved.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ def _agrees(depth_P: Array, z_P: Array) -> Array:
 def visible_in(points_world_P3: Array, depth_HW: Array, camera: Camera) -> Array:
     """Tell which points a depth image shows.
 
-    A point is shown if it projects inside the image, in front of the camera, and the depth there
-    agrees with its own: the depth of the nearest pixel, or 1/depth interpolated between the four
-    pixels around it. (1/depth is linear in the image on a plane, so that a floor seen at a
-    grazing angle, where depth changes by more than the tolerance from row to row, is recognised.)
+    A point is shown if it projects inside the image, in front of the camera, and its depth agrees
+    with the image there: either with the nearest pixel, or with 1/depth interpolated between the
+    four pixels around it. (On a plane 1/depth is linear in the image. So a floor seen at a grazing
+    angle is recognised, although its depth changes by more than the tolerance from row to row.)
 
     Args:
         points_world_P3: (P, 3) points in the world, metres.

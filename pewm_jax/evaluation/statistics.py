@@ -1,9 +1,9 @@
-"""From sums under masks to the numbers of the table, with honest standard errors.
+"""Scores and their standard errors, from sums under masks.
 
-Clips of one scene show the same rooms, so they are not independent: standard errors are clustered
-by scene (Liang & Zeger 1986; with one clip per scene this is σ / √n), or by episode where there is
-one scene only. Sampling seeds are averaged within a clip first: more seeds sharpen a clip's score
-but are no new evidence about new places.
+Clips of one scene show the same rooms, so they are not independent. Standard errors are therefore
+clustered by scene (Liang & Zeger 1986; with one clip per scene this is σ / √n), or by episode if
+there is only one scene. Sampling seeds are averaged within a clip first: more seeds make a clip's
+score more precise but say nothing about new places.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from pewm_jax.evaluation.images import MASKS, PSNR_CEILING, SUMS
 METRICS = ("psnr", "ssim", "depth_mae", "depth_rel")
 """dB; structural similarity; metres; share of the true depth."""
 LEAST_SHARE = 0.01
-"""A clip or frame with fewer of its pixels than this under a mask has no score there."""
+"""The smallest share of pixels that a mask must cover for a clip or frame to get a score."""
 
 
 def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
     """Turn sums into scores.
 
     Args:
-        sums: (..., 3, 7) as ``error_sums``, over whatever frames were added up.
+        sums: (..., 3, 7) from ``error_sums``, possibly summed over frames.
 
     Returns:
-        ``scores[mask][metric]`` of shape (...), NaN where the mask covers too little.
+        ``scores[mask][metric]`` of shape (...), NaN if the mask covers too little.
     """
     result: dict[str, dict[str, np.ndarray]] = {}
     everything = sums[..., MASKS.index("all"), SUMS.index("colours")]
@@ -52,15 +52,15 @@ def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
 
 
 def summary(values: np.ndarray, clusters: np.ndarray) -> dict[str, Any]:
-    """Average clips and state how sure the average is.
+    """Return the average over clips and its standard error.
 
     Args:
-        values: (clips,) one number per clip, NaN where a clip has none.
+        values: (clips,) one number per clip, NaN if a clip has no score.
         clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
-        ``mean``, ``stderr`` clustered (None where fewer than two clusters have a
-        value), and ``n``, the number of clips.
+        ``mean``; ``stderr``, clustered (None if fewer than two clusters have a value); and ``n``,
+        the number of clips with a value.
     """
     known = np.isfinite(values)
     values, clusters = values[known], clusters[known]
@@ -139,7 +139,7 @@ def per_frame(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str,
 
     Returns:
         ``[method][mask][metric] = {mean: [T], stderr: [T], n: [T]}``; entry 0 is the first
-        imagined frame. None where no clip has a score.
+        imagined frame. Entries are None if no clip has a score.
     """
     result: dict[str, Any] = {}
     for method, sums_SCT37 in sums.items():

@@ -1,4 +1,4 @@
-"""Side-by-side videos in H.264 that every browser plays."""
+"""Side-by-side videos in H.264, which every browser plays."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def side_by_side(
     far_m: float,
     cell: int = 256,
 ) -> list[np.ndarray]:
-    """Lay out colour above depth for several versions of the same frames.
+    """Draw several versions of the same frames side by side, colour above depth.
 
     Args:
         columns: caption, colours (T, H, W, 3) and depth (T, H, W) of each version.

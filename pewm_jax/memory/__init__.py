@@ -1,1 +1,1 @@
-"""Chapter 4, what is remembered: image features, the voxel map, and its tokens."""
+"""Chapter 4, what is remembered: image features, the voxel map and its rivals, map tokens."""

@@ -21,7 +21,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "python -m pewm_jax.memo
 
     Args:
         argv: the arguments, by default those of the process.
-        prog: the words that it was called by, for help and refusals.
+        prog: the command as the user typed it, for help and error messages.
 
     Returns:
         The exit code: 0, 2 bad input, 130 interrupted.
@@ -34,7 +34,7 @@ def _main(argv: Sequence[str], prog: str) -> int:
         print(USAGE.format(prog=prog))
         return 0 if argv else 2
     command, flags = cli.choose(argv[0], COMMANDS, "command"), argv[1:]
-    # Imported here and not above: help and refusals come at once.
+    # Imported late, so that help and refusals are fast.
     from pewm_jax.memory.feature_command import CacheConfig, cache
 
     config = cli.parse_command(CacheConfig, flags, f"{prog} {command}")

@@ -1,6 +1,6 @@
-"""Cells of the grid as plain integers, samples of a frame, and the rule of who is read first.
+"""Grid cells as integers, sampled pixels, and the order in which tokens are chosen.
 
-What the rival memories share with the voxel map: the same grid, the same order of tokens.
+All memories share this grid and this order of tokens.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pewm_jax.geometry.cameras import project, unproject
 from pewm_jax.types import Array, Camera, Frames
 
 FAR_M = 1e4
-"""Added to the distance of what no camera has in view, so that it comes after all that is."""
+"""Added to the distance of points that no camera sees, so that they come after all others."""
 
 
 def origin(config: MemorySettings, centre_3: Array) -> Array:
@@ -27,9 +27,9 @@ def origin(config: MemorySettings, centre_3: Array) -> Array:
 
 
 def keys(config: MemorySettings, origin_3: Array, points_3: Array) -> Array:
-    """Return (...,) int32: the number of the cell of each point (..., 3).
+    """Return (...,) int32: the cell number of each point (..., 3).
 
-    Points beyond the grid and points that are not numbers get the number of cells.
+    Points outside the grid, and points with NaN, get the number of cells, which is no cell.
     """
     place = jnp.floor((points_3 - origin_3) / np.asarray(config.cell_m, np.float32))
     inside = jnp.all((place >= 0) & (place < np.asarray(config.cells, np.float32)), -1)
@@ -39,7 +39,7 @@ def keys(config: MemorySettings, origin_3: Array, points_3: Array) -> Array:
 
 
 def grid_of(height: int, width: int, most: int) -> tuple[int, int]:
-    """Return rows and columns of the largest even grid over an image with ``most`` places."""
+    """Return rows and columns of an even grid over an image with at most ``most`` fields."""
     rows = min(max(int(math.sqrt(most * height / width)), 1), height, most)
     return rows, max(min(most // rows, round(rows * width / height), width), 1)
 
@@ -47,12 +47,12 @@ def grid_of(height: int, width: int, most: int) -> tuple[int, int]:
 def sample(
     frames: Frames, rows: int, columns: int, valid_T: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Look at the pixels in the middle of the fields of an even grid over each frame.
+    """Sample the pixels at the centres of an even grid over each frame.
 
     Args:
         frames: T frames.
-        rows: of the grid.
-        columns: of the grid.
+        rows: rows of the grid.
+        columns: columns of the grid.
         valid_T: (T,) bool, False frames have no valid pixel.
 
     Returns:
@@ -78,16 +78,16 @@ def in_view_first(
 ) -> Array:
     """Return (≤ count,) indices of the points that condition one clip.
 
-    Points inside the view of any of the clip's cameras come first, nearest first (by the smallest
-    depth at which a camera sees them); then the others by distance to the nearest camera; invalid
-    ones last. Ties go to the lower index.
+    Points in view of any of the clip's cameras come first, nearest first (by the smallest depth at
+    which a camera sees them). The others follow, by distance to the nearest camera; invalid points
+    are last. Ties go to the lower index.
 
     Args:
         points_P3: world points, metres.
         valid_P: (P,) bool.
         camera: (T,) cameras of the clip.
         size: image height and width in pixels.
-        count: how many at most; fewer where there are fewer points.
+        count: the most indices to return; fewer if there are fewer points.
     """
     uv, z = project(points_P3[None], camera)
     seen = jnp.all((uv >= 0) & (uv <= np.array([size[1], size[0]], np.float32)), -1) & (z > 0)

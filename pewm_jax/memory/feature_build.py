@@ -1,4 +1,4 @@
-"""Filling a feature cache: every frame of a split through the image encoder, resumable."""
+"""Building a feature cache: encode every frame of a split; can be resumed."""
 
 from __future__ import annotations
 
@@ -45,25 +45,25 @@ def build(
     batch: int = 16,
     say: Callable[[str], None] = print,
 ) -> FeatureCache:
-    """Compute the features of every frame of a split, or go on where that was interrupted.
+    """Compute the features of every frame of a split, or continue an interrupted build.
 
-    Frames are spread over all devices. Each episode's file is written aside and renamed.
+    Frames are spread over all devices. Each episode's file is written atomically.
 
     Args:
         config: the encoder.
         params: the encoder's parameters, empty where it has none.
         data: a finished split.
         out: the folder to fill.
-        dtype: of the stored features.
+        dtype: dtype of the stored features.
         batch: frames encoded at once, rounded up to a multiple of the devices.
-        say: receives the lines to show.
+        say: shows a progress line.
 
     Returns:
         The finished cache.
 
     Raises:
-        UserError: the data cannot be read, ``out`` holds a cache of something else or is being
-            filled by another process, or a feature is too large for float16.
+        UserError: the data cannot be read, ``out`` holds another cache or is being filled by
+            another process, or a feature is too large for the dtype.
     """
     source = EpisodeSource(data)
     made_of = fingerprint(config, params, source.manifest)
@@ -135,7 +135,7 @@ class _Encoder:
 
 @contextlib.contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """Let one process fill a folder at a time."""
+    """Lock a folder, so that only one process fills it."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / "caching.lock").open("w") as file:
         try:
@@ -146,7 +146,7 @@ def _locked(out: Path) -> Iterator[None]:
 
 
 def _begin(out: Path, settings: Mapping[str, Any]) -> None:
-    """Note what a folder is being filled with, or insist that it is what was noted before."""
+    """Record what a folder is being filled with, or compare with the earlier record."""
     note = out / UNFINISHED
     if note.is_file():
         before = read_json(note)
@@ -157,16 +157,16 @@ def _begin(out: Path, settings: Mapping[str, Any]) -> None:
                 "with that or remove the folder."
             )
         return
-    strange = [p.name for p in out.iterdir() if p.name != "caching.lock"]
-    if strange:
+    unknown = [p.name for p in out.iterdir() if p.name != "caching.lock"]
+    if unknown:
         raise UserError(
-            f"{out} holds other files ({tree.listing(strange)}); name an empty or a new folder."
+            f"{out} holds other files ({tree.listing(unknown)}); name an empty or a new folder."
         )
     write_json(note, settings)
 
 
 def _narrow(found: np.ndarray, dtype: Dtype, name: str) -> np.ndarray:
-    """Return features in the stored dtype, refusing what it cannot hold."""
+    """Convert features to the stored dtype, or refuse values that it cannot hold."""
     with np.errstate(over="ignore"):
         narrow = found.astype(jax.numpy.dtype(dtype))
     if not np.isfinite(narrow.astype(np.float32)).all():

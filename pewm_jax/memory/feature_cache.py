@@ -1,9 +1,9 @@
-"""Image features of a whole data set, computed once and kept: for encoders dearer than a read.
+"""A cache of the image features of a data set, for encoders that are slower than reading a file.
 
-A cache is a folder per split with one safetensors file per episode, ``features_ThwF``, and
-``cache.json``, written last: which encoder weights, which preprocessing and which data it holds,
-each by a hash or its settings. Whoever opens it says what he would compute himself; where that
-differs the cache is stale, and refused. ``feature_build`` fills it.
+A cache is a folder per split. It has one safetensors file per episode, with ``features_ThwF``, and
+``cache.json``, which is written last. That file identifies the encoder's weights, the preprocessing
+and the data, by hashes and settings. A cache is refused as stale if these differ from what the
+reader uses. ``feature_build`` fills it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pewm_jax.types import Params
 
 MANIFEST = "cache.json"
 UNFINISHED = "caching.json"
-"""Lies in a cache while it is being filled, and says with what."""
+"""A file that says what an unfinished cache is being filled with."""
 TENSOR = "features_ThwF"
 VERSION = 1
 Dtype = Literal["float16", "bfloat16", "float32"]
@@ -40,7 +40,7 @@ class FeatureCache:
     Attributes:
         path: its folder.
         made_of: the fingerprint of encoder, preprocessing and data.
-        files: episode name → (file name, frames).
+        files: episode name → (file name, number of frames).
     """
 
     path: Path
@@ -51,8 +51,8 @@ class FeatureCache:
 def fingerprint(config: EncoderSettings, params: Params, data: Manifest) -> dict[str, Any]:
     """Return what features depend on: encoder, weights, preprocessing, data.
 
-    Weights count by their float32 values, whatever dtype they are stored in; data by the hashes of
-    the split's shards.
+    Weights are identified by a hash of their float32 values, whatever dtype they are stored in;
+    data by the hashes of the split's shards.
 
     Args:
         config: the encoder.
@@ -74,7 +74,7 @@ def fingerprint(config: EncoderSettings, params: Params, data: Manifest) -> dict
 
 
 def open_cache(path: Path, config: EncoderSettings, params: Params, data: Path) -> FeatureCache:
-    """Open a finished cache, if it holds what this encoder makes of this data.
+    """Open a finished cache, if it belongs to this encoder and this data.
 
     Args:
         path: the cache of one split.
@@ -83,8 +83,8 @@ def open_cache(path: Path, config: EncoderSettings, params: Params, data: Path) 
         data: the split that it should belong to.
 
     Raises:
-        UserError: it is absent, unfinished, damaged, or stale: of other weights, other
-            preprocessing or other data.
+        UserError: it is absent, unfinished, damaged or stale (made with other weights, other
+            preprocessing or other data).
     """
     cache = read(path)
     require_fresh(cache, config, params, data)
@@ -92,10 +92,10 @@ def open_cache(path: Path, config: EncoderSettings, params: Params, data: Path) 
 
 
 def require_fresh(cache: FeatureCache, config: EncoderSettings, params: Params, data: Path) -> None:
-    """Refuse a cache of other weights, other preprocessing or other data; see ``open_cache``.
+    """Refuse a stale cache; see ``open_cache``.
 
     Raises:
-        UserError: it is stale; the message says in what.
+        UserError: it is stale; the message says what differs.
     """
     refuse_stale(cache.path, cache.made_of, fingerprint(config, params, read_manifest(data)))
 
@@ -103,7 +103,7 @@ def require_fresh(cache: FeatureCache, config: EncoderSettings, params: Params, 
 def features(
     cache: FeatureCache, episode: Episode | str, frame_indices: Sequence[int] | np.ndarray
 ) -> np.ndarray:
-    """Return the features of some frames, read from disk and nothing else of the episode.
+    """Return the features of some frames; only these are read from disk.
 
     Args:
         cache: from ``open_cache``.
@@ -132,10 +132,10 @@ def features(
 
 
 def refuse_stale(path: Path, have: Mapping[str, Any], want: Mapping[str, Any]) -> None:
-    """Refuse what was made of something else, and say of what.
+    """Refuse a cache whose fingerprint differs from the one wanted.
 
     Raises:
-        UserError: two fingerprints differ.
+        UserError: the fingerprints differ; the message says in what.
     """
     again = "make it again with `python -m pewm_jax.memory cache` in a new folder"
     for key in ("encoder", "network", "preprocessing"):
@@ -144,9 +144,9 @@ def refuse_stale(path: Path, have: Mapping[str, Any], want: Mapping[str, Any]) -
             if isinstance(old, dict) and isinstance(new, dict):
                 names = sorted(n for n in old.keys() | new.keys() if old.get(n) != new.get(n))
                 old, new = ({n: d.get(n) for n in names} for d in (old, new))
-            words = {"network": "another network", "encoder": "another encoder"}
+            titles = {"network": "another network", "encoder": "another encoder"}
             raise UserError(
-                f"{path} is stale: it was made with {words.get(key, f'other {key}')} ({old}, now "
+                f"{path} is stale: it was made with {titles.get(key, f'other {key}')} ({old}, now "
                 f"{new}); {again}."
             )
     for key, what in (("weights", "other encoder weights"), ("data", "other data")):
@@ -184,7 +184,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON table.
 
     Raises:
-        UserError: it is none.
+        UserError: the file is not JSON, or not a table.
     """
     try:
         value = json.loads(path.read_text("utf-8"))

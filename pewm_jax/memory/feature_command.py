@@ -23,26 +23,26 @@ from pewm_jax.types import Params
 
 @dataclasses.dataclass(frozen=True)
 class CacheConfig:
-    """Compute the image encoder's features of every frame of a data set once, and keep them.
+    """Compute the image encoder's features of every frame of a data set once, and store them.
 
-    The same command goes on after an interruption. Features of other encoder weights, other
-    preprocessing or other data are refused when the cache is read.
+    After an interruption, run the same command again. A cache made with other encoder weights,
+    other preprocessing or other data is refused when it is read.
     """
 
     data: Annotated[Path, tyro.conf.Positional]
-    """A dataset folder, of which every finished split is done, or one split."""
+    """A dataset folder, all finished splits of which are encoded, or the folder of one split."""
     out: Annotated[Path, tyro.conf.Positional]
-    """The folder to fill; for a dataset, with a folder per split."""
+    """The folder to fill; for a dataset, it gets a folder per split."""
     encoder: str = ""
-    """Folder of DINOv2 made by `python -m pewm_jax.convert import dinov2`; empty for the patch
-    colours, which have no weights."""
+    """Folder of DINOv2 made by `python -m pewm_jax.convert import dinov2`; if empty, patch colours,
+    which have no weights, are the encoder."""
     size: int = 518
-    """Side of the square picture that DINOv2 is shown, pixels; `memory.encoder.size` of the
-    experiment."""
+    """Side in pixels of the square that images are resized to for DINOv2; `memory.encoder.size` of
+    the experiment."""
     patch: int = 2
     """Pixels per patch of the patch colours; `memory.encoder.patch` of the experiment."""
     dtype: Dtype = "float16"
-    """How features are stored."""
+    """Dtype of the stored features."""
     batch: int = 16
     """Frames encoded at once."""
 
@@ -64,7 +64,7 @@ def cache(config: CacheConfig) -> None:
 
 
 def _encoder(config: CacheConfig) -> tuple[EncoderSettings, Params]:
-    """Return the settings that an experiment with this encoder has, and its parameters."""
+    """Return the encoder's settings, as an experiment has them, and its parameters."""
     if not config.encoder:
         return PatchColoursConfig(patch=config.patch), {}
     network, params = dinov2.load(Path(config.encoder))

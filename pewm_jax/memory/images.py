@@ -1,9 +1,9 @@
 """A compact set of snapshots that together show what was seen (after 3D-Mem, arXiv 2411.17735).
 
-3D-Mem clusters detected objects; without a detector, what a frame shows is the set of map cells
-its pixels fall into, and the snapshots are chosen by greedy maximum coverage of all cells seen so
-far: at least 1 − 1/e of what the best K frames would cover. Tokens are the patches of the
-snapshots, each at the place in the world that its middle pixel shows.
+3D-Mem clusters detected objects. Here, without a detector, a frame covers the set of map cells that
+its pixels fall into. Snapshots are chosen by greedy maximum coverage of all cells seen so far,
+which reaches at least 1 − 1/e of the best possible coverage by K frames. Tokens are the patches of
+the snapshots; a patch's position is the world point that its middle pixel shows.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pewm_jax.memory import cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
 MOST = 24 * 24
-"""Pixels of a frame, in an even grid, whose cells count as covered by it."""
+"""The most pixels of a frame, in an even grid, that determine the cells it covers."""
 
 
 @jax.tree_util.register_dataclass
@@ -29,12 +29,12 @@ class Snapshots:
 
     Attributes:
         features_KPF: (K, P, F) patch features.
-        points_KP3: (K, P, 3) where patches stand in the world, metres.
-        valid_KP: (K, P) bool, False without depth; all False where a place is free.
-        cell_KC: (K, C) int32 cells covered, in any order and repeated; the number of cells where
-            there is none.
+        points_KP3: (K, P, 3) positions of the patches in the world, metres.
+        valid_KP: (K, P) bool, False without depth, and for unused snapshots.
+        cell_KC: (K, C) int32 cells covered, in any order, with repetitions; entries equal to the
+            number of cells are no cell.
         origin_3: (3,) lower corner of the grid, metres.
-        dropped: () int32, cells seen but shown by none of the snapshots kept (per insertion).
+        dropped: () int32, cells seen that no snapshot covers, summed over insertions.
     """
 
     features_KPF: Array
@@ -51,13 +51,13 @@ def _settings(model: ModelConfig) -> ImagesConfig:
 
 
 def patch_grid(model: ModelConfig) -> tuple[int, int]:
-    """Return rows and columns of patches of a snapshot: K snapshots fit into ``memory.tokens``."""
+    """Return a snapshot's rows and columns of patches; K snapshots fit into ``memory.tokens``."""
     memory, clip = _settings(model), model.clip
     return cells.grid_of(clip.height, clip.width, memory.tokens // memory.snapshots)
 
 
 def empty(model: ModelConfig, centre_3: Array) -> Snapshots:
-    """Return no snapshots; the cells they will cover are of a grid around a world position."""
+    """Return an empty set of snapshots, with a grid centred on a world position."""
     memory, channels = _settings(model), model.memory.encoder.channels
     count, patches = memory.snapshots, math.prod(patch_grid(model))
     covers = math.prod(cells.grid_of(model.clip.height, model.clip.width, MOST))
@@ -73,16 +73,16 @@ def empty(model: ModelConfig, centre_3: Array) -> Snapshots:
 
 def remember(
     model: ModelConfig,
-    kept: Snapshots,
+    snapshots: Snapshots,
     frames: Frames,
     features_ThwF: Array,
     valid_T: Array | None = None,
 ) -> Snapshots:
-    """Choose anew among the snapshots kept so far and T frames.
+    """Choose the best snapshots among the present ones and T new frames.
 
     Args:
         model: the model.
-        kept: the snapshots so far; they win ties against new frames.
+        snapshots: the present ones; they win ties against new frames.
         frames: T frames.
         features_ThwF: (T, h, w, F) their patch features, pooled to the patches of a snapshot.
         valid_T: (T,) bool; False frames are ignored.
@@ -92,21 +92,21 @@ def remember(
     points, _, valid = cells.sample(frames, rows, columns, valid_T)
     pooled = jax.image.resize(features_ThwF, (shape[0], rows, columns, shape[-1]), "linear")
     pooled = pooled.reshape(shape[0], rows * columns, shape[-1])
-    looked, _, measured = cells.sample(
+    covered, _, measured = cells.sample(
         frames, *cells.grid_of(frames.depth_THW.shape[1], frames.depth_THW.shape[2], MOST)
     )
     if valid_T is not None:
         measured = measured & valid_T[:, None]
     nowhere = math.prod(memory.cells)
-    cell = jnp.where(measured, cells.keys(memory, kept.origin_3, looked), nowhere)
+    cell = jnp.where(measured, cells.keys(memory, snapshots.origin_3, covered), nowhere)
 
     everything = Snapshots(
-        jnp.concatenate([kept.features_KPF, jnp.where(valid[..., None], pooled, 0)]),
-        jnp.concatenate([kept.points_KP3, jnp.where(valid[..., None], points, 0)]),
-        jnp.concatenate([kept.valid_KP, valid]),
-        jnp.concatenate([kept.cell_KC, cell]),
-        kept.origin_3,
-        kept.dropped,
+        jnp.concatenate([snapshots.features_KPF, jnp.where(valid[..., None], pooled, 0)]),
+        jnp.concatenate([snapshots.points_KP3, jnp.where(valid[..., None], points, 0)]),
+        jnp.concatenate([snapshots.valid_KP, valid]),
+        jnp.concatenate([snapshots.cell_KC, cell]),
+        snapshots.origin_3,
+        snapshots.dropped,
     )
     chosen_K, gain_K, missed = greedy_cover(everything.cell_KC, memory.snapshots, nowhere)
     useful = gain_K > 0
@@ -115,23 +115,23 @@ def remember(
         jnp.where(useful[:, None, None], everything.points_KP3[chosen_K], 0),
         useful[:, None] & everything.valid_KP[chosen_K],
         jnp.where(useful[:, None], everything.cell_KC[chosen_K], nowhere),
-        kept.origin_3,
-        dropped=kept.dropped + missed,
+        snapshots.origin_3,
+        dropped=snapshots.dropped + missed,
     )
 
 
 def greedy_cover(cell_XC: Array, count: int, nowhere: int) -> tuple[Array, Array, Array]:
-    """Choose sets one by one, each time the one that covers most cells not yet covered.
+    """Choose sets greedily: each time the one that covers the most uncovered cells.
 
     Args:
-        cell_XC: (X, C) the cells of each of X sets, in any order and repeated.
-        count: how many to choose.
-        nowhere: a number that stands for no cell.
+        cell_XC: (X, C) the cells of each of X sets, in any order, with repetitions.
+        count: number of sets to choose.
+        nowhere: the number that stands for no cell.
 
     Returns:
         ``(chosen, gain, missed)``: (count,) indices of the sets in the order of choice (ties go to
-        the lower index); (count,) cells that each one added, 0 where nothing was left to cover and
-        the index means nothing; () cells that stay uncovered.
+        the lower index); (count,) cells that each set added, 0 if none were left, in which case
+        its index is meaningless; () cells that remain uncovered.
     """
     sets = cell_XC.shape[0]
     flat = cell_XC.reshape(-1)
@@ -152,21 +152,21 @@ def greedy_cover(cell_XC: Array, count: int, nowhere: int) -> tuple[Array, Array
     return chosen, gain, left_U.sum(dtype=jnp.int32)
 
 
-def to_points(model: ModelConfig, kept: Snapshots) -> tuple[Array, Array, Array]:
+def to_points(model: ModelConfig, snapshots: Snapshots) -> tuple[Array, Array, Array]:
     """Return all patches as ``(points_world_V3, features_VF, valid_V)``."""
     del model
-    channels = kept.features_KPF.shape[-1]
+    channels = snapshots.features_KPF.shape[-1]
     return (
-        kept.points_KP3.reshape(-1, 3),
-        kept.features_KPF.reshape(-1, channels),
-        kept.valid_KP.reshape(-1),
+        snapshots.points_KP3.reshape(-1, 3),
+        snapshots.features_KPF.reshape(-1, channels),
+        snapshots.valid_KP.reshape(-1),
     )
 
 
-def tokens(model: ModelConfig, kept: Snapshots, camera: Camera) -> MapTokens:
-    """Return all patches of all snapshots, then masked tokens up to ``memory.tokens``."""
+def tokens(model: ModelConfig, snapshots: Snapshots, camera: Camera) -> MapTokens:
+    """Return all patches of all snapshots, padded with masked tokens to ``memory.tokens``."""
     del camera
-    parts = to_points(model, kept)
+    parts = to_points(model, snapshots)
     missing = model.memory.tokens - parts[2].shape[0]
     points, features, valid = (
         jnp.pad(part, [(0, missing)] + [(0, 0)] * (part.ndim - 1)) for part in parts

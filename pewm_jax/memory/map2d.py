@@ -1,7 +1,7 @@
-"""A feature map seen from above: the voxel map with one layer of cells as high as its extent.
+"""A feature map seen from above: the voxel map with a single layer of cells.
 
-The rival "2D map" of the paper's Table 1. All that stands above one place of the floor is one
-cell, the maximum of its features; a token stands at the height the grid is centred on.
+The rival "2D map" of the paper's Table 1. Everything above one square of the floor falls into one
+cell, which keeps the maximum of the features. Tokens are at the height of the grid's centre.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 
 
 def flattened(config: MemorySettings) -> MemorySettings:
-    """Return the settings of the voxel map that a 2D map is."""
+    """Return the settings of the voxel map with one layer that implements the 2D map."""
     (x, y, z), (nx, ny, nz) = config.cell_m, config.cells
     return dataclasses.replace(config, cell_m=(x, y, z * nz), cells=(nx, ny, 1))
 
 
 def empty(model: ModelConfig, centre_3: Array) -> VoxelMap:
-    """Return a 2D map that has seen nothing.
+    """Return an empty 2D map.
 
-    The single layer is centred on the given height exactly: snapped to its whole height, as the
-    sides are to theirs, it could miss the room.
+    The single layer is centred exactly on the given height. If it were snapped to multiples of the
+    cell's height, like the horizontal position, it could miss the room.
     """
     flat = flattened(model.memory)
     voxels = voxel_map.empty(flat, centre_3, model.memory.encoder.channels)
@@ -52,5 +52,5 @@ def tokens(model: ModelConfig, voxels: VoxelMap, camera: Camera) -> MapTokens:
 
 
 def to_points(model: ModelConfig, voxels: VoxelMap) -> tuple[Array, Array, Array]:
-    """Return the cells' centres, features and whether they are taken."""
+    """Return centre, features and validity of all slots."""
     return voxel_map.to_points(flattened(model.memory), voxels)

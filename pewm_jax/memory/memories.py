@@ -1,9 +1,9 @@
-"""Every memory behind one interface, chosen by the type of its settings: what a world remembers.
+"""Memories of a world: one interface, chosen by the type of the settings.
 
-    memory = empty(model, centre)                          # around where the agent is
+    memory = empty(model, centre)                          # a grid around the agent
     memory = remember(model, memory, frames, features)     # posed RGB-D frames
-    seen = tokens(model, memory, camera)                   # what conditions one clip
-    view = render(model, memory, camera, height, width)    # what cameras see of it
+    seen = tokens(model, memory, camera)                   # tokens that condition one clip
+    view = render(model, memory, camera, height, width)    # the memory seen by cameras
 
 ============ ============================================ =====================================
 kind         what it keeps                                paper
@@ -16,9 +16,10 @@ points       a coloured point per 3D cell, no features    point cloud (ablation 
 ============ ============================================ =====================================
 
 A memory is a ``MemorySettings`` and a module (or object) with the functions ``empty``,
-``remember``, ``tokens`` and ``to_points`` that are called below. All memories are pytrees of static
-size, and their tokens have the same shapes, so that the networks that read them have the same
-parameters. The functions are pure, for one world: jit and vmap them.
+``remember``, ``tokens`` and ``to_points``, as they are called below, and optionally ``render``, if
+it can show more than its points. All memories are pytrees of static size. Their tokens have the
+same shapes, so a reader has the same parameters with any of them. The functions are pure and handle
+one world: jit and vmap them.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import ModelConfig, PointsConfig, functions
+from pewm_jax.config import ModelConfig, functions
 from pewm_jax.memory import rendering
 from pewm_jax.models import encoders
 from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
 
 Memory: TypeAlias = Any
-"""Whatever a world remembers: a pytree, of the type that the memory's ``empty`` makes."""
+"""A pytree, of the type that the memory's ``empty`` returns."""
 
 
 def empty(model: ModelConfig, centre_3: Array) -> Memory:
-    """Return a memory of nothing.
+    """Return an empty memory.
 
     Args:
         model: the model.
@@ -59,7 +60,7 @@ def remember(
     Args:
         model: the model.
         memory: from ``empty`` or from an earlier call.
-        frames: T frames, colours float in [−1, 1]; pixels without depth leave no trace.
+        frames: T frames, colours float in [−1, 1]; pixels without depth are ignored.
         features_ThwF: (T, h, w, F) their patch features (``encoders.encode``).
         valid_T: (T,) bool; False frames are ignored.
     """
@@ -78,9 +79,9 @@ def tokens(model: ModelConfig, memory: Memory, camera: Camera) -> MapTokens:
 
 
 def to_points(model: ModelConfig, memory: Memory) -> tuple[Array, Array, Array]:
-    """Return all that is remembered as ``(points_world_V3, features_VF, valid_V)``.
+    """Return the whole memory as ``(points_world_V3, features_VF, valid_V)``.
 
-    V is static; the memory ``none`` has one place, never taken.
+    V is static; the memory ``none`` has one slot, which is never valid.
     """
     return functions(model.memory).to_points(model, memory)
 
@@ -88,15 +89,18 @@ def to_points(model: ModelConfig, memory: Memory) -> tuple[Array, Array, Array]:
 def render(
     model: ModelConfig, memory: Memory, camera: Camera, height: int, width: int
 ) -> rendering.View:
-    """Return what cameras see of the memory: its points in images, the nearest in front.
+    """Render the memory's points for cameras; nearer points hide farther ones.
 
     Args:
         model: the model.
         memory: what is remembered.
         camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
-        height: of the images, pixels.
-        width: of the images, pixels.
+        height: height of the images, pixels.
+        width: width of the images, pixels.
     """
+    own = getattr(functions(model.memory), "render", None)
+    if own is not None:
+        return own(model, memory, camera, height, width)
     return rendering.splat(*to_points(model, memory), camera, height, width)
 
 
@@ -116,7 +120,7 @@ def from_context(
         params: the world model's parameters; those of the image encoder are used.
         context: S frames of one world, colours in [−1, 1].
         valid_S: (S,) bool, False frames are ignored.
-        features_ShwF: (S, h, w, F) what the encoder makes of the frames, if it is known already.
+        features_ShwF: (S, h, w, F) the encoder's features of the frames, if they are known.
     """
     last = jnp.argmax(jnp.where(valid_S, jnp.arange(valid_S.shape[0]), -1))
     memory = empty(model, context.camera.world_from_camera[last, :3, 3])
@@ -129,8 +133,8 @@ def from_context(
 
 
 def colours(model: ModelConfig, features_VF: Array) -> np.ndarray:
-    """Return (V, 3) colours in [−1, 1] to draw remembered places with."""
+    """Return (V, 3) colours in [−1, 1] in which the memory's points are drawn."""
     values = np.asarray(features_VF)
-    if isinstance(model.memory, PointsConfig) or not len(values):
+    if not model.memory.KEEPS_FEATURES or not len(values):
         return values[..., :3]
     return encoders.colours(model.memory.encoder, values)

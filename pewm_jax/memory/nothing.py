@@ -1,7 +1,7 @@
-"""No memory at all: the rival that only knows the present frame (NWM in the paper's Table 1).
+"""No memory: the rival that knows only the present frame (NWM in the paper's Table 1).
 
-Its tokens are all masked. The memory blocks still exist and still train what does not read a
-memory, their feed-forward, so that this rival has the same parameters and the same chance.
+All its tokens are masked. The memory blocks still exist, and their feed-forward networks are still
+trained, so this rival has the same number of trained parameters as the others.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pewm_jax.types import Array, Camera, Frames, MapTokens
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Nothing:
-    """Holds nothing."""
+    """An empty pytree."""
 
 
 def empty(model: ModelConfig, centre_3: Array) -> Nothing:
-    """Return nothing."""
+    """Return the empty memory."""
     del model, centre_3
     return Nothing()
 
@@ -34,7 +34,7 @@ def remember(
     features_ThwF: Array,
     valid_T: Array | None = None,
 ) -> Nothing:
-    """Remember nothing."""
+    """Return the memory unchanged."""
     del model, frames, features_ThwF, valid_T
     return memory
 
@@ -46,7 +46,7 @@ def tokens(model: ModelConfig, memory: Nothing, camera: Camera) -> MapTokens:
 
 
 def to_points(model: ModelConfig, memory: Nothing) -> tuple[Array, Array, Array]:
-    """Return one place, not taken."""
+    """Return one invalid slot."""
     del memory
     blank = _masked(model, 1)
     return blank.points_world_M3, blank.features_MF, blank.valid_M

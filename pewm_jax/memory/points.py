@@ -1,8 +1,8 @@
-"""A point cloud: where something stands and its colour, without features.
+"""A point cloud: positions and colours, without features.
 
-The rival "point cloud" of the paper's ablation. Thinned as point clouds usually are: of all points
-that fell into a cell of the grid one is kept, at their mean position and with their mean colour.
-Kept sorted by cell, so that an insertion is one sort and one segmented sum.
+The rival "point cloud" of the paper's ablation. It is thinned as usual (voxel downsampling): each
+grid cell keeps one point, with the mean position and mean colour of all points that fell into it.
+Points are sorted by cell, so an insertion is one sort and one segmented sum.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pewm_jax.memory import cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
 MOST = 64 * 64
-"""Pixels of a frame that are looked at, at most, in an even grid."""
+"""The most pixels of a frame that are inserted, in an even grid."""
 CHANNELS = 4
-"""Colour in [−1, 1], and 1 for being there."""
+"""Channels of a point: its colour in [−1, 1], and a 1 that marks it as occupied."""
 
 
 @jax.tree_util.register_dataclass
@@ -30,10 +30,10 @@ class PointCloud:
 
     Attributes:
         cell_V: (V,) int32 cells in increasing order; free slots, last, hold the number of cells.
-        sums_V7: (V, 7) count of points, sum of their offsets from ``origin_3``, of their colours.
+        sums_V7: (V, 7) number of points, sum of their offsets from ``origin_3``, sum of colours.
         origin_3: (3,) lower corner of the grid, metres.
-        occupied: () int32, points in use.
-        dropped: () int32, cells seen but not kept because the capacity was full (per insertion).
+        occupied: () int32, slots in use.
+        dropped: () int32, cells that did not fit into the capacity, summed over insertions.
         outside: () int32, points that fell outside the grid.
     """
 
@@ -62,7 +62,7 @@ def empty(model: ModelConfig, centre_3: Array) -> PointCloud:
 def insert(
     config: MemorySettings, cloud: PointCloud, points_P3: Array, rgb_PC: Array, valid_P: Array
 ) -> PointCloud:
-    """Insert coloured points; new cells beyond the capacity are counted, lower cells stay.
+    """Insert coloured points; new cells that do not fit are dropped, highest numbers first.
 
     Args:
         config: cell size, extent, capacity.
@@ -83,12 +83,12 @@ def insert(
     order = jnp.argsort(cell, stable=True)
     cell, old = cell[order], order < capacity
     first = jnp.concatenate([jnp.ones((1,), bool), cell[1:] != cell[:-1]]) & (cell < nowhere)
-    # Stable: of equal cells the one already in the cloud stands first.
+    # The sort is stable: of equal cells, the one already in the cloud comes first.
     known, new = first & old, first & ~old
     room = capacity - cloud.occupied
-    kept = known | (new & (jnp.cumsum(new) <= room))
-    slot = jnp.where(kept, jnp.cumsum(kept) - 1, capacity)
-    # Every row goes where the first row of its cell goes.
+    admitted = known | (new & (jnp.cumsum(new) <= room))
+    slot = jnp.where(admitted, jnp.cumsum(admitted) - 1, capacity)
+    # Every row goes to the slot of the first row of its cell.
     leader = jax.lax.cummax(jnp.where(first, jnp.arange(cell.shape[0]), 0))
     target = jnp.where(cell < nowhere, slot[leader], capacity)
     sums = jnp.concatenate([cloud.sums_V7, rows])[order]
@@ -96,8 +96,8 @@ def insert(
         jnp.full((capacity,), nowhere, jnp.int32).at[slot].set(cell, mode="drop"),
         jnp.zeros((capacity, 7)).at[target].add(sums, mode="drop", indices_are_sorted=False),
         cloud.origin_3,
-        occupied=kept.sum(dtype=jnp.int32),
-        dropped=cloud.dropped + (new & ~kept).sum(dtype=jnp.int32),
+        occupied=admitted.sum(dtype=jnp.int32),
+        dropped=cloud.dropped + (new & ~admitted).sum(dtype=jnp.int32),
         outside=cloud.outside + outside,
     )
 
@@ -109,7 +109,7 @@ def remember(
     features_ThwF: Array | None = None,
     valid_T: Array | None = None,
 ) -> PointCloud:
-    """Insert the pixels of posed RGB-D frames, colours in [−1, 1]; features are not kept."""
+    """Insert the pixels of posed RGB-D frames, colours in [−1, 1]; features are not used."""
     del features_ThwF
     rows, columns = cells.grid_of(frames.depth_THW.shape[1], frames.depth_THW.shape[2], MOST)
     points, rgb, valid = cells.sample(frames, rows, columns, valid_T)
@@ -119,11 +119,11 @@ def remember(
 def to_points(model: ModelConfig, cloud: PointCloud) -> tuple[Array, Array, Array]:
     """Return all slots as ``(points_world_V3, features_VF, valid_V)``.
 
-    Features are the colour and a 1 for being there, then zeros up to the encoder's channels; free
-    slots are 0 altogether.
+    Features are the colour and a 1, then zeros up to the encoder's number of channels; free slots
+    are all 0.
 
     Raises:
-        ValueError: fewer than four channels.
+        ValueError: the encoder has fewer than four channels.
     """
     channels = model.memory.encoder.channels
     if channels < CHANNELS:
@@ -131,9 +131,9 @@ def to_points(model: ModelConfig, cloud: PointCloud) -> tuple[Array, Array, Arra
     valid = cloud.sums_V7[:, 0] > 0
     mean = cloud.sums_V7[:, 1:] / jnp.where(valid, cloud.sums_V7[:, 0], 1)[:, None]
     points = jnp.where(valid[:, None], cloud.origin_3 + mean[:, :3], 0)
-    there = valid[:, None].astype(jnp.float32)
+    mark = valid[:, None].astype(jnp.float32)
     padding = jnp.zeros((valid.shape[0], channels - CHANNELS))
-    return points, jnp.concatenate([mean[:, 3:], there, padding], -1), valid
+    return points, jnp.concatenate([mean[:, 3:], mark, padding], -1), valid
 
 
 def tokens(model: ModelConfig, cloud: PointCloud, camera: Camera) -> MapTokens:

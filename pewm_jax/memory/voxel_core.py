@@ -1,4 +1,4 @@
-"""What a voxel map is and does, all but editing and files (see ``voxel_map``)."""
+"""The voxel map's operations except editing and files (see ``voxel_map``)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 def empty(
     config: MemorySettings, centre_3: Array, channels: int, dtype: DTypeLike = jnp.float32
 ) -> VoxelMap:
-    """Return a map that has seen nothing.
+    """Return an empty map.
 
     Args:
         config: cell size, extent, capacity.
         centre_3: (3,) world position the grid is centred on, metres; the grid's corner is
             snapped to whole cells so that maps of one world share their cells.
         channels: features F per cell.
-        dtype: of the features, float32 or bfloat16.
+        dtype: dtype of the features, float32 or bfloat16.
     """
     zero = jnp.zeros((), jnp.int32)
     return VoxelMap(
@@ -53,7 +53,7 @@ def insert(
     Args:
         config: cell size, extent, capacity.
         voxels: the map.
-        points_P3: (P, 3) world points, metres; what is not a number is outside.
+        points_P3: (P, 3) world points, metres; NaN counts as outside the grid.
         features_PF: (P, F) their features, rounded to the map's dtype.
         valid_P: (P,) bool; False points are ignored.
 
@@ -64,7 +64,7 @@ def insert(
         UserError: points, features, validity and the map's channels do not fit together.
     """
     points_P3, features_PF, valid_P = map(jnp.asarray, (points_P3, features_PF, valid_P))
-    none, size = voxel_cells.nowhere(config), len(points_P3)
+    no_cell, size = voxel_cells.nowhere(config), len(points_P3)
     shapes = points_P3.shape, features_PF.shape, valid_P.shape
     wanted = (size, 3), (size, voxels.features_VF.shape[-1]), (size,)
     if shapes != wanted:
@@ -75,16 +75,16 @@ def insert(
     if size == 0:
         return voxels
     seen = cells.keys(config, voxels.origin_3, points_P3)
-    beyond = (valid_P & (seen == none)).sum(dtype=jnp.int32)
-    seen = jnp.where(valid_P, seen, none)
-    cell_V, dropped = voxel_cells.admit(voxels.cell_of_slot_V, seen, none)
+    beyond = (valid_P & (seen == no_cell)).sum(dtype=jnp.int32)
+    seen = jnp.where(valid_P, seen, no_cell)
+    cell_V, dropped = voxel_cells.admit(voxels.cell_of_slot_V, seen, no_cell)
 
     def read(start: Array, block: int) -> tuple[Array, Array]:
         cell, rows = (jax.lax.dynamic_slice_in_dim(x, start, block) for x in (seen, features_PF))
         slot, found = voxel_cells.find(cell_V, cell)
-        return jnp.where(found & (cell < none), slot, cell_V.shape[0]), rows
+        return jnp.where(found & (cell < no_cell), slot, cell_V.shape[0]), rows
 
-    rows = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, none)
+    rows = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, no_cell)
     rows = voxel_cells.maximum_over_blocks(rows, jnp.asarray(size, jnp.int32), size, read)
     return renewed(config, voxels, cell_V, rows, dropped, beyond)
 
@@ -98,13 +98,13 @@ def insert_frames(
 ) -> VoxelMap:
     """Insert posed depth frames: upsampling, unprojection and maximum in one pass.
 
-    The same as upsampling the features to all pixels and inserting every pixel's point, up to
-    rounding of the interpolation; the upsampled features never exist (see ``voxel_frames``).
+    The result equals upsampling the features to all pixels and inserting every pixel's point, up to
+    rounding of the interpolation. The upsampled features are never stored (see ``voxel_frames``).
 
     Args:
         config: cell size, extent, capacity.
         voxels: the map.
-        frames: T frames, of which depth and cameras are used; pixels without depth are ignored.
+        frames: T frames; depth and cameras are used, and pixels without depth are ignored.
         features_ThwF: (T, h, w, F) features of a grid of patches that covers each frame, float32
             or bfloat16; they are upsampled bilinearly in float32, patch centres at half-integers.
         valid_T: (T,) bool, False frames are ignored.
@@ -112,7 +112,7 @@ def insert_frames(
     Raises:
         UserError: frames, features and the map's channels do not fit together.
     """
-    none, depth_THW = voxel_cells.nowhere(config), jnp.asarray(frames.depth_THW)
+    no_cell, depth_THW = voxel_cells.nowhere(config), jnp.asarray(frames.depth_THW)
     count, channels = len(depth_THW), voxels.features_VF.shape[-1]
     shape = jnp.shape(features_ThwF)
     if len(shape) != 4 or (shape[0], shape[-1]) != (count, channels):
@@ -125,8 +125,8 @@ def insert_frames(
     valid = depth_THW > 0
     if valid_T is not None:
         valid = valid & jnp.asarray(valid_T)[:, None, None]
-    beyond = (valid & (seen == none)).sum(dtype=jnp.int32)
-    seen = jnp.where(valid, seen, none)
+    beyond = (valid & (seen == no_cell)).sum(dtype=jnp.int32)
+    seen = jnp.where(valid, seen, no_cell)
     cell_V, rows, dropped = voxel_frames.insert(
         config, voxels.cell_of_slot_V, voxels.features_VF, seen, jnp.asarray(features_ThwF)
     )
@@ -136,17 +136,17 @@ def insert_frames(
 def merge(config: MemorySettings, a: VoxelMap, b: VoxelMap) -> VoxelMap:
     """Return the union of two maps of one world: the maximum where both have a cell.
 
-    While the capacity holds, inserting into a and then into b's points gives the same as merging.
-    Counts of dropped cells and outside points are added up.
+    As long as everything fits, merging equals inserting the points of both into one map. Counts of
+    dropped cells and of points outside are added.
 
     Args:
         config: cell size, extent, capacity of both.
         a: a map; its grid is kept, and its cells have precedence where the capacity is full.
-        b: a map, its grid at the same place or shifted by whole cells; its cells beyond a's grid
+        b: a map whose grid is equal to a's or shifted by whole cells; its cells outside a's grid
             are counted as outside, once per cell.
 
     Raises:
-        UserError: the grids are not shifted by whole cells (seen outside of jit only).
+        UserError: the grids are not shifted by whole cells (not checked under jit).
     """
     shift_3 = (b.origin_3 - a.origin_3) / np.asarray(config.cell_m, np.float32)
     if not isinstance(shift_3, Tracer) and not np.allclose(shift_3, np.round(shift_3), atol=1e-2):
@@ -179,11 +179,10 @@ def tokens(
 ) -> MapTokens:
     """Choose the M = ``memory.tokens`` cells that condition one clip.
 
-    Cells inside the view of any of the clip's cameras come first, nearest first (by the smallest
-    depth at which a camera sees them); then the others by distance to the nearest camera. Ties
-    go to the lower cell number. Fewer than M occupied cells leave masked tokens. Positions are
-    those of the world; ``models.memory_geometry`` turns them into what attention needs, in the
-    clip's first camera or not (``memory.positions``, ``memory.frame``).
+    Cells in view of any of the clip's cameras come first, nearest first (by the smallest depth at
+    which a camera sees them). The others follow, by distance to the nearest camera. Ties go to the
+    lower cell number. With fewer than M occupied cells, the remaining tokens are masked. Positions
+    are in the world; ``models.memory_geometry`` encodes them for attention.
 
     Args:
         config: gives M.
@@ -204,7 +203,7 @@ def renewed(
     dropped: Array | int = 0,
     outside: Array | int = 0,
 ) -> VoxelMap:
-    """Return a map with other cells and features, its counts of losses increased."""
+    """Return a map with new cells and features, and increased counts of dropped and outside."""
     return dataclasses.replace(
         voxels,
         cell_of_slot_V=cell_V,

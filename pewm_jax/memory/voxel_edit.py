@@ -1,11 +1,11 @@
-"""Editing a voxel map, in metres and world coordinates: erase, copy, paste, move.
+"""Editing a voxel map in world coordinates (metres): erase, copy, paste, move.
 
-The world model imagines what the map says, so moving a piece of the map moves that piece of the
-world. A box is (2, 3), its lower and its upper corner; a cell belongs to the box its centre lies
-in, the lower faces included, the upper ones not. A transform is a rigid 4×4 matrix that takes
-places of the piece to where they shall be.
+The world model imagines what the map shows, so moving a part of the map moves that part of the
+world. A box is (2, 3), its lower and upper corner. A cell belongs to a box if its centre lies in
+it; lower faces are included, upper ones are not. A transform is a rigid 4×4 matrix from old to new
+positions.
 
-All functions are pure and jittable with ``config`` static; capacities stay.
+All functions are pure and jittable with ``config`` static, and keep a map's capacity.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def erase(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> VoxelMap:
 
 
 def copy(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> VoxelMap:
-    """Return a map of the cells in a box alone; nothing counts as dropped or outside in it.
+    """Return a map of only the cells in a box; its counts of dropped and outside are 0.
 
     Args:
         config: cell size, extent, capacity.
@@ -57,20 +57,21 @@ def copy(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> VoxelMap:
 def paste(
     config: MemorySettings, voxels: VoxelMap, piece: VoxelMap, transform: Array | None = None
 ) -> VoxelMap:
-    """Put a piece into a map; where both have a cell, the maximum counts.
+    """Insert a piece into a map; where both have a cell, take the maximum.
 
-    Each cell of the map takes the piece's cell that its centre comes from, so that a turned piece
-    has no holes and is no thicker; whole quarter turns and moves by whole cells are exact.
+    Each cell of the map takes the cell of the piece that its centre comes from (inverse warping),
+    so a rotated piece has no holes and does not grow. Quarter turns and shifts by whole cells are
+    exact.
 
     Args:
         config: cell size, extent, capacity of both.
         voxels: the map; its cells have precedence where the capacity is full.
         piece: from ``copy``, or any map of the same cell size.
-        transform: (4, 4) rigid, metres; nothing is moved without.
+        transform: (4, 4) rigid, metres; None for the identity.
 
     Returns:
-        The map. Cells that do not fit count as dropped, cells of the piece whose centre would lie
-        beyond the extent as outside.
+        The map. Cells that do not fit are counted as dropped; cells of the piece whose centre
+        leaves the grid are counted as outside.
 
     Raises:
         UserError: the transform is not a rigid 4×4.
@@ -80,30 +81,32 @@ def paste(
         raise UserError(f"paste() got a transform of shape {transform.shape}; give a rigid 4×4.")
     if not isinstance(transform, Tracer) and not _is_rigid(np.asarray(transform)):
         raise UserError("paste() got a transform that is not rigid; give a rotation and a shift.")
-    none, back = voxel_cells.nowhere(config), invert_rigid(transform)
+    no_cell, back = voxel_cells.nowhere(config), invert_rigid(transform)
 
     def source(cell: Array) -> tuple[Array, Array]:
         """Return the piece's slot that each cell of the map takes, and whether there is one."""
-        centres = voxel_core.cell_centres(config, voxels.origin_3, jnp.where(cell < none, cell, 0))
-        there = cells.keys(config, piece.origin_3, transform_points(back, centres))
-        slot, found = voxel_cells.find(piece.cell_of_slot_V, there)
-        return slot, found & (there < none) & (cell < none)
+        centres = voxel_core.cell_centres(
+            config, voxels.origin_3, jnp.where(cell < no_cell, cell, 0)
+        )
+        origin = cells.keys(config, piece.origin_3, transform_points(back, centres))
+        slot, found = voxel_cells.find(piece.cell_of_slot_V, origin)
+        return slot, found & (origin < no_cell) & (cell < no_cell)
 
     points, _, valid = voxel_core.to_points(config, piece)
     moved = transform_points(transform, points)
-    here = cells.keys(config, voxels.origin_3, moved)
+    target = cells.keys(config, voxels.origin_3, moved)
     around = moved + _neighbours(config)[:, None]
     near = cells.keys(config, voxels.origin_3, around.reshape(-1, 3))
-    near = jnp.where(jnp.tile(valid, len(around)), near, none)
+    near = jnp.where(jnp.tile(valid, len(around)), near, no_cell)
     cell_V, dropped = voxel_cells.admit(
-        voxels.cell_of_slot_V, jnp.where(source(near)[1], near, none), none
+        voxels.cell_of_slot_V, jnp.where(source(near)[1], near, no_cell), no_cell
     )
 
-    old = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, none)
+    old = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, no_cell)
     slot, taken = source(cell_V)
     lowest = jnp.asarray(-jnp.inf, old.dtype)
     new = jnp.where(taken[:, None], piece.features_VF[slot].astype(old.dtype), lowest)
-    outside = (valid & (here == none)).sum(dtype=jnp.int32)
+    outside = (valid & (target == no_cell)).sum(dtype=jnp.int32)
     return voxel_core.renewed(config, voxels, cell_V, jnp.maximum(old, new), dropped, outside)
 
 
@@ -114,7 +117,7 @@ def move(config: MemorySettings, voxels: VoxelMap, box_23: Array, transform: Arr
         config: cell size, extent, capacity.
         voxels: the map.
         box_23: (2, 3) lower and upper corner in the world, metres.
-        transform: (4, 4) rigid, from where things are to where they shall be, metres.
+        transform: (4, 4) rigid, from old to new positions, metres.
 
     Raises:
         UserError: the box is not a box, or the transform not a rigid 4×4.
@@ -145,14 +148,14 @@ def _within(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> Array:
 
 
 def _only(config: MemorySettings, voxels: VoxelMap, keep_V: Array) -> VoxelMap:
-    none = voxel_cells.nowhere(config)
-    cell_V = jnp.sort(jnp.where(keep_V, voxels.cell_of_slot_V, none))
-    rows = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, none)
+    no_cell = voxel_cells.nowhere(config)
+    cell_V = jnp.sort(jnp.where(keep_V, voxels.cell_of_slot_V, no_cell))
+    rows = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, no_cell)
     return voxel_core.renewed(config, voxels, cell_V, rows)
 
 
 def _neighbours(config: MemorySettings) -> np.ndarray:
-    """Return (O, 3) steps to all cells whose centre a turned cell can cover, metres."""
+    """Return (O, 3) offsets, metres, to all cells whose centre a rotated cell can cover."""
     half_diagonal = math.dist(config.cell_m, (0, 0, 0)) / 2
     reach = [int(half_diagonal / size + 0.5) for size in config.cell_m]
     steps = itertools.product(*(range(-n, n + 1) for n in reach))

@@ -1,7 +1,7 @@
-"""A voxel map for other programs: PLY (z up, as ours) and GLB (y up, as glTF wants).
+"""Export of a voxel map to PLY (z up, as in this library) and GLB (y up, as glTF requires).
 
-As points, or as cubes, every cell a box a little smaller than itself. Both formats are written by
-hand: they are a header and three arrays.
+Cells are written as points, or as boxes slightly smaller than the cells. Both formats are a header
+and three arrays, so no library is needed to write them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pewm_jax.models import encoders
 from pewm_jax.types import Array, VoxelMap
 
 FILLED = 0.9
-"""Side of a cube over the side of its cell, so that neighbours can be told apart."""
+"""Side of a cube over the side of its cell; the gap makes neighbours distinguishable."""
 _CORNERS = np.asarray(list(itertools.product((-0.5, 0.5), repeat=3)), np.float32)
 _SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 _TRIANGLES = np.asarray([t for a, b, c, d in _SIDES for t in ((a, b, c), (a, c, d))], np.int32)
@@ -37,18 +37,18 @@ def export(
     style: Literal["cubes", "points"] = "cubes",
     colours_V3: Array | None = None,
 ) -> None:
-    """Write the occupied cells with their colours, aside and then renamed.
+    """Write the occupied cells with their colours to a file, atomically.
 
     Args:
         config: the map's settings.
         voxels: one map.
-        path: the file; its suffix, ``.ply`` or ``.glb``, says the format. Its folder is made.
+        path: the file, whose suffix ``.ply`` or ``.glb`` is the format; its folder is created.
         style: `cubes` or `points`.
-        colours_V3: (V, 3) in [−1, 1] of all slots; by default ``encoders.colours``: the true ones
-            where features are colours, else the three principal components.
+        colours_V3: (V, 3) colours in [−1, 1] of all slots. By default ``encoders.colours``: the
+            true colours if features are colours, else three principal components.
 
     Raises:
-        UserError: the suffix is another, or the map is empty.
+        UserError: the suffix is unknown, or the map is empty.
     """
     path = Path(path)
     write = {".ply": _ply, ".glb": _glb}.get(path.suffix.lower())
@@ -79,13 +79,13 @@ def export(
 
 def _ply(points_N3: np.ndarray, colours_N3: np.ndarray, triangles: np.ndarray | None) -> bytes:
     """Return a binary little-endian PLY file."""
-    place = [(axis, "<f4") for axis in "xyz"]
+    position = [(axis, "<f4") for axis in "xyz"]
     shade = [(name, "u1") for name in ("red", "green", "blue")]
-    vertices = np.empty(len(points_N3), place + shade)
-    for (name, _), column in zip(place + shade, [*points_N3.T, *colours_N3.T], strict=True):
+    vertices = np.empty(len(points_N3), position + shade)
+    for (name, _), column in zip(position + shade, [*points_N3.T, *colours_N3.T], strict=True):
         vertices[name] = column
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name, _ in place]
+    header += [f"property float {name}" for name, _ in position]
     header += [f"property uchar {name}" for name, _ in shade]
     body = vertices.tobytes()
     if triangles is not None:
@@ -97,7 +97,7 @@ def _ply(points_N3: np.ndarray, colours_N3: np.ndarray, triangles: np.ndarray | 
 
 
 def _glb(points_N3: np.ndarray, colours_N3: np.ndarray, triangles: np.ndarray | None) -> bytes:
-    """Return a glTF 2.0 file in one piece; the world's z is its y."""
+    """Return a binary glTF 2.0 file; the world's z axis becomes y."""
     points = np.stack([points_N3[:, 0], points_N3[:, 2], -points_N3[:, 1]], -1).astype("<f4")
     opaque = np.concatenate([colours_N3, np.full((len(points), 1), 255, np.uint8)], -1)
     parts = [points.tobytes(), opaque.tobytes()]

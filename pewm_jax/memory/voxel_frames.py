@@ -1,15 +1,14 @@
-"""Frames into a voxel map in one fused pass that never holds upsampled features.
+"""Inserting frames into a voxel map in one fused pass, without storing upsampled features.
 
 Two facts make it fast:
 
-* Only places are computed for every pixel: its cell, straight from depth and camera.
-* Between four neighbouring patch centres the upsampled features are bilinear: along a row or a
-  column of pixels they rise or fall steadily. So within one such square the maximum over the
-  pixels of a cell is taken at a pixel that ends both its row and its column of pixels of that cell
-  (from any other one can walk on without falling). Only these *corner* pixels are interpolated:
-  of 14 × 14 pixels on one wall, four.
+* Only a pixel's cell has to be computed for every pixel, directly from depth and camera.
+* Between four neighbouring patch centres the upsampled features are bilinear, hence monotonic along
+  each row and each column of pixels. Within such a square, the maximum over the pixels of a cell is
+  therefore reached at a pixel that is the end of both its horizontal and its vertical run of pixels
+  of that cell. Only these *corner* pixels are interpolated: four of 14 × 14 pixels on one wall.
 
-Both hold for any depth image; on noise every pixel is a corner, and all are interpolated.
+Both hold for any depth image. On noise every pixel is a corner, and all are interpolated.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ from pewm_jax.memory import voxel_cells
 from pewm_jax.types import Array, Camera
 
 WORTH_A_BRANCH = 8192
-"""Pixels from which on few corner pixels are sorted by a program of their own."""
+"""Number of corner pixels from which a separate branch, with a shorter sort, pays off."""
 
 
 def pixel_cells(config: MemorySettings, origin_3: Array, depth_THW: Array, camera: Camera) -> Array:
-    """Return (T, H, W) int32, the cell each pixel's surface lies in, as ``cells.keys`` numbers it.
+    """Return (T, H, W) int32, the cell of each pixel's surface point (see ``cells.keys``).
 
-    The same as unprojecting to points first, but one pass over the pixels without them.
+    The result equals unprojecting to points first, but takes one pass and stores no points.
 
     Args:
         config: cell size and extent.
@@ -48,19 +47,21 @@ def pixel_cells(config: MemorySettings, origin_3: Array, depth_THW: Array, camer
         row = pose[:, axis]
         world = row[:, 0] * x + row[:, 1] * y + row[:, 2] * depth_THW + row[:, 3]
         place = jnp.floor((world - origin_3[axis]) / np.float32(size))
-        here = (place >= 0) & (place < count)
-        inside = inside & here
-        cell = cell * count + jnp.where(here, place, 0).astype(jnp.int32)
+        within = (place >= 0) & (place < count)
+        inside = inside & within
+        cell = cell * count + jnp.where(within, place, 0).astype(jnp.int32)
     return jnp.where(inside, cell, voxel_cells.nowhere(config))
 
 
 def corners(cell_THW: Array, square_H: np.ndarray, square_W: np.ndarray) -> Array:
-    """Return (T, H, W) bool: pixels that end both their row and their column.
+    """Return (T, H, W) bool: pixels that end both their horizontal and their vertical run.
+
+    A run is a sequence of neighbouring pixels of the same cell and the same square.
 
     Args:
         cell_THW: (T, H, W) cell of each pixel.
-        square_H: (H,) between which rows of patch centres a row of pixels lies.
-        square_W: (W,) between which columns of patch centres a column of pixels lies.
+        square_H: (H,) index of the row of patch centres before each row of pixels.
+        square_W: (W,) index of the column of patch centres before each column of pixels.
     """
     down = (cell_THW[:, 1:] == cell_THW[:, :-1]) & (square_H[1:] == square_H[:-1])[:, None]
     right = (cell_THW[:, :, 1:] == cell_THW[:, :, :-1]) & (square_W[1:] == square_W[:-1])
@@ -71,11 +72,12 @@ def corners(cell_THW: Array, square_H: np.ndarray, square_W: np.ndarray) -> Arra
 
 
 def between(pixels: int, patches: int) -> tuple[np.ndarray, np.ndarray]:
-    """Place pixel centres between patch centres along one side of an image.
+    """Locate pixel centres between patch centres along one side of an image.
 
     Returns:
-        ``(square, share)``: the patch centre at or before each pixel centre, from −1 (before the
-        first one) to patches − 1, and how far the pixel is on the way to the next one, [0, 1).
+        ``(square, share)``: the index of the patch centre at or before each pixel centre, from −1
+        (before the first one) to patches − 1; and the pixel's distance from it, as a share [0, 1)
+        of the distance to the next one.
     """
     place = (np.arange(pixels) + 0.5) * patches / pixels - 0.5
     square = np.floor(place)
@@ -86,11 +88,11 @@ def compact(mask_THW: Array) -> tuple[Array, Array]:
     """List the True pixels.
 
     Returns:
-        ``(index_P, count)``: linear pixel indices, the True ones first, P after them; and how many.
+        ``(index_P, count)``: the linear indices of the True pixels, padded with P; their number.
     """
     frames, _, width = mask_THW.shape
     size = mask_THW.size
-    # Down the columns, all of them at once: on a processor far cheaper than along the rows.
+    # Sums run down all columns at once, which is much faster on a CPU than along rows.
     rank = jax.lax.platform_dependent(
         mask_THW, cpu=_running_sum, default=lambda mask: jnp.cumsum(mask, 1, dtype=jnp.int32)
     )
@@ -104,7 +106,7 @@ def compact(mask_THW: Array) -> tuple[Array, Array]:
 
 
 def _running_sum(mask_THW: Array) -> Array:
-    """Return (T, H, W) int32: how many are True down to here in each column."""
+    """Return (T, H, W) int32: the cumulative number of True pixels down each column."""
     frames, _, width = mask_THW.shape
 
     def add(above_TW: Array, row_TW: Array) -> tuple[Array, Array]:
@@ -128,22 +130,22 @@ def insert(
         config: gives the number that stands for no cell.
         cell_V: (V,) the cells of the map.
         features_VF: (V, F) their features.
-        cell_THW: (T, H, W) the cell of each pixel, ``nowhere`` where it counts for nothing.
+        cell_THW: (T, H, W) the cell of each pixel, ``nowhere`` for pixels to ignore.
         features_ThwF: (T, h, w, F) patch features.
 
     Returns:
         ``(cell_V, features_VF, dropped)``.
     """
-    none = voxel_cells.nowhere(config)
+    no_cell = voxel_cells.nowhere(config)
     _, height, width = cell_THW.shape
     _, rows, columns, channels = features_ThwF.shape
     (square_H, down_H), (square_W, right_W) = between(height, rows), between(width, columns)
-    index, count = compact(corners(cell_THW, square_H, square_W) & (cell_THW < none))
+    index, count = compact(corners(cell_THW, square_H, square_W) & (cell_THW < no_cell))
     flat = cell_THW.reshape(-1)
 
     def admitted(most: int) -> tuple[Array, Array]:
-        seen = flat.at[index[:most]].get(mode="fill", fill_value=none)
-        return voxel_cells.admit(cell_V, seen, none)
+        seen = flat.at[index[:most]].get(mode="fill", fill_value=no_cell)
+        return voxel_cells.admit(cell_V, seen, no_cell)
 
     few = flat.shape[0] // 8
     if few < WORTH_A_BRANCH:
@@ -172,13 +174,13 @@ def insert(
             for i in (0, 1)
             for j in (0, 1)
         ]
-        # Computed once per pixel, not again for each of its features.
+        # The barrier keeps XLA from recomputing these for every feature of a pixel.
         slot, places, weights = jax.lax.optimization_barrier((slot, places, weights))
         return slot, sum(
             patches.at[place].get(mode="promise_in_bounds") * weight[:, None]
             for place, weight in zip(places, weights, strict=True)
         )
 
-    moved = voxel_cells.relocate(cell_V, features_VF, new_V, none)
+    moved = voxel_cells.relocate(cell_V, features_VF, new_V, no_cell)
     rows_VF = voxel_cells.maximum_over_blocks(moved, count, flat.shape[0], read)
     return new_V, rows_VF, dropped

@@ -1,17 +1,17 @@
-"""The 3D voxel feature map: scatter-max with occupancy, exact, sparse and of static capacity.
+"""The 3D voxel feature map: sparse, of static capacity, filled by scatter-max.
 
-A cell's feature is the maximum over all points that ever fell into it, so neither order nor
-batching nor repetition of points matters: while the capacity holds, maps of the same points are
-equal bit for bit. Cells start at −inf and not at 0, so that negative features survive and an
-unobserved cell is not a cell with feature 0. Memory is kept for *occupied* cells only; the grid's
-extent costs nothing (``voxel_cells``).
+A cell's feature is the maximum over all points that ever fell into it. The order, batching and
+repetition of points do not matter: as long as everything fits, maps of the same points are equal
+bit for bit. Cells start at −inf, not at 0, so negative features survive, and an unobserved cell
+differs from a cell with feature 0. Only *occupied* cells take memory; the grid's extent does not
+matter (``voxel_cells``).
 
-Nothing is lost silently: cells that do not fit are counted in ``dropped``, once per insertion that
-saw them, points beyond the extent in ``outside``. Which cells stay is deterministic: those of
-earlier insertions, and within one insertion those of the lowest numbers.
+Nothing is lost silently. Cells that do not fit are counted in ``dropped``, once per insertion that
+saw them, and points outside the grid in ``outside``. The choice of cells is deterministic: cells of
+earlier insertions stay, and within one insertion lower cell numbers have precedence.
 
-All that make a map of a map are pure and work under jit (``config`` is static), vmap, donation of
-the map, and with the batch of a vmapped map sharded over devices.
+All functions from maps to maps are pure. They work under jit (``config`` is static) and vmap, with
+donated maps, and with a batch of maps sharded over devices.
 
     voxels = empty(config, centre, channels)
     voxels = insert_frames(config, voxels, frames, patch_features)
@@ -19,8 +19,9 @@ the map, and with the batch of a vmapped map sharded over devices.
     voxels = move(config, voxels, box, transform)
     export(config, voxels, "map.glb")
 
-This module is the whole of it; the parts are in ``voxel_core``, ``voxel_cells`` (which cells are
-kept), ``voxel_frames`` (the fused pass), ``voxel_edit``, ``voxel_files`` and ``voxel_export``.
+This module exports all functions of the map. They are defined in ``voxel_core``, ``voxel_cells``
+(the list of cells), ``voxel_frames`` (the fused pass), ``voxel_edit``, ``voxel_files`` and
+``voxel_export``.
 """
 
 from __future__ import annotations

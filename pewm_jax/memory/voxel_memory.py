@@ -1,4 +1,4 @@
-"""The voxel map as a memory: the functions that ``memories`` calls."""
+"""The voxel map as a memory: the functions that ``memories`` requires."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 
 
 def empty(model: ModelConfig, centre_3: Array) -> VoxelMap:
-    """Return a map that has seen nothing, its grid around a world position."""
+    """Return an empty map with a grid centred on a world position."""
     return voxel_map.empty(model.memory, centre_3, model.memory.encoder.channels)
 
 
@@ -29,5 +29,5 @@ def tokens(model: ModelConfig, voxels: VoxelMap, camera: Camera) -> MapTokens:
 
 
 def to_points(model: ModelConfig, voxels: VoxelMap) -> tuple[Array, Array, Array]:
-    """Return the cells' centres, features and whether they are taken."""
+    """Return centre, features and validity of all slots."""
     return voxel_map.to_points(model.memory, voxels)

@@ -1,1 +1,1 @@
-"""Chapter 3, the networks: codec, layers, diffusion transformer, memory blocks, world model."""
+"""Chapter 3, the networks: codec, control, denoiser, memory readers, image encoder."""

@@ -1,7 +1,7 @@
-"""The paper's reader: an expert block of cross-attention after every block of the backbone.
+"""The paper's memory reader: a cross-attention block after every block of the backbone.
 
-Parameters: ``camera`` (rays → per token), ``tokens`` (map tokens → width of the attention) and
-``blocks``, stacked over the backbone's places. Their gates start at zero: nothing changes at first.
+Parameters: ``camera`` embeds the rays of each video token, ``tokens`` embeds the map tokens, and
+``blocks`` holds the memory blocks, stacked. Gates start at zero, so a fresh reader changes nothing.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import AttentionConfig, ModelConfig, NoMemoryConfig
+from pewm_jax.config import AttentionConfig, CameraConfig, ModelConfig
 from pewm_jax.models import layers
 from pewm_jax.models.backbones import Readers
 from pewm_jax.models.costs import (
@@ -29,7 +29,7 @@ from pewm_jax.models.memory_geometry import Sightings, patch_pixels, sightings, 
 from pewm_jax.models.token_layout import TokenLayout
 from pewm_jax.types import Array, Camera, MapTokens, Params
 
-WHOLE = P()
+REPLICATED = P()
 
 SHARDING = (
     (r"memory/blocks/(attention/to_[qkv]|ff/up|linear)/kernel", P("fsdp", "tensor")),
@@ -39,19 +39,19 @@ SHARDING = (
     (r"memory/(camera|tokens)/kernel", P(None, "fsdp")),
     (r"memory/blocks/attention/([qk]_constant|k_depth)", P("tensor", None)),
     (r"memory/blocks/attention/(nearer|sink)", P("tensor")),
-    (r"memory/blocks/(to_out|ff/down|with_camera)/bias", WHOLE),
-    (r"memory/(camera|tokens)/bias", WHOLE),
-    (r"memory/blocks/(attention/norm_[qk]|norm_video|norm_memory|norm2)/(scale|bias)", WHOLE),
+    (r"memory/blocks/(to_out|ff/down|with_camera)/bias", REPLICATED),
+    (r"memory/(camera|tokens)/bias", REPLICATED),
+    (r"memory/blocks/(attention/norm_[qk]|norm_video|norm_memory|norm2)/(scale|bias)", REPLICATED),
 )
 
 STREAMS = (14, 34)
-"""Times that a block's tokens are read or written by element-wise work, forward and backward."""
+"""How often element-wise work reads or writes a block's tokens: forward, backward."""
 SINUSOID = 60
-"""Channels of a position as a sinusoid."""
+"""Channels of a position encoded as a sinusoid."""
 
 
 def token_channels(model: ModelConfig) -> int:
-    """Return the channels of a map token: features and, with sinusoid positions, its place."""
+    """Return the channels of a map token: its features and, if sinusoidal, its position."""
     positions = SINUSOID if _settings(model).positions == "sinusoid" else 0
     return model.memory.encoder.channels + positions
 
@@ -65,15 +65,15 @@ def _settings(model: ModelConfig) -> AttentionConfig:
 def _ray_channels(model: ModelConfig) -> int:
     """Return the channels of the rays of one video token."""
     places = model.backbone.places
-    return 6 * model.codec.temporal * places.patch**2 * places.patch_t
+    return CameraConfig().channels(model) * places.patch**2 * places.patch_t
 
 
 def _embeddings(model: ModelConfig) -> tuple[layers.nn.Dense, layers.nn.Dense]:
-    """Return the embeddings of rays (per video token) and of map tokens."""
+    """Return the linear layers that embed rays (one vector per video token) and map tokens."""
     dtype = jnp.dtype(model.dtype)
     camera = layers.dense(model.backbone.places.width // 2, dtype, "camera")
-    # The layer norm that follows would forget how large a feature is; next to a constant of
-    # size 1 in random directions it keeps it.
+    # A layer norm follows, which would discard the magnitude of the features. A random bias of
+    # unit variance keeps it visible.
     constant = layers.nn.initializers.normal(1.0)
     width = _settings(model).width
     tokens = layers.nn.Dense(width, dtype=dtype, bias_init=constant, name="tokens")
@@ -82,8 +82,7 @@ def _embeddings(model: ModelConfig) -> tuple[layers.nn.Dense, layers.nn.Dense]:
 
 def _block(model: ModelConfig, layout: TokenLayout) -> MemoryBlock:
     grid = max(model.clip.height, model.clip.width) // patch_pixels(model)
-    always = isinstance(model.memory, NoMemoryConfig)
-    return MemoryBlock(_settings(model), grid, layout, always)
+    return MemoryBlock(_settings(model), grid, layout, always=not model.memory.REMEMBERS)
 
 
 def init(model: ModelConfig, key: Array) -> Params:
@@ -125,11 +124,11 @@ def init(model: ModelConfig, key: Array) -> Params:
 def prepare(
     model: ModelConfig, params: Params, seen: MapTokens, camera: Camera, rays_BthwC: Array
 ) -> Readers:
-    """Embed rays and map tokens, and say which tokens each camera looks at; see ``readers``."""
+    """Embed rays and map tokens, and choose the tokens each camera attends to; see ``readers``."""
     config, places, dtype = _settings(model), model.backbone.places, jnp.dtype(model.dtype)
     missing = -rays_BthwC.shape[1] % places.patch_t
     rays = jnp.concatenate([rays_BthwC[:, :1]] * missing + [rays_BthwC], 1).astype(dtype)
-    layout = TokenLayout.here(text_tokens(model), *video_tokens(model))
+    layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
     camera_layer, token_layer = _embeddings(model)
     patches = patchify(rays, places.patch, places.patch_t)
     looks_from = layout.spread(camera_layer.apply({"params": params["camera"]}, patches))
@@ -153,19 +152,21 @@ def prepare(
 
 
 def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return the memory blocks' costs; all are trained."""
+    """Return the costs of the memory blocks, all of which are trained."""
     config, places = _settings(model), model.backbone.places
     frames, patches = video_tokens(model)
     video, joint = frames * patches, frames * patches + text_tokens(model)
     remat = bool(model.backbone.remat)
-    whole = share.clips * joint * places.width * share.wide / share.context
+    whole = share.clips * joint * places.width * share.activation_bytes / share.context
     each = share.clips * video / share.context / share.tensor
-    wide, inner = each * places.width * share.wide, each * config.width * share.wide
-    wider, table = wide * config.mlp_ratio, each * _seen(model) * config.heads * FLOAT
+    per_channel = each * share.activation_bytes
+    tokens, inner = per_channel * places.width, per_channel * config.width
+    hidden, logits = tokens * config.mlp_ratio, each * _attended(model) * config.heads * FLOAT
     if remat:
-        kept, block = 0.0, 5 * wider + 4 * inner + 3.3 * table
+        kept, block = 0.0, 5 * hidden + 4 * inner + 3.3 * logits
     else:
-        kept, block = places.count * (10 * wide + 6 * wider + 4.5 * inner + 3.3 * table), 0.0
+        kept = places.count * (10 * tokens + 6 * hidden + 4.5 * inner + 3.3 * logits)
+        block = 0.0
     forward, backward = STREAMS
     return Costs(
         products=_products(model, video, again=float(remat)),
@@ -176,8 +177,8 @@ def costs(model: ModelConfig, share: Share) -> Costs:
     )
 
 
-def _seen(model: ModelConfig) -> int:
-    """Return how many map tokens a query looks at."""
+def _attended(model: ModelConfig) -> int:
+    """Return the number of map tokens that one query attends to."""
     config, tokens = _settings(model), model.memory.tokens
     return min(config.looks, tokens) if config.positions == "projective" else tokens
 
@@ -190,7 +191,7 @@ def _products(model: ModelConfig, video: int, again: float) -> tuple[Product, ..
     mixed = depth * video * width * (2 * inner + place + 2 * config.mlp_ratio * width)
     keys = depth * 2 * tokens * inner * inner
     modulation = video_times(model) * depth * places.time * (4 * width + 2 * inner)
-    attention = depth * video * _seen(model) * (2 * inner + place)
+    attention = depth * video * _attended(model) * (2 * inner + place)
     ends = video * _ray_channels(model) * (width // 2) + tokens * token_channels(model) * inner
     return (
         Product("memory", "linear", camera, 2.0, again, ("context",)),

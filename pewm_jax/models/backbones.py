@@ -1,14 +1,13 @@
-"""The denoiser: every backbone behind one interface, chosen by the type of its settings.
+"""Backbones: every denoiser behind one interface, chosen by the type of its settings.
 
 A backbone is a ``BackboneSettings`` and a module (or object) with
 
     init(settings, key, in_channels, out_channels) -> params
     apply(settings, params, x_BthwC, time_B, conditioning, readers) -> prediction_BthwC
-    SHARDING                                    rules over ``backbone/…`` paths, as ``tree`` reads
+    SHARDING                                    rules over ``backbone/…`` paths, see ``tree``
     costs(model, share, *, trained) -> Costs    see ``models.costs``
 
-and ``settings.places`` says where it lets a reader of the memory run. ``models.dit_backbone`` is an
-example.
+and ``settings.places`` says where a memory reader may run. ``models.dit_backbone`` is an example.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ from pewm_jax.types import Array, Params
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Conditioning:
-    """What a denoiser is told besides the noisy latents; what is None is not there.
+    """The inputs of a denoiser besides the noisy latents; a field that is None is unused.
 
     Attributes:
-        joined_BthwC: joined to the channels of the input.
+        joined_BthwC: concatenated to the channels of the noisy latents.
         modulation_BtE: added to the time embedding, per latent frame.
-        tokens_BLC: text tokens, or others of their width.
+        tokens_BLC: text tokens, or other tokens of the same width.
     """
 
     joined_BthwC: Array | None = None
@@ -42,11 +41,13 @@ class Conditioning:
 
 @dataclasses.dataclass(frozen=True)
 class Readers:
-    """What reads the memory, made by a reader's ``prepare`` for one batch of clips.
+    """The functions with which a backbone reads the memory, for one batch of clips.
+
+    A reader's ``prepare`` makes it.
 
     Attributes:
         block: ``(params of one place, video_BND, time_BE) -> video_BND``, run at each of the
-            backbone's places on the video tokens, in the order of ``token_layout``; None for none.
+            backbone's places on the video tokens, in the order of ``token_layout``; or None.
             ``time_BE`` may be (B, t, E), one embedding for each token in time.
         params: the parameters of ``block``, stacked over places.
         added_BND: added to the embedded video tokens before the first block.
@@ -57,12 +58,12 @@ class Readers:
     added_BND: Array | None = None
 
 
-NOBODY = Readers()
-"""Nobody reads."""
+NO_READERS = Readers()
+"""No memory is read."""
 
 
 def init(config: BackboneSettings, key: Array, in_channels: int, out_channels: int) -> Params:
-    """Return random parameters for so many latent channels in and out."""
+    """Return random parameters of a backbone with these input and output channels."""
     return functions(config).init(config, key, in_channels, out_channels)
 
 
@@ -72,17 +73,17 @@ def apply(
     x_BthwC: Array,
     time_B: Array,
     conditioning: Conditioning,
-    readers: Readers = NOBODY,
+    readers: Readers = NO_READERS,
 ) -> Array:
-    """Denoise.
+    """Predict from noisy latents what the noise asks for.
 
     Args:
         config: the backbone.
         params: its parameters.
         x_BthwC: (B, t, h, w, C) noisy latents; their dtype is the dtype of the computation.
-        time_B: (B,) what the noise tells the network, or (B, t), one for each latent frame.
-        conditioning: what is joined, added and given as tokens.
-        readers: who reads the memory.
+        time_B: (B,) noise level as the network sees it, or (B, t), one for each latent frame.
+        conditioning: further inputs.
+        readers: how the memory is read.
 
     Returns:
         (B, t, h, w, C_out) prediction.
@@ -91,7 +92,7 @@ def apply(
 
 
 def joined(x_BthwC: Array, conditioning: Conditioning) -> Array:
-    """Return the noisy latents with what is joined to their channels."""
+    """Return the noisy latents with the conditioning concatenated to their channels."""
     if conditioning.joined_BthwC is None:
         return x_BthwC
     return jnp.concatenate([x_BthwC, conditioning.joined_BthwC], -1)

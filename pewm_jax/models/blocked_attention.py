@@ -1,11 +1,11 @@
-"""Attention without a table of all its logits: in pieces on a CPU, cuDNN's kernel on a GPU.
+"""Attention that never stores all logits: in blocks on a CPU, by cuDNN's kernel on a GPU.
 
-With a thousand tokens and more the logits of all heads are hundreds of megabytes. A CPU then spends
-its time moving them: one head and a block of queries at a time is the same arithmetic, three times
-as fast there (1,370 tokens, 6 heads of 64). And for gradients a table per layer would have to be
-kept: here only the logarithm of each query's normaliser is, and the backward pass computes a
-piece's weights again from it (as FlashAttention does, Dao et al. 2022), which is also faster than
-reading them back. Other platforms get the same formula without the loops.
+With a thousand tokens or more, the logits of all heads take hundreds of megabytes, and a CPU spends
+its time moving them. Computing one head and one block of queries at a time is the same arithmetic
+and three times as fast there (1,370 tokens, 6 heads of 64). The backward pass keeps only the
+logarithm of each query's normaliser and recomputes the attention weights from it (FlashAttention,
+Dao et al. 2022). This saves memory and is faster than reading the weights back. Other platforms use
+the same formula without the loops.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def attention(
     implementation: Implementation = "auto",
     real_M: np.ndarray | None = None,
 ) -> Array:
-    """Scaled dot-product attention (B, K, N, d), in pieces where the platform is a CPU.
+    """Scaled dot-product attention (B, K, N, d), in blocks on a CPU.
 
     Over several devices (``placement``) batch, heads and queries are split; each device has all
     keys and values of its clips and heads, and computes alone.
@@ -46,10 +46,10 @@ def attention(
         v_BKMD: values.
         implementation: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `xla` runs anywhere,
             `auto` takes cudnn where it works.
-        real_M: where the keys stand that count; None where all do.
+        real_M: indices of the keys that are not padding; None if all are real.
 
     Raises:
-        UserError: cudnn is asked for where it does not work.
+        UserError: `cudnn` is asked for and cannot run here.
     """
 
     def alone(q: Array, k: Array, v: Array) -> Array:
@@ -63,7 +63,7 @@ def attention(
 
 
 def _alone(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implementation) -> Array:
-    """Do ``attention`` on one device."""
+    """Compute ``attention`` on one device."""
     batch, heads, queries, _ = q_BKND.shape
     works = has_flash() and fits_flash(q_BKND)
     if implementation == "cudnn" and not works:
@@ -82,7 +82,7 @@ def _alone(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implemen
 
 
 def has_flash() -> bool:
-    """Whether what computes is an NVIDIA GPU with cuDNN's flash attention."""
+    """Tell whether JAX runs on an NVIDIA GPU that has cuDNN's flash attention."""
     if jax.default_backend() != "gpu":
         return False
     capability = str(getattr(jax.local_devices()[0], "compute_capability", ""))
@@ -90,7 +90,7 @@ def has_flash() -> bool:
 
 
 def fits_flash(q_BKND: Array) -> bool:
-    """Whether cuDNN's flash attention takes heads like these."""
+    """Tell whether cuDNN's flash attention supports this dtype and head size."""
     channels = q_BKND.shape[-1]
     sixteen = q_BKND.dtype in (jnp.bfloat16, jnp.float16)
     return sixteen and channels <= 128 and channels % 8 == 0
@@ -149,8 +149,8 @@ def _piece_backward(
 ) -> tuple[Array, Array, Array]:
     """Return the gradients of q, k and v; ``shared`` is (grad · output) of each query.
 
-    Those of k and v are computed transposed: a CPU transposes the few channels of q much faster
-    than the many weights.
+    The gradients of k and v are computed transposed: transposing the few channels of q is much
+    faster on a CPU than transposing the many weights.
     """
     weights = jnp.exp(_logits(q, k) - normaliser)
     slope = weights * (_dot("...nd,...md->...nm", grad, v) - shared)
@@ -164,7 +164,7 @@ def _piece_backward(
 
 
 def _cut(x_BKNC: Array, blocks: int) -> Array:
-    """(B, K, N, C) → (K, blocks, B, n, C); padding is zero, for which all gradients are zero."""
+    """(B, K, N, C) → (K, blocks, B, n, C); the zero padding has zero gradients."""
     batch, heads, queries, channels = x_BKNC.shape
     size = -(-queries // blocks)
     padded = jnp.pad(x_BKNC, ((0, 0), (0, 0), (0, blocks * size - queries), (0, 0)))
@@ -179,7 +179,7 @@ def _join(x_KnBsC: Array, queries: int) -> Array:
 
 
 def _pieces_forward(q: Array, k: Array, v: Array, *, blocks: int) -> tuple[Array, Array]:
-    """Do ``_piece_forward`` for one head and one of ``blocks`` blocks of queries at a time."""
+    """Run ``_piece_forward`` one head and one block of queries at a time, in ``blocks`` blocks."""
 
     def head(inputs: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         q_nBsD, k_BMD, v_BMD = inputs
@@ -199,7 +199,7 @@ def _pieces_backward(
     *,
     blocks: int,
 ) -> tuple[Array, Array, Array]:
-    """Do ``_piece_backward`` one head and one block of queries at a time."""
+    """Run ``_piece_backward`` one head and one block of queries at a time."""
 
     def head(inputs: tuple[tuple[Array, ...], Array, Array]) -> tuple[Array, Array, Array]:
         (q_nBsD, *rest), k_BMD, v_BMD = inputs
@@ -221,5 +221,5 @@ def _pieces_backward(
 
 
 def in_pieces(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, blocks: int) -> Array:
-    """Attention one head and one of ``blocks`` blocks of queries at a time, on any platform."""
+    """Compute attention in ``blocks`` blocks of queries, one head at a time, on any platform."""
     return _pieces_forward(q_BKND, k_BKMD, v_BKMD, blocks=blocks)[0]

@@ -1,4 +1,4 @@
-"""Cameras steer: Plücker rays, relative to the first camera, joined to the denoiser's input."""
+"""Control by cameras: Plücker rays relative to the first camera, concatenated to the input."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def rays(model: ModelConfig, camera: Camera) -> Array:
 def condition(
     model: ModelConfig, params: Params, observed: Frames, control: Control
 ) -> Conditioning:
-    """Join the cameras' rays to the input; see ``controls.condition``."""
+    """Return the cameras' rays as input channels; see ``controls.condition``."""
     del params, observed
     return Conditioning(joined_BthwC=rays(model, control.camera))
 
 
 def costs(model: ModelConfig, share: Share, *, trained: bool) -> Costs:
-    """Return the costs: none that count."""
+    """Return the costs, which are negligible."""
     del model, share, trained
     return Costs()

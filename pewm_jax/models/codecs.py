@@ -2,15 +2,15 @@
 
 A codec is a ``CodecSettings`` and a module (or object) with
 
-    init(settings, key) -> params                                    {} where there are none
+    init(settings, key) -> params                                    {} if it has none
     encode(settings, params, video_BTHWC, *, condition=False) -> latents_BthwC
     decode(settings, params, latents_BthwC) -> video_BTHWC
     SHARDING                                                         rules over ``codec/…`` paths
     costs(model, share) -> Costs                                     see ``models.costs``
 
-and keeps the frame rule q·k + 1 frames → k + 1 latent frames. Colour and depth are encoded
-separately and their channels concatenated, as the paper does with the VAE, which sees depth as a
-grey picture (``DEPTH_AS_GREY``).
+and obeys the frame rule: q·k + 1 frames become k + 1 latent frames. Colour and depth are encoded
+separately and their channels concatenated, as in the paper. The VAE sees depth as a grey image
+(``DEPTH_AS_GREY``).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def encode(
         params: its parameters, empty for the pixel codec.
         video_BTHWC: (B, q·k + 1, H, W, C) float in [−1, 1]; C is 3 where depth is encoded as grey.
         condition: whether the latents are what the denoiser is conditioned on. CogVideoX-1.5's
-            image-to-video model divides these by the scaling factor instead of multiplying.
+            image-to-video model divides such latents by the scaling factor; others multiply.
 
     Returns:
         (B, k + 1, H/s, W/s, C') latents.
@@ -102,8 +102,8 @@ def encode_rgbd(
         """Encode clip by clip, so that memory does not grow with the batch."""
         if len(videos[0]) == 1:
             return together(weights, *videos)
-        one = jax.lax.map(lambda clip: together(weights, *(x[None] for x in clip)), videos)
-        return one[:, 0]
+        latents = jax.lax.map(lambda clip: together(weights, *(x[None] for x in clip)), videos)
+        return latents[:, 0]
 
     traced = isinstance(rgb_BTHWC, Tracer)
     return placement.by_batch(one_by_one if traced else together, weights, rgb_BTHWC, signal)
@@ -123,12 +123,15 @@ def decode_rgbd(model: ModelConfig, params: Params, latents_BthwC: Array) -> tup
 
 
 def measured(model: ModelConfig, depth_BTHW: Array) -> Array:
-    """Return what share of each depth latent was measured, to weigh its error with.
+    """Return the share of measured pixels in each depth latent, the weight of its error.
 
-    Shape (B, t, h, w, C) that broadcasts with the depth channels of ``encode_rgbd``. Where a
-    channel is one pixel, as the pixel codec's are, that is 0 or 1; other latents count by the share
-    of their pixels.
+    The shape (B, t, h, w, C) broadcasts with the depth channels of ``encode_rgbd``. If a channel is
+    one pixel, as in the pixel codec, the share is 0 or 1. Otherwise it is the mean over the
+    latent's pixels.
     """
+    own = getattr(functions(model.codec), "measured", None)
+    if own is not None:
+        return own(model.codec, depth_BTHW)
     valid = (depth_BTHW > 0).astype(jnp.float32)[..., None]
     share = fold(valid, model.codec.spatial, model.codec.temporal)
     return share if model.codec.PIXELWISE else share.mean(-1, keepdims=True)

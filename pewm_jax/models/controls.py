@@ -1,13 +1,13 @@
-"""What steers a clip: every control behind one interface, chosen by the type of its settings.
+"""Controls, which steer a clip: one interface, chosen by the type of the settings.
 
 A control is a ``ControlSettings`` and a module (or object) with
 
-    init(model, key) -> params                       {} where there are none
+    init(model, key) -> params                       {} if it has none
     condition(model, params, observed, control) -> Conditioning
     SHARDING                                         rules over ``control/…`` paths
     costs(model, share, *, trained) -> Costs         see ``models.costs``
 
-and ``settings.channels(model)`` says how many channels it joins to the denoiser's input.
+and ``settings.channels(model)``, the number of channels it adds to the denoiser's input.
 ``models.camera_control`` is an example.
 """
 
@@ -26,15 +26,15 @@ def init(model: ModelConfig, key: Array) -> Params:
 def condition(
     model: ModelConfig, params: Params, observed: Frames, control: Control
 ) -> Conditioning:
-    """Say what steers a batch of clips.
+    """Turn what steers a batch of clips into inputs of the denoiser.
 
     Args:
         model: the model.
         params: the control's parameters, empty where it has none.
         observed: (B, 1) the observed first frames, colours in [−1, 1].
-        control: (B, T) cameras, and (B, T − 1) actions where there are any.
+        control: (B, T) cameras, and (B, T − 1) actions if there are any.
 
     Returns:
-        What is joined to the input, added to the modulation (per latent frame), given as tokens.
+        Input channels, modulation (per latent frame) and tokens.
     """
     return functions(model.control).condition(model, params, observed, control)

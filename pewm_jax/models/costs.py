@@ -1,12 +1,11 @@
-"""What a network costs, by the sum on paper (derived in ``docs/scaling.md``).
+"""What a network costs, computed by formulas (derived in ``docs/scaling.md``).
 
-Each network says its own costs, beside its functions; ``pewm_jax.worlds.costs`` adds them up for a
+Each network states its costs beside its functions. ``pewm_jax.worlds.costs`` collects them for a
 stage of training, and ``pewm_jax.scaling`` turns them into bytes, seconds and a plan.
 
-Every matrix product is a line: its multiply-adds for one clip, and whether training goes back
-through it. A product whose input depends on something trained is done again, backwards, for the
-gradient of that input; one whose weights are trained once more for theirs; and what the backward
-pass recomputes (``remat``) is done once more forwards.
+Every matrix product is listed with its multiply-adds for one clip. The backward pass repeats that
+work once if the gradient of the product's input is needed, once more if its weights are trained,
+and once more if its forward pass is recomputed (``remat``).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import dataclasses
 from pewm_jax.config import ModelConfig
 
 SPLIT = ("tensor", "context")
-"""The axes of the mesh that split a block."""
+"""The mesh axes that split the work of a block."""
 FLOAT = 4
 """Bytes of a float32."""
 
@@ -27,12 +26,12 @@ class Product:
 
     Attributes:
         part: the network, as its parameters are named: ``backbone``, ``memory``, ``codec`` …
-        kind: ``linear``, ``attention`` or ``convolution``: what hardware runs at different speed.
-        macs: multiply-adds of one clip, forward, all layers together.
-        backward: forward passes' worth of the gradients.
-        again: forward passes' worth of what the backward pass computes again.
-        axes: the axes of the mesh, beside the batch's, over which it is split; devices along
-            others do the same work.
+        kind: ``linear``, ``attention`` or ``convolution``; hardware runs them at different speeds.
+        macs: multiply-adds of the forward pass of one clip, summed over all layers.
+        backward: work of the gradients, in forward passes.
+        again: work of what the backward pass recomputes, in forward passes.
+        axes: the mesh axes, besides the batch's, that split it; devices along other axes repeat
+            the same work.
     """
 
     part: str
@@ -44,47 +43,47 @@ class Product:
 
     @property
     def model(self) -> float:
-        """FLOPs of one clip that the mathematics needs: forward and gradients."""
+        """FLOPs of one clip without recomputation: forward pass and gradients."""
         return 2 * self.macs * (1 + self.backward)
 
     @property
     def hardware(self) -> float:
-        """FLOPs of one clip that are done."""
+        """FLOPs of one clip with recomputation."""
         return 2 * self.macs * (1 + self.backward + self.again)
 
 
 @dataclasses.dataclass(frozen=True)
 class Share:
-    """What one device has of a step; by default one clip on one device, in float32.
+    """One device's share of a step; by default one clip on one device, in float32.
 
     Attributes:
-        clips: clips of this device.
-        tensor: parts that heads and hidden channels are split into.
-        context: parts that video tokens are split into.
-        wide: bytes of an activation.
-        flash: whether attention's logits stay in a kernel (cuDNN's) and are not held.
+        clips: clips per device.
+        tensor: devices that share heads and hidden channels.
+        context: devices that share video tokens.
+        activation_bytes: bytes of one activation value.
+        flash: whether a fused kernel (cuDNN's) computes attention, so that no logits are stored.
     """
 
     clips: float = 1.0
     tensor: int = 1
     context: int = 1
-    wide: int = FLOAT
+    activation_bytes: int = FLOAT
     flash: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class Costs:
-    """What a network costs in one step on one device; all but ``products`` in bytes.
+    """The costs of a network in one step on one device, in bytes except for ``products``.
 
     Attributes:
-        products: its matrix products, of one clip on all devices that share it.
-        kept: activations kept from the forward pass for the backward pass.
-        block: what the backward pass needs besides, at its peak.
-        held: what a frozen network holds while it runs, before anything else is there.
-        streamed: read and written by element-wise work.
-        summed: added up over the devices along ``tensor``.
-        gathered: gathered along ``context``, forwards.
-        scattered: scattered along ``context``, backwards.
+        products: its matrix products, for one clip, summed over the devices that share the clip.
+        kept: activations stored by the forward pass for the backward pass.
+        block: further memory at the peak of the backward pass.
+        held: memory of a frozen encoder while it runs, before the denoiser starts.
+        streamed: traffic to memory of element-wise work.
+        summed: summed over the devices along ``tensor`` (all-reduce).
+        gathered: gathered along ``context`` in the forward pass.
+        scattered: reduce-scattered along ``context`` in the backward pass.
     """
 
     products: tuple[Product, ...] = ()
@@ -98,14 +97,14 @@ class Costs:
 
 
 def video_tokens(model: ModelConfig) -> tuple[int, int]:
-    """Return how many video tokens a clip has: in time, and in each of these."""
+    """Return the video tokens of a clip: (tokens in time, tokens at each time)."""
     (t, h, w), places = model.latent_shape, model.backbone.places
     return -(-t // places.patch_t), (h // places.patch) * (w // places.patch)
 
 
 def video_times(model: ModelConfig) -> int:
-    """Return how many time embeddings the video tokens of a clip have: one, or one per frame."""
-    apart = model.control.MODULATES or getattr(model.noise, "per_frame", False)
+    """Return the number of time embeddings of a clip: 1, or one per token in time."""
+    apart = model.control.MODULATES or model.noise.per_frame
     return video_tokens(model)[0] if apart else 1
 
 

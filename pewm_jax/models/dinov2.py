@@ -2,7 +2,7 @@
 
 The reference is ``Dinov2Model`` and ``Dinov2WithRegistersModel``. (The original repository shifts
 the interpolation of position embeddings by a tenth of a patch in its models without registers;
-``transformers`` does not, and neither do we. At the pretrained size all three agree.)
+``transformers`` does not, nor does this module. At the pretrained size all three agree.)
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from pewm_jax.types import Array, Params
 MEAN_3 = (0.485, 0.456, 0.406)
 """ImageNet's mean colour in [0, 1], which DINOv2 subtracts."""
 STD_3 = (0.229, 0.224, 0.225)
-"""ImageNet's standard deviation of colours, by which it divides."""
+"""ImageNet's standard deviation of colours, by which DINOv2 divides."""
 
 
 class Block(nn.Module):
-    """Pre-norm attention and feed-forward, each scaled per channel before it is added."""
+    """Pre-norm attention and feed-forward, each with a learned scale per channel (LayerScale)."""
 
     config: DINOv2Config
 
@@ -60,7 +60,7 @@ class Block(nn.Module):
 
 
 def _norm(config: DINOv2Config, name: str | None = None) -> nn.LayerNorm:
-    """Layer norm in float32; the plain variance, since some channels of DINOv2 are large."""
+    """Layer norm in float32, with the exact variance because some channels of DINOv2 are large."""
     return nn.LayerNorm(
         epsilon=config.epsilon, dtype=jnp.float32, use_fast_variance=False, name=name
     )
@@ -70,7 +70,7 @@ def init(config: DINOv2Config, key: Array) -> Params:
     """Initialise: float32, blocks stacked over layers.
 
     The tree: ``patch_embed`` (a linear layer on p·p·3 pixels), ``cls_token`` (D,),
-    ``register_tokens`` (R, D) where there are any, ``position_embed`` (1 + g², D) with the class
+    ``register_tokens`` (R, D) if there are any, ``position_embed`` (1 + g², D) with the class
     token's first, ``blocks``, ``norm``.
     """
     patch_key, cls_key, register_key, position_key, blocks_key = jax.random.split(key, 5)
@@ -96,7 +96,7 @@ def init(config: DINOv2Config, key: Array) -> Params:
 def apply(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
     """Return the patch tokens after the final layer norm.
 
-    A pure function of each image, so a batch sharded over devices stays where it is.
+    Images are independent, so a batch that is sharded over devices stays sharded.
 
     Args:
         config: the encoder.
@@ -109,7 +109,7 @@ def apply(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
         (B, H/p, W/p, D) in the images' dtype.
 
     Raises:
-        UserError: a size that is not a multiple of the patch, or images of another kind.
+        UserError: a size is not a multiple of the patch, or the array is not of RGB floats.
     """
     images = jnp.asarray(images_BHWC)
     height, width = _grid(config, images.shape, images.dtype)
@@ -126,16 +126,16 @@ def apply(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
     tokens = jnp.concatenate([first, tokens], 1)
 
     tokens = _blocks(config, params["blocks"], tokens)
-    kept = tokens[:, 1 + config.registers :]
-    normed: Array = _norm(config).apply({"params": params["norm"]}, kept)
+    patch_tokens = tokens[:, 1 + config.registers :]
+    normed: Array = _norm(config).apply({"params": params["norm"]}, patch_tokens)
     return normed.reshape(-1, height, width, config.width).astype(dtype)
 
 
 def _blocks(config: DINOv2Config, blocks: Params, tokens_BND: Array) -> Array:
-    """Run all layers; on a CPU that is the only device image by image.
+    """Run all layers; on a single CPU device, image by image.
 
-    What one image needs stays in a processor's cache: four at 518² take a seventh less time than
-    together. Over several devices the batch may be spread, and must not be cut.
+    The activations of one image fit into the processor's cache: four images of 518² take a seventh
+    less time one by one. With several devices the batch may be sharded and is not cut.
     """
 
     def body(x_BND: Array, layer: Params) -> tuple[Any, None]:
@@ -159,7 +159,7 @@ def load(folder: Path) -> tuple[DINOv2Config, Params]:
         The configuration and NumPy parameters in the stored dtype.
 
     Raises:
-        UserError: something is absent or damaged, or the two do not fit.
+        UserError: a file is absent or damaged, or the weights do not fit the configuration.
     """
     if not (folder / "config.json").is_file():
         raise UserError(
@@ -177,13 +177,13 @@ def load(folder: Path) -> tuple[DINOv2Config, Params]:
 def preprocess(rgb_BHWC: Array, size: int | tuple[int, int], patch: int = 14) -> Array:
     """Turn colours in [−1, 1] into the encoder's input: resized, then normalised as ImageNet.
 
-    Bicubic with antialiasing, as the published models' image processor resizes, but to the given
-    size without a crop, so that every pixel of the camera keeps its features.
+    Resizing is bicubic with antialiasing, as in the published models' image processor. Nothing is
+    cropped, so every pixel of the camera has features.
 
     Args:
         rgb_BHWC: (B, H, W, 3) floats in [−1, 1].
-        size: pixels of the sides, one number or (height, width), multiples of the patch; 518 gives
-            37×37 patches.
+        size: the new size in pixels, one number or (height, width), multiples of the patch; 518
+            gives 37×37 patches.
         patch: pixels per patch.
 
     Returns:
@@ -211,10 +211,10 @@ def patchify(images_BHWC: Array, patch: int) -> Array:
 def interpolate_positions(
     config: DINOv2Config, position_embed: Array, height: int, width: int
 ) -> Array:
-    """Return the class token's position and those of a grid of another size, (1 + h·w, D).
+    """Return the position embeddings of a grid of another size, (1 + h·w, D), class token first.
 
-    Bicubic in float32, pixels at half-integers, edges repeated without antialiasing and cut off
-    with it (``torch.nn.functional.interpolate``, which cuts a filter short in the latter case).
+    Bicubic in float32 with pixels at half-integers, as ``torch.nn.functional.interpolate``: at the
+    edges pixels are repeated without antialiasing, and the filter is truncated with it.
     """
     if (height, width) == (config.grid, config.grid):
         return position_embed
@@ -238,11 +238,11 @@ def resize_matrix(old: int, new: int, antialias: bool) -> np.ndarray:
     matrix = np.zeros((new, old))
     for row in range(new):
         if antialias:
-            wide = max(scale, 1.0)
+            stretch = max(scale, 1.0)
             centre = scale * (row + 0.5)
-            low = max(int(centre - 2 * wide + 0.5), 0)
-            taps = np.arange(low, min(int(centre + 2 * wide + 0.5), old))
-            weights = _keys((taps - centre + 0.5) / wide, -0.5)
+            low = max(int(centre - 2 * stretch + 0.5), 0)
+            taps = np.arange(low, min(int(centre + 2 * stretch + 0.5), old))
+            weights = _keys((taps - centre + 0.5) / stretch, -0.5)
             weights /= weights.sum()
         else:
             centre = scale * (row + 0.5) - 0.5
@@ -262,7 +262,7 @@ def _keys(x: np.ndarray, a: float) -> np.ndarray:
 
 
 def _grid(config: DINOv2Config, shape: tuple[int, ...], dtype: jnp.dtype) -> tuple[int, int]:
-    """Return patches down and across, or say why the images do not fit."""
+    """Return the (rows, columns) of patches, or refuse images that do not fit."""
     if len(shape) != 4 or shape[3] != 3 or not jnp.issubdtype(dtype, jnp.floating):
         raise UserError(
             f"DINOv2 got images of shape {shape} and dtype {dtype}: give it floats of shape "

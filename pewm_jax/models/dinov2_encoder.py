@@ -21,7 +21,7 @@ SHARDING = (
     (r"encoder/cls_token", P()),
     (r"encoder/.*/(scale|bias)", P()),
 )
-"""Gathered when it computes, each device its own frames."""
+"""Weights are stored sharded and gathered for use; each device encodes its own frames."""
 
 colours = principal_colours
 
@@ -38,7 +38,7 @@ def encode(config: DINOv2EncoderConfig, params: Params, rgb_THWC: Array) -> Arra
 
 
 def preprocessing(config: DINOv2EncoderConfig) -> dict[str, Any]:
-    """Return what the features depend on beside the weights."""
+    """Return what the features depend on besides the weights."""
     return {
         "network": configuration.to_dict(config.network),
         "preprocessing": {
@@ -51,7 +51,7 @@ def preprocessing(config: DINOv2EncoderConfig) -> dict[str, Any]:
 
 
 def costs(model: ModelConfig, share: Share, frames: int) -> Costs:
-    """Return the costs of all context frames, with the resizing of the pictures."""
+    """Return the costs of encoding all context frames, including their resizing."""
     del share
     config, clip = model.memory.encoder, model.clip
     assert isinstance(config, DINOv2EncoderConfig)

@@ -1,8 +1,8 @@
 """The diffusion transformer, equal to CogVideoX's.
 
-Text and video tokens attend jointly; each kind has its own adaptive-layernorm modulation from the
-time embedding ("expert" adaptive layernorm) around one shared layernorm; queries and keys are
-normalised per head; a 3D rotary embedding turns the video tokens. The blocks are scanned, so
+Text and video tokens attend jointly. Each kind has its own adaptive-layernorm modulation from the
+time embedding ("expert" adaptive layernorm) around one shared layernorm. Queries and keys are
+normalised per head, and video tokens get a 3D rotary embedding. The blocks are scanned, so
 compile time does not grow with depth. Reference: ``CogVideoXTransformer3DModel`` of diffusers;
 ``pewm_jax.config.published`` has the settings of its five published networks.
 
@@ -28,18 +28,18 @@ BlockExpert = Callable[[Any, Array, Array], Array]
 """``expert(layer_params, video_BND, time_BE) -> video_BND``, run after a block."""
 
 OFS = 2.0
-"""The second scalar that 1.5-5B-I2V is always given."""
+"""The value of the second scalar input, with which 1.5-5B-I2V was trained."""
 
 KEEP = jax.checkpoint_policies.dots_saveable
-"""What a block keeps for its backward pass: matrix products. Norms, modulation, rotation and gelu
-are cheaper to compute again than to stack over layers and read back."""
+"""What a block stores for its backward pass: the results of matrix products. Norms, modulation,
+rotation and gelu are cheaper to recompute than to store for every layer and read back."""
 
 
 def open_gates(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
-    """Start shifts and scales at 0 and both gates at 1: a plain pre-norm transformer.
+    """Initialise shifts and scales to 0 and both gates to 1: a plain pre-norm transformer.
 
-    With gates at zero a backbone trained from nothing spends its first hundreds of steps on
-    opening them. (Only the memory blocks must start as the identity.)
+    With gates at zero, a backbone trained from scratch spends hundreds of steps on opening them.
+    (Only the memory blocks must start as the identity.)
     """
     del key
     part = jnp.arange(shape[0]) // (shape[0] // 6)
@@ -57,9 +57,9 @@ class LayerNormZero(nn.Module):
 
         Args:
             tokens_BND: (B, L + N, D) text and video tokens.
-            time_BE: (B, E) time embedding; or (B, 1 + t, E): that of the text, and one for each
-                token in time.
-            layout: their order.
+            time_BE: (B, E) time embedding; or (B, 1 + t, E): the text's, then one for each token
+                in time.
+            layout: the order of the tokens.
         """
         width, dtype = tokens_BND.shape[-1], tokens_BND.dtype
         linear = nn.Dense(
@@ -73,7 +73,7 @@ class LayerNormZero(nn.Module):
         video, text = jnp.split(layers.to_tokens(modulation), 2, -1)
         if time_BE.ndim == 3:
             text = jnp.broadcast_to(
-                text[:, :1], (len(text), layout.parts * layout.length, text.shape[-1])
+                text[:, :1], (len(text), layout.parts * layout.text_per_part, text.shape[-1])
             )
             joined = layout.join(text, layout.per_token(video[:, 1:]))
             video = text = joined
@@ -109,7 +109,7 @@ class Block(nn.Module):
     def before(
         self, tokens_BND: Array, time_BE: Array, angles_NR: Array | None, layout: TokenLayout
     ) -> tuple[Array, Array, Array, Array]:
-        """Return queries, keys and values (B, K, N, d), and the gate of what they will find."""
+        """Return queries, keys and values (B, K, N, d), and the gate of the attention's output."""
         heads, width, dtype = self.config.heads, self.config.width, tokens_BND.dtype
         normed, gate = LayerNormZero(name="norm1")(tokens_BND, time_BE, layout)
         q, k, v = (
@@ -129,7 +129,7 @@ class Block(nn.Module):
         gate: Array,
         layout: TokenLayout,
     ) -> Array:
-        """Return the tokens with what attention found, and the feed-forward network's."""
+        """Add the outputs of attention and of the feed-forward network to the tokens."""
         width, dtype = self.config.width, tokens_BND.dtype
         mixed = layers.merge_heads(mixed_BKND)
         tokens_BND += gate * layers.dense(width, dtype, "to_out")(mixed)
@@ -139,7 +139,7 @@ class Block(nn.Module):
 
 
 class Ends(nn.Module):
-    """What stands before and after the blocks: embeddings and the output layer."""
+    """The layers before and after the blocks: embeddings and the output projection."""
 
     config: DiTConfig
     out_channels: int
@@ -175,7 +175,7 @@ class Ends(nn.Module):
         return tokens, time
 
     def project(self, video_BND: Array, time_BE: Array, layout: TokenLayout | None = None) -> Array:
-        """Return output patches (B, N, C·p_t·p·p); ``time_BE`` is as for the blocks."""
+        """Return output patches (B, N, C·p_t·p·p) with ``time_BE`` as in the blocks."""
         modulation = placement.constrain(self.modulate_out(nn.silu(time_BE)), "batch")
         if layout is not None and time_BE.ndim == 3:
             modulation = layout.per_token(modulation[:, 1:])
@@ -230,11 +230,11 @@ def init(config: DiTConfig, key: Array) -> Params:
     """Initialise: float32, output layer at zero, blocks stacked over layers.
 
     Raises:
-        UserError: ``in_channels`` or ``out_channels`` is 0 (left to the world model to fill).
+        UserError: ``in_channels`` or ``out_channels`` is 0 (to be filled in by the world model).
     """
     if not (config.in_channels and config.out_channels):
         raise UserError(
-            "dit.in_channels and dit.out_channels are 0, which leaves them to the world model: "
+            "in_channels and out_channels are 0, which leaves them to the world model: "
             "set both to build the transformer alone (CogVideoX: 16 and 16)."
         )
     ends_key, blocks_key = jax.random.split(key)
@@ -268,7 +268,7 @@ def apply(
     modulation_BtE: Array | None = None,
     added_BND: Array | None = None,
 ) -> Array:
-    """Denoise.
+    """Predict from noisy latents.
 
     Args:
         config: the transformer.
@@ -276,21 +276,21 @@ def apply(
         latents_BthwC: (B, t, h, w, C) input latents; h and w are multiples of the patch, t of
             ``patch_t``. Their dtype is the dtype of the computation.
         text_BLD: (B, L, text_dim) text tokens.
-        timesteps_B: (B,) diffusion times, 0 … train_steps − 1, or one for all; or (B, t'), one
+        timesteps_B: (B,) diffusion times, 0 … train_steps − 1, or a single one; or (B, t'), one
             for each of the t' = t / ``patch_t`` tokens in time (the text gets their mean).
-        ofs_B: (B,) second scalar of 1.5-5B-I2V; None is the 2.0 it was trained with.
-        expert: run after every block on the video tokens (the memory block), in the order that
-            ``layout_of`` says.
+        ofs_B: (B,) second scalar of 1.5-5B-I2V; None means ``OFS``.
+        expert: a function of the video tokens that runs after every block (the memory block);
+            tokens are in the order of ``layout_of``.
         expert_params: the experts' parameters, stacked over layers.
-        modulation_BtE: (B, t', E) added to the time embedding of each token in time (not to that
-            of the text).
+        modulation_BtE: (B, t', E) added to the time embedding of each token in time, not to the
+            text's.
         added_BND: (B, N, D) added to the embedded video tokens, in the order of ``layout_of``.
 
     Returns:
         (B, t, h, w, C_out) prediction in the latents' dtype; C_out is the output layer's.
 
     Raises:
-        UserError: sizes that this network cannot take, when traced.
+        UserError: the network cannot take these sizes; raised while tracing.
     """
     grid = positions.token_grid(config, latents_BthwC.shape)
     _require_inputs(config, params, latents_BthwC, text_BLD, ofs_B)
@@ -305,7 +305,7 @@ def apply(
         ends_params,
         patchify(latents_BthwC, patch, patch_t),
         text_BLD.astype(dtype),
-        _for_all(jnp.asarray(timesteps_B), batch),
+        _per_clip(jnp.asarray(timesteps_B), batch),
         jnp.broadcast_to(jnp.asarray(OFS if ofs_B is None else ofs_B), (batch,)),
         method="embed",
     )
@@ -336,13 +336,13 @@ def apply(
     return unpatchify(layout.gather(patches), frames, height, width, patch, patch_t)
 
 
-def _for_all(timesteps: Array, batch: int) -> Array:
-    """Give every clip its time, or its times."""
+def _per_clip(timesteps: Array, batch: int) -> Array:
+    """Broadcast times (B,), (1,), () or (B, t) to one row per clip."""
     return jnp.broadcast_to(timesteps, (batch, *timesteps.shape[1:]))
 
 
 def _frame_times(time: Array, modulation_BtE: Array | None) -> Array:
-    """Return (B, 1 + t, E): the time embedding of the text, and that of each token in time."""
+    """Return the time embeddings (B, 1 + t, E): the text's, then one for each token in time."""
     base, frames = (time, time[:, None]) if time.ndim == 2 else (time.mean(1), time)
     if modulation_BtE is not None:
         frames = frames + modulation_BtE.astype(time.dtype)
@@ -350,9 +350,9 @@ def _frame_times(time: Array, modulation_BtE: Array | None) -> Array:
 
 
 def layout_of(config: DiTConfig, shape: tuple[int, ...], length: int) -> TokenLayout:
-    """Return the order of the tokens of latents of a shape (B, t, h, w, C) and L text tokens."""
+    """Return the token order for latents of shape (B, t, h, w, C) and ``length`` text tokens."""
     frames, rows, columns = positions.token_grid(config, shape)
-    return TokenLayout.here(length, frames, rows * columns)
+    return TokenLayout.for_mesh(length, frames, rows * columns)
 
 
 def _require_inputs(

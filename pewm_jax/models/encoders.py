@@ -1,14 +1,14 @@
-"""Image features for the memory: every encoder behind one interface, by the type of its settings.
+"""Image encoders, whose features the memory keeps: one interface, chosen by the settings' type.
 
 An encoder is an ``EncoderSettings`` and a module (or object) with
 
-    init(settings, key) -> params                       {} where there are none
+    init(settings, key) -> params                       {} if it has none
     encode(settings, params, rgb_THWC) -> features_ThwF
-    preprocessing(settings) -> {"network": …, "preprocessing": …}, plain values that a cache of
-                                                        features is compared by
-    colours(features_VF) -> (V, 3)                      colours to draw features with
+    preprocessing(settings) -> {"network": …, "preprocessing": …}
+                                                        plain values that identify a feature cache
+    colours(features_VF) -> (V, 3)                      colours in which features are drawn
     SHARDING                                            rules over ``encoder/…`` paths
-    costs(model, share, frames) -> Costs                of a clip with so many frames of context
+    costs(model, share, frames) -> Costs                for a clip with this many context frames
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ def encode(config: EncoderSettings, params: Params, rgb_THWC: Array) -> Array:
 
 
 def colours(config: EncoderSettings, features_VF: Array) -> np.ndarray:
-    """Return (V, 3) colours in [−1, 1] to draw features with."""
+    """Return (V, 3) colours in [−1, 1] in which features are drawn."""
     return functions(config).colours(np.asarray(features_VF, np.float32))
 
 
 def principal_colours(features_VF: np.ndarray) -> np.ndarray:
-    """Draw features that hold no colour by their three principal components, in [−1, 1]."""
+    """Return colours in [−1, 1] from the features' first three principal components."""
     centred = features_VF - features_VF.mean(0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     shown = centred @ axes[:3].T

@@ -1,6 +1,6 @@
-"""The layers that the diffusion transformer and the memory blocks share.
+"""Layers shared by the diffusion transformer and the memory blocks.
 
-Flax linen modules; parameters are float32, computation is in the dtype of the activations, norms
+Flax linen modules. Parameters are float32, computation is in the dtype of the activations, norms
 and softmax are in float32.
 """
 
@@ -20,7 +20,7 @@ zeros = nn.initializers.zeros_init()
 
 
 def dense(features: int, dtype: jnp.dtype, name: str, *, zero: bool = False) -> nn.Dense:
-    """Return a linear layer with bias; ``zero`` starts it at exactly nothing."""
+    """Return a linear layer with bias; ``zero`` initialises its kernel to zero."""
     kernel = zeros if zero else nn.initializers.lecun_normal()
     return nn.Dense(features, dtype=dtype, kernel_init=kernel, name=name)
 
@@ -51,7 +51,7 @@ def modulate(x: Array, shift_BD: Array, scale_BD: Array) -> Array:
 
 
 def to_tokens(x_BD: Array) -> Array:
-    """Let (B, D) stand for all tokens; (B, N, D), one for each, stays."""
+    """Add a token axis to (B, D); return (B, N, D) unchanged."""
     return x_BD[:, None] if x_BD.ndim == 2 else x_BD
 
 

@@ -1,14 +1,14 @@
 """The memory expert block: how the denoiser reads the map (paper, Eq. 2 and Fig. 2).
 
-``concat(H, camera embedding)`` and the map tokens M each get their own adaptive layernorm from
-the time embedding; H attends to M; α_M gates the attention, α_H the feed-forward:
+``concat(H, camera embedding)`` and the map tokens M each get an adaptive layernorm from the time
+embedding. H attends to M. α_M gates the attention, α_H the feed-forward network:
 
     H ← H + α_M · Attn(H_norm, M_norm)
     H ← H + α_H · FF(LN(H))
 
-Both gates start at zero, so that a fresh block is the identity and stage 2 begins exactly at the
-stage-1 model. Where a clip's map is empty the whole block is skipped, exactly; with the memory
-``none`` every map is, so there the block keeps what does not read the map, its feed-forward.
+Both gates start at zero, so a fresh block is the identity and stage 2 begins exactly at the stage-1
+model. If a clip's map is empty, the block returns its input unchanged. With the memory ``none``
+every map is empty; there the feed-forward network still runs, so that the block can be trained.
 """
 
 from __future__ import annotations
@@ -28,24 +28,25 @@ from pewm_jax.models.token_layout import TokenLayout
 from pewm_jax.types import Array
 
 PEAK = 12.0
-"""Logit by which a cell in the middle of the patch looked at stands out at the start."""
+"""Initial logit advantage of a cell that projects to the centre of the query's patch."""
 
 QUERIES: placement.Names = ("batch", "heads", "tokens")
 KEYS: placement.Names = ("batch", "heads")
 VIEWS: placement.Names = ("batch", None, "heads")
 MIXED: placement.Names = ("batch", "tokens", "heads")
-"""How queries, keys, what cameras see and what is found are split over devices."""
+"""How queries, keys, the tokens in view and the results are split over devices."""
 
 
 def masked_attention(logits: Array, mask: Array, sink_K: Array, values: Array) -> Array:
-    """Attend to what is not masked, or to nothing.
+    """Attend to unmasked tokens, or to none.
 
-    Softmax over the last axis with one more, valueless, entry per head (the sink): a query that
-    finds nothing, or for which everything is masked, gets zeros, never NaN.
+    The softmax over the last axis has one extra entry per head whose value is zero (the sink). A
+    query may attend to it instead of to tokens, and if all tokens are masked the result is zero,
+    never NaN.
 
     Args:
         logits: (..., K, n, M) float32.
-        mask: broadcastable to logits, True where a token may be seen.
+        mask: broadcastable to logits, True where a token may be attended to.
         sink_K: (K,) logit of the sink.
         values: (..., K, M, d).
     """
@@ -77,14 +78,14 @@ class SinusoidAttention(nn.Module):
 
 
 def _read_all(q: Array, k: Array, v: Array, valid_BM: Array, sink_K: Array) -> Array:
-    """Return what every query finds among all map tokens, (B, N, K·d); on one device."""
+    """Return the attention over all map tokens, (B, N, K·d), on one device."""
     logits = jnp.einsum("bknd,bkmd->bknm", q, k, preferred_element_type=jnp.float32)
     logits = logits / math.sqrt(q.shape[-1])
     return layers.merge_heads(masked_attention(logits, valid_BM[:, None, None], sink_K, v))
 
 
 class ProjectiveAttention(nn.Module):
-    """Cross-attention by where cells project, per latent frame and camera."""
+    """Cross-attention by image position: cells are projected into each latent frame's cameras."""
 
     heads: int
     head_dim: int
@@ -92,7 +93,7 @@ class ProjectiveAttention(nn.Module):
     """Patches along the longer side of the image."""
 
     def _constant(self, key: Array, shape: tuple[int, int]) -> Array:
-        """Start queries so that each head peaks at its own random place within the patch."""
+        """Initialise queries so that each head peaks at its own random point of the patch."""
         heads, head_dim = shape
         offset = jax.random.uniform(key, (heads, 2), minval=-0.5, maxval=0.5)
         angle = offset[..., None] * jnp.asarray(frequencies(head_dim, self.grid))
@@ -101,10 +102,10 @@ class ProjectiveAttention(nn.Module):
 
     @nn.compact
     def __call__(self, video_BND: Array, memory_BMD: Array, seen: Sightings) -> Array:
-        """Return (B, N, K·(d + 3)): attended features and mean place per head."""
+        """Return (B, N, K·(d + 3)): attended features and mean position, per head."""
         dtype, heads, head_dim = video_BND.dtype, self.heads, self.head_dim
         width = heads * head_dim
-        through = np.arange(heads) % seen.angles_tqJR.shape[2]
+        camera_of_head = np.arange(heads) % seen.angles_tqJR.shape[2]
 
         q = layers.split_heads(layers.dense(width, dtype, "to_q")(video_BND), heads)
         k = layers.split_heads(layers.dense(width, dtype, "to_k")(memory_BMD), heads)
@@ -126,42 +127,47 @@ class ProjectiveAttention(nn.Module):
 
         q, k = norm(q, "norm_q"), norm(k, "norm_k")
         views = (seen.index_tqJ, seen.angles_tqJR, seen.place_tqJ3, seen.visible_tqJ)
-        views = tuple(x[:, :, through] for x in views)
-        born = (q_constant, k_constant, k_depth, nearer, sink)
+        views = tuple(x[:, :, camera_of_head] for x in views)
+        learned = (q_constant, k_constant, k_depth, nearer, sink)
         read = placement.local(
             _read_seen, (QUERIES, KEYS, KEYS, VIEWS, ("tokens",), ("heads",)), MIXED
         )
-        return read(q, k, v, views, layout_angles(seen.query_angles_nR), born)
+        return read(q, k, v, views, pad_angles(seen.query_angles_nR), learned)
 
 
-def layout_angles(angles_nR: Array) -> Array:
-    """Fill up the angles of a frame's patches to a multiple of the parts that tokens come in."""
+def pad_angles(angles_nR: Array) -> Array:
+    """Pad the angles of a frame's patches to a multiple of the devices that share tokens."""
     more = -len(angles_nR) % placement.parts("tokens")
     return jnp.pad(angles_nR, ((0, more), (0, 0))) if more else angles_nR
 
 
 def _look(x_BKMD: Array, index_BtKJ: Array) -> Array:
-    """Return (B, t, K, J, d): the tokens that each head's camera looks at."""
+    """Return (B, t, K, J, d): the tokens in view of each head's camera."""
     rows = jax.vmap(jax.vmap(lambda x, i: x[i]))(x_BKMD, index_BtKJ.swapaxes(1, 2))
     return rows.swapaxes(1, 2)
 
 
 def _read_seen(
-    q: Array, k: Array, v: Array, views: tuple[Array, ...], turns_nR: Array, born: tuple[Array, ...]
+    q: Array,
+    k: Array,
+    v: Array,
+    views: tuple[Array, ...],
+    turns_nR: Array,
+    learned: tuple[Array, ...],
 ) -> Array:
-    """Return what every query finds where its frame's cameras look; on one device.
+    """Return the attention over the tokens in view of each frame's cameras, on one device.
 
     Args:
         q: (B, K, t·n, d) queries, normalised, without position.
         k: (B, K, M, d) keys, normalised, without position.
         v: (B, K, M, d) values.
-        views: index, angles, place and visibility of the J tokens that each head looks at in each
-            frame, (B, t, K, J, …).
+        views: index, angles, position and visibility of the J tokens in view of each head in
+            each frame, (B, t, K, J, …).
         turns_nR: (n, d/2) rotary angles of the n patches of a frame.
-        born: the parameters ``q_constant, k_constant, k_depth, nearer, sink``.
+        learned: the parameters ``q_constant``, ``k_constant``, ``k_depth``, ``nearer``, ``sink``.
     """
     index, angles, place, visible = views
-    q_constant, k_constant, k_depth, nearer, sink = born
+    q_constant, k_constant, k_depth, nearer, sink = learned
     dtype, (batch, heads, _, head_dim) = q.dtype, q.shape
     log_z = place[..., 2]
     q = q + q_constant[:, None].astype(dtype)
@@ -188,7 +194,7 @@ class MemoryBlock(nn.Module):
     layout: TokenLayout
     """The order of the video tokens."""
     always: bool = False
-    """Whether a clip whose memory is empty keeps what does not read it, the feed-forward."""
+    """Whether the feed-forward network also runs for clips whose memory is empty."""
 
     @nn.compact
     def __call__(
@@ -200,16 +206,16 @@ class MemoryBlock(nn.Module):
         valid_BM: Array,
         seen: Sightings | None,
     ) -> Array:
-        """Read the map.
+        """Update the video tokens with what the map holds.
 
         Args:
             video_BND: (B, N, D) hidden states H.
-            time_BE: (B, E) time embedding, or (B, t, E), one for each token in time (the map's
-                tokens get their mean).
+            time_BE: (B, E) time embedding, or (B, t, E), one for each token in time (map tokens
+                get their mean).
             camera_BNC: (B, N, C) camera embedding of each video token.
             memory_BMD: (B, M, Dm) embedded map tokens.
             valid_BM: (B, M) bool, False tokens contribute nothing.
-            seen: the tokens through the clip's cameras, for projective positions.
+            seen: the tokens in view of the clip's cameras, for projective positions.
         """
         config, dtype = self.config, video_BND.dtype
         width, memory_width = video_BND.shape[-1], memory_BMD.shape[-1]

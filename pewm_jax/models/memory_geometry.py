@@ -1,15 +1,14 @@
-"""Where each remembered cell stands, as memory attention wants to know it.
+"""Positions of remembered cells for memory attention.
 
 Two schemes:
 
 * ``sinusoid`` (the paper): a 3D sinusoid of the cell's position, concatenated to its features. The
-  position is in the camera of the clip's first frame or, with ``frame`` world, absolute.
-* ``projective``: every cell is moved into the camera of every frame. Its image coordinates give
-  the key a rotary embedding, the centre of a patch gives the query the same one, so that a query's
-  logit is largest for cells that project into its patch; cells behind the camera or far outside
-  the image are masked. A latent frame covers several frames, each with its own camera: head k
-  looks through camera k mod q. Nothing here changes when cameras and map are moved together by a
-  rigid motion.
+  position is relative to the clip's first camera or, with ``frame`` world, absolute.
+* ``projective``: every cell is projected into the camera of every frame. Keys get a rotary
+  embedding of their image coordinates, queries one of their patch's centre. A query's logit is
+  therefore largest for cells that project into its patch. Cells behind the camera or far outside
+  the image are masked. A latent frame covers q frames, each with its own camera, and head k uses
+  camera k mod q. Moving cameras and map together by a rigid motion changes nothing.
 """
 
 from __future__ import annotations
@@ -28,9 +27,9 @@ from pewm_jax.models import placement
 from pewm_jax.types import Array, Camera
 
 MARGIN = 0.25
-"""Cells up to this share of the image outside its border are still looked at."""
+"""Cells may project outside the image by up to this share of its size."""
 BEHIND = 1.4
-"""A cell this many times farther than the nearest one in its patch of the image is hidden."""
+"""A cell counts as hidden if it is this many times farther than the nearest one in its patch."""
 NEAREST_M = 0.05
 """Cells nearer to the camera plane than this are masked, metres."""
 
@@ -38,13 +37,13 @@ NEAREST_M = 0.05
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sightings:
-    """Map tokens as seen through the cameras of every token's frames.
+    """Map tokens as seen by the cameras of a clip.
 
-    A token covers t = 1 latent frame of q cameras, or ``patch_t`` latent frames and as many
-    times the cameras; below, t and q count tokens in time and cameras of a token.
+    Below, t counts tokens in time, and q the cameras of one token: those of its ``patch_t`` latent
+    frames.
 
     Attributes:
-        index_tqJ: (B, t, q, J) int32, which of the M map tokens are looked at.
+        index_tqJ: (B, t, q, J) int32, which of the M map tokens each camera attends to.
         angles_tqJR: (B, t, q, J, d/2) rotary angles of the keys.
         place_tqJ3: (B, t, q, J, 3) image coordinates in [−1, 1] and log depth.
         visible_tqJ: (B, t, q, J) bool.
@@ -61,7 +60,7 @@ class Sightings:
 def group_latents(cameras_tqX: Array, patch_t: int) -> Array:
     """Join the cameras of ``patch_t`` latent frames: (t, q, …) → (⌈t/p⌉, p·q, …).
 
-    As the denoiser pads, the first latent frame is repeated at the front where t is no multiple.
+    If t is not a multiple of p, the first latent frame is repeated in front, as in the denoiser.
     """
     missing = -cameras_tqX.shape[0] % patch_t
     padded = jnp.concatenate([cameras_tqX[:1]] * missing + [cameras_tqX])
@@ -82,7 +81,7 @@ def _angles(uv_2: Array, head_dim: int, grid: int) -> Array:
 
 
 def hidden(uv_TM2: Array, z_TM: Array, visible_TM: Array, size: np.ndarray, bin_px: int) -> Array:
-    """Return (T, M) bool: cells behind a much nearer one in the same bin of the image.
+    """Return (T, M) bool: cells that are behind a much nearer cell in the same image bin.
 
     A coarse depth buffer with bins of ``bin_px`` pixels. Cells are thick, so a cell counts as
     hidden only where it is ``BEHIND`` times farther than the nearest one.
@@ -97,17 +96,17 @@ def hidden(uv_TM2: Array, z_TM: Array, visible_TM: Array, size: np.ndarray, bin_
 
 
 def patch_pixels(model: ModelConfig) -> int:
-    """Return the pixels of a video token, each way."""
+    """Return the side of a video token in pixels."""
     return model.codec.spatial * model.backbone.places.patch
 
 
 def sightings(
     model: ModelConfig, config: AttentionConfig, camera: Camera, points_M3: Array, valid_M: Array
 ) -> Sightings:
-    """Choose and place the map tokens that each camera of a batch of clips looks at.
+    """Choose the map tokens that each camera attends to, and compute their positions.
 
-    Each camera gets the J = ``looks`` nearest tokens in its view; tokens hidden behind much nearer
-    ones come last.
+    Each camera gets the J = ``looks`` nearest tokens in view. Tokens hidden behind much nearer ones
+    come last.
 
     Args:
         model: the model.
@@ -161,11 +160,12 @@ def sinusoid_3d(
 ) -> Array:
     """Return (B, M, 6·10) sines and cosines of the positions of map tokens.
 
-    Wavelengths are geometric from 4 cells' smallest side to 4 × the map's largest extent.
+    The 10 wavelengths grow geometrically from 4 × a cell's smallest side to 4 × the map's largest
+    extent.
 
     Args:
-        model: the model; of its memory, cell size and extent.
-        config: the reader; ``frame`` says where positions count from.
+        model: the model; its memory gives cell size and extent.
+        config: the reader; ``frame`` is the origin of positions.
         camera: (B, T) cameras of the clips.
         points_M3: (B, M, 3) world points, metres.
     """

@@ -1,7 +1,7 @@
-"""The small image encoder: the mean colour c of each patch and its negative, no weights.
+"""The small image encoder, without weights: the mean colour c of each patch, and −c.
 
-The map keeps the maximum over all views, so a cell holds the largest value of each channel and,
-through −c, the smallest one too; their middle is the cell's colour.
+The map keeps the maximum over all views. A cell therefore holds the largest value of each colour
+channel and, through −c, the smallest one. The middle of the two is the cell's colour.
 """
 
 from __future__ import annotations
@@ -55,6 +55,6 @@ def colours(features_VF: np.ndarray) -> np.ndarray:
 
 
 def costs(model: ModelConfig, share: Share, frames: int) -> Costs:
-    """Return the costs: none that count."""
+    """Return the costs, which are negligible."""
     del model, share, frames
     return Costs()

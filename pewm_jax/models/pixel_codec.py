@@ -1,7 +1,7 @@
 """The pixel codec: no parameters, exactly invertible.
 
-Space-to-depth of s × s pixels and a temporal fold of q frames, with CogVideoX's frame rule (q·k + 1
-frames → k + 1 latent frames; the first frame is alone in its latent, repeated q times).
+Space-to-depth of s × s pixels, and q frames folded into one latent frame, with CogVideoX's frame
+rule: q·k + 1 frames become k + 1 latent frames, the first of which holds q copies of frame 0.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def init(config: PixelConfig, key: Array) -> Params:
 
 
 def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return the costs: none that count."""
+    """Return the costs, which are negligible."""
     del model, share
     return Costs()
 

@@ -1,11 +1,11 @@
-"""Where activations live: names of an array's axes → axes of the mesh.
+"""How activations are sharded: from names of array axes to axes of the mesh.
 
-The networks say what an axis *is* (``batch``, ``tokens``, ``heads``, ``hidden``), and the table
-below says over which axes of the mesh such an axis is split. The mesh is the one in context
-(``jax.set_mesh``). Without one, on a mesh of one device, and inside of what already runs device by
-device (``local``, ``by_batch``), everything here does nothing.
+Networks name the axes of their arrays (``batch``, ``tokens``, ``heads``, ``hidden``). The table
+below says over which mesh axes each name is split. The mesh is the current one (``jax.set_mesh``).
+These functions do nothing without a mesh, on a mesh of one device, and inside code that already
+runs device by device (``local``, ``by_batch``).
 
-An axis that its part of the mesh does not divide evenly is left whole.
+An axis is left whole if its size is not a multiple of its mesh axes.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ AXES_OF: dict[str, tuple[str, ...]] = {
 """The mesh axes along which an axis of this name is split."""
 
 Names = Sequence[str | None]
-"""The name of each leading axis of an array; None, and what is not named, stays whole."""
+"""The names of an array's leading axes; axes named None, and the remaining axes, stay whole."""
 
 
 def _sizes() -> dict[str, int]:
-    """Return the sizes of the mesh's axes that the compiler distributes over; empty without any."""
+    """Return the sizes of the mesh axes that the compiler shards over; {} if there are none."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty or mesh.size == 1 or any(kind != AxisType.Auto for kind in mesh.axis_types):
         return {}
@@ -44,20 +44,20 @@ def _sizes() -> dict[str, int]:
 
 
 def parts(name: str) -> int:
-    """Return into how many parts an axis of this name is split here."""
+    """Return the number of parts that the current mesh splits an axis of this name into."""
     sizes = _sizes()
     return math.prod(sizes.get(axis, 1) for axis in AXES_OF[name])
 
 
 def _split(name: str | None, size: int) -> tuple[str, ...] | None:
-    """Return the mesh axes for an axis of this name and size; None leaves it whole."""
+    """Return the mesh axes that split an axis of this name and size; None if it stays whole."""
     if name is None or size % parts(name):
         return None
     return tuple(axis for axis in AXES_OF[name] if _sizes().get(axis, 1) > 1) or None
 
 
 def constrain(x: Array, *names: str | None) -> Array:
-    """Keep an array split as its axes' names say.
+    """Constrain an array's sharding to what the names of its axes say.
 
     Args:
         x: any array.
@@ -70,19 +70,19 @@ def constrain(x: Array, *names: str | None) -> Array:
 
 
 def local(function: Callable[..., Any], takes: Sequence[Names], gives: Names) -> Callable[..., Any]:
-    """Run a function on each device's part of its arguments.
+    """Make a function run on each device's part of its arguments.
 
-    What is not split is gathered before, and computed by each of the devices that share it. The
-    compiler does not look inside, so loops over batch or heads stay on the device.
+    Axes that are not split are gathered first, and every device computes them. The compiler does
+    not shard inside the function, so loops over batch or heads stay on the device.
 
     Args:
-        function: of arrays, or trees of arrays whose leaves are all split alike.
-        takes: the names of the axes of each argument. An axis is split where all that bear its
-            name can be.
-        gives: those of the result, or of all results.
+        function: takes arrays, or trees of arrays whose leaves are all split alike.
+        takes: the axis names of each argument. A name is split only if all axes with that name
+            can be.
+        gives: the axis names of the result, or of every result.
 
     Returns:
-        The function of whole arrays.
+        The same function, for whole arrays.
     """
 
     def run(*arguments: Any) -> Any:
@@ -94,12 +94,12 @@ def local(function: Callable[..., Any], takes: Sequence[Names], gives: Names) ->
                 for name, size in zip(names, leaf.shape, strict=False):
                     sizes.setdefault(name or "", set()).add(size)
 
-        alone = tuple(axis for axis, size in _sizes().items() if size == 1)
+        unsplit = tuple(axis for axis, size in _sizes().items() if size == 1)
 
         def spec(names: Names) -> P:
             axes = [_split(n, math.gcd(*sizes[n])) if n else None for n in names]
-            if names and names[0]:  # else gradients would be summed over these axes, for nothing
-                axes[0] = (*(axes[0] or ()), *(a for a in alone if a not in (axes[0] or ())))
+            if names and names[0]:  # avoids summing gradients over axes of size 1
+                axes[0] = (*(axes[0] or ()), *(a for a in unsplit if a not in (axes[0] or ())))
             return P(*axes)
 
         mapped = jax.shard_map(
@@ -118,8 +118,8 @@ def by_batch(function: Callable[..., Any], whole: Any, *batched: Any) -> Any:
 
     Args:
         function: pure; its results have the batch as their leading axis.
-        whole: what every example needs, as weights: gathered, once.
-        batched: trees of arrays with the batch as their leading axis; all of one batch.
+        whole: what every example needs, such as weights; gathered once.
+        batched: trees of arrays with the batch as their leading axis.
 
     Returns:
         ``function``'s results, split along the batch.

@@ -1,4 +1,4 @@
-"""Where a video token is: rotary angles, fixed sinusoids and a learned table.
+"""Positions of video tokens: rotary angles, fixed sinusoids, a learned table.
 
 Angles and sinusoids are computed on the host while tracing, from the configuration and the token
 grid. Reference: ``get_3d_rotary_pos_embed``, ``get_resize_crop_region_for_grid``,
@@ -28,7 +28,7 @@ def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
         shape: (B, t, h, w, C) of the latents.
 
     Raises:
-        UserError: in one sentence, for every illegal size.
+        UserError: the network cannot take latents of this size.
     """
     if len(shape) != 5:
         raise UserError(f"The latents have shape {tuple(shape)}: give (batch, t, h, w, channels).")
@@ -82,17 +82,17 @@ def sample_grid(config: DiTConfig) -> Grid:
 
 
 def sample_tokens(config: DiTConfig) -> int:
-    """Return the number of video tokens at the sample size."""
+    """Return the number of video tokens at the size that the network was trained for."""
     return math.prod(sample_grid(config))
 
 
 def add(config: DiTConfig, tokens_BND: Array, table_ND: Array | None, grid: Grid) -> Array:
-    """Add to text and video tokens the positions that do not turn them: a table or a sinusoid.
+    """Add the positions that are not rotary to text and video tokens: a table or a sinusoid.
 
     Args:
         config: the transformer.
         tokens_BND: (B, L + t·h·w, D) text tokens, then video tokens.
-        table_ND: (L + N, D) the learned table of the sample size, where there is one.
+        table_ND: (L + N, D) the learned table of the sample size, if there is one.
         grid: t, h, w.
     """
     length, dtype = tokens_BND.shape[1] - math.prod(grid), tokens_BND.dtype
@@ -179,9 +179,9 @@ def rope_angles(
 
 
 def joint_angles(config: DiTConfig, grid: Grid, length: int) -> np.ndarray | None:
-    """Return (length + t·h·w, head_dim/2) angles of text (0: not turned) and video tokens.
+    """Return (length + t·h·w, head_dim/2) rotary angles of text tokens (0) and video tokens.
 
-    None where the network turns nothing.
+    None if the network has no rotary embedding.
     """
     if config.positions == "sincos":
         return None
@@ -190,7 +190,7 @@ def joint_angles(config: DiTConfig, grid: Grid, length: int) -> np.ndarray | Non
 
 
 def sincos_table(config: DiTConfig, grid: Grid) -> np.ndarray:
-    """Return (t·h·w, D): 1/4 of the channels say the time, 3/8 the column, 3/8 the row."""
+    """Return (t·h·w, D): 1/4 of the channels encode the time, 3/8 the column, 3/8 the row."""
     frames, rows, columns = (np.arange(n) for n in grid)
     places = (
         frames / config.temporal_interpolation,

@@ -1,11 +1,11 @@
-"""Who reads the memory: every reader behind one interface, chosen by the type of its settings.
+"""Memory readers: one interface, chosen by the type of the settings.
 
 A reader is a ``ReaderSettings`` and a module (or object) with
 
-    init(model, key) -> params                          under ``memory/``; changes nothing at first
+    init(model, key) -> params                          under ``memory/``; has no effect at first
     prepare(model, params, seen, camera, rays_BthwC) -> Readers
     SHARDING                                            rules over ``memory/…`` paths
-    costs(model, share) -> Costs                        of a stage that trains it
+    costs(model, share) -> Costs                        in a stage that trains it
 
 ``models.attention_reader`` is an example.
 """
@@ -18,23 +18,23 @@ from pewm_jax.types import Array, Camera, MapTokens, Params
 
 
 def init(model: ModelConfig, key: Array) -> Params:
-    """Return random parameters with which the reader still changes nothing."""
+    """Return random parameters, initialised so that the reader has no effect yet."""
     return functions(model.memory.reader).init(model, key)
 
 
 def prepare(
     model: ModelConfig, params: Params, seen: MapTokens, camera: Camera, rays_BthwC: Array
 ) -> Readers:
-    """Make ready to read the memories of a batch of clips.
+    """Prepare to read the memories of a batch of clips.
 
     Args:
         model: the model.
         params: the reader's parameters.
-        seen: (B, M) what of the memory conditions each clip.
+        seen: (B, M) map tokens that condition each clip.
         camera: (B, T) cameras of the clips.
         rays_BthwC: their Plücker rays at the latent rate (``camera_control.rays``).
 
     Returns:
-        What the backbone runs.
+        The functions that the backbone calls.
     """
     return functions(model.memory.reader).prepare(model, params, seen, camera, rays_BthwC)

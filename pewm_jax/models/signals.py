@@ -1,4 +1,4 @@
-"""What networks are shown: colours and depth as numbers in [−1, 1], and back."""
+"""Colours and metric depth to network inputs in [−1, 1], and back."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def depth_from_signal(config: ClipConfig, signal: Array) -> Array:
 
 
 def signal_from_rgb(rgb: Array) -> Array:
-    """Map uint8 colours to float32 in [−1, 1]; floats pass through."""
+    """Map uint8 colours to float32 in [−1, 1]; return floats unchanged."""
     if jnp.issubdtype(rgb.dtype, jnp.integer):
         return jnp.asarray(rgb, jnp.float32) / 127.5 - 1
     return jnp.asarray(rgb)

@@ -1,14 +1,14 @@
-"""The order of a clip's tokens: text, then video; or, split over devices, a share of each per part.
+"""The order of a clip's tokens: text, then video; split over devices, a share of both per device.
 
-Attention does not ask in which order tokens stand. So where the mesh splits tokens into X parts,
-each part gets 1/X of the text and 1/X of *every* latent frame, one after the other:
+Attention does not depend on the order of tokens. If the mesh splits tokens into X parts, each part
+gets 1/X of the text and 1/X of *every* latent frame:
 
     one part     text                          frame 0          frame 1 …
     X parts      text[0] frame 0[0] frame 1[0] … | text[1] frame 0[1] frame 1[1] … | …
 
-Then text and video come apart, and frames too, without a token leaving its device. What X does not
-divide is filled up with tokens of zeros, which queries never see (``real``) and which are dropped
-at the end.
+So text and video, and single frames, can be taken apart without moving a token between devices. If
+X does not divide a count, it is padded with zero tokens. They are masked in attention (``real``)
+and dropped at the end.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class TokenLayout:
     """How L text tokens and t·n video tokens are ordered; static.
 
     Attributes:
-        parts: X, into how many parts they are split.
-        text: L.
-        frames: t, frames of video tokens.
-        patches: n, video tokens of a frame.
+        parts: X, number of parts that the tokens are split into.
+        text: L, number of text tokens.
+        frames: t, number of latent frames, counted in tokens.
+        patches: n, video tokens per frame.
     """
 
     parts: int
@@ -39,29 +39,29 @@ class TokenLayout:
     patches: int
 
     @classmethod
-    def here(cls, text: int, frames: int, patches: int) -> TokenLayout:
-        """Return the layout that the mesh in context asks for."""
+    def for_mesh(cls, text: int, frames: int, patches: int) -> TokenLayout:
+        """Return the layout for the current mesh."""
         return cls(placement.parts("tokens"), text, frames, patches)
 
     @property
-    def length(self) -> int:
-        """Return the text tokens of a part, with what fills up."""
+    def text_per_part(self) -> int:
+        """Return the text tokens of a part, with padding."""
         return -(-self.text // self.parts)
 
     @property
-    def wide(self) -> int:
-        """Return a frame's video tokens in a part, with what fills up."""
+    def patches_per_part(self) -> int:
+        """Return the video tokens of one frame in a part, with padding."""
         return -(-self.patches // self.parts)
 
     def spread(self, video_BNC: Array) -> Array:
-        """(B, t·n, C) → (B, X·t·n', C): the share of each part of every frame, part by part."""
+        """(B, t·n, C) → (B, X·t·n', C): each part's share of every frame, part by part."""
         if self.parts == 1:
             return video_BNC
         batch, channels = video_BNC.shape[0], video_BNC.shape[-1]
         grid = video_BNC.reshape(batch, self.frames, self.patches, channels)
-        more = self.parts * self.wide - self.patches
+        more = self.parts * self.patches_per_part - self.patches
         grid = jnp.pad(grid, ((0, 0), (0, 0), (0, more), (0, 0)))
-        grid = grid.reshape(batch, self.frames, self.parts, self.wide, channels)
+        grid = grid.reshape(batch, self.frames, self.parts, self.patches_per_part, channels)
         spread = grid.swapaxes(1, 2).reshape(batch, -1, channels)
         return placement.constrain(spread, "batch", "tokens")
 
@@ -70,20 +70,20 @@ class TokenLayout:
         if self.parts == 1:
             return video_BNC
         batch, channels = video_BNC.shape[0], video_BNC.shape[-1]
-        grid = video_BNC.reshape(batch, self.parts, self.frames, self.wide, channels)
+        grid = video_BNC.reshape(batch, self.parts, self.frames, self.patches_per_part, channels)
         grid = grid.swapaxes(1, 2).reshape(batch, self.frames, -1, channels)
         return grid[:, :, : self.patches].reshape(batch, -1, channels)
 
     def arrange(self, tokens_BNC: Array) -> Array:
-        """(B, L + t·n, C) text, then video, in their own order → in the order of this layout."""
+        """(B, L + t·n, C) text then video tokens → the same tokens in the order of this layout."""
         if self.parts == 1:
             return tokens_BNC
         text, video = jnp.split(tokens_BNC, [self.text], 1)
-        more = self.parts * self.length - self.text
+        more = self.parts * self.text_per_part - self.text
         return self.join(jnp.pad(text, ((0, 0), (0, more), (0, 0))), self.spread(video))
 
     def join(self, text_BLC: Array, video_BNC: Array) -> Array:
-        """Join what ``split`` gives."""
+        """Invert ``split``."""
         if self.parts == 1:
             return jnp.concatenate([text_BLC, video_BNC], 1)
         batch, channels = video_BNC.shape[0], video_BNC.shape[-1]
@@ -100,35 +100,37 @@ class TokenLayout:
         grid = tokens_BNC.reshape(batch, self.parts, -1, channels)
         text, video = (
             placement.constrain(x.reshape(batch, -1, channels), "batch", "tokens")
-            for x in jnp.split(grid, [self.length], 2)
+            for x in jnp.split(grid, [self.text_per_part], 2)
         )
         return text, video
 
     def per_token(self, frames_BtC: Array) -> Array:
-        """(B, t, C) of tokens in time → (B, N, C) of video tokens, each part by part."""
+        """(B, t, C), one vector per token in time → (B, N, C), one per video token."""
         return self.spread(jnp.repeat(frames_BtC, self.patches, 1))
 
     @property
     def is_text(self) -> np.ndarray:
-        """Return (N', 1) bool over all tokens: which are text."""
-        part = np.arange(self.length + self.frames * self.wide) < self.length
+        """Return (N', 1) bool: True for text tokens."""
+        part = (
+            np.arange(self.text_per_part + self.frames * self.patches_per_part) < self.text_per_part
+        )
         return np.tile(part, self.parts)[:, None]
 
     @property
     def real(self) -> np.ndarray | None:
-        """Return where the tokens stand that do not only fill up; None where all do not."""
+        """Return the indices of the tokens that are not padding; None if there is no padding."""
         ones = np.ones((1, self.text + self.frames * self.patches, 1), np.int8)
         marks = _on_host(self, ones)[0, :, 0]
         return None if marks.all() else np.flatnonzero(marks)
 
 
 def _on_host(layout: TokenLayout, tokens: np.ndarray) -> np.ndarray:
-    """Do ``arrange`` with NumPy."""
+    """Compute ``arrange`` with NumPy."""
     text, video = np.split(tokens, [layout.text], 1)
-    more = layout.parts * layout.length - layout.text
+    more = layout.parts * layout.text_per_part - layout.text
     text = np.pad(text, ((0, 0), (0, more), (0, 0))).reshape(1, layout.parts, -1, 1)
     video = video.reshape(1, layout.frames, layout.patches, 1)
-    more = layout.parts * layout.wide - layout.patches
+    more = layout.parts * layout.patches_per_part - layout.patches
     video = np.pad(video, ((0, 0), (0, 0), (0, more), (0, 0)))
-    video = video.reshape(1, layout.frames, layout.parts, layout.wide, 1).swapaxes(1, 2)
+    video = video.reshape(1, layout.frames, layout.parts, layout.patches_per_part, 1).swapaxes(1, 2)
     return np.concatenate([text, video.reshape(1, layout.parts, -1, 1)], 2).reshape(1, -1, 1)

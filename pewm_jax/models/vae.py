@@ -1,16 +1,17 @@
 """CogVideoX's video autoencoder: frames ↔ latents, causal, in chunks of time.
 
-Four frames and 8 × 8 pixels become one latent; the first frame is alone in its latent. A clip is
-encoded in chunks of 8 frames, the first also taking what is left over, and decoded in chunks of 2
-latents, the first taking 3 of an odd number. Every convolution hands its last two frames to the
-next chunk; the group norms see one chunk at a time. So the chunks are part of the result, and also
-what bounds the memory. A latent depends on no later frame but through those norms' statistics,
-which reach to the end of its chunk. Chunks of equal shape share one compiled body: inside ``jit``
-they are scanned; called as they are, ``encode`` and ``decode`` call a compiled function per chunk,
-so that videos of every length share two.
+Four frames of 8 × 8 pixels become one latent; the first frame has a latent of its own. A clip is
+encoded in chunks of 8 frames (the first chunk also takes the remainder) and decoded in chunks of 2
+latents (3 in the first chunk if their number is odd). Every convolution passes its last two frames
+on to the next chunk, but the group norms see one chunk at a time. The chunks therefore affect the
+result, and they bound the memory. A latent depends on later frames only through the statistics of
+the norms, which cover its own chunk.
 
-How many frames? 8N + 1 frames ↔ 2N + 1 latents ↔ 8N + 1 frames. An *even* number of latents has no
-first-frame rule: 2 latents decode to 8 frames, not 5. ``frames_of`` and ``latents_of`` count.
+Chunks of equal shape share one compiled body. Inside ``jit`` they are scanned. Outside, ``encode``
+and ``decode`` call a compiled function per chunk, so two compilations serve videos of any length.
+
+8N + 1 frames become 2N + 1 latents and 8N + 1 frames again. An *even* number of latents has no
+first-frame rule: 2 latents decode to 8 frames, not 5. See ``frames_of`` and ``latents_of``.
 
 Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``. Reference:
 ``AutoencoderKLCogVideoX`` of diffusers.
@@ -36,9 +37,9 @@ from pewm_jax.types import Array, Params
 __all__ = ["decode", "encode", "frames_of", "init", "latents_of", "layout"]
 
 ENCODE_FRAMES = 8
-"""Frames of a chunk to encode."""
+"""Frames per chunk in the encoder."""
 DECODE_LATENTS = 2
-"""Latents of a chunk to decode."""
+"""Latents per chunk in the decoder."""
 LOGVAR_RANGE = (-30.0, 20.0)
 """The logarithm of a latent's variance is clipped to this range."""
 
@@ -46,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 
 def frames_of(config: VAEConfig, latents: int) -> int:
-    """Return how many frames a number of latents decodes to.
+    """Return the number of frames that some latents decode to.
 
     Odd: temporal·(latents − 1) + 1. Even: temporal·latents, without the first-frame rule.
     """
@@ -54,11 +55,11 @@ def frames_of(config: VAEConfig, latents: int) -> int:
 
 
 def latents_of(config: VAEConfig, frames: int) -> int:
-    """Return how many latents a number of frames is encoded to.
+    """Return the number of latents that some frames are encoded to.
 
     Raises:
-        UserError: a number that the reference would fold so that no latent starts at a fixed
-            frame: neither temporal·k + 1 nor a multiple of 8.
+        UserError: the number is neither temporal·k + 1 nor a multiple of 8; the reference would
+            fold such a video irregularly.
     """
     step = config.temporal
     if frames >= 1 and ((frames - 1) % step == 0 or frames % ENCODE_FRAMES == 0):
@@ -70,14 +71,16 @@ def latents_of(config: VAEConfig, frames: int) -> int:
 
 
 def encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
-    """Encode a video; sample latents as mean + exp(logvar / 2)·noise, or take the mean.
+    """Encode a video to the mean and variance of its latents.
+
+    To sample, compute mean + exp(logvar / 2)·noise.
 
     Args:
         config: the autoencoder.
         params: its parameters.
         video_BTHWC: (B, T, H, W, C) floats in [−1, 1]; their dtype is that of the computation.
-            T is 8N + 1; see ``latents_of`` for what else there is. H and W are multiples of
-            ``config.spatial``; rows and columns beyond are lost, as in the reference.
+            T is 8N + 1, or another number that ``latents_of`` accepts. H and W are multiples
+            of ``config.spatial``; excess rows and columns are lost, as in the reference.
 
     Returns:
         Mean and logarithm of the variance, each (B, t, H/8, W/8, z), not scaled.
@@ -112,17 +115,18 @@ def decode(
 ) -> Array:
     """Decode latents to a video.
 
-    Memory: two latents are decoded at a time, however long the clip. Published widths at
-    480 × 720 in float32, 49 frames: 20.8 GiB beside parameters and video, by XLA's plan for a CPU
-    (``python benchmarks/cogvideox_vae.py --memory``). It goes with the pixels of a frame, so with
-    ``config.tiling`` tiles of 240 × 360 need about a quarter.
+    Memory does not grow with the length of the clip, since two latents are decoded at a time. With
+    the published widths, 49 frames of 480 × 720 in float32 need 20.8 GiB besides parameters and
+    video, by XLA's memory analysis on a CPU (``python benchmarks/cogvideox_vae.py --memory``). It
+    is proportional to the pixels of a frame: with ``config.tiling``, tiles of 240 × 360 need about
+    a quarter.
 
     Args:
         config: the autoencoder.
         params: its parameters.
         latents_BthwC: (B, t, h, w, z) latents, divided by ``config.scaling_factor`` again; their
             dtype is that of the computation.
-        frames: how many frames you expect; an even number of latents is surprising otherwise.
+        frames: the number of frames expected; if not given, an even number of latents warns.
 
     Returns:
         (B, T, 8h, 8w, C) video in about [−1, 1]; T = ``frames_of(config, t)``.
@@ -164,7 +168,7 @@ def _decode(config: VAEConfig, params: Params, latents_BthwC: Array) -> Array:
 def _in_chunks(
     step: Callable[[Array, Params], tuple[Array, Params]], x_BTHWC: Array, size: int
 ) -> Array:
-    """Run ``step(chunk, past) → (out, past)`` over chunks of time and join what comes out."""
+    """Run ``step(chunk, past) → (out, past)`` over chunks of time and join the outputs."""
     batch, frames = x_BTHWC.shape[:2]
     more = max(frames // size, 1) - 1
     split = frames - more * size

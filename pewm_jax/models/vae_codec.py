@@ -16,12 +16,12 @@ SHARDING = (
     (r"codec/.*/kernel", P(None, "fsdp")),
     (r"codec/.*/(scale|bias)", P()),
 )
-"""Gathered when it computes, each device its own clips."""
+"""Weights are stored sharded and gathered for use; each device encodes its own clips."""
 
 PASSES = 70
-"""Times that the widest array is read or written while a clip is encoded."""
+"""How often encoding a clip reads or writes as many values as its widest array has."""
 HELD = 4.4
-"""Copies of the widest array of a chunk that are held while it is encoded."""
+"""Peak memory of encoding a chunk, in copies of its widest array."""
 
 init = vae.init
 
@@ -38,7 +38,7 @@ def decode(config: VAEConfig, params: Params, latents_BthwC: Array) -> Array:
     """Decode scaled latents to q·(t − 1) + 1 frames.
 
     Raises:
-        UserError: latents that the VAE decodes to another number of frames.
+        UserError: the VAE decodes this many latents to another number of frames.
     """
     frames = config.temporal * (latents_BthwC.shape[1] - 1) + 1
     return vae.decode(config, params, latents_BthwC / config.scaling_factor, frames=frames)
@@ -50,17 +50,21 @@ def _scale(config: VAEConfig, *, condition: bool) -> float:
 
 
 def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return what encoding colour and depth costs, of the clip and of its first frame."""
+    """Return the costs of encoding colour and depth, of the clip and of its first frame."""
     config, clip = model.codec, model.clip
     assert isinstance(config, VAEConfig)
     macs = sum(_encode_macs(config, model, frames) for frames in (clip.frames, 1))
     pixels = 2 * (clip.frames + 1) * clip.height * clip.width
-    at_once = vae.ENCODE_FRAMES + clip.frames % vae.ENCODE_FRAMES  # the first chunk's
+    at_once = vae.ENCODE_FRAMES + clip.frames % vae.ENCODE_FRAMES  # frames of the first chunk
     chunk = clip.height * clip.width * min(at_once, clip.frames)
     return Costs(
         products=(Product("codec", "convolution", 2 * macs),),
-        streamed=PASSES * share.clips * pixels * config.widths[0] * share.wide,
-        held=HELD * 2 * chunk * config.widths[0] * share.wide,  # colour and depth, of one clip
+        streamed=PASSES * share.clips * pixels * config.widths[0] * share.activation_bytes,
+        held=HELD
+        * 2
+        * chunk
+        * config.widths[0]
+        * share.activation_bytes,  # colour and depth, of one clip
     )
 
 
@@ -82,7 +86,7 @@ def _encode_macs(config: VAEConfig, model: ModelConfig, frames: int) -> float:
 
 
 def _level(path: str, levels: int) -> int:
-    """Return how often the frame was halved where a layer of the encoder works."""
+    """Return how often the frame has been halved before a layer of the encoder."""
     name = path.split("/")[1]
     if name == "conv_in":
         return 0

@@ -1,14 +1,14 @@
-"""Convolutions of videos, in the form that the backend runs fastest.
+"""3D convolutions of videos, in the form that the backend runs fastest.
 
-A causal 3×3×3 convolution is, for output frame t, a sum of three 2D convolutions: of frames t, t+1
-and t+2 of the padded video. Three forms of the same:
+Output frame t of a causal 3×3×3 convolution is a sum of three 2D convolutions, of frames t, t+1 and
+t+2 of the padded video. There are three equivalent forms:
 
-* ``volume``: one 3D convolution; what GPUs and TPUs have a kernel for.
-* ``taps``: the sum, written out.
-* ``winograd``: four neighbouring output frames need twelve 2D convolutions; by the minimal
-  filtering of Winograd (1980) six suffice, of weighted sums of the six input frames. XLA's CPU
-  backend then takes about half the time, and less memory, for three times the rounding error of a
-  3D convolution (2e-6 of the largest value), which float32 has to spare and bfloat16 has not.
+* ``volume``: one 3D convolution, for which GPUs and TPUs have a kernel.
+* ``taps``: the sum of three 2D convolutions.
+* ``winograd``: four neighbouring output frames take twelve 2D convolutions. By Winograd's minimal
+  filtering (1980) six suffice, applied to weighted sums of the six input frames. XLA's CPU backend
+  then needs about half the time and less memory. The rounding error is three times that of a 3D
+  convolution (2e-6 of the largest value), which is acceptable in float32 but not in bfloat16.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from pewm_jax.config import VAEConfig
 from pewm_jax.types import Array, Params
 
 POINTS = (0.0, 1.0, -1.0, 0.5, -2.0)
-"""Where the polynomials behind the minimal filtering are evaluated, besides infinity; small and
-spread, for little rounding."""
+"""Points, besides infinity, at which minimal filtering evaluates polynomials. Small numbers that
+lie apart keep rounding errors small."""
 WORTHWHILE = 256
-"""Output pixels of all frames from which ``winograd`` gains more than it spends on the kernel."""
+"""Fewest output pixels of all frames for which ``winograd`` saves more than it costs."""
 SAME = ((1, 1), (1, 1))
-"""One row and column of zeros on every side."""
+"""Padding by one row or column of zeros on every side."""
 
 
 def convolve(config: VAEConfig, params: Params, padded_BTHWC: Array) -> Array:
@@ -68,10 +68,10 @@ def convolve_2d(params: Params, x_BTHWC: Array, stride: int, padding: Sequence) 
 
 
 def convolve_doubled(params: Params, x_BTHWC: Array) -> Array:
-    """``convolve_2d`` of frames of double height and width (nearest), without making them.
+    """Upsample frames twofold (nearest) and apply ``convolve_2d``, without storing the upsampled.
 
-    In a doubled frame a 3×3 window sees 2×2 cells, so each of the four places of a pixel within
-    its cell is a 2×2 convolution of the small frame: 16 products in place of 36.
+    A 3×3 window of an upsampled frame covers 2×2 different pixels. Each of the four output pixels
+    of an input pixel is therefore a 2×2 convolution of the input: 16 products instead of 36.
 
     Args:
         params: ``kernel`` (3, 3, C, D) and ``bias``.
@@ -80,7 +80,7 @@ def convolve_doubled(params: Params, x_BTHWC: Array) -> Array:
     Returns:
         (B, T, 2H, 2W, D).
     """
-    dtype, kernel = x_BTHWC.dtype, params["kernel"].astype(jnp.float32)  # sums need its bits
+    dtype, kernel = x_BTHWC.dtype, params["kernel"].astype(jnp.float32)  # for exact sums
     batch, frames, height, width, _ = x_BTHWC.shape
     rows = []
     for first in (kernel[0], kernel[1] + kernel[2]), (kernel[0] + kernel[1], kernel[2]):
@@ -128,13 +128,13 @@ def _frames(
 
 def _taps(padded_BTHWC: Array, kernel: Array) -> Array:
     """Sum of three convolutions, in float32."""
-    frames, wide = padded_BTHWC.shape[1] - 2, jnp.dtype(jnp.float32)
+    frames, float32 = padded_BTHWC.shape[1] - 2, jnp.dtype(jnp.float32)
     inputs = [padded_BTHWC[:, k : k + frames] for k in range(3)]
-    return sum(_frames(x, kernel[k], 1, SAME, wide) for k, x in enumerate(inputs))
+    return sum(_frames(x, kernel[k], 1, SAME, float32) for k, x in enumerate(inputs))
 
 
 def _winograd(padded_BTHWC: Array, kernel: Array) -> Array:
-    """Convolve in tiles of 4, 3 or 2 frames, each size once for all its tiles."""
+    """Convolve in tiles of 4, 3 or 2 frames; tiles of one size are computed together."""
     parts, start = [], 0
     for size, count in _split(padded_BTHWC.shape[1] - 2):
         end = start + size * count
@@ -148,7 +148,7 @@ def _winograd(padded_BTHWC: Array, kernel: Array) -> Array:
 
 
 def _split(frames: int) -> list[tuple[int, int]]:
-    """Cut a number of frames into tiles: (size, count), with as few convolutions as possible."""
+    """Split frames into tiles, as (size, count) pairs, with as few convolutions as possible."""
     fours, rest = divmod(frames, 4)
     if rest == 1 and fours:
         fours, threes, rest = (fours - 2, 3, 0) if fours > 1 else (0, 1, 2)
@@ -158,14 +158,14 @@ def _split(frames: int) -> list[tuple[int, int]]:
 
 
 def _tiles(padded_BTHWC: Array, kernel: Array, size: int) -> Array:
-    """Tiles of ``size`` output frames by size + 2 convolutions each."""
+    """Compute tiles of ``size`` output frames with size + 2 convolutions each."""
     batch, frames, height, width, _ = padded_BTHWC.shape
-    count, wide = (frames - 2) // size, jnp.dtype(jnp.float32)
+    count, float32 = (frames - 2) // size, jnp.dtype(jnp.float32)
     out_of, weigh, into = minimal_filter(size)
     inputs = [padded_BTHWC[:, i : i + size * (count - 1) + 1 : size] for i in range(size + 2)]
     weighed = jnp.einsum("aj,jhwcd->ahwcd", np.float32(weigh), kernel)
     products = [
-        _frames(_combine(row, inputs), weighed[a].astype(padded_BTHWC.dtype), 1, SAME, wide)
+        _frames(_combine(row, inputs), weighed[a].astype(padded_BTHWC.dtype), 1, SAME, float32)
         for a, row in enumerate(into)
     ]
     out = jnp.stack([_combine(row, products) for row in out_of], 2)
@@ -177,8 +177,8 @@ def minimal_filter(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return float64 matrices of Winograd's F(size, 3) for a three-tap filter.
 
     ``out_of @ ((weigh @ kernel) * (into @ inputs))`` is the correlation of size + 2 inputs with 3
-    taps. By transposing Toom and Cook's product of polynomials: evaluate at size + 1 points and at
-    infinity, multiply, interpolate.
+    taps. It is the transpose of Toom-Cook multiplication of polynomials: evaluate at size + 1
+    points and at infinity, multiply, interpolate.
 
     Returns:
         out_of (size, size + 2), weigh (size + 2, 3), into (size + 2, size + 2).

@@ -1,8 +1,8 @@
 """The layers of the video autoencoder, channels last.
 
-A causal layer sees no later frame. Before the first frame it sees that frame repeated; in a later
-chunk of time it sees the last frames of the chunk before, which travel as its ``past``: an array
-per convolution, nested like the parameters. Reference: ``autoencoder_kl_cogvideox.py`` of
+A causal layer sees no later frames. The first chunk of a video is padded by repeating its first
+frame; a later chunk by the last frames of the chunk before. These are passed on as ``past``: one
+array per convolution, nested like the parameters. Reference: ``autoencoder_kl_cogvideox.py`` of
 diffusers.
 """
 
@@ -16,7 +16,7 @@ from pewm_jax.models.vae_convolution import convolve, convolve_2d, convolve_doub
 from pewm_jax.types import Array, Params
 
 EPS = 1e-6
-"""Added to the variance wherever the reference does not ask its settings."""
+"""Added to the variance where the reference uses a constant instead of its setting."""
 
 
 def causal_conv(
@@ -52,7 +52,7 @@ def group_norm(params: Params, x_BTHWC: Array, groups: int, eps: float) -> tuple
     """
     batch, *_, channels = x_BTHWC.shape
     x = x_BTHWC.astype(jnp.float32)
-    # Squares of distances to some pixel lose no digits when the mean is far from zero.
+    # Subtracting some pixel first keeps the variance exact when the mean is far from zero.
     origin = jax.lax.stop_gradient(x[:, :1, :1, :1])
     near = x - origin
     count = x[0, ..., 0].size
@@ -76,10 +76,10 @@ def group_norm(params: Params, x_BTHWC: Array, groups: int, eps: float) -> tuple
 def norm(
     params: Params, x_BTHWC: Array, latents_BthwC: Array | None, groups: int, eps: float
 ) -> Array:
-    """Group norm and swish; with latents, the norm's result is scaled and shifted by them.
+    """Group norm and swish; with latents, they scale and shift the normalised values.
 
-    The reference stretches the latents to x's size (nearest) and then maps their channels; here
-    they are mapped first, which is the same and far less work.
+    The reference upsamples the latents to x's size (nearest) and then maps their channels. Mapping
+    them first gives the same result with far less work.
 
     Args:
         params: ``scale`` and ``bias``; with latents also ``scale_by`` and ``shift_by``.
@@ -101,7 +101,7 @@ def norm(
 
 
 def stretch(x_BthwC: Array, shape: tuple[int, ...]) -> Array:
-    """Repeat cells to (B, T, H, W, C); of an odd number of frames the first stays alone."""
+    """Upsample (nearest) to (B, T, H, W, C); if T is odd, the first frame is not repeated."""
     _, frames, height, width, _ = shape
     t, h, w = x_BthwC.shape[1:4]
     if frames > 1 and frames % 2:
@@ -127,7 +127,7 @@ def resnet(
         params: ``norm1, conv1, norm2, conv2`` and, where the width changes, ``shortcut``.
         x_BTHWC: (B, T, H, W, C).
         latents_BthwC: what the decoder's norms are conditioned on; None in the encoder.
-        past: of the convolutions; empty in the first chunk.
+        past: the convolutions' past; empty in the first chunk.
 
     Returns:
         (B, T, H, W, D), and the next chunk's past.
@@ -144,9 +144,9 @@ def resnet(
 
 
 def downsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
-    """Halve height and width by a strided convolution; first average pairs of frames.
+    """Average pairs of frames, then halve height and width by a strided convolution.
 
-    Of an odd number of frames the first is kept as it is.
+    If the number of frames is odd, the first one is not averaged.
     """
     if in_time:
         odd = x_BTHWC.shape[1] % 2
@@ -159,8 +159,8 @@ def downsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
 def upsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
     """Double height and width (nearest) and convolve each frame; then repeat frames.
 
-    Of an odd number of frames the first is not repeated. (Repeating frames before or after a
-    convolution of single frames is the same; after is less work.)
+    If the number of frames is odd, the first one is not repeated. (Repeating frames after a
+    convolution of single frames gives the same as before it, with less work.)
     """
     x = convolve_doubled(params, x_BTHWC)
     frames = x.shape[1]

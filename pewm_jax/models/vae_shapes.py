@@ -1,6 +1,6 @@
-"""Which parameters the autoencoder has: the path and shape of every leaf.
+"""The parameters of the video autoencoder: path and shape of every leaf.
 
-One list from which the parameters are drawn, and by which foreign weights are read. A convolution
+Initialisation and the import of published weights both use this list. A convolution
 is ``kernel (kt, kh, kw, in, out)`` (2D ones without kt) and ``bias``; a norm is ``scale`` and
 ``bias``; a norm of the decoder also holds the 1×1×1 convolutions ``scale_by`` and ``shift_by``
 from latents to its channels.
@@ -27,7 +27,7 @@ def layout(config: VAEConfig) -> dict[str, tuple[int, ...]]:
 
 
 def init(config: VAEConfig, key: Array) -> Params:
-    """Draw the parameters: float32, kernels of variance 1/inputs, norms and biases as they start.
+    """Return random parameters: float32, kernels of variance 1/inputs, scales 1, biases 0.
 
     Args:
         config: the autoencoder.

@@ -1,7 +1,7 @@
-"""Work on a video in overlapping tiles of space, and blend them.
+"""Process a video in overlapping spatial tiles, and blend them.
 
-Less memory than the whole frame, at a slightly different result, since norms and borders see a
-tile. Tiles of equal shape share one compiled body and run one after another. Reference:
+Tiles need less memory than whole frames. The result differs slightly, since norms and borders see
+only a tile. Tiles of equal shape share one compiled body and run one after another. Reference:
 ``tiled_encode`` and ``tiled_decode`` of ``AutoencoderKLCogVideoX`` in diffusers.
 """
 
@@ -23,17 +23,17 @@ _log = logging.getLogger(__name__)
 def in_tiles(
     whole: Callable[[Array], Array], x_BTHWC: Array, config: VAEConfig, *, shrink: bool
 ) -> Array:
-    """Apply ``whole`` to the tiles of a video and blend, or to all of it if that is no larger.
+    """Apply ``whole`` to the tiles of a video and blend, or to a video no larger than a tile.
 
     Args:
         whole: (B, T, H, W, C) → (B, T', H', W', C').
         x_BTHWC: the video, or the latents.
-        config: the autoencoder; without ``config.tiling`` nothing is cut.
+        config: the autoencoder; without ``config.tiling`` the video is not split.
         shrink: whether ``whole`` encodes (pixels in, latents out) or decodes.
 
     Returns:
-        What ``whole`` would return, up to the tiles' borders. (Where tiles overlap by no whole
-        number of latents the reference returns another size; so does this, and says so.)
+        What ``whole`` would return, up to effects at tile borders. If tiles do not overlap by a
+        whole number of latents, the size differs, as in the reference, and a warning is logged.
     """
     pixels = config.tile_pixels
     latents = tuple(size // config.spatial for size in pixels)
@@ -77,7 +77,7 @@ def _run(
     starts: list[list[int]],
     tile: tuple[int, ...],
 ) -> dict[tuple[int, int], Array]:
-    """Apply ``whole`` to every tile, those of one shape under one ``lax.map``."""
+    """Apply ``whole`` to every tile, with one ``lax.map`` per shape of tile."""
     height, width = x_BTHWC.shape[2:4]
     shapes: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, top in enumerate(starts[0]):
@@ -88,11 +88,11 @@ def _run(
     for shape, places in shapes.items():
         corners = np.array([(starts[0][i], starts[1][j]) for i, j in places])
 
-        def one(corner: Array, shape: tuple[int, int] = shape) -> Array:
+        def process(corner: Array, shape: tuple[int, int] = shape) -> Array:
             cut = jax.lax.dynamic_slice_in_dim(x_BTHWC, corner[0], shape[0], 2)
             return whole(jax.lax.dynamic_slice_in_dim(cut, corner[1], shape[1], 3))
 
-        tiles.update(zip(places, jax.lax.map(one, jnp.asarray(corners)), strict=True))
+        tiles.update(zip(places, jax.lax.map(process, jnp.asarray(corners)), strict=True))
     return tiles
 
 

@@ -1,12 +1,12 @@
-"""The denoiser and all that conditions it: what was seen, what is done, what is remembered.
+"""The world model's network: the denoiser, conditioned on frame, control, text and memory.
 
-Input channels, in order: noisy colour and depth latents, clean latents of the observed first
-frame (zero for later latent frames), what the control joins (Plücker rays). Where the backbone lets
-it, a reader reads the memory.
+Input channels, in order: noisy colour and depth latents; clean latents of the observed first frame
+(zero for later latent frames); the channels of the control (Plücker rays). At the places that the
+backbone provides, a reader reads the memory.
 
-Parameters: ``backbone``, ``memory`` (the reader), and where the settings ask for them ``control``,
-the frozen ``codec`` (the VAE), ``encoder`` (DINOv2) and ``text`` (the prompt's embedding). Without
-the ``memory`` entry, or without map tokens, it is the stage-1 model.
+Parameters: ``backbone``, ``memory`` (the reader) and, if the settings need them, ``control``, the
+frozen ``codec`` (the VAE), ``encoder`` (DINOv2) and ``text`` (the prompt's embedding). Without the
+``memory`` entry, or without map tokens, it is the stage-1 model.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ import numpy as np
 
 from pewm_jax.config import ModelConfig
 from pewm_jax.models import backbones, camera_control, codecs, controls, encoders, readers
-from pewm_jax.models.backbones import NOBODY, Conditioning
+from pewm_jax.models.backbones import NO_READERS, Conditioning
 from pewm_jax.types import Array, Camera, Control, Frames, MapTokens, Params
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ClipConditioning:
-    """All that conditions a batch of clips besides the memory.
+    """Everything that conditions a batch of clips, except the memory.
 
     Attributes:
-        given: what the backbone is told.
+        given: the backbone's conditioning.
         camera: (B, T) cameras of the clips' frames.
         rays_BthwC: their Plücker rays at the latent rate, for readers.
     """
@@ -48,7 +48,7 @@ def condition(
         model: the model.
         params: the world model's parameters; codec, control and text are used.
         observed: (B, 1) the first frames, colours float in [−1, 1], depth in metres.
-        control: (B, T) cameras of all frames, and (B, T − 1) actions where there are any.
+        control: (B, T) cameras of all frames, and (B, T − 1) actions if there are any.
     """
     batch, (frames, h, w) = len(observed.depth_THW), model.latent_shape
     first = codecs.encode_rgbd(model, params, observed.rgb_THWC, observed.depth_THW, condition=True)
@@ -65,7 +65,7 @@ def condition(
 
 
 def _text(model: ModelConfig, params: Params, batch: int, more: Array | None) -> Array | None:
-    """Return the prompt's tokens, zeros where there is no prompt, and those of the control."""
+    """Return the prompt's tokens (zeros without a prompt), followed by the control's."""
     shape = model.backbone.text_shape
     if shape is None:
         return more
@@ -76,7 +76,7 @@ def _text(model: ModelConfig, params: Params, batch: int, more: Array | None) ->
 
 
 def init(model: ModelConfig, key: Array, *, memory: bool = True) -> Params:
-    """Initialise the backbone and, with ``memory``, the reader (which changes nothing at first)."""
+    """Return random parameters; with ``memory`` also the reader's, without effect at first."""
     backbone_key, memory_key = jax.random.split(key)
     frozen_key = jax.random.fold_in(key, 2)
     channels = model.in_channels, model.codec.channels
@@ -102,35 +102,35 @@ def apply(
     time_B: Array,
     tokens: MapTokens | None = None,
 ) -> Array:
-    """Predict what the noise asks for (x0, v, ε, velocity …) from noisy latents.
+    """Predict the noise's target (x0, v, ε, velocity …) from noisy latents.
 
     Args:
         model: the model.
         params: ``{"backbone": …, "memory": …}``.
         noisy_BthwC: (B, t, h, w, C) noisy colour and depth latents.
         conditioning: the observed frame, control and text.
-        time_B: (B,) what the noise tells the network, or (B, t), for each latent frame.
+        time_B: (B,) noise level as the network sees it, or (B, t), one for each latent frame.
         tokens: map tokens with leading axis B; None is the stage-1 model.
 
     Returns:
         (B, t, h, w, C) float32 prediction.
     """
-    dtype, who = jnp.dtype(model.dtype), NOBODY
+    dtype, memory_readers = jnp.dtype(model.dtype), NO_READERS
     if tokens is not None and "memory" in params:
-        who = readers.prepare(
+        memory_readers = readers.prepare(
             model, params["memory"], tokens, conditioning.camera, conditioning.rays_BthwC
         )
     noisy = _seen(model, noisy_BthwC).astype(dtype)
     out = backbones.apply(
-        model.backbone, params["backbone"], noisy, time_B, conditioning.given, who
+        model.backbone, params["backbone"], noisy, time_B, conditioning.given, memory_readers
     )
     return _seen(model, out.astype(jnp.float32))
 
 
 def _seen(model: ModelConfig, latents_C: Array) -> Array:
-    """Blank the depth channels of latents where the denoiser works without depth.
+    """Set the depth channels of latents to zero if the denoiser works without depth.
 
-    They stay, so that both variants have the same parameters.
+    The channels remain, so that both variants have the same parameters.
     """
     if model.clip.depth:
         return latents_C

@@ -1,1 +1,1 @@
-"""What a training will cost, before it starts: FLOPs, memory, time, the best mesh."""
+"""Chapter 7b, what a training will cost before it starts: FLOPs, memory, time, the best mesh."""

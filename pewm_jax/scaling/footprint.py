@@ -1,9 +1,9 @@
-"""What a training step holds in memory, by the sum on paper (derived in ``docs/scaling.md``).
+"""The memory of a training step, computed by formulas (derived in ``docs/scaling.md``).
 
-What lasts (weights, moments, average, batch) follows from shapes alone. What a step needs besides
-is, at its peak, either the encoders' work or the backward pass of one block. The buffers alive
-there were counted in the compiled program; the compiler may do with other ones, which is what the
-comparison with ``memory_analysis`` in the tests is for.
+The size of the state (weights, moments, average) and of the batch follows from shapes alone. The
+peak of a step's temporary memory is either in the encoders or in the backward pass of one block.
+The number of live buffers there was counted in a compiled program. A compiler may need others, so
+tests compare the formulas with ``memory_analysis``.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from pewm_jax.worlds import costs
 
 
 @dataclasses.dataclass(frozen=True)
-class Arranged:
-    """How many devices lie along each axis of the mesh."""
+class MeshSizes:
+    """The number of devices along each mesh axis."""
 
     data: int = 1
     fsdp: int = 1
@@ -33,7 +33,7 @@ class Arranged:
     context: int = 1
 
     @classmethod
-    def of(cls, mesh: Mesh) -> Arranged:
+    def of(cls, mesh: Mesh) -> MeshSizes:
         """Return the sizes of a mesh."""
         return cls(**{name: mesh.shape[name] for name in ("data", "fsdp", "tensor", "context")})
 
@@ -44,24 +44,24 @@ class Arranged:
 
     @property
     def devices(self) -> int:
-        """All devices."""
+        """The number of all devices."""
         return math.prod(self.sizes.values())
 
     @property
     def batch(self) -> int:
-        """Parts that the batch is split into."""
+        """The number of parts that the batch is split into."""
         return self.data * self.fsdp
 
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """Some parameters: how many, by the axes of the mesh that split them."""
+    """Counts of parameters, grouped by the mesh axes that split them."""
 
     split: tuple[tuple[tuple[str, ...], int], ...]
 
     @classmethod
     def of(cls, model: WorldSettings, params: Params) -> Weights:
-        """Count parameters, abstract ones too, by the networks' sharding rules."""
+        """Count parameters, which may be abstract, by the model's sharding rules."""
         specs = tree.flatten(tree.assign(worlds.sharding(model), params, "sharding rules"))
         found: dict[tuple[str, ...], int] = {}
         for path, leaf in tree.flatten(params).items():
@@ -71,25 +71,25 @@ class Weights:
 
     @property
     def count(self) -> int:
-        """All of them."""
+        """The number of all parameters."""
         return sum(count for _, count in self.split)
 
-    def on(self, mesh: Arranged) -> float:
-        """How many a device has."""
-        sizes_ = mesh.sizes
-        return sum(count / math.prod(sizes_[axis] for axis in axes) for axes, count in self.split)
+    def on(self, mesh: MeshSizes) -> float:
+        """Return the number of parameters on one device."""
+        sizes = mesh.sizes
+        return sum(count / math.prod(sizes[axis] for axis in axes) for axes, count in self.split)
 
 
 @dataclasses.dataclass(frozen=True)
 class Counts:
-    """The parameters of a stage.
+    """Numbers of parameters in a stage.
 
     Attributes:
-        trained: what the stage trains.
-        frozen: backbone (in stage 2), text and whatever else stands still.
+        trained: trained parameters.
+        frozen: frozen parameters, such as the backbone in stage 2, without the encoders.
         encoders: the frozen VAE and DINOv2.
-        layer: number in one block, with its memory block.
-        trained_layer: number of what of it is trained.
+        layer: parameters of one block and its memory block.
+        trained_layer: those of them that are trained.
     """
 
     trained: Weights
@@ -101,28 +101,29 @@ class Counts:
 
 @functools.cache
 def counts(config: Config, stage: Stage) -> Counts:
-    """Count the parameters of a stage, without making them."""
+    """Count the parameters of a stage from shapes alone."""
     params = jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
     trained, frozen = tree.split(params, stage.trained)
     encoders = {name: frozen.pop(name) for name in ("codec", "encoder") if name in frozen}
-    weigh = functools.partial(Weights.of, config.model)
+    count = functools.partial(Weights.of, config.model)
     return Counts(
-        trained=weigh(trained),
-        frozen=weigh(frozen),
-        encoders=weigh(encoders),
+        trained=count(trained),
+        frozen=count(frozen),
+        encoders=count(encoders),
         layer=_one_block(params),
         trained_layer=_one_block(trained),
     )
 
 
 def _one_block(params: Params) -> int:
-    """Count the parameters of one block: what is stacked under ``blocks``, else a whole network."""
+    """Count the parameters of one block per network, or of a whole network without ``blocks``."""
     total = 0
     for name, part in params.items():
         if name in ("codec", "encoder", "text"):
             continue
-        blocks = part.get("blocks", part)
-        layers = jax.tree.leaves(blocks)[0].shape[0] if "blocks" in part else 1
+        stacked = isinstance(part, dict) and "blocks" in part
+        blocks = part["blocks"] if stacked else part
+        layers = jax.tree.leaves(blocks)[0].shape[0] if stacked else 1
         total += _count(blocks) // layers
     return total
 
@@ -133,20 +134,20 @@ def _count(params: Params) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Footprint:
-    """Bytes on one device.
+    """Memory of one device in bytes.
 
     Attributes:
-        trained: master weights in float32.
-        frozen: frozen weights, of the encoders too.
-        average: the moving average of what trains.
-        moments: Adam's.
-        batch: the clips of this device.
-        gradients: of what trains, in float32.
-        kept: activations kept from the forward pass for the backward pass.
-        block: what the backward pass of one block needs besides.
-        gathered: one block's weights, whole, as they compute, or its gradients not yet shared; on
-            a CPU also all frozen ones, widened.
-        encoders: what VAE and DINOv2 need while they run, before anything else is there.
+        trained: trained weights in float32.
+        frozen: frozen weights, including the encoders'.
+        average: moving average of the trained weights.
+        moments: Adam's moments.
+        batch: the device's clips.
+        gradients: gradients of the trained weights in float32.
+        kept: activations stored by the forward pass for the backward pass.
+        block: further memory of the backward pass of one block.
+        gathered: one block's gathered weights in compute precision, or its gradients before they
+            are scattered; on a CPU also all frozen weights, converted to float32.
+        encoders: memory of VAE and DINOv2 while they run, before the denoiser starts.
     """
 
     trained: float
@@ -162,64 +163,67 @@ class Footprint:
 
     @property
     def state(self) -> float:
-        """What lasts from step to step, and the batch."""
+        """Memory of the training state and the batch."""
         return self.trained + self.frozen + self.average + self.moments + self.batch
 
     @property
     def step(self) -> float:
-        """What a step needs besides, at its peak."""
+        """Peak of the temporary memory of a step."""
         return max(self.gradients + self.kept + self.block + self.gathered, self.encoders)
 
     @property
     def peak(self) -> float:
-        """All together."""
+        """Peak memory: state, batch and temporary memory."""
         return self.state + self.step
 
 
-def footprint(config: Config, stage: Stage, mesh: Arranged, *, wide: int, flash: bool) -> Footprint:
-    """Sum up what one device holds.
+def footprint(
+    config: Config, stage: Stage, mesh: MeshSizes, *, activation_bytes: int, flash: bool
+) -> Footprint:
+    """Return the memory of one device.
 
     Args:
         config: the experiment.
         stage: the stage.
-        mesh: how devices are arranged.
-        wide: bytes of an activation: 2 for bfloat16, and 4 on a CPU, which widens it.
-        flash: whether attention's logits stay in a kernel (cuDNN's) and are not held.
+        mesh: the device mesh.
+        activation_bytes: bytes of one activation value: 2 in bfloat16, but 4 on a CPU, where XLA
+            computes in float32.
+        flash: whether a fused kernel (cuDNN's) computes attention, so that no logits are stored.
     """
     c = counts(config, stage)
     clips = stage.settings(config).batch / mesh.batch
-    frozen_wide = 2 if config.model.dtype == "bfloat16" else FLOAT
+    frozen_bytes = 2 if config.model.dtype == "bfloat16" else FLOAT
     trained = FLOAT * c.trained.on(mesh)
-    widened = FLOAT * c.frozen.on(mesh) if wide > frozen_wide else 0.0
-    share = share_of(config, stage, mesh, wide=wide, flash=flash)
+    widened = FLOAT * c.frozen.on(mesh) if activation_bytes > frozen_bytes else 0.0
+    share = share_of(config, stage, mesh, activation_bytes=activation_bytes, flash=flash)
     parts = costs.of_stage(config, stage, share)
-    # Encoders work clip by clip, their weights gathered; what comes of it is kept for all clips.
+    # Encoders run clip by clip with gathered weights; their outputs are stored for all clips.
     pixels = clips * config.model.clip.frames * config.model.clip.height * config.model.clip.width
     held = max(part.held for part in parts.values()) + 2 * pixels * 3 * FLOAT
     return Footprint(
         trained=trained,
-        frozen=frozen_wide * (c.frozen.on(mesh) + c.encoders.on(mesh)),
+        frozen=frozen_bytes * (c.frozen.on(mesh) + c.encoders.on(mesh)),
         average=trained,
         moments=2 * trained,
         batch=clips * clip_bytes(config, stage),
         gradients=trained,
         kept=sum(part.kept for part in parts.values()),
         block=sum(part.block for part in parts.values()),
-        gathered=max(c.layer * wide, c.trained_layer * FLOAT) / mesh.tensor + widened,
-        encoders=held + (c.encoders.count * wide if mesh.fsdp > 1 else 0),
+        gathered=max(c.layer * activation_bytes, c.trained_layer * FLOAT) / mesh.tensor + widened,
+        encoders=held + (c.encoders.count * activation_bytes if mesh.fsdp > 1 else 0),
     )
 
 
 def share_of(
-    config: Config, stage: Stage, mesh: Arranged, *, wide: int, flash: bool = False
+    config: Config, stage: Stage, mesh: MeshSizes, *, activation_bytes: int, flash: bool = False
 ) -> Share:
-    """Return what one device has of a step; arguments as for ``footprint``."""
+    """Return one device's share of a step; arguments are as for ``footprint``."""
     clips = stage.settings(config).batch / mesh.batch
-    return Share(clips, mesh.tensor, mesh.context, wide, flash)
+    return Share(clips, mesh.tensor, mesh.context, activation_bytes, flash)
 
 
 def clip_bytes(config: Config, stage: Stage) -> float:
-    """Return the bytes of one clip of a batch: colours in 8 bits, depth in 32, kept features."""
+    """Return the bytes of one clip of a batch: 8-bit colours, 32-bit depth, cached features."""
     clip, context = config.model.clip, config.data.context
     pixels = (clip.frames + context) * clip.height * clip.width * (3 + FLOAT)
     if not (config.data.features and stage.memory):

@@ -1,7 +1,8 @@
-"""What a compiled program does, counted from its text: FLOPs, and bytes between devices.
+"""FLOPs and communication of a compiled program, counted from its HLO text.
 
-XLA's own ``cost_analysis`` counts the body of a loop once; here a body counts as often as it runs.
-Only products and convolutions are counted, 2 FLOPs per multiply-add. Figures are of one device.
+XLA's own ``cost_analysis`` counts the body of a loop once; here it counts as often as it runs. Only
+matrix products and convolutions are counted, with 2 FLOPs per multiply-add. All figures are for one
+device.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 KINDS = ("all-gather", "reduce-scatter", "all-reduce", "all-to-all", "collective-permute")
-"""The kinds of communication."""
+"""The kinds of collective communication."""
 THROUGH = ("bitcast", "copy", "convert", "transpose", "reshape")
-"""Operations behind which an array is still the same one."""
+"""Operations that pass an array on without using its values."""
 BITS = {"pred": 8, "s4": 4, "u4": 4, "bf16": 16, "c64": 64, "c128": 128}
-"""Bits of the types whose names do not end with them."""
+"""Bits of the types whose name does not tell."""
 
 _COMPUTATION = re.compile(r"^(?:ENTRY )?%?([\w.$-]+) .*\{$")
 _NAME = re.compile(r"^\s+(?:ROOT )?%?([\w.$-]+) = ")
@@ -44,8 +45,8 @@ class Product:
     """A matrix product or convolution.
 
     Attributes:
-        label: where in the program it comes from, as JAX names it.
-        flops: all its runs together.
+        label: JAX's name for its place in the program.
+        flops: FLOPs of all its runs.
     """
 
     label: str
@@ -54,13 +55,13 @@ class Product:
 
 @dataclasses.dataclass(frozen=True)
 class Collective:
-    """One communication between devices.
+    """A collective communication between devices.
 
     Attributes:
         kind: one of ``KINDS``.
-        label: where in the program it comes from.
-        group: the devices of one of the groups that communicate, by their place in the mesh.
-        sent: bytes that a device sends in all its runs together, going round in a ring.
+        label: JAX's name for its place in the program.
+        group: one of the groups of devices that communicate, by their index in the mesh.
+        sent: bytes that a device sends in all its runs, with ring algorithms.
     """
 
     kind: str
@@ -76,8 +77,8 @@ class Program:
     Attributes:
         products: its matrix products and convolutions.
         collectives: its communication.
-        unknown: labels of loops that hold products or communication and do not say how often they
-            run; they are counted as one run.
+        unknown: labels of loops with products or communication whose number of runs is not in the
+            text; they count as one run.
     """
 
     products: tuple[Product, ...]
@@ -91,7 +92,7 @@ class Program:
 
     def sent(self, kind: str) -> float:
         """Return the bytes that a device sends in communication of one kind."""
-        return sum(one.sent for one in self.collectives if one.kind == kind)
+        return sum(item.sent for item in self.collectives if item.kind == kind)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,18 +120,26 @@ def read(text: str) -> Program:
     users = {name: _users(lines) for name, lines in computations.items()}
     unknown: list[str] = []
 
-    def sliced(where: str, name: str, beyond: Callable[[], bool] = lambda: False) -> bool:
-        """Whether of an array only slices are used, here or ``beyond`` what gives it on."""
-        if name == next(reversed(computations[where])):  # what the computation gives
-            return beyond()
-        return bool(users[where].get(name)) and all(
+    def only_sliced(
+        computation: str, name: str, result_is_sliced: Callable[[], bool] = lambda: False
+    ) -> bool:
+        """Tell whether every use of an array is a slice of it.
+
+        If the array is the computation's result, ``result_is_sliced`` tells it for the caller.
+        """
+        if name == next(reversed(computations[computation])):  # the computation's result
+            return result_is_sliced()
+        return bool(users[computation].get(name)) and all(
             _is_slice(line, name)
-            or (line.opcode in THROUGH and sliced(where, user, beyond))
+            or (line.opcode in THROUGH and only_sliced(computation, user, result_is_sliced))
             or any(
-                sliced(*place, functools.partial(sliced, where, user, beyond))
-                for place in _parameters(line, name, computations)
+                only_sliced(
+                    *parameter,
+                    functools.partial(only_sliced, computation, user, result_is_sliced),
+                )
+                for parameter in _parameters(line, name, computations)
             )
-            for user, line in users[where][name]
+            for user, line in users[computation][name]
         )
 
     @functools.cache
@@ -142,20 +151,22 @@ def read(text: str) -> Program:
             if (flops := _flops(line, lines)) > 0:
                 products.append(Product(line.label, flops))
             elif line.opcode.removesuffix("-start") in KINDS:
-                collectives += _collectives(line, lines, functools.partial(sliced, name))
-            for (some, others), trips in _inside(line, walk):
-                if trips == 0 and (some or others):
+                collectives += _collectives(line, lines, functools.partial(only_sliced, name))
+            for (inner_products, inner_collectives), trips in _inside(line, walk):
+                if trips == 0 and (inner_products or inner_collectives):
                     unknown.append(line.label)
                 times = max(trips, 1)
-                products += [Product(p.label, p.flops * times) for p in some]
-                collectives += [dataclasses.replace(c, sent=c.sent * times) for c in others]
+                products += [Product(p.label, p.flops * times) for p in inner_products]
+                collectives += [
+                    dataclasses.replace(c, sent=c.sent * times) for c in inner_collectives
+                ]
         return tuple(products), tuple(collectives)
 
     return Program(*walk(entry), tuple(unknown))
 
 
 def _inside(line: _Line, walk) -> Iterator[tuple]:
-    """Yield what an instruction runs, and how often: 0 where the program does not say."""
+    """Yield what an instruction calls, and how often: 0 if the text does not tell."""
     if line.opcode == "while":
         trips = _TRIPS.search(line.rest)
         body = _CALLED.search(line.rest)
@@ -174,7 +185,7 @@ def _inside(line: _Line, walk) -> Iterator[tuple]:
 
 
 def _split(text: str) -> tuple[dict[str, dict[str, _Line]], str]:
-    """Split a program into its computations, and name the one it begins with."""
+    """Split a program into its computations; also return the name of the entry computation."""
     computations: dict[str, dict[str, _Line]] = {}
     entry, lines = "", {}
     for row in text.splitlines():
@@ -187,7 +198,7 @@ def _split(text: str) -> tuple[dict[str, dict[str, _Line]], str]:
 
 
 def _parse(text: str) -> _Line:
-    """Take an instruction apart: ``TYPE opcode(operands), attributes``."""
+    """Parse an instruction: ``TYPE opcode(operands), attributes``."""
     end = _close(text, 0) if text.startswith("(") else text.find(" ")
     shape, text = text[:end], text[end:]
     found = _OPCODE.match(text)
@@ -200,7 +211,7 @@ def _parse(text: str) -> _Line:
 
 
 def _close(text: str, start: int) -> int:
-    """Return the place after the parenthesis that closes the one at ``start``."""
+    """Return the index after the parenthesis that closes the one at ``start``."""
     depth = 0
     for place in range(start, len(text)):
         depth += (text[place] == "(") - (text[place] == ")")
@@ -215,7 +226,7 @@ def _dims(shape: str) -> tuple[int, ...]:
 
 
 def size(shape: str) -> float:
-    """Return the bytes of an array's or a tuple's type, such as ``(f32[2,3]{1,0}, s32[])``."""
+    """Return the bytes of an array or tuple type such as ``(f32[2,3]{1,0}, s32[])``."""
     total = 0.0
     for kind, dims in _ARRAY.findall(shape):
         digits = re.search(r"\d+", kind)
@@ -230,7 +241,7 @@ def _numbers(line: _Line, name: str) -> list[int]:
 
 
 def _flops(line: _Line, lines: dict[str, _Line]) -> float:
-    """Return the FLOPs of one instruction by itself."""
+    """Return the FLOPs of one instruction, without what it calls."""
     matmul = line.opcode == "custom-call" and "matmul" in line.rest
     if line.opcode not in ("dot", "convolution") and not matmul:
         return 0.0
@@ -248,29 +259,32 @@ def _flops(line: _Line, lines: dict[str, _Line]) -> float:
 
 
 def _collectives(
-    line: _Line, lines: dict[str, _Line], sliced: Callable[[str], bool]
+    line: _Line, lines: dict[str, _Line], only_sliced: Callable[[str], bool]
 ) -> Iterator[Collective]:
-    """Yield the communication that an instruction is: one for each array that it takes."""
+    """Yield a ``Collective`` for each operand of a communication instruction.
+
+    An all-reduce whose result is only sliced counts as a reduce-scatter.
+    """
     kind, group = line.opcode.removesuffix("-start"), _group(line)
-    others = (len(group) - 1) / max(len(group), 1)
+    ring = (len(group) - 1) / max(len(group), 1)
     own = next((name for name, other in lines.items() if other is line), "")
     for index, operand in enumerate(line.operands):
         taken = size(lines[operand].shape) if operand in lines else 0.0
-        made = kind
-        if kind == "all-reduce" and sliced(_element(own, index, lines)):
-            made = "reduce-scatter"
+        effective = kind
+        if kind == "all-reduce" and only_sliced(_element(own, index, lines)):
+            effective = "reduce-scatter"
         sent = {
             "all-gather": taken * (len(group) - 1),
-            "reduce-scatter": taken * others,
-            "all-reduce": 2 * taken * others,
-            "all-to-all": taken * others,
+            "reduce-scatter": taken * ring,
+            "all-reduce": 2 * taken * ring,
+            "all-to-all": taken * ring,
             "collective-permute": taken,
-        }[made]
-        yield Collective(made, line.label, group, sent)
+        }[effective]
+        yield Collective(effective, line.label, group, sent)
 
 
 def _element(name: str, index: int, lines: dict[str, _Line]) -> str:
-    """Return the name under which one of the results of an instruction goes on."""
+    """Return the name of one of an instruction's results, by its index in the tuple."""
     for other, line in lines.items():
         taken = line.opcode == "get-tuple-element" and line.operands == (name,)
         if taken and re.search(rf"\bindex={index}\b", line.rest):
@@ -279,7 +293,7 @@ def _element(name: str, index: int, lines: dict[str, _Line]) -> str:
 
 
 def _users(lines: dict[str, _Line]) -> dict[str, list[tuple[str, _Line]]]:
-    """Return, for each name, the instructions that take it."""
+    """Return, for each name, the instructions that use it as an operand."""
     found: dict[str, list[tuple[str, _Line]]] = {}
     for name, line in lines.items():
         for operand in set(line.operands):
@@ -294,7 +308,7 @@ def _is_slice(line: _Line, name: str) -> bool:
 def _parameters(
     line: _Line, name: str, computations: dict[str, dict[str, _Line]]
 ) -> Iterator[tuple[str, str]]:
-    """Yield where a fusion's or a call's operand goes on inside: (computation, name)."""
+    """Yield the parameter of a fusion or call that an operand becomes: (computation, name)."""
     called = _CALLED.search(line.rest) if line.opcode in ("fusion", "call") else None
     if called is None:
         return
@@ -323,12 +337,12 @@ def _group(line: _Line) -> tuple[int, ...]:
 
 
 def _along(mesh: str, axes: str, order: str) -> tuple[int, ...]:
-    """Return the first group along axes, or parts of axes, of a mesh.
+    """Return the first group along mesh axes, or along parts of them.
 
     Args:
-        mesh: sizes, as in ``'a'=4,'b'=2``.
-        axes: as in ``'a'``, or ``'a':(2)2`` for two of its parts after the first two.
-        order: of the devices, if not their own: ``[4,2]T(1,0)`` or ``0,2,4,6``.
+        mesh: sizes, such as ``'a'=4,'b'=2``.
+        axes: such as ``'a'``, or ``'a':(2)2`` for a sub-axis of size 2 after one of size 2.
+        order: device order if it is not 0, 1, 2 …: ``[4,2]T(1,0)`` or ``0,2,4,6``.
     """
     sizes = {name: int(count) for name, count in re.findall(r"'([^']*)'=(\d+)", mesh)}
     strides, stride = {}, 1

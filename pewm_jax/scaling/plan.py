@@ -1,9 +1,9 @@
-"""What a training would take on hardware that is not here: ``python train.py PRESET --plan``.
+"""Plan a training for hardware that is not present: ``python train.py PRESET --plan``.
 
-The real step is compiled ahead of time for as many virtual CPU devices as are asked for, from
-shapes alone: no data is read, no weight is made, no folder written. The compiled program says what
-is done and sent; the sums on paper (``costs``, ``footprint``, ``predict``), which it confirms, say
-what that is on the chip.
+The real step is compiled ahead of time for the requested number of virtual CPU devices, from shapes
+alone: no data is read, no weights are created, no folder is written. The compiled program tells how
+much is computed and communicated. The formulas (``costs``, ``footprint``, ``predict``), which it
+confirms, tell what this means on the chip.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import jax
 from pewm_jax.config import Config, Launch, UserError, VAEConfig
 from pewm_jax.data import abstract
 from pewm_jax.scaling import hlo, plan_text, suggest
-from pewm_jax.scaling.footprint import Arranged, footprint
+from pewm_jax.scaling.footprint import MeshSizes, footprint
 from pewm_jax.scaling.stage_plan import Compiled, Plan
 from pewm_jax.training import chips, sharding, stages, step
 from pewm_jax.training.stages import Stage
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-"""What is never run need not be fast: only the machine code differs, not what is planned."""
+"""Compiler options that save time. They affect only machine code, which is never run."""
 
 
 def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> list[Plan]:
@@ -32,18 +32,18 @@ def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> 
 
     Args:
         config: the experiment.
-        launch: how many devices, and of what kind.
+        launch: number and kind of devices.
         say: prints a line.
 
     Raises:
-        ConfigError: the chip is not known, or the devices cannot be arranged or share a batch so.
-        UserError: devices were in use before and are too few.
+        ConfigError: the chip is not known, or the devices cannot form the mesh or share the batch.
+        UserError: JAX already uses devices, and too few.
     """
     chip = chips.named(launch.chip)
-    arranged = Arranged(*config.train.mesh.shape(launch.devices))
+    sizes = MeshSizes(*config.train.mesh.shape(launch.devices))
     planned = stages.planned(config)
     for stage in planned:
-        sharding.require_divisible(config, stage, _abstract(arranged))
+        sharding.require_divisible(config, stage, _abstract_mesh(sizes))
     devices = virtual(launch.devices)
     plans = []
     for stage in planned:
@@ -51,7 +51,7 @@ def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> 
         compiled = compile_stage(config, stage, devices)
         say(f"{stage.title}: compiled in {compiled.seconds:.0f} s")
         best = suggest.rank(config, stage, launch.devices, chip)[:3]
-        choice = suggest.weigh(config, stage, arranged, chip)
+        choice = suggest.assess(config, stage, sizes, chip)
         plans.append(Plan(config, stage, chip, choice, compiled, tuple(best)))
         for line in plan_text.lines(plans[-1]):
             say(line)
@@ -59,16 +59,16 @@ def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> 
 
 
 def virtual(count: int) -> Sequence[Any]:
-    """Return so many CPU devices that there are not; before any device is used.
+    """Return virtual CPU devices; call it before JAX uses any device.
 
     Raises:
-        UserError: devices are in use already, and too few.
+        UserError: JAX already uses devices, and too few.
     """
     try:
         jax.config.update("jax_platforms", "cpu")
         jax.config.update("jax_num_cpu_devices", count)
     except RuntimeError:
-        pass  # in use already: they may be enough
+        pass  # JAX already uses devices; they may suffice
     devices = jax.devices("cpu")
     if len(devices) < count:
         raise UserError(
@@ -79,12 +79,12 @@ def virtual(count: int) -> Sequence[Any]:
 
 
 def compile_stage(config: Config, stage: Stage, devices: Sequence[Any]) -> Compiled:
-    """Compile a stage's real step from shapes alone, and read what it does."""
+    """Compile a stage's real step from shapes alone, and count what it does."""
     began = time.monotonic()
     mesh = sharding.make_mesh(devices, config.train.mesh)
-    as_there = _as_on_chips(config)
+    on_chip = _as_on_chips(config)
     lowered = step.lower_step(
-        as_there,
+        on_chip,
         stage,
         mesh,
         abstract.clip(config, stage.settings(config).batch, features=stage.memory),
@@ -93,24 +93,24 @@ def compile_stage(config: Config, stage: Stage, devices: Sequence[Any]) -> Compi
     memory, text = compiled.memory_analysis(), compiled.as_text()
     if memory is None or text is None:
         raise UserError("This JAX does not say what a compiled program needs; use 0.10 or newer.")
-    kept = memory.output_size_in_bytes - memory.alias_size_in_bytes
+    outputs = memory.output_size_in_bytes - memory.alias_size_in_bytes
     return Compiled(
         program=hlo.read(text),
         arguments=float(memory.argument_size_in_bytes),
-        temporary=float(memory.temp_size_in_bytes + kept),
-        expected=footprint(config, stage, Arranged.of(mesh), wide=4, flash=False),
+        temporary=float(memory.temp_size_in_bytes + outputs),
+        expected=footprint(config, stage, MeshSizes.of(mesh), activation_bytes=4, flash=False),
         seconds=time.monotonic() - began,
     )
 
 
 def _as_on_chips(config: Config) -> Config:
-    """Have the VAE's convolutions as accelerators run them, not in a CPU's form."""
+    """Choose the form of the VAE's convolutions that accelerators use."""
     codec = config.model.codec
     if not isinstance(codec, VAEConfig) or codec.convolution != "auto":
         return config
     return config.with_model(codec=dataclasses.replace(codec, convolution="volume"))
 
 
-def _abstract(arranged: Arranged) -> Any:
+def _abstract_mesh(mesh: MeshSizes) -> Any:
     """Return a mesh without devices."""
-    return jax.sharding.AbstractMesh(tuple(arranged.sizes.values()), tuple(arranged.sizes))
+    return jax.sharding.AbstractMesh(tuple(mesh.sizes.values()), tuple(mesh.sizes))

@@ -1,4 +1,4 @@
-"""A plan in words and numbers."""
+"""A plan as text for the terminal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from pewm_jax.scaling import hlo, suggest
 from pewm_jax.scaling.stage_plan import Plan
-from pewm_jax.scaling.suggest import Choice
+from pewm_jax.scaling.suggest import Arrangement
 from pewm_jax.training.log import duration
 
 MEMORY = (
@@ -21,7 +21,7 @@ MEMORY = (
     ("one block's weights, gathered", "gathered"),
     ("or before all that: VAE and DINOv2", "encoders"),
 )
-"""What stands in which line of the table of memory."""
+"""Label and ``Footprint`` field of each line in the table of memory."""
 
 
 def lines(plan: Plan) -> Iterator[str]:
@@ -74,7 +74,7 @@ def lines(plan: Plan) -> Iterator[str]:
 
 
 def _verdict(plan: Plan) -> Iterator[str]:
-    """Yield whether it fits, and where that number comes from."""
+    """Yield whether the step fits into memory, and how that was computed."""
     verdict, raised = "fits" if plan.fits else "does not fit", plan.raised
     yield (
         f"    {verdict}: {size(plan.peak)} of {size(plan.chip.memory)}, of which "
@@ -87,13 +87,13 @@ def _verdict(plan: Plan) -> Iterator[str]:
     yield f"    that is the formula's {size(plan.choice.footprint.peak)}, {why}"
 
 
-def arranged(choice: Choice) -> str:
-    """Write an arrangement: ``data 8 × fsdp 8 × tensor 1 × context 1``."""
+def arranged(choice: Arrangement) -> str:
+    """Format an arrangement: ``data 8 × fsdp 8 × tensor 1 × context 1``."""
     return " × ".join(f"{name} {count}" for name, count in choice.mesh.sizes.items())
 
 
 def size(count: float) -> str:
-    """Write bytes as people do."""
+    """Format a number of bytes."""
     for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= factor:
             return f"{_short(count / factor)} {unit}"
@@ -101,7 +101,7 @@ def size(count: float) -> str:
 
 
 def work(flops: float) -> str:
-    """Write a number of FLOPs as people do."""
+    """Format a number of FLOPs."""
     for unit, factor in (("EFLOP", 1e18), ("PFLOP", 1e15), ("TFLOP", 1e12), ("GFLOP", 1e9)):
         if flops >= factor:
             return f"{_short(flops / factor)} {unit}"
@@ -109,10 +109,10 @@ def work(flops: float) -> str:
 
 
 def rate(count: float) -> str:
-    """Write a rate to three digits, without an exponent."""
+    """Format a rate with three digits and no exponent."""
     return f"{count:,.0f}" if count >= 1000 else f"{count:.3g}"
 
 
 def _short(value: float) -> str:
-    """Write three digits, and all those before the point."""
+    """Format a number with three digits, or with all digits before the point."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""The plan of one stage on one kind of device: what the compiler and the sums on paper say."""
+"""The plan of one stage on one kind of device, from the compiler and from formulas."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import dataclasses
 from pewm_jax.config import Config
 from pewm_jax.scaling import hlo, suggest
 from pewm_jax.scaling.footprint import Footprint
-from pewm_jax.scaling.suggest import Choice
+from pewm_jax.scaling.suggest import Arrangement
 from pewm_jax.training.chips import Chip
 from pewm_jax.training.stages import Stage
 
 
 @dataclasses.dataclass(frozen=True)
 class Compiled:
-    """What the compiler says about one stage's step, per device.
+    """What the compiler reports about one stage's step, per device.
 
     Attributes:
         program: its products and communication.
         arguments: bytes of state and batch.
-        temporary: bytes that the step needs besides.
-        expected: the sum on paper for a CPU, which widens 16 bits to 32 and cuts attention in
-            pieces; to be compared with.
-        seconds: what compiling took.
+        temporary: bytes of temporary memory and new outputs.
+        expected: the formula's result for a CPU, which computes 16-bit values in 32 bits and
+            attention in blocks; for comparison.
+        seconds: time of compilation.
     """
 
     program: hlo.Program
@@ -33,7 +33,7 @@ class Compiled:
 
     @property
     def peak(self) -> float:
-        """All together."""
+        """Peak memory in bytes."""
         return self.arguments + self.temporary
 
 
@@ -45,29 +45,29 @@ class Plan:
         config: the experiment.
         stage: the stage.
         chip: the kind of device.
-        choice: the arrangement asked for, and what it takes by the sums on paper.
-        compiled: what the compiler says.
+        choice: the requested arrangement, with its memory and time by the formulas.
+        compiled: the compiler's report.
         best: the best arrangements.
     """
 
     config: Config
     stage: Stage
     chip: Chip
-    choice: Choice
+    choice: Arrangement
     compiled: Compiled
-    best: tuple[Choice, ...]
+    best: tuple[Arrangement, ...]
 
     @property
     def raised(self) -> float:
-        """By what the sums are raised where the compiler finds more; never less than 1."""
+        """The factor, at least 1, by which the compiled program exceeds the formula."""
         return max(1.0, self.compiled.peak / self.compiled.expected.peak)
 
     @property
     def peak(self) -> float:
-        """Bytes on a device that decide: by the sums, more where the compiler finds more."""
+        """Peak bytes on a device: the formula's result times ``raised``."""
         return self.choice.footprint.peak * self.raised
 
     @property
     def fits(self) -> bool:
-        """Whether the step fits, with a margin."""
+        """Whether the step fits into memory with a margin."""
         return self.peak <= suggest.MARGIN * self.chip.memory

@@ -1,4 +1,4 @@
-"""Which arrangement of devices suits a stage best: all of them, by the sums on paper."""
+"""Rank all device meshes for a stage by the formulas for memory and time."""
 
 from __future__ import annotations
 
@@ -6,39 +6,39 @@ import dataclasses
 from collections.abc import Iterator
 
 from pewm_jax.config import Config, functions
-from pewm_jax.scaling.footprint import Arranged, Footprint, footprint
+from pewm_jax.scaling.footprint import Footprint, MeshSizes, footprint
 from pewm_jax.scaling.predict import Prediction, predict
 from pewm_jax.training.chips import Chip
 from pewm_jax.training.stages import Stage
 
 MARGIN = 0.9
-"""Share of the memory that a plan may fill; the rest is for the runtime and for fragmentation."""
+"""Share of the memory that a plan may fill; the runtime and fragmentation need the rest."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Choice:
-    """One arrangement, and what it takes.
+class Arrangement:
+    """A device mesh, with its memory and time for a stage.
 
     Attributes:
-        mesh: the arrangement.
-        footprint: bytes on one device.
-        time: the step.
-        fits: whether memory suffices.
+        mesh: the number of devices along each axis.
+        footprint: memory of one device.
+        time: predicted time of a step.
+        fits: whether the memory suffices.
     """
 
-    mesh: Arranged
+    mesh: MeshSizes
     footprint: Footprint
     time: Prediction
     fits: bool
 
     @property
     def flags(self) -> str:
-        """The flags of ``train.py`` that ask for it."""
+        """The flags of ``train.py`` that choose it."""
         return " ".join(f"--train.mesh.{name} {n}" for name, n in self.mesh.sizes.items())
 
 
 def has_flash(config: Config, chip: Chip) -> bool:
-    """Whether attention runs in a kernel that holds no logits: cuDNN's, in 16 bits."""
+    """Tell whether attention can use cuDNN's fused kernel, which stores no logits."""
     gpu = "NVIDIA" in chip.device_kind
     return (
         gpu
@@ -47,19 +47,20 @@ def has_flash(config: Config, chip: Chip) -> bool:
     )
 
 
-def weigh(config: Config, stage: Stage, mesh: Arranged, chip: Chip) -> Choice:
-    """Say what a stage takes on an arrangement of one kind of device."""
-    wide = 2 if config.model.dtype == "bfloat16" else 4
-    needed = footprint(config, stage, mesh, wide=wide, flash=has_flash(config, chip))
+def assess(config: Config, stage: Stage, mesh: MeshSizes, chip: Chip) -> Arrangement:
+    """Compute a stage's memory and time on a mesh of one kind of device."""
+    activation_bytes = 2 if config.model.dtype == "bfloat16" else 4
+    needed = footprint(
+        config, stage, mesh, activation_bytes=activation_bytes, flash=has_flash(config, chip)
+    )
     time = predict(config, stage, mesh, chip)
-    return Choice(mesh, needed, time, needed.peak <= MARGIN * chip.memory)
+    return Arrangement(mesh, needed, time, needed.peak <= MARGIN * chip.memory)
 
 
-def arrangements(config: Config, stage: Stage, devices: int) -> Iterator[Arranged]:
-    """Yield all meshes of so many devices that can share the stage's batch and heads.
+def arrangements(config: Config, stage: Stage, devices: int) -> Iterator[MeshSizes]:
+    """Yield all meshes of this many devices that can share the stage's batch and heads.
 
-    ``tensor`` and ``context`` stay within what a block has to split: the heads, and 64 tokens of a
-    frame for each device.
+    ``tensor`` divides the numbers of heads, and ``context`` is at most 16.
     """
     batch = stage.settings(config).batch
     heads = functions(config.model).split_heads(config.model, stage).values()
@@ -73,19 +74,19 @@ def arrangements(config: Config, stage: Stage, devices: int) -> Iterator[Arrange
             if batch % rest:
                 continue
             for fsdp in _divisors(rest):
-                yield Arranged(rest // fsdp, fsdp, tensor, context)
+                yield MeshSizes(rest // fsdp, fsdp, tensor, context)
 
 
-def rank(config: Config, stage: Stage, devices: int, chip: Chip) -> list[Choice]:
-    """Return all arrangements: those that fit first, each kind the fastest first.
+def rank(config: Config, stage: Stage, devices: int, chip: Chip) -> list[Arrangement]:
+    """Return all arrangements: those that fit, fastest first; then the others, smallest first.
 
-    Where two are as fast to a hundredth, the one that leaves more memory comes first.
+    If the times of two agree to two digits, the one that needs less memory comes first.
     """
-    choices = [weigh(config, stage, mesh, chip) for mesh in arrangements(config, stage, devices)]
+    choices = [assess(config, stage, mesh, chip) for mesh in arrangements(config, stage, devices)]
     return sorted(choices, key=_order)
 
 
-def _order(choice: Choice) -> tuple[bool, float, float]:
+def _order(choice: Arrangement) -> tuple[bool, float, float]:
     seconds = float(f"{choice.time.step_s:.2g}") if choice.fits else choice.footprint.peak
     return not choice.fits, seconds, choice.footprint.peak
 

@@ -7,6 +7,9 @@ enter the norm that is clipped. (``optax.masked`` alone would pass raw gradients
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
@@ -61,5 +64,18 @@ def make(config: Config, stage: Stage) -> optax.GradientTransformation:
         optax.scale_by_adam(),
         optax.add_decayed_weights(config.train.weight_decay, mask=decayed),
         optax.scale_by_learning_rate(schedule(stage.settings(config))),
+        *([_rates(stage)] if stage.rates else []),
     )
     return optax.partition({TRAIN: adam, FREEZE: optax.set_to_zero()}, stage.labels)
+
+
+def _rates(stage: Stage) -> optax.GradientTransformation:
+    """Multiply updates by the stage's factors for their paths."""
+    rules = (*stage.rates, (r".*", 1.0))
+
+    def scaled(updates: Any, params: Any = None) -> Any:
+        del params
+        factors = tree.assign(rules, updates, f"learning rates of {stage.name}")
+        return jax.tree.map(lambda update, factor: update * factor, updates, factors)
+
+    return optax.stateless(scaled)

@@ -1,26 +1,30 @@
-"""Chapter 6, worlds: what is imagined next, whatever it is imagined by.
+"""Chapter 6, worlds: what is imagined next.
 
-A world is driven the same way whatever it is made of. All three are pure: jit them with the model
-static, vmap them over states, controls and keys. ::
+Every world is driven by the same three functions, whatever networks it has. They are pure: jit them
+with the model static, vmap them over states, controls and keys. ::
 
     state = start(model, params, frames)                        # a few posed RGB-D frames
-    state = observe(model, params, state, frames)               # more of them, half-way
+    state = observe(model, params, state, frames)               # more real frames, later
     state, frames = imagine(model, params, state, control, key) # what will be seen
+    state, frames = imagine_many(model, params, state, controls, keys)  # many candidates
 
 A world is a ``WorldSettings`` and a module (or object) with these three functions and
 
     init(model, key) -> params               all parameters
-    stages(model) -> (Stage, …)              how it is trained: ``worlds.stages``
+    stages(model) -> (Stage, …)              how it is trained, see ``worlds.stages``
     sharding(model) -> rules                 path of a parameter → the mesh axes of its last axes
-    split_heads(model, stage) -> {name: n}   what ``train.mesh.tensor`` must divide
-    costs(config, stage, share) -> {part: Costs}
+    split_heads(model, stage) -> {name: n}   numbers that ``train.mesh.tensor`` must divide
+    costs(config, stage, share) -> {part: Costs}   see ``models.costs``
 
-``worlds.pewm`` is the first of them.
+``worlds.pewm`` is an example.
 """
 
 from __future__ import annotations
 
+import functools
 from typing import Any
+
+import jax
 
 from pewm_jax.config import Config, WorldSettings, functions
 from pewm_jax.types import Array, Frames, Params, WorldState
@@ -28,7 +32,7 @@ from pewm_jax.worlds.stages import Stage
 
 
 def model_of(config: Config | WorldSettings) -> Any:
-    """Return the model's settings, also where a whole experiment's are given."""
+    """Return the model's settings, from a whole experiment's if those are given."""
     return config.model if isinstance(config, Config) else config
 
 
@@ -36,7 +40,7 @@ def start(model: Config | WorldSettings, params: Params, frames: Frames) -> Worl
     """Begin a world from a few posed RGB-D frames.
 
     Args:
-        model: the model's settings, or an experiment's, of which they are taken.
+        model: the model's settings, or an experiment's, which contain them.
         params: the world model's parameters; those of the image encoder are used, if it has any.
         frames: S ≥ 1 frames (S, H, W, …), uint8 or float colours; all are remembered, the last one
             is the present.
@@ -54,7 +58,7 @@ def start(model: Config | WorldSettings, params: Params, frames: Frames) -> Worl
 def observe(
     model: Config | WorldSettings, params: Params, state: WorldState, frames: Frames
 ) -> WorldState:
-    """Take in real frames: they are remembered, and the last one becomes the present.
+    """Remember real frames; the last one becomes the present.
 
     Args:
         model: as for ``start``.
@@ -63,7 +67,7 @@ def observe(
         frames: S ≥ 1 frames, as for ``start``.
 
     Raises:
-        UserError: as ``start``.
+        UserError: as for ``start``.
     """
     model = model_of(model)
     return functions(model).observe(model, params, state, frames)
@@ -85,22 +89,22 @@ def imagine(
         model: as for ``start``; static under jit.
         params: the world model's parameters.
         state: from ``start``, ``observe`` or an earlier ``imagine``.
-        control: what is done, for any number n ≥ 1 of frames: (n,) discrete actions (0 forward,
-            1 turn left, 2 turn right), (n, 3) continuous ones (dx, dy, dyaw: metres forward, metres
-            left, radians counter-clockwise), a ``Camera`` (n,) for each frame to imagine (six
-            degrees of freedom), or a ``Control`` with (n,) cameras and (n, A) actions.
+        control: n ≥ 1 steps, any number: (n,) discrete actions (0 forward, 1 turn left, 2 turn
+            right); (n, 3) continuous ones (dx, dy, dyaw: metres forward, metres left, radians
+            counter-clockwise); a ``Camera`` (n,) for the frames to imagine (six degrees of
+            freedom); or a ``Control`` with (n,) cameras and (n, A) actions.
         key: randomness of the sampling noise.
-        remember: whether what is imagined is remembered. Without, states share the memory that
-            they came from: cheap for comparing many controls.
+        remember: whether the imagined frames are remembered. If not, the state keeps the memory
+            that it had; ``imagine_many`` uses this to compare many controls.
         memory: False ignores what is remembered (the empty-memory baseline).
 
     Returns:
         ``(state, frames)``: the world after the last frame, and the n imagined frames, colours
-        float32 in [−1, 1], depth in metres. Clips are imagined whole; of the last one, what was
-        not asked for is dropped.
+        float32 in [−1, 1], depth in metres. Whole clips are imagined; surplus frames of the last
+        one are dropped.
 
     Raises:
-        UserError: the control has another form, or no frames.
+        UserError: the control is empty or has none of these forms.
     """
     model = model_of(model)
     return functions(model).imagine(
@@ -108,16 +112,47 @@ def imagine(
     )
 
 
-def init(model: WorldSettings, key: Array) -> Params:
-    """Return random parameters of all of a world's networks."""
+def imagine_many(
+    model: Config | WorldSettings,
+    params: Params,
+    state: WorldState,
+    controls: Any,
+    keys: Array,
+    *,
+    memory: bool = True,
+) -> tuple[WorldState, Frames]:
+    """Imagine K candidate controls from one state, without remembering any.
+
+    Args:
+        model: as for ``start``.
+        params: the world model's parameters.
+        state: the world so far; all candidates share its memory.
+        controls: as for ``imagine``, with a leading axis K.
+        keys: (K,) randomness of each candidate; equal keys give equal noise.
+        memory: see ``imagine``.
+
+    Returns:
+        ``(state, frames)``: K present frames with the shared memory, which is not copied, and
+        (K, n) imagined frames.
+    """
+    candidate = functools.partial(imagine, model, remember=False, memory=memory)
+    shared = WorldState(0, None)  # type: ignore[arg-type]
+    return jax.vmap(candidate, (None, None, 0, 0), (shared, 0))(params, state, controls, keys)
+
+
+def init(model: Config | WorldSettings, key: Array) -> Params:
+    """Return random parameters for all networks of a world."""
+    model = model_of(model)
     return functions(model).init(model, key)
 
 
-def stages(model: WorldSettings) -> tuple[Stage, ...]:
-    """Return how a world is trained, stage by stage, in order."""
+def stages(model: Config | WorldSettings) -> tuple[Stage, ...]:
+    """Return the stages of a world's training, in order."""
+    model = model_of(model)
     return functions(model).stages(model)
 
 
-def sharding(model: WorldSettings) -> tuple[tuple[str, Any], ...]:
+def sharding(model: Config | WorldSettings) -> tuple[tuple[str, Any], ...]:
     """Return the rules from paths of parameters to the mesh axes of their last axes."""
+    model = model_of(model)
     return functions(model).sharding(model)

@@ -1,4 +1,4 @@
-"""What people give to steer a world, brought into one form: cameras, and actions where known."""
+"""User input that steers a world, converted to one form: cameras, and actions if known."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from pewm_jax.config import ModelConfig, UserError
+from pewm_jax.config import ModelConfig, UserError, kinds
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.types import Array, Camera, Control
 
@@ -16,15 +16,51 @@ from pewm_jax.types import Array, Camera, Control
 def control_of(model: ModelConfig, present: Camera, control: Any) -> Control:
     """Return (n,) cameras of the frames to imagine, and the (n, A) actions that lead to them.
 
+    Of a ``Control`` the present frame is not a part here, in contrast to those of training.
+
     Args:
-        model: says what a discrete action does.
+        model: defines what a discrete action does.
         present: (1,) the camera of the present frame.
         control: actions, a ``Camera`` or a ``Control``; see ``worlds.imagine``.
 
     Raises:
-        UserError: it has another form, or no frames, or a discrete action is not known (under jit,
-            vmap and grad values are unknown and not checked).
+        UserError: the control is empty, has none of these forms, or holds an unknown discrete
+            action (under jit, vmap and grad the values of actions are not checked).
     """
+    found = _in_one_form(model, present, control)
+    require_actions(model, found.actions_TA, "imagine()")
+    return found
+
+
+def require_actions(model: ModelConfig, actions_TA: Array | None, who: str) -> None:
+    """Refuse what lacks the actions that the model's control needs, or has others.
+
+    Args:
+        model: the model.
+        actions_TA: (..., T, A) actions, or None.
+        who: where they came in, for the message.
+
+    Raises:
+        UserError: they are absent, or of another width.
+    """
+    wanted = model.control.actions
+    if not wanted:
+        return
+    if actions_TA is None:
+        raise UserError(
+            f"{who} got cameras without actions, and this model's control "
+            f"({kinds.of(model.control).name}) is steered by actions of {wanted} numbers: give "
+            "actions, or a Control with both."
+        )
+    if actions_TA.shape[-1] != wanted:
+        raise UserError(
+            f"{who} got actions of {actions_TA.shape[-1]} numbers, and this model's control "
+            f"({kinds.of(model.control).name}) takes {wanted}: give those it was trained with."
+        )
+
+
+def _in_one_form(model: ModelConfig, present: Camera, control: Any) -> Control:
+    """Return cameras, and actions where there are any; see ``control_of``."""
     if isinstance(control, Control):
         count = _require_cameras(control.camera)
         actions = None if control.actions_TA is None else jnp.asarray(control.actions_TA)
@@ -59,7 +95,7 @@ def _as_arrays(camera: Camera) -> Camera:
 
 
 def _require_cameras(camera: Camera) -> int:
-    """Refuse cameras that are no sequence; returns how many there are."""
+    """Return the number of cameras, or refuse arrays that are not a sequence of cameras."""
     poses, intrinsics = camera.world_from_camera.shape, camera.intrinsics_4.shape
     count = poses[0] if len(poses) == 3 else 0
     if count < 1 or poses != (count, 4, 4) or intrinsics != (count, 4):
@@ -71,7 +107,7 @@ def _require_cameras(camera: Camera) -> int:
 
 
 def _require_known(actions: Array) -> None:
-    """Refuse discrete actions outside the table, which a lookup would clamp to the last row."""
+    """Refuse unknown discrete actions, which a table lookup would clamp to the last row."""
     if isinstance(actions, Tracer) or not jnp.issubdtype(actions.dtype, jnp.integer):
         return
     wrong = sorted({int(a) for a in np.ravel(actions)} - set(range(len(action_geometry.NAMES))))

@@ -13,33 +13,34 @@ from pewm_jax.memory import memories
 from pewm_jax.models import codecs, encoders, placement, world_model
 from pewm_jax.models.signals import as_signal, signal_from_rgb
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, MapTokens, Params
+from pewm_jax.worlds.control import require_actions
 
 
 def clip_tokens(model: ModelConfig, params: Params, clip: Clip) -> MapTokens:
     """Build every clip's memory from its context and return its tokens, leading axis B."""
 
-    def one(context: Frames, valid_S: Array, features: Array, camera: Camera) -> MapTokens:
+    def of_clip(context: Frames, valid_S: Array, features: Array, camera: Camera) -> MapTokens:
         memory = memories.from_context(model, {}, context, valid_S, features)
         return memories.tokens(model, memory, camera)
 
-    def some(weights: Params, clip: Clip) -> MapTokens:
+    def of_batch(weights: Params, clip: Clip) -> MapTokens:
         features = clip.context_features_ShwF
         if features is None:
             features = _encode(model, weights, clip.context.rgb_THWC)
         context = as_signal(clip.context)
-        return jax.vmap(one)(context, clip.context_valid_S, features, clip.frames.camera)
+        return jax.vmap(of_clip)(context, clip.context_valid_S, features, clip.frames.camera)
 
-    return placement.by_batch(some, params.get("encoder", {}), clip)
+    return placement.by_batch(of_batch, params.get("encoder", {}), clip)
 
 
 def _encode(model: ModelConfig, weights: Params, rgb_BSHWC: Array) -> Array:
-    """Return the features of every clip's context; a large encoder sees clip by clip."""
+    """Return the features of every clip's context; large encoders run clip by clip."""
     encoder = model.memory.encoder
 
-    def one(rgb_SHWC: Array) -> Array:
+    def encode(rgb_SHWC: Array) -> Array:
         return encoders.encode(encoder, weights, signal_from_rgb(rgb_SHWC))
 
-    return jax.lax.map(one, rgb_BSHWC) if encoder.CONVERTED else jax.vmap(one)(rgb_BSHWC)
+    return jax.lax.map(encode, rgb_BSHWC) if encoder.CONVERTED else jax.vmap(encode)(rgb_BSHWC)
 
 
 def loss(
@@ -55,16 +56,16 @@ def loss(
 
     Args:
         model: the model.
-        train: of the training, the noise on the observed frame.
+        train: the training's settings; gives the noise on the observed frame.
         params: the world model's parameters.
         clip: a batch, leading axis B, colours uint8 or float.
         key: randomness of times, noise and image noise.
-        memory: whether the memory is read: not in stage 1, but in stage 2.
+        memory: whether the memory is read (in stage 2).
 
     Returns:
-        ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of what the network is
-        asked for, averaged over everything with valid depth. Where the denoiser works without depth
-        (``clip.depth``), colour alone counts.
+        ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of the noise's target,
+        averaged over colour and over depth where it was measured. If the denoiser works without
+        depth (``clip.depth``), only colour counts.
     """
     frames = as_signal(clip.frames)
     x0 = codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
@@ -83,11 +84,12 @@ def loss(
     observed = Frames(
         first[:, None], frames.depth_THW[:, :1], jax.tree.map(lambda x: x[:, :1], frames.camera)
     )
+    require_actions(model, clip.actions_TA, "the loss")
     control = Control(frames.camera, clip.actions_TA)
     conditioning = world_model.condition(model, params, observed, control)
     tokens = clip_tokens(model, params, clip) if memory else None
-    shown, told = noises.shown(model.noise, x_t, times)
-    prediction = world_model.apply(model, params, shown, conditioning, told, tokens)
+    inputs, network_time = noises.shown(model.noise, x_t, times)
+    prediction = world_model.apply(model, params, inputs, conditioning, network_time, tokens)
 
     error = (prediction - noises.target(model.noise, x0, noise, times)) ** 2
     error = error * noises.spread(noises.weight(model.noise, times), error.ndim)

@@ -1,7 +1,7 @@
 """The world of PEWM: a video diffusion model, clip after clip, with a memory.
 
-Each clip is conditioned on the present frame, on what steers it, and on what of the memory its
-cameras see; what it imagines is remembered exactly as what was observed.
+Each clip is conditioned on the present frame, on the control, and on the part of the memory that
+its cameras see. Imagined frames are remembered in the same way as observed ones.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ STAGES = (
         memory=True,
     ),
 )
-"""Stage 1 fine-tunes the backbone, without any memory, to the domain, to the control and to RGB-D.
-Stage 2 adds the memory's reader, which changes nothing at first, and trains nothing else."""
+"""Stage 1 adapts the backbone to the domain, the control and RGB-D, without memory. Stage 2 adds
+the memory reader, which has no effect at first, and trains only that."""
 
 
 def stages(model: ModelConfig) -> tuple[Stage, ...]:
@@ -54,7 +54,7 @@ def stages(model: ModelConfig) -> tuple[Stage, ...]:
 
 
 def sharding(model: ModelConfig) -> tuple[tuple[str, Any], ...]:
-    """Return the rules of all parts, each part's own."""
+    """Return the sharding rules of all parts of the model."""
     memory = model.memory
     parts = (model.backbone, memory.reader, model.codec, memory.encoder, model.control)
     rules = [rule for part in parts for rule in functions(part).SHARDING]
@@ -62,7 +62,7 @@ def sharding(model: ModelConfig) -> tuple[tuple[str, Any], ...]:
 
 
 def split_heads(model: ModelConfig, stage: Stage) -> dict[str, int]:
-    """Return what ``train.mesh.tensor`` must divide."""
+    """Return the head counts that ``train.mesh.tensor`` must divide."""
     heads = {"backbone.heads": model.backbone.split_heads}
     if stage.memory:
         heads["memory.reader.heads"] = model.memory.reader.split_heads
@@ -102,10 +102,14 @@ def imagine(
     clips = -(-count // length)
     missing = clips * length - count
 
-    def cut(x: Array) -> Array:
-        """(n, …) → (clips, T − 1, …), the last row repeated where frames are missing."""
-        filled = jnp.concatenate([x, jnp.repeat(x[-1:], missing, 0)]) if missing else x
+    def cut(x: Array, still: Array) -> Array:
+        """(n, …) → (clips, T − 1, …); where frames are missing the agent stands still."""
+        filled = jnp.concatenate([x, jnp.repeat(still, missing, 0)]) if missing else x
         return filled.reshape(clips, length, *x.shape[1:])
+
+    chunks = Control(jax.tree.map(lambda x: cut(x, x[-1:]), asked.camera))
+    if asked.actions_TA is not None:
+        chunks = Control(chunks.camera, cut(asked.actions_TA, jnp.zeros_like(asked.actions_TA[:1])))
 
     wanted = jnp.arange(clips * length).reshape(clips, length) < count if missing else None
 
@@ -115,7 +119,7 @@ def imagine(
             model, params, state, chunk, clip_key, remember=remember, memory=memory, valid_T=valid
         )
 
-    inputs = (jax.tree.map(cut, asked), jax.random.split(key, clips), wanted)
+    inputs = (chunks, jax.random.split(key, clips), wanted)
     state, frames = jax.lax.scan(step, state, inputs)
     return state, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], frames)
 
@@ -141,11 +145,11 @@ def imagine_clip(
         key: sampling noise.
         remember: see ``worlds.imagine``.
         memory: False ignores the memory.
-        valid_T: (T − 1,) bool, True for the first frames, which count; None where all do.
+        valid_T: (T − 1,) bool, True for the leading frames that were asked for; None if all were.
 
     Returns:
-        The next state and T − 1 frames, colours float in [−1, 1]. A denoiser that works without
-        depth (``clip.depth``) imagines none: 0 everywhere, which no memory keeps.
+        The next state and T − 1 frames, colours float in [−1, 1]. If the denoiser works without
+        depth (``clip.depth``), depth is 0 everywhere, and memories ignore these frames.
     """
     present, future = state.frame, control.camera
     camera = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), present.camera, future)
@@ -198,7 +202,7 @@ def sample(
         conditioning: observed frame, control, text.
         tokens: map tokens, or None for no memory.
         noise_BthwC: standard normal start.
-        key: randomness of the steps, where the sampler draws any.
+        key: randomness of the steps, if the sampler draws noise.
 
     Returns:
         (B, t, h, w, C) latents.
@@ -209,8 +213,8 @@ def sample(
     noise = model.noise
 
     def x0(x: Array, times: Array, tokens: MapTokens | None) -> Array:
-        shown, told = noises.shown(noise, x, times)
-        out = world_model.apply(model, params, shown, conditioning, told, tokens)
+        inputs, network_time = noises.shown(noise, x, times)
+        out = world_model.apply(model, params, inputs, conditioning, network_time, tokens)
         return noises.to_x0(noise, out, x, times)
 
     def denoise(x: Array, times: Array, weight: Array) -> Array:
@@ -237,7 +241,7 @@ def _remember(
 
 
 def _require_frames(model: ModelConfig, frames: Frames, who: str) -> int:
-    """Refuse frames of other shapes than the model's; returns how many there are."""
+    """Return the number of frames, or refuse frames whose shapes do not fit the model."""
     count = frames.depth_THW.shape[0] if frames.depth_THW.ndim else 0
     expected = (count, model.clip.height, model.clip.width)
     if count < 1 or frames.rgb_THWC.shape != (*expected, 3) or frames.depth_THW.shape != expected:

@@ -1,4 +1,4 @@
-"""What a step of PEWM's stages costs: the sum over its parts, each of which knows its own."""
+"""The costs of PEWM's training stages, collected from the parts of the model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     Args:
         config: the experiment.
         stage: the stage.
-        share: what one device has of the step.
+        share: one device's share of the step.
     """
     model = config.model
     assert isinstance(model, ModelConfig)
@@ -32,6 +32,6 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
 
 
 def encodes(config: Config) -> bool:
-    """Whether a stage with memory runs the image encoder: features are kept, and not cached."""
+    """Tell whether a stage with memory runs the image encoder: features are used, not cached."""
     assert isinstance(config.model, ModelConfig)
     return config.model.memory.KEEPS_FEATURES and not config.data.features

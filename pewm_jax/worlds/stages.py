@@ -1,7 +1,8 @@
-"""What is trained when: each world names its stages.
+"""Training stages: what is trained, by which loss, in which order.
 
-A stage has a loss, says by rules over parameter paths what trains and what stands still, and finds
-its settings (steps, batch, learning rate) under its name in ``train``.
+Each world names its stages. A stage has a loss and rules over parameter paths that say what is
+trained and what is frozen. Its settings (steps, batch, learning rate) are in ``train``, under its
+name.
 """
 
 from __future__ import annotations
@@ -27,13 +28,15 @@ class Stage:
     """One stage of training; static and hashable.
 
     Attributes:
-        name: of its settings (``train.NAME``), folders and log entries.
-        number: its place among the world's stages, from 1; weights and noise are drawn by it.
+        name: names its settings (``train.NAME``), folders and log entries.
+        number: its place among the world's stages, from 1; seeds its weights, noise and data order.
         rules: (pattern, ``TRAIN`` or ``FREEZE``) over parameter paths, the first match wins (see
             ``pewm_jax.tree``); a leaf that none matches is an error.
         init: ``init(model, key) -> params``, all the parameters that the stage needs.
         loss: what it minimises.
-        memory: whether clips' context is read, and so the image features that may be kept of it.
+        memory: whether it reads the clips' context, and so may use cached image features.
+        rates: (pattern, factor) over the paths of trained parameters, the first match wins: the
+            learning rate there is the stage's times the factor; elsewhere it is the stage's.
     """
 
     name: str
@@ -42,19 +45,20 @@ class Stage:
     init: Callable[[Any, Array], Params]
     loss: Loss
     memory: bool = False
+    rates: tuple[tuple[str, float], ...] = ()
 
     @property
     def title(self) -> str:
-        """The name as people read it: ``stage1`` is "stage 1"."""
+        """The name for people to read: "stage 1" for ``stage1``."""
         return re.sub(r"(?<=[a-z])(?=[0-9])|_", " ", self.name)
 
     @property
     def trained(self) -> tuple[str, ...]:
-        """The patterns of what is trained."""
+        """The path patterns of the trained parameters."""
         return tuple(pattern for pattern, label in self.rules if label == TRAIN)
 
     def labels(self, params: Any) -> Any:
-        """Return a tree of ``TRAIN`` and ``FREEZE``, the mask that the optimizer works by.
+        """Return a tree of ``TRAIN`` and ``FREEZE``, one per parameter, for the optimizer.
 
         Raises:
             TreeError: leaves that no rule matches.
@@ -66,5 +70,5 @@ class Stage:
         return getattr(config.train, self.name)
 
     def data_seed(self, config: Config) -> int:
-        """Return the seed of the order in which this stage reads the data."""
+        """Return the seed of this stage's data order."""
         return config.train.seed + self.number

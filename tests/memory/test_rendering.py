@@ -16,6 +16,7 @@ from tests.memory.test_memory_rivals import ALL, KINDS, model_of, scene, seen
 
 HEIGHT, WIDTH = 6, 9
 splat = jax.jit(rendering.splat, static_argnums=(4, 5))
+insert_frames = jax.jit(voxel_map.insert_frames, static_argnums=0)
 render = jax.jit(memories.render, static_argnums=(0, 3, 4))
 
 
@@ -129,7 +130,7 @@ def test_the_map_of_a_wall_is_where_the_wall_is(yaw):
     model = tiny_model(memory=VoxelConfig(cell_m=(cell,) * 3, cells=(64, 64, 32)))
     voxels = voxel_map.empty(model.memory, np.zeros(3), 6)
     patches = np.zeros((1, 4, 6, 6), np.float32)
-    voxels = voxel_map.insert_frames(model.memory, voxels, Frames(rgb, depth, camera), patches)
+    voxels = insert_frames(model.memory, voxels, Frames(rgb, depth, camera), patches)
     assert int(voxels.dropped) == int(voxels.outside) == 0
     view = render(model, voxels, camera, height, width)
     found = np.asarray(view.seen_THW)

@@ -1,6 +1,7 @@
 """A learned table of positions at other sizes than its own: resized, left out, or refused."""
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -10,8 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pewm_jax import presets
 from pewm_jax.config import ConfigError, DiTConfig, UserError, published
-from pewm_jax.models import dit, positions
+from pewm_jax.models import dit, positions, world_model
 from tests.helpers import randomise
 
 TABLE = dataclasses.replace(
@@ -122,6 +124,19 @@ def test_the_reference_s_sinusoid_takes_the_table_s_place_where_it_is_asked_for(
     added = positions.add(choose("reference"), zeros, params["positions"], grid)[0]
     np.testing.assert_array_equal(added[:length], 0)
     np.testing.assert_allclose(added[length:], positions.sincos_table(TABLE, grid), atol=1e-6)
+
+
+def test_the_preset_takes_its_clip():
+    """As shapes alone: nothing of the network is allocated."""
+    model = presets.load("pewm_5b_i2v").model
+    assert model.backbone.learned == "interpolate"
+    like = jax.eval_shape(lambda: world_model.init(model, jax.random.key(0), memory=False))
+    video = (1, *model.latent_shape, model.in_channels)
+    text = (1, *model.backbone.text_shape)
+    given = [jax.ShapeDtypeStruct(shape, jnp.bfloat16) for shape in (video, text, (1,))]
+    sized = dataclasses.replace(model.backbone, in_channels=video[-1], out_channels=32)
+    out = jax.eval_shape(functools.partial(dit.apply, sized), like["backbone"], *given)
+    assert out.shape == (1, 3, 64, 64, 32)
 
 
 def test_only_a_table_can_be_chosen_for():

@@ -43,7 +43,7 @@ def test_tokens_come_back_and_only_zeros_are_added(layout):
 @layouts
 def test_every_part_has_its_share_of_every_frame(layout):
     video = np.asarray(layout.split(layout.arrange(tokens_of(layout)))[1])
-    shares = video.reshape(layout.parts, layout.frames, layout.wide)
+    shares = video.reshape(layout.parts, layout.frames, layout.patches_per_part)
     for frame in range(layout.frames):
         first = 1 + frame * layout.patches
         held = shares[:, frame].ravel()

@@ -49,7 +49,7 @@ def decode(config, params, latents_BthwC):
     return pixels.reshape(b, t, h * s, w * s, -1)
 
 
-def costs(model):
+def costs(model, share):
     config, (t, h, w) = model.codec, model.latent_shape
     macs = (t + 1) * h * w * (config.rgb_channels**2 + config.depth_channels**2)
     return Costs(products=(Product("codec", "linear", macs),))

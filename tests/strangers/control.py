@@ -21,6 +21,8 @@ class PushConfig(ControlSettings):
 
     width: int = 3
 
+    actions = property(lambda self: self.width)
+
 
 def init(model, key):
     shape = (model.codec.temporal * model.control.width, model.backbone.places.time)

@@ -1,5 +1,7 @@
 """The learning rate, the clipping, the decay, and who pays for moments."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,6 +69,19 @@ def test_frozen_leaves_have_no_moments_no_update_and_no_say_in_the_clipping():
         np.testing.assert_array_equal(updates["backbone"]["kernel"], 0)
         moments = sorted(float(leaf.max()) for leaf in jax.tree.leaves(after) if leaf.ndim)
         np.testing.assert_allclose(moments, [0.001 * 0.01, 0.1 * 0.1], rtol=1e-5)
+
+
+def test_a_stage_may_learn_faster_at_some_paths():
+    stage = dataclasses.replace(pewm.STAGES[0], rates=((r".*/bias", 10.0),))
+    config = fakes.config()
+    gradients = jax.tree.map(lambda leaf: 0.1 * leaf, PARAMS)
+    plain, fast = (optimizer.make(config, s) for s in (pewm.STAGES[0], stage))
+    one, ten = (
+        adam.update(gradients, adam.init(PARAMS), PARAMS)[0]["backbone"]["dense"]
+        for adam in (plain, fast)
+    )
+    np.testing.assert_allclose(ten["bias"], 10 * one["bias"], rtol=1e-6)
+    np.testing.assert_array_equal(ten["kernel"], one["kernel"])
 
 
 def test_nothing_to_train_is_refused_and_empty_stages_are_skipped():

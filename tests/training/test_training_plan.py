@@ -17,7 +17,7 @@ from pewm_jax.data import abstract
 from pewm_jax.models import vae_codec
 from pewm_jax.models.costs import SPLIT, Share
 from pewm_jax.scaling import plan, plan_text, predict, suggest
-from pewm_jax.scaling.footprint import Arranged, counts, footprint
+from pewm_jax.scaling.footprint import MeshSizes, counts, footprint
 from pewm_jax.training import chips
 from pewm_jax.worlds import costs
 from pewm_jax.worlds.pewm import STAGES
@@ -92,9 +92,9 @@ def test_the_presets_have_the_parameters_that_they_state():
 @pytest.mark.parametrize("name", ["pewm_2b", "pewm_5b"])
 def test_the_presets_fit_on_h200_in_both_stages(name, devices):
     config = configs.load(name)
-    mesh = Arranged(*config.train.mesh.shape(devices))
+    mesh = MeshSizes(*config.train.mesh.shape(devices))
     for stage in STAGES:
-        choice = suggest.weigh(config, stage, mesh, H200)
+        choice = suggest.assess(config, stage, mesh, H200)
         assert choice.fits, (stage.number, choice.footprint)
         assert 0.2 < choice.time.mfu < 0.65
 
@@ -115,9 +115,11 @@ def test_every_suggestion_uses_all_devices_and_shares_batch_and_heads():
 
 def test_more_devices_need_less_memory_each_and_do_less_work_each():
     config, stage = configs.load("pewm_5b"), STAGES[0]
-    few, many = (Arranged(fsdp=n) for n in (8, 64))
+    few, many = (MeshSizes(fsdp=n) for n in (8, 64))
     for wide in (2, 4):
-        held = [footprint(config, stage, m, wide=wide, flash=True).peak for m in (few, many)]
+        held = [
+            footprint(config, stage, m, activation_bytes=wide, flash=True).peak for m in (few, many)
+        ]
         assert held[1] < held[0] / 2
     products = costs.products(config, stage)
     work = [sum(costs.flops_of_device(p, m.sizes, 256) for p in products) for m in (few, many)]
@@ -125,13 +127,13 @@ def test_more_devices_need_less_memory_each_and_do_less_work_each():
 
 
 def test_the_vae_holds_a_chunk_of_a_long_clip():
-    config, stage, mesh = configs.load("pewm_5b"), STAGES[0], Arranged(fsdp=256)
+    config, stage, mesh = configs.load("pewm_5b"), STAGES[0], MeshSizes(fsdp=256)
     nine, long = (
         footprint(
             config.with_model(clip=dataclasses.replace(config.model.clip, frames=frames)),
             stage,
             mesh,
-            wide=2,
+            activation_bytes=2,
             flash=True,
         ).encoders
         for frames in (9, 49)
@@ -141,8 +143,10 @@ def test_the_vae_holds_a_chunk_of_a_long_clip():
 
 def test_the_vae_works_clip_by_clip_and_streams_all_clips_in_their_precision():
     model = configs.load("pewm_2b").model
-    one = vae_codec.costs(model, Share(clips=1, wide=2))
-    four, wide = (vae_codec.costs(model, Share(clips=n, wide=w)) for n, w in ((4, 2), (1, 4)))
+    one = vae_codec.costs(model, Share(clips=1, activation_bytes=2))
+    four, wide = (
+        vae_codec.costs(model, Share(clips=n, activation_bytes=w)) for n, w in ((4, 2), (1, 4))
+    )
     assert (four.held, four.streamed) == (one.held, 4 * one.streamed)
     assert (wide.held, wide.streamed) == (2 * one.held, 2 * one.streamed)
     assert one.products == four.products == wide.products

@@ -25,7 +25,7 @@ from pewm_jax.config import (
     VoxelConfig,
 )
 from pewm_jax.scaling import hlo, plan, predict
-from pewm_jax.scaling.footprint import Arranged
+from pewm_jax.scaling.footprint import MeshSizes
 from pewm_jax.worlds import costs
 from pewm_jax.worlds.pewm import STAGES
 
@@ -96,7 +96,7 @@ def measure(number, settings, devices):
     stage = STAGES[number - 1]
     used = devices if "mesh" in settings else devices[:1]
     compiled = plan.compile_stage(config, stage, used)
-    mesh = Arranged(*config.train.mesh.shape(len(used)))
+    mesh = MeshSizes(*config.train.mesh.shape(len(used)))
     clips = stage.settings(config).batch
     sent = predict.traffic(config, stage, mesh)
     done = [costs.flops_of_device(p, mesh.sizes, clips) for p in costs.products(config, stage)]
