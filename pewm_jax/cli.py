@@ -120,7 +120,7 @@ def _with_kinds(description: str | None, default: Any) -> str | None:
     kinds = flag_names.kinds_text(default) if isinstance(default, configuration.Config) else ""
     if not kinds:
         return description
-    return f"{description}\nParts of the model of which there are several kinds:\n{kinds}"
+    return f"{description}\n\nParts of the model of which there are several kinds:\n{kinds}"
 
 
 def parse_command(kind: type[T], argv: Sequence[str], prog: str) -> T:
@@ -219,19 +219,26 @@ def overlay(default: T, path: Path) -> T:
             f"a {type(values).__name__}."
         )
     if isinstance(default, configuration.Config):
-        values = configuration.upgrade(values, path.name)
-        default, _ = flag_names.take_kinds(list(_kinds_in(values)), default)
+        there = configuration.to_dict(default.model)
+        under = {".".join(where): name for where, name in _kinds_in(there)}
+        values = configuration.upgrade(values, path.name, under)
+        for where, name in sorted(_kinds_in(values), key=lambda found: len(found[0])):
+            try:
+                default = flag_names.with_kind(default, where, name)
+            except ConfigError as error:
+                place = ".".join([path.name, *where, "kind"])
+                raise ConfigError(f"{place}: {error}") from None
     merged = _deep_merge(configuration.to_dict(default), values)
     return configuration.from_dict(type(default), merged, path.name)
 
 
-def _kinds_in(values: dict[str, Any], prefix: str = "--") -> Iterator[str]:
-    """List the kinds that a table names, as flags."""
+def _kinds_in(values: dict[str, Any], *path: str) -> Iterator[tuple[tuple[str, ...], str]]:
+    """List the paths of the sections of a table that name their kind, with the name."""
     for name, value in values.items():
-        if name == "kind":
-            yield f"{prefix}kind={value}"
+        if name == "kind" and isinstance(value, str):
+            yield path, value
         elif isinstance(value, dict):
-            yield from _kinds_in(value, f"{prefix}{name}.")
+            yield from _kinds_in(value, *path, name)
 
 
 def cache_compilation(folder: Path) -> None:

@@ -34,12 +34,16 @@ def spelled_out(flags: Sequence[str], default: Any) -> list[str]:
         if not flag.startswith("--"):
             return flag
         name, equals, value = flag[2:].partition("=")
-        name = name.replace("-", "_")
+        name, given = name.replace("-", "_"), flag
+        head, dot, last = name.removeprefix("no_").rpartition(".")
+        if name.startswith("no_") and dot:
+            name = f"{head}.no_{last}"
+            given = f"--{name}{equals}{value}"
         for old, new in RENAMED_FLAGS:
             if name == old or (old.endswith((".", "_")) and name.startswith(old)):
                 return f"--{new}{name.removeprefix(old)}{equals}{value}"
         first = name.partition(".")[0].removeprefix("no_")
-        return f"--model.{name}{equals}{value}" if first in short else flag
+        return f"--model.{name}{equals}{value}" if first in short else given
 
     return [full(flag) for flag in flags]
 
@@ -56,24 +60,47 @@ def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
         other arguments.
 
     Raises:
-        ConfigError: there is no such kind.
+        ConfigError: there is no such kind, or a flag lacks its value.
     """
     rest: list[str] = []
+    chosen: list[tuple[list[str], str | None, str]] = []
     queue = list(flags)
     while queue:
-        flag, equals, value = queue.pop(0).partition("=")
-        path = flag.removeprefix("--").split(".")
-        section = _section(default, path[:-1])
-        if not flag.startswith("--") or path[-1] != "kind" or section is None:
-            rest.append(flag + equals + value)
+        word = queue.pop(0)
+        flag, equals, value = word.partition("=")
+        if not (flag.startswith("--") and flag.endswith(".kind")):
+            rest.append(word)
             continue
-        if not equals:
-            if not queue:
-                known = ", ".join(kinds.names(section.SECTION))
-                raise ConfigError(f"{flag} needs a value: {known}.")
-            value = queue.pop(0)
-        default = _replaced(default, path[:-1], _as_kind(section, value))
+        path = flag.removeprefix("--").split(".")[:-1]
+        chosen.append((path, value if equals else queue.pop(0) if queue else None, flag))
+    for path, name, flag in sorted(chosen, key=lambda choice: len(choice[0])):
+        section = _section(default, path)
+        if section is None:
+            rest.append(flag if name is None else f"{flag}={name}")
+        elif name is None:
+            there = ", ".join(kinds.names(section.SECTION))
+            raise ConfigError(f"{flag} needs a value: {there}.")
+        else:
+            default = with_kind(default, path, name)
     return default, rest
+
+
+def with_kind(default: T, path: Sequence[str], name: str) -> T:
+    """Put settings of another kind into a section, with what both kinds have in common.
+
+    Args:
+        default: the settings that the section is in.
+        path: of the section; where there is none that has kinds, nothing changes.
+        name: of the kind.
+
+    Returns:
+        Settings that are not validated: what follows may be what makes them fit each other.
+
+    Raises:
+        ConfigError: there is no such kind, or one that cannot be made from defaults.
+    """
+    section = _section(default, path)
+    return default if section is None else _replaced(default, path, _as_kind(section, name))
 
 
 def of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
@@ -120,6 +147,12 @@ def _as_kind(old: Any, name: str) -> Any:
     kind = kinds.named(old.SECTION, name)
     if kind.settings is type(old):
         return old
+    needed = serialize.needed(kind.settings)
+    if needed:
+        raise ConfigError(
+            f"The {kind.section} {name!r} cannot be chosen by its name: its settings "
+            f"{', '.join(needed)} have no default; give {kind.settings.__name__} one for each."
+        )
     values = {field.name: getattr(old, field.name) for field in dataclasses.fields(old)}
     both = values.keys() & {field.name for field in dataclasses.fields(kind.settings)}
     shared = {name for name in both if serialize.accepts(kind.settings, name, values[name])}
@@ -132,7 +165,7 @@ def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
         return value
     inner = _replaced(getattr(settings, path[0]), path[1:], value)
     changes = {path[0]: inner}
-    if isinstance(settings, Config) and path == ["model"]:
+    if isinstance(settings, Config) and list(path) == ["model"]:
         # Another world has other stages, which start with their default settings.
         common = configuration.to_dict(settings.train)
         wanted = {field.name for field in dataclasses.fields(value.TRAIN)}

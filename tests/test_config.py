@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 import inspect
 import json
 from pathlib import Path
@@ -10,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pewm_jax import cli, presets
 from pewm_jax import config as configuration
-from pewm_jax import presets
 from pewm_jax.config import (
     ActionConfig,
     AttentionConfig,
@@ -158,10 +159,26 @@ def test_what_the_checks_must_not_refuse():
         ({"model": {"backbone": {"depth": 4}}}, "config.json.model.backbone has no setting depth"),
         ({"model": {"backbone": 4}}, "config.json.model.backbone must be a table of settings"),
         ({"model": {"noise": {"kind": "none"}}}, "noise.kind: There is no noise of kind 'none'"),
-        ({"model": {"memory": {"kind": 3}}}, "there is images, map2d, none, points, voxel"),
+        ({"model": {"memory": {"kind": 3}}}, "there is images, map2d, .*none, points, voxel"),
         ({"model": {"memory": {"reader": {"kind": "?"}}}}, "memory.reader.kind: There is no"),
         ({"train": {"stage3": {}}}, "config.json.train has no setting stage3"),
         ({"codec": {"kind": "vae", "vae": 3}}, "codec.vae must be a table"),
+        ({"codec": {"vae": 3}}, "codec.vae must be a table"),
+        ({"memory": {"dinov2": 3}}, "memory.dinov2 must be a table"),
+        ({"clip": 3, "memory": {"depth": False}}, "clip must be a table"),
+        *(
+            ({"model": {"backbone": {"kind": bad}}}, r"model.backbone.kind: There is no backbone")
+            for bad in (["a"], {"a": 1}, None, 3, "", True)
+        ),
+        ({"model": {"kind": ["a"]}}, "model.kind: There is no world of kind"),
+        ({"model": {"memory": {"reader": {"kind": []}}}}, "model.memory.reader.kind: There is no"),
+        ({"codec": {"kind": ["a"]}}, "codec.kind: There is no codec"),
+        ({"memory": {"kind": ["a"]}}, "memory.kind: There is no memory"),
+        ({"memory": {"encoder": ["a"], "dinov2": {}}}, "encoder.kind: There is no encoder"),
+        (
+            {"model": {"codec": [1]}},
+            "model.codec must be a table of settings, got list",
+        ),
         ({"version": 3}, "of version 3, .* versions up to 2: install a newer pewm_jax"),
         *(({"version": v}, "must be a whole number from 1") for v in (0, -1, "2", 2.0, True, None)),
         ({"version": 2, "dit": {}}, "no setting dit"),
@@ -170,8 +187,10 @@ def test_what_the_checks_must_not_refuse():
 def test_a_wrong_file_is_refused_by_name(change, sentence, tmp_path):
     path = tmp_path / "config.json"
     path.write_text(json.dumps(change))
-    with pytest.raises(ConfigError, match=sentence):
-        configuration.load(path)
+    for read in (configuration.load, functools.partial(cli.overlay, Config())):
+        with pytest.raises(ConfigError, match=sentence) as refusal:
+            read(path)
+        assert "\n" not in str(refusal.value)
 
 
 def test_absent_and_broken_files_are_refused(tmp_path):

@@ -121,7 +121,7 @@ def test_another_kind_keeps_what_both_have_and_takes_settings_of_its_own():
 @pytest.mark.parametrize(
     ("argv", "sentence"),
     [
-        (["--memory.kind", "image"], "no memory of kind 'image'; there is images, map2d, none"),
+        (["--memory.kind", "image"], "no memory of kind 'image'; there is images, map2d, .*none"),
         (["--memory.kind"], "--model.memory.kind needs a value: images, map2d"),
         (["--memory.snapshots", 3], "--model.memory.snapshots is not a setting"),
         (["--memory.reader.kind", "?"], "no reader of kind"),
@@ -175,15 +175,64 @@ def test_a_file_of_settings_old_or_new_does_what_flags_do(table, argv, tmp_path)
     assert parse("--train.seed", 9, f"--config={file}") == parse(*argv, "--train.seed", 9)
 
 
-def test_a_setting_of_another_kind_in_an_old_file_is_not_passed_over(tmp_path):
+DINO = TINY.with_model(memory=dataclasses.replace(TINY.model.memory, encoder=DINOv2EncoderConfig()))
+VAE = TINY.with_model(clip=dataclasses.replace(TINY.model.clip, frames=9), codec=VAEConfig())
+IMAGES = TINY.with_model(memory=ImagesConfig(reader=TINY.model.memory.reader))
+
+
+@pytest.mark.parametrize(
+    ("under", "table", "argv"),
+    [
+        (IMAGES, {"memory": {"snapshots": 3}}, ["--memory.snapshots", 3]),
+        (TINY, {"memory": {"snapshots": 3}}, []),
+        (IMAGES, {"memory": {"kind": "voxel", "snapshots": 3}}, ["--memory.kind", "voxel"]),
+        (TINY, {"codec": {"vae": {"groups": 4}}}, []),
+        (VAE, {"codec": {"vae": {"groups": 4}}}, ["--codec.groups", 4]),
+        (VAE, {"codec": {"spatial": 8}}, []),
+        (VAE, {"codec": {"kind": "pixel", "spatial": 8}},
+         ["--codec.kind", "pixel", "--codec.spatial", 8]),
+        (TINY, {"codec": {"spatial": 2, "vae": {"groups": 4}}}, ["--codec.spatial", 2]),
+        (DINO, {"memory": {"encoder_patch": 4}}, []),
+        (TINY, {"memory": {"encoder_patch": 4}}, ["--memory.encoder.patch", 4]),
+        (TINY, {"memory": {"encoder_size": 28, "dinov2": {"layers": 2}}}, []),
+        (DINO, {"memory": {"encoder_size": 28, "dinov2": {"layers": 2}}},
+         ["--memory.encoder.size", 28, "--memory.encoder.network.layers", 2]),
+        (TINY, {"memory": {"encoder": "dinov2", "encoder_size": 28, "encoder_patch": 4}},
+         ["--memory.encoder.kind", "dinov2", "--memory.encoder.size", 28]),
+    ],
+)  # fmt: skip
+def test_a_part_of_an_old_file_does_over_any_kind_what_it_did(under, table, argv, tmp_path):
+    """Version 1 kept the settings of all kinds side by side: those of others changed nothing."""
     file = tmp_path / "mine.json"
-    file.write_text('{"memory": {"encoder_size": 28}}')
-    with pytest.raises(ConfigError, match="encoder has no setting size"):
-        parse("--config", file)
-    dino = TINY.with_model(
-        memory=dataclasses.replace(TINY.model.memory, encoder=DINOv2EncoderConfig())
-    )
-    assert parse("--config", file, default=dino).model.memory.encoder.size == 28
+    file.write_text(json.dumps({"train": {"seed": 9}} | table))
+    assert parse("--config", file, default=under) == parse(*argv, "--train.seed", 9, default=under)
+
+
+@pytest.mark.parametrize(
+    ("setting", "new"),
+    [
+        ("memory.depth", "model.clip.no_depth"),
+        ("clip.depth", "model.clip.no_depth"),
+        ("model.clip.depth", "model.clip.no_depth"),
+        ("diffusion.zero_terminal_snr", "model.noise.no_zero_terminal_snr"),
+        ("dit.remat", "model.backbone.no_remat"),
+        ("codec.vae.tiling", "model.codec.no_tiling"),
+    ],
+)
+def test_a_flag_is_negated_in_every_spelling(setting, new):
+    head, _, last = setting.rpartition(".")
+    spellings = [f"no-{setting}", f"no_{setting}", f"{head}.no-{last}", f"{head}.no_{last}"]
+    spellings += [name.replace("_", "-") for name in spellings]
+    for name in spellings:
+        (full,) = flags.spelled_out([f"--{name}"], VAE)
+        assert full.replace("no-", "no_").replace("-terminal-snr", "_terminal_snr") == f"--{new}"
+        assert parse(f"--{name}", default=VAE) == parse(f"--{new}", default=VAE)
+
+
+def test_a_negated_old_flag_switches_off():
+    assert TINY.model.clip.depth
+    assert not parse("--no-memory.depth").model.clip.depth
+    assert not parse("--no-diffusion.zero-terminal-snr").model.noise.zero_terminal_snr
 
 
 @pytest.mark.parametrize("name", ["images", "pewm_2b"])

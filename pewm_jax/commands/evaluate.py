@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pewm_jax import cli
+from pewm_jax.commands import imports
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +46,11 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
     Returns:
         The exit code.
     """
-    about = "Score a trained run on held-out scenes and write RUN/report/index.html."
+    argv = imports.take(argv)
+    about = (
+        "Score a trained run on held-out scenes and write RUN/report/index.html. Beside these "
+        f"settings:\n{imports.HELP}"
+    )
     asks = bool(argv) and argv[0] in ("-h", "--help")
     if not asks and (not argv or argv[0].startswith("-")):
         raise cli.ConfigError(f"Name a run folder first: {prog} runs/demo.")

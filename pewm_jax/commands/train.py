@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pewm_jax import cli, presets
 from pewm_jax import config as configuration
+from pewm_jax.commands import imports
 from pewm_jax.config import Config, Launch
 
 USAGE = """usage: {prog} PRESET [--config FILE.json] [--SETTING VALUE …]
@@ -18,6 +19,7 @@ Presets:
 
 Beside the settings there are
 {launch}
+{imports}
 
 Examples:
 {examples}
@@ -46,6 +48,7 @@ def main(argv: Sequence[str], prog: str = "python train.py") -> int:
     Returns:
         The exit code.
     """
+    argv = imports.take(argv)
     if argv and argv[0] in ("-h", "--help"):
         more = "The same command again goes on where an interrupted training stopped."
         print(_usage(prog, TRAIN_EXAMPLES, cli.list_flags(Launch), more))
@@ -87,6 +90,7 @@ def _usage(prog: str, examples: Sequence[str], launch: str, more: str) -> str:
         prog=prog,
         presets="\n".join(lines),
         launch=launch,
+        imports=imports.HELP,
         examples="\n".join(f"  {prog} {example}" for example in examples),
         more=more,
     )
@@ -114,7 +118,7 @@ def _read(argv: Sequence[str], prog: str) -> tuple[Config, Launch]:
         default=default,
         prog=f"{prog} {name}",
         description=f"{about} Settings also come from --config FILE.json. "
-        f"Beside these settings:\n{cli.list_flags(Launch)}",
+        f"Beside these settings:\n{cli.list_flags(Launch)}\n{imports.HELP}",
     )
     return config, launch
 

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from pewm_jax.config.errors import require
+from pewm_jax.config.kinds import require_section
 from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.training import DataConfig, EvalConfig, TrainConfig, TrainSettings
 
@@ -38,6 +39,7 @@ class Config:
             self.version == VERSION,
             f"version is {self.version}: this library writes version {VERSION}; leave it out.",
         )
+        require_section(self.model, "world", "model")
         require(
             isinstance(self.train, self.model.TRAIN),
             f"train is a {type(self.train).__name__}, and a {type(self.model).__name__} is trained "

@@ -11,12 +11,16 @@ From then on its functions are found by the type of the settings:
 ``{"backbone": {"kind": "mine", "layers": 4}}``. The functions of each part are documented in
 ``pewm_jax.models`` (``backbones``, ``codecs``, ``controls``, ``readers``, ``encoders``),
 ``pewm_jax.memory.memories``, ``pewm_jax.diffusion.noise`` and ``pewm_jax.worlds``.
+
+When a name is not known, the modules of the entry-point group ``pewm_jax.kinds`` are imported, by
+which installed packages register kinds of theirs.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+from importlib import metadata
 from typing import Any, ClassVar
 
 from pewm_jax.config.errors import ConfigError
@@ -60,11 +64,19 @@ class Kind:
     where: Any
 
 
+GROUP = "pewm_jax.kinds"
+"""The entry points whose modules register kinds when they are imported."""
+
 _KINDS: dict[tuple[str, str], Kind] = {}
+_ENTERED: set[str] = set()
+"""Modules of entry points that were imported, or are being imported."""
 
 
 def register(section: str, name: str, settings: type, where: Any) -> None:
-    """Make a kind known; registering the same settings again replaces their functions.
+    """Make a kind known.
+
+    Registering the same settings again replaces them and their functions: the same class, or the
+    one that a notebook's cell or a reloaded module defines anew.
 
     Args:
         section: the part of a model, such as ``backbone``.
@@ -73,20 +85,34 @@ def register(section: str, name: str, settings: type, where: Any) -> None:
         where: the name of the module with its functions, or a module or other object.
 
     Raises:
-        ConfigError: the settings are of another section, or the name is taken by other settings.
+        ConfigError: the settings are no frozen dataclass or of another section, or the name is
+            taken by other settings.
     """
-    if getattr(settings, "SECTION", None) != section:
+    if not (isinstance(settings, type) and issubclass(settings, Settings)) or (
+        section != settings.SECTION
+    ):
         raise ConfigError(
-            f"{settings.__name__} cannot be registered as a {section}: derive it from the settings "
-            f"of that section, which say SECTION = {section!r}."
+            f"{getattr(settings, '__name__', settings)} cannot be registered as a {section}: "
+            f"derive a class from the settings of that section, which say SECTION = {section!r}."
+        )
+    parameters = vars(settings).get("__dataclass_params__")
+    if parameters is None or not parameters.frozen:
+        raise ConfigError(
+            f"{settings.__name__} cannot be registered as a {section}: it is no frozen dataclass, "
+            "so write @dataclasses.dataclass(frozen=True) above it."
         )
     taken = _KINDS.get((section, name))
-    if taken is not None and taken.settings is not settings:
+    if taken is not None and not _same(taken.settings, settings):
         raise ConfigError(
             f"There is a {section} {name!r} already ({taken.settings.__name__}); choose another "
             "name."
         )
     _KINDS[section, name] = Kind(section, name, settings, where)
+
+
+def _same(one: type, other: type) -> bool:
+    """Tell whether two classes are one, or the same definition run twice."""
+    return (one.__module__, one.__qualname__) == (other.__module__, other.__qualname__)
 
 
 def names(section: str) -> list[str]:
@@ -95,18 +121,60 @@ def names(section: str) -> list[str]:
 
 
 def named(section: str, name: str) -> Kind:
-    """Return a kind by its name.
+    """Return a kind by its name; installed packages are asked for one that is not known.
 
     Raises:
-        ConfigError: there is no such kind; the message lists the known ones.
+        ConfigError: there is no such kind; the message lists the known ones, and the modules of
+            entry points that could not be imported.
     """
-    kind = _KINDS.get((section, name))
-    if kind is None:
+    failed: list[str] = []
+    if isinstance(name, str):  # a table read from JSON may hold anything
+        if (section, name) not in _KINDS:
+            failed = _import_entry_points()
+        if (section, name) in _KINDS:
+            return _KINDS[section, name]
+    raise ConfigError(
+        f"There is no {section} of kind {name!r}; there is {', '.join(names(section))} (a kind of "
+        "your own is known once its module is imported: say --import MODULE to the command, or "
+        f"name the module in an entry point of the group {GROUP!r})"
+        + "".join(f"; {sentence.removesuffix('.')}" for sentence in failed)
+        + "."
+    )
+
+
+def _import_entry_points() -> list[str]:
+    """Import the modules that installed packages name, each once; return what went wrong."""
+    failed = []
+    for point in metadata.entry_points(group=GROUP):
+        if point.module in _ENTERED:
+            continue
+        _ENTERED.add(point.module)  # before: what it imports may ask for a kind
+        try:
+            imported(point.module, f"entry point {point.name!r} of {GROUP}")
+        except ConfigError as error:
+            _ENTERED.discard(point.module)
+            failed.append(str(error))
+    return failed
+
+
+def imported(name: str, what: str) -> Any:
+    """Import a module of a user's.
+
+    Args:
+        name: its name.
+        what: what asks for it, for the error message.
+
+    Raises:
+        ConfigError: it cannot be imported, for whatever reason.
+    """
+    try:
+        return importlib.import_module(name)
+    except Exception as error:  # a module may raise anything when it is run
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise ConfigError(
-            f"There is no {section} of kind {name!r}; there is {', '.join(names(section))} (a kind "
-            "of your own is known once the module that registers it is imported)."
-        )
-    return kind
+            f"{what}: the module {name} cannot be imported ({reason}); mend it, install what it "
+            "needs, or put it where Python looks for modules."
+        ) from error
 
 
 def of(settings: Any) -> Kind:
@@ -115,9 +183,10 @@ def of(settings: Any) -> Kind:
     Raises:
         ConfigError: their type is not registered.
     """
-    for kind in _KINDS.values():
-        if kind.settings is type(settings):
-            return kind
+    for same in (lambda one, other: one is other, _same):
+        for kind in _KINDS.values():
+            if same(kind.settings, type(settings)):
+                return kind
     raise ConfigError(
         f"{type(settings).__name__} is not registered: call pewm_jax.config.register(section, "
         "name, settings, functions) once, where it is defined."
@@ -125,6 +194,38 @@ def of(settings: Any) -> Kind:
 
 
 def functions(settings: Any) -> Any:
-    """Return the module or object with the functions for settings, chosen by their type."""
-    where = of(settings).where
-    return importlib.import_module(where) if isinstance(where, str) else where
+    """Return the module or object with the functions for settings, chosen by their type.
+
+    Raises:
+        ConfigError: their type is not registered, or the module cannot be imported.
+    """
+    kind = of(settings)
+    if not isinstance(kind.where, str):
+        return kind.where
+    return imported(kind.where, f"{kind.section} of kind {kind.name!r}")
+
+
+def require_section(value: Any, section: str, where: str) -> None:
+    """Refuse what are not settings of a section, also in the sections below it.
+
+    Args:
+        value: what was given.
+        section: that it must be of.
+        where: its name in the error message.
+
+    Raises:
+        ConfigError: in one sentence.
+    """
+    given = not isinstance(value, type) and dataclasses.is_dataclass(value)
+    if not given or getattr(value, "SECTION", None) != section:
+        found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+        there = [kind.settings.__name__ for kind in _KINDS.values() if kind.section == section]
+        raise ConfigError(
+            f"{where} is {found}: give it settings of the section {section!r}, such as "
+            f"{' or '.join(there)}."
+        )
+    for field in dataclasses.fields(value):
+        if isinstance(field.default, Settings):
+            require_section(
+                getattr(value, field.name), field.default.SECTION, f"{where}.{field.name}"
+            )

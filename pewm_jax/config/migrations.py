@@ -7,21 +7,25 @@ turns its values into those of the next.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pewm_jax.config.errors import ConfigError, require
 from pewm_jax.config.experiment import VERSION
 
 Values = dict[str, Any]
+Kinds = Mapping[str, Any]
+"""The kind of each section by its path in the model: ``{"memory.encoder": "dinov2"}``."""
 
 
-def upgrade(values: Values, where: str) -> Values:
+def upgrade(values: Values, where: str, under: Kinds | None = None) -> Values:
     """Upgrade the plain values of a configuration to the current version.
 
     Args:
         values: nested plain values, as read from JSON; they are not changed.
         where: name of the file, for error messages.
+        under: kinds of the settings that the values are laid over, which a section that does not
+            say its own is of; by default those that were the default in the values' version.
 
     Raises:
         ConfigError: the version is not a number, or newer than this library knows.
@@ -36,18 +40,22 @@ def upgrade(values: Values, where: str) -> Values:
         )
     values = copy.deepcopy(values)
     for number in range(version, VERSION):
-        values = MIGRATIONS[number](values, where)
+        values = MIGRATIONS[number](values, where, under or {})
         values["version"] = number + 1
     return values
 
 
-def from_1(values: Values, where: str) -> Values:
+def from_1(values: Values, where: str, under: Kinds) -> Values:
     """Move the model's sections under ``model`` and split them into parts with kinds.
 
-    Parts that had only one kind in version 1 get no ``kind``: it is the default now.
+    Version 1 held the settings of all kinds side by side, and used those of one: what is of the
+    others is dropped. A part that does not say its kind is of that which lies under, or of the one
+    that was the default, and is now.
     """
-    _require_tables(values, where, "codec", "dit", "memory", "diffusion", "train")
+    sections = ("clip", "actions", "codec", "dit", "memory", "diffusion", "train")
+    _require_tables(values, where, *sections)
     _require_tables(values.get("codec", {}), f"{where}.codec", "vae")
+    _require_tables(values.get("memory", {}), f"{where}.memory", "dinov2")
     old = dict(values)
     model: Values = {}
     for name in ("clip", "actions"):
@@ -63,14 +71,14 @@ def from_1(values: Values, where: str) -> Values:
     if train:
         old["train"] = train
     if "codec" in old:
-        model["codec"] = _codec(old.pop("codec"))
+        model["codec"] = _codec(old.pop("codec"), under)
     if "dit" in old:
         model["backbone"] = _backbone(old.pop("dit"))
     if "memory" in old:
         memory = old.pop("memory")
         if "depth" in memory:
             _move(memory, "depth", model.setdefault("clip", {}), "depth")
-        model["memory"] = _memory(memory)
+        model["memory"] = _memory(memory, under)
     return {"version": 2, "model": model, **old}
 
 
@@ -90,28 +98,29 @@ def _backbone(old: Values) -> Values:
     return table | old
 
 
-def _codec(old: Values) -> Values:
-    if old.get("kind") == "vae" or set(old) == {"vae"}:
-        return {"kind": "vae", **old.get("vae", {})}
-    return {name: value for name, value in old.items() if name != "vae"}
+def _codec(old: Values, under: Kinds) -> Values:
+    vae = old.pop("vae", {})
+    if old.get("kind", under.get("codec", "pixel")) != "vae":
+        return old
+    unused = ("spatial", "temporal")
+    return {name: value for name, value in old.items() if name not in unused} | vae
 
 
-def _memory(old: Values) -> Values:
+def _memory(old: Values, under: Kinds) -> Values:
     """Split memory settings into memory, ``encoder`` and ``reader``."""
     new, encoder, reader = {}, {}, {}
-    kind = old.get("kind", "voxel")
+    kind = old.get("kind", under.get("memory", "voxel"))
     _move(old, "kind", new, "kind")
     _move(old, "encoder", encoder, "kind")
     _move(old, "encoder_patch", encoder, "patch")
     _move(old, "encoder_size", encoder, "size")
     _move(old, "dinov2", encoder, "network")
-    unused = {"dinov2": ("patch",), "patch_colours": ("size", "network")}.get(
-        encoder.get("kind", ""), ()
-    )
+    features = encoder.get("kind", under.get("memory.encoder", "patch_colours"))
+    unused = {"dinov2": ("patch",), "patch_colours": ("size", "network")}.get(str(features), ())
     encoder = {name: value for name, value in encoder.items() if name not in unused}
     for name in ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio"):
         _move(old, name, reader, name)
-    if kind != "images":
+    if kind in ("voxel", "map2d", "points", "none"):
         old.pop("snapshots", None)
     parts = {"encoder": encoder, "reader": reader}
     return new | old | {name: part for name, part in parts.items() if part}
@@ -122,7 +131,7 @@ def _move(old: Values, name: str, new: Values, to: str) -> None:
         new[to] = old.pop(name)
 
 
-MIGRATIONS: dict[int, Callable[[Values, str], Values]] = {1: from_1}
+MIGRATIONS: dict[int, Callable[[Values, str, Kinds], Values]] = {1: from_1}
 """Version → the function that upgrades its values to the next version."""
 
 RENAMED_FLAGS = (

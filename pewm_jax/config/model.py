@@ -10,7 +10,8 @@ from pewm_jax.config.clip import ActionConfig, ClipConfig
 from pewm_jax.config.codec import CodecSettings, PixelConfig
 from pewm_jax.config.control import CameraConfig, ControlSettings
 from pewm_jax.config.dit import DiTConfig
-from pewm_jax.config.kinds import Settings
+from pewm_jax.config.errors import require
+from pewm_jax.config.kinds import Settings, require_section
 from pewm_jax.config.memory import MemorySettings, VoxelConfig
 from pewm_jax.config.noise import DDPMConfig, NoiseSettings
 from pewm_jax.config.training import TrainConfig, TrainSettings
@@ -64,7 +65,14 @@ class ModelConfig(WorldSettings):
         return 2 * self.codec.channels + self.control.channels(self)
 
     def __post_init__(self):
-        """Validate settings that depend on each other."""
+        """Validate what is in each section, and settings that depend on each other."""
+        require_section(self, "world", "model")
+        for name, kind in (("clip", ClipConfig), ("actions", ActionConfig)):
+            found = getattr(self, name)
+            require(
+                isinstance(found, kind),
+                f"model.{name} is {type(found).__name__}: give it a {kind.__name__}.",
+            )
         parts: tuple[Any, ...] = (self.backbone, self.codec, self.control, self.memory, self.noise)
         for part in parts:
             part.check(self)

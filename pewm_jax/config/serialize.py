@@ -58,18 +58,28 @@ def from_dict(kind: type[T], values: dict[str, Any], where: str = "config") -> T
     built: dict[str, Any] = {}
     for name, value in values.items():
         hint = fields[name].metadata.get("kinds", hints[name])
-        if _has_kinds(hint) and isinstance(value, dict) and "kind" not in value:
-            hint = type(fields[name].default)  # a section without a kind is of the default one
+        usual = type(fields[name].default)
+        if isinstance(value, dict) and "kind" not in value and _has_kinds(usual):
+            hint = usual  # a section without a kind is of the default one
         built[name] = _coerce(hint, value, f"{where}.{name}")
     if issubclass(kind, Config):
         built = _with_training(built, values, where)
+    missing = sorted(name for name in needed(kind) if name not in built)
+    require(not missing, f"{where} lacks {', '.join(missing)}, which has no default: add it.")
     return kind(**built)
+
+
+def needed(kind: type) -> list[str]:
+    """Return the names of the settings without a default."""
+    nothing = dataclasses.MISSING
+    fields = dataclasses.fields(kind)
+    return [f.name for f in fields if f.init and f.default is f.default_factory is nothing]
 
 
 def _with_training(built: dict[str, Any], values: dict[str, Any], where: str) -> dict[str, Any]:
     """Build the section ``train``, whose stages depend on the model."""
     stages = built.get("model", Config().model).TRAIN
-    return built | {"train": _coerce(stages, values.get("train", {}), f"{where}.train")}
+    return built | {"train": from_dict(stages, values.get("train", {}), f"{where}.train")}
 
 
 def _has_kinds(hint: Any) -> bool:

@@ -1,0 +1,344 @@
+"""Kinds of parts: what may be registered, how a user's own are found, and what is refused."""
+
+import contextlib
+import dataclasses
+import importlib
+import json
+import sys
+import textwrap
+
+import pytest
+
+from pewm_jax import cli, flags, presets
+from pewm_jax import config as configuration
+from pewm_jax.commands import evaluate, imports, train
+from pewm_jax.config import (
+    AttentionConfig,
+    CameraConfig,
+    ClipConfig,
+    Config,
+    ConfigError,
+    DDPMConfig,
+    ModelConfig,
+    NoiseSettings,
+    PixelConfig,
+    VoxelConfig,
+    WorldSettings,
+    kinds,
+    register,
+)
+from tests.strangers import run as strangers
+
+TINY = presets.load("tiny")
+PART = """
+    import dataclasses
+    import sys
+
+    from pewm_jax.config import NoiseSettings, register
+
+
+    @dataclasses.dataclass(frozen=True)
+    class MineConfig(NoiseSettings):
+        sample_steps: int = 3
+        strength: float = 1.0
+
+
+    register("noise", {name!r}, MineConfig, sys.modules[__name__])
+"""
+
+
+@pytest.fixture(autouse=True)
+def forgotten(monkeypatch):
+    """What a test registers or puts on the path is gone after it."""
+    monkeypatch.setattr(kinds, "_KINDS", dict(kinds._KINDS))
+    monkeypatch.setattr(kinds, "_ENTERED", set())
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if name.startswith("mine_"):
+            del sys.modules[name]
+    importlib.invalidate_caches()
+
+
+def package(folder, module, text, *, entry=True):
+    """A module, and what an installer writes beside it for an entry point."""
+    (folder / f"{module}.py").write_text(textwrap.dedent(text))
+    info = folder / f"{module}-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1\n")
+    if entry:
+        (info / "entry_points.txt").write_text(f"[pewm_jax.kinds]\nours = {module}\n")
+
+
+def one_sentence(refusal):
+    text = str(refusal.value)
+    assert "\n" not in text
+    assert text.endswith(".")
+    return text
+
+
+def named_mine(name):
+    return configuration.from_dict(Config, {"model": {"noise": {"kind": name, "strength": 2}}})
+
+
+def test_an_installed_package_s_kind_is_found_by_its_entry_point(tmp_path, monkeypatch):
+    package(tmp_path, "mine_installed", PART.format(name="installed"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    config = named_mine("installed")
+    assert (type(config.model.noise).__name__, config.model.noise.strength) == ("MineConfig", 2.0)
+    assert configuration.to_dict(config)["model"]["noise"]["kind"] == "installed"
+
+
+def test_a_name_that_is_known_imports_no_one_s_module(tmp_path, monkeypatch):
+    package(tmp_path, "mine_heavy", "raise RuntimeError('too early')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert kinds.named("noise", "ddpm").settings is DDPMConfig
+
+
+def test_an_entry_point_that_cannot_be_imported_is_named_only_if_the_kind_is_not_found(
+    tmp_path, monkeypatch
+):
+    package(tmp_path, "mine_broken", "import no_such_library")
+    package(tmp_path, "mine_whole", PART.format(name="whole"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert named_mine("whole").model.noise.strength == 2
+    with pytest.raises(ConfigError, match=r"mine_broken cannot be imported .*no_such_lib") as error:
+        named_mine("absent")
+    assert "'ours' of pewm_jax.kinds" in one_sentence(error)
+
+
+def test_a_module_of_entry_points_is_imported_once(tmp_path, monkeypatch):
+    package(tmp_path, "mine_once", "import pewm_jax\npewm_jax.times = pewm_jax.times + 1")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    pewm_jax = sys.modules["pewm_jax"]
+    monkeypatch.setattr(pewm_jax, "times", 0, raising=False)
+    for _ in range(2):
+        with pytest.raises(ConfigError, match="no noise of kind"):
+            kinds.named("noise", "absent")
+        sys.modules.pop("mine_once", None)
+    assert pewm_jax.times == 1
+
+
+def test_the_refusal_of_an_unknown_kind_names_both_ways():
+    with pytest.raises(ConfigError, match=r"--import MODULE .* entry point .*pewm_jax\.kinds") as e:
+        kinds.named("noise", "absent")
+    one_sentence(e)
+
+
+@pytest.mark.parametrize("spelling", [["--import", "mine_here"], ["--import=mine_here"]])
+def test_a_file_in_the_current_folder_is_imported_for_training(spelling, tmp_path, monkeypatch):
+    package(tmp_path, "mine_here", PART.format(name="here"), entry=False)
+    monkeypatch.chdir(tmp_path)
+    seen = []
+    from pewm_jax.scaling import plan
+
+    monkeypatch.setattr(plan, "show", lambda config, launch: seen.append(config))
+    chosen = ["--noise.kind", "here", "--noise.strength", "2"]
+    train.main(["tiny", *spelling, *chosen, "--plan"])
+    train.plan([*spelling, "tiny", *chosen])
+    configuration.save(seen[0], tmp_path / "config.json")
+    assert [type(config.model.noise).__name__ for config in seen] == ["MineConfig"] * 2
+    assert seen[0].model.noise.strength == 2
+    assert configuration.load(tmp_path / "config.json") == seen[0]
+
+
+def test_evaluation_imports_before_it_opens_the_run(tmp_path, monkeypatch):
+    package(tmp_path, "mine_first", PART.format(name="first"), entry=False)
+    package(tmp_path, "mine_second", PART.format(name="second"), entry=False)
+    monkeypatch.chdir(tmp_path)
+    from pewm_jax.evaluation import report
+
+    seen = []
+    monkeypatch.setattr(
+        report, "evaluate", lambda run, **_: seen.append([run, *kinds.names("noise")])
+    )
+    monkeypatch.setattr(cli, "cache_compilation", lambda folder: None)
+    evaluate.main(["--import", "mine_first", "runs/x", "--import", "mine_second", "--clips", "1"])
+    assert seen[0][0] == "runs/x"
+    assert {"first", "second"} <= set(seen[0])
+
+
+@pytest.mark.parametrize("command", [train.main, train.plan, evaluate.main])
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--import"], "--import needs the name of a module"),
+        (["--import="], "--import needs the name of a module"),
+        (["--import", "parts/mine.py"], "needs the name of a module, .* got 'parts/mine.py'"),
+        (["--import", "mine.py"], "such as my_parts for my_parts.py"),
+        (["--import", "mine_absent"], "--import: the module mine_absent cannot be imported"),
+    ],
+)
+def test_what_cannot_be_imported_is_refused_in_a_sentence(command, words, sentence):
+    with pytest.raises(ConfigError, match=sentence) as refusal:
+        command(["tiny", *words])
+    one_sentence(refusal)
+
+
+def test_a_module_that_is_broken_is_refused_in_a_sentence(tmp_path, monkeypatch):
+    package(tmp_path, "mine_wrong", "raise ValueError('two\\nlines')", entry=False)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"mine_wrong .*ValueError: two lines") as refusal:
+        imports.take(["tiny", "--import", "mine_wrong"])
+    one_sentence(refusal)
+
+
+def test_the_help_names_the_flag(capsys):
+    for command in (train.main, train.plan, evaluate.main):
+        with contextlib.suppress(SystemExit):
+            command(["--help"])
+        assert "--import MODULE" in capsys.readouterr().out
+
+
+def cell(module="__main__"):
+    """What a notebook's cell defines each time it is run."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Cell(NoiseSettings):
+        sample_steps: int = 3
+
+    Cell.__module__ = module
+    return Cell
+
+
+def test_a_cell_that_is_run_again_takes_the_place_of_the_first():
+    first, second = cell(), cell()
+    register("noise", "cell", first, "json")
+    made = ModelConfig(noise=first())
+    register("noise", "cell", second, "math")
+    assert kinds.named("noise", "cell").settings is second
+    assert (
+        kinds.functions(second()) is kinds.functions(made.noise) is importlib.import_module("math")
+    )
+    assert configuration.to_dict(made)["noise"]["kind"] == "cell"
+    with pytest.raises(ConfigError, match="a noise 'cell' already"):
+        register("noise", "cell", cell("elsewhere"), "json")
+
+
+def test_a_module_that_is_reloaded_registers_anew(tmp_path, monkeypatch):
+    package(tmp_path, "mine_reloaded", PART.format(name="reloaded"), entry=False)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    module = importlib.import_module("mine_reloaded")
+    first = module.MineConfig
+    importlib.reload(module)
+    assert kinds.named("noise", "reloaded").settings is module.MineConfig is not first
+
+
+class Plain(NoiseSettings):
+    pass
+
+
+class Undecorated(DDPMConfig):
+    extra: int = 3
+
+
+@dataclasses.dataclass
+class Thawed(NoiseSettings):
+    extra: int = 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        (Plain, "Plain .* no frozen dataclass"),
+        (Undecorated, "Undecorated .* no frozen dataclass"),
+        (Thawed, r"Thawed .* write @dataclasses.dataclass\(frozen=True\)"),
+        (PixelConfig, "PixelConfig cannot be registered as a noise: derive"),
+        (ClipConfig, "ClipConfig cannot be registered as a noise: derive"),
+        (DDPMConfig(), "cannot be registered as a noise: derive a class"),
+    ],
+)
+def test_what_is_no_settings_of_a_section_cannot_be_registered(settings, sentence):
+    with pytest.raises(ConfigError, match=sentence) as refusal:
+        register("noise", "new", settings, "json")
+    one_sentence(refusal)
+    assert "new" not in kinds.names("noise")
+
+
+@pytest.mark.parametrize(
+    ("build", "sentence"),
+    [
+        (lambda: ModelConfig(noise=PixelConfig()), "model.noise is PixelConfig: .* DDPMConfig"),
+        (lambda: ModelConfig(memory=None), "model.memory is NoneType"),
+        (lambda: ModelConfig(control=CameraConfig), "model.control is the class CameraConfig"),
+        (lambda: ModelConfig(noise=Plain()), "model.noise is Plain"),
+        (lambda: ModelConfig(clip=None), "model.clip is NoneType: give it a ClipConfig"),
+        (lambda: ModelConfig(actions=ClipConfig()), "model.actions is ClipConfig"),
+        (
+            lambda: ModelConfig(memory=VoxelConfig(encoder=AttentionConfig())),
+            "model.memory.encoder is AttentionConfig",
+        ),
+        (lambda: Config(model=PixelConfig()), "model is PixelConfig: .* 'world'"),
+        (lambda: Config(model=None), "model is NoneType"),
+    ],
+)
+def test_what_does_not_belong_into_a_section_is_refused(build, sentence):
+    with pytest.raises(ConfigError, match=sentence) as refusal:
+        build()
+    one_sentence(refusal)
+
+
+def test_functions_that_cannot_be_imported_are_refused_with_the_reason():
+    gone = cell()
+    register("noise", "gone", gone, "no_such_module.noise")
+    with pytest.raises(ConfigError, match=r"noise of kind 'gone': .*no_such_module") as refusal:
+        kinds.functions(gone())
+    assert "ModuleNotFoundError" in one_sentence(refusal)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--codec.kind", "pixel", "--clip.frames", "5", "--memory.reader.heads", "4"],
+        ["--clip.frames=5", "--memory.reader.heads=4", "--codec.kind=pixel"],
+    ],
+)
+def test_a_kind_is_chosen_together_with_what_it_needs(words, tmp_path):
+    default = strangers.experiment()  # 4 frames, which the pixel codec cannot fold
+    found = cli.parse(Config, words, default=default, prog="train.py").model
+    assert (found.codec, found.clip.frames) == (PixelConfig(), 5)
+    file = tmp_path / "mine.json"
+    table = {"clip": {"frames": 5}, "codec": {"kind": "pixel"}, "memory": {"reader": {"heads": 4}}}
+    file.write_text(json.dumps({"model": table}))
+    assert cli.overlay(default, file).model == found
+    with pytest.raises(ConfigError, match=r"use 4k \+ 1"):
+        cli.parse(Config, ["--codec.kind", "pixel"], default=default, prog="train.py")
+
+
+@dataclasses.dataclass(frozen=True)
+class Demanding(NoiseSettings):
+    strength: float
+    sample_steps: int = 3
+
+
+def test_settings_without_a_default_are_asked_for():
+    register("noise", "demanding", Demanding, "json")
+    found = configuration.from_dict(NoiseSettings, {"kind": "demanding", "strength": 2})
+    assert found == Demanding(2.0)
+    with pytest.raises(ConfigError, match="config lacks strength") as refusal:
+        configuration.from_dict(NoiseSettings, {"kind": "demanding"})
+    one_sentence(refusal)
+    with pytest.raises(ConfigError, match="strength have no default") as refusal:
+        flags.take_kinds(["--model.noise.kind", "demanding"], Config())
+    one_sentence(refusal)
+
+
+DDPM = DDPMConfig()
+
+
+@dataclasses.dataclass(frozen=True)
+class Other(WorldSettings):
+    noise: NoiseSettings = DDPM
+    dtype: str = "float32"
+
+
+def test_a_world_is_chosen_before_its_parts(tmp_path):
+    register("world", "other", Other, "json")
+    words = ["--model.noise.kind", "flow", "--model.kind", "other"]
+    found, rest = flags.take_kinds(words, TINY)
+    assert (type(found.model), type(found.model.noise).__name__, rest) == (Other, "FlowConfig", [])
+    file = tmp_path / "mine.json"
+    file.write_text('{"model": {"noise": {"kind": "flow", "shift": 2}, "kind": "other"}}')
+    assert cli.overlay(TINY, file).model.noise.shift == 2
