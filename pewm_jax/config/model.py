@@ -22,11 +22,13 @@ class WorldSettings(Settings):
     Attributes:
         TRAIN: its training settings: ``TrainSettings`` with a ``StageConfig`` for each stage, named
             as ``pewm_jax.worlds.stages`` names them.
+        TRAINS: parts that other worlds take from ``train.start`` and this one trains itself.
         dtype: compute precision, in which frozen weights are kept too.
     """
 
     SECTION: ClassVar[str] = "world"
     TRAIN: ClassVar[type[TrainSettings]] = TrainSettings
+    TRAINS: ClassVar[tuple[str, ...]] = ()
     dtype: Any = "float32"
 
 
