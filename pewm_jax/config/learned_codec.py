@@ -6,7 +6,7 @@ import dataclasses
 from typing import ClassVar
 
 from pewm_jax.config.codec import CodecSettings
-from pewm_jax.config.errors import require, require_positive
+from pewm_jax.config.errors import require_positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,8 +22,6 @@ class LearnedCodecConfig(CodecSettings):
     CONVERTED: ClassVar[bool] = True
     WEIGHTS_FROM: ClassVar[str] = "train it (pewm-jax train codec)"
 
-    temporal: int = 1
-    """Frames per latent frame after the first: 1, every frame by itself."""
     latent_channels: int = 16
     """Latent channels of colour, and as many of depth."""
     fine: int = 64
@@ -42,6 +40,11 @@ class LearnedCodecConfig(CodecSettings):
         return 8
 
     @property
+    def temporal(self) -> int:
+        """Frames per latent frame after the first: every frame is encoded by itself."""
+        return 1
+
+    @property
     def rgb_channels(self) -> int:
         """Latent channels of colour."""
         return self.latent_channels
@@ -55,8 +58,3 @@ class LearnedCodecConfig(CodecSettings):
         """Validate."""
         sizes = ("latent_channels", "fine", "coarse", "fine_blocks", "coarse_blocks")
         require_positive(self, "codec", *sizes)
-        require(
-            self.temporal == 1,
-            f"codec.temporal is {self.temporal}: the learned codec encodes every frame by itself, "
-            "use 1 (the pixel codec and the VAE fold frames).",
-        )

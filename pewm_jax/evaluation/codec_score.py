@@ -24,6 +24,7 @@ from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.models import learned_codec
 from pewm_jax.models.signals import depth_from_signal, signal_from_depth, signal_from_rgb
 from pewm_jax.rollouts import load_finished
+from pewm_jax.training import runs
 from pewm_jax.types import Array, Frames, Params
 
 FRAMES = 16
@@ -56,6 +57,11 @@ def score(
     config, params = load_finished(run)
     if not isinstance(config.model, CodecWorldConfig):
         raise UserError(f"{run} holds a world model and no codec alone: use pewm-jax evaluate.")
+    if not runs.is_finished(run, config):
+        raise UserError(
+            f"{run} is not trained to its end: run the training's command again, which goes on "
+            "where it stopped and fits the latents' statistics last."
+        )
     folder = Path(data or config.data.path) / (split or config.evaluate.split)
     episodes = EpisodeSource(folder)
     measure = jax.jit(functools.partial(measures, config.model))
@@ -101,7 +107,8 @@ def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[st
     Returns:
         Of each frame (T,): ``psnr`` of colour in decibels; of measured pixels within the model's
         range ``depth_cm``, the mean absolute error in centimetres, and ``depth_relative`` (not a
-        number where nothing was measured); mean and variance of all normalised latents.
+        number where nothing was measured); ``square_rgb`` and ``square_depth``, the mean squares of
+        the normalised latents, together 1 on average where the frames are like those trained on.
     """
     rgb = signal_from_rgb(frames.rgb_THWC)
     depth = jnp.asarray(frames.depth_THW)
@@ -117,9 +124,8 @@ def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[st
         "psnr": psnr(squared.mean((1, 2, 3))),
         "depth_cm": 100 * off.sum((1, 2)) / count,
         "depth_relative": (off / jnp.where(inside, depth, 1)).sum((1, 2)) / count,
-        "latent_mean": latents.mean((0, 2, 3, 4)),
-        "latent_variance": jnp.square(latents).mean((0, 2, 3, 4))
-        - jnp.square(latents.mean((0, 2, 3, 4))),
+        "square_rgb": jnp.square(latents[0]).mean((1, 2, 3)),
+        "square_depth": jnp.square(latents[1]).mean((1, 2, 3)),
     }
 
 
@@ -148,12 +154,12 @@ def _lines(numbers: Mapping[str, Mapping[str, float | None]]) -> list[str]:
         "psnr": "colour, PSNR, dB",
         "depth_cm": "depth off by, cm",
         "depth_relative": "depth off by, share",
-        "latent_mean": "latents, mean",
-        "latent_variance": "latents, variance",
+        "square_rgb": "latents of colour, mean square",
+        "square_depth": "latents of depth, mean square",
     }
     lines = []
     for name, about in units.items():
         mean, error = numbers[name]["mean"], numbers[name]["error"]
         shown = "nothing measured" if mean is None else f"{mean:.3f}"
-        lines.append(f"  {about:<20} {shown}" + (f" ± {error:.3f}" if error is not None else ""))
+        lines.append(f"  {about:<30} {shown}" + (f" ± {error:.3f}" if error is not None else ""))
     return lines

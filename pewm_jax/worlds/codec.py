@@ -21,7 +21,7 @@ from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 SMALL = 1e-4
 """Added to variances."""
-PULL = 1e-3
+PULL = 1e-2
 """Weight of what keeps each channel of the latents near mean 0 and variance 1."""
 
 

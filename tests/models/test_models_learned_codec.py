@@ -9,11 +9,13 @@ import pytest
 
 from pewm_jax.config import (
     ClipConfig,
+    CodecSettings,
     CodecWorldConfig,
     ConfigError,
     DiTConfig,
     LearnedCodecConfig,
     UserError,
+    from_dict,
     functions,
 )
 from pewm_jax.models import codecs, learned_codec
@@ -82,8 +84,8 @@ def test_sizes_that_do_not_fit_are_refused_in_a_sentence(params, video, says):
 
 
 def test_settings_that_cannot_work_are_refused_in_a_sentence():
-    with pytest.raises(ConfigError, match=r"codec\.temporal is 4: .* every frame by itself, use 1"):
-        LearnedCodecConfig(temporal=4)
+    with pytest.raises(ConfigError, match=r"codec has no setting temporal; it has coarse, "):
+        from_dict(CodecSettings, {"kind": "learned", "temporal": 4}, "codec")
     with pytest.raises(ConfigError, match=r"codec\.coarse is 0: use at least 1"):
         LearnedCodecConfig(coarse=0)
     with pytest.raises(ConfigError, match=r"multiples of codec\.spatial × backbone\.patch = 16"):

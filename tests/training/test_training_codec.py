@@ -241,7 +241,7 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
     result = json.loads((run / "report" / "codec-validation.json").read_text())
     assert result["episodes"] == 6
     numbers = result["numbers"]
-    assert f"depth off by, cm     {numbers['depth_cm']['mean']:.3f} ± " in out
+    assert f"depth off by, cm               {numbers['depth_cm']['mean']:.3f} ± " in out
 
     config, params = pewm_jax.load(run)
     one = codec_score.EpisodeSource(data / "validation")[0].frames()
@@ -253,5 +253,10 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
 
     blind = codec_score.score(run, data=data, split="blind", say=lambda _line: None)
     assert json.loads(blind.read_text())["numbers"]["depth_cm"] == {"mean": None, "error": None}
+    longer = dataclasses.replace(config.train.statistics, steps=3)
+    half = dataclasses.replace(config.train, statistics=longer)
+    configuration.save(dataclasses.replace(config, train=half), run / "config.json")
+    with pytest.raises(UserError, match="is not trained to its end"):
+        codec_score.score(run, data=data, split="validation")
     with pytest.raises(ConfigError, match="leave out --seeds, --steps"):
         evaluate.main([str(run), "--steps", "2", "--seeds", "0"])
