@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pewm_jax import cli
+from pewm_jax import config as configuration
 from pewm_jax.commands import imports
 
 
@@ -61,10 +62,35 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
     from pewm_jax.evaluation import report
 
     cli.cache_compilation(Path(argv[0]).parent)
+    if _is_codec(Path(argv[0])):
+        return _codec(argv[0], settings)
     try:
         page = report.evaluate(argv[0], **vars(settings))
     except KeyboardInterrupt:
         again = "Interrupted; what is scored is kept, run the same command again to go on."
         raise KeyboardInterrupt(again) from None
     print(f"report: {page}")
+    return 0
+
+
+def _is_codec(run: Path) -> bool:
+    """Tell whether a run trained a codec alone."""
+    file = run / "config.json"
+    return file.is_file() and isinstance(
+        configuration.load(file).model, configuration.CodecWorldConfig
+    )
+
+
+def _codec(run: str, settings: Settings) -> int:
+    """Print the numbers of a codec; returns the exit code."""
+    from pewm_jax.evaluation import codec_score
+
+    given = {name: value for name, value in vars(settings).items() if value is not None}
+    chosen = {name: given.pop(name, None) for name in ("data", "split")}
+    if given:
+        raise cli.ConfigError(
+            f"{run} holds a codec, which is scored on the frames of --data and --split: leave out "
+            f"{', '.join('--' + name for name in given)}."
+        )
+    print(f"numbers: {codec_score.score(run, **chosen)}")
     return 0

@@ -104,7 +104,7 @@ def _read(argv: Sequence[str], prog: str) -> tuple[Config, Launch]:
     """
     known = presets.names()
     if not argv or argv[0].startswith("-"):
-        raise cli.ConfigError(f"Name a preset first: {prog} {known[0]} ({', '.join(known)}).")
+        raise cli.ConfigError(f"Name a preset first: {prog} demo ({', '.join(known)}).")
     name, folder = argv[0], Path(argv[0])
     launch, argv = cli.take(Launch, argv)
     if name not in known and (folder / "config.json").is_file():

@@ -7,6 +7,7 @@ is built, in a sentence that names the fix; other code does not check them again
 from pewm_jax.config.backbone import BackboneSettings, Places
 from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
 from pewm_jax.config.codec import CodecSettings, PixelConfig
+from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
 from pewm_jax.config.control import CameraConfig, ControlSettings
 from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
@@ -15,6 +16,7 @@ from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.kinds import Settings, functions, register
 from pewm_jax.config.launch import Launch
+from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.memory import (
     ImagesConfig,
     Map2DConfig,
@@ -33,9 +35,11 @@ from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainC
 from pewm_jax.config.vae import VAEConfig
 
 register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
+register("world", "codec", CodecWorldConfig, "pewm_jax.worlds.codec")
 register("backbone", "dit", DiTConfig, "pewm_jax.models.dit_backbone")
 register("codec", "pixel", PixelConfig, "pewm_jax.models.pixel_codec")
 register("codec", "vae", VAEConfig, "pewm_jax.models.vae_codec")
+register("codec", "learned", LearnedCodecConfig, "pewm_jax.models.learned_codec")
 register("control", "camera", CameraConfig, "pewm_jax.models.camera_control")
 register("encoder", "patch_colours", PatchColoursConfig, "pewm_jax.models.patch_colours")
 register("encoder", "dinov2", DINOv2EncoderConfig, "pewm_jax.models.dinov2_encoder")
@@ -60,6 +64,8 @@ __all__ = [
     "CameraConfig",
     "ClipConfig",
     "CodecSettings",
+    "CodecTrainConfig",
+    "CodecWorldConfig",
     "Config",
     "ConfigError",
     "ControlSettings",
@@ -74,6 +80,7 @@ __all__ = [
     "FlowConfig",
     "ImagesConfig",
     "Launch",
+    "LearnedCodecConfig",
     "Map2DConfig",
     "MemorySettings",
     "MeshConfig",

@@ -23,11 +23,13 @@ class WorldSettings(Settings):
     Attributes:
         TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
             for each of the world's stages, named as the stage.
+        TRAINS: parts that other worlds take from ``train.start`` and this one trains itself.
         dtype: precision of computation and of frozen weights.
     """
 
     SECTION: ClassVar[str] = "world"
     TRAIN: ClassVar[type[TrainSettings]] = TrainSettings
+    TRAINS: ClassVar[tuple[str, ...]] = ()
     dtype: Any = "float32"
 
 

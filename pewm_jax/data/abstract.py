@@ -40,13 +40,15 @@ def clip(config: Config, batch: int, *, features: bool = False, actions: bool = 
         encoder = config.model.memory.encoder
         shape = (batch, context, *encoder.grid(size), encoder.channels)
         kept = array(*shape, dtype=np.float16)
+    control = getattr(config.model, "control", None)  # a world that is not steered has none
+    width = getattr(control, "actions", 0) or ACTION
     pixels = {"height": size.height, "width": size.width}
     return Clip(
         frames(batch, size.frames, **pixels),
         frames(batch, context, **pixels),
         array(batch, context, dtype=np.bool_),
         kept,
-        array(batch, size.frames - 1, config.model.control.actions or ACTION) if actions else None,
+        array(batch, size.frames - 1, width) if actions else None,
     )
 
 

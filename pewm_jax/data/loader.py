@@ -269,6 +269,7 @@ def _check_size(config: Config, episode: Episode) -> None:
 def _check_actions(config: Config, episode: Episode) -> None:
     """Compare the settings of the actions with what an episode was made with, or has."""
     data, actions = config.data, episode.actions
+    table = getattr(config.model, "actions", None)  # a world that is not steered has none
     if actions is not None and actions.shape[1] != PLANAR and data.stride_min < data.stride_max:
         raise ConfigError(
             f"episode {episode.name} has actions of width {actions.shape[1]}, which only join to "
@@ -276,8 +277,8 @@ def _check_actions(config: Config, episode: Episode) -> None:
             f"to the same number, for instance --data.stride_max {data.stride_min}."
         )
     for name in ("step_m", "turn_deg"):
-        made, wanted = episode.info.get(name), getattr(config.model.actions, name)
-        if made is not None and not np.isclose(made, wanted, rtol=1e-6):
+        made, wanted = episode.info.get(name), getattr(table, name, None)
+        if made is not None and wanted is not None and not np.isclose(made, wanted, rtol=1e-6):
             raise ConfigError(
                 f"episode {episode.name} was collected with {name} {made:g}, the configuration has "
                 f"actions.{name} {wanted:g}: set --actions.{name} {made:g}."

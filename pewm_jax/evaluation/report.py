@@ -13,7 +13,7 @@ from typing import Any
 import jax
 
 from pewm_jax import atomic
-from pewm_jax.config import Config, UserError, kinds, to_dict
+from pewm_jax.config import Config, ModelConfig, UserError, kinds, to_dict
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import statistics
 from pewm_jax.evaluation.gallery import make_gallery
@@ -82,6 +82,11 @@ def evaluate(run: str | Path, *, say: Callable[[str], Any] = print_now, **change
     if not run.is_dir():
         raise UserError(f"{run} does not exist; train a model first, e.g. `python train.py demo`.")
     config, params = load_finished(run)
+    if not isinstance(config.model, ModelConfig):
+        raise UserError(
+            f"{run} holds a world of kind {kinds.of(config.model).name}, of which there is no "
+            "report: of a codec, pewm_jax.evaluation.codec_score.score gives the numbers."
+        )
     trained_on = Path(config.data.path) / TRAINED_ON
     if "memory" not in params:
         raise UserError(

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import Config, Launch, UserError, VAEConfig
+from pewm_jax.config import Config, Launch, ModelConfig, UserError, VAEConfig, kinds
 from pewm_jax.data import abstract
 from pewm_jax.scaling import hlo, plan_text, suggest
 from pewm_jax.scaling.footprint import MeshSizes, footprint
@@ -37,8 +37,13 @@ def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> 
 
     Raises:
         ConfigError: the chip is not known, or the devices cannot form the mesh or share the batch.
-        UserError: JAX already uses devices, and too few.
+        UserError: JAX already uses devices, and too few; or the world is not PEWM.
     """
+    if not isinstance(config.model, ModelConfig):
+        raise UserError(
+            f"A plan is made of worlds of kind pewm, and this is of kind "
+            f"{kinds.of(config.model).name}: train it where it is to be trained."
+        )
     chip = chips.named(launch.chip)
     sizes = MeshSizes(*config.train.mesh.shape(launch.devices))
     planned = stages.planned(config)

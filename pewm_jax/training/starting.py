@@ -31,11 +31,13 @@ def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]
 def require_weights(config: Config) -> None:
     """Refuse networks that are never trained, if ``train.start`` names no weights for them."""
     for where, part in _parts(config.model):
-        if getattr(part, "CONVERTED", False) and not config.train.start:
+        if where in config.model.TRAINS or config.train.start:
+            continue
+        if getattr(part, "CONVERTED", False):
+            convert = "convert a checkpoint (python -m pewm_jax.convert --help)"
             raise UserError(
                 f"{where} of kind {kinds.of(part).name} needs weights that are not trained here: "
-                "convert a checkpoint (python -m pewm_jax.convert --help) and name its folder by "
-                "train.start."
+                f"{getattr(part, 'WEIGHTS_FROM', convert)} and name its folder by train.start."
             )
 
 

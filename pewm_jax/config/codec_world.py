@@ -1,0 +1,70 @@
+"""The world in which the learned codec is trained: single frames in, the same frames out."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar, Literal
+
+from pewm_jax.config.clip import ClipConfig
+from pewm_jax.config.codec import CodecSettings
+from pewm_jax.config.errors import require
+from pewm_jax.config.learned_codec import LearnedCodecConfig
+from pewm_jax.config.model import WorldSettings
+from pewm_jax.config.training import StageConfig, TrainSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class CodecTrainConfig(TrainSettings):
+    """How the codec learns: to give frames back, and then how its latents are distributed."""
+
+    run: str = "runs/codec"
+    """Folder of this run: checkpoints, logs, numbers."""
+    preview_every: int = 0
+    """Steps between sample pictures; 0, since a codec imagines none."""
+    codec: StageConfig = StageConfig(steps=2000, batch=32)
+    """The codec learns to give frames back."""
+    statistics: StageConfig = StageConfig(steps=200, batch=32, learning_rate=0.03, warmup=0)
+    """Mean and scale of the latents are fitted; the codec stands still."""
+    latent_noise: float = 0.1
+    """Noise on the latents while the codec learns, as a share of each channel's deviation."""
+    gradient_weight: float = 1.0
+    """Weight of the absolute difference of neighbouring pixels' differences, beside that of the
+    pixels themselves."""
+    squared_weight: float = 0.5
+    """Weight of the squared error."""
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(
+            self.preview_every == 0,
+            f"train.preview_every is {self.preview_every}: a codec imagines nothing to be shown, "
+            "use 0 (pewm-jax evaluate prints its numbers).",
+        )
+        for name in ("latent_noise", "gradient_weight", "squared_weight"):
+            value = getattr(self, name)
+            require(value >= 0, f"train.{name} is {value}: use 0 or more.")
+
+
+@dataclasses.dataclass(frozen=True)
+class CodecWorldConfig(WorldSettings):
+    """A codec by itself, to be trained; it imagines nothing."""
+
+    TRAIN: ClassVar[type[TrainSettings]] = CodecTrainConfig
+    TRAINS: ClassVar[tuple[str, ...]] = ("codec",)
+
+    clip: ClipConfig = ClipConfig(frames=2)
+    """What the loader reads: every frame of a clip is learned from by itself."""
+    codec: CodecSettings = LearnedCodecConfig()
+    """The codec that is trained."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Compute precision; master weights of what trains stay float32."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(
+            isinstance(self.codec, LearnedCodecConfig),
+            f"codec is a {type(self.codec).__name__}, and the world `codec` trains the learned one "
+            "alone: use codec.kind learned.",
+        )
+        self.codec.check(self)

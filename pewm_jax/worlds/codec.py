@@ -1,0 +1,194 @@
+"""The world that trains the learned codec, frame by frame; it imagines nothing.
+
+Stage ``codec`` has it give frames back through noise on its latents. Stage ``statistics`` then fits
+mean and scale of the averaged codec's latents, by which it normalises them. So a finished run holds
+a codec that another model can start from.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NoReturn
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings, UserError
+from pewm_jax.models import learned_codec
+from pewm_jax.models.costs import Costs, Product, Share
+from pewm_jax.models.signals import as_signal, depth_from_signal, signal_from_depth
+from pewm_jax.types import Array, Clip, Params
+from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
+
+SMALL = 1e-4
+"""Added to variances."""
+PULL = 1e-2
+"""Weight of what keeps each channel of the latents near mean 0 and variance 1."""
+
+
+def init(model: CodecWorldConfig, key: Array) -> Params:
+    """Return random parameters, under ``codec`` as in every model."""
+    return {"codec": learned_codec.init(model.codec, key)}  # type: ignore[arg-type]
+
+
+def pictures(model: CodecWorldConfig, clip: Clip) -> tuple[Array, Array]:
+    """Return a batch's frames as the codec sees them, and which pixels count.
+
+    Returns:
+        (2, N, H, W, 3) colour and depth as a grey picture, in [−1, 1], and (2, N, H, W, 1): 0 where
+        depth was not measured, else 1.
+    """
+    frames = as_signal(clip.frames)
+    rgb = frames.rgb_THWC.reshape(-1, *frames.rgb_THWC.shape[-3:])
+    depth = frames.depth_THW.reshape(-1, *frames.depth_THW.shape[-2:], 1)
+    grey = jnp.broadcast_to(signal_from_depth(model.clip, depth), rgb.shape)
+    measured = (depth > 0).astype(rgb.dtype)
+    return jnp.stack([rgb, grey]), jnp.stack([jnp.ones_like(measured), measured])
+
+
+def reconstruct(
+    model: CodecWorldConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, dict[str, Array]]:
+    """Return the loss of stage ``codec``: frames given back through noise on their latents.
+
+    Absolute and squared error of the pixels, and absolute error of the differences between
+    neighbours, with the weights in ``train``; depth counts where it was measured. The noise of a
+    channel is relative to its deviation in the batch, so that larger latents gain nothing.
+
+    Returns:
+        ``(loss, measured)``: of colour ``psnr_rgb`` in decibels, of depth ``depth_m``, the mean
+        absolute error in metres; both through the noise.
+    """
+    assert isinstance(train, CodecTrainConfig)
+    truth, counts = pictures(model, clip)
+    weights, codec = params["codec"], model.codec
+    latents = learned_codec.encode_raw(codec, weights, truth.astype(model.dtype))  # type: ignore[arg-type]
+    latents = latents.astype(jnp.float32)
+    mean, variance = _moments(latents)
+    noise = jax.random.normal(key, latents.shape) * jnp.sqrt(variance)
+    noisy = (latents + train.latent_noise * noise).astype(model.dtype)
+    made = learned_codec.decode_raw(codec, weights, noisy).astype(jnp.float32)  # type: ignore[arg-type]
+
+    error = (made - truth) * counts
+    pixels = jnp.maximum(counts.sum((1, 2, 3, 4)), 1) * error.shape[-1]
+    absolute = jnp.abs(error).sum((1, 2, 3, 4)) / pixels
+    squared = jnp.square(error).sum((1, 2, 3, 4)) / pixels
+    gradients = _of_neighbours(made - truth, counts, 2) + _of_neighbours(made - truth, counts, 3)
+    each = absolute + train.gradient_weight * gradients + train.squared_weight * squared
+    pull = jnp.square(mean).mean() + jnp.square(jnp.log(variance)).mean()
+    off = depth_from_signal(model.clip, made[1].mean(-1))
+    off = jnp.abs(off - depth_from_signal(model.clip, truth[1, ..., 0])) * counts[1, ..., 0]
+    return each.mean() + PULL * pull, {
+        "loss_rgb": each[0],
+        "loss_depth": each[1],
+        "psnr_rgb": -10 * jnp.log10(jnp.maximum(squared[0] / 4, 1e-10)),
+        "depth_m": off.sum() / jnp.maximum(counts[1].sum(), 1),
+    }
+
+
+def distribute(
+    model: CodecWorldConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, dict[str, Array]]:
+    """Return the loss of stage ``statistics``: how unlikely latents are under its normal law.
+
+    It is least where ``latent_mean_C`` and ``latent_scale_C`` are mean and standard deviation.
+    """
+    del train, key
+    truth, _ = pictures(model, clip)
+    latents = learned_codec.encode(model.codec, params["codec"], truth.astype(model.dtype))  # type: ignore[arg-type]
+    latents = latents.astype(jnp.float32)
+    scale = jnp.abs(params["codec"]["latent_scale_C"])
+    mean, variance = _moments(latents)
+    loss = (jnp.square(latents) / 2).mean() + jnp.log(scale).mean()
+    return loss, {
+        "latent_mean": jnp.abs(mean).max(),
+        "latent_variance": variance.mean(),
+    }
+
+
+def _moments(latents: Array) -> tuple[Array, Array]:
+    """Return the mean and the variance of each channel."""
+    places = tuple(range(latents.ndim - 1))
+    return latents.mean(places), latents.var(places) + SMALL
+
+
+def _of_neighbours(error: Array, counts: Array, axis: int) -> Array:
+    """Return the mean absolute difference between neighbours along an axis, (2,)."""
+
+    def cut(x: Array, first: int, last: int) -> Array:
+        return jax.lax.slice_in_dim(x, first, last, axis=axis)
+
+    size = error.shape[axis]
+    both = cut(counts, 1, size) * cut(counts, 0, size - 1)
+    apart = jnp.abs(cut(error, 1, size) - cut(error, 0, size - 1)) * both
+    return apart.sum((1, 2, 3, 4)) / (jnp.maximum(both.sum((1, 2, 3, 4)), 1) * error.shape[-1])
+
+
+STATISTICS = r"codec/latent_(mean|scale)_C"
+NETWORKS = r"codec/(encoder|decoder)/.*"
+STAGES = (
+    Stage("codec", 1, ((STATISTICS, FREEZE), (NETWORKS, TRAIN)), init, reconstruct),
+    Stage("statistics", 2, ((STATISTICS, TRAIN), (NETWORKS, FREEZE)), init, distribute),
+)
+
+
+def stages(model: CodecWorldConfig) -> tuple[Stage, ...]:
+    """Return the two stages."""
+    del model
+    return STAGES
+
+
+def sharding(model: CodecWorldConfig) -> tuple[tuple[str, Any], ...]:
+    """Return the codec's rules."""
+    del model
+    return learned_codec.SHARDING
+
+
+def split_heads(model: CodecWorldConfig, stage: Stage) -> dict[str, int]:
+    """Return what ``train.mesh.tensor`` must divide: nothing."""
+    del model, stage
+    return {}
+
+
+def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
+    """Return the costs of one device: of one clip, the frames' colour and depth."""
+    del share
+    model, trained = config.model, stage is STAGES[0]
+    size, frames = (model.clip.height, model.clip.width), 2 * model.clip.frames
+    parts = {"encoder": 2.0 * trained} | ({"decoder": 2.0} if trained else {})
+    products = tuple(
+        Product(
+            "codec", "convolution", frames * learned_codec.macs(model.codec, part, *size), backward
+        )
+        for part, backward in parts.items()
+    )
+    return {"codec": Costs(products)}
+
+
+def start(model: CodecWorldConfig, params: Params, frames: Any) -> NoReturn:
+    """Refuse; see ``_refuse``."""
+    del model, params, frames
+    _refuse("start")
+
+
+def observe(model: CodecWorldConfig, params: Params, state: Any, frames: Any) -> NoReturn:
+    """Refuse; see ``_refuse``."""
+    del model, params, state, frames
+    _refuse("observe")
+
+
+def imagine(*arguments: Any, **options: Any) -> NoReturn:
+    """Refuse; see ``_refuse``."""
+    del arguments, options
+    _refuse("imagine")
+
+
+def _refuse(who: str) -> NoReturn:
+    """Say that a codec is no world model.
+
+    Raises:
+        UserError: always.
+    """
+    raise UserError(
+        f"{who}() got a run that trained a codec alone, which imagines nothing: name its folder by "
+        "train.start of a model whose codec.kind is learned."
+    )

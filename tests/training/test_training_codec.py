@@ -1,0 +1,262 @@
+"""The learned codec is trained by the trainer of world models, scored, and started from."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import optax
+import pytest
+
+import pewm_jax
+from pewm_jax import config as configuration
+from pewm_jax import presets, tree, worlds
+from pewm_jax.commands import evaluate
+from pewm_jax.config import (
+    ClipConfig,
+    CodecTrainConfig,
+    CodecWorldConfig,
+    Config,
+    ConfigError,
+    DataConfig,
+    Launch,
+    LearnedCodecConfig,
+    PixelConfig,
+    StageConfig,
+    UserError,
+)
+from pewm_jax.data import abstract, loader
+from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, write_shard
+from pewm_jax.data.episodes import EpisodeArrays, write_episode
+from pewm_jax.evaluation import codec_score, report
+from pewm_jax.scaling import plan
+from pewm_jax.training import loop, stages, starting, step
+from pewm_jax.worlds import codec as world
+from tests.helpers import random_camera
+
+TINY = LearnedCodecConfig(latent_channels=4, fine=8, coarse=12, fine_blocks=1, coarse_blocks=1)
+
+
+def experiment(run="runs/it", steps=2, **train):
+    stage = StageConfig(steps=steps, batch=4, warmup=0, learning_rate=3e-3, decay="constant")
+    settings = {"save_every": 1, "log_every": 1, "ema": 0.0, "codec": stage} | train
+    settings.setdefault("statistics", dataclasses.replace(stage, learning_rate=0.03))
+    return Config(
+        model=CodecWorldConfig(clip=ClipConfig(frames=2, height=16, width=24), codec=TINY),
+        data=DataConfig(context=1),
+        train=CodecTrainConfig(run=str(run), **settings),
+    )
+
+
+def smooth(rng, *shape):
+    """Pictures of broad random waves, in [−1, 1]."""
+    v, u = np.mgrid[:16, :24] / 16
+    rate, phase = rng.uniform(-4, 4, (2, *shape, 1, 1)), rng.uniform(0, 6, (*shape, 1, 1))
+    return np.sin(rate[0] * v + rate[1] * u + phase)
+
+
+def batch(config, rows=4, seed=0):
+    rng = np.random.default_rng(seed)
+    like = abstract.clip(config, rows)
+    clip = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
+    rgb = 127.5 * (np.moveaxis(smooth(rng, rows, 2, 3), 2, -1) + 1)
+    depth = (2 + smooth(rng, rows, 2)).astype(np.float32)
+    frames = dataclasses.replace(clip.frames, rgb_THWC=rgb.astype(np.uint8), depth_THW=depth)
+    return dataclasses.replace(clip, frames=frames)
+
+
+@pytest.fixture
+def clips(monkeypatch):
+    def endless(config, split="train", *, seed, batch: int, start_step=0, **_options):
+        for number in range(start_step, 1000):
+            yield make(config, batch, 1000 * seed + number)
+
+    make = batch
+    monkeypatch.setattr(loader, "clips", endless)
+
+
+def descend(config, params, stage, count, rate, clips_of):
+    loss = jax.jit(
+        jax.value_and_grad(
+            lambda p, clip, key: stage.loss(config.model, config.train, p, clip, key), has_aux=True
+        )
+    )
+    rule = optax.masked(
+        optax.adam(rate),
+        lambda p: tree.assign(
+            [(pattern, label == stages.TRAIN) for pattern, label in stage.rules], p, "mask"
+        ),
+    )
+    state, found = rule.init(params), []
+    for number in range(count):
+        (value, parts), slope = loss(params, clips_of(number), jax.random.key(number))
+        kept = tree.assign([(p, float(k == stages.TRAIN)) for p, k in stage.rules], slope, "mask")
+        slope = jax.tree.map(lambda x, k: x * k, slope, kept)
+        move, state = rule.update(slope, state, params)
+        params = optax.apply_updates(params, move)
+        found.append((float(value), {name: float(x) for name, x in parts.items()}))
+    return params, found
+
+
+def test_descent_lowers_the_loss_and_then_the_latents_are_distributed_normally():
+    config = experiment()
+    first, second = worlds.stages(config)
+    params = worlds.init(config, jax.random.key(0))
+    params, found = descend(config, params, first, 20, 5e-3, lambda n: batch(config, seed=n % 2))
+    assert found[-1][0] < 0.8 * found[0][0]
+    assert found[-1][1]["psnr_rgb"] > found[0][1]["psnr_rgb"]
+    before = tree.flatten(params)
+    params, found = descend(config, params, second, 150, 0.02, lambda _: batch(config, seed=0))
+    assert found[-1][1]["latent_variance"] == pytest.approx(1, abs=0.05)
+    assert found[-1][1]["latent_mean"] < 0.1
+    after = tree.flatten(params)
+    moved = {path for path in before if not np.array_equal(before[path], after[path])}
+    assert moved == {"codec/latent_mean_C", "codec/latent_scale_C"}
+
+
+def test_depth_that_was_not_measured_does_not_count():
+    config = experiment()
+    params = worlds.init(config, jax.random.key(0))
+    clip = batch(config)
+    holes = clip.frames.depth_THW.copy()
+    holes[..., :8, :] = 0
+    loss = worlds.stages(config)[0].loss
+    train = dataclasses.replace(config.train, latent_noise=0.0)
+    made = []
+    for out in ("encoder", "decoder"):  # what is made does not depend on what is seen then
+        params["codec"][out]["out"]["kernel"] *= 0
+    for depth in (clip.frames.depth_THW, holes):
+        seen = dataclasses.replace(clip.frames, depth_THW=depth)
+        made.append(
+            loss(
+                config.model,
+                train,
+                params,
+                dataclasses.replace(clip, frames=seen),
+                jax.random.key(0),
+            )[1]
+        )
+    truth, counts = world.pictures(config.model, clip)
+    lower = np.abs(truth[1])[:, 8:].mean()
+    pixels = float(lower) + 0.5 * float((np.asarray(truth[1])[:, 8:] ** 2).mean())
+    slopes = sum(float(np.abs(np.diff(np.asarray(truth[1])[:, 8:], axis=a)).mean()) for a in (1, 2))
+    assert made[1]["loss_depth"] == pytest.approx(pixels + slopes, rel=1e-4)
+    assert made[0]["loss_rgb"] == made[1]["loss_rgb"]
+    assert counts.min() == 1
+
+
+def test_it_is_trained_stopped_in_the_middle_loaded_and_no_world_model(clips, tmp_path):
+    config = experiment(tmp_path / "run")
+    run = loop.train(config, say=lambda _line: None)
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [(x["stage"], x["step"]) for x in lines] == [(1, 1), (1, 2), (2, 1), (2, 2)]
+    assert {"psnr_rgb", "depth_m"} <= lines[0].keys()
+    assert {"latent_mean", "latent_variance"} <= lines[-1].keys()
+    loaded, params = pewm_jax.load(run)
+    assert loaded == config
+    assert not np.array_equal(params["codec"]["latent_mean_C"], np.zeros(4))
+    _, first = pewm_jax.load(run / "checkpoints" / "codec" / "1")
+    assert np.array_equal(first["codec"]["latent_mean_C"], np.zeros(4))
+    acts = (
+        lambda: worlds.start(loaded, params, None),
+        lambda: worlds.observe(loaded, params, None, None),
+        lambda: worlds.imagine(loaded, params, None, [0], jax.random.key(0)),
+    )
+    for act, who in zip(acts, ("start", "observe", "imagine"), strict=True):
+        with pytest.raises(UserError, match=rf"{who}\(\) got a run that trained a codec alone"):
+            act()
+    with pytest.raises(UserError, match="world of kind codec, of which there is no report"):
+        report.evaluate(run)
+
+
+def test_a_model_starts_from_it_and_is_refused_without_it(clips, tmp_path):
+    run = loop.train(experiment(tmp_path / "run"), say=lambda _line: None)
+    tiny = presets.load("tiny")
+    backbone = dataclasses.replace(tiny.model.backbone, patch=1)
+    clip = ClipConfig(frames=3, height=16, width=24)
+    tiny = tiny.with_model(codec=TINY, backbone=backbone, clip=clip)
+    with pytest.raises(
+        UserError, match=r"codec of kind learned .*train it \(pewm-jax train codec\)"
+    ):
+        starting.require_weights(tiny)
+    fresh = (r"memory/.*", r"backbone/.*", r"control/.*")
+    train = dataclasses.replace(tiny.train, start=str(run), fresh=fresh)
+    tiny = dataclasses.replace(tiny, train=train)
+    starting.require_weights(tiny)
+    stage = stages.planned(tiny)[0]
+    start = starting.read_weights(tiny, stage, print)
+    mesh = loop.sharding.make_mesh()
+    state = step.initial_state(tiny, stage, mesh, start)
+    mine = tree.flatten(state.params["codec"])
+    for path, leaf in tree.flatten(pewm_jax.load(run)[1]["codec"]).items():
+        np.testing.assert_array_equal(mine[path], leaf)
+
+
+def test_what_cannot_work_is_refused_in_a_sentence():
+    with pytest.raises(ConfigError, match=r"codec is a PixelConfig, .* use codec\.kind learned"):
+        CodecWorldConfig(codec=PixelConfig())
+    with pytest.raises(ConfigError, match=r"train\.preview_every is 5: a codec imagines nothing"):
+        CodecTrainConfig(preview_every=5)
+    with pytest.raises(ConfigError, match=r"train\.latent_noise is -1: use 0 or more"):
+        CodecTrainConfig(latent_noise=-1)
+    with pytest.raises(
+        UserError, match="plan is made of worlds of kind pewm, and this is of kind codec"
+    ):
+        plan.show(experiment(), Launch(plan=True, devices=1, chip="h100"))
+
+
+def test_the_preset_goes_to_json_and_back_and_keeps_to_an_hour(tmp_path):
+    config = presets.load("codec")
+    configuration.save(config, tmp_path / "config.json")
+    assert configuration.load(tmp_path / "config.json") == config
+    assert (config.model.clip.height, config.model.clip.width) == (64, 64)
+    assert config.train.codec.decay == "cosine"
+
+
+def recorded(folder, scenes, holes=False):
+    """Write a split of two episodes in each of some scenes, of 16 × 24 pixels."""
+    rng, records = np.random.default_rng(0), []
+    for scene in range(scenes):
+        for walk in range(2):
+            rgb = (127.5 * (np.moveaxis(smooth(rng, 3, 3), 1, -1) + 1)).astype(np.uint8)
+            depth = (0.0 if holes else 2.0) + np.zeros((3, 16, 24), np.float32)
+            camera = random_camera(rng, 3)
+            arrays = EpisodeArrays(rgb, depth, camera.intrinsics_4[0], camera.world_from_camera)
+            records.append(write_episode(arrays, f"{scene}-{walk}", f"house-{scene}"))
+    shard = folder / "shard-00000-of-00001.array_record"
+    folder.mkdir(parents=True)
+    write_shard(shard, records)
+    write_manifest(folder, Manifest(folder.name, (describe_shard(shard),), {}, 3 * len(records)))
+
+
+def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
+    run = loop.train(experiment(tmp_path / "run"), say=lambda _line: None)
+    data = tmp_path / "data"
+    recorded(data / "validation", 3)
+    recorded(data / "blind", 1, holes=True)
+    argv = [str(run), "--data", str(data), "--split", "validation"]
+    assert evaluate.main(argv) == 0
+    out = capsys.readouterr().out
+    assert "3 scenes, 24×16 pixels" in out
+    result = json.loads((run / "report" / "codec-validation.json").read_text())
+    assert result["episodes"] == 6
+    numbers = result["numbers"]
+    assert f"depth off by, cm               {numbers['depth_cm']['mean']:.3f} ± " in out
+
+    config, params = pewm_jax.load(run)
+    one = codec_score.EpisodeSource(data / "validation")[0].frames()
+    found = codec_score.measures(config.model, params["codec"], one)
+    assert found["psnr"].shape == (3,)
+    worse = dataclasses.replace(one, rgb_THWC=255 - one.rgb_THWC)
+    made = codec_score.measures(config.model, params["codec"], worse)
+    assert not np.allclose(found["psnr"], made["psnr"])
+
+    blind = codec_score.score(run, data=data, split="blind", say=lambda _line: None)
+    assert json.loads(blind.read_text())["numbers"]["depth_cm"] == {"mean": None, "error": None}
+    longer = dataclasses.replace(config.train.statistics, steps=3)
+    half = dataclasses.replace(config.train, statistics=longer)
+    configuration.save(dataclasses.replace(config, train=half), run / "config.json")
+    with pytest.raises(UserError, match="is not trained to its end"):
+        codec_score.score(run, data=data, split="validation")
+    with pytest.raises(ConfigError, match="leave out --seeds, --steps"):
+        evaluate.main([str(run), "--steps", "2", "--seeds", "0"])
