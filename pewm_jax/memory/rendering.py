@@ -203,7 +203,7 @@ def _cover(
     found = _nearest(seat, z_V, there_V & inside, most * most * shape[0] * shape[1])
     depth, index = (x.reshape(most, most, *shape) for x in found)  # down, across, row, column
     depth, index = _spread(jnp.moveaxis(depth, 1, 0), jnp.moveaxis(index, 1, 0), axis=2)
-    depth, index = _spread(depth, index, axis=1)
+    depth, index = _spread(depth, index, axis=0)
     return tuple(x[most - 1 :, most - 1 :].reshape(-1) for x in (depth, index))
 
 
