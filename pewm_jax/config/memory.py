@@ -105,7 +105,7 @@ class SurfelConfig(MemorySettings):
     """Pixels that a surfel covers at most, across and down, when the memory is rendered."""
 
     @property
-    def KEEPS_FEATURES(self) -> bool:  # type: ignore[override]
+    def KEEPS_FEATURES(self) -> bool:  # noqa: N802  # type: ignore[override]
         """Whether points carry the encoder's features; else the first three are their colour."""
         return self.features
 

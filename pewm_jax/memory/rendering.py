@@ -187,7 +187,7 @@ def window(uv_V2: Array, half_V2: Array, most: int) -> tuple[Array, Array]:
 def _cover(
     uv_V2: Array, half_V2: Array, z_V: Array, there_V: Array, height: int, width: int, most: int
 ) -> tuple[Array, Array]:
-    """Return (H·W,) depth and index of the nearest point that covers each pixel; inf and ≥ V if none.
+    """Return (H·W,) depth and index of the nearest point covering each pixel; inf and ≥ V if none.
 
     No window is drawn pixel by pixel. Windows of one size that begin at one pixel cover the same
     pixels, so that only the nearest of them counts: a z-buffer per size. And a window is the union
@@ -235,7 +235,7 @@ def _spread(depth: Array, index: Array, axis: int) -> tuple[Array, Array]:
         second = (b[0] < a[0]) | ((b[0] == a[0]) & (b[1] < a[1]))
         return jnp.where(second, b[0], a[0]), jnp.where(second, b[1], a[1])
 
-    def moved(x: Array, nothing: float | int) -> Array:
+    def moved(x: Array, nothing: float) -> Array:
         kept = jax.lax.slice_in_dim(x, 0, x.shape[axis] - 1, axis=axis)
         ahead = [(int(i == axis), 0) for i in range(x.ndim)]
         return jnp.pad(kept, ahead, constant_values=nothing)

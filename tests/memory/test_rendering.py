@@ -144,7 +144,9 @@ def test_the_map_of_a_wall_is_where_the_wall_is(yaw):
     assert off[found].max() > 0.01, "cells are no points"
 
 
-surfels = jax.jit(rendering.splat_surfels, static_argnums=(5, 6), static_argnames=("most", "average"))
+surfels = jax.jit(
+    rendering.splat_surfels, static_argnums=(5, 6), static_argnames=("most", "average")
+)
 fill = jax.jit(rendering.fill_nearest)
 
 
@@ -173,7 +175,7 @@ def shown_by_loop(points, features, valid, camera, front, covering, average):
         corner = np.floor(uv[p] - 0.5) if average else np.floor(uv[p])
         share = (uv[p] - 0.5 - corner) if average else np.zeros(2)
         for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)) if average else ((0, 0),):
-            column, row = (corner + (i, j)).astype(int)
+            column, row = (corner + np.array([i, j])).astype(int)
             if not (0 <= row < HEIGHT and 0 <= column < WIDTH):
                 continue
             if z[p] > front[row, column] + rendering.tolerance(front[row, column]):
@@ -200,9 +202,7 @@ def test_points_with_a_size_are_drawn_as_by_a_loop(seed, most, average):
     camera = random_camera(np.random.default_rng(seed), 2, HEIGHT, WIDTH)
     points, features, valid = cloud(seed, 80)
     size = np.random.default_rng(seed).uniform(0.01, 1.2, len(points)).astype(np.float32)
-    view = surfels(
-        points, features, size, valid, camera, HEIGHT, WIDTH, most=most, average=average
-    )
+    view = surfels(points, features, size, valid, camera, HEIGHT, WIDTH, most=most, average=average)
     for t in range(2):
         one = jax.tree.map(lambda x, t=t: x[t], camera)
         front, covering = covered_by_loop(points, size, valid, one, most)

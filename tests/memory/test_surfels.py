@@ -19,7 +19,7 @@ from pewm_jax.memory import memories, rendering, surfels
 from pewm_jax.models.signals import as_signal
 from pewm_jax.types import Frames
 from tests.helpers import TINY, random_camera, tiny_model
-from tests.memory.test_memory_rivals import ALL, encoded, scene
+from tests.memory.test_memory_rivals import encoded, scene
 
 SMALL = SurfelConfig(cell_m=(0.5,) * 3, cells=(8, 8, 8), capacity=64, tokens=8)
 insert = jax.jit(surfels.insert, static_argnums=(0, 3))
@@ -56,7 +56,8 @@ def by_loop(config, batches):
             cell = tuple(place[p])
             if observed or not (cell in held and held[cell][3]):
                 shown.setdefault(cell, []).append(p)
-        for cell, members in shown.items():
+        for cell, every in shown.items():
+            members = every
             if config.keep == "newest":
                 newest = max(new.time_P[p] for p in members)
                 members = [p for p in members if new.time_P[p] == newest]
@@ -156,7 +157,7 @@ def test_what_was_imagined_gives_way_to_what_is_observed_and_never_the_other_way
 def test_a_memory_is_told_what_is_imagined_where_it_asks():
     frames = jax.tree.map(jnp.asarray, scene())
     for config, told in ((SMALL, True), (TINY.memory, False)):
-        assert config.TELLS_IMAGINED == told
+        assert told == config.TELLS_IMAGINED
         model = tiny_model(memory=dataclasses.replace(config, cells=(24, 24, 24), capacity=2048))
         made = [
             memories.remember(
@@ -176,7 +177,7 @@ def test_features_are_those_of_the_patch_a_pixel_lies_in():
     frames = scene(count=1)
     patches = encoded(frames)
     memory = memories.remember(model, memories.empty(model, jnp.zeros(3)), frames, patches)
-    points, features, valid = memories.to_points(model, memory)
+    _, features, valid = memories.to_points(model, memory)
     assert features.shape[1] == model.memory.encoder.channels
     rows = {tuple(x) for x in np.asarray(patches).reshape(-1, patches.shape[-1])}
     single = np.asarray(valid & (memory.sums_VC[:, 0] == 1))
@@ -190,9 +191,10 @@ def test_wrong_settings_are_refused_in_a_sentence():
         dataclasses.replace(SMALL, footprint=0)
     with pytest.raises(ConfigError, match="mean or newest"):
         dataclasses.replace(SMALL, keep="oldest")
+    model = of(SMALL, features=True)
+    memory = memories.empty(model, jnp.zeros(3))
     with pytest.raises(ValueError, match="no features"):
-        model = of(SMALL, features=True)
-        memories.remember(model, memories.empty(model, jnp.zeros(3)), scene(), None)
+        surfels.remember(model, memory, scene())
 
 
 @pytest.mark.parametrize("footprint", [1, 3])
