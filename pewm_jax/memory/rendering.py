@@ -9,6 +9,7 @@ of equally near ones that of the lowest index. Far surfaces show through between
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -152,7 +153,8 @@ def splat_surfels(
         depth = jnp.where(direct, depth, cover)
         return jnp.where(seen[:, None], features, 0), jnp.where(seen, depth, 0), seen
 
-    features, depth, seen = jax.vmap(one)(camera)
+    # Frame after frame: what one needs fits a processor's cache, which nine do not.
+    features, depth, seen = jax.lax.map(one, jax.tree.map(jnp.asarray, camera))
     frames = depth.shape[0]
     return View(
         features.reshape(frames, height, width, -1),
@@ -240,11 +242,13 @@ def _spread(depth: Array, index: Array, axis: int) -> tuple[Array, Array]:
         ahead = [(int(i == axis), 0) for i in range(x.ndim)]
         return jnp.pad(kept, ahead, constant_values=nothing)
 
-    best = depth[-1], index[-1]
-    for level in range(len(depth) - 2, -1, -1):
+    def step(best: tuple[Array, Array], level: tuple[Array, Array]) -> Any:
         next_one = moved(best[0], jnp.inf), moved(best[1], np.iinfo(np.int32).max)
-        best = nearer(nearer(best, next_one), (depth[level], index[level]))
-    return best
+        return nearer(nearer(best, next_one), level), None
+
+    # A scan, so that each level is computed once and not anew by all that read it.
+    smaller = depth[:-1], index[:-1]
+    return jax.lax.scan(step, (depth[-1], index[-1]), smaller, reverse=True)[0]
 
 
 def fill_nearest(view: View) -> View:
@@ -270,21 +274,22 @@ def fill_nearest(view: View) -> View:
         distance = (source_HW // width - row) ** 2 + (source_HW % width - column) ** 2
         return jnp.where(source_HW >= 0, distance, far)
 
+    def flood(source: Array, step: Array) -> Any:
+        padded = jnp.pad(source, steps[0], constant_values=-1)
+        best, nearest = off(source), source
+        for move in np.ndindex(3, 3):
+            start = steps[0] + (np.array(move) - 1) * step
+            other = jax.lax.dynamic_slice(padded, start, (height, width))
+            distance = off(other)
+            better = (distance < best) | ((distance == best) & (other < nearest))
+            better = better & (other >= 0)
+            best = jnp.where(better, distance, best)
+            nearest = jnp.where(better, other, nearest)
+        return nearest, None
+
     def one(seen_HW: Array) -> Array:
-        source = jnp.where(seen_HW, place, -1)
-        for step in steps:
-            padded = jnp.pad(source, step, constant_values=-1)
-            best, nearest = off(source), source
-            for down in (0, step, 2 * step):
-                for across in (0, step, 2 * step):
-                    other = padded[down : down + height, across : across + width]
-                    distance = off(other)
-                    better = (distance < best) | ((distance == best) & (other < nearest))
-                    better = better & (other >= 0)
-                    best = jnp.where(better, distance, best)
-                    nearest = jnp.where(better, other, nearest)
-            source = nearest
-        return source
+        # A scan, so that each pass is computed once and not anew by all that read it.
+        return jax.lax.scan(flood, jnp.where(seen_HW, place, -1), jnp.array(steps))[0]
 
     source = jax.vmap(one)(jnp.asarray(view.seen_THW)).reshape(frames, -1)
     index, found = jnp.maximum(source, 0), source >= 0
