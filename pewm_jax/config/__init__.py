@@ -23,6 +23,7 @@ from pewm_jax.config.memory import (
     MemorySettings,
     NoMemoryConfig,
     PointsConfig,
+    SurfelConfig,
     VoxelConfig,
 )
 from pewm_jax.config.mesh import AXES, MeshConfig
@@ -47,6 +48,7 @@ register("reader", "attention", AttentionConfig, "pewm_jax.models.attention_read
 register("memory", "voxel", VoxelConfig, "pewm_jax.memory.voxel_memory")
 register("memory", "map2d", Map2DConfig, "pewm_jax.memory.map2d")
 register("memory", "points", PointsConfig, "pewm_jax.memory.points")
+register("memory", "surfels", SurfelConfig, "pewm_jax.memory.surfels")
 register("memory", "images", ImagesConfig, "pewm_jax.memory.images")
 register("memory", "none", NoMemoryConfig, "pewm_jax.memory.nothing")
 register("noise", "ddpm", DDPMConfig, "pewm_jax.diffusion.ddpm")
@@ -94,6 +96,7 @@ __all__ = [
     "ReaderSettings",
     "Settings",
     "StageConfig",
+    "SurfelConfig",
     "TrainConfig",
     "TrainSettings",
     "UserError",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.encoder import EncoderSettings, PatchColoursConfig
 from pewm_jax.config.errors import require, require_positive
@@ -25,6 +25,8 @@ class MemorySettings(Settings):
     """Whether it keeps the encoder's features; else the first three of a point are its colour."""
     REMEMBERS: ClassVar[bool] = True
     """Whether it ever holds anything."""
+    TELLS_IMAGINED: ClassVar[bool] = False
+    """Whether its ``remember`` asks, by ``observed``, if frames were observed or imagined."""
 
     cell_m: tuple[float, float, float] = (0.25, 0.25, 1.0)
     """Size of a map cell along x, y, z (z is up), metres; the default is the paper's."""
@@ -82,6 +84,52 @@ class PointsConfig(MemorySettings):
     """Coloured points, one per cell, without features."""
 
     KEEPS_FEATURES: ClassVar[bool] = False
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfelConfig(MemorySettings):
+    """Small coloured surfaces at the sensor's resolution; cells, tokens and capacity as elsewhere.
+
+    What was observed is never overwritten by what was imagined.
+    """
+
+    TELLS_IMAGINED: ClassVar[bool] = True
+
+    cell_m: tuple[float, float, float] = (0.04, 0.04, 0.04)
+    """Size of a cell along x, y, z, metres: of all that was seen in one, one surfel is kept."""
+    cells: tuple[int, int, int] = (1024, 1024, 128)
+    """Cells of the grid along x, y, z; the extent costs nothing."""
+    capacity: int = 65536
+    """Surfels that can be kept; what does not fit is counted."""
+    keep: Literal["mean", "newest"] = "mean"
+    """Of what was seen in one cell: the mean of all, or what the newest frame showed."""
+    features: bool = False
+    """Keep the encoder's features beside the colour, and give them to the reader."""
+    footprint: int = 3
+    """Pixels that a surfel covers at most, across and down, when the memory is rendered."""
+
+    @property
+    def KEEPS_FEATURES(self) -> bool:  # noqa: N802  # type: ignore[override]
+        """Whether points carry the encoder's features; else the first three are their colour."""
+        return self.features
+
+    def check(self, model: Any) -> None:
+        """Refuse an encoder without room for a colour."""
+        super().check(model)
+        require(
+            self.features or self.encoder.channels >= 4,
+            f"memory.encoder has {self.encoder.channels} channels: a coloured surfel needs 4; take "
+            "an encoder with more, or set memory.features.",
+        )
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require_positive(self, "memory", "footprint")
+        require(
+            self.keep in ("mean", "newest"),
+            f"memory.keep is {self.keep!r}; choose mean or newest.",
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ none         nothing                                      NWM (own backbone, emp
 images       features of a few covering snapshots         Image Memory (3D-Mem)
 map2d        maximum of features per place on the floor   Ours (w/ 2D-Map)
 points       a coloured point per 3D cell, no features    point cloud (ablation of the map)
+surfels      a coloured surfel per small cell             none: ours alone
 ============ ============================================ =====================================
 
 A memory is a ``MemorySettings`` and a module (or object) with the functions ``empty``,
@@ -54,6 +55,8 @@ def remember(
     frames: Frames,
     features_ThwF: Array,
     valid_T: Array | None = None,
+    *,
+    observed: bool = True,
 ) -> Memory:
     """Return the memory after T more frames.
 
@@ -63,8 +66,11 @@ def remember(
         frames: T frames, colours float in [−1, 1]; pixels without depth are ignored.
         features_ThwF: (T, h, w, F) their patch features (``encoders.encode``).
         valid_T: (T,) bool; False frames are ignored.
+        observed: False where the frames were imagined; memories that do not tell
+            (``TELLS_IMAGINED``) remember both alike.
     """
-    return functions(model.memory).remember(model, memory, frames, features_ThwF, valid_T)
+    told = {"observed": observed} if model.memory.TELLS_IMAGINED else {}
+    return functions(model.memory).remember(model, memory, frames, features_ThwF, valid_T, **told)
 
 
 def tokens(model: ModelConfig, memory: Memory, camera: Camera) -> MapTokens:

@@ -179,7 +179,7 @@ def costs(model: ModelConfig, share: Share) -> Costs:
     config, clip = model.codec, model.clip
     assert isinstance(config, LearnedCodecConfig)
     frames = 2 * (clip.frames + 1)
-    widest = clip.height * clip.width // PATCH**2 * config.fine * share.wide
+    widest = clip.height * clip.width // PATCH**2 * config.fine * share.activation_bytes
     work = frames * macs(config, "encoder", clip.height, clip.width)
     return Costs(
         products=(Product("codec", "convolution", work),),

@@ -1,7 +1,8 @@
 """The world of PEWM: a video diffusion model, clip after clip, with a memory.
 
 Each clip is conditioned on the present frame, on the control, and on the part of the memory that
-its cameras see. Imagined frames are remembered in the same way as observed ones.
+its cameras see. Imagined frames are remembered in the same way as observed ones; a memory that says
+``TELLS_IMAGINED`` is told which they are.
 """
 
 from __future__ import annotations
@@ -165,7 +166,7 @@ def imagine_clip(
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
     remembered = state.map
     if remember:
-        remembered = _remember(model, params, state.map, frames, valid_T)
+        remembered = _remember(model, params, state.map, frames, valid_T, observed=False)
     last = frames.depth_THW.shape[0] - 1 if valid_T is None else valid_T.sum() - 1
     present = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, last, 1), frames)
     return WorldState(present, remembered), frames
@@ -233,11 +234,13 @@ def _remember(
     memory: Any,
     frames: Frames,
     valid_T: Array | None = None,
+    *,
+    observed: bool = True,
 ) -> Any:
     """Put frames into the memory."""
     weights = params.get("encoder", {})
     features = encoders.encode(model.memory.encoder, weights, frames.rgb_THWC)
-    return memories.remember(model, memory, frames, features, valid_T)
+    return memories.remember(model, memory, frames, features, valid_T, observed=observed)
 
 
 def _require_frames(model: ModelConfig, frames: Frames, who: str) -> int:

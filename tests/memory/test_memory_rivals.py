@@ -18,6 +18,7 @@ from pewm_jax.config import (
     Map2DConfig,
     NoMemoryConfig,
     PointsConfig,
+    SurfelConfig,
     VoxelConfig,
     kinds,
 )
@@ -32,6 +33,7 @@ KINDS = {
     "images": ImagesConfig,
     "map2d": Map2DConfig,
     "points": PointsConfig,
+    "surfels": SurfelConfig,
     "none": NoMemoryConfig,
 }
 SEEDS = st.integers(0, 100_000)

@@ -98,8 +98,9 @@ def test_every_memory_can_be_rendered(kind):
     channels = model.memory.encoder.channels
     assert view.features_THWF.shape == (3, HEIGHT, WIDTH, channels)
     assert view.depth_THW.shape == view.seen_THW.shape == (3, HEIGHT, WIDTH)
-    points = (np.asarray(x) for x in memories.to_points(model, memory))
-    compare(view, by_loop(*points, camera, HEIGHT, WIDTH))
+    if kind != "surfels":  # these have a size: tests/memory/test_surfels.py
+        points = (np.asarray(x) for x in memories.to_points(model, memory))
+        compare(view, by_loop(*points, camera, HEIGHT, WIDTH))
     assert bool(view.seen_THW.any()) == (kind != "none")
 
 
@@ -141,3 +142,158 @@ def test_the_map_of_a_wall_is_where_the_wall_is(yaw):
     off = np.abs(view.depth_THW - depth) * across
     assert (off <= cell / 2 + slack + 1e-4)[found].all()
     assert off[found].max() > 0.01, "cells are no points"
+
+
+surfels = jax.jit(
+    rendering.splat_surfels, static_argnums=(5, 6), static_argnames=("most", "average")
+)
+fill = jax.jit(rendering.fill_nearest)
+
+
+def covered_by_loop(points, size, valid, camera, most):
+    """The nearest point that covers each pixel and its depth, point by point, pixel by pixel."""
+    depth = np.full((HEIGHT, WIDTH), np.inf, np.float32)
+    index = np.full((HEIGHT, WIDTH), len(points))
+    uv, z = (np.asarray(x) for x in cameras.project(points, camera))
+    for p in np.flatnonzero(valid & (z > rendering.NEAREST_M)):
+        half = size[p] / 2 * np.asarray(camera.intrinsics_4[:2]) / z[p]
+        first, wide = (np.asarray(x)[0] for x in rendering.window(uv[p][None], half[None], most))
+        for row in range(first[1], first[1] + wide[1]):
+            for column in range(first[0], first[0] + wide[0]):
+                inside = 0 <= row < HEIGHT and 0 <= column < WIDTH
+                if inside and z[p] < depth[row, column]:
+                    depth[row, column], index[row, column] = z[p], p
+    return depth, index
+
+
+def shown_by_loop(points, features, valid, camera, front, covering, average):
+    """What is not behind the front, shared by the pixels around it, or the nearest of a pixel."""
+    uv, z = (np.asarray(x) for x in cameras.project(points, camera))
+    image = np.zeros((HEIGHT, WIDTH, features.shape[1] + 1))
+    weight, nearest = np.zeros((HEIGHT, WIDTH)), np.full((HEIGHT, WIDTH), np.inf)
+    for p in np.flatnonzero(valid & (z > rendering.NEAREST_M)):
+        corner = np.floor(uv[p] - 0.5) if average else np.floor(uv[p])
+        share = (uv[p] - 0.5 - corner) if average else np.zeros(2)
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)) if average else ((0, 0),):
+            column, row = (corner + np.array([i, j])).astype(int)
+            if not (0 <= row < HEIGHT and 0 <= column < WIDTH):
+                continue
+            if z[p] > front[row, column] + rendering.tolerance(front[row, column]):
+                continue
+            part = (share[0] if i else 1 - share[0]) * (share[1] if j else 1 - share[1])
+            value = np.append(features[p], z[p])
+            if average:
+                image[row, column] += part * value
+                weight[row, column] += part
+            elif z[p] < nearest[row, column]:
+                image[row, column], weight[row, column] = value, 1
+                nearest[row, column] = z[p]
+    direct = weight > rendering.LEAST
+    image = image / np.where(direct, weight, 1)[..., None]
+    rest = ~direct & (covering < len(points))
+    image[rest] = np.concatenate([features, z[:, None]], 1)[covering[rest]]
+    return np.where((direct | rest)[..., None], image, 0), direct | rest
+
+
+@pytest.mark.parametrize("average", [True, False])
+@pytest.mark.parametrize("most", [1, 3, 4])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_points_with_a_size_are_drawn_as_by_a_loop(seed, most, average):
+    camera = random_camera(np.random.default_rng(seed), 2, HEIGHT, WIDTH)
+    points, features, valid = cloud(seed, 80)
+    size = np.random.default_rng(seed).uniform(0.01, 1.2, len(points)).astype(np.float32)
+    view = surfels(points, features, size, valid, camera, HEIGHT, WIDTH, most=most, average=average)
+    for t in range(2):
+        one = jax.tree.map(lambda x, t=t: x[t], camera)
+        front, covering = covered_by_loop(points, size, valid, one, most)
+        image, seen = shown_by_loop(points, features, valid, one, front, covering, average)
+        np.testing.assert_array_equal(view.seen_THW[t], seen)
+        np.testing.assert_allclose(view.features_THWF[t], image[..., :-1], atol=1e-4)
+        np.testing.assert_allclose(view.depth_THW[t], image[..., -1], atol=1e-4)
+        assert seen.any()
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 100_000), most=st.integers(1, 5))
+def test_a_window_holds_the_pixel_of_its_point_and_has_the_size_of_its_point(seed, most):
+    rng = np.random.default_rng(seed)
+    uv, half = rng.uniform(-3, 9, (50, 2)), rng.uniform(0, 3, (50, 2))
+    begin, wide = (np.asarray(x) for x in rendering.window(uv, half, most))
+    assert ((wide >= 1) & (wide <= most)).all()
+    assert ((begin <= np.floor(uv)) & (np.floor(uv) < begin + wide)).all()
+    assert (np.abs(wide - np.clip(2 * half, 1, most)) <= 1 + 1e-4).all()
+
+
+def wall(distance, spacing, across=2.5):
+    """Points of a wall that stands ahead, in a square raster."""
+    steps = np.arange(-across, across, spacing) + spacing / 2
+    y, z = np.meshgrid(steps, steps)
+    return np.stack([np.full(y.size, distance), y.ravel(), z.ravel()], -1).astype(np.float32)
+
+
+@pytest.mark.parametrize("average", [True, False])
+def test_a_wall_is_not_seen_through_the_wall_before_it(average):
+    """Both of a raster of 10 cm; the near one is seen so closely that its points lie apart."""
+    size, spacing = 32, 0.1
+    near, far = wall(1.0, spacing, 1.5), wall(3.0, spacing / 4, 4.0)
+    points = np.concatenate([near, far])
+    colour = np.concatenate([np.ones(len(near)), -np.ones(len(far))]).astype(np.float32)[:, None]
+    camera = looking_ahead(size, size)
+    wide = np.where(np.arange(len(points)) < len(near), spacing, spacing / 4).astype(np.float32)
+    everything = np.ones(len(points), bool)
+    plain = splat(points, colour, everything, camera, size, size)
+    assert (np.asarray(plain.features_THWF) < 0).sum() > 100, "points alone show what is behind"
+    view = surfels(points, colour, wide, everything, camera, size, size, most=3, average=average)
+    assert np.asarray(view.seen_THW).all()
+    np.testing.assert_allclose(view.features_THWF, 1, atol=1e-5)
+    np.testing.assert_allclose(view.depth_THW, 1, atol=1e-5)
+    half = near[:, 1] < 0  # where the near wall ends, the far one is seen
+    points, colour, wide = (
+        np.concatenate([x[: len(near)][half], x[len(near) :]]) for x in (points, colour, wide)
+    )
+    everything = np.ones(len(points), bool)
+    view = surfels(points, colour, wide, everything, camera, size, size, most=3, average=average)
+    image = np.asarray(view.features_THWF)[0, ..., 0]
+    np.testing.assert_allclose(image[:, size // 2 :], 1, atol=1e-5)
+    np.testing.assert_allclose(image[:, : size // 2 - 2], -1, atol=1e-5)
+
+
+def test_points_with_a_size_are_drawn_alike_in_a_batch_and_again():
+    camera = jax.tree.map(jnp.asarray, random_camera(np.random.default_rng(5), 2, HEIGHT, WIDTH))
+    points, features, valid = (jnp.stack([jnp.asarray(x)] * 2) for x in cloud(5))
+    size = jnp.full(points.shape[:2], 0.3)
+    draw = lambda p, f, s, v: rendering.splat_surfels(p, f, s, v, camera, HEIGHT, WIDTH)  # noqa: E731
+    many = jax.jit(jax.vmap(draw))
+    first, again = many(points, features, size, valid), many(points, features, size, valid)
+    alone = jax.jit(draw)(points[0], features[0], size[0], valid[0])
+    for a, b, c in zip(*map(jax.tree.leaves, (first, again, alone)), strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_allclose(a[1], c, atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.003, 0.02, 0.3])
+@pytest.mark.parametrize("shape", [(7, 12), (24, 17), (1, 5)])
+def test_holes_are_filled_from_the_nearest_hit(shape, share):
+    rng = np.random.default_rng(3)
+    seen = rng.random((4, *shape)) < share
+    seen[:3, 0, 2], seen[3] = True, False
+    value = rng.normal(size=(*seen.shape, 2)).astype(np.float32) * seen[..., None]
+    depth = rng.uniform(1, 5, seen.shape).astype(np.float32) * seen
+    view = fill(rendering.View(value, depth, seen))
+    np.testing.assert_array_equal(view.seen_THW, seen)
+    np.testing.assert_array_equal(view.features_THWF[seen], value[seen])
+    assert not np.asarray(view.depth_THW)[3].any(), "an empty image stays empty"
+    farther = total = 0
+    for t in range(3):
+        hits = np.argwhere(seen[t])
+        for row, column in np.argwhere(~seen[t]):
+            distance = ((hits - (row, column)) ** 2).sum(1)
+            filled = np.asarray(view.depth_THW)[t, row, column]
+            (source,) = np.flatnonzero(depth[t][tuple(hits.T)] == filled)
+            np.testing.assert_array_equal(
+                view.features_THWF[t, row, column], value[t][tuple(hits[source])]
+            )
+            farther += distance[source] > distance.min()
+            assert np.sqrt(distance[source]) <= np.sqrt(distance.min()) + 1
+            total += 1
+    assert farther <= 0.01 * total

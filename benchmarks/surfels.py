@@ -1,0 +1,129 @@
+"""Rendering a memory of points: 9 frames of 512 × 512 from 200,000 points, beside torch.
+
+`python benchmarks/surfels.py` prints the time of `rendering.splat` (a point is a pixel) beside the
+same z-buffer in torch (`scatter_reduce` with amin, then the lowest index of the nearest), of
+`rendering.splat_surfels` (points with a size, hidden surfaces, shared pixels), which has no peer
+here, and of filling the holes. Both z-buffers must agree.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import statistics
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+from memory_peers import SIZE, T, room
+from record import machine, record, table
+
+from pewm_jax.geometry.cameras import invert_rigid, unproject
+from pewm_jax.memory import rendering
+from pewm_jax.types import Array, Camera
+
+POINTS = 200_000
+
+
+def scene() -> tuple[Array, Array, Array, Array, Camera]:
+    """Return points of a furnished room, colours, widths, validity, and the clip's cameras."""
+    frames = jax.tree.map(jnp.asarray, room(0))
+    chosen = np.random.default_rng(0).permutation(frames.depth_THW.size)[:POINTS]
+    points = unproject(frames.depth_THW, frames.camera).reshape(-1, 3)[chosen]
+    colours = jnp.asarray(np.random.default_rng(1).uniform(-1, 1, (POINTS, 3)), jnp.float32)
+    return points, colours, jnp.full(POINTS, 0.04), jnp.ones(POINTS, bool), frames.camera
+
+
+def torch_splat(points: Array, colours: Array, camera: Camera) -> Callable[[], tuple]:
+    """Return the z-buffer of ``rendering.splat`` in torch, frame after frame."""
+    places, shades = (torch.from_numpy(np.array(x)) for x in (points, colours))
+    moves = torch.from_numpy(np.array(invert_rigid(camera.world_from_camera)))
+    intrinsics = torch.from_numpy(np.array(camera.intrinsics_4))
+    numbers, pixels = torch.arange(POINTS), SIZE * SIZE
+
+    def run() -> tuple[torch.Tensor, torch.Tensor]:
+        images, depths = [], []
+        for move, (fx, fy, cx, cy) in zip(moves, intrinsics, strict=True):
+            x, y, z = (places @ move[:3, :3].T + move[:3, 3]).unbind(1)
+            safe = torch.where(z > 1e-6, z, 1.0)
+            column = torch.floor(x / safe * fx + cx).long()
+            row = torch.floor(y / safe * fy + cy).long()
+            there = (z > rendering.NEAREST_M) & (row >= 0) & (row < SIZE)
+            there &= (column >= 0) & (column < SIZE)
+            pixel = torch.where(there, row * SIZE + column, pixels)
+            depth = torch.full((pixels + 1,), torch.inf).scatter_reduce_(0, pixel, z, "amin")
+            first = torch.where(there & (z <= depth[pixel]), pixel, pixels)
+            index = torch.full((pixels + 1,), POINTS).scatter_reduce_(0, first, numbers, "amin")
+            index, depth = index[:-1], depth[:-1]
+            seen = index < POINTS
+            images.append(torch.where(seen[:, None], shades[index.clamp(max=POINTS - 1)], 0.0))
+            depths.append(torch.where(seen, depth, 0.0))
+        return torch.stack(images), torch.stack(depths)
+
+    return run
+
+
+def measure(repeats: int) -> tuple[dict[str, list[float]], str]:
+    """Return the seconds of every run of everything, in turn, and what was checked."""
+    points, colours, wide, valid, camera = scene()
+    plain = jax.jit(rendering.splat, static_argnums=(4, 5))
+    sized = jax.jit(rendering.splat_surfels, static_argnums=(5, 6), static_argnames=("most",))
+    fill = jax.jit(rendering.fill_nearest)
+    peer = torch_splat(points, colours, camera)
+    drawn = functools.partial(sized, points, colours, wide, valid, camera, SIZE, SIZE)
+    ours = functools.partial(plain, points, colours, valid, camera, SIZE, SIZE)
+    view, covered = ours(), drawn(most=3)
+    runs: dict[str, Callable[[], object]] = {
+        "ours, splat": ours,
+        "torch, scatter_reduce": peer,
+        "ours, splat_surfels, 1 pixel": functools.partial(drawn, most=1),
+        "ours, splat_surfels, up to 3 × 3 pixels": functools.partial(drawn, most=3),
+        "ours, fill_nearest": functools.partial(fill, covered),
+    }
+    image, depth = (x.numpy().reshape(T, SIZE, SIZE, -1) for x in peer())
+    same = np.isclose(np.asarray(view.depth_THW), depth[..., 0], atol=1e-4)
+    assert same.mean() > 0.999, "the same depths, but for points on the border of two pixels"
+    alike = np.isclose(np.asarray(view.features_THWF), image, atol=1e-4).all(-1)
+    assert alike.mean() > 0.999, "the same points in front"
+    words = (
+        f"Pixels hit: {np.asarray(view.seen_THW).mean():.0%} by `splat`, "
+        f"{np.asarray(covered.seen_THW).mean():.0%} by `splat_surfels` up to 3 × 3; `splat` and "
+        f"torch agree in {alike.mean():.2%} of the pixels."
+    )
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for turn in range(repeats + 1):
+        for name, run in runs.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(run())
+            if turn:  # the first compiles
+                times[name].append(time.perf_counter() - begin)
+    return times, words
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--record", action="store_true", help="rewrite this section of RESULTS.md")
+    chosen = parser.parse_args()
+    times, words = measure(chosen.repeats)
+    ours, rows = times["ours, splat"], []
+    for name, spent in times.items():
+        ratio = statistics.median(a / b for a, b in zip(spent, ours, strict=True))
+        rows.append([name, f"{statistics.median(spent) * 1e3:.0f} ms", f"{ratio:.1f}×"])
+    text = table(["what", "one clip", "time over ours, splat"], rows)
+    print(text, words, sep="\n", flush=True)
+    if chosen.record:
+        how = (
+            f"`python benchmarks/surfels.py --record`: {T} frames of {SIZE} × {SIZE} pixels from "
+            f"{POINTS:,} points; medians of {chosen.repeats}; torch on "
+            f"{torch.get_num_threads()} threads. {machine('jax', 'torch', 'numpy')}."
+        )
+        title = "## Rendering a memory of points"
+        record("surfels", "\n\n".join([title, how, text, words]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+"""Surfels: what was seen, at the sensor's resolution, one small coloured surface per small cell.
+
+The voxel map keeps features of cells of a quarter of a metre; this keeps colours of cells of a few
+centimetres, so that what was seen can be shown again (``render``). Each surfel stands at the mean
+position of what fell into its cell and is as wide as the cell, or as a pixel of the camera that saw
+it was there if that is wider. What was observed beats what was imagined: frames told to be imagined
+change no observed cell, and the first observation of an imagined cell replaces it.
+
+Cells are kept sorted, as the voxel map's are. Sums are added up in the order of the pixels, so that
+on a CPU equal frames make equal memories bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import ModelConfig, SurfelConfig
+from pewm_jax.geometry.cameras import unproject
+from pewm_jax.memory import cells, rendering, voxel_cells
+from pewm_jax.types import Array, Camera, Frames, MapTokens
+
+COLOUR = 4
+"""The columns of ``sums_VC`` before the colour: how many points, and their offsets."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Surfels:
+    """Surfels with static capacity V.
+
+    Attributes:
+        cell_V: (V,) int32 cells in increasing order; free slots, last, hold the number of cells.
+        sums_VC: (V, 7 + F) count of points, and sums of their offsets from the cell's lower corner
+            (metres), of their colours, and of their features where these are kept (else F = 0).
+        size_V: (V,) width of the finest pixel that saw it, metres at its place; 0 in free slots.
+        observed_V: (V,) bool, False where a surfel is imagined or the slot is free.
+        origin_3: (3,) lower corner of the grid, metres.
+        occupied: () int32, surfels in use.
+        dropped: () int32, cells seen but not kept because the capacity was full (per insertion).
+        outside: () int32, points that fell outside the grid.
+    """
+
+    cell_V: Array
+    sums_VC: Array
+    size_V: Array
+    observed_V: Array
+    origin_3: Array
+    occupied: Array
+    dropped: Array
+    outside: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Points:
+    """What is inserted: P points.
+
+    Attributes:
+        points_P3: (P, 3) in the world, metres.
+        values_PC: (P, 3 + F) colours in [−1, 1], then features.
+        size_P: (P,) width of the pixel that saw it, metres at its place.
+        time_P: (P,) int32 ≥ 0, larger is newer.
+        valid_P: (P,) bool; others are ignored.
+    """
+
+    points_P3: Array
+    values_PC: Array
+    size_P: Array
+    time_P: Array
+    valid_P: Array
+
+
+def empty(model: ModelConfig, centre_3: Array) -> Surfels:
+    """Return a memory of no surfels, its grid centred on a world position."""
+    config = settings_of(model)
+    count, zero = config.capacity, jnp.zeros((), jnp.int32)
+    columns = COLOUR + 3 + (config.encoder.channels if config.features else 0)
+    return Surfels(
+        jnp.full((count,), voxel_cells.nowhere(config), jnp.int32),
+        jnp.zeros((count, columns)),
+        jnp.zeros((count,)),
+        jnp.zeros((count,), bool),
+        cells.origin(config, centre_3),
+        occupied=zero,
+        dropped=zero,
+        outside=zero,
+    )
+
+
+def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool = True) -> Surfels:
+    """Insert points; new cells beyond the capacity are counted, and what is there stays.
+
+    Args:
+        config: cell size, extent, capacity, what is kept of a cell.
+        surfels: those so far.
+        new: the points.
+        observed: False where they were imagined.
+    """
+    none, capacity = voxel_cells.nowhere(config), surfels.cell_V.shape[0]
+    cell_P = cells.keys(config, surfels.origin_3, new.points_P3)
+    outside = (new.valid_P & (cell_P == none)).sum(dtype=jnp.int32)
+    cell_P = jnp.where(new.valid_P, cell_P, none)
+    cell_V, dropped = voxel_cells.admit(surfels.cell_V, cell_P, none)
+
+    before, known = voxel_cells.find(surfels.cell_V, cell_V)
+    known = known & (cell_V < none)
+    was_observed = known & surfels.observed_V[before]
+    slot, found = voxel_cells.find(cell_V, cell_P)
+    taken = found & (cell_P < none)
+    if not observed:
+        taken = taken & ~was_observed[slot]
+    if config.keep == "newest":
+        newest = jnp.full((capacity,), -1, jnp.int32)
+        newest = newest.at[jnp.where(taken, slot, capacity)].max(new.time_P, mode="drop")
+        taken = taken & (new.time_P == newest[slot])
+    target = jnp.where(taken, slot, capacity)
+    touched = jnp.zeros((capacity,), bool).at[target].set(True, mode="drop")
+    stays = known & ~touched
+    if config.keep == "mean":
+        stays = stays | (known & was_observed if observed else known)
+
+    corner = corners(config, surfels.origin_3, jnp.where(taken, cell_P, 0))
+    offset = jnp.where(taken[:, None], new.points_P3 - corner, 0)
+    values = jnp.where(taken[:, None], new.values_PC, 0)
+    rows = jnp.concatenate([taken[:, None].astype(jnp.float32), offset, values], -1)
+    sums = jnp.where(stays[:, None], surfels.sums_VC[before], 0)
+    size = jnp.where(stays, surfels.size_V[before], jnp.inf)
+    size = size.at[target].min(new.size_P, mode="drop")
+    return Surfels(
+        cell_V,
+        sums.at[target].add(rows, mode="drop"),
+        jnp.where(cell_V < none, size, 0),
+        was_observed | touched if observed else was_observed,
+        surfels.origin_3,
+        occupied=(cell_V < none).sum(dtype=jnp.int32),
+        dropped=surfels.dropped + dropped,
+        outside=surfels.outside + outside,
+    )
+
+
+def remember(
+    model: ModelConfig,
+    surfels: Surfels,
+    frames: Frames,
+    features_ThwF: Array | None = None,
+    valid_T: Array | None = None,
+    observed: bool = True,
+) -> Surfels:
+    """Insert every pixel of posed RGB-D frames, colours in [−1, 1].
+
+    Args:
+        model: the model.
+        surfels: those so far.
+        frames: T frames, the newest last.
+        features_ThwF: (T, h, w, F) the encoder's; a pixel gets those of the patch it lies in. Not
+            used where features are not kept.
+        valid_T: (T,) bool, False frames are ignored.
+        observed: False where the frames were imagined.
+    """
+    config = settings_of(model)
+    depth_THW = jnp.asarray(frames.depth_THW)
+    count, height, width = depth_THW.shape
+    valid = (depth_THW > 0) & jnp.isfinite(depth_THW)
+    if valid_T is not None:
+        valid = valid & jnp.asarray(valid_T)[:, None, None]
+    values = jnp.asarray(frames.rgb_THWC)
+    if config.features:
+        if features_ThwF is None:
+            raise ValueError("memory.features is set, but no features were given.")
+        down, across = features_ThwF.shape[1:3]
+        row = ((np.arange(height) + 0.5) * down / height).astype(int)
+        column = ((np.arange(width) + 0.5) * across / width).astype(int)
+        patches = jnp.asarray(features_ThwF)[:, row][:, :, column]
+        values = jnp.concatenate([values, patches.astype(values.dtype)], -1)
+    focal = jnp.asarray(frames.camera.intrinsics_4)[:, 0, None, None]
+    time = jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32)[:, None, None], depth_THW.shape)
+    new = Points(
+        unproject(depth_THW, jax.tree.map(jnp.asarray, frames.camera)).reshape(-1, 3),
+        values.reshape(-1, values.shape[-1]),
+        (depth_THW / focal).reshape(-1),
+        time.reshape(-1),
+        valid.reshape(-1),
+    )
+    return insert(config, surfels, new, observed)
+
+
+def means(config: SurfelConfig, surfels: Surfels) -> tuple[Array, Array, Array, Array]:
+    """Return ``(points_world_V3, colours_V3, features_VF, valid_V)``; free slots are 0.
+
+    F is 0 where features are not kept.
+    """
+    valid = surfels.cell_V < voxel_cells.nowhere(config)
+    mean = surfels.sums_VC[:, 1:] / jnp.where(valid, surfels.sums_VC[:, 0], 1)[:, None]
+    corner = corners(config, surfels.origin_3, jnp.where(valid, surfels.cell_V, 0))
+    points = jnp.where(valid[:, None], corner + mean[:, :3], 0)
+    return points, mean[:, 3:6], mean[:, 6:], valid
+
+
+def to_points(model: ModelConfig, surfels: Surfels) -> tuple[Array, Array, Array]:
+    """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0.
+
+    Without ``memory.features`` these are the colour, a 1 for being there, and zeros up to the
+    encoder's channels.
+    """
+    config = settings_of(model)
+    points, colours, features, valid = means(config, surfels)
+    if config.features:
+        return points, features, valid
+    there = valid[:, None].astype(jnp.float32)
+    padding = jnp.zeros((valid.shape[0], config.encoder.channels - 4))
+    return points, jnp.concatenate([colours, there, padding], -1), valid
+
+
+def tokens(model: ModelConfig, surfels: Surfels, camera: Camera) -> MapTokens:
+    """Choose the surfels that condition one clip: in view first, nearest first."""
+    points, features, valid = to_points(model, surfels)
+    size = (model.clip.height, model.clip.width)
+    order = cells.in_view_first(points, valid, camera, size, model.memory.tokens)
+    return MapTokens(features[order], points[order], valid[order])
+
+
+def render(
+    model: ModelConfig, surfels: Surfels, camera: Camera, height: int, width: int
+) -> rendering.View:
+    """Return what cameras see, with the features of ``to_points``; see ``memories.render``."""
+    points, features, valid = to_points(model, surfels)
+    return _shown(settings_of(model), surfels, points, features, valid, camera, height, width)
+
+
+def render_colours(
+    model: ModelConfig, surfels: Surfels, camera: Camera, height: int, width: int
+) -> rendering.View:
+    """Return what cameras see, with the 3 colours alone, in [−1, 1]."""
+    config = settings_of(model)
+    points, colours, _, valid = means(config, surfels)
+    return _shown(config, surfels, points, colours, valid, camera, height, width)
+
+
+def _shown(
+    config: SurfelConfig,
+    surfels: Surfels,
+    points_V3: Array,
+    features_VF: Array,
+    valid_V: Array,
+    camera: Camera,
+    height: int,
+    width: int,
+) -> rendering.View:
+    """Draw surfels as wide as they are."""
+    wide = jnp.maximum(surfels.size_V, max(config.cell_m))
+    return rendering.splat_surfels(
+        points_V3, features_VF, wide, valid_V, camera, height, width, most=config.footprint
+    )
+
+
+def corners(config: SurfelConfig, origin_3: Array, cell_P: Array) -> Array:
+    """Return (P, 3) the lower corners of cells by their numbers, metres."""
+    _, ny, nz = config.cells
+    place = jnp.stack([cell_P // (ny * nz), cell_P // nz % ny, cell_P % nz], -1)
+    return origin_3 + place.astype(jnp.float32) * np.asarray(config.cell_m, np.float32)
+
+
+def settings_of(model: ModelConfig) -> SurfelConfig:
+    """Return the settings of the memory, which must be surfels."""
+    config = model.memory
+    if not isinstance(config, SurfelConfig):
+        raise TypeError(f"surfels need a SurfelConfig, got {type(config).__name__}.")
+    return config
