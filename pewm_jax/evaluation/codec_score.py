@@ -19,7 +19,7 @@ from pewm_jax import atomic
 from pewm_jax.config import CodecWorldConfig, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation.images import psnr, unit_colours
-from pewm_jax.evaluation.imagine import aloud
+from pewm_jax.evaluation.imagine import print_now
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.models import learned_codec
 from pewm_jax.models.signals import depth_from_signal, signal_from_depth, signal_from_rgb
@@ -36,7 +36,7 @@ def score(
     *,
     data: str | Path | None = None,
     split: str | None = None,
-    say: Callable[[str], Any] = aloud,
+    say: Callable[[str], Any] = print_now,
 ) -> Path:
     """Score a trained codec on a split and print and write the numbers.
 

@@ -1,10 +1,10 @@
 """Rendering points by splatting them into a z-buffer.
 
 Shapes are static and the result is deterministic (``average`` adds in the order of the points on a
-CPU). ``splat`` lets each point cover the one pixel that it projects to; of several points at a pixel
-the nearest is seen, and ties go to the lowest index. Far surfaces show through between such points;
-``splat_surfels`` gives points a size, so that they do not. ``fill_nearest`` fills the pixels that no
-point covers.
+CPU). ``splat`` lets each point cover the one pixel that it projects to; of several points at a
+pixel the nearest is seen, and ties go to the lowest index. Far surfaces show through between such
+points; ``splat_surfels`` gives points a size, so that they do not. ``fill_nearest`` fills the pixels
+that no point covers.
 """
 
 from __future__ import annotations
