@@ -3,7 +3,7 @@
 Shapes are static and the result is deterministic (``average`` adds in the order of the points on a
 CPU). ``splat`` lets each point cover the one pixel that it projects to; of several points at a
 pixel the nearest is seen, and ties go to the lowest index. Far surfaces show through between such
-points; ``splat_surfels`` gives points a size, so that they do not. ``fill_nearest`` fills the pixels
+points; ``splat_surfels`` gives points a size, so that they do not. ``fill_nearest`` fills pixels
 that no point covers.
 """
 
