@@ -308,7 +308,9 @@ def test_previews_measure_what_is_shown(run, tmp_path, monkeypatch):
     monkeypatch.setattr(preview, "CLIPS", 2)
     config, true = configs.load(run / "config.json"), []
     load = preview.load_clip
-    monkeypatch.setattr(preview, "load_clip", lambda *a: (true.append(load(*a)), true[-1])[1])
+    monkeypatch.setattr(
+        preview, "load_clip", lambda *a, **k: (true.append(load(*a, **k)), true[-1])[1]
+    )
     off = {False: 16, True: 0}  # levels of 255
 
     def imagined(_model, _context, _actions, _seeds, *, memory, params):
@@ -333,10 +335,10 @@ def test_data_that_cannot_be_previewed_cost_one_line_and_not_the_training(tmp_pa
     assert said[0].startswith("no previews")
     assert "validation does not exist" in said[0]
 
+    # Motion that is not upright, as of a recording made by hand, is driven by its cameras.
     write_split(tmp_path / "data" / "validation", episodes=1, nod=0.3)
-    assert preview.make_preview(config, tmp_path, said.append) is None
-    assert len(said) == 2
-    assert "upright motion" in said[1]
+    assert preview.make_preview(config, tmp_path, said.append) is not None
+    assert len(said) == 1
 
 
 def test_places_are_called_new_only_where_they_are(run, tmp_path):
