@@ -66,7 +66,7 @@ def still(moves):
 @functools.partial(jax.jit, static_argnums=0)
 def remembered(model, memory, frames):
     features = encoders.encode(model.memory.encoder, {}, frames.rgb_THWC)
-    return memories.remember(model, memory, frames, features)
+    return memories.remember(model, memory, frames, features, observed=False)
 
 
 @pytest.mark.parametrize("count", [1, LENGTH - 1, LENGTH, LENGTH + 2])
