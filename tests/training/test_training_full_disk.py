@@ -49,7 +49,9 @@ def found(tmp_path_factory):
         folder, sys.executable, str(HERE / "training_full_disk.py"), str(folder)
     )
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    # Orbax may say that it removes what a failed write has left; nothing else is said.
+    orbax = "WARNING:absl:Attempted to create temporary directory"
+    assert [line for line in done.stderr.splitlines() if not line.startswith(orbax)] == []
     return json.loads(done.stdout.splitlines()[-1])
 
 
