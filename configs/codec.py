@@ -15,7 +15,7 @@ def config() -> Config:
     """Return the settings of the codec's training.
 
     Many houses teach more than many frames of one:
-    ``pewm-jax data collect data/codec --train 1500 --frames 24 --validation 24``.
+    ``pewm-jax data collect data/codec --train 1000 --frames 28 --validation 24 --test 8``.
     Two frames of each of 32 episodes make a step; a context of one frame, which every clip has, is
     not looked at. ``pewm-jax evaluate runs/codec`` prints the numbers on houses never trained on.
     """

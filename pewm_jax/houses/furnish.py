@@ -159,13 +159,11 @@ class Furnisher:
         for _ in range(2 * TRIES):
             turn = int(rng.integers(2))
             w, d = table.size[:2] if turn == 0 else table.size[1::-1]
-            room = [x0y0x1y1[i + 2] - x0y0x1y1[i] - 1.6 for i in range(2)]
-            if room[0] < w or room[1] < d:
+            low = [x0y0x1y1[i] + 0.8 + s / 2 for i, s in enumerate((w, d))]
+            high = [x0y0x1y1[i + 2] - 0.8 - s / 2 for i, s in enumerate((w, d))]
+            if low[0] > high[0] or low[1] > high[1]:
                 continue
-            centre = [
-                rng.uniform(x0y0x1y1[i] + 0.8 + s / 2, x0y0x1y1[i + 2] - 0.8 - s / 2)
-                for i, s in enumerate((w, d))
-            ]
+            centre = [rng.uniform(*ends) for ends in zip(low, high, strict=True)]
             pose = turned(turn, centre) @ shift(0, -table.size[1] / 2)
             if not self._free_standing(table, pose):
                 continue
