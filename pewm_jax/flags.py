@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from pewm_jax import config as configuration
 from pewm_jax.config import Config, ConfigError, Settings, kinds, serialize
-from pewm_jax.config.migrations import RENAMED_FLAGS
+from pewm_jax.config.migrations import RENAMED_FLAGS, kind_now
 
 T = TypeVar("T")
 
@@ -81,7 +81,7 @@ def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
             there = ", ".join(kinds.names(section.SECTION))
             raise ConfigError(f"{flag} needs a value: {there}.")
         else:
-            default = with_kind(default, path, name)
+            default = with_kind(default, path, kind_now(section.SECTION, name))
     return default, rest
 
 

@@ -258,7 +258,7 @@ def experiments(draw):
     names = {"backbone", "codec", "control", "noise"}
     parts = {name: draw(some(name))() for name in sorted(names)}
     steps = dataclasses.replace(parts["noise"], sample_steps=draw(st.integers(1, 50)))
-    reader = dataclasses.replace(draw(some("reader"))(), heads=draw(st.integers(4, 9)))
+    reader = dataclasses.replace(draw(some("reader"))(), mlp_ratio=draw(st.integers(1, 4)))
     memory = dataclasses.replace(
         draw(some("memory"))(),
         cell_m=draw(st.tuples(*[st.floats(0.1, 2)] * 3)),
@@ -276,6 +276,15 @@ def experiments(draw):
 @given(experiments())
 def test_every_combination_of_kinds_goes_to_json_and_back(config):
     assert there_and_back(config, Config) == config
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_reader_of_an_earlier_version_is_known_by_its_name_of_now(version):
+    reader = {"kind": "attention" if version == 2 else "attend", "looks": 7}
+    table = {"version": version, "model": {"memory": {"reader": reader}}}
+    read = configuration.from_dict(Config, table).model.memory.reader
+    assert read == AttentionConfig(looks=7)
+    assert configuration.to_dict(read)["kind"] == "attend"
 
 
 def test_a_section_without_a_kind_is_of_the_usual_one():

@@ -69,12 +69,20 @@ def test_a_short_name_a_full_one_and_one_with_hyphens_set_the_same():
         (["--memory.encoder_patch", 4], ["--model.memory.encoder.patch", 4]),
         (["--memory.encoder", "dinov2"], ["--model.memory.encoder.kind", "dinov2"]),
         (["--memory.no_depth"], ["--model.clip.no_depth"]),
+        (["--memory.read", "render"], ["--model.memory.reader.kind", "render"]),
+        (["--model.memory.read=both"], ["--model.memory.reader.kind", "both"]),
         (["--memory.tokens", 8], ["--model.memory.tokens", 8]),
         (["--actions.step_m", 2], ["--model.actions.step_m", 2]),
     ],
 )
 def test_old_names_set_what_they_set(old, new):
     assert parse(*old) == parse(*new) != TINY
+
+
+def test_a_kind_is_chosen_by_its_earlier_name_too_and_keeps_what_the_kinds_share():
+    both = parse("--memory.read", "both", "--memory.reader.picture_width", 32)
+    assert (both.model.memory.reader.heads, both.model.memory.reader.picture_width) == (4, 32)
+    assert parse("--memory.reader.kind", "attention", default=both) == TINY
 
 
 def test_every_flag_of_an_earlier_version_is_one_now():
@@ -91,7 +99,7 @@ def test_every_flag_of_an_earlier_version_is_one_now():
     assert len(now) > 90
 
 
-@pytest.mark.parametrize("section", ["codec", "memory", "noise", "memory.encoder"])
+@pytest.mark.parametrize("section", ["codec", "memory", "noise", "memory.encoder", "memory.reader"])
 def test_every_kind_can_be_put_into_its_section(section):
     part = section.rsplit(".", 1)[-1]
     for name in kinds.names(part):

@@ -30,7 +30,7 @@ from pewm_jax.config.mesh import AXES, MeshConfig
 from pewm_jax.config.migrations import upgrade
 from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettings
-from pewm_jax.config.reader import AttentionConfig, ReaderSettings
+from pewm_jax.config.reader import AttentionConfig, BothConfig, ReaderSettings, RenderConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.vae import VAEConfig
@@ -44,7 +44,9 @@ register("codec", "learned", LearnedCodecConfig, "pewm_jax.models.learned_codec"
 register("control", "camera", CameraConfig, "pewm_jax.models.camera_control")
 register("encoder", "patch_colours", PatchColoursConfig, "pewm_jax.models.patch_colours")
 register("encoder", "dinov2", DINOv2EncoderConfig, "pewm_jax.models.dinov2_encoder")
-register("reader", "attention", AttentionConfig, "pewm_jax.models.attention_reader")
+register("reader", "attend", AttentionConfig, "pewm_jax.models.attention_reader")
+register("reader", "render", RenderConfig, "pewm_jax.models.render_reader")
+register("reader", "both", BothConfig, "pewm_jax.models.both_reader")
 register("memory", "voxel", VoxelConfig, "pewm_jax.memory.voxel_memory")
 register("memory", "map2d", Map2DConfig, "pewm_jax.memory.map2d")
 register("memory", "points", PointsConfig, "pewm_jax.memory.points")
@@ -63,6 +65,7 @@ __all__ = [
     "ActionConfig",
     "AttentionConfig",
     "BackboneSettings",
+    "BothConfig",
     "CameraConfig",
     "ClipConfig",
     "CodecSettings",
@@ -94,6 +97,7 @@ __all__ = [
     "Places",
     "PointsConfig",
     "ReaderSettings",
+    "RenderConfig",
     "Settings",
     "StageConfig",
     "SurfelConfig",

@@ -82,6 +82,22 @@ def from_1(values: Values, where: str, under: Kinds) -> Values:
     return {"version": 2, "model": model, **old}
 
 
+def from_2(values: Values, where: str, under: Kinds) -> Values:
+    """Call the reader that attends to points `attend`; there are others beside it now."""
+    del where, under
+    section: Any = values
+    for name in ("model", "memory", "reader"):
+        section = section.get(name, {}) if isinstance(section, dict) else {}
+    if isinstance(section, dict) and "kind" in section:
+        section["kind"] = kind_now("reader", section["kind"])
+    return values
+
+
+def kind_now(section: str, name: Any) -> Any:
+    """Return the present name of a kind that earlier versions may have called otherwise."""
+    return RENAMED_KINDS.get((section, name), name) if isinstance(name, str) else name
+
+
 def _require_tables(values: Values, where: str, *names: str) -> None:
     """Refuse anything but tables in sections whose settings move."""
     for name in names:
@@ -131,8 +147,11 @@ def _move(old: Values, name: str, new: Values, to: str) -> None:
         new[to] = old.pop(name)
 
 
-MIGRATIONS: dict[int, Callable[[Values, str, Kinds], Values]] = {1: from_1}
+MIGRATIONS: dict[int, Callable[[Values, str, Kinds], Values]] = {1: from_1, 2: from_2}
 """Version → the function that upgrades its values to the next version."""
+
+RENAMED_KINDS = {("reader", "attention"): "attend"}
+"""Section and name of kinds in earlier versions → their names now."""
 
 RENAMED_FLAGS = (
     ("dit.", "model.backbone."),
@@ -143,6 +162,8 @@ RENAMED_FLAGS = (
     ("memory.depth", "model.clip.depth"),
     ("memory.no_depth", "model.clip.no_depth"),
     ("memory.encoder", "model.memory.encoder.kind"),
+    ("memory.read", "model.memory.reader.kind"),
+    ("model.memory.read", "model.memory.reader.kind"),
     ("memory.dinov2.", "model.memory.encoder.network."),
     ("memory.encoder_patch", "model.memory.encoder.patch"),
     ("memory.encoder_size", "model.memory.encoder.size"),
@@ -151,5 +172,5 @@ RENAMED_FLAGS = (
         for name in ("positions", "frame", "looks", "heads", "head_dim", "mlp_ratio")
     ),
 )
-"""Names of flags in version 1 → their names now; the first match counts. An entry that ends in a
-dot or an underscore is a prefix."""
+"""Short and earlier names of flags → their names now; the first match counts. An entry that ends in
+a dot or an underscore is a prefix."""

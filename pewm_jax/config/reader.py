@@ -1,4 +1,4 @@
-"""Memory readers: how the denoiser reads the memory."""
+"""Memory readers: how the denoiser reads the memory: `attend` to points, `render`, or `both`."""
 
 from __future__ import annotations
 
@@ -70,3 +70,52 @@ class AttentionConfig(ReaderSettings):
             f"memory.reader.head_dim is {self.head_dim}: use a multiple of 8, the projective "
             "rotary embedding splits a head in two times two halves.",
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderConfig(ReaderSettings):
+    """What the memory looks like from each frame's camera, given to the video tokens there."""
+
+    READS_TOKENS: ClassVar[bool] = False
+    READS_VIEW: ClassVar[bool] = True
+
+    picture_width: int = 128
+    """Channels of a token's part of the picture, embedded."""
+    reduced: int = 8
+    """Pictures of more channels are first reduced to this many, at every pixel."""
+    blocks: bool = True
+    """Also give the picture to a memory block after every block of the backbone; else only to its
+    input."""
+    mlp_ratio: int = 2
+    """Hidden channels of such a block over model width."""
+
+    def check(self, model: Any) -> None:
+        """Refuse clips that cannot be folded as the pictures are."""
+        clip, q = model.clip, model.codec.temporal
+        require(
+            (clip.frames - 1) % q == 0,
+            f"clip.frames is {clip.frames}: the memory's pictures are folded by codec.temporal = "
+            f"{q}, so use {q}k + 1 frames, or memory.reader.kind attend.",
+        )
+
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "memory.reader", "picture_width", "reduced", "mlp_ratio")
+
+
+@dataclasses.dataclass(frozen=True)
+class BothConfig(AttentionConfig, RenderConfig):
+    """Cross-attention and rendering, one after the other at every place."""
+
+    READS_TOKENS: ClassVar[bool] = True
+    READS_VIEW: ClassVar[bool] = True
+
+    def check(self, model: Any) -> None:
+        """Refuse what either of the two refuses."""
+        AttentionConfig.check(self, model)
+        RenderConfig.check(self, model)
+
+    def __post_init__(self):
+        """Validate."""
+        AttentionConfig.__post_init__(self)
+        RenderConfig.__post_init__(self)

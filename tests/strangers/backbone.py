@@ -35,6 +35,7 @@ def init(config, key, in_channels, out_channels):
 def apply(config, params, x_BthwC, time_B, conditioning, readers):
     x = backbones.joined(x_BthwC, conditioning)
     tokens = x.reshape(len(x), -1, x.shape[-1]) @ params["into"].astype(x.dtype)
+    tokens += 0 if readers.added_BND is None else readers.added_BND
     time = layers.sinusoid(time_B, config.width)[:, None] + conditioning.modulation_BtE
     per_token = jnp.repeat(time, tokens.shape[1] // time.shape[1], 1)
 

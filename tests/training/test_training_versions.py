@@ -197,13 +197,13 @@ def test_what_is_written_now_says_its_version_and_comes_back(tmp_path):
     assert configuration.load(tmp_path / "config.json") == config
 
 
-@pytest.mark.parametrize("version", [99, 3])
+@pytest.mark.parametrize("version", [99, configuration.VERSION + 1])
 def test_a_newer_version_is_refused_in_a_sentence(tmp_path, version):
     (tmp_path / "config.json").write_text(json.dumps({"version": version, "world": {}}))
     with pytest.raises(ConfigError) as refused:
         pewm_jax.load(tmp_path)
     assert str(refused.value) == (
-        f"config.json is of version {version}, and this pewm_jax reads versions up to 2: install "
+        f"config.json is of version {version}, and this pewm_jax reads versions up to {configuration.VERSION}: install "
         "a newer pewm_jax."
     )
 

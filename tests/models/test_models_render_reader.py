@@ -1,0 +1,196 @@
+"""Rendering as a reader: what it adds, where, and that it starts from nothing."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax.config import (
+    AttentionConfig,
+    BothConfig,
+    NoMemoryConfig,
+    RenderConfig,
+    SurfelConfig,
+    VoxelConfig,
+)
+from pewm_jax.memory import memories
+from pewm_jax.models import readers, render_reader, world_model
+from pewm_jax.types import Clip, Control, Frames, MapTokens, Sight, View
+from pewm_jax.worlds import objective, pewm
+from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
+
+READERS = {
+    "attend": AttentionConfig(heads=4, head_dim=8),
+    "render": RenderConfig(picture_width=16),
+    "input": RenderConfig(picture_width=16, blocks=False),
+    "both": BothConfig(heads=4, head_dim=8, picture_width=16),
+}
+RENDERS = pytest.mark.parametrize("kind", ["render", "input", "both"])
+ALL = pytest.mark.parametrize("kind", READERS)
+TIMES = jnp.array([5, 700])
+apply = jax.jit(world_model.apply, static_argnums=0)
+look = jax.jit(objective.clip_sight, static_argnums=0)
+
+
+def model_of(kind, memory=VoxelConfig, **sections):
+    """The tiny model with another reader, perhaps of another memory."""
+    shape = {name: getattr(TINY.memory, name) for name in ("cell_m", "cells", "capacity", "tokens")}
+    return tiny_model(memory=memory(reader=READERS[kind], **shape), **sections)
+
+
+@functools.cache
+def inputs():
+    """Conditioning, what a memory of 6 channels shows, and noisy latents, of two clips."""
+    rng = np.random.default_rng(0)
+    camera = jax.tree.map(lambda x: jnp.asarray(np.stack([x, x[::-1]])), random_camera(rng, 9))
+
+    def draw(*shape):
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    depth = jnp.asarray(rng.uniform(0.5, 4, (2, 9, 16, 24)), jnp.float32)
+    first = jax.tree.map(lambda x: x[:, :1], camera)
+    observed = Frames(jnp.tanh(draw(2, 1, 16, 24, 3)), depth[:, :1], first)
+    conditioning = world_model.condition(TINY, {}, observed, Control(camera))
+    sight = Sight(
+        MapTokens(draw(2, 20, 6), draw(2, 20, 3), jnp.ones((2, 20), bool)),
+        View(draw(2, 9, 16, 24, 6), depth, jnp.asarray(rng.uniform(size=(2, 9, 16, 24)) < 0.6)),
+    )
+    return conditioning, sight, draw(2, *TINY.latent_shape, TINY.codec.channels)
+
+
+def predict(model, params, sight):
+    conditioning, _, noisy = inputs()
+    return apply(model, params, noisy, conditioning, TIMES, sight)
+
+
+def hidden(sight):
+    """The same, but the memory shows nothing."""
+    tokens, view = sight.tokens, sight.view
+    tokens = dataclasses.replace(tokens, valid_M=jnp.zeros_like(tokens.valid_M))
+    return Sight(tokens, dataclasses.replace(view, seen_THW=jnp.zeros_like(view.seen_THW)))
+
+
+@ALL
+def test_a_fresh_reader_changes_nothing_bit_for_bit(kind):
+    model, (_, sight, _) = model_of(kind), inputs()
+    params = init_world(model)
+    params["backbone"] = randomise(params["backbone"])
+    base = predict(TINY, {"backbone": params["backbone"]}, None)
+    assert np.abs(base).max() > 0.1
+    np.testing.assert_array_equal(predict(model, params, sight), base)
+
+
+@ALL
+def test_an_empty_memory_changes_nothing_bit_for_bit_whatever_was_learned(kind):
+    model, (_, sight, _) = model_of(kind), inputs()
+    params = randomise(init_world(model))
+    backbone = {"backbone": params["backbone"]}
+    base = predict(TINY, backbone, None)
+    np.testing.assert_array_equal(predict(model, params, hidden(sight)), base)
+    np.testing.assert_array_equal(predict(model, backbone, sight), base)
+    assert np.abs(predict(model, params, sight) - base).max() > 1e-3
+
+
+@RENDERS
+def test_what_is_not_seen_is_not_read(kind):
+    model, (_, sight, _) = model_of(kind), inputs()
+    params = randomise(init_world(model))
+    seen = sight.view.seen_THW
+    junk = View(
+        jnp.where(seen[..., None], sight.view.features_THWF, jnp.nan),
+        jnp.where(seen, sight.view.depth_THW, jnp.inf),
+        seen,
+    )
+    base = predict(model, params, sight)
+    np.testing.assert_array_equal(predict(model, params, Sight(sight.tokens, junk)), base)
+
+
+def test_each_token_gets_the_pixels_that_it_stands_for():
+    model, (conditioning, sight, _) = model_of("render"), inputs()
+    params = randomise(init_world(model)["memory"])
+    camera, rays = conditioning.camera, conditioning.rays_BthwC
+    added = functools.partial(readers.prepare, model, params, camera=camera, rays_BthwC=rays)
+    base = added(sight=sight).added_BND.reshape(2, 3, 2, 3, -1)
+    rng = np.random.default_rng(1)
+    for frame, row, column in zip(*(rng.integers(n, size=6) for n in (9, 16, 24)), strict=True):
+        features = sight.view.features_THWF.at[1, frame, row, column].add(3.0)
+        seen = sight.view.seen_THW.at[:, frame, row, column].set(True)
+        moved = dataclasses.replace(sight.view, features_THWF=features, seen_THW=seen)
+        shown = dataclasses.replace(sight.view, seen_THW=seen)
+        other = added(sight=Sight(None, moved)).added_BND.reshape(base.shape)
+        same = added(sight=Sight(None, shown)).added_BND.reshape(base.shape)
+        changed = np.argwhere(np.abs(other - same).max(-1) > 0).tolist()
+        assert changed == [[1, (frame + 3) // 4, row // 8, column // 8]]
+
+
+def test_many_channels_are_reduced_and_a_token_in_time_may_hold_two_latent_frames():
+    backbone = dataclasses.replace(TINY.backbone, patch_t=2)
+    reader = RenderConfig(picture_width=16, reduced=2)
+    memory = dataclasses.replace(TINY.memory, reader=reader)
+    model, (_, sight, _) = tiny_model(memory=memory, backbone=backbone), inputs()
+    assert render_reader.pixel_channels(model) == 4
+    params = init_world(model)
+    assert params["memory"]["render"]["reduce"]["kernel"].shape == (6, 2)
+    params["backbone"] = randomise(params["backbone"])
+    fresh = predict(model, params, sight)
+    np.testing.assert_array_equal(fresh, predict(model, {"backbone": params["backbone"]}, None))
+    assert np.abs(predict(model, randomise(params), sight) - fresh).max() > 1e-3
+
+
+def test_a_block_takes_a_time_for_each_frame():
+    model, (conditioning, sight, _) = model_of("render"), inputs()
+    params = randomise(init_world(model)["memory"])
+    read = readers.prepare(model, params, sight, conditioning.camera, conditioning.rays_BthwC)
+    layer = jax.tree.map(lambda x: x[0], read.params)
+    rng = np.random.default_rng(0)
+    video = jnp.asarray(rng.normal(size=(2, 18, 32)), jnp.float32)
+    times = jnp.asarray(rng.normal(size=(2, 3, 16)), jnp.float32)
+    one = read.block(layer, video, times[:, 0])
+    each = read.block(layer, video, jnp.tile(times[:, :1], (1, 3, 1)))
+    np.testing.assert_allclose(each, one, atol=1e-5 * np.abs(one).max())
+    other = read.block(layer, video, times.at[:, 1].add(1.0)) - read.block(layer, video, times)
+    assert np.flatnonzero(np.abs(other).reshape(2, 3, -1).max((0, 2))).tolist() == [1]
+
+
+def batch_of(model, count=2):
+    """Clips of random frames that stand where their context stood."""
+    rng = np.random.default_rng(0)
+    made = [random_frames(rng, 9) for _ in range(count)]
+    frames = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *made)
+    return Clip(frames, frames, jnp.ones((count, 9), bool))
+
+
+@pytest.mark.parametrize("memory", [VoxelConfig, SurfelConfig])
+def test_a_rollout_looks_as_training_does(memory):
+    model = model_of("both", memory)
+    batch = batch_of(model)
+    sight = look(model, {}, batch)
+    assert sight.view.features_THWF.shape == (2, 9, 16, 24, memories.rendered_channels(model))
+    assert sight.view.seen_THW.mean() > 0.1
+    for i in range(2):
+        frames = jax.tree.map(lambda x, i=i: x[i], batch.frames)
+        state = pewm.start(model, {}, frames)
+        alone = memories.look(model, state.map, frames.camera)
+        one = jax.tree.map(lambda x, i=i: x[i], sight)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), alone, one)
+
+
+def test_readers_get_what_they_ask_for():
+    batch = batch_of(None)
+    for kind, wanted in {"attend": "tokens", "render": "view", "both": "tokens view"}.items():
+        sight = jax.eval_shape(functools.partial(objective.clip_sight, model_of(kind), {}), batch)
+        given = {name for name in ("tokens", "view") if getattr(sight, name) is not None}
+        assert given == set(wanted.split())
+
+
+@RENDERS
+def test_without_a_memory_there_is_nothing_to_see_but_a_reader_to_train(kind):
+    model = model_of(kind, NoMemoryConfig)
+    sight = look(model, {}, batch_of(model))
+    assert not np.asarray(sight.view.seen_THW).any()
+    params = randomise(init_world(model))
+    base = predict(model, {"backbone": params["backbone"]}, None)
+    assert np.abs(predict(model, params, sight) - base).max() > 1e-3
