@@ -179,7 +179,7 @@ def test_what_the_checks_must_not_refuse():
             {"model": {"codec": [1]}},
             "model.codec must be a table of settings, got list",
         ),
-        ({"version": 3}, "of version 3, .* versions up to 2: install a newer pewm_jax"),
+        ({"version": 4}, "of version 4, .* versions up to 3: install a newer pewm_jax"),
         *(({"version": v}, "must be a whole number from 1") for v in (0, -1, "2", 2.0, True, None)),
         ({"version": 2, "dit": {}}, "no setting dit"),
     ],

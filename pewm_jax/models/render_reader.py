@@ -160,7 +160,8 @@ def prepare(
     block = RenderBlock(config.mlp_ratio, layout)
 
     def read(layer: Params, video: Array, time: Array) -> Array:
-        return jnp.where(shown, block.apply({"params": layer}, video, time, picture), video)
+        out: Array = block.apply({"params": layer}, video, time, picture)
+        return jnp.where(shown, out, video)
 
     return Readers(read, weights["blocks"], added)
 
