@@ -145,6 +145,36 @@ class MapTokens:
 
 @_pytree
 @dataclasses.dataclass(frozen=True)
+class View:
+    """The images of T cameras, rendered from points, any leading shape before T.
+
+    Attributes:
+        features_THWF: (..., T, H, W, F) features of the nearest point at each pixel, 0 without one.
+        depth_THW: (..., T, H, W) its depth along z, metres, 0 without one.
+        seen_THW: (..., T, H, W) bool, whether a point is at the pixel.
+    """
+
+    features_THWF: Array
+    depth_THW: Array
+    seen_THW: Array
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
+class Sight:
+    """What a memory shows one clip, or each clip of a batch; what is not asked for is None.
+
+    Attributes:
+        tokens: the points that the clip's cameras see, for attention.
+        view: what the memory looks like from each of the clip's cameras, at the clip's size.
+    """
+
+    tokens: MapTokens | None = None
+    view: View | None = None
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
 class WorldState:
     """The state that a rollout carries from one clip to the next.
 

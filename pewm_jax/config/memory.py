@@ -47,6 +47,11 @@ class MemorySettings(Settings):
         """The longest side of the grid in metres."""
         return max(size * count for size, count in zip(self.cell_m, self.cells, strict=True))
 
+    @property
+    def rendered_channels(self) -> int:
+        """Channels of the memory's pictures: the colour, or the features that are kept."""
+        return self.encoder.channels if self.KEEPS_FEATURES else 3
+
     def check(self, model: Any) -> None:
         """Refuse a model that the encoder or the reader does not fit."""
         self.encoder.check(model)

@@ -13,10 +13,14 @@ class ReaderSettings(Settings):
     """Settings that every reader has; see ``pewm_jax.models.readers`` for its functions.
 
     Attributes:
+        READS_TOKENS: whether it takes the points that a clip's cameras see (``Sight.tokens``).
+        READS_VIEW: whether it takes what the memory looks like from them (``Sight.view``).
         split_heads: a number that ``train.mesh.tensor`` must divide.
     """
 
     SECTION: ClassVar[str] = "reader"
+    READS_TOKENS: ClassVar[bool] = True
+    READS_VIEW: ClassVar[bool] = False
     split_heads: Any = 1
 
 

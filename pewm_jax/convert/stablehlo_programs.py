@@ -16,7 +16,7 @@ from pewm_jax.config import Config, DDPMConfig, UserError, kinds
 from pewm_jax.data import abstract
 from pewm_jax.memory import memories
 from pewm_jax.models import world_model
-from pewm_jax.types import Array, Camera, Control, Params
+from pewm_jax.types import Array, Camera, Control, Params, Sight
 
 Arrays: TypeAlias = dict[str, Array]
 """Name → array, or anything with a shape and a dtype."""
@@ -104,17 +104,20 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
     if "memory" in params:
 
         def read(c: Camera) -> Any:
-            return memories.tokens(model, memories.empty(model, jnp.zeros(3)), c)
+            return memories.look(model, memories.empty(model, jnp.zeros(3)), c)
 
-        parts["tokens"] = jax.eval_shape(jax.vmap(read), camera)
+        sight = jax.eval_shape(jax.vmap(read), camera)
+        shown = {"tokens": sight.tokens, "view": sight.view}
+        parts |= {name: part for name, part in shown.items() if part is not None}
     noisy = like((*model.latent_shape, model.codec.channels))
 
     def denoise(weights: Arrays, inputs: Arrays) -> Arrays:
-        given = _pack(parts, inputs)
-        tokens = given[1] if len(given) > 1 else None
+        given = dict(zip(parts, _pack(parts, inputs), strict=True))
+        conditioning = given.pop("conditioning")
+        sight = Sight(**given) if given else None
         noisy, times = inputs["noisy_BthwC"], inputs["timesteps_B"]
         world = tree.unflatten(weights)
-        out = world_model.apply(model, world, noisy, given[0], times, tokens)
+        out = world_model.apply(model, world, noisy, conditioning, times, sight)
         return {"prediction_BthwC": out}
 
     noise, time = model.noise, like(())

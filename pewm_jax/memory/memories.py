@@ -3,6 +3,7 @@
     memory = empty(model, centre)                          # a grid around the agent
     memory = remember(model, memory, frames, features)     # posed RGB-D frames
     seen = tokens(model, memory, camera)                   # tokens that condition one clip
+    sight = look(model, memory, camera)                    # what the model's reader takes of it
     view = render(model, memory, camera, height, width)    # the memory seen by cameras
 
 ============ ============================================ =====================================
@@ -33,7 +34,7 @@ import numpy as np
 from pewm_jax.config import ModelConfig, functions
 from pewm_jax.memory import rendering
 from pewm_jax.models import encoders
-from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
+from pewm_jax.types import Array, Camera, Frames, MapTokens, Params, Sight, View
 
 Memory: TypeAlias = Any
 """A pytree, of the type that the memory's ``empty`` returns."""
@@ -108,6 +109,40 @@ def render(
     if own is not None:
         return own(model, memory, camera, height, width)
     return rendering.splat(*to_points(model, memory), camera, height, width)
+
+
+def rendered_channels(model: ModelConfig) -> int:
+    """Return the channels of the pictures that ``render`` gives."""
+    return model.memory.rendered_channels
+
+
+def shows_colours(model: ModelConfig) -> bool:
+    """Tell whether the first three channels of the memory's pictures are the colours seen."""
+    return model.memory.REMEMBERS and not model.memory.KEEPS_FEATURES
+
+
+def shows(model: ModelConfig) -> bool:
+    """Tell whether a clip is shown pictures: the reader takes them, or the codec's gate does."""
+    gate = bool(getattr(model.codec, "gate", 0)) and shows_colours(model)
+    return model.memory.reader.READS_VIEW or gate
+
+
+def look(model: ModelConfig, memory: Memory, camera: Camera) -> Sight:
+    """Return what the memory shows one clip, as far as the reader and the codec ask for it.
+
+    Args:
+        model: the model.
+        memory: what is remembered.
+        camera: (T,) cameras of the clip, whose intrinsics are for images of its size.
+    """
+    seen, view = None, None
+    if model.memory.reader.READS_TOKENS:
+        seen = tokens(model, memory, camera)
+    if shows(model):
+        view = render(model, memory, camera, model.clip.height, model.clip.width)
+        features = view.features_THWF[..., : rendered_channels(model)]
+        view = View(features, view.depth_THW, view.seen_THW)
+    return Sight(seen, view)
 
 
 def from_context(

@@ -9,7 +9,6 @@ that no point covers.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.geometry.cameras import project
-from pewm_jax.types import Array, Camera
+from pewm_jax.types import Array, Camera, View
 
 NEAREST_M = 0.05
 """Points nearer to the camera plane than this are not seen, metres."""
@@ -26,22 +25,6 @@ TOLERANCE_M, TOLERANCE_RELATIVE = 0.05, 0.1
 grazing angle is that deep from pixel to pixel)."""
 LEAST = 1e-4
 """The least share of a point that shows it."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class View:
-    """The images of T cameras.
-
-    Attributes:
-        features_THWF: (T, H, W, F) features of the nearest point at each pixel, 0 without one.
-        depth_THW: (T, H, W) its depth along z, metres, 0 without one.
-        seen_THW: (T, H, W) bool, whether a point is at the pixel.
-    """
-
-    features_THWF: Array
-    depth_THW: Array
-    seen_THW: Array
 
 
 def splat(

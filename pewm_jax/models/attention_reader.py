@@ -27,7 +27,7 @@ from pewm_jax.models.memory_block import MemoryBlock
 from pewm_jax.models.memory_geometry import Sightings, patch_pixels, sightings, sinusoid_3d
 from pewm_jax.models.patches import patchify
 from pewm_jax.models.token_layout import TokenLayout
-from pewm_jax.types import Array, Camera, MapTokens, Params
+from pewm_jax.types import Array, Camera, Params, Sight
 
 REPLICATED = P()
 
@@ -122,7 +122,7 @@ def init(model: ModelConfig, key: Array) -> Params:
 
 
 def prepare(
-    model: ModelConfig, params: Params, seen: MapTokens, camera: Camera, rays_BthwC: Array
+    model: ModelConfig, params: Params, sight: Sight, camera: Camera, rays_BthwC: Array
 ) -> Readers:
     """Embed rays and map tokens, and choose the tokens each camera attends to; see ``readers``."""
     config, places, dtype = _settings(model), model.backbone.places, jnp.dtype(model.dtype)
@@ -133,6 +133,8 @@ def prepare(
     patches = patchify(rays, places.patch, places.patch_t)
     looks_from = layout.spread(camera_layer.apply({"params": params["camera"]}, patches))
 
+    seen = sight.tokens
+    assert seen is not None
     valid, sights = seen.valid_M, None
     points, features = (
         jnp.where(valid[..., None], x, 0) for x in (seen.points_world_M3, seen.features_MF)

@@ -3,7 +3,7 @@
 A reader is a ``ReaderSettings`` and a module (or object) with
 
     init(model, key) -> params                          under ``memory/``; has no effect at first
-    prepare(model, params, seen, camera, rays_BthwC) -> Readers
+    prepare(model, params, sight, camera, rays_BthwC) -> Readers
     SHARDING                                            rules over ``memory/…`` paths
     costs(model, share) -> Costs                        in a stage that trains it
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from pewm_jax.config import ModelConfig, functions
 from pewm_jax.models.backbones import Readers
-from pewm_jax.types import Array, Camera, MapTokens, Params
+from pewm_jax.types import Array, Camera, Params, Sight
 
 
 def init(model: ModelConfig, key: Array) -> Params:
@@ -23,18 +23,19 @@ def init(model: ModelConfig, key: Array) -> Params:
 
 
 def prepare(
-    model: ModelConfig, params: Params, seen: MapTokens, camera: Camera, rays_BthwC: Array
+    model: ModelConfig, params: Params, sight: Sight, camera: Camera, rays_BthwC: Array
 ) -> Readers:
     """Prepare to read the memories of a batch of clips.
 
     Args:
         model: the model.
         params: the reader's parameters.
-        seen: (B, M) map tokens that condition each clip.
+        sight: what the memory shows each clip, leading axis B; it has what the reader's settings
+            ask for (``READS_TOKENS``, ``READS_VIEW``).
         camera: (B, T) cameras of the clips.
         rays_BthwC: their Plücker rays at the latent rate (``camera_control.rays``).
 
     Returns:
         The functions that the backbone calls.
     """
-    return functions(model.memory.reader).prepare(model, params, seen, camera, rays_BthwC)
+    return functions(model.memory.reader).prepare(model, params, sight, camera, rays_BthwC)

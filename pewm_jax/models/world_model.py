@@ -6,7 +6,7 @@ backbone provides, a reader reads the memory.
 
 Parameters: ``backbone``, ``memory`` (the reader) and, if the settings need them, ``control``, the
 frozen ``codec`` (the VAE), ``encoder`` (DINOv2) and ``text`` (the prompt's embedding). Without the
-``memory`` entry, or without map tokens, it is the stage-1 model.
+``memory`` entry, or without sight of a memory, it is the stage-1 model.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from pewm_jax.config import ModelConfig
 from pewm_jax.models import backbones, camera_control, codecs, controls, encoders, readers
 from pewm_jax.models.backbones import NO_READERS, Conditioning
-from pewm_jax.types import Array, Camera, Control, Frames, MapTokens, Params
+from pewm_jax.types import Array, Camera, Control, Frames, Params, Sight
 
 
 @jax.tree_util.register_dataclass
@@ -100,7 +100,7 @@ def apply(
     noisy_BthwC: Array,
     conditioning: ClipConditioning,
     time_B: Array,
-    tokens: MapTokens | None = None,
+    sight: Sight | None = None,
 ) -> Array:
     """Predict the noise's target (x0, v, ε, velocity …) from noisy latents.
 
@@ -110,15 +110,15 @@ def apply(
         noisy_BthwC: (B, t, h, w, C) noisy colour and depth latents.
         conditioning: the observed frame, control and text.
         time_B: (B,) noise level as the network sees it, or (B, t), one for each latent frame.
-        tokens: map tokens with leading axis B; None is the stage-1 model.
+        sight: what the memory shows each clip, leading axis B; None is the stage-1 model.
 
     Returns:
         (B, t, h, w, C) float32 prediction.
     """
     dtype, memory_readers = jnp.dtype(model.dtype), NO_READERS
-    if tokens is not None and "memory" in params:
+    if sight is not None and "memory" in params:
         memory_readers = readers.prepare(
-            model, params["memory"], tokens, conditioning.camera, conditioning.rays_BthwC
+            model, params["memory"], sight, conditioning.camera, conditioning.rays_BthwC
         )
     noisy = _seen(model, noisy_BthwC).astype(dtype)
     out = backbones.apply(

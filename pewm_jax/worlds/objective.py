@@ -12,23 +12,29 @@ from pewm_jax.diffusion import noise as noises
 from pewm_jax.memory import memories
 from pewm_jax.models import codecs, encoders, placement, world_model
 from pewm_jax.models.signals import as_signal, signal_from_rgb
-from pewm_jax.types import Array, Camera, Clip, Control, Frames, MapTokens, Params
+from pewm_jax.types import Array, Camera, Clip, Control, Frames, Params, Sight
 from pewm_jax.worlds.control import require_actions
 
 
-def clip_tokens(model: ModelConfig, params: Params, clip: Clip) -> MapTokens:
-    """Build every clip's memory from its context and return its tokens, leading axis B."""
+def clip_sight(model: ModelConfig, params: Params, clip: Clip) -> Sight:
+    """Build every clip's memory from its context and return what it shows, leading axis B.
 
-    def of_clip(context: Frames, valid_S: Array, features: Array, camera: Camera) -> MapTokens:
+    Pictures are rendered clip by clip: one by itself fits a processor's cache.
+    """
+
+    def of_clip(context: Frames, valid_S: Array, features: Array, camera: Camera) -> Sight:
         memory = memories.from_context(model, {}, context, valid_S, features)
-        return memories.tokens(model, memory, camera)
+        return memories.look(model, memory, camera)
 
-    def of_batch(weights: Params, clip: Clip) -> MapTokens:
+    def of_batch(weights: Params, clip: Clip) -> Sight:
         features = clip.context_features_ShwF
         if features is None:
             features = _encode(model, weights, clip.context.rgb_THWC)
         context = as_signal(clip.context)
-        return jax.vmap(of_clip)(context, clip.context_valid_S, features, clip.frames.camera)
+        parts = context, clip.context_valid_S, features, clip.frames.camera
+        if memories.shows(model):
+            return jax.lax.map(lambda one: of_clip(*one), parts)
+        return jax.vmap(of_clip)(*parts)
 
     return placement.by_batch(of_batch, params.get("encoder", {}), clip)
 
@@ -87,9 +93,9 @@ def loss(
     require_actions(model, clip.actions_TA, "the loss")
     control = Control(frames.camera, clip.actions_TA)
     conditioning = world_model.condition(model, params, observed, control)
-    tokens = clip_tokens(model, params, clip) if memory else None
+    sight = clip_sight(model, params, clip) if memory else None
     inputs, network_time = noises.shown(model.noise, x_t, times)
-    prediction = world_model.apply(model, params, inputs, conditioning, network_time, tokens)
+    prediction = world_model.apply(model, params, inputs, conditioning, network_time, sight)
 
     error = (prediction - noises.target(model.noise, x0, noise, times)) ** 2
     error = error * noises.spread(noises.weight(model.noise, times), error.ndim)

@@ -19,7 +19,7 @@ from pewm_jax.diffusion import noise as noises
 from pewm_jax.memory import memories
 from pewm_jax.models import codecs, encoders, world_model
 from pewm_jax.models.signals import as_signal
-from pewm_jax.types import Array, Control, Frames, MapTokens, Params, WorldState
+from pewm_jax.types import Array, Control, Frames, Params, Sight, WorldState
 from pewm_jax.worlds import objective, pewm_costs
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
@@ -157,10 +157,10 @@ def imagine_clip(
     whole = jax.tree.map(lambda x: x[None], Control(camera, control.actions_TA))
     observed = jax.tree.map(lambda x: x[None], present)
     conditioning = world_model.condition(model, params, observed, whole)
-    tokens = None
+    sight = None
     if memory and "memory" in params:
-        tokens = jax.tree.map(lambda x: x[None], memories.tokens(model, state.map, camera))
-    latents = _sample(model, params, conditioning, tokens, key)
+        sight = jax.tree.map(lambda x: x[None], memories.look(model, state.map, camera))
+    latents = _sample(model, params, conditioning, sight, key)
     rgb, depth = codecs.decode_rgbd(model, params, latents)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
@@ -176,19 +176,19 @@ def _sample(
     model: ModelConfig,
     params: Params,
     conditioning: world_model.ClipConditioning,
-    tokens: MapTokens | None,
+    sight: Sight | None,
     key: Array,
 ) -> Array:
     """Sample the latents of one clip, (1, t, h, w, C)."""
     noise = jax.random.normal(key, (1, *model.latent_shape, model.codec.channels))
-    return sample(model, params, conditioning, tokens, noise, jax.random.fold_in(key, 1))
+    return sample(model, params, conditioning, sight, noise, jax.random.fold_in(key, 1))
 
 
 def sample(
     model: ModelConfig,
     params: Params,
     conditioning: world_model.ClipConditioning,
-    tokens: MapTokens | None,
+    sight: Sight | None,
     noise_BthwC: Array,
     key: Array | None = None,
 ) -> Array:
@@ -201,7 +201,7 @@ def sample(
         model: the model.
         params: the world model's parameters.
         conditioning: observed frame, control, text.
-        tokens: map tokens, or None for no memory.
+        sight: what the memory shows the clips, or None for no memory.
         noise_BthwC: standard normal start.
         key: randomness of the steps, if the sampler draws noise.
 
@@ -213,14 +213,14 @@ def sample(
     """
     noise = model.noise
 
-    def x0(x: Array, times: Array, tokens: MapTokens | None) -> Array:
+    def x0(x: Array, times: Array, sight: Sight | None) -> Array:
         inputs, network_time = noises.shown(noise, x, times)
-        out = world_model.apply(model, params, inputs, conditioning, network_time, tokens)
+        out = world_model.apply(model, params, inputs, conditioning, network_time, sight)
         return noises.to_x0(noise, out, x, times)
 
     def denoise(x: Array, times: Array, weight: Array) -> Array:
-        with_map = x0(x, times, tokens)
-        if tokens is None or noise.guidance == 1:
+        with_map = x0(x, times, sight)
+        if sight is None or noise.guidance == 1:
             return with_map
         without = x0(x, times, None)
         return without + weight * (with_map - without)

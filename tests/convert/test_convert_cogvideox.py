@@ -27,7 +27,7 @@ from pewm_jax.convert import assemble, base, cogvideox, mapping, sources, widen,
 from pewm_jax.convert.__main__ import main
 from pewm_jax.models import dit, readers, world_model
 from pewm_jax.models.backbones import Conditioning
-from pewm_jax.types import Camera, MapTokens
+from pewm_jax.types import Camera, MapTokens, Sight
 
 WORLD = ["--rgbd", "--camera", "--memory", "--frames", "9", "--height", "32", "--width", "32"]
 
@@ -222,7 +222,9 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     noisy, conditioning, tokens, video = inputs(config, plan)
     times = jnp.array([999, 40])
     apply = jax.jit(world_model.apply, static_argnums=0)
-    got = apply(config.model, wide, noisy, conditioning, times, tokens)[..., : old.out_channels]
+    got = apply(config.model, wide, noisy, conditioning, times, Sight(tokens))[
+        ..., : old.out_channels
+    ]
     want = jax.jit(dit.apply, static_argnums=0)(
         old, params, video, conditioning.given.tokens_BLC, times
     )

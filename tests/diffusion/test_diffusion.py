@@ -146,11 +146,11 @@ def test_pixels_without_depth_do_not_train_depth():
 
 def test_invalid_context_frames_are_not_remembered():
     clip = make_clip()
-    tokens = objective.clip_tokens(TINY, {}, clip)
+    tokens = objective.clip_sight(TINY, {}, clip).tokens
     changed = np.array(clip.context.rgb_THWC)
     changed[:, 0] = 255 - changed[:, 0]
     context = dataclasses.replace(clip.context, rgb_THWC=changed)
-    again = objective.clip_tokens(TINY, {}, dataclasses.replace(clip, context=context))
+    again = objective.clip_sight(TINY, {}, dataclasses.replace(clip, context=context)).tokens
     np.testing.assert_array_equal(tokens.features_MF, again.features_MF)
     assert tokens.valid_M.any()
 
@@ -159,21 +159,21 @@ def test_guidance_interpolates_between_with_and_without_map():
     clip, key = make_clip(), jax.random.key(0)
     params = randomise(init_world(TINY, key))
     conditioning = conditioning_of(TINY, params, clip)
-    tokens = objective.clip_tokens(TINY, params, clip)
+    sight = objective.clip_sight(TINY, params, clip)
     noise = jax.random.normal(key, (2, 3, 4, 6, 256))
 
-    def run(guidance, tokens, **more):
+    def run(guidance, sight, **more):
         settings = dataclasses.replace(TINY.noise, guidance=guidance, sample_steps=1, **more)
-        return sample(tiny_model(noise=settings), params, conditioning, tokens, noise)
+        return sample(tiny_model(noise=settings), params, conditioning, sight, noise)
 
-    with_map, without = run(1.0, tokens), run(1.0, None)
-    np.testing.assert_allclose(run(0.0, tokens), without, atol=1e-5)
-    np.testing.assert_allclose(run(3.0, tokens), without + 3 * (with_map - without), atol=1e-3)
+    with_map, without = run(1.0, sight), run(1.0, None)
+    np.testing.assert_allclose(run(0.0, sight), without, atol=1e-5)
+    np.testing.assert_allclose(run(3.0, sight), without + 3 * (with_map - without), atol=1e-3)
     assert np.abs(with_map - without).max() > 1e-4
     settings = DDPMConfig(sample_steps=1, guidance=3.0, dynamic_guidance=True)
     (weight,) = schedule.guidance(settings)
     assert 1 <= weight <= 4
-    swung = run(3.0, tokens, dynamic_guidance=True)
+    swung = run(3.0, sight, dynamic_guidance=True)
     np.testing.assert_allclose(swung, without + weight * (with_map - without), atol=1e-3)
 
 

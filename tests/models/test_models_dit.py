@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from pewm_jax.config import PUBLISHED, ConfigError, DiTConfig, UserError, published
 from pewm_jax.models import dit, dit_block, layers, patches, positions, world_model
 from pewm_jax.models.token_layout import TokenLayout
+from pewm_jax.types import Sight
 from tests.helpers import TINY, init_world, randomise
 from tests.models.test_models_world_model import setup as world
 
@@ -136,7 +137,7 @@ def test_with_closed_memory_gates_stage_2_is_stage_1_and_feels_no_map():
         memory = {**params["memory"], "blocks": blocks}
         seen = dataclasses.replace(tokens, features_MF=features)
         both = {**stage1, "memory": memory}
-        return world_model.apply(model, both, noisy, conditioning, times, seen)
+        return world_model.apply(model, both, noisy, conditioning, times, Sight(seen))
 
     @jax.jit
     def compare(linear):

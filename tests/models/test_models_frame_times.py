@@ -11,6 +11,7 @@ from pewm_jax.models import backbones, dit, dit_block, world_model
 from pewm_jax.models.backbones import Conditioning, Readers
 from pewm_jax.models.memory_block import MemoryBlock
 from pewm_jax.models.token_layout import TokenLayout
+from pewm_jax.types import Sight
 from tests.helpers import TINY, init_world, randomise, with_reader
 from tests.models.test_models_dit import CONFIG, inputs, random_params
 from tests.models.test_models_world_model import setup as world
@@ -155,7 +156,7 @@ def test_a_world_with_memory_takes_a_time_for_each_latent_frame(positions, patch
 
     @jax.jit
     def run(times):
-        return world_model.apply(model, params, noisy, conditioning, times, tokens)
+        return world_model.apply(model, params, noisy, conditioning, times, Sight(tokens))
 
     one = run(times)
     each = jnp.tile(times[:, None], (1, FRAMES))

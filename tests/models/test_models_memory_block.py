@@ -18,7 +18,7 @@ from pewm_jax.models.memory_block import MemoryBlock, masked_attention
 from pewm_jax.models.memory_geometry import sightings, sinusoid_3d
 from pewm_jax.models.signals import as_signal
 from pewm_jax.models.token_layout import TokenLayout
-from pewm_jax.types import Camera, Clip, Control, Frames, MapTokens
+from pewm_jax.types import Camera, Clip, Control, Frames, MapTokens, Sight
 from pewm_jax.worlds import objective
 from tests.helpers import TINY, random_camera, random_frames, randomise, rigid, with_reader
 
@@ -67,7 +67,7 @@ def predict(positions, tokens, conditioning=None, **changes):
     first, _, noisy = inputs()
     model = model_of(positions=positions, **changes)
     conditioning = first if conditioning is None else conditioning
-    return apply(model, weights(positions), noisy, conditioning, TIMES, tokens)
+    return apply(model, weights(positions), noisy, conditioning, TIMES, Sight(tokens))
 
 
 def dense(p, x):
@@ -300,5 +300,5 @@ def test_without_depth_training_weighs_colour_alone_and_rollouts_add_nothing_to_
     np.testing.assert_array_equal(made.depth_THW, 0)
     for a, b in zip(jax.tree.leaves(after.map), jax.tree.leaves(state.map), strict=True):
         np.testing.assert_array_equal(a, b)
-    tokens = jax.jit(objective.clip_tokens, static_argnums=0)(model, params, batch)
-    assert np.asarray(tokens.valid_M).any()
+    sight = jax.jit(objective.clip_sight, static_argnums=0)(model, params, batch)
+    assert np.asarray(sight.tokens.valid_M).any()
