@@ -34,6 +34,7 @@ STAGES = (
         rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|encoder|text)/.*", FREEZE)),
         init=functools.partial(world_model.init, memory=False),
         loss=objective.without_memory,
+        prepare=functools.partial(objective.prepare, memory=False),
     ),
     Stage(
         name="stage2",
@@ -42,6 +43,7 @@ STAGES = (
         init=world_model.init,
         loss=objective.with_memory,
         memory=True,
+        prepare=functools.partial(objective.prepare, memory=True),
     ),
 )
 """Stage 1 adapts the backbone to the domain, the control and RGB-D, without memory. Stage 2 adds
