@@ -38,7 +38,7 @@ def clip_sight(model: ModelConfig, params: Params, clip: Clip) -> Sight:
             features = _encode(model, weights, clip.context.rgb_THWC)
         context = as_signal(clip.context)
         parts = context, clip.context_valid_S, features, clip.frames.camera
-        if memories.shows(model):
+        if model.memory.reader.READS_VIEW:
             return jax.lax.map(lambda one: of_clip(*one), parts)
         return jax.vmap(of_clip)(*parts)
 

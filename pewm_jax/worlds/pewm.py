@@ -161,9 +161,12 @@ def imagine_clip(
     conditioning = world_model.condition(model, params, observed, whole)
     sight = None
     if memory and "memory" in params:
-        sight = jax.tree.map(lambda x: x[None], memories.look(model, state.map, camera))
+        shown = memories.look(model, state.map, camera, pictures=memories.gated(model))
+        sight = jax.tree.map(lambda x: x[None], shown)
     latents = _sample(model, params, conditioning, sight, key)
     rgb, depth = codecs.decode_rgbd(model, params, latents)
+    if sight is not None and memories.gated(model):
+        rgb, depth = codecs.mix(model, params, rgb, depth, sight.view)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
     remembered = state.map
