@@ -94,6 +94,9 @@ class Clip:
             None if none were recorded (hand-held cameras). A = 3 is a planar action.
         voxels_TXYZ: (..., T, X, Y, Z) integer class ids of the cells around the agent at each
             frame, None if none were recorded.
+        latents_thwC: (..., t, h, w, C) latents of the frames, if they were encoded beforehand
+            (``worlds.objective.prepare``), else None.
+        sight: what the memory of the context shows, if that was looked at beforehand, else None.
     """
 
     frames: Frames
@@ -102,6 +105,8 @@ class Clip:
     context_features_ShwF: Array | None = None
     actions_TA: Array | None = None
     voxels_TXYZ: Array | None = None
+    latents_thwC: Array | None = None
+    sight: Sight | None = None
 
 
 @_pytree

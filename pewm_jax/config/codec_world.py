@@ -9,6 +9,7 @@ from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.codec import CodecSettings
 from pewm_jax.config.errors import require
 from pewm_jax.config.learned_codec import LearnedCodecConfig
+from pewm_jax.config.memory import MemorySettings, SurfelConfig
 from pewm_jax.config.model import WorldSettings
 from pewm_jax.config.training import StageConfig, TrainSettings
 
@@ -25,12 +26,17 @@ class CodecTrainConfig(TrainSettings):
     """The codec learns to give frames back."""
     statistics: StageConfig = StageConfig(steps=200, batch=32, learning_rate=0.03, warmup=0)
     """Mean and scale of the latents are fitted; the codec stands still."""
-    latent_noise: float = 0.1
+    gate: StageConfig = StageConfig(batch=12, warmup=30)
+    """The gate learns to mix; all else stands still. Only where `codec.gate` asks for one."""
+    gate_noise: float = 0.8
+    """Largest noise on the latents while the gate learns, as a share of their deviation; each clip
+    draws its own."""
+    latent_noise: float = 0.05
     """Noise on the latents while the codec learns, as a share of each channel's deviation."""
     gradient_weight: float = 1.0
     """Weight of the absolute difference of neighbouring pixels' differences, beside that of the
     pixels themselves."""
-    squared_weight: float = 0.5
+    squared_weight: float = 4.0
     """Weight of the squared error."""
 
     def __post_init__(self):
@@ -41,7 +47,7 @@ class CodecTrainConfig(TrainSettings):
             f"train.preview_every is {self.preview_every}: a codec imagines nothing to be shown, "
             "use 0 (pewm-jax evaluate prints its numbers).",
         )
-        for name in ("latent_noise", "gradient_weight", "squared_weight"):
+        for name in ("latent_noise", "gate_noise", "gradient_weight", "squared_weight"):
             value = getattr(self, name)
             require(value >= 0, f"train.{name} is {value}: use 0 or more.")
 
@@ -57,6 +63,8 @@ class CodecWorldConfig(WorldSettings):
     """What the loader reads: every frame of a clip is learned from by itself."""
     codec: CodecSettings = LearnedCodecConfig()
     """The codec that is trained."""
+    memory: MemorySettings = SurfelConfig()
+    """The memory that the gate sees rendered; it must show colours."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute precision; master weights of what trains stay float32."""
 

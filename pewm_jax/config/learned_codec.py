@@ -6,7 +6,7 @@ import dataclasses
 from typing import ClassVar
 
 from pewm_jax.config.codec import CodecSettings
-from pewm_jax.config.errors import require_positive
+from pewm_jax.config.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +33,9 @@ class LearnedCodecConfig(CodecSettings):
     as many in the decoder."""
     coarse_blocks: int = 4
     """Residual blocks at an eighth of the resolution, in the encoder and as many in the decoder."""
+    gate: int = 0
+    """Channels of the gate, which mixes decoded frames with the rendered memory (48, say); 0 for no
+    gate."""
 
     @property
     def spatial(self) -> int:
@@ -58,3 +61,4 @@ class LearnedCodecConfig(CodecSettings):
         """Validate."""
         sizes = ("latent_channels", "fine", "coarse", "fine_blocks", "coarse_blocks")
         require_positive(self, "codec", *sizes)
+        require(self.gate >= 0, f"codec.gate is {self.gate}: use 0 (no gate) or more channels.")

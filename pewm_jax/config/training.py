@@ -24,6 +24,10 @@ class DataConfig:
     features: str = ""
     """Folder of cached image features of `data.path`, made by `python -m pewm_jax.memory cache`; if
     empty, they are computed at every step."""
+    prepared: int = 0
+    """Clips that are encoded, and their memories built and shown, once before the first step, kept
+    in main memory, and drawn again and again; 0 does this at every step, each time with new clips.
+    A CPU needs longer for that than for the step itself."""
     workers: int = 0
     """Threads that read and decode data ahead of training; 0 means one."""
     bad_records: int = 0
@@ -38,6 +42,7 @@ class DataConfig:
             "1 ≤ min ≤ max.",
         )
         require(self.context >= 1, "data.context must be at least 1 frame.")
+        require(self.prepared >= 0, f"data.prepared is {self.prepared}: use 0 or more clips.")
         require(self.workers >= 0, f"data.workers is {self.workers}: use 0 or more threads.")
         require(self.bad_records >= 0, f"data.bad_records is {self.bad_records}: use 0 or more.")
 
@@ -101,6 +106,9 @@ class TrainSettings:
     """Mean of log σ of the noise added to the observed first frame."""
     image_noise_std: float = 0.5
     """Standard deviation of log σ of the noise added to the observed first frame."""
+    depth_noise: float = 0.0
+    """Size of the noise on the observed first frame's depth, as a share of the depth; the size of
+    each clip's is drawn up to this. Imagined depth is as wrong as that, or it drifts."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
     """If a loss or gradient is not finite: `stop` training, or `skip` the update and count it."""
     grace_s: float = 30.0
@@ -120,6 +128,10 @@ class TrainSettings:
         require(
             self.image_noise_std >= 0,
             f"train.image_noise_std is {self.image_noise_std}: use 0 or more.",
+        )
+        require(
+            0 <= self.depth_noise < 1,
+            f"train.depth_noise is {self.depth_noise}: use a share of the depth in [0, 1).",
         )
         for pattern in self.fresh:
             require(is_pattern(pattern), f"train.fresh: {pattern!r} is no regular expression.")

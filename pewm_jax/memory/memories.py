@@ -121,24 +121,25 @@ def shows_colours(model: ModelConfig) -> bool:
     return model.memory.REMEMBERS and not model.memory.KEEPS_FEATURES
 
 
-def shows(model: ModelConfig) -> bool:
-    """Tell whether a clip is shown pictures: the reader takes them, or the codec's gate does."""
-    gate = bool(getattr(model.codec, "gate", 0)) and shows_colours(model)
-    return model.memory.reader.READS_VIEW or gate
+def gated(model: ModelConfig) -> bool:
+    """Tell whether the codec's gate mixes what is decoded with what the memory looks like."""
+    gate = bool(getattr(model.codec, "gate", 0))
+    return gate and model.clip.depth and shows_colours(model)
 
 
-def look(model: ModelConfig, memory: Memory, camera: Camera) -> Sight:
-    """Return what the memory shows one clip, as far as the reader and the codec ask for it.
+def look(model: ModelConfig, memory: Memory, camera: Camera, *, pictures: bool = False) -> Sight:
+    """Return what the memory shows one clip, as far as the reader asks for it.
 
     Args:
         model: the model.
         memory: what is remembered.
         camera: (T,) cameras of the clip, whose intrinsics are for images of its size.
+        pictures: render it even if the reader does not.
     """
     seen, view = None, None
     if model.memory.reader.READS_TOKENS:
         seen = tokens(model, memory, camera)
-    if shows(model):
+    if pictures or model.memory.reader.READS_VIEW:
         view = render(model, memory, camera, model.clip.height, model.clip.width)
         features = view.features_THWF[..., : rendered_channels(model)]
         view = View(features, view.depth_THW, view.seen_THW)

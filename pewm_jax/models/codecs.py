@@ -23,7 +23,7 @@ from pewm_jax.config import CodecSettings, ModelConfig, functions
 from pewm_jax.models import placement
 from pewm_jax.models.pixel_codec import fold
 from pewm_jax.models.signals import depth_from_signal, signal_from_depth
-from pewm_jax.types import Array, Params
+from pewm_jax.types import Array, Params, View
 
 
 def init(config: CodecSettings, key: Array) -> Params:
@@ -120,6 +120,36 @@ def decode_rgbd(model: ModelConfig, params: Params, latents_BthwC: Array) -> tup
         video = decode(model.codec, weights, both).astype(jnp.float32)
         rgb, signal = jnp.split(video, 2)
     return jnp.clip(rgb, -1, 1), depth_from_signal(model.clip, signal.mean(-1))
+
+
+def mix(
+    model: ModelConfig, params: Params, rgb_BTHWC: Array, depth_BTHW: Array, view: View
+) -> tuple[Array, Array]:
+    """Mix decoded frames with what the memory looks like from their cameras, by the codec's gate.
+
+    Args:
+        model: the model, whose codec has a gate.
+        params: the world model's parameters.
+        rgb_BTHWC: (B, T, H, W, 3) decoded colours in [−1, 1].
+        depth_BTHW: (B, T, H, W) decoded depth, metres.
+        view: (B, T) the rendered memory; the first 3 of its features are colours.
+
+    Returns:
+        Colours and depth; those given where nothing is rendered.
+    """
+
+    def pictures(rgb: Array, depth: Array) -> Array:
+        four = jnp.concatenate([rgb, signal_from_depth(model.clip, depth)[..., None]], -1)
+        return four.reshape(-1, *four.shape[-3:])
+
+    made = functions(model.codec).mix(
+        params["codec"],
+        pictures(rgb_BTHWC, depth_BTHW),
+        pictures(view.features_THWF[..., :3], view.depth_THW),
+        view.seen_THW.reshape(-1, *view.seen_THW.shape[-2:]),
+    ).reshape(*rgb_BTHWC.shape[:-1], 4)
+    depth = jnp.where(view.seen_THW, depth_from_signal(model.clip, made[..., 3]), depth_BTHW)
+    return jnp.clip(made[..., :3], -1, 1), depth
 
 
 def measured(model: ModelConfig, depth_BTHW: Array) -> Array:

@@ -1,8 +1,10 @@
 """The learned codec: a small convolutional autoencoder, frame by frame, 8 × 8 pixels to a cell.
 
 Space-to-depth brings 4 × 4 pixels into the channels; residual blocks of 3 × 3 convolutions work at
-a quarter and at an eighth of the resolution; the decoder is the mirror image. Nothing is normalised
-over space, so frames of any size and number are encoded alike. Latents leave with mean 0 and
+a quarter and at an eighth of the resolution; the decoder is the mirror image. Beside them a linear
+map leads straight from a cell's pixels to its latents, and one back: by itself it soon finds the
+principal components, and the networks learn what these leave. Nothing is normalised over space, so
+frames of any size and number are encoded alike. Latents leave with mean 0 and
 variance 1 per channel, once ``latent_mean_C`` and ``latent_scale_C`` are fitted (``worlds.codec``).
 """
 
@@ -15,6 +17,8 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import LearnedCodecConfig, ModelConfig, UserError
+from pewm_jax.models import gates
+from pewm_jax.models.convolution import convolve
 from pewm_jax.models.costs import Costs, Product, Share
 from pewm_jax.types import Array, Params
 
@@ -28,6 +32,8 @@ SHARDING = (
 PATCH = 4
 """Pixels, each way, that are brought into the channels at first."""
 COLOURS = 3
+GATE = 65535
+"""Folded into the key of the gate's parameters."""
 PASSES = 30
 """Times that the widest array is read or written while a frame is encoded."""
 
@@ -43,15 +49,18 @@ def layout(config: LearnedCodecConfig) -> dict[str, tuple[tuple[int, int, int], 
             for part in ("one", "two")
         }
 
+    cell = 2 * PATCH
     return {
+        "encoder/direct": ((1, COLOURS * cell**2, c), cell),
+        "decoder/direct": ((1, c, COLOURS * cell**2), cell),
         "encoder/into": ((3, pixels, a), PATCH),
         **blocks("encoder", "fine", config.fine_blocks, a, PATCH),
-        "encoder/down": ((1, 4 * a, b), 2 * PATCH),
-        **blocks("encoder", "coarse", config.coarse_blocks, b, 2 * PATCH),
-        "encoder/out": ((3, b, c), 2 * PATCH),
-        "decoder/into": ((3, c, b), 2 * PATCH),
-        **blocks("decoder", "coarse", config.coarse_blocks, b, 2 * PATCH),
-        "decoder/up": ((1, b, 4 * a), 2 * PATCH),
+        "encoder/down": ((1, 4 * a, b), cell),
+        **blocks("encoder", "coarse", config.coarse_blocks, b, cell),
+        "encoder/out": ((3, b, c), cell),
+        "decoder/into": ((3, c, b), cell),
+        **blocks("decoder", "coarse", config.coarse_blocks, b, cell),
+        "decoder/up": ((1, b, 4 * a), cell),
         **blocks("decoder", "fine", config.fine_blocks, a, PATCH),
         "decoder/out": ((3, a, pixels), PATCH),
     }
@@ -71,7 +80,14 @@ def init(config: LearnedCodecConfig, key: Array) -> Params:
         drawn = jax.random.normal(jax.random.fold_in(key, number), (side, side, width, out))
         gain = 0.0 if name == "two" else 1 / math.sqrt(side * side * width)
         node[name] = {"kernel": gain * drawn, "bias": jnp.zeros((out,))}
+    if config.gate:
+        params["gate"] = gates.init(config.gate, jax.random.fold_in(key, GATE))
     return params
+
+
+def mix(params: Params, decoded_NHWC: Array, rendered_NHWC: Array, seen_NHW: Array) -> Array:
+    """Mix decoded and rendered pictures (N, H, W, 4) by the gate; see ``gates.apply``."""
+    return gates.apply(params["gate"], decoded_NHWC, rendered_NHWC, seen_NHW)
 
 
 def with_statistics(params: Params, mean_C: Array, scale_C: Array) -> Params:
@@ -113,24 +129,26 @@ def encode_raw(config: LearnedCodecConfig, params: Params, video_BTHWC: Array) -
             "times the same)."
         )
     weights = params["encoder"]
-    x = video_BTHWC.reshape(-1, height, width, colours)
-    x = _convolve(weights["into"], _gather(x, PATCH))
+    pixels = video_BTHWC.reshape(-1, height, width, colours)
+    x = _convolve(weights["into"], _gather(pixels, PATCH))
     x = _blocks(weights, "fine", config.fine_blocks, x)
     x = _convolve(weights["down"], _gather(x, 2))
     x = _blocks(weights, "coarse", config.coarse_blocks, x)
     x = _convolve(weights["out"], jax.nn.silu(x))
+    x = x + _convolve(weights["direct"], _gather(pixels, cell))
     return x.reshape(*lead, *x.shape[1:])
 
 
 def decode_raw(config: LearnedCodecConfig, params: Params, latents_BthwC: Array) -> Array:
     """Decode latents that are not normalised; see ``decode``."""
     weights, lead = params["decoder"], latents_BthwC.shape[:-3]
-    x = latents_BthwC.reshape(-1, *latents_BthwC.shape[-3:])
-    x = _convolve(weights["into"], x)
+    latents = latents_BthwC.reshape(-1, *latents_BthwC.shape[-3:])
+    x = _convolve(weights["into"], latents)
     x = _blocks(weights, "coarse", config.coarse_blocks, x)
     x = _spread(_convolve(weights["up"], x), 2)
     x = _blocks(weights, "fine", config.fine_blocks, x)
     x = _spread(_convolve(weights["out"], jax.nn.silu(x)), PATCH)
+    x = x + _spread(_convolve(weights["direct"], latents), config.spatial)
     return x.reshape(*lead, *x.shape[1:])
 
 
@@ -145,8 +163,9 @@ def _blocks(weights: Params, name: str, count: int, x_NHWC: Array) -> Array:
 def _convolve(weights: Params, x_NHWC: Array) -> Array:
     """Convolve, with zeros around the frame."""
     kernel, bias = (weights[name].astype(x_NHWC.dtype) for name in ("kernel", "bias"))
-    letters = ("NHWC", "HWIO", "NHWC")
-    return jax.lax.conv_general_dilated(x_NHWC, kernel, (1, 1), "SAME", None, None, letters) + bias
+    if kernel.shape[0] == 1:
+        return x_NHWC @ kernel[0, 0] + bias
+    return convolve(x_NHWC, kernel) + bias
 
 
 def _gather(x_NHWC: Array, s: int) -> Array:

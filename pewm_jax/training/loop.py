@@ -22,7 +22,7 @@ from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.memory import feature_cache
-from pewm_jax.training import processes, runs, sharding, stages, starting
+from pewm_jax.training import prepared, processes, runs, sharding, stages, starting
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.feed import Feed, rows_of
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, duration
@@ -202,9 +202,13 @@ class _Worker:
             last=settings.steps,
             say=self.view.say,
         )
-        with Feed(iter(batches), where, settings.batch) as feed, closing(traced):
+        batches, state = iter(batches), None
+        if prepared.applies(config, self.stage):
+            state = self._make_state(done)
+            batches = self._prepare(done, state)
+        with Feed(batches, where, settings.batch) as feed, closing(traced):
             clip = next(feed)
-            state, step_fn = self._compile(done, clip)
+            state, step_fn = self._compile(done, clip, state)
             if cache is not None:
                 split = Path(config.data.path) / "train"
                 processes.first(
@@ -238,11 +242,23 @@ class _Worker:
                 clip = following
         return state
 
-    def _compile(self, done: int, clip: Clip):
+    def _prepare(self, done: int, state: TrainState) -> Iterator[Clip]:
+        """Prepare clips, the same however often training stopped, and draw from them."""
+        seed = self.stage.data_seed(self.config)
+        batch = self.settings.batch
+        fresh = loader.clips(self.config, "train", seed=seed, batch=batch, bad=self.bad)
+        clips = prepared.gather(
+            self.config, self.stage, state.params, iter(fresh), self.stop.unless_requested
+        )
+        if clips is None:
+            raise self.stop.interrupted(self.stage.title, done)
+        return prepared.draw(clips, batch, seed, done)
+
+    def _compile(self, done: int, clip: Clip, state: TrainState | None):
         """Make the state, whose first weights are compiled too, and compile the step."""
         self.view.say(f"{self.stage.title}: compiling the training step …")
         began = time.monotonic()
-        state = self._make_state(done)
+        state = self._make_state(done) if state is None else state
         step_fn = compile_step(self.config, self.stage, self.mesh, clip)
         took = duration(time.monotonic() - began)
         self.view.say(f"{self.stage.title}: compiled the training step in {took}")

@@ -17,7 +17,7 @@ from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
-from pewm_jax.training import chips, processes
+from pewm_jax.training import chips, prepared, processes
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, drop_after
 from pewm_jax.training.stages import Stage
 from pewm_jax.training.step import Metrics
@@ -135,8 +135,16 @@ class Watch:
     def _records(self, step: int) -> dict[str, object]:
         """Return the names of the records in a step's batch, or why they cannot be found."""
         seed, batch = self.stage.data_seed(self.config), self.settings.batch
+
+        def read(number: int) -> list[str]:
+            return loader.records(self.config, "train", seed=seed, batch=batch, step=number)
+
         try:
-            names = loader.records(self.config, "train", seed=seed, batch=batch, step=step - 1)
+            if self.config.data.prepared:
+                rows = prepared.rows(self.config, self.stage, step - 1)
+                names = [read(row // batch)[row % batch] for row in rows]
+            else:
+                names = read(step - 1)
         except UserError as error:
             return {"records": [], "why_not": str(error)}
         return {"records": names}

@@ -1,12 +1,14 @@
 """The world that trains the learned codec, frame by frame; it imagines nothing.
 
 Stage ``codec`` has it give frames back through noise on its latents. Stage ``statistics`` then fits
-mean and scale of the averaged codec's latents, by which it normalises them. So a finished run holds
-a codec that another model can start from.
+mean and scale of the averaged codec's latents, by which it normalises them. Where ``codec.gate``
+asks for a gate, stage ``gate`` trains that (``codec_gate``). So a finished run holds a codec that
+another model can start from.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NoReturn
 
 import jax
@@ -17,6 +19,7 @@ from pewm_jax.models import learned_codec
 from pewm_jax.models.costs import Costs, Product, Share
 from pewm_jax.models.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.types import Array, Clip, Params
+from pewm_jax.worlds.codec_gate import macs, mix
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 SMALL = 1e-4
@@ -28,6 +31,12 @@ PULL = 1e-2
 def init(model: CodecWorldConfig, key: Array) -> Params:
     """Return random parameters, under ``codec`` as in every model."""
     return {"codec": learned_codec.init(model.codec, key)}  # type: ignore[arg-type]
+
+
+def _without_gate(model: CodecWorldConfig, key: Array) -> Params:
+    """Return random parameters of all but the gate."""
+    plain = dataclasses.replace(model.codec, gate=0)  # type: ignore[call-arg]
+    return init(dataclasses.replace(model, codec=plain), key)
 
 
 def pictures(model: CodecWorldConfig, clip: Clip) -> tuple[Array, Array]:
@@ -125,16 +134,17 @@ def _of_neighbours(error: Array, counts: Array, axis: int) -> Array:
 
 STATISTICS = r"codec/latent_(mean|scale)_C"
 NETWORKS = r"codec/(encoder|decoder)/.*"
+GATE = r"codec/gate/.*"
 STAGES = (
-    Stage("codec", 1, ((STATISTICS, FREEZE), (NETWORKS, TRAIN)), init, reconstruct),
-    Stage("statistics", 2, ((STATISTICS, TRAIN), (NETWORKS, FREEZE)), init, distribute),
+    Stage("codec", 1, ((STATISTICS, FREEZE), (NETWORKS, TRAIN)), _without_gate, reconstruct),
+    Stage("statistics", 2, ((STATISTICS, TRAIN), (NETWORKS, FREEZE)), _without_gate, distribute),
+    Stage("gate", 3, ((GATE, TRAIN), (STATISTICS, FREEZE), (NETWORKS, FREEZE)), init, mix),
 )
 
 
 def stages(model: CodecWorldConfig) -> tuple[Stage, ...]:
-    """Return the two stages."""
-    del model
-    return STAGES
+    """Return the stages: two, and one for the gate if there is one."""
+    return STAGES if model.codec.gate else STAGES[:2]  # type: ignore[attr-defined]
 
 
 def sharding(model: CodecWorldConfig) -> tuple[tuple[str, Any], ...]:
@@ -154,14 +164,18 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     del share
     model, trained = config.model, stage is STAGES[0]
     size, frames = (model.clip.height, model.clip.width), 2 * model.clip.frames
-    parts = {"encoder": 2.0 * trained} | ({"decoder": 2.0} if trained else {})
-    products = tuple(
+    parts = {"encoder": 2.0 * trained}
+    if stage is not STAGES[1]:
+        parts["decoder"] = 2.0 * trained
+    products = [
         Product(
             "codec", "convolution", frames * learned_codec.macs(model.codec, part, *size), backward
         )
         for part, backward in parts.items()
-    )
-    return {"codec": Costs(products)}
+    ]
+    if stage is STAGES[2]:
+        products.append(Product("codec", "convolution", model.clip.frames * macs(model), 2.0))
+    return {"codec": Costs(tuple(products))}
 
 
 def start(model: CodecWorldConfig, params: Params, frames: Any) -> NoReturn:

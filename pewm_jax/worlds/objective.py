@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
@@ -14,6 +15,11 @@ from pewm_jax.models import codecs, encoders, placement, world_model
 from pewm_jax.models.signals import as_signal, signal_from_rgb
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, Params, Sight
 from pewm_jax.worlds.control import require_actions
+
+BROAD = 8
+"""Pixels, each way, over which the noise on depth is alike."""
+FINE = 0.3
+"""The noise on depth that differs from pixel to pixel, as a share of the broad noise."""
 
 
 def clip_sight(model: ModelConfig, params: Params, clip: Clip) -> Sight:
@@ -32,7 +38,7 @@ def clip_sight(model: ModelConfig, params: Params, clip: Clip) -> Sight:
             features = _encode(model, weights, clip.context.rgb_THWC)
         context = as_signal(clip.context)
         parts = context, clip.context_valid_S, features, clip.frames.camera
-        if memories.shows(model):
+        if model.memory.reader.READS_VIEW:
             return jax.lax.map(lambda one: of_clip(*one), parts)
         return jax.vmap(of_clip)(*parts)
 
@@ -47,6 +53,29 @@ def _encode(model: ModelConfig, weights: Params, rgb_BSHWC: Array) -> Array:
         return encoders.encode(encoder, weights, signal_from_rgb(rgb_SHWC))
 
     return jax.lax.map(encode, rgb_BSHWC) if encoder.CONVERTED else jax.vmap(encode)(rgb_BSHWC)
+
+
+def prepare(model: ModelConfig, params: Params, clip: Clip, *, memory: bool) -> Clip:
+    """Encode a batch's frames and look at its memories; the context is not kept.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; codec and image encoder are used.
+        clip: a batch, leading axis B.
+        memory: whether the memory is read (in stage 2).
+
+    Returns:
+        The batch with ``latents_thwC`` and, with a memory, ``sight``.
+    """
+    frames = as_signal(clip.frames)
+    return dataclasses.replace(
+        clip,
+        context=jax.tree.map(lambda x: x[:, :0], clip.context),
+        context_valid_S=clip.context_valid_S[:, :0],
+        context_features_ShwF=None,
+        latents_thwC=codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW),
+        sight=clip_sight(model, params, clip) if memory else None,
+    )
 
 
 def loss(
@@ -74,7 +103,9 @@ def loss(
         depth (``clip.depth``), only colour counts.
     """
     frames = as_signal(clip.frames)
-    x0 = codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
+    x0 = clip.latents_thwC
+    if x0 is None:
+        x0 = codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
     batch = x0.shape[0]
     time_key, noise_key, level_key, image_key = jax.random.split(key, 4)
     times = noises.draw(model.noise, time_key, batch, x0.shape[1])
@@ -87,13 +118,18 @@ def loss(
     )
     first = frames.rgb_THWC[:, 0]
     first = first + level * jax.random.normal(image_key, first.shape)
+    depth = frames.depth_THW[:, :1]
+    if train.depth_noise:
+        depth = depth * wrong(jax.random.fold_in(image_key, 1), depth.shape, train.depth_noise)
     observed = Frames(
-        first[:, None], frames.depth_THW[:, :1], jax.tree.map(lambda x: x[:, :1], frames.camera)
+        first[:, None], depth, jax.tree.map(lambda x: x[:, :1], frames.camera)
     )
     require_actions(model, clip.actions_TA, "the loss")
     control = Control(frames.camera, clip.actions_TA)
     conditioning = world_model.condition(model, params, observed, control)
-    sight = clip_sight(model, params, clip) if memory else None
+    sight = clip.sight if memory else None
+    if memory and sight is None:
+        sight = clip_sight(model, params, clip)
     inputs, network_time = noises.shown(model.noise, x_t, times)
     prediction = world_model.apply(model, params, inputs, conditioning, network_time, sight)
 
@@ -108,6 +144,23 @@ def loss(
     channels = error.shape[-1]
     total = (rgb * split + depth * (channels - split)) / channels
     return total, {"loss_rgb": rgb, "loss_depth": depth}
+
+
+def wrong(key: Array, shape: tuple[int, ...], most: float) -> Array:
+    """Draw factors by which depth is wrong, as imagined depth is: broadly, and a little at pixels.
+
+    Args:
+        key: randomness.
+        shape: (B, T, H, W).
+        most: each clip draws its size from 0 to this, a share of the depth.
+    """
+    size_key, broad_key, fine_key = jax.random.split(key, 3)
+    batch, frames, height, width = shape
+    size = most * jax.random.uniform(size_key, (batch, 1, 1, 1))
+    cells = (batch, frames, -(-height // BROAD), -(-width // BROAD))
+    broad = jax.image.resize(jax.random.normal(broad_key, cells), shape, "bilinear")
+    fine = jax.random.normal(fine_key, shape)
+    return jnp.exp(size * (broad + FINE * fine))
 
 
 without_memory = functools.partial(loss, memory=False)

@@ -34,6 +34,7 @@ STAGES = (
         rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|encoder|text)/.*", FREEZE)),
         init=functools.partial(world_model.init, memory=False),
         loss=objective.without_memory,
+        prepare=functools.partial(objective.prepare, memory=False),
     ),
     Stage(
         name="stage2",
@@ -42,6 +43,7 @@ STAGES = (
         init=world_model.init,
         loss=objective.with_memory,
         memory=True,
+        prepare=functools.partial(objective.prepare, memory=True),
     ),
 )
 """Stage 1 adapts the backbone to the domain, the control and RGB-D, without memory. Stage 2 adds
@@ -159,9 +161,12 @@ def imagine_clip(
     conditioning = world_model.condition(model, params, observed, whole)
     sight = None
     if memory and "memory" in params:
-        sight = jax.tree.map(lambda x: x[None], memories.look(model, state.map, camera))
+        shown = memories.look(model, state.map, camera, pictures=memories.gated(model))
+        sight = jax.tree.map(lambda x: x[None], shown)
     latents = _sample(model, params, conditioning, sight, key)
     rgb, depth = codecs.decode_rgbd(model, params, latents)
+    if sight is not None and memories.gated(model):
+        rgb, depth = codecs.mix(model, params, rgb, depth, sight.view)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
     remembered = state.map

@@ -14,7 +14,7 @@ from typing import Any
 
 from pewm_jax import tree
 from pewm_jax.config import Config, StageConfig
-from pewm_jax.types import Array, Params
+from pewm_jax.types import Array, Clip, Params
 
 TRAIN, FREEZE = "train", "freeze"
 
@@ -35,6 +35,9 @@ class Stage:
         init: ``init(model, key) -> params``, all the parameters that the stage needs.
         loss: what it minimises.
         memory: whether it reads the clips' context, and so may use cached image features.
+        prepare: ``prepare(model, params, clip) -> clip``: does beforehand what the loss computes of
+            a batch with frozen weights alone, and leaves out what that no longer needs; the loss is
+            the same.
         rates: (pattern, factor) over the paths of trained parameters, the first match wins: the
             learning rate there is the stage's times the factor; elsewhere it is the stage's.
     """
@@ -45,6 +48,7 @@ class Stage:
     init: Callable[[Any, Array], Params]
     loss: Loss
     memory: bool = False
+    prepare: Callable[[Any, Params, Clip], Clip] | None = None
     rates: tuple[tuple[str, float], ...] = ()
 
     @property

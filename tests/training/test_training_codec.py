@@ -124,7 +124,8 @@ def test_depth_that_was_not_measured_does_not_count():
     train = dataclasses.replace(config.train, latent_noise=0.0)
     made = []
     for out in ("encoder", "decoder"):  # what is made does not depend on what is seen then
-        params["codec"][out]["out"]["kernel"] *= 0
+        for last in ("out", "direct"):
+            params["codec"][out][last]["kernel"] *= 0
     for depth in (clip.frames.depth_THW, holes):
         seen = dataclasses.replace(clip.frames, depth_THW=depth)
         made.append(
@@ -138,7 +139,7 @@ def test_depth_that_was_not_measured_does_not_count():
         )
     truth, counts = world.pictures(config.model, clip)
     lower = np.abs(truth[1])[:, 8:].mean()
-    pixels = float(lower) + 0.5 * float((np.asarray(truth[1])[:, 8:] ** 2).mean())
+    pixels = float(lower) + train.squared_weight * float((np.asarray(truth[1])[:, 8:] ** 2).mean())
     slopes = sum(float(np.abs(np.diff(np.asarray(truth[1])[:, 8:], axis=a)).mean()) for a in (1, 2))
     assert made[1]["loss_depth"] == pytest.approx(pixels + slopes, rel=1e-4)
     assert made[0]["loss_rgb"] == made[1]["loss_rgb"]
