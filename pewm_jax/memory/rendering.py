@@ -27,6 +27,8 @@ TOLERANCE_M, TOLERANCE_RELATIVE = 0.05, 0.1
 grazing angle is that deep from pixel to pixel)."""
 LEAST = 1e-4
 """The least share of a point that shows it."""
+RASTER, REACH, PILE = 64, 8, 8
+"""Of the images of cells, see ``splat_cells``."""
 BLOCK = 16
 """Slots that are drawn or left out together."""
 SHARE = 3 / 8
@@ -161,6 +163,51 @@ def splat_surfels(
         depth.reshape(frames, height, width),
         seen.reshape(frames, height, width),
     )
+
+
+def splat_cells(
+    points_V3: Array,
+    features_VF: Array,
+    cell_m: tuple[float, float, float],
+    valid_V: Array,
+    camera: Camera,
+    height: int,
+    width: int,
+) -> View:
+    """Return what cameras see of cells: each pixel shows one cell, near ones hide far ones.
+
+    A cell that is taller than wide is a pile of at most ``PILE`` square ones. The images are drawn
+    at most ``RASTER`` pixels long, in which a cell covers at most ``REACH`` across and down, and
+    their pixels repeated: cells are coarse, and what they cover costs.
+
+    Args:
+        points_V3: (V, 3) the middles of cells in the world, metres.
+        features_VF: (V, F).
+        cell_m: width, depth and height of a cell, metres.
+        valid_V: (V,) bool; others are not there.
+        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
+        height: of the images, pixels.
+        width: of the images, pixels.
+    """
+    wide, tall = max(cell_m[:2]), cell_m[2]
+    pile = min(max(round(tall / wide), 1), PILE)
+    rise = np.zeros((pile, 3), np.float32)
+    rise[:, 2] = (np.arange(pile) - (pile - 1) / 2) * min(wide, tall / pile)
+    points = (points_V3[:, None] + rise).reshape(-1, 3)
+    features, valid = jnp.repeat(features_VF, pile, 0), jnp.repeat(valid_V, pile, 0)
+    size = jnp.full(len(points), wide, jnp.float32)
+
+    step = -(-max(height, width) // RASTER)
+    rows, columns = -(-height // step), -(-width // step)
+    small = Camera(jnp.asarray(camera.intrinsics_4) / step, camera.world_from_camera)
+    view = splat_surfels(
+        points, features, size, valid, small, rows, columns, most=REACH, average=False
+    )
+
+    def whole(image: Array) -> Array:
+        return jnp.repeat(jnp.repeat(image, step, 1), step, 2)[:, :height, :width]
+
+    return jax.tree.map(whole, view) if step > 1 else view
 
 
 def _whole_blocks(*arrays_V: Array) -> tuple[Array, ...]:
