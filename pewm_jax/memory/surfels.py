@@ -3,8 +3,8 @@
 The voxel map keeps features of cells of a quarter of a metre; this keeps colours of cells of a few
 centimetres, so that what was seen can be shown again (``render``). Each surfel stands at the mean
 position of what fell into its cell and is as wide as the cell, or as a pixel of the camera that saw
-it was there if that is wider. What was observed beats what was imagined: frames told to be imagined
-change no observed cell, and the first observation of an imagined cell replaces it.
+it was there if that is wider. What was observed beats what was imagined: the first observation of
+an imagined cell replaces it and, with ``memory.protect``, imagined frames change no observed cell.
 
 Cells are kept sorted, as the voxel map's are. Sums are added up in the order of the pixels, so that
 on a CPU equal frames make equal memories bit for bit.
@@ -111,7 +111,7 @@ def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool =
     was_observed = known & surfels.observed_V[before]
     slot, found = voxel_cells.find(cell_V, cell_P)
     taken = found & (cell_P < none)
-    if not observed:
+    if not observed and config.protect:
         taken = taken & ~was_observed[slot]
     if config.keep == "newest":
         newest = jnp.full((capacity,), -1, jnp.int32)
@@ -226,9 +226,15 @@ def tokens(model: ModelConfig, surfels: Surfels, camera: Camera) -> MapTokens:
 def render(
     model: ModelConfig, surfels: Surfels, camera: Camera, height: int, width: int
 ) -> rendering.View:
-    """Return what cameras see, with the features of ``to_points``; see ``memories.render``."""
-    points, features, valid = to_points(model, surfels)
-    return _shown(settings_of(model), surfels, points, features, valid, camera, height, width)
+    """Return what cameras see: the features if they are kept, else the 3 colours.
+
+    See ``memories.render``.
+    """
+    config = settings_of(model)
+    if not config.features:
+        return render_colours(model, surfels, camera, height, width)
+    points, _, features, valid = means(config, surfels)
+    return _shown(config, surfels, points, features, valid, camera, height, width)
 
 
 def render_colours(
