@@ -20,7 +20,7 @@ import jax
 from jax.typing import ArrayLike
 
 from pewm_jax import config as configs
-from pewm_jax import weights, worlds
+from pewm_jax import shipped, weights, worlds
 from pewm_jax.config import Config, WorldSettings
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 
@@ -29,7 +29,8 @@ def load_finished(path: str | Path, *, lazily: bool = False) -> tuple[Config, Pa
     """Load the weights of a finished training; ``training.loading.load`` also reads checkpoints.
 
     Args:
-        path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``.
+        path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``,
+            or the name of weights that come with the library.
         lazily: map the file into memory, so that what is not looked at is not read.
 
     Returns:
@@ -38,7 +39,7 @@ def load_finished(path: str | Path, *, lazily: bool = False) -> tuple[Config, Pa
     Raises:
         UserError: something is absent or damaged, or the weights do not fit the configuration.
     """
-    folder = Path(path)
+    folder = shipped.find(path)
     config = configs.load(folder / "config.json")
     params = (weights.lazy if lazily else weights.load)(folder / "weights.safetensors")
     expected = _expected(config, params)

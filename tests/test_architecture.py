@@ -17,6 +17,7 @@ CHAPTERS = [
     "tree",
     "tensor_files",
     "weights",
+    "shipped",
     "flags",
     "cli",
     "geometry",

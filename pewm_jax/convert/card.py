@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, UserError, kinds
+from pewm_jax.config import CodecWorldConfig, Config, UserError, kinds
 from pewm_jax.data.dataset import read_manifest
 from pewm_jax.evaluation.page import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, number
 from pewm_jax.types import Params
@@ -66,11 +66,16 @@ def _what(facts: Facts) -> str:
         for part, tree in facts.params.items()
     }
     rows = [f"| {part} | {count / 1e6:.2f} |" for part, count in counts.items()]
+    table = "\n".join(["| part | million parameters |", "|---|---:|", *rows])
+    if isinstance(config.model, CodecWorldConfig):
+        return (
+            "A small image codec: 8 × 8 pixels of one RGB-D frame to latents and back, colour and "
+            f"depth by the same weights. pewm_jax {facts.version}.\n\n{table}"
+        )
     memory = f"a memory of kind `{kinds.of(config.model.memory).name}`"
     if "memory" not in facts.params:
         memory = "no memory (only its first stage is trained)"
     size = f"{clip.frames} frames of {clip.width} × {clip.height} pixels"
-    table = "\n".join(["| part | million parameters |", "|---|---:|", *rows])
     return (
         "A persistent embodied world model: given posed RGB-D frames and an agent's actions, it "
         f"imagines what the agent will see, colour and depth, in clips of {size}, with {memory}, "
@@ -78,12 +83,18 @@ def _what(facts: Facts) -> str:
         f"`{kinds.of(config.model.codec).name}`."
         f"\n\n{table}\n\n"
         "Weights are the moving average of training where it trained and the unchanged base "
-        f"elsewhere, rounded to bfloat16; they compute in {config.model.dtype}. Written by "
+        f"elsewhere, rounded to 16 bits; they compute in {config.model.dtype}. Written by "
         f"pewm_jax {facts.version}."
     )
 
 
 def _use(facts: Facts) -> str:
+    if isinstance(facts.config.model, CodecWorldConfig):
+        return (
+            "## Use\n\nA model whose `codec.kind` is `learned` starts from it, `train.start` "
+            f"{facts.name}: see the preset `demo`. In Python, `pewm_jax.models.codecs` encodes and "
+            "decodes."
+        )
     clip, actions = facts.config.model.clip, facts.config.model.actions
     length = clip.frames - 1
     return f"""## Use

@@ -1,13 +1,14 @@
-"""A training run → a folder for inference: averaged weights in bfloat16, settings, and a card.
+"""A training run → a folder for inference: averaged weights in 16 bits, settings, and a card.
 
 ::
 
     DST/config.json           the run's settings
-        weights.safetensors   every leaf of the run's weights, floats rounded to bfloat16
+        weights.safetensors   every leaf of the run's weights, floats rounded to bfloat16, or to
+                              float16 if that is asked for
         base.json             where the run has one: the checkpoint it was made from
         README.md             the card
 
-``pewm_jax.load(DST)`` returns the leaves as they are stored, bfloat16, which halves the memory;
+``pewm_jax.load(DST)`` returns the leaves as they are stored, which halves the memory;
 the networks compute in ``model.dtype`` all the same, because every layer casts its weights to it.
 """
 
@@ -36,7 +37,9 @@ CARD = "README.md"
 REPORT = Path("report") / METRICS
 
 
-def export(run: Path, dst: Path, *, say: Callable[[str], Any] = print) -> Path:
+def export(
+    run: Path, dst: Path, dtype: str = "bfloat16", *, say: Callable[[str], Any] = print
+) -> Path:
     """Write what inference needs of a training run into a new folder.
 
     The run's weights file already holds the moving average where the run trained and the frozen
@@ -45,6 +48,7 @@ def export(run: Path, dst: Path, *, say: Callable[[str], Any] = print) -> Path:
     Args:
         run: a run folder made by ``train.py`` (or a converted checkpoint in the same form).
         dst: the folder to make.
+        dtype: ``bfloat16`` or ``float16``.
         say: called with a line on each step.
 
     Returns:
@@ -71,8 +75,8 @@ def export(run: Path, dst: Path, *, say: Callable[[str], Any] = print) -> Path:
             metrics=_metrics(run),
         )
         total = sum(np.size(leaf) for leaf in jax.tree.leaves(params))
-        say(f"writing {total / 1e6:.1f} million parameters in bfloat16 …")
-        _write(folder / runs.WEIGHTS, params, {**metadata, "dtype": "bfloat16"})
+        say(f"writing {total / 1e6:.1f} million parameters in {dtype} …")
+        _write(folder / runs.WEIGHTS, params, {**metadata, "dtype": dtype}, jnp.dtype(dtype))
         configuration.save(config, folder / runs.CONFIG)
         if origin:
             shutil.copyfile(origin, folder / runs.BASE)
@@ -81,26 +85,36 @@ def export(run: Path, dst: Path, *, say: Callable[[str], Any] = print) -> Path:
     return dst
 
 
-def narrow(leaf: Any) -> np.ndarray:
-    """Return an array with floats rounded to bfloat16; everything else as it is."""
+def narrow(leaf: Any, dtype: Any = jnp.bfloat16) -> np.ndarray:
+    """Return an array with floats rounded to 16 bits; everything else as it is.
+
+    Raises:
+        UserError: a float is beyond the range of float16.
+    """
     array = np.asarray(leaf)
-    return array.astype(jnp.bfloat16) if jnp.issubdtype(array.dtype, jnp.floating) else array
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    with np.errstate(over="ignore"):
+        rounded = array.astype(dtype)
+    if np.isfinite(array).all() and not np.isfinite(rounded).all():
+        raise UserError("the weights exceed the range of float16: use --dtype bfloat16.")
+    return rounded
 
 
-def _write(path: Path, params: Params, metadata: Mapping[str, str]) -> None:
+def _write(path: Path, params: Params, metadata: Mapping[str, str], dtype: Any) -> None:
     """Write the weights leaf by leaf, so that no second copy of them is held."""
     leaves = tree.flatten(params)
     like = {
         name: jax.ShapeDtypeStruct(
             np.shape(leaf),
-            jnp.bfloat16 if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf.dtype,
+            dtype if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf.dtype,
         )
         for name, leaf in leaves.items()
     }
 
     def narrowed() -> Iterator[tuple[str, np.ndarray]]:
         for name, leaf in leaves.items():
-            yield name, narrow(leaf)
+            yield name, narrow(leaf, dtype)
 
     tensor_files.write(path, like, narrowed(), tensor_files.header(metadata))
 

@@ -21,6 +21,7 @@ from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation.images import psnr, unit_colours
 from pewm_jax.evaluation.imagine import print_now
 from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.geometry import holes
 from pewm_jax.models import learned_codec
 from pewm_jax.models.signals import depth_from_signal, signal_from_depth, signal_from_rgb
 from pewm_jax.rollouts import load_finished
@@ -112,7 +113,8 @@ def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[st
     """
     rgb = signal_from_rgb(frames.rgb_THWC)
     depth = jnp.asarray(frames.depth_THW)
-    grey = jnp.broadcast_to(signal_from_depth(model.clip, depth)[..., None], rgb.shape)
+    whole = holes.fill_depth(depth, model.clip.far_m)
+    grey = jnp.broadcast_to(signal_from_depth(model.clip, whole)[..., None], rgb.shape)
     both = jnp.stack([rgb, grey])
     latents = learned_codec.encode(model.codec, params, both)  # type: ignore[arg-type]
     made = learned_codec.decode(model.codec, params, latents)  # type: ignore[arg-type]

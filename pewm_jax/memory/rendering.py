@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.geometry import zbuffer
+from pewm_jax.geometry import holes, zbuffer
 from pewm_jax.geometry.cameras import project
 from pewm_jax.geometry.zbuffer import NEAREST_M, Spots
 from pewm_jax.types import Array, Camera, View
@@ -286,35 +286,7 @@ def fill_nearest(view: View) -> View:
         The view with features and depth everywhere; ``seen_THW`` still tells what was seen.
     """
     frames, height, width = view.seen_THW.shape
-    place = np.arange(height * width, dtype=np.int32).reshape(height, width)
-    row, column = np.divmod(place, width)
-    most = max(height, width)
-    steps = [2**k for k in range(max(most - 1, 1).bit_length() - 1, -1, -1)] + [1]
-    far = np.int32(2 * most * most)
-
-    def off(source_HW: Array) -> Array:
-        distance = (source_HW // width - row) ** 2 + (source_HW % width - column) ** 2
-        return jnp.where(source_HW >= 0, distance, far)
-
-    def flood(source: Array, step: Array) -> Any:
-        padded = jnp.pad(source, steps[0], constant_values=-1)
-        best, nearest = off(source), source
-        for move in np.ndindex(3, 3):
-            start = steps[0] + (np.array(move) - 1) * step
-            other = jax.lax.dynamic_slice(padded, start, (height, width))
-            distance = off(other)
-            better = (distance < best) | ((distance == best) & (other < nearest))
-            better = better & (other >= 0)
-            best = jnp.where(better, distance, best)
-            nearest = jnp.where(better, other, nearest)
-        return nearest, None
-
-    def one(seen_HW: Array) -> Array:
-        # A scan, so that each pass is computed once and not anew by all that read it.
-        return jax.lax.scan(flood, jnp.where(seen_HW, place, -1), jnp.array(steps))[0]
-
-    source = jax.vmap(one)(jnp.asarray(view.seen_THW)).reshape(frames, -1)
-    index, found = jnp.maximum(source, 0), source >= 0
+    index, found = holes.nearest(view.seen_THW)
     features = jnp.asarray(view.features_THWF).reshape(frames, height * width, -1)
     features = jnp.take_along_axis(features, index[:, :, None], 1)
     depth = jnp.take_along_axis(jnp.asarray(view.depth_THW).reshape(frames, -1), index, 1)

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from pewm_jax.config import CodecSettings, ModelConfig, functions
+from pewm_jax.geometry import holes
 from pewm_jax.models import placement
 from pewm_jax.models.pixel_codec import fold
 from pewm_jax.models.signals import depth_from_signal, signal_from_depth
@@ -79,6 +80,9 @@ def encode_rgbd(
 ) -> Array:
     """Encode colour in [−1, 1] and metric depth separately and concatenate the channels.
 
+    No measurement is not a surface: a pixel without depth is encoded with that of the nearest pixel
+    that has one, and an image without any at ``clip.far_m``. ``measured`` says what to count.
+
     Args:
         model: the model.
         params: the world model's parameters; those of the codec are under ``codec``.
@@ -86,7 +90,9 @@ def encode_rgbd(
         depth_BTHW: (B, T, H, W) metres.
         condition: see ``encode``.
     """
-    signal = signal_from_depth(model.clip, depth_BTHW)[..., None]
+    depth = jnp.asarray(depth_BTHW)
+    whole = holes.fill_depth(depth.reshape(-1, *depth.shape[-2:]), model.clip.far_m)
+    signal = signal_from_depth(model.clip, whole.reshape(depth.shape))[..., None]
     weights = params.get("codec", {})
     if not model.codec.DEPTH_AS_GREY:
         parts = [encode(model.codec, weights, x, condition=condition) for x in (rgb_BTHWC, signal)]

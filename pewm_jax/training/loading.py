@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 
 from pewm_jax import config as configuration
-from pewm_jax import rollouts, weights
+from pewm_jax import rollouts, shipped, weights
 from pewm_jax.config import Config, UserError
 from pewm_jax.training import runs, stages, step_folders
 from pewm_jax.types import Params
@@ -25,7 +25,8 @@ def load(path: str | Path) -> tuple[Config, Params]:
         path: a run folder made by ``train.py``, finished or not: the newest weights in it are
             taken, those of its newest whole checkpoint while a stage is being trained. Or a
             checkpoint's own folder, such as ``runs/demo/checkpoints/stage1/200``. Or a folder of
-            converted weights.
+            converted weights. Or the name of weights that come with the library
+            (``shipped.names()``).
 
     Returns:
         ``(config, params)``; the averaged weights that inference uses, as NumPy arrays in the
@@ -34,7 +35,7 @@ def load(path: str | Path) -> tuple[Config, Params]:
     Raises:
         UserError: something is absent or damaged, or the weights do not fit the configuration.
     """
-    folder = Path(path)
+    folder = shipped.find(path)
     if (folder / step_folders.WEIGHTS_ITEM).is_dir():
         return _read(folder)
     newer = _checkpoints(folder)

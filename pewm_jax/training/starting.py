@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from pewm_jax import rollouts, weights
+from pewm_jax import rollouts, shipped, weights
 from pewm_jax.config import Config, Settings, UserError, kinds
 from pewm_jax.memory import feature_cache
 from pewm_jax.training import loading, processes, runs, step_folders
@@ -58,7 +58,7 @@ def read_weights(config: Config, stage: Stage, say: Callable[[str], None]) -> Pa
     """
     if not config.train.start:
         return None
-    file = Path(config.train.start) / runs.WEIGHTS
+    file = shipped.find(config.train.start) / runs.WEIGHTS
     params = _given(config)
     if file.exists():  # a checkpoint has been verified while reading
         processes.first(lambda: weights.verify(file))
@@ -91,7 +91,7 @@ def encoder(config: Config) -> Params:
 
 def _given(config: Config) -> Params:
     """Return the weights in ``train.start``: those of its file, or else of a checkpoint."""
-    folder = Path(config.train.start)
+    folder = shipped.find(config.train.start)
     if (folder / runs.WEIGHTS).exists():
         return rollouts.load_finished(folder, lazily=True)[1]
     return loading.load(folder)[1]

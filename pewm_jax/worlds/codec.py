@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings, UserError
+from pewm_jax.geometry import holes
 from pewm_jax.models import learned_codec
 from pewm_jax.models.costs import Costs, Product, Share
 from pewm_jax.models.signals import as_signal, depth_from_signal, signal_from_depth
@@ -49,7 +50,8 @@ def pictures(model: CodecWorldConfig, clip: Clip) -> tuple[Array, Array]:
     frames = as_signal(clip.frames)
     rgb = frames.rgb_THWC.reshape(-1, *frames.rgb_THWC.shape[-3:])
     depth = frames.depth_THW.reshape(-1, *frames.depth_THW.shape[-2:], 1)
-    grey = jnp.broadcast_to(signal_from_depth(model.clip, depth), rgb.shape)
+    whole = holes.fill_depth(depth[..., 0], model.clip.far_m)[..., None]
+    grey = jnp.broadcast_to(signal_from_depth(model.clip, whole), rgb.shape)
     measured = (depth > 0).astype(rgb.dtype)
     return jnp.stack([rgb, grey]), jnp.stack([jnp.ones_like(measured), measured])
 
