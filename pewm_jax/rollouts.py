@@ -20,7 +20,7 @@ import jax
 from jax.typing import ArrayLike
 
 from pewm_jax import config as configs
-from pewm_jax import shipped, weights, worlds
+from pewm_jax import shipped, tree, weights, worlds
 from pewm_jax.config import Config, WorldSettings
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 
@@ -54,7 +54,10 @@ def _expected(config: Config, params: Params) -> Params:
         jax.eval_shape(functools.partial(stage.init, config.model), key)
         for stage in worlds.stages(config.model)
     ]
-    return next((shapes for shapes in made if shapes.keys() == params.keys()), made[-1])
+    found = tree.flatten(params).keys()
+    same = (shapes for shapes in made if tree.flatten(shapes).keys() == found)
+    alike = (shapes for shapes in made if shapes.keys() == params.keys())
+    return next(same, next(alike, made[-1]))
 
 
 def rollout(
