@@ -142,12 +142,16 @@ def mix(
         four = jnp.concatenate([rgb, signal_from_depth(model.clip, depth)[..., None]], -1)
         return four.reshape(-1, *four.shape[-3:])
 
-    made = functions(model.codec).mix(
-        params["codec"],
-        pictures(rgb_BTHWC, depth_BTHW),
-        pictures(view.features_THWF[..., :3], view.depth_THW),
-        view.seen_THW.reshape(-1, *view.seen_THW.shape[-2:]),
-    ).reshape(*rgb_BTHWC.shape[:-1], 4)
+    made = (
+        functions(model.codec)
+        .mix(
+            params["codec"],
+            pictures(rgb_BTHWC, depth_BTHW),
+            pictures(view.features_THWF[..., :3], view.depth_THW),
+            view.seen_THW.reshape(-1, *view.seen_THW.shape[-2:]),
+        )
+        .reshape(*rgb_BTHWC.shape[:-1], 4)
+    )
     depth = jnp.where(view.seen_THW, depth_from_signal(model.clip, made[..., 3]), depth_BTHW)
     return jnp.clip(made[..., :3], -1, 1), depth
 

@@ -121,9 +121,7 @@ def loss(
     depth = frames.depth_THW[:, :1]
     if train.depth_noise:
         depth = depth * wrong(jax.random.fold_in(image_key, 1), depth.shape, train.depth_noise)
-    observed = Frames(
-        first[:, None], depth, jax.tree.map(lambda x: x[:, :1], frames.camera)
-    )
+    observed = Frames(first[:, None], depth, jax.tree.map(lambda x: x[:, :1], frames.camera))
     require_actions(model, clip.actions_TA, "the loss")
     control = Control(frames.camera, clip.actions_TA)
     conditioning = world_model.condition(model, params, observed, control)
