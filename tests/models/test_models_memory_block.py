@@ -271,9 +271,8 @@ def test_a_denoiser_without_depth_neither_sees_nor_makes_any():
     base = predict("projective", tokens, depth=False)
     np.testing.assert_array_equal(base[..., split:], 0)
     assert np.abs(base[..., :split]).max() > 0.1
-    out = apply(
-        model, weights("projective"), noisy.at[..., split:].add(1.0), conditioning, TIMES, tokens
-    )
+    deeper = noisy.at[..., split:].add(1.0)
+    out = apply(model, weights("projective"), deeper, conditioning, TIMES, Sight(tokens))
     np.testing.assert_array_equal(out, base)
     frames = jax.tree.map(jnp.asarray, random_frames(np.random.default_rng(0), 9))
     batch = jax.tree.map(lambda x: x[None], as_signal(frames))

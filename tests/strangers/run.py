@@ -9,7 +9,7 @@ import numpy as np
 
 from pewm_jax import worlds
 from pewm_jax.config import (
-    AttentionConfig,
+    BothConfig,
     ClipConfig,
     Config,
     DataConfig,
@@ -39,7 +39,7 @@ def experiment(mesh=None, run="runs/strangers", batch=8, width=32) -> Config:
             backbone=PerceptronConfig(width=width),
             control=PushConfig(),
             memory=NewestConfig(
-                tokens=16, reader=AttentionConfig(heads=2, head_dim=width // 2, looks=8)
+                tokens=16, reader=BothConfig(heads=2, head_dim=width // 2, looks=8)
             ),
             noise=CosineConfig(),
         ),

@@ -9,7 +9,7 @@ import pytest
 
 from pewm_jax import presets as configs
 from pewm_jax import tree
-from pewm_jax.config import DiTConfig
+from pewm_jax.config import DiTConfig, RenderConfig, SurfelConfig
 from pewm_jax.models import world_model
 from pewm_jax.training import sharding, stages, step
 from pewm_jax.types import Clip
@@ -100,3 +100,33 @@ def test_every_leaf_has_a_rule_and_one_without_fails(stage):
     if frozen:
         with pytest.raises(tree.TreeError, match="matches backbone/"):
             fewer.labels(params)
+
+
+def test_stage_2_learns_from_pictures_and_changes_nothing_but_the_reader():
+    """The clips are what was seen before, so that the pictures show the answer."""
+    tiny = configs.load("tiny")
+    seen = SurfelConfig(reader=RenderConfig(), capacity=4096, tokens=16, footprint=2)
+    stage = dataclasses.replace(tiny.train.stage2, steps=12, learning_rate=1e-2, warmup=0, batch=2)
+    config = dataclasses.replace(
+        tiny.with_model(memory=seen), train=dataclasses.replace(tiny.train, stage2=stage)
+    )
+    frames = CLIP.frames
+    valid = np.ones(frames.depth_THW.shape[:2], bool)
+    clip = dataclasses.replace(CLIP, context=frames, context_valid_S=valid)
+    mesh = one_device()
+    start = {"backbone": randomise(init_world(config, memory=False), scale=0.05)["backbone"]}
+    state = step.initial_state(config, TWO, mesh, start)
+    before = jax.tree.map(np.asarray, state.params)
+    run = step.compile_step(config, TWO, mesh, clip)
+    key, losses = step.stage_key(config, TWO), []
+    for _ in range(12):  # the same noise at every step
+        same = dataclasses.replace(state, step=jax.numpy.zeros_like(state.step))
+        state, metrics = run(same, clip, key)
+        losses.append(float(metrics["loss"]))
+    assert losses[-1] < 0.9 * losses[0]
+    old, new = tree.flatten(before), tree.flatten(jax.tree.map(np.asarray, state.params))
+    for path, leaf in new.items():
+        if path.startswith("memory/"):
+            assert not np.array_equal(leaf, old[path]), path
+        else:
+            np.testing.assert_array_equal(leaf, old[path], err_msg=path)

@@ -203,8 +203,8 @@ def test_a_newer_version_is_refused_in_a_sentence(tmp_path, version):
     with pytest.raises(ConfigError) as refused:
         pewm_jax.load(tmp_path)
     assert str(refused.value) == (
-        f"config.json is of version {version}, and this pewm_jax reads versions up to {configuration.VERSION}: install "
-        "a newer pewm_jax."
+        f"config.json is of version {version}, and this pewm_jax reads versions up to "
+        f"{configuration.VERSION}: install a newer pewm_jax."
     )
 
 

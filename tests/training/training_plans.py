@@ -9,6 +9,7 @@ from typing import Literal
 
 from pewm_jax.config import (
     AttentionConfig,
+    BothConfig,
     ClipConfig,
     Config,
     DataConfig,
@@ -46,6 +47,7 @@ VARIANTS = {
     "stage 2 with VAE and DINOv2": (2, {"size": 64, "batch": 4, **ENCODERS}),
     "stage 2, fsdp 8, bfloat16": (2, {"mesh": FSDP, "batch": 16, "layers": 4, "dtype": "bfloat16"}),
     "stage 2, tensor 2 × fsdp 4": (2, {"mesh": TENSOR, "batch": 16}),
+    "stage 2, both readers": (2, {"layers": 4, "both": True}),
     "stage 1, context 4 × fsdp 2": (1, {"mesh": CONTEXT, "batch": 16, "heads": 8}),
 }
 """Name → stage and what differs from the defaults of ``experiment``."""
@@ -63,10 +65,12 @@ def experiment(
     mesh=None,
     codec=None,
     encoder=None,
+    both=False,
 ):
     """Return a small experiment."""
     stage = StageConfig(batch=batch)
-    reader = AttentionConfig(heads=8, head_dim=16, mlp_ratio=mlp, positions="sinusoid")
+    kind = BothConfig if both else AttentionConfig
+    reader = kind(heads=8, head_dim=16, mlp_ratio=mlp, positions="sinusoid")
     memory = VoxelConfig(tokens=tokens, encoder=encoder or PatchColoursConfig(), reader=reader)
     backbone = DiTConfig(
         layers=layers,
