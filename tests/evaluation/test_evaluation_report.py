@@ -25,7 +25,8 @@ from pewm_jax import weights
 from pewm_jax.config import UserError
 from pewm_jax.evaluation import imagine, preview, report
 from pewm_jax.evaluation.imagine import Imagination
-from pewm_jax.evaluation.page import introduction, number, verdict
+from pewm_jax.evaluation.page import introduction
+from pewm_jax.evaluation.words import number, verdict
 from pewm_jax.models import world_model
 from pewm_jax.types import Frames
 from pewm_jax.worlds.pewm import STAGES
@@ -88,7 +89,7 @@ def copied(run, tmp_path):
 
 def test_metrics_hold_every_method_mask_and_metric(run):
     metrics = json.loads((run / "report" / "metrics.json").read_text())
-    for method in ("memory", "empty", "copy"):
+    for method in ("memory", "empty", "reproject", "copy"):
         for mask in ("seen", "unseen", "all"):
             for metric in ("psnr", "ssim", "depth_mae", "depth_rel"):
                 entry = metrics["results"][method][mask][metric]
@@ -175,7 +176,7 @@ def test_a_damaged_page_is_drawn_again_without_imagining(copied, monkeypatch):
 def test_more_seeds_keep_what_was_scored(copied):
     said = []
     report.evaluate(copied, say=said.append, seeds=(0, 1, 2))
-    assert any("10 of 14 pieces were scored before" in line for line in said)
+    assert any("12 of 16 pieces were scored before" in line for line in said)
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     assert metrics["protocol"]["seeds"] == [0, 1, 2]
 
