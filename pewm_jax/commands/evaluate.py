@@ -70,8 +70,8 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
     if _is_codec(Path(argv[0])):
         return _codec(argv[0], settings)
     try:
-        none = None if settings.none is None else str(settings.none)
-        page = report.evaluate(argv[0], **vars(settings) | {"none": none})
+        changes = {name: value for name, value in vars(settings).items() if name != "out"}
+        page = report.evaluate(argv[0], out=settings.out, **changes)
     except KeyboardInterrupt:
         again = "Interrupted; what is scored is kept, run the same command again to go on."
         raise KeyboardInterrupt(again) from None

@@ -45,6 +45,8 @@ def override(config: Config, **changes: Any) -> Config:
     """
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
+    if "none" in changes:
+        changes["none"] = str(changes["none"])
     if steps is not None:
         config = config.with_model(
             noise=dataclasses.replace(config.model.noise, sample_steps=steps)
