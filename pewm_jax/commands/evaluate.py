@@ -35,10 +35,15 @@ class Settings:
     """Clips generated one after the other in a long rollout."""
     batch: int | None = None
     """Clips sampled at once."""
+    none: Path | None = None
+    """Run trained for as many steps without a memory (same clip and codec), which gets a row."""
+    out: Path | None = None
+    """Folder of the report; by default RUN/report, or RUN/report-NAME for other data than the
+    run's own."""
 
 
 def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
-    """Write RUN/report/index.html and print its path.
+    """Write the report, RUN/report/index.html unless told otherwise, and print its path.
 
     Args:
         argv: the arguments: a run's folder, and what is to differ from its settings.
@@ -65,7 +70,8 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
     if _is_codec(Path(argv[0])):
         return _codec(argv[0], settings)
     try:
-        page = report.evaluate(argv[0], **vars(settings))
+        changes = {name: value for name, value in vars(settings).items() if name != "out"}
+        page = report.evaluate(argv[0], out=settings.out, **changes)
     except KeyboardInterrupt:
         again = "Interrupted; what is scored is kept, run the same command again to go on."
         raise KeyboardInterrupt(again) from None

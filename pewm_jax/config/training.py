@@ -185,6 +185,9 @@ class EvalConfig:
     """Clips generated one after the other in a long rollout; long rollouts reveal drift."""
     batch: int = 16
     """Clips sampled at once."""
+    none: str = ""
+    """Folder of a run trained for as many steps without a memory (of the same clip and codec, all
+    its steps in stage 1), which gets a row of its own; if empty, the report has no such row."""
 
     def __post_init__(self):
         """Validate."""

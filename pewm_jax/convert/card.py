@@ -13,7 +13,7 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import CodecWorldConfig, Config, UserError, kinds
 from pewm_jax.data.dataset import read_manifest
-from pewm_jax.evaluation.page import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, number
+from pewm_jax.evaluation.words import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, number
 from pewm_jax.types import Params
 
 TRAINED_ON = "train"
@@ -172,6 +172,8 @@ def _scores(metrics: Mapping[str, Any] | None) -> str:
     ]
     for mask, where in MASK_NAMES.items():
         for method, label in METHOD_NAMES.items():
+            if method not in metrics["results"]:
+                continue
             scores = metrics["results"][method][mask]
             cells = [number(scores[m], digits) for m, (_, digits) in METRIC_NAMES.items()]
             rows.append(f"| {where} | {label} | " + " | ".join(cells) + " |")

@@ -28,8 +28,8 @@ from pewm_jax.types import Frames
 
 ABOVE_CAMERA_M = 0.4
 """Map cells higher than this above the camera are left out of the view from above."""
-CAPTIONS = {"memory": "with its map", "empty": "empty map"}
-"""Names of the methods in images."""
+CAPTIONS = {"memory": "with its map", "empty": "empty map", "reproject": "reprojected"}
+"""The methods in images, in their order, and their names."""
 HOLD = 4
 """Video frames for which the observed image is held."""
 
@@ -40,7 +40,7 @@ class Gallery:
 
     Attributes:
         videos: (caption, MP4) of each long rollout.
-        strip: frames of one rollout in rows: truth, with its map, empty map.
+        strip: frames of one rollout in rows: truth, with its map, empty map, reprojected.
         strip_note: which rollout and which frames they are.
         masks: the same true frames with never-seen pixels greyed out.
         above: the map from above, before and after that rollout.
@@ -132,7 +132,7 @@ def _video(config: Config, long: LongRollouts, item: _Rollout) -> tuple[str, byt
     ]
     count = len(item.truth.depth_THW)
     share = item.seen_THW.mean((1, 2))
-    footers = ["the present, observed by all three"] + [
+    footers = ["the present, observed by all"] + [
         f"imagined frame {t + 1} of {count}: {100 * share[t]:.0f} % of it was seen before"
         for t in range(count)
     ]

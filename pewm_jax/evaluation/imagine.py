@@ -17,9 +17,6 @@ from pewm_jax.rollouts import rollout
 from pewm_jax.types import Array, Camera, Frames, Params, WorldState
 from pewm_jax.worlds import start
 
-METHODS = ("memory", "empty", "copy")
-"""The model with its map; with an empty map; the last observed frame, repeated."""
-
 
 def print_now(line: str) -> None:
     """Print a line without buffering, even if the output is not a terminal."""

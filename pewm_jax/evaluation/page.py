@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
+from pewm_jax.evaluation import page_tables
 from pewm_jax.evaluation.gallery import ABOVE_CAMERA_M, Gallery
 from pewm_jax.evaluation.pictures import png
 from pewm_jax.evaluation.plots import COLOURS, Line, chart
 from pewm_jax.evaluation.seen import TOLERANCE_M, TOLERANCE_RELATIVE
+from pewm_jax.evaluation.words import METHOD_NAMES, summary_lines
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2028; --paper: #fff; --quiet: #666d7a;
@@ -53,54 +55,6 @@ PLACES = {
     None: "places that the model may have been trained on (its training data is not there to tell)",
 }
 """A phrase for each value of ``held_out`` in the protocol."""
-METHOD_NAMES = {
-    "memory": "with its map",
-    "empty": "same weights, empty map",
-    "copy": "copying the last frame",
-}
-"""Names of the methods on the page."""
-CLUSTERS = {
-    "scene": "clustered by scene, because clips of one scene show the same rooms",
-    "episode": "clustered by episode: all clips are of one scene, and how much other scenes would "
-    "differ cannot be said",
-}
-"""A phrase for each value of ``clustered_by`` in the protocol: what a standard error covers."""
-MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
-"""Names of the masks on the page."""
-METRIC_NAMES = {
-    "psnr": ("PSNR, dB ↑", 2),
-    "ssim": ("SSIM ↑", 3),
-    "depth_mae": ("depth error, m ↓", 3),
-    "depth_rel": ("relative depth error ↓", 3),
-}
-"""Heading and digits of each metric."""
-
-
-def number(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
-    """Format an entry as ``mean ± stderr``, or as a dash."""
-    if entry["mean"] is None:
-        return "–"
-    text = f"{entry['mean']:{'+' if sign else ''}.{digits}f}"
-    return text if entry["stderr"] is None else f"{text} ± {entry['stderr']:.{digits}f}"
-
-
-def verdict(entry: Mapping[str, Any], where: str) -> str:
-    """Return a sentence on what the map changes (PSNR of memory minus empty)."""
-    mean, stderr = entry["mean"], entry["stderr"]
-    if mean is None:
-        return f"No clip has enough pixels {where} to compare."
-    if stderr is None:
-        return (
-            f"On pixels {where} the map changes PSNR by {mean:+.2f} dB; with clips of one place "
-            "only, how sure that is cannot be said."
-        )
-    amount = f"{abs(mean):.2f} ± {stderr:.2f} dB"
-    if mean > 2 * stderr:
-        ratio = f", {mean / stderr:.0f} times the standard error" if stderr > 0 else ""
-        return f"On pixels {where} the map brings the model {amount} closer to the truth{ratio}."
-    if mean < -2 * stderr:
-        return f"On pixels {where} the map makes the model worse, by {amount}."
-    return f"On pixels {where} the map makes no clear difference ({mean:+.2f} ± {stderr:.2f} dB)."
 
 
 def introduction(protocol: Mapping[str, Any]) -> str:
@@ -123,17 +77,19 @@ def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         metrics: the content of ``metrics.json``.
         gallery: images and videos.
     """
-    seen = verdict(metrics["margin"]["seen"]["psnr"], "seen before")
-    unseen = verdict(metrics["margin"]["unseen"]["psnr"], "never seen")
+    seen, *others = summary_lines(metrics)
     sections = [
         "<h1>Does the model remember what it saw?</h1>",
         f'<p class="quiet">{introduction(metrics["protocol"])}</p>',
-        f'<p class="lead"><strong>{escape(seen)}</strong> {escape(unseen)}</p>',
+        f'<p class="lead"><strong>{escape(seen)}</strong></p>',
+        f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in others)}</ul>",
         _videos(gallery),
         _stills(gallery),
         "<h2>Scores</h2>",
-        _table(metrics),
+        page_tables.scores(metrics),
         _curves(metrics),
+        page_tables.drift(metrics),
+        page_tables.coverage(metrics),
         _map(gallery),
         _protocol(metrics["protocol"]),
     ]
@@ -155,17 +111,18 @@ def _videos(gallery: Gallery) -> str:
         for caption, film in gallery.videos
     ]
     return (
-        "<h2>Long rollouts, side by side</h2><p>Left the recording, in the middle the model with "
-        "its map, on the right the same model with an empty map. Above colour, below depth "
-        "(bright is near). All three start from the same observed picture and follow the same "
-        "actions; after each clip the model goes on from its own last frame. The first episodes of "
+        "<h2>Long rollouts, side by side</h2><p>From left to right the recording, the model with "
+        "its map, the same model with an empty map, and what was observed reprojected without a "
+        "network. Above colour, below depth (bright is near). All start from the same observed "
+        "picture and follow the same actions; after each clip the model goes on from its own last "
+        "frame, while the reprojection only ever shows what was observed. The first episodes of "
         "the split, not chosen.</p>" + "".join(figures)
     )
 
 
 def _stills(gallery: Gallery) -> str:
     return (
-        f'<figure><img alt="truth, with its map, empty map" '
+        f'<figure><img alt="truth, with its map, empty map, reprojected" '
         f'src="{embed("image/png", png(gallery.strip))}">'
         f"<figcaption>{escape(gallery.strip_note)}</figcaption></figure>"
         f'<figure><img alt="seen before" src="{embed("image/png", png(gallery.masks))}">'
@@ -177,45 +134,11 @@ def _stills(gallery: Gallery) -> str:
     )
 
 
-def _table(metrics: Mapping[str, Any]) -> str:
-    heads = "".join(f"<th>{name}</th>" for name, _ in METRIC_NAMES.values())
-    rows = []
-    for mask, name in MASK_NAMES.items():
-        rows.append(f'<tr class="head"><td colspan="6">{name}</td></tr>')
-        for method, label in METHOD_NAMES.items():
-            scores = metrics["results"][method][mask]
-            cells = "".join(
-                f"<td>{number(scores[m], digits)}</td>" for m, (_, digits) in METRIC_NAMES.items()
-            )
-            rows.append(f"<tr><td>{label}</td>{cells}<td>{scores['psnr']['n']}</td></tr>")
-        gains = metrics["margin"][mask]
-        cells = "".join(
-            f"<td>{number(gains[m], digits, sign=True)}</td>"
-            for m, (_, digits) in METRIC_NAMES.items()
-        )
-        rows.append(
-            f'<tr class="gain"><td>map minus empty map</td>{cells}'
-            f"<td>{gains['psnr']['n']}</td></tr>"
-        )
-    seeds = metrics["protocol"]["seeds"]
-    cover = CLUSTERS[metrics["protocol"]["clustered_by"]]
-    per_seed = ", ".join(f"{value:+.2f}" for value in metrics["margin"]["seen"]["psnr"]["per_seed"])
-    return (
-        f'<div class="scroll"><table><thead><tr><th></th>{heads}<th>clips</th></tr></thead><tbody>'
-        + "".join(rows)
-        + "</tbody></table></div>"
-        "<p class='quiet'>Mean ± standard error over clips. Sampling seeds are averaged within a "
-        f"clip first, and the error is {cover}. "
-        "The difference is taken clip by clip with the same noise. "
-        f"Gain on pixels seen before, seed by seed ({', '.join(map(str, seeds))}): "
-        f"{per_seed} dB.</p>"
-    )
-
-
 def _lines(per_frame: Mapping[str, Any], mask: str, metric: str) -> list[Line]:
     return [
         Line(label, COLOURS[method], points["mean"], points["stderr"])
         for method, label in METHOD_NAMES.items()
+        if method in per_frame
         for points in [per_frame[method][mask][metric]]
     ]
 
@@ -234,6 +157,7 @@ def _curves(metrics: Mapping[str, Any]) -> str:
     keys = "".join(
         f'<span class="key" style="background:{COLOURS[method]}"></span>{label}'
         for method, label in METHOD_NAMES.items()
+        if method in clips
     )
     count = metrics["protocol"]["long_rollouts"]["rollouts"]
     return (
@@ -262,9 +186,11 @@ def _protocol(protocol: Mapping[str, Any]) -> str:
     skip = {"config", "clip_list", "scene_names"}
     items = []
     for key, value in protocol.items():
-        if key in skip:
+        if key in skip or value is None:
             continue
-        if isinstance(value, dict):
+        if key == "reproject":
+            text = value["why"]
+        elif isinstance(value, dict):
             text = ", ".join(f"{k.replace('_', ' ')} {v}" for k, v in value.items())
         else:
             text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -7,7 +7,13 @@ import math
 from collections.abc import Sequence
 from html import escape
 
-COLOURS = {"memory": "#1f6feb", "empty": "#e8731a", "copy": "#8a8f98"}
+COLOURS = {
+    "memory": "#1f6feb",
+    "empty": "#e8731a",
+    "none": "#b8479c",
+    "reproject": "#1a9a6c",
+    "copy": "#8a8f98",
+}
 """The colour of each method; distinguishable for the colour-blind."""
 WIDTH, HEIGHT = 440, 280
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 36, 44

@@ -197,7 +197,7 @@ def file_hash(path: Path) -> str:
 
 
 def fingerprint(config: Config, weights: str, dataset: str) -> str:
-    """Return a hash of everything that the scores depend on, except the choice of seeds.
+    """Return a hash of everything that the scores depend on, except the choice of seeds and rivals.
 
     Args:
         config: the run's configuration, with overrides for the evaluation.
@@ -205,7 +205,7 @@ def fingerprint(config: Config, weights: str, dataset: str) -> str:
         dataset: sha256 of the data set's index.
     """
     settings = to_dict(config)
-    for key in ("seeds", "videos"):
+    for key in ("seeds", "videos", "none"):
         settings["evaluate"].pop(key)
     for key in ("train", "data"):
         settings.pop(key)

@@ -14,7 +14,8 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation.images import error_sums_batch, unit_colours
-from pewm_jax.evaluation.imagine import METHODS, Imagination, copy_last, print_now
+from pewm_jax.evaluation.imagine import print_now
+from pewm_jax.evaluation.methods import Methods
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, stack
 from pewm_jax.evaluation.seen import seen_masks_batch
@@ -28,7 +29,7 @@ class Scored:
 
     Attributes:
         choices: the C clips.
-        sums: method → (seeds, C, N, 3, 7) as ``images.error_sums``; one seed for copying.
+        sums: method → (seeds, C, N, 3, 7) as ``images.error_sums``; one seed without a network.
     """
 
     choices: list[ClipChoice]
@@ -78,6 +79,10 @@ class _Batch:
     def seeds(self, seed: int) -> np.ndarray:
         return np.stack([np.full_like(self.numbers_B, seed), self.numbers_B], -1)
 
+    def imagine(self, methods: Methods, method: str, seed: int) -> tuple[Any, Any, Frames]:
+        seeds, camera = self.seeds(seed), self.targets.camera
+        return methods.imagine(method, self.context, self.control, camera, seeds)
+
     def sums(self, frames: Frames) -> np.ndarray:
         sums = error_sums_batch(frames, self.targets, self.seen, self.unseen)
         return np.asarray(sums)[: self.real]
@@ -105,7 +110,7 @@ def _load(
 def score_table(
     config: Config,
     episodes: Sequence[Episode],
-    model: Imagination,
+    methods: Methods,
     partials: Partials,
     say: Callable[[str], Any] = print_now,
 ) -> Scored:
@@ -122,16 +127,16 @@ def score_table(
     pieces: dict[tuple[str, int, int], np.ndarray] = {}
     todo: list[tuple[str, int, int]] = []
     for first in starts:
-        for method in METHODS:
-            for seed in config.evaluate.seeds if method != "copy" else (0,):
-                found = partials.get(f"table-{method}-seed{seed}-clip{first:04d}")
+        for method in methods.names:
+            for seed in methods.seeds(method, config.evaluate.seeds):
+                found = partials.get(_piece(methods, method, seed, first))
                 if found is None:
                     todo.append((method, seed, first))
                 else:
                     pieces[method, seed, first] = found["sums"]
     if pieces:
         say(f"{len(pieces)} of {len(pieces) + len(todo)} pieces were scored before and are kept")
-    model.prepare(sorted({method == "memory" for method, _, _ in todo if method != "copy"}))
+    methods.prepare(method for method, _, _ in todo)
     frames_each = config.evaluate.chain * (config.model.clip.frames - 1)
     total = sum(
         frames_each * min(config.evaluate.batch, len(choices) - first) for _, _, first in todo
@@ -141,40 +146,32 @@ def score_table(
         for method, seed, first in todo:
             if loaded is None or loaded[0] != first:
                 chosen = choices[first : first + config.evaluate.batch]
-                loaded = first, _load(config, episodes, chosen, first, cameras=model.cameras)
+                loaded = (
+                    first,
+                    _load(config, episodes, chosen, first, cameras=methods.model.cameras),
+                )
             batch = loaded[1]
-            frames = _imagine(model, batch, method, seed)[2]
-            piece = partials.put(
-                f"table-{method}-seed{seed}-clip{first:04d}", sums=batch.sums(frames)
-            )
-            pieces[method, seed, first] = piece["sums"]
+            frames = batch.imagine(methods, method, seed)[2]
+            sums = batch.sums(frames)
+            partials.put(_piece(methods, method, seed, first), sums=sums)
+            pieces[method, seed, first] = sums
             meter.advance(frames_each * batch.real)
     if todo:
         say(meter.summary())
-    sums = {
+    table = {
         method: np.stack(
             [
                 np.concatenate([pieces[method, seed, first] for first in starts])
-                for seed in (config.evaluate.seeds if method != "copy" else (0,))
+                for seed in methods.seeds(method, config.evaluate.seeds)
             ]
         )
-        for method in METHODS
+        for method in methods.names
     }
-    return Scored(choices, sums)
+    return Scored(choices, table)
 
 
-def _imagine(model: Imagination, batch: _Batch, method: str, seed: int) -> tuple[Any, Any, Frames]:
-    if method == "copy":
-        return None, None, copy_last(batch.context, batch.targets.depth_THW.shape[1])
-    first, last, frames = model.run(
-        batch.context, batch.control, batch.seeds(seed), memory=method == "memory"
-    )
-    if not all(np.isfinite(leaf).all() for leaf in (frames.rgb_THWC, frames.depth_THW)):
-        raise UserError(
-            "the model imagines values that are not finite: its weights are damaged or its "
-            "training diverged; train it again."
-        )
-    return first, last, frames
+def _piece(methods: Methods, method: str, seed: int, first: int) -> str:
+    return f"table-{methods.piece(method)}-seed{seed}-clip{first:04d}"
 
 
 def long_choices(config: Config, episodes: Sequence[Episode]) -> tuple[list[ClipChoice], int]:
@@ -196,7 +193,7 @@ def long_choices(config: Config, episodes: Sequence[Episode]) -> tuple[list[Clip
 def roll_long(
     config: Config,
     episodes: Sequence[Episode],
-    model: Imagination,
+    methods: Methods,
     partials: Partials,
     say: Callable[[str], Any] = print_now,
 ) -> LongRollouts:
@@ -207,16 +204,17 @@ def roll_long(
     """
     choices, chain = long_choices(config, episodes)
     shown = min(config.evaluate.videos, len(choices))
-    name = {method: f"long-{method}-seed{config.evaluate.seeds[0]}" for method in METHODS}
-    pieces = {method: partials.get(name[method]) for method in METHODS}
-    todo = [m for m in METHODS if (p := pieces[m]) is None or len(p["rgb"]) < shown]
+    seed = config.evaluate.seeds[0]
+    name = {method: f"long-{methods.piece(method)}-seed{seed}" for method in methods.names}
+    pieces = {method: partials.get(name[method]) for method in methods.names}
+    todo = [m for m in methods.names if (p := pieces[m]) is None or len(p["rgb"]) < shown]
     if todo:
-        model.prepare(sorted({method == "memory" for method in todo if method != "copy"}))
-        batch = _load(config, episodes, choices, 0, cameras=model.cameras)
+        methods.prepare(todo)
+        batch = _load(config, episodes, choices, 0, cameras=methods.model.cameras)
         count = chain * (config.model.clip.frames - 1)
         with Meter("long rollouts", len(todo) * count * batch.real, "frames") as meter:
             for method in todo:
-                first, last, frames = _imagine(model, batch, method, config.evaluate.seeds[0])
+                first, last, frames = batch.imagine(methods, method, seed)
                 colours = np.asarray(unit_colours(frames.rgb_THWC[:shown]))
                 kept = {
                     "sums": batch.sums(frames),

@@ -18,6 +18,8 @@ from pewm_jax.evaluation.images import MASKS, PSNR_CEILING, SUMS
 
 METRICS = ("psnr", "ssim", "depth_mae", "depth_rel")
 """dB; structural similarity; metres; share of the true depth."""
+ENDS = 16
+"""Frames at the start and at the end of a long rollout that are compared to tell its drift."""
 LEAST_SHARE = 0.01
 """The smallest share of pixels that a mask must cover for a clip or frame to get a score."""
 
@@ -127,6 +129,43 @@ def margin(better: np.ndarray, base: np.ndarray, clusters: np.ndarray) -> dict[s
                 "per_seed": [float(value) for value in per_seed],
                 "stderr_over_seeds": spread,
             }
+    return result
+
+
+def margins(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
+    """Compare the model with its map with every other method, as ``margin`` does."""
+    return {
+        method: margin(sums["memory"], other, clusters)
+        for method, other in sums.items()
+        if method != "memory"
+    }
+
+
+def drift(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
+    """Tell how PSNR over pixels seen before changes along long rollouts.
+
+    Args:
+        sums: method → (seeds, rollouts, N, 3, 7).
+        clusters: (rollouts,) the scene (or episode) each comes from.
+
+    Returns:
+        ``[method]``: ``quarters``, the scores of the four quarters of the frames; and ``first16``,
+        ``last16`` and ``difference``, the last 16 frames minus the first rollout by rollout, or
+        None where a rollout has fewer than 32 frames. Each is ``{mean, stderr, n}``.
+    """
+
+    def of(sums_SCT37: np.ndarray) -> np.ndarray:
+        return scores(sums_SCT37.sum(2))["seen"]["psnr"].mean(0)
+
+    result: dict[str, Any] = {}
+    for method, sums_SCT37 in sums.items():
+        quarters = np.array_split(sums_SCT37, 4, axis=2)
+        ends: dict[str, Any] = {"first16": None, "last16": None, "difference": None}
+        if sums_SCT37.shape[2] >= 2 * ENDS:
+            first, last = of(sums_SCT37[:, :, :ENDS]), of(sums_SCT37[:, :, -ENDS:])
+            each = {"first16": first, "last16": last, "difference": last - first}
+            ends = {name: summary(values, clusters) for name, values in each.items()}
+        result[method] = {"quarters": [summary(of(part), clusters) for part in quarters], **ends}
     return result
 
 

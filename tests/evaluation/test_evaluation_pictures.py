@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 
 import av
@@ -40,6 +43,29 @@ def test_video_is_h264_with_every_frame_in_order():
     assert len(frames) == len(levels)
     for frame, level in zip(frames, levels, strict=True):
         assert frame.mean() == pytest.approx(level, abs=4)
+
+
+ENCODE = """
+import hashlib, numpy as np
+from pewm_jax.evaluation.video import encode_h264
+noise = np.random.default_rng(0).integers(0, 255, (12, 15, 20, 3)).astype(np.uint8)
+film = encode_h264([picture.repeat(8, 0).repeat(8, 1) for picture in noise])
+print(hashlib.sha256(film).hexdigest())
+"""
+
+
+def test_video_does_not_depend_on_what_the_memory_held_before():
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", ENCODE],
+            env={**os.environ, "MALLOC_PERTURB_": perturb},  # glibc fills new memory with it
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for perturb in ("0", "1", "85")
+    ]
+    assert len(set(said)) == 1
 
 
 def test_side_by_side_puts_each_version_where_its_caption_is():

@@ -13,8 +13,10 @@ from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.evaluation import imagine, scoring
 from pewm_jax.evaluation.imagine import Imagination
+from pewm_jax.evaluation.methods import Methods
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import choose
+from pewm_jax.evaluation.reproject import ReprojectSettings
 from pewm_jax.evaluation.statistics import margin, table
 
 PARAMS = {"offset": np.float32(0)}
@@ -37,7 +39,7 @@ def knowing_model(tmp_path_factory):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(imagine, "rollout", functools.partial(knowing_rollout, late=late))
             model.prepare([True, False])
-        return model
+        return Methods(model, ReprojectSettings())
 
     return make
 
@@ -58,6 +60,10 @@ def test_a_model_that_remembers_wins_by_a_mile(knowing_model, episodes, tmp_path
     assert results["empty"]["all"]["psnr"]["mean"] < 15
     assert results["empty"]["all"]["depth_mae"]["mean"] == pytest.approx(1, abs=0.01)
     assert results["copy"]["all"]["psnr"]["mean"] < 25
+    # Without a network: better than standing still where something was seen, worse than knowing.
+    seen = {method: results[method]["seen"]["psnr"]["mean"] for method in results}
+    assert seen["memory"] > seen["reproject"] > seen["copy"] + 3
+    assert results["reproject"]["seen"]["depth_mae"]["mean"] < 0.1
     gain = margin(scored.sums["memory"], scored.sums["empty"], scored.clusters)["seen"]["psnr"]
     assert gain["mean"] > 10 * gain["stderr"]
     assert gain["mean"] > 35

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from pewm_jax.evaluation.images import MASKS, SUMS
 from pewm_jax.evaluation.statistics import (
     METRICS,
+    drift,
     margin,
+    margins,
     per_frame,
     scores,
     seen_share,
@@ -117,6 +119,25 @@ def test_margin_is_the_difference_of_the_table():
             )
             assert gain[mask][metric]["mean"] == pytest.approx(difference, abs=1e-9)
     assert np.mean(gain["all"]["psnr"]["per_seed"]) == pytest.approx(gain["all"]["psnr"]["mean"])
+
+
+def test_every_rival_gets_a_margin_also_where_it_has_one_seed():
+    error = np.full((3, 4, 2), 0.01)
+    sums = {"memory": sums_of(error), "empty": sums_of(10 * error), "copy": sums_of(error[:1])}
+    got = margins(sums, np.arange(4))
+    assert got["empty"]["all"]["psnr"]["mean"] == pytest.approx(10)
+    assert got["copy"]["all"]["psnr"]["mean"] == pytest.approx(0)
+    assert len(got["copy"]["all"]["psnr"]["per_seed"]) == 3
+
+
+def test_drift_compares_the_ends_of_a_rollout():
+    error = np.concatenate([np.full(20, 0.001), np.full(20, 0.01)])
+    got = drift({"memory": sums_of(np.broadcast_to(error, (1, 3, 40)))}, np.arange(3))["memory"]
+    assert [part["mean"] for part in got["quarters"]] == pytest.approx([30, 30, 20, 20])
+    assert got["first16"]["mean"] == pytest.approx(30)
+    assert got["difference"]["mean"] == pytest.approx(-10)
+    short = drift({"memory": sums_of(np.full((1, 3, 31), 0.1))}, np.arange(3))["memory"]
+    assert (short["first16"], short["difference"]) == (None, None)
 
 
 def test_per_frame_keeps_frames_apart():

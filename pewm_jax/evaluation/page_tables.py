@@ -1,0 +1,100 @@
+"""The tables of the report's page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from html import escape
+from typing import Any
+
+from pewm_jax.evaluation.words import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, RIVALS, number
+
+CLUSTERS = {
+    "scene": "clustered by scene, because clips of one scene show the same rooms",
+    "episode": "clustered by episode: all clips are of one scene, and how much other scenes would "
+    "differ cannot be said",
+}
+"""A phrase for each value of ``clustered_by`` in the protocol: what a standard error covers."""
+QUARTERS = ("first quarter", "second", "third", "last")
+COVERAGE = {
+    "held": "held by the map",
+    "chosen": "among the tokens chosen",
+    "looked": "looked at",
+}
+"""What the coverage table says of pixels seen before, each a share of them."""
+
+
+def scores(metrics: Mapping[str, Any]) -> str:
+    """Return every method's scores, and the margins of the model with its map."""
+    heads = "".join(f"<th>{name}</th>" for name, _ in METRIC_NAMES.values())
+    rows = []
+    for mask, name in MASK_NAMES.items():
+        rows.append(f'<tr class="head"><td colspan="6">{name}</td></tr>')
+        for method, label in METHOD_NAMES.items():
+            if method in metrics["results"]:
+                rows.append(_row(label, metrics["results"][method][mask]))
+        for method in RIVALS:
+            if method in metrics["margins"]:
+                label = f"map minus {METHOD_NAMES[method]}"
+                rows.append(_row(label, metrics["margins"][method][mask], gain=True))
+    seeds = metrics["protocol"]["seeds"]
+    cover = CLUSTERS[metrics["protocol"]["clustered_by"]]
+    per_seed = ", ".join(f"{value:+.2f}" for value in metrics["margin"]["seen"]["psnr"]["per_seed"])
+    return (
+        _table(f"<th></th>{heads}<th>clips</th>", rows)
+        + "<p class='quiet'>Mean ± standard error over clips. Sampling seeds are averaged within a "
+        f"clip first, and the error is {cover}. "
+        "Differences are taken clip by clip, among models with the same noise. "
+        f"Gain of the map over an empty one on pixels seen before, seed by seed "
+        f"({', '.join(map(str, seeds))}): {per_seed} dB.</p>"
+    )
+
+
+def drift(metrics: Mapping[str, Any]) -> str:
+    """Return PSNR over pixels seen before along long rollouts, by quarter."""
+    rows = []
+    for method, entry in metrics["long"]["drift"].items():
+        shown = [*entry["quarters"], entry["first16"], entry["last16"], entry["difference"]]
+        cells = "".join(
+            f"<td>{'–' if one is None else number(one, 2, sign=i == 6)}</td>"
+            for i, one in enumerate(shown)
+        )
+        rows.append(f"<tr><td>{METHOD_NAMES[method]}</td>{cells}</tr>")
+    heads = (*QUARTERS, "first 16 frames", "last 16", "difference")
+    frames = metrics["protocol"]["long_rollouts"]["frames_each"]
+    return (
+        f"<h2>Drift</h2><p>PSNR over pixels seen before, dB, along rollouts of {frames} frames.</p>"
+        + _table("<th></th>" + "".join(f"<th>{head}</th>" for head in heads), rows)
+    )
+
+
+def coverage(metrics: Mapping[str, Any]) -> str:
+    """Return which share of the pixels seen before the model's map could show it; "" if unknown."""
+    shares = metrics.get("coverage")
+    if not shares:
+        return ""
+    rows = [
+        f"<tr><td>{escape(label)}</td><td>{100 * shares[key]:.1f} %</td></tr>"
+        for key, label in COVERAGE.items()
+        if shares.get(key) is not None
+    ]
+    return (
+        "<h2>What the map covers</h2><p>Of the pixels seen before, the share whose surface is</p>"
+        + _table("<th></th><th>share</th>", rows)
+    )
+
+
+def _row(label: str, entries: Mapping[str, Any], *, gain: bool = False) -> str:
+    cells = "".join(
+        f"<td>{number(entries[metric], digits, sign=gain)}</td>"
+        for metric, (_, digits) in METRIC_NAMES.items()
+    )
+    kind = ' class="gain"' if gain else ""
+    return f"<tr{kind}><td>{label}</td>{cells}<td>{entries['psnr']['n']}</td></tr>"
+
+
+def _table(heads: str, rows: list[str]) -> str:
+    return (
+        f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>'
+        + "".join(rows)
+        + "</tbody></table></div>"
+    )

@@ -1,0 +1,131 @@
+"""The report's words: names of methods, masks and metrics, numbers, and what is said of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+METHOD_NAMES = {
+    "memory": "with its map",
+    "empty": "same weights, empty map",
+    "none": "trained as long without a memory",
+    "reproject": "reprojection, no network",
+    "copy": "copying the last frame",
+}
+"""Names of the methods, in the order of the tables."""
+RIVALS = {
+    "reproject": "reprojecting what was observed",
+    "none": "a model trained as long without a memory",
+    "empty": "an empty map",
+}
+"""What the model with its map is compared with, in sentences."""
+MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
+"""Names of the masks."""
+METRIC_NAMES = {
+    "psnr": ("PSNR, dB ↑", 2),
+    "ssim": ("SSIM ↑", 3),
+    "depth_mae": ("depth error, m ↓", 3),
+    "depth_rel": ("relative depth error ↓", 3),
+}
+"""Heading and digits of each metric."""
+NONE_HOW = (
+    "A row for a model trained as long without a memory is missing: train one of the same clip, "
+    "codec and number of steps with all steps in stage 1 (--train.stage1.steps N "
+    "--train.stage2.steps 0) and name its folder by --none."
+)
+
+
+def number(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
+    """Format an entry as ``mean ± stderr``, or as a dash."""
+    if entry["mean"] is None:
+        return "–"
+    text = f"{entry['mean']:{'+' if sign else ''}.{digits}f}"
+    return text if entry["stderr"] is None else f"{text} ± {entry['stderr']:.{digits}f}"
+
+
+def verdict(entry: Mapping[str, Any], where: str) -> str:
+    """Return a sentence on what the map changes (PSNR of memory minus empty)."""
+    mean, stderr = entry["mean"], entry["stderr"]
+    if mean is None:
+        return f"No clip has enough pixels {where} to compare."
+    if stderr is None:
+        return (
+            f"On pixels {where} the map changes PSNR by {mean:+.2f} dB; with clips of one place "
+            "only, how sure that is cannot be said."
+        )
+    amount = f"{abs(mean):.2f} ± {stderr:.2f} dB"
+    if mean > 2 * stderr:
+        ratio = f", {mean / stderr:.0f} times the standard error" if stderr > 0 else ""
+        return f"On pixels {where} the map brings the model {amount} closer to the truth{ratio}."
+    if mean < -2 * stderr:
+        return f"On pixels {where} the map makes the model worse, by {amount}."
+    return f"On pixels {where} the map makes no clear difference ({mean:+.2f} ± {stderr:.2f} dB)."
+
+
+def comparison(margin: Mapping[str, Any], rival: str) -> str:
+    """Return a sentence on whether the model with its map beats another method, mask by mask.
+
+    Args:
+        margin: ``[mask]["psnr"]`` of memory minus the rival.
+        rival: key of ``RIVALS``.
+    """
+    places = {
+        "seen": "over pixels seen before",
+        "unseen": "over those never seen",
+        "all": "over all",
+    }
+    said = [f"{where} {_outcome(margin[mask]['psnr'])}" for mask, where in places.items()]
+    return f"The model with its map against {RIVALS[rival]}: {'; '.join(said)}."
+
+
+def _outcome(entry: Mapping[str, Any]) -> str:
+    mean, stderr = entry["mean"], entry["stderr"]
+    if mean is None:
+        return "there is nothing to compare"
+    if stderr is None:
+        return f"{mean:+.2f} dB in one place, how sure cannot be said"
+    amount = f"{mean:+.2f} ± {stderr:.2f} dB"
+    if abs(mean) <= 2 * stderr:
+        return f"no clear difference ({amount})"
+    return f"it {'is better' if mean > 0 else 'is WORSE'} ({amount})"
+
+
+def drifted(drift: Mapping[str, Any]) -> str:
+    """Return a sentence on how long rollouts of the model with its map change.
+
+    Args:
+        drift: ``statistics.drift`` of the method ``memory``.
+    """
+    if drift["difference"] is None:
+        return "Long rollouts have fewer than 32 frames: their drift is not measured."
+    first, last, change = (drift[name] for name in ("first16", "last16", "difference"))
+    return (
+        f"Along long rollouts PSNR over pixels seen before goes from {number(first, 2)} dB (first "
+        f"16 frames) to {number(last, 2)} dB (last 16): {number(change, 2, sign=True)} dB."
+    )
+
+
+def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Return the report's sentences, for the terminal: against the baselines, then the map alone.
+
+    Args:
+        metrics: the content of ``metrics.json``.
+    """
+    margins = metrics["margins"]
+    lines = [
+        verdict(margins["empty"]["seen"]["psnr"], "seen before"),
+        verdict(margins["empty"]["unseen"]["psnr"], "never seen"),
+    ]
+    lines += [comparison(margins[name], name) for name in ("reproject", "none") if name in margins]
+    lines += [] if "none" in margins else [NONE_HOW]
+    return [*lines, drifted(metrics["long"]["drift"]["memory"])]
+
+
+def score_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Return the PSNR of every method under every mask as lines of a table, for the terminal."""
+    lines = [f"{'PSNR, dB':<34}" + "".join(f"{name:>16}" for name in MASK_NAMES.values())]
+    for method, label in METHOD_NAMES.items():
+        if method in metrics["results"]:
+            cells = (number(metrics["results"][method][mask]["psnr"], 2) for mask in MASK_NAMES)
+            lines.append(f"{label:<34}" + "".join(f"{cell:>16}" for cell in cells))
+    return lines

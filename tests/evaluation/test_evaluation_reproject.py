@@ -1,0 +1,120 @@
+"""The baseline without a network: what was seen is shown again, and its settings are chosen."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from evaluation_scene import look, record, tiny, write_split
+
+from pewm_jax.config import ConfigError
+from pewm_jax.data.episodes import read_episode
+from pewm_jax.evaluation import reproject_choice
+from pewm_jax.evaluation.images import unit_colours
+from pewm_jax.evaluation.partial import Partials
+from pewm_jax.evaluation.reproject import (
+    CANDIDATES,
+    ReprojectSettings,
+    reproject,
+    reproject_batch,
+)
+from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+from pewm_jax.types import Camera, Frames
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Frames of an episode that looks all around."""
+    return read_episode(record(0, size=24)).frames(range(14))
+
+
+def some(frames, rows):
+    return jax.tree.map(lambda leaf: leaf[np.asarray(rows)], frames)
+
+
+@pytest.mark.parametrize("settings", CANDIDATES, ids=lambda settings: settings.name)
+def test_the_camera_that_saw_it_sees_it_again(seen, settings):
+    one = some(seen, [3])
+    made = reproject(settings, one, one.camera)
+    colours = np.asarray(unit_colours(one.rgb_THWC))
+    tolerance = 0.08 if settings.footprint > 1 and settings.width > 1 else 1e-3
+    off = np.abs(np.asarray(unit_colours(made.rgb_THWC)) - colours)
+    assert np.quantile(off, 0.9) < tolerance
+    np.testing.assert_allclose(np.median(made.depth_THW / one.depth_THW), 1, atol=1e-3)
+
+
+@pytest.mark.parametrize("settings", CANDIDATES, ids=lambda settings: settings.name)
+def test_another_camera_sees_the_room_that_was_seen(seen, settings):
+    pose = pose_from_yaw(np.array([-0.3, 0.15, 1.25]), 0.8)
+    intrinsics = intrinsics_from_fov(24, 24, 90.0)
+    colour, depth = look(pose, intrinsics, size=24)
+    camera = Camera(np.asarray(intrinsics)[None], np.asarray(pose)[None])
+    made = reproject(settings, seen, camera)
+    assert np.median(np.abs(np.asarray(made.depth_THW[0]) - depth)) < 0.05
+    assert np.median(np.abs((np.asarray(made.rgb_THWC[0]) + 1) / 2 - colour)) < 0.06
+
+
+def test_frames_without_depth_do_not_count(seen):
+    blank = some(seen, [0, 1])
+    blank = Frames(blank.rgb_THWC * 0, blank.depth_THW * 0, blank.camera)
+    padded = jax.tree.map(lambda a, b: np.concatenate([a, b]), some(seen, [2, 3]), blank)
+    alone = reproject(ReprojectSettings(), some(seen, [2, 3]), seen.camera)
+    both = reproject(ReprojectSettings(), padded, seen.camera)
+    np.testing.assert_allclose(alone.rgb_THWC, both.rgb_THWC, atol=1e-6)
+    nothing = reproject(ReprojectSettings(), blank, blank.camera)
+    assert not np.asarray(nothing.depth_THW).any()
+
+
+def test_a_batch_is_its_clips(seen):
+    context, target = some(seen, [[0, 1, 2], [5, 6, 7]]), some(seen, [[3, 4], [8, 9]])
+    made = reproject_batch(ReprojectSettings(), context, target.camera)
+    assert made.rgb_THWC.shape == (2, 2, 24, 24, 3)
+    for row in range(2):
+        one = jax.tree.map(lambda leaf, row=row: leaf[row], (context, target.camera))
+        single = reproject(ReprojectSettings(), *one)
+        np.testing.assert_allclose(made.rgb_THWC[row], single.rgb_THWC, atol=1e-5)
+
+
+def test_settings_have_distinct_names_and_are_checked():
+    assert len({item.name for item in CANDIDATES}) == len({str(item) for item in CANDIDATES}) == 6
+    assert CANDIDATES[0] == ReprojectSettings(average=False)  # the plain z-buffer is among them
+    with pytest.raises(ConfigError, match="footprint is 0"):
+        ReprojectSettings(footprint=0)
+
+
+def test_the_best_on_validation_is_taken_and_kept(tmp_path, monkeypatch):
+    config = tiny(tmp_path)
+    write_split(tmp_path / "data" / "validation", episodes=2)
+    partials, said = Partials(tmp_path, "e" * 64, "f" * 64), []
+    found = reproject_choice.choose_settings(config, partials, said.append)
+    assert len(said) == 1
+    assert found.scores[found.settings.name] == max(found.scores.values())
+    assert len(found.scores) == len(CANDIDATES)
+    assert found.clips == reproject_choice.CLIPS
+    facts = found.facts()
+    assert facts["split"] == "validation"
+    assert facts["chosen"] in [item["settings"] for item in facts["candidates"]]
+    monkeypatch.setattr(reproject_choice, "_score", None)
+    assert reproject_choice.choose_settings(config, partials, said.append) == found
+    assert len(said) == 1
+
+
+def test_without_fitting_validation_data_the_default_is_taken_and_said(tmp_path):
+    partials = Partials(tmp_path, "e" * 64, "f" * 64)
+    found = reproject_choice.choose_settings(tiny(tmp_path), partials, print)
+    assert found.settings == ReprojectSettings()
+    assert "does not exist" in found.why
+    assert found.facts()["split"] is None
+    write_split(tmp_path / "data" / "validation", episodes=1, size=24)
+    found = reproject_choice.choose_settings(tiny(tmp_path), partials, print)
+    assert (found.settings, found.scores) == (ReprojectSettings(), {})
+    assert "24×24" in found.why
+
+
+def test_other_clips_are_other_scores(tmp_path):
+    config = tiny(tmp_path)
+    more = dataclasses.replace(config, data=dataclasses.replace(config.data, context=7))
+    assert reproject_choice._piece(config, "a") != reproject_choice._piece(config, "b")
+    assert reproject_choice._piece(config, "a") != reproject_choice._piece(more, "a")
