@@ -216,10 +216,11 @@ def to_points(model: ModelConfig, surfels: Surfels) -> tuple[Array, Array, Array
 
 
 def tokens(model: ModelConfig, surfels: Surfels, camera: Camera) -> MapTokens:
-    """Choose the surfels that condition one clip: in view first, nearest first."""
+    """Choose the surfels that condition one clip; see ``cells.choose``."""
     points, features, valid = to_points(model, surfels)
     size = (model.clip.height, model.clip.width)
-    order = cells.in_view_first(points, valid, camera, size, model.memory.tokens)
+    wide = widths(settings_of(model), surfels)
+    order = cells.choose(model.memory, points, valid, camera, size, wide)
     return MapTokens(features[order], points[order], valid[order])
 
 
@@ -257,10 +258,15 @@ def _shown(
     width: int,
 ) -> rendering.View:
     """Draw surfels as wide as they are."""
-    wide = jnp.maximum(surfels.size_V, max(config.cell_m))
+    wide_V = widths(config, surfels)
     return rendering.splat_surfels(
-        points_V3, features_VF, wide, valid_V, camera, height, width, most=config.footprint
+        points_V3, features_VF, wide_V, valid_V, camera, height, width, most=config.footprint
     )
+
+
+def widths(config: SurfelConfig, surfels: Surfels) -> Array:
+    """Return (V,) how wide surfels are, metres: as their cell, or as the pixel that saw them."""
+    return jnp.maximum(surfels.size_V, max(config.cell_m))
 
 
 def corners(config: SurfelConfig, origin_3: Array, cell_P: Array) -> Array:
