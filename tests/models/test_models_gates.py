@@ -1,4 +1,4 @@
-"""The gate: the decoder where nothing is rendered, at first mostly the memory where something is."""
+"""The gate: the decoder where nothing is rendered, and at first mostly the memory elsewhere."""
 
 import jax
 import jax.numpy as jnp
