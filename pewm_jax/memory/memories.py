@@ -85,8 +85,8 @@ def trusted(model: ModelConfig, frames: Frames) -> Frames:
 
     That is beyond ``memory.imagined_far`` of ``clip.far_m`` (walls that were never seen are
     imagined at the end of the range), at the near end of the range (where a model puts what has no
-    depth), and on both sides of an edge (``memory.imagined_edge``: there a depth between two surfaces is
-    imagined, where nothing is).
+    depth), and on both sides of an edge (``memory.imagined_edge``: there a depth between two
+    surfaces is imagined, where nothing is).
 
     Args:
         model: the model.
