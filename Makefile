@@ -4,7 +4,7 @@ PY = .venv/bin/python
 RUN ?= runs/demo
 DATA ?= data/demo
 PRESET ?= demo
-COLLECT ?= --size 48
+COLLECT ?= --train 144 --frames 80
 BENCH ?= render cogvideox memory dinov2 training
 # What may differ between versions of Python and JAX: networks beside their references, sampling,
 # sharding over simulated devices, a training from the command line that is stopped and goes on.

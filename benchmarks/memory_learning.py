@@ -83,8 +83,8 @@ Result = dict[str, Any]
 
 
 def settings(options: argparse.Namespace, variant: Variant, seed: int) -> Config:
-    """Return the demo's settings, smaller, with another memory."""
-    config = configs.load("demo")
+    """Return the settings of the preset `pixels`, smaller, with another memory."""
+    config = configs.load("pixels")
     kind, positions = variant if variant != BEFORE else ("none", "projective")
     model = config.model
     reader = dataclasses.replace(model.memory.reader, positions=positions, **READER)

@@ -91,14 +91,13 @@ def small_settings():
     demo = presets.load("demo")
     tiny = presets.load("tiny")
     stage = {"steps": 2, "batch": 2, "warmup": 1}
-    reader = {"looks": 32, "heads": 4, "head_dim": 8}
     return {
         "model": {
             "backbone": configuration.to_dict(tiny.model.backbone),
-            "memory": {"tokens": 64, "cells": [32, 32, 16], "reader": reader},
+            "memory": {"capacity": 8192, "tokens": 64, "reader": {"picture_width": 16}},
             "noise": {"snr_shift": demo.model.noise.snr_shift, "sample_steps": 2},
         },
-        "data": {"context": 4},
+        "data": {"context": 4, "prepared": 4},
         "train": {"stage1": stage, "stage2": stage, "preview_every": 2},
     }
 
