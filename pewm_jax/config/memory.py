@@ -36,7 +36,15 @@ class MemorySettings(Settings):
     capacity: int = 4096
     """Occupied cells that a map can hold; cells that do not fit are dropped and counted."""
     tokens: int = 512
-    """Map tokens that condition one clip: those in view, nearest first."""
+    """Map tokens that condition one clip."""
+    choose: Literal["visible", "nearest"] = "visible"
+    """Which tokens come first: those that the clip's cameras can see, each frame and each part of
+    its image in turn, hidden ones later; or the nearest in view, hidden or not."""
+    imagined_far: float = 0.95
+    """Imagined surfaces beyond this share of `clip.far_m` are not remembered."""
+    imagined_edge: float = 0.2
+    """Imagined pixels whose depth differs by more than this share from that of a pixel beside them
+    are not remembered: they lie on the edge of something. 0 remembers them."""
     encoder: EncoderSettings = PatchColoursConfig()
     """The image features that are kept."""
     reader: ReaderSettings = AttentionConfig()
@@ -62,6 +70,20 @@ class MemorySettings(Settings):
             "can be numbered; take fewer or larger cells.",
         )
         require_positive(self, "memory", "capacity", "tokens")
+        require(
+            self.choose in ("visible", "nearest"),
+            f"memory.choose is {self.choose!r}; choose visible or nearest.",
+        )
+        require(
+            self.imagined_far > 0,
+            f"memory.imagined_far is {self.imagined_far}: nothing imagined would be remembered; "
+            "use a share of clip.far_m above 0, such as 0.95.",
+        )
+        require(
+            self.imagined_edge >= 0,
+            f"memory.imagined_edge is {self.imagined_edge}: use a share such as 0.2, or 0 to "
+            "remember edges.",
+        )
         require(
             self.tokens <= self.capacity,
             f"memory.tokens {self.tokens} exceeds memory.capacity {self.capacity}: a clip cannot "
@@ -90,7 +112,7 @@ class PointsConfig(MemorySettings):
 class SurfelConfig(MemorySettings):
     """Small coloured surfaces at the sensor's resolution; cells, tokens and capacity as elsewhere.
 
-    What was observed is never overwritten by what was imagined.
+    They alone know what was observed and what was imagined: see ``protect``.
     """
 
     TELLS_IMAGINED: ClassVar[bool] = True
@@ -103,6 +125,8 @@ class SurfelConfig(MemorySettings):
     """Surfels that can be kept; what does not fit is counted."""
     keep: Literal["mean", "newest"] = "mean"
     """Of what was seen in one cell: the mean of all, or what the newest frame showed."""
+    protect: bool = True
+    """What was imagined never changes what was observed."""
     features: bool = False
     """Keep the encoder's features beside the colour, and give them to the reader."""
     footprint: int = 3

@@ -13,6 +13,7 @@ import numpy as np
 
 from pewm_jax.config import MemorySettings
 from pewm_jax.geometry.cameras import project, unproject
+from pewm_jax.geometry.visibility import visible_first
 from pewm_jax.types import Array, Camera, Frames
 
 FAR_M = 1e4
@@ -71,6 +72,34 @@ def sample(
     if valid_T is not None:
         valid = valid & valid_T[:, None]
     return take(unproject(frames.depth_THW, frames.camera)), take(frames.rgb_THWC), valid
+
+
+def choose(
+    config: MemorySettings,
+    points_V3: Array,
+    valid_V: Array,
+    camera: Camera,
+    size: tuple[int, int],
+    wide_V: Array | None = None,
+) -> Array:
+    """Return (≤ ``memory.tokens``,) indices of the points that condition one clip.
+
+    By ``memory.choose``: those that the clip's cameras can see first (``geometry.visibility``), or
+    those in view by their distance (``in_view_first``).
+
+    Args:
+        config: gives order, number and the size of a cell.
+        points_V3: (V, 3) world points, metres.
+        valid_V: (V,) bool.
+        camera: (T,) cameras of the clip.
+        size: image height and width in pixels.
+        wide_V: (V,) widths of the points, metres, if they are not those of a cell.
+    """
+    if config.choose == "nearest":
+        return in_view_first(points_V3, valid_V, camera, size, config.tokens)
+    wide = jnp.float32(max(config.cell_m[:2])) if wide_V is None else wide_V
+    tall = jnp.float32(config.cell_m[2]) if wide_V is None else wide_V
+    return visible_first(points_V3, wide, tall, valid_V, camera, size, config.tokens)
 
 
 def in_view_first(

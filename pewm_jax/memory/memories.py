@@ -25,8 +25,10 @@ one world: jit and vmap them.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, TypeAlias
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -37,6 +39,8 @@ from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
 
 Memory: TypeAlias = Any
 """A pytree, of the type that the memory's ``empty`` returns."""
+NEAR = 1.5
+"""Imagined depths below this many times ``clip.near_m`` are no measurements."""
 
 
 def empty(model: ModelConfig, centre_3: Array) -> Memory:
@@ -66,11 +70,44 @@ def remember(
         frames: T frames, colours float in [−1, 1]; pixels without depth are ignored.
         features_ThwF: (T, h, w, F) their patch features (``encoders.encode``).
         valid_T: (T,) bool; False frames are ignored.
-        observed: False where the frames were imagined; memories that do not tell
-            (``TELLS_IMAGINED``) remember both alike.
+        observed: False where the frames were imagined: of these only what is ``trusted`` is
+            remembered, and memories that tell (``TELLS_IMAGINED``) are told.
     """
+    if not observed:
+        frames = trusted(model, frames)
     told = {"observed": observed} if model.memory.TELLS_IMAGINED else {}
     return functions(model.memory).remember(model, memory, frames, features_ThwF, valid_T, **told)
+
+
+def trusted(model: ModelConfig, frames: Frames) -> Frames:
+    """Return imagined frames with a depth of 0 where it is not to be remembered.
+
+    That is beyond ``memory.imagined_far`` of ``clip.far_m`` (walls that were never seen are imagined
+    at the end of the range), at the near end of the range (where a model puts what has no depth),
+    and on both sides of an edge (``memory.imagined_edge``: there a depth between two surfaces is
+    imagined, where nothing is).
+
+    Args:
+        model: the model.
+        frames: (..., T) frames.
+    """
+    settings, clip = model.memory, model.clip
+    depth = jnp.asarray(frames.depth_THW)
+    measured = (depth > NEAR * clip.near_m) & jnp.isfinite(depth)
+    kept = measured & (depth <= settings.imagined_far * clip.far_m)
+    if settings.imagined_edge:
+        for axis in (-2, -1):
+            ahead = jax.lax.slice_in_dim(depth, 1, None, axis=axis)
+            behind = jax.lax.slice_in_dim(depth, 0, -1, axis=axis)
+            apart = jnp.abs(ahead - behind) > settings.imagined_edge * jnp.minimum(ahead, behind)
+            # Beside what has no depth nothing is known of an edge.
+            apart = apart & (jnp.minimum(ahead, behind) > NEAR * clip.near_m)
+            sides = [(0, 0)] * depth.ndim
+            sides[axis] = (1, 0)
+            kept = kept & ~jnp.pad(apart, sides)
+            sides[axis] = (0, 1)
+            kept = kept & ~jnp.pad(apart, sides)
+    return dataclasses.replace(frames, depth_THW=jnp.where(kept, depth, 0))
 
 
 def tokens(model: ModelConfig, memory: Memory, camera: Camera) -> MapTokens:
@@ -95,7 +132,11 @@ def to_points(model: ModelConfig, memory: Memory) -> tuple[Array, Array, Array]:
 def render(
     model: ModelConfig, memory: Memory, camera: Camera, height: int, width: int
 ) -> rendering.View:
-    """Render the memory's points for cameras; nearer points hide farther ones.
+    """Render the memory for cameras; nearer things hide farther ones.
+
+    Its points are drawn as wide as the cells of ``memory.cell_m``, unless it has a ``render`` of its
+    own. Static shapes; the memory ``none`` shows nothing. Large memories are drawn in branches, of
+    which ``jax.vmap`` runs both sides: render a batch by ``jax.lax.map``.
 
     Args:
         model: the model.
@@ -103,11 +144,27 @@ def render(
         camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
         height: height of the images, pixels.
         width: width of the images, pixels.
+
+    Returns:
+        The view; its features have ``rendered_channels(model)`` channels.
     """
     own = getattr(functions(model.memory), "render", None)
     if own is not None:
         return own(model, memory, camera, height, width)
-    return rendering.splat(*to_points(model, memory), camera, height, width)
+    points, features, valid = to_points(model, memory)
+    shown = features[:, : rendered_channels(model)]
+    cell_m = model.memory.cell_m
+    return rendering.splat_cells(points, shown, cell_m, valid, camera, height, width)
+
+
+def rendered_channels(model: ModelConfig) -> int:
+    """Return how many channels ``render`` shows: the encoder's, or 3 for colours."""
+    return 3 if shows_colours(model) else model.memory.encoder.channels
+
+
+def shows_colours(model: ModelConfig) -> bool:
+    """Return whether ``render`` shows plain colours in [−1, 1], and not features."""
+    return not model.memory.KEEPS_FEATURES
 
 
 def from_context(

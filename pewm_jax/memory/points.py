@@ -137,8 +137,8 @@ def to_points(model: ModelConfig, cloud: PointCloud) -> tuple[Array, Array, Arra
 
 
 def tokens(model: ModelConfig, cloud: PointCloud, camera: Camera) -> MapTokens:
-    """Choose the points that condition one clip: in view first, nearest first."""
+    """Choose the points that condition one clip; see ``cells.choose``."""
     points, features, valid = to_points(model, cloud)
     size = (model.clip.height, model.clip.width)
-    order = cells.in_view_first(points, valid, camera, size, model.memory.tokens)
+    order = cells.choose(model.memory, points, valid, camera, size)
     return MapTokens(features[order], points[order], valid[order])

@@ -10,22 +10,31 @@ that no point covers.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pewm_jax.geometry import zbuffer
 from pewm_jax.geometry.cameras import project
+from pewm_jax.geometry.zbuffer import NEAREST_M, Spots, window
 from pewm_jax.types import Array, Camera
 
-NEAREST_M = 0.05
-"""Points nearer to the camera plane than this are not seen, metres."""
 TOLERANCE_M, TOLERANCE_RELATIVE = 0.05, 0.1
 """Points on one surface lie within the larger of 5 cm and 10 % behind its front (a floor seen at a
 grazing angle is that deep from pixel to pixel)."""
 LEAST = 1e-4
 """The least share of a point that shows it."""
+RASTER, REACH, PILE = 64, 8, 8
+"""Of the images of cells, see ``splat_cells``."""
+BLOCK = 16
+"""Slots that are drawn or left out together."""
+SHARE = 3 / 8
+"""Of all blocks, how many are drawn in the branch where a camera sees only some of them."""
+WORTH_A_BRANCH = 4096
+"""Points in that branch from which it pays off."""
 
 
 @jax.tree_util.register_dataclass
@@ -104,6 +113,11 @@ def splat_surfels(
     lies behind the front by more than a tolerance is hidden. Where no point in front falls on or
     beside a pixel that is covered, the covering point is shown.
 
+    Points in neighbouring slots are taken to be neighbours in the world, as those of a memory are:
+    where the blocks of ``BLOCK`` slots that reach into a camera's view are at most ``SHARE`` of
+    all, only they are drawn. That changes no result. It is a branch, of which ``jax.vmap`` runs
+    both sides: render a batch by ``jax.lax.map``.
+
     Args:
         points_V3: (V, 3) in the world, metres.
         features_VF: (V, F).
@@ -116,43 +130,30 @@ def splat_surfels(
         average: show the mean of all that is not hidden, each point shared bilinearly by the four
             pixels around it; else the nearest point that falls on the pixel, as it is.
     """
-    count, pixels = len(points_V3), height * width
-    size = np.array([width, height])
+    points_V3, features_VF, size_V, valid_V = _whole_blocks(points_V3, features_VF, size_V, valid_V)
+    blocks = len(points_V3) // BLOCK
+    few = int(blocks * SHARE)
 
     def one(camera: Camera) -> tuple[Array, Array, Array]:
-        uv, z = project(points_V3, camera)
-        there = valid_V & (z > NEAREST_M)
-        half = size_V[:, None] / 2 * camera.intrinsics_4[:2] / jnp.where(there, z, 1)[:, None]
-        cover, covering = _cover(uv, half, z, there, height, width, most)
+        spots = zbuffer.look(points_V3, size_V, size_V, valid_V, camera)
 
-        def visible(place: Array) -> tuple[Array, Array]:
-            inside = ((place >= 0) & (place < size)).all(-1)
-            pixel = jnp.where(inside, place[:, 1] * width + place[:, 0], 0)
-            front = cover[pixel]
-            return pixel, there & inside & (z <= front + tolerance(front))
+        def drawn(spots: Spots, features_VF: Array) -> tuple[Array, Array, Array]:
+            return _draw(spots, features_VF, height, width, most, average)
 
-        if average:
-            corner = jnp.floor(uv - 0.5)
-            share = uv - 0.5 - corner
-            values = jnp.concatenate([features_VF, z[:, None], jnp.ones((count, 1))], -1)
-            total = jnp.zeros((pixels, values.shape[-1]))
-            for step in ((0, 0), (1, 0), (0, 1), (1, 1)):
-                pixel, shown = visible(corner.astype(jnp.int32) + np.array(step))
-                weight = jnp.where(np.array(step) == 1, share, 1 - share).prod(-1)
-                rows = jnp.where(shown[:, None], values * weight[:, None], 0)
-                total = total.at[jnp.where(shown, pixel, pixels)].add(rows, mode="drop")
-            direct = total[:, -1] > LEAST
-            mean = total / jnp.where(direct, total[:, -1], 1)[:, None]
-            features, depth = mean[:, :-2], mean[:, -2]
-        else:
-            pixel, shown = visible(jnp.floor(uv).astype(jnp.int32))
-            depth, index = _nearest(pixel, z, shown, pixels)
-            direct = index < count
-            features = features_VF[jnp.minimum(index, count - 1)]
-        seen = direct | (covering < count)
-        features = jnp.where(direct[:, None], features, features_VF[covering.clip(0, count - 1)])
-        depth = jnp.where(direct, depth, cover)
-        return jnp.where(seen[:, None], features, 0), jnp.where(seen, depth, 0), seen
+        if few * BLOCK < WORTH_A_BRANCH:
+            return drawn(spots, features_VF)
+        listed, count = _blocks_in_view(spots, height, width, most, few)
+
+        def chosen(x: Array) -> Array:
+            rows = x.reshape(blocks, BLOCK, *x.shape[1:])
+            rows = rows.at[listed].get(mode="fill", fill_value=0)
+            return rows.reshape(few * BLOCK, *x.shape[1:])
+
+        return jax.lax.cond(
+            count <= few,
+            lambda: drawn(*jax.tree.map(chosen, (spots, features_VF))),
+            lambda: drawn(spots, features_VF),
+        )
 
     # Frame after frame: what one needs fits a processor's cache, which nine do not.
     features, depth, seen = jax.lax.map(one, jax.tree.map(jnp.asarray, camera))
@@ -164,92 +165,129 @@ def splat_surfels(
     )
 
 
+def splat_cells(
+    points_V3: Array,
+    features_VF: Array,
+    cell_m: tuple[float, float, float],
+    valid_V: Array,
+    camera: Camera,
+    height: int,
+    width: int,
+) -> View:
+    """Return what cameras see of cells: each pixel shows one cell, near ones hide far ones.
+
+    A cell that is taller than wide is a pile of at most ``PILE`` square ones. The images are drawn
+    at most ``RASTER`` pixels long, in which a cell covers at most ``REACH`` across and down, and
+    their pixels repeated: cells are coarse, and what they cover costs.
+
+    Args:
+        points_V3: (V, 3) the middles of cells in the world, metres.
+        features_VF: (V, F).
+        cell_m: width, depth and height of a cell, metres.
+        valid_V: (V,) bool; others are not there.
+        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
+        height: of the images, pixels.
+        width: of the images, pixels.
+    """
+    wide, tall = max(cell_m[:2]), cell_m[2]
+    pile = min(max(round(tall / wide), 1), PILE)
+    rise = np.zeros((pile, 3), np.float32)
+    rise[:, 2] = (np.arange(pile) - (pile - 1) / 2) * min(wide, tall / pile)
+    points = (points_V3[:, None] + rise).reshape(-1, 3)
+    features, valid = jnp.repeat(features_VF, pile, 0), jnp.repeat(valid_V, pile, 0)
+    size = jnp.full(len(points), wide, jnp.float32)
+
+    step = -(-max(height, width) // RASTER)
+    rows, columns = -(-height // step), -(-width // step)
+    small = Camera(jnp.asarray(camera.intrinsics_4) / step, camera.world_from_camera)
+    view = splat_surfels(
+        points, features, size, valid, small, rows, columns, most=REACH, average=False
+    )
+
+    def whole(image: Array) -> Array:
+        return jnp.repeat(jnp.repeat(image, step, 1), step, 2)[:, :height, :width]
+
+    return jax.tree.map(whole, view) if step > 1 else view
+
+
+def _whole_blocks(*arrays_V: Array) -> tuple[Array, ...]:
+    """Pad the slots of arrays with zeros to a multiple of ``BLOCK``."""
+    missing = -len(arrays_V[0]) % BLOCK
+    return tuple(jnp.pad(x, [(0, missing)] + [(0, 0)] * (jnp.ndim(x) - 1)) for x in arrays_V)
+
+
+def _blocks_in_view(
+    spots: Spots, height: int, width: int, most: int, few: int
+) -> tuple[Array, Array]:
+    """Return (few,) the blocks that reach into the image, padded with their number; how many do."""
+    # A point reaches half of `most` beyond where it is, and its bilinear share one pixel.
+    reach = most / 2 + 1
+    across = (spots.u_V > -reach) & (spots.u_V < width + reach)
+    down = (spots.v_V > -reach) & (spots.v_V < height + reach)
+    used = (across & down & spots.there_V).reshape(-1, BLOCK).any(-1)
+    number = jnp.arange(len(used), dtype=jnp.int32)
+    place = jnp.where(used, jnp.cumsum(used) - 1, few)
+    listed = jnp.full((few,), len(used), jnp.int32).at[place].set(number, mode="drop")
+    return listed, used.sum()
+
+
+def _draw(
+    spots: Spots, features_VF: Array, height: int, width: int, most: int, average: bool
+) -> tuple[Array, Array, Array]:
+    """Return (H·W, F) features, (H·W,) depth and (H·W,) whether something is seen."""
+    count, pixels = len(features_VF), height * width
+    front_P, covering = zbuffer.cover(spots, height, width, most)
+
+    def visible(column: Array, row: Array) -> tuple[Array, Array]:
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = jnp.where(inside, row * width + column, 0)
+        front = front_P[pixel]
+        shown = spots.there_V & inside & (spots.z_V <= front + tolerance(front))
+        return jnp.where(shown, pixel, pixels), shown
+
+    if average:
+        total = _shares(spots, features_VF, visible, pixels)
+        direct = total[:, -1] > LEAST
+        mean = total / jnp.where(direct, total[:, -1], 1)[:, None]
+        features, depth = mean[:, :-2], mean[:, -2]
+    else:
+        column, row = (jnp.floor(x).astype(jnp.int32) for x in (spots.u_V, spots.v_V))
+        pixel, shown = visible(column, row)
+        depth, index = zbuffer.nearest(pixel, spots.z_V, shown, pixels)
+        direct = index < count
+        features = features_VF[jnp.minimum(index, count - 1)]
+    seen = direct | (covering < count)
+    features = jnp.where(direct[:, None], features, features_VF[covering.clip(0, count - 1)])
+    depth = jnp.where(direct, depth, front_P)
+    return jnp.where(seen[:, None], features, 0), jnp.where(seen, depth, 0), seen
+
+
+def _shares(
+    spots: Spots,
+    features_VF: Array,
+    visible: Callable[[Array, Array], tuple[Array, Array]],
+    pixels: int,
+) -> Array:
+    """Return (H·W, F + 2) sums of the features, depth and 1 of the points around each pixel."""
+    left, above = jnp.floor(spots.u_V - 0.5), jnp.floor(spots.v_V - 0.5)
+    right, below = spots.u_V - 0.5 - left, spots.v_V - 0.5 - above
+    column, row = left.astype(jnp.int32), above.astype(jnp.int32)
+    values = [features_VF, spots.z_V[:, None], jnp.ones((len(features_VF), 1))]
+    places = []
+    for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        pixel, _ = visible(column + i, row + j)
+        places.append((pixel, (right if i else 1 - right) * (below if j else 1 - below)))
+    # The barrier keeps XLA from computing these anew for every channel.
+    places, values_VC = jax.lax.optimization_barrier((places, jnp.concatenate(values, -1)))
+    total = jnp.zeros((pixels, values_VC.shape[-1]))
+    for pixel, weight in places:
+        total = total.at[pixel].add(values_VC * weight[:, None], mode="drop")
+    return total
+
+
 def tolerance(depth: Array) -> Array:
     """Return how far behind the front a point may lie and still be on it, metres."""
     return jnp.maximum(TOLERANCE_M, TOLERANCE_RELATIVE * depth)
-
-
-def window(uv_V2: Array, half_V2: Array, most: int) -> tuple[Array, Array]:
-    """Return the pixels that points cover, as ``(begin_V2, wide_V2)``, across and down, int32.
-
-    Those whose centres lie in [uv − half, uv + half), at least the pixel at uv, and at most
-    ``most``, then those in the middle.
-
-    Args:
-        uv_V2: (V, 2) where the points are, pixels.
-        half_V2: (V, 2) half their size, pixels.
-        most: pixels at most.
-    """
-    half = jnp.minimum(half_V2, most / 2)
-    here = jnp.floor(uv_V2)
-    begin = jnp.minimum(jnp.ceil(uv_V2 - half - 0.5), here)
-    wide = jnp.maximum(jnp.ceil(uv_V2 + half - 0.5), here + 1) - begin
-    return begin.astype(jnp.int32), jnp.clip(wide, 1, most).astype(jnp.int32)
-
-
-def _cover(
-    uv_V2: Array, half_V2: Array, z_V: Array, there_V: Array, height: int, width: int, most: int
-) -> tuple[Array, Array]:
-    """Return (H·W,) depth and index of the nearest point covering each pixel; inf and ≥ V if none.
-
-    No window is drawn pixel by pixel. Windows of one size that begin at one pixel cover the same
-    pixels, so that only the nearest of them counts: a z-buffer per size. And a window is the union
-    of the two windows one pixel smaller that begin at the same and at the next pixel: each size is
-    spread into the next smaller one, down to single pixels.
-    """
-    begin, wide = window(uv_V2, half_V2, most)
-    # A window may begin up to most − 1 pixels before the image.
-    begin, shape = begin + (most - 1), (height + most - 1, width + most - 1)
-    inside = ((begin >= 0) & (begin < np.array(shape[::-1]))).all(-1)
-    level = (wide[:, 1] - 1) * most + wide[:, 0] - 1
-    seat = (level * shape[0] + begin[:, 1]) * shape[1] + begin[:, 0]
-    found = _nearest(seat, z_V, there_V & inside, most * most * shape[0] * shape[1])
-    depth, index = (x.reshape(most, most, *shape) for x in found)  # down, across, row, column
-    depth, index = _spread(jnp.moveaxis(depth, 1, 0), jnp.moveaxis(index, 1, 0), axis=2)
-    depth, index = _spread(depth, index, axis=0)
-    return tuple(x[most - 1 :, most - 1 :].reshape(-1) for x in (depth, index))
-
-
-def _nearest(seat_V: Array, z_V: Array, there_V: Array, seats: int) -> tuple[Array, Array]:
-    """Return the smallest depth at each seat and the lowest index that has it; inf and V if none.
-
-    Args:
-        seat_V: (V,) int32, the seat of each point; not used where it is not there.
-        z_V: (V,) depths.
-        there_V: (V,) bool.
-        seats: how many seats there are.
-    """
-    count = len(z_V)
-    seat = jnp.where(there_V, seat_V, seats)
-    depth = jnp.full((seats,), jnp.inf).at[seat].min(z_V, mode="drop")
-    first = there_V & (z_V <= depth[jnp.clip(seat_V, 0, seats - 1)])
-    index = jnp.full((seats,), count, jnp.int32)
-    seat = jnp.where(first, seat_V, seats)
-    return depth, index.at[seat].min(jnp.arange(count, dtype=jnp.int32), mode="drop")
-
-
-def _spread(depth: Array, index: Array, axis: int) -> tuple[Array, Array]:
-    """Spread images (level, …) of windows of 1, 2, … pixels along an axis of each down to pixels.
-
-    Of several at one pixel the nearest counts, of equals the lowest index.
-    """
-
-    def nearer(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
-        second = (b[0] < a[0]) | ((b[0] == a[0]) & (b[1] < a[1]))
-        return jnp.where(second, b[0], a[0]), jnp.where(second, b[1], a[1])
-
-    def moved(x: Array, nothing: float) -> Array:
-        kept = jax.lax.slice_in_dim(x, 0, x.shape[axis] - 1, axis=axis)
-        ahead = [(int(i == axis), 0) for i in range(x.ndim)]
-        return jnp.pad(kept, ahead, constant_values=nothing)
-
-    def step(best: tuple[Array, Array], level: tuple[Array, Array]) -> Any:
-        next_one = moved(best[0], jnp.inf), moved(best[1], np.iinfo(np.int32).max)
-        return nearer(nearer(best, next_one), level), None
-
-    # A scan, so that each level is computed once and not anew by all that read it.
-    smaller = depth[:-1], index[:-1]
-    return jax.lax.scan(step, (depth[-1], index[-1]), smaller, reverse=True)[0]
 
 
 def fill_nearest(view: View) -> View:

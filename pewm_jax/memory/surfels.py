@@ -3,8 +3,8 @@
 The voxel map keeps features of cells of a quarter of a metre; this keeps colours of cells of a few
 centimetres, so that what was seen can be shown again (``render``). Each surfel stands at the mean
 position of what fell into its cell and is as wide as the cell, or as a pixel of the camera that saw
-it was there if that is wider. What was observed beats what was imagined: frames told to be imagined
-change no observed cell, and the first observation of an imagined cell replaces it.
+it was there if that is wider. What was observed beats what was imagined: the first observation of an
+imagined cell replaces it and, with ``memory.protect``, imagined frames change no observed cell.
 
 Cells are kept sorted, as the voxel map's are. Sums are added up in the order of the pixels, so that
 on a CPU equal frames make equal memories bit for bit.
@@ -111,7 +111,7 @@ def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool =
     was_observed = known & surfels.observed_V[before]
     slot, found = voxel_cells.find(cell_V, cell_P)
     taken = found & (cell_P < none)
-    if not observed:
+    if not observed and config.protect:
         taken = taken & ~was_observed[slot]
     if config.keep == "newest":
         newest = jnp.full((capacity,), -1, jnp.int32)
@@ -216,19 +216,26 @@ def to_points(model: ModelConfig, surfels: Surfels) -> tuple[Array, Array, Array
 
 
 def tokens(model: ModelConfig, surfels: Surfels, camera: Camera) -> MapTokens:
-    """Choose the surfels that condition one clip: in view first, nearest first."""
+    """Choose the surfels that condition one clip; see ``cells.choose``."""
     points, features, valid = to_points(model, surfels)
     size = (model.clip.height, model.clip.width)
-    order = cells.in_view_first(points, valid, camera, size, model.memory.tokens)
+    wide = widths(settings_of(model), surfels)
+    order = cells.choose(model.memory, points, valid, camera, size, wide)
     return MapTokens(features[order], points[order], valid[order])
 
 
 def render(
     model: ModelConfig, surfels: Surfels, camera: Camera, height: int, width: int
 ) -> rendering.View:
-    """Return what cameras see, with the features of ``to_points``; see ``memories.render``."""
-    points, features, valid = to_points(model, surfels)
-    return _shown(settings_of(model), surfels, points, features, valid, camera, height, width)
+    """Return what cameras see: the features if they are kept, else the 3 colours.
+
+    See ``memories.render``.
+    """
+    config = settings_of(model)
+    if not config.features:
+        return render_colours(model, surfels, camera, height, width)
+    points, _, features, valid = means(config, surfels)
+    return _shown(config, surfels, points, features, valid, camera, height, width)
 
 
 def render_colours(
@@ -251,10 +258,15 @@ def _shown(
     width: int,
 ) -> rendering.View:
     """Draw surfels as wide as they are."""
-    wide = jnp.maximum(surfels.size_V, max(config.cell_m))
+    wide_V = widths(config, surfels)
     return rendering.splat_surfels(
-        points_V3, features_VF, wide, valid_V, camera, height, width, most=config.footprint
+        points_V3, features_VF, wide_V, valid_V, camera, height, width, most=config.footprint
     )
+
+
+def widths(config: SurfelConfig, surfels: Surfels) -> Array:
+    """Return (V,) how wide surfels are, metres: as their cell, or as the pixel that saw them."""
+    return jnp.maximum(surfels.size_V, max(config.cell_m))
 
 
 def corners(config: SurfelConfig, origin_3: Array, cell_P: Array) -> Array:

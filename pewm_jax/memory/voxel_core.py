@@ -179,9 +179,8 @@ def tokens(
 ) -> MapTokens:
     """Choose the M = ``memory.tokens`` cells that condition one clip.
 
-    Cells in view of any of the clip's cameras come first, nearest first (by the smallest depth at
-    which a camera sees them). The others follow, by distance to the nearest camera. Ties go to the
-    lower cell number. With fewer than M occupied cells, the remaining tokens are masked. Positions
+    Cells that the clip's cameras can see come first (``cells.choose``). Ties go to the lower cell
+    number. With fewer than M occupied cells, the remaining tokens are masked. Positions
     are in the world; ``models.memory_geometry`` encodes them for attention.
 
     Args:
@@ -191,7 +190,7 @@ def tokens(
         size: image height and width in pixels.
     """
     points, features, valid = to_points(config, voxels)
-    order = cells.in_view_first(points, valid, camera, size, config.tokens)
+    order = cells.choose(config, points, valid, camera, size)
     return MapTokens(features[order], points[order], valid[order])
 
 

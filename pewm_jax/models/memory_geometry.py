@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import AttentionConfig, ModelConfig
+from pewm_jax.geometry import visibility
 from pewm_jax.geometry.cameras import invert_rigid, project, transform_points
 from pewm_jax.geometry.plucker import fold_frames
 from pewm_jax.models import placement
@@ -105,8 +106,9 @@ def sightings(
 ) -> Sightings:
     """Choose the map tokens that each camera attends to, and compute their positions.
 
-    Each camera gets the J = ``looks`` nearest tokens in view. Tokens hidden behind much nearer ones
-    come last.
+    Each camera gets J = ``looks`` tokens in view: first those that it can see, every part of its
+    image in turn (``geometry.visibility``; not with ``memory.choose`` nearest), then the nearest.
+    Tokens hidden behind much nearer ones come last.
 
     Args:
         model: the model.
@@ -142,7 +144,11 @@ def _look(
     inside = jnp.all((uv > -margin) & (uv < size + margin), -1)
     visible = inside & (z > NEAREST_M) & valid_M[:, None]
     behind = jax.vmap(lambda uv, z, seen: hidden(uv, z, seen, size, patch))(uv, z, visible)
-    rank = jnp.where(visible, z + jnp.where(behind, 1e3, 0.0), jnp.inf)
+    rank = z + jnp.where(behind, 1e3, 0.0)
+    if model.memory.choose == "visible":
+        turn = jax.vmap(lambda *seen: _turns(model, *seen))(points_M3, valid_M, camera)
+        rank = jnp.where(turn < visibility.CLASS, turn - visibility.CLASS, rank)
+    rank = jnp.where(visible, rank, jnp.inf)
     _, index = jax.lax.top_k(-rank, looks)
 
     uv = jnp.take_along_axis(uv, index[..., None], 2)
@@ -153,6 +159,13 @@ def _look(
 
     fold = jax.vmap(lambda x: group_latents(fold_frames(x, model.codec.temporal), patch_t))
     return fold(index), _angles(fold(uv) / patch, head_dim, grid), fold(place), fold(visible)
+
+
+def _turns(model: ModelConfig, points_M3: Array, valid_M: Array, camera: Camera) -> Array:
+    """Return (T, M) how early each camera names each token; see ``visibility.rank``."""
+    cell_m, size = model.memory.cell_m, (model.clip.height, model.clip.width)
+    wide, tall = jnp.float32(max(cell_m[:2])), jnp.float32(cell_m[2])
+    return visibility.rank(points_M3, wide, tall, valid_M, camera, size)
 
 
 def sinusoid_3d(

@@ -1,0 +1,153 @@
+"""Z-buffers of points that have a size: which point is the nearest at each pixel of an image.
+
+Everything is of static shape and deterministic; of equally near points the first is seen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.geometry.cameras import invert_rigid
+from pewm_jax.types import Array, Camera
+
+
+NEAREST_M = 0.05
+"""Points nearer to the camera plane than this are not seen, metres."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Spots:
+    """Points as one camera sees them, axis by axis: vectors are what processors are fast with.
+
+    Attributes:
+        u_V: (V,) where they are across, pixels.
+        v_V: (V,) down, pixels.
+        z_V: (V,) depth, metres.
+        across_V: (V,) half their width, pixels.
+        down_V: (V,) half their height, pixels.
+        there_V: (V,) bool; others are not there, or behind the camera.
+    """
+
+    u_V: Array
+    v_V: Array
+    z_V: Array
+    across_V: Array
+    down_V: Array
+    there_V: Array
+
+
+def look(points_V3: Array, wide_V: Array, tall_V: Array, valid_V: Array, camera: Camera) -> Spots:
+    """Return what one camera sees of points; see ``cameras.project``.
+
+    Args:
+        points_V3: (V, 3) in the world, metres.
+        wide_V: (V,) or () their width in the image, metres.
+        tall_V: (V,) or () their height in the image, metres.
+        valid_V: (V,) bool; others are not there.
+        camera: one camera.
+    """
+    world, (fx, fy, cx, cy) = invert_rigid(camera.world_from_camera), camera.intrinsics_4
+    x, y, z = (
+        sum((row[i] * points_V3[:, i] for i in range(3)), start=row[3]) for row in world[:3]
+    )
+    there = valid_V & (z > NEAREST_M)
+    near = 1 / jnp.where(there, z, 1)
+    place = x * near * fx + cx, y * near * fy + cy
+    # The barrier keeps XLA from computing a place anew for each use, rounded to either side of the
+    # border of a pixel.
+    found = (*place, z, wide_V / 2 * fx * near, tall_V / 2 * fy * near, there)
+    return Spots(*jax.lax.optimization_barrier(found))
+
+
+def window(place: Array, half: Array, most: int) -> tuple[Array, Array]:
+    """Return the pixels that points cover along one axis, as ``(begin, wide)``, int32.
+
+    Those whose centres lie in [place − half, place + half), at least the pixel at the place, and at
+    most ``most``, then those in the middle.
+
+    Args:
+        place: (…) where the points are, pixels.
+        half: (…) half their size, pixels.
+        most: pixels at most.
+    """
+    half = jnp.minimum(half, most / 2)
+    here = jnp.floor(place)
+    begin = jnp.minimum(jnp.ceil(place - half - 0.5), here)
+    wide = jnp.maximum(jnp.ceil(place + half - 0.5), here + 1) - begin
+    return begin.astype(jnp.int32), jnp.clip(wide, 1, most).astype(jnp.int32)
+
+
+def cover(spots: Spots, height: int, width: int, most: int) -> tuple[Array, Array]:
+    """Return (H·W,) depth and index of the nearest point covering each pixel; inf and ≥ V if none.
+
+    No window is drawn pixel by pixel. Windows of one size that begin at one pixel cover the same
+    pixels, so that only the nearest of them counts: a z-buffer per size. And a window is the union
+    of the two windows one pixel smaller that begin at the same and at the next pixel: each size is
+    spread into the next smaller one, down to single pixels.
+
+    Args:
+        spots: the points.
+        height: of the image, pixels.
+        width: of the image, pixels.
+        most: pixels that a point covers at most, across and down.
+    """
+    left, wide = window(spots.u_V, spots.across_V, most)
+    above, tall = window(spots.v_V, spots.down_V, most)
+    # A window may begin up to most − 1 pixels before the image.
+    left, above, shape = left + most - 1, above + most - 1, (height + most - 1, width + most - 1)
+    inside = (left >= 0) & (left < shape[1]) & (above >= 0) & (above < shape[0])
+    level = (tall - 1) * most + wide - 1
+    seat = (level * shape[0] + above) * shape[1] + left
+    found = nearest(seat, spots.z_V, spots.there_V & inside, most * most * shape[0] * shape[1])
+    depth, index = (x.reshape(most, most, *shape) for x in found)  # down, across, row, column
+    depth, index = _spread(jnp.moveaxis(depth, 1, 0), jnp.moveaxis(index, 1, 0), axis=2)
+    depth, index = _spread(depth, index, axis=0)
+    return tuple(x[most - 1 :, most - 1 :].reshape(-1) for x in (depth, index))
+
+
+def nearest(seat_V: Array, z_V: Array, there_V: Array, seats: int) -> tuple[Array, Array]:
+    """Return the smallest depth at each seat and the lowest index that has it; inf and V if none.
+
+    Args:
+        seat_V: (V,) int32, the seat of each point; not used where it is not there.
+        z_V: (V,) depths.
+        there_V: (V,) bool.
+        seats: how many seats there are.
+    """
+    count = len(z_V)
+    seat = jnp.where(there_V, seat_V, seats)
+    depth = jnp.full((seats,), jnp.inf).at[seat].min(z_V, mode="drop")
+    first = there_V & (z_V <= depth[jnp.clip(seat_V, 0, seats - 1)])
+    index = jnp.full((seats,), count, jnp.int32)
+    seat = jnp.where(first, seat_V, seats)
+    return depth, index.at[seat].min(jnp.arange(count, dtype=jnp.int32), mode="drop")
+
+
+def _spread(depth: Array, index: Array, axis: int) -> tuple[Array, Array]:
+    """Spread images (level, …) of windows of 1, 2, … pixels along an axis of each down to pixels.
+
+    Of several at one pixel the nearest counts, of equals the lowest index.
+    """
+
+    def nearer(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
+        second = (b[0] < a[0]) | ((b[0] == a[0]) & (b[1] < a[1]))
+        return jnp.where(second, b[0], a[0]), jnp.where(second, b[1], a[1])
+
+    def moved(x: Array, nothing: float) -> Array:
+        kept = jax.lax.slice_in_dim(x, 0, x.shape[axis] - 1, axis=axis)
+        ahead = [(int(i == axis), 0) for i in range(x.ndim)]
+        return jnp.pad(kept, ahead, constant_values=nothing)
+
+    def step(best: tuple[Array, Array], level: tuple[Array, Array]) -> Any:
+        next_one = moved(best[0], jnp.inf), moved(best[1], np.iinfo(np.int32).max)
+        return nearer(nearer(best, next_one), level), None
+
+    # A scan, so that each level is computed once and not anew by all that read it.
+    smaller = depth[:-1], index[:-1]
+    return jax.lax.scan(step, (depth[-1], index[-1]), smaller, reverse=True)[0]

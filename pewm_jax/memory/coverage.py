@@ -1,0 +1,136 @@
+"""How much of what was seen before reaches the denoiser: remembered, chosen, looked at.
+
+A pixel of a frame to be imagined that was seen before can be known only if the memory holds the
+place that it shows, if that place is among the tokens that condition the clip, and if the frame's
+own camera attends to it; or, where the memory is rendered, if the rendering shows that place.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import AttentionConfig, Map2DConfig, MemorySettings, ModelConfig, SurfelConfig
+from pewm_jax.geometry.cameras import unproject
+from pewm_jax.geometry.plucker import fold_frames
+from pewm_jax.memory import cells, map2d, memories, rendering
+from pewm_jax.models.memory_geometry import group_latents, sightings
+from pewm_jax.types import Array, Camera, Frames, MapTokens
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Coverage:
+    """Numbers of pixels, () int32 each; divide by ``seen`` after adding up clips.
+
+    Attributes:
+        seen: pixels seen before, with a depth.
+        held: of these, whose place the memory holds.
+        chosen: whose place is among the clip's tokens.
+        attended: whose place is among the tokens that the frame's camera attends to; with positions
+            that know no cameras all that are chosen.
+        rendered: where the rendered memory's depth agrees with the true one.
+    """
+
+    seen: Array
+    held: Array
+    chosen: Array
+    attended: Array
+    rendered: Array
+
+
+def coverage(
+    model: ModelConfig,
+    memory: memories.Memory,
+    tokens: MapTokens,
+    frames: Frames,
+    seen_THW: Array,
+    reader: AttentionConfig | None = None,
+) -> Coverage:
+    """Count the pixels seen before that are remembered, chosen, looked at and rendered.
+
+    A place is a cell of the memory's grid; for surfels, whose cells are about as small as pixels,
+    that cell or one beside it.
+
+    Args:
+        model: the model.
+        memory: what is remembered, of one world.
+        tokens: the clip's tokens (``memories.tokens``).
+        frames: T true frames of the clip, with depth.
+        seen_THW: (T, H, W) bool, pixels seen before.
+        reader: settings of the attention, by default the memory's reader; where that is of another
+            kind, all that is chosen counts as attended to.
+    """
+    depth = jnp.asarray(frames.depth_THW)
+    _, height, width = depth.shape
+    seen = jnp.asarray(seen_THW) & (depth > 0) & jnp.isfinite(depth)
+    camera = jax.tree.map(jnp.asarray, frames.camera)
+    points, _, valid = memories.to_points(model, memory)
+    grid = _grid(model.memory)
+    # Memories without a grid of their own get one around their first camera.
+    origin = getattr(memory, "origin_3", None)
+    if origin is None:
+        origin = cells.origin(grid, camera.world_from_camera[0, :3, 3])
+    pixel_THW = cells.keys(grid, origin, unproject(depth, camera))
+    reach = 1 if isinstance(model.memory, SurfelConfig) else 0
+
+    def among(cell: Array, points_V3: Array, valid_V: Array) -> Array:
+        return _among(grid, cell, cells.keys(grid, origin, points_V3), valid_V, reach)
+
+    chosen = among(pixel_THW, tokens.points_world_M3, tokens.valid_M)
+    looked_TM = _looked(model, reader or model.memory.reader, camera, tokens)
+    attended = jax.lax.map(
+        lambda x: among(x[0], tokens.points_world_M3, x[1]), (pixel_THW, looked_TM)
+    )
+    view = memories.render(model, memory, camera, height, width)
+    slack = jnp.maximum(rendering.tolerance(depth), max(grid.cell_m[:2]))
+    agrees = view.seen_THW & (jnp.abs(view.depth_THW - depth) <= slack)
+
+    def count(mask: Array) -> Array:
+        return (seen & mask).sum(dtype=jnp.int32)
+
+    held = among(pixel_THW, points, valid)
+    return Coverage(*map(count, (jnp.ones_like(seen), held, chosen, attended, agrees)))
+
+
+def _grid(config: MemorySettings) -> MemorySettings:
+    """Return the settings whose cells the memory's points stand for."""
+    return map2d.flattened(config) if isinstance(config, Map2DConfig) else config
+
+
+def _among(
+    config: MemorySettings, cell: Array, cell_V: Array, valid_V: Array, reach: int
+) -> Array:
+    """Return (...,) bool: whether cells, or those at most ``reach`` beside them, are in a list."""
+    nowhere = math.prod(config.cells)
+    listed = jnp.sort(jnp.where(valid_V, cell_V, nowhere))
+    _, ny, nz = config.cells
+    place = (cell // (ny * nz), cell // nz % ny, cell % nz)
+    found = jnp.zeros(cell.shape, bool)
+    for step in np.ndindex(*(2 * reach + 1,) * 3):
+        moved = [x + i - reach for x, i in zip(place, step, strict=True)]
+        inside = cell < nowhere
+        for x, size in zip(moved, config.cells, strict=True):
+            inside = inside & (x >= 0) & (x < size)
+        beside = jnp.where(inside, (moved[0] * ny + moved[1]) * nz + moved[2], nowhere)
+        slot = jnp.minimum(jnp.searchsorted(listed, beside), len(listed) - 1)
+        found = found | (inside & (listed[slot] == beside))
+    return found
+
+
+def _looked(model: ModelConfig, reader: object, camera: Camera, tokens: MapTokens) -> Array:
+    """Return (T, M) bool: the tokens that each frame's camera attends to."""
+    frames, count = len(camera.world_from_camera), len(tokens.valid_M)
+    if not isinstance(reader, AttentionConfig) or reader.positions != "projective":
+        return jnp.broadcast_to(tokens.valid_M, (frames, count))
+    batch = jax.tree.map(lambda x: x[None], (camera, tokens.points_world_M3, tokens.valid_M))
+    seen = sightings(model, reader, *batch)
+    fold = fold_frames(jnp.arange(frames), model.codec.temporal)
+    frame_tq = group_latents(fold, model.backbone.places.patch_t)
+    looked = jnp.zeros((frames, count), bool)
+    place = jnp.broadcast_to(frame_tq[..., None], seen.index_tqJ.shape[1:])
+    return looked.at[place, seen.index_tqJ[0]].max(seen.visible_tqJ[0])
