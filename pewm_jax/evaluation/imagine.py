@@ -61,13 +61,7 @@ class Imagination:
         if not memories:
             return
         states = jax.eval_shape(self._start_batch, self.params, self._abstract_context())
-        if self._begin is None:
-            self._begin = _compile(
-                f"the start from {self.context} frames",
-                self._start_batch,
-                (self.params, self._abstract_context()),
-                self._say,
-            )
+        self._prepare_start()
         length = self.config.model.clip.frames - 1
         control = abstract.array(self.batch, length, 3)
         if self.cameras:
@@ -81,6 +75,10 @@ class Imagination:
                 (self.params, states, control, keys),
                 self._say,
             )
+
+    def begin(self, context: Frames) -> WorldState:
+        """Return the states that (B, S) observed frames lead to."""
+        return self._prepare_start()(self.params, context)
 
     def run(
         self,
@@ -120,6 +118,17 @@ class Imagination:
             state, frames = self._clip[memory](params, state, part, now)
             made.append(jax.device_get(frames))
         return first, state, jax.tree.map(lambda *parts: np.concatenate(parts, 1), *made)
+
+    def _prepare_start(self) -> Callable[..., WorldState]:
+        begin = self._begin
+        if begin is None:
+            begin = self._begin = _compile(
+                f"the start from {self.context} frames",
+                self._start_batch,
+                (self.params, self._abstract_context()),
+                self._say,
+            )
+        return begin
 
     def _start_batch(self, params: Params, context: Frames) -> WorldState:
         return jax.vmap(functools.partial(start, self.config), (None, 0))(params, context)

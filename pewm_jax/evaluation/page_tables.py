@@ -6,7 +6,14 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from pewm_jax.evaluation.words import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, RIVALS, number
+from pewm_jax.evaluation.words import (
+    COVERAGE_NAMES,
+    MASK_NAMES,
+    METHOD_NAMES,
+    METRIC_NAMES,
+    RIVALS,
+    number,
+)
 
 CLUSTERS = {
     "scene": "clustered by scene, because clips of one scene show the same rooms",
@@ -15,12 +22,6 @@ CLUSTERS = {
 }
 """A phrase for each value of ``clustered_by`` in the protocol: what a standard error covers."""
 QUARTERS = ("first quarter", "second", "third", "last")
-COVERAGE = {
-    "held": "held by the map",
-    "chosen": "among the tokens chosen",
-    "looked": "looked at",
-}
-"""What the coverage table says of pixels seen before, each a share of them."""
 
 
 def scores(metrics: Mapping[str, Any]) -> str:
@@ -69,13 +70,12 @@ def drift(metrics: Mapping[str, Any]) -> str:
 
 def coverage(metrics: Mapping[str, Any]) -> str:
     """Return which share of the pixels seen before the model's map could show it; "" if unknown."""
-    shares = metrics.get("coverage")
+    shares = metrics["coverage"]
     if not shares:
         return ""
     rows = [
         f"<tr><td>{escape(label)}</td><td>{100 * shares[key]:.1f} %</td></tr>"
-        for key, label in COVERAGE.items()
-        if shares.get(key) is not None
+        for key, label in COVERAGE_NAMES.items()
     ]
     return (
         "<h2>What the map covers</h2><p>Of the pixels seen before, the share whose surface is</p>"

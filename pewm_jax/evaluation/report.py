@@ -13,6 +13,7 @@ from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import opened as runs
+from pewm_jax.evaluation.covered import score_coverage
 from pewm_jax.evaluation.gallery import make_gallery
 from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.measure import measure
@@ -117,6 +118,7 @@ def evaluate(
     long = roll_long(config, episodes, methods, partials, say)
     say("drawing the report …")
     metrics = measure(config, scored, long)
+    metrics["coverage"] = score_coverage(config, episodes, methods.model, partials, say)
     if cameras:
         metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
     metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {

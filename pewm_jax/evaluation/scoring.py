@@ -67,7 +67,9 @@ class LongRollouts:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Batch:
+class Batch:
+    """Chosen clips, padded to one size by repeating the last; ``real`` of them are asked for."""
+
     context: Frames
     targets: Frames
     control: Any
@@ -77,32 +79,36 @@ class _Batch:
     real: int
 
     def seeds(self, seed: int) -> np.ndarray:
+        """Return what the sampler's noise is drawn from: sampling seed, clip number."""
         return np.stack([np.full_like(self.numbers_B, seed), self.numbers_B], -1)
 
     def imagine(self, methods: Methods, method: str, seed: int) -> tuple[Any, Any, Frames]:
+        """Imagine the clips, see ``Methods.imagine``."""
         seeds, camera = self.seeds(seed), self.targets.camera
         return methods.imagine(method, self.context, self.control, camera, seeds)
 
     def sums(self, frames: Frames) -> np.ndarray:
+        """Return ``images.error_sums`` of the clips asked for."""
         sums = error_sums_batch(frames, self.targets, self.seen, self.unseen)
         return np.asarray(sums)[: self.real]
 
 
-def _load(
+def load_batch(
     config: Config,
     episodes: Sequence[Episode],
     choices: Sequence[ClipChoice],
     first: int,
     *,
     cameras: bool,
-) -> _Batch:
+) -> Batch:
+    """Read clips, the first of them number ``first``, and find what was seen before."""
     size = config.evaluate.batch
     parts = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
     context = stack([part[0] for part in parts], size)
     targets = stack([part[1] for part in parts], size)
     control = stack([part[2] for part in parts], size)
     seen, unseen = seen_masks_batch(targets, context)
-    return _Batch(
+    return Batch(
         context, targets, control, first + np.arange(size), seen, unseen, real=len(choices)
     )
 
@@ -142,13 +148,13 @@ def score_table(
         frames_each * min(config.evaluate.batch, len(choices) - first) for _, _, first in todo
     )
     with Meter("scoring", total, "frames") as meter:
-        loaded: tuple[int, _Batch] | None = None
+        loaded: tuple[int, Batch] | None = None
         for method, seed, first in todo:
             if loaded is None or loaded[0] != first:
                 chosen = choices[first : first + config.evaluate.batch]
                 loaded = (
                     first,
-                    _load(config, episodes, chosen, first, cameras=methods.model.cameras),
+                    load_batch(config, episodes, chosen, first, cameras=methods.model.cameras),
                 )
             batch = loaded[1]
             frames = batch.imagine(methods, method, seed)[2]
@@ -210,7 +216,7 @@ def roll_long(
     todo = [m for m in methods.names if (p := pieces[m]) is None or len(p["rgb"]) < shown]
     if todo:
         methods.prepare(todo)
-        batch = _load(config, episodes, choices, 0, cameras=methods.model.cameras)
+        batch = load_batch(config, episodes, choices, 0, cameras=methods.model.cameras)
         count = chain * (config.model.clip.frames - 1)
         with Meter("long rollouts", len(todo) * count * batch.real, "frames") as meter:
             for method in todo:

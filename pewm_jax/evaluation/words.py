@@ -28,6 +28,13 @@ METRIC_NAMES = {
     "depth_rel": ("relative depth error ↓", 3),
 }
 """Heading and digits of each metric."""
+COVERAGE_NAMES = {
+    "held": "held by the map",
+    "chosen": "among the tokens chosen",
+    "attended": "looked at",
+    "rendered": "shown by the rendered map",
+}
+"""What becomes of the pixels seen before, each a share of them."""
 NONE_HOW = (
     "A row for a model trained as long without a memory is missing: train one of the same clip, "
     "codec and number of steps with all steps in stage 1 (--train.stage1.steps N "
@@ -105,6 +112,12 @@ def drifted(drift: Mapping[str, Any]) -> str:
     )
 
 
+def covered(shares: Mapping[str, float]) -> str:
+    """Return a sentence on what the map knows of the pixels seen before."""
+    said = (f"{100 * shares[key]:.1f} % {name}" for key, name in COVERAGE_NAMES.items())
+    return f"Of the pixels seen before: {', '.join(said)}."
+
+
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     """Return the report's sentences, for the terminal: against the baselines, then the map alone.
 
@@ -118,6 +131,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     ]
     lines += [comparison(margins[name], name) for name in ("reproject", "none") if name in margins]
     lines += [] if "none" in margins else [NONE_HOW]
+    lines += [covered(metrics["coverage"])] if metrics["coverage"] else []
     return [*lines, drifted(metrics["long"]["drift"]["memory"])]
 
 

@@ -117,6 +117,9 @@ def test_metrics_hold_every_method_mask_and_metric(run):
     assert set(metrics["margins"]) == {"empty", "reproject", "copy"}
     assert protocol["reproject"]["split"] == "validation"
     assert protocol["none"] is None
+    shares = metrics["coverage"]
+    assert set(shares) == {"held", "chosen", "attended", "rendered"}
+    assert 1 >= shares["held"] >= shares["chosen"] >= shares["attended"] > 0
     assert len(metrics["long"]["drift"]["memory"]["quarters"]) == 4
     assert len(metrics["long"]["per_frame"]["memory"]["all"]["psnr"]["mean"]) == 8
 
