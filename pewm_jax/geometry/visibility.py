@@ -84,7 +84,9 @@ def rank(
         small = Camera(camera.intrinsics_4 * scale, camera.world_from_camera)
         spots = zbuffer.look(points_V3, wide_V, tall_V, valid_V, small)
         front, shown = zbuffer.cover(spots, rows, columns, MOST)
-        named = jnp.full((count,), jnp.inf).at[shown].min(turn, mode="drop")
+        area = jnp.zeros((count,)).at[shown].add(1.0, mode="drop")
+        first = jnp.full((count,), jnp.inf).at[shown].min(turn / len(turn), mode="drop")
+        named = len(turn) - area + first
         u, v = spots.u_V, spots.v_V
         inside = spots.there_V & (u >= 0) & (u <= columns) & (v >= 0) & (v <= rows)
         column = jnp.clip(u, 0, columns - 1).astype(jnp.int32)
@@ -127,8 +129,9 @@ def visible_first(
     squares = sum((points_V3[None, :, i] - centres[:, None, i]) ** 2 for i in range(3))
     far = 3 * CLASS + jnp.sqrt(jnp.min(jnp.asarray(squares), 0))
     # A turn of one camera comes before the next turn of any other.
-    first = jnp.argmin(rank_TV, 0).astype(jnp.float32) / (2 * len(centres))
+    pix = float(np.prod(raster(size)))
     best = rank_TV.min(0)
-    best = jnp.where(best < CLASS, best + first, best)
+    area = jnp.where(rank_TV<CLASS, pix+1-rank_TV, 0).sum(0)
+    best = jnp.where(best < CLASS, CLASS - area, best)
     score = jnp.where(valid_V, jnp.minimum(best, far), jnp.inf)
     return jax.lax.top_k(-score, min(count, len(points_V3)))[1]

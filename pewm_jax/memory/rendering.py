@@ -269,9 +269,11 @@ def _shares(
     pixels: int,
 ) -> Array:
     """Return (H·W, F + 2) sums of the features, depth and 1 of the points around each pixel."""
-    left, above = jnp.floor(spots.u_V - 0.5), jnp.floor(spots.v_V - 0.5)
-    right, below = spots.u_V - 0.5 - left, spots.v_V - 0.5 - above
-    column, row = left.astype(jnp.int32), above.astype(jnp.int32)
+    column, row = (jnp.floor(x - 0.5).astype(jnp.int32) for x in (spots.u_V, spots.v_V))
+    # Places may be computed anew for each use, and rounded to either side of the border of a pixel:
+    # these are computed once for all that follows, so that shares and pixels fit together.
+    column, row, u, v = jax.lax.optimization_barrier((column, row, spots.u_V, spots.v_V))
+    right, below = u - 0.5 - column, v - 0.5 - row
     values = [features_VF, spots.z_V[:, None], jnp.ones((len(features_VF), 1))]
     places = []
     for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)):
