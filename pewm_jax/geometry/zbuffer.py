@@ -15,7 +15,6 @@ import numpy as np
 from pewm_jax.geometry.cameras import invert_rigid
 from pewm_jax.types import Array, Camera
 
-
 NEAREST_M = 0.05
 """Points nearer to the camera plane than this are not seen, metres."""
 
@@ -53,9 +52,7 @@ def look(points_V3: Array, wide_V: Array, tall_V: Array, valid_V: Array, camera:
         camera: one camera.
     """
     world, (fx, fy, cx, cy) = invert_rigid(camera.world_from_camera), camera.intrinsics_4
-    x, y, z = (
-        sum((row[i] * points_V3[:, i] for i in range(3)), start=row[3]) for row in world[:3]
-    )
+    x, y, z = (sum((row[i] * points_V3[:, i] for i in range(3)), start=row[3]) for row in world[:3])
     there = valid_V & (z > NEAREST_M)
     near = 1 / jnp.where(there, z, 1)
     return Spots(

@@ -102,9 +102,7 @@ def _grid(config: MemorySettings) -> MemorySettings:
     return map2d.flattened(config) if isinstance(config, Map2DConfig) else config
 
 
-def _among(
-    config: MemorySettings, cell: Array, cell_V: Array, valid_V: Array, reach: int
-) -> Array:
+def _among(config: MemorySettings, cell: Array, cell_V: Array, valid_V: Array, reach: int) -> Array:
     """Return (...,) bool: whether cells, or those at most ``reach`` beside them, are in a list."""
     nowhere = math.prod(config.cells)
     listed = jnp.sort(jnp.where(valid_V, cell_V, nowhere))

@@ -19,7 +19,7 @@ import numpy as np
 
 from pewm_jax.geometry import zbuffer
 from pewm_jax.geometry.cameras import project
-from pewm_jax.geometry.zbuffer import NEAREST_M, Spots, window
+from pewm_jax.geometry.zbuffer import NEAREST_M, Spots
 from pewm_jax.types import Array, Camera
 
 TOLERANCE_M, TOLERANCE_RELATIVE = 0.05, 0.1

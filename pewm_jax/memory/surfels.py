@@ -3,8 +3,8 @@
 The voxel map keeps features of cells of a quarter of a metre; this keeps colours of cells of a few
 centimetres, so that what was seen can be shown again (``render``). Each surfel stands at the mean
 position of what fell into its cell and is as wide as the cell, or as a pixel of the camera that saw
-it was there if that is wider. What was observed beats what was imagined: the first observation of an
-imagined cell replaces it and, with ``memory.protect``, imagined frames change no observed cell.
+it was there if that is wider. What was observed beats what was imagined: the first observation of
+an imagined cell replaces it and, with ``memory.protect``, imagined frames change no observed cell.
 
 Cells are kept sorted, as the voxel map's are. Sums are added up in the order of the pixels, so that
 on a CPU equal frames make equal memories bit for bit.
