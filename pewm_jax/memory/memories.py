@@ -82,8 +82,8 @@ def remember(
 def trusted(model: ModelConfig, frames: Frames) -> Frames:
     """Return imagined frames with a depth of 0 where it is not to be remembered.
 
-    That is beyond ``memory.imagined_far`` of ``clip.far_m`` (walls that were never seen are imagined
-    at the end of the range), at the near end of the range (where a model puts what has no depth),
+    That is beyond ``memory.imagined_far`` of ``clip.far_m`` (walls never seen are imagined at the
+    end of the range), at the near end of the range (where a model puts what has no depth),
     and on both sides of an edge (``memory.imagined_edge``: there a depth between two surfaces is
     imagined, where nothing is).
 
@@ -134,8 +134,8 @@ def render(
 ) -> rendering.View:
     """Render the memory for cameras; nearer things hide farther ones.
 
-    Its points are drawn as wide as the cells of ``memory.cell_m``, unless it has a ``render`` of its
-    own. Static shapes; the memory ``none`` shows nothing. Large memories are drawn in branches, of
+    Its points are drawn as wide as the cells of ``memory.cell_m``, unless it has a ``render`` of
+    its own. Static shapes; the memory ``none`` shows nothing. Large memories are drawn in branches, of
     which ``jax.vmap`` runs both sides: render a batch by ``jax.lax.map``.
 
     Args:
