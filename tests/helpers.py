@@ -32,6 +32,7 @@ TINY = ModelConfig(
         cells=(24, 24, 8),
         capacity=2048,
         tokens=32,
+        imagined_edge=0.0,  # untrained models imagine nothing but edges
         reader=AttentionConfig(heads=4, head_dim=8),
     ),
     noise=DDPMConfig(sample_steps=3),
@@ -50,6 +51,7 @@ TINY = ModelConfig(
         cells=(24, 24, 8),
         capacity=2048,
         tokens=32,
+        imagined_edge=0.0,  # untrained models imagine nothing but edges
         reader=AttentionConfig(heads=4, head_dim=8),
     ),
     noise=DDPMConfig(sample_steps=3),
@@ -68,6 +70,7 @@ TINY = ModelConfig(
         cells=(24, 24, 8),
         capacity=2048,
         tokens=32,
+        imagined_edge=0.0,  # untrained models imagine nothing but edges
         reader=AttentionConfig(heads=4, head_dim=8),
     ),
     noise=DDPMConfig(sample_steps=3),
@@ -86,6 +89,7 @@ TINY = ModelConfig(
         cells=(24, 24, 8),
         capacity=2048,
         tokens=32,
+        imagined_edge=0.0,  # untrained models imagine nothing but edges
         reader=AttentionConfig(heads=4, head_dim=8),
     ),
     noise=DDPMConfig(sample_steps=3),

@@ -1,11 +1,10 @@
 """Which of many points conditions a clip: first those that its cameras can see.
 
-Each camera draws the points into a small z-buffer, as wide as they are. Every pixel of it names the
-point it shows. The pixels have their turn in a fixed order that goes round the bins of all images:
-in the first round each bin of each image names one point, in the second another pixel of each bin
-names one, and so on. So no camera and no part of an image is starved, and what covers much of an
-image is named early. Points that no pixel shows come after them: first those that lie on a surface
-that is seen, then those hidden in view, then all others.
+Each camera draws the points into a small z-buffer, as wide as they are; every pixel of it names the
+point it shows. Points named by most pixels come first: they stand for the largest part of what is
+to be imagined. Of equals the one whose pixel has the earlier turn, in an order that goes round all
+bins of the image, so that no part of it is starved. Then come points on a surface that is seen,
+then those hidden in view, then all others.
 """
 
 from __future__ import annotations
@@ -37,10 +36,9 @@ def turns(rows: int, columns: int) -> np.ndarray:
     row, column = np.divmod(np.arange(rows * columns), columns)
     v, u = row % BIN, column % BIN
     # The bits of u and v, lowest first: next turns are half a bin apart, then a quarter.
-    within = sum(
-        (((u ^ v) >> k & 1) * 2 + (v >> k & 1)) << 2 * (BIN.bit_length() - 2 - k)
-        for k in range(BIN.bit_length() - 1)
-    )
+    within = np.zeros_like(row)
+    for k in range(BIN.bit_length() - 1):
+        within += (((u ^ v) >> k & 1) * 2 + (v >> k & 1)) << 2 * (BIN.bit_length() - 2 - k)
     bins = (row // BIN) * (-(-columns // BIN)) + column // BIN
     scattered = np.random.default_rng(0).permutation(bins.max() + 1)[bins]
     order = np.lexsort((scattered, within))
@@ -65,8 +63,8 @@ def rank(
 ) -> Array:
     """Return (T, V) how early each camera would have each point; inf for points out of its view.
 
-    Below ``CLASS`` is the turn at which a pixel names the point; then follow points on a surface
-    that is seen, and from 2 ``CLASS`` on hidden ones, both by depth.
+    Below ``CLASS`` are points that pixels name, those of most pixels first; then follow points on a
+    surface that is seen, and from 2 ``CLASS`` on hidden ones, both by depth.
 
     Args:
         points_V3: (V, 3) in the world, metres.
@@ -84,7 +82,9 @@ def rank(
         small = Camera(camera.intrinsics_4 * scale, camera.world_from_camera)
         spots = zbuffer.look(points_V3, wide_V, tall_V, valid_V, small)
         front, shown = zbuffer.cover(spots, rows, columns, MOST)
-        named = jnp.full((count,), jnp.inf).at[shown].min(turn, mode="drop")
+        area = jnp.zeros((count,)).at[shown].add(1.0, mode="drop")
+        first = jnp.full((count,), jnp.inf).at[shown].min(turn / len(turn), mode="drop")
+        named = len(turn) - area + first
         u, v = spots.u_V, spots.v_V
         inside = spots.there_V & (u >= 0) & (u <= columns) & (v >= 0) & (v <= rows)
         column = jnp.clip(u, 0, columns - 1).astype(jnp.int32)
@@ -108,7 +108,7 @@ def visible_first(
 ) -> Array:
     """Return (≤ count,) indices of the points that condition one clip, the most useful first.
 
-    Points that a pixel of some camera shows, in the order of the pixels' turns; then points on a
+    Points that pixels of some camera show, those of most pixels first; then points on a
     seen surface and then hidden points in view, nearest first (by the smallest depth at which a
     camera has them); then others by distance to the nearest camera; invalid ones are last. Ties go
     to the lower index.
@@ -126,9 +126,9 @@ def visible_first(
     centres = jnp.asarray(camera.world_from_camera)[:, :3, 3]
     squares = sum((points_V3[None, :, i] - centres[:, None, i]) ** 2 for i in range(3))
     far = 3 * CLASS + jnp.sqrt(jnp.min(jnp.asarray(squares), 0))
-    # A turn of one camera comes before the next turn of any other.
-    first = jnp.argmin(rank_TV, 0).astype(jnp.float32) / (2 * len(centres))
+    pixels = float(np.prod(raster(size)))
+    area = jnp.where(rank_TV < CLASS, pixels + 1 - rank_TV, 0).sum(0)
     best = rank_TV.min(0)
-    best = jnp.where(best < CLASS, best + first, best)
+    best = jnp.where(best < CLASS, CLASS - area, best)
     score = jnp.where(valid_V, jnp.minimum(best, far), jnp.inf)
     return jax.lax.top_k(-score, min(count, len(points_V3)))[1]

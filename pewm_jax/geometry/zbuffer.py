@@ -55,11 +55,14 @@ def look(points_V3: Array, wide_V: Array, tall_V: Array, valid_V: Array, camera:
     x, y, z = (sum((row[i] * points_V3[:, i] for i in range(3)), start=row[3]) for row in world[:3])
     there = valid_V & (z > NEAREST_M)
     near = 1 / jnp.where(there, z, 1)
-    place = x * near * fx + cx, y * near * fy + cy
-    # The barrier keeps XLA from computing a place anew for each use, rounded to either side of the
-    # border of a pixel.
-    found = (*place, z, wide_V / 2 * fx * near, tall_V / 2 * fy * near, there)
-    return Spots(*jax.lax.optimization_barrier(found))
+    return Spots(
+        x * near * fx + cx,
+        y * near * fy + cy,
+        z,
+        wide_V / 2 * fx * near,
+        tall_V / 2 * fy * near,
+        there,
+    )
 
 
 def window(place: Array, half: Array, most: int) -> tuple[Array, Array]:

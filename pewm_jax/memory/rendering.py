@@ -27,6 +27,8 @@ LEAST = 1e-4
 """The least share of a point that shows it."""
 RASTER, REACH, PILE = 64, 8, 8
 """Of the images of cells, see ``splat_cells``."""
+MIDDLE = 1e-3
+"""Pixels before its middle at which a point begins to count as at its middle."""
 BLOCK = 16
 """Slots that are drawn or left out together."""
 SHARE = 3 / 8
@@ -251,9 +253,11 @@ def _shares(
     pixels: int,
 ) -> Array:
     """Return (H·W, F + 2) sums of the features, depth and 1 of the points around each pixel."""
-    left, above = jnp.floor(spots.u_V - 0.5), jnp.floor(spots.v_V - 0.5)
-    right, below = spots.u_V - 0.5 - left, spots.v_V - 0.5 - above
-    column, row = left.astype(jnp.int32), above.astype(jnp.int32)
+    # A place may be computed anew for each use, rounded to either side of the middle of a pixel,
+    # where a point that is seen again lies: the border between two pixels is moved from there.
+    u, v = spots.u_V - 0.5, spots.v_V - 0.5
+    column, row = (jnp.floor(x + MIDDLE).astype(jnp.int32) for x in (u, v))
+    right, below = jnp.maximum(u - column, 0), jnp.maximum(v - row, 0)
     values = [features_VF, spots.z_V[:, None], jnp.ones((len(features_VF), 1))]
     places = []
     for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)):
