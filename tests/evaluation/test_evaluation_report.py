@@ -231,7 +231,7 @@ def test_a_model_without_a_memory_gets_a_row(copied, tmp_path):
     none = rival(copied, tmp_path / "none", steps=1000)
     said = []
     report.evaluate(copied, say=said.append, none=none)
-    assert any("14 of 18 pieces were scored before" in line for line in said)
+    assert any("12 of 16 pieces were scored before" in line for line in said)
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     assert set(metrics["results"]) == {"memory", "empty", "none", "reproject", "copy"}
     assert metrics["results"]["none"] != metrics["results"]["empty"]
@@ -242,7 +242,7 @@ def test_a_model_without_a_memory_gets_a_row(copied, tmp_path):
     report.evaluate(copied, say=said.append, none=none)
     assert "nothing to do" in said[-1]
     report.evaluate(copied, say=said.append)
-    assert "--none" in said[-2]  # how to get the row
+    assert any("--none" in line for line in said)  # how to get the row
 
 
 def test_a_rival_that_cannot_be_compared_is_refused(copied, command, capsys, tmp_path):
