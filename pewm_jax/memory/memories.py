@@ -135,8 +135,8 @@ def render(
     """Render the memory for cameras; nearer things hide farther ones.
 
     Its points are drawn as wide as the cells of ``memory.cell_m``, unless it has a ``render`` of
-    its own. Static shapes; the memory ``none`` shows nothing. Large memories are drawn in branches, of
-    which ``jax.vmap`` runs both sides: render a batch by ``jax.lax.map``.
+    its own. Static shapes; the memory ``none`` shows nothing. Large memories are drawn in
+    branches, of which ``jax.vmap`` runs both sides: render a batch by ``jax.lax.map``.
 
     Args:
         model: the model.
