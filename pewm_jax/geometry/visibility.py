@@ -41,7 +41,7 @@ def turns(rows: int, columns: int) -> np.ndarray:
         within += (((u ^ v) >> k & 1) * 2 + (v >> k & 1)) << 2 * (BIN.bit_length() - 2 - k)
     bins = (row // BIN) * (-(-columns // BIN)) + column // BIN
     scattered = np.random.default_rng(0).permutation(bins.max() + 1)[bins]
-    order = np.lexsort((scattered, within))
+    order = np.lexsort((scattered, np.asarray(within)))
     turn = np.empty(len(order), np.int32)
     turn[order] = np.arange(len(order), dtype=np.int32)
     return turn
