@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from pewm_jax import cli
+from pewm_jax import cli, shipped
 from pewm_jax import config as configuration
 from pewm_jax.commands import imports
 
@@ -81,7 +81,7 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
 
 def _is_codec(run: Path) -> bool:
     """Tell whether a run trained a codec alone."""
-    file = run / "config.json"
+    file = shipped.find(run) / "config.json"
     return file.is_file() and isinstance(
         configuration.load(file).model, configuration.CodecWorldConfig
     )

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax import atomic
+from pewm_jax import atomic, shipped
 from pewm_jax.config import CodecWorldConfig, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation.images import psnr, unit_colours
@@ -42,19 +42,21 @@ def score(
     """Score a trained codec on a split and print and write the numbers.
 
     Args:
-        run: the folder of a finished run of the world `codec`.
+        run: the folder of a finished run of the world `codec`, or the name of a codec that comes
+            with the library.
         data: the data set's folder; by default the run's.
         split: the folder inside it; by default the run's ``evaluate.split``.
         say: told the numbers.
 
     Returns:
-        The file written, ``RUN/report/codec-SPLIT.json``. Scores are means over frames, then over
+        The file written, ``RUN/report/codec-SPLIT.json`` (``runs/NAME/report/…`` of a codec that
+        comes with the library). Scores are means over frames, then over
         episodes, then over scenes; ``error`` is the standard error over scenes.
 
     Raises:
         UserError: the run, its weights or the data are absent, damaged, or do not fit together.
     """
-    run = Path(run)
+    home, run = shipped.home(run), shipped.find(run)
     config, params = load_finished(run)
     if not isinstance(config.model, CodecWorldConfig):
         raise UserError(f"{run} holds a world model and no codec alone: use pewm-jax evaluate.")
@@ -88,8 +90,8 @@ def score(
         "parameters": sum(x.size for x in jax.tree.leaves(params["codec"])),
         "numbers": numbers,
     }
-    path = run / "report" / f"codec-{folder.name}.json"
-    path.parent.mkdir(exist_ok=True)
+    path = home / "report" / f"codec-{folder.name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
     atomic.write_text(path, json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     say(f"{folder}: {len(scenes)} scenes, {', '.join(sizes)} pixels")
     for line in _lines(numbers):

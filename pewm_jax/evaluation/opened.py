@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from pewm_jax import weights
+from pewm_jax import shipped, weights
 from pewm_jax.config import Config, ModelConfig, UserError, kinds
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.rollouts import load_finished
@@ -52,16 +52,16 @@ def folders(run: str | Path) -> tuple[Path, Path]:
     """Return where a run is and where its reports go.
 
     Args:
-        run: a run folder. (The name of a model that ships with the library belongs here: its files
-            are in the package, which is not written to, and its reports go to ``runs/NAME``.)
+        run: a run folder, or the name of a model that comes with the library: its files are in
+            the package, which is not written to, and its reports go to ``runs/NAME``.
 
     Raises:
         UserError: there is no such folder.
     """
-    folder = Path(run)
+    folder = shipped.find(run)
     if not folder.is_dir():
         raise UserError(f"{run} does not exist; train a model first, e.g. `python train.py demo`.")
-    return folder, folder
+    return folder, shipped.home(run)
 
 
 def open_run(run: str | Path) -> Opened:

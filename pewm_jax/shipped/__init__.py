@@ -27,3 +27,9 @@ def find(path: str | Path) -> Path:
     if not folder.exists() and str(path) in names():
         return HERE / str(path)
     return folder
+
+
+def home(path: str | Path) -> Path:
+    """Return where reports of weights go: beside them, or to ``runs/NAME`` if they came along."""
+    folder = find(path)
+    return Path("runs") / folder.name if folder.parent == HERE else folder
