@@ -156,8 +156,10 @@ def _training(facts: Facts) -> str:
         else:
             done = str(stage.steps) if number_ < (facts.stage or "") else f"0 of {stage.steps}"
         rows.append(f"| {number_} | {done} | {stage.batch} | {stage.learning_rate:g} | {what} |")
-    noise = kinds.of(facts.config.model.noise).name
-    tail = f"\n\nMoving average {train.ema:g}, seed {train.seed}, noise {noise}."
+    tail = f"\n\nMoving average {train.ema:g}, seed {train.seed}"
+    if not isinstance(facts.config.model, CodecWorldConfig):
+        tail += f", noise {kinds.of(facts.config.model.noise).name}"
+    tail += f". It started from `{train.start}`." if train.start else "."
     return head + "\n".join(rows) + tail
 
 

@@ -135,7 +135,10 @@ def is_published(run: Path, stage: stages.Stage, step: int) -> bool:
     """Tell whether the run's file of weights is of this stage and step, and undamaged."""
     path = run / WEIGHTS
     try:
-        if not path.exists() or not _metadata(stage, step).items() <= weights.metadata(path).items():
+        if (
+            not path.exists()
+            or not _metadata(stage, step).items() <= weights.metadata(path).items()
+        ):
             return False
         weights.verify(path)
     except UserError:
