@@ -1,7 +1,10 @@
 """Compile fast rather than well: tests are never timed, and compiling is most of what they do."""
 
+import gc
 import os
 import signal
+import sys
+from pathlib import Path
 
 from hypothesis import settings
 
@@ -31,6 +34,23 @@ SLOW = (
     "test_evaluation_report.py",
 )
 """Files of long programs: begun first, so that no worker is left alone with one at the end."""
+
+
+MAPS = Path("/proc/self/maps")
+MOST_MAPS = 25_000
+"""Linux lets a process map 65,530 regions of memory. Every compiled program takes several, and one
+too many ends the process."""
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Let go of compiled programs between files, where there are very many."""
+    another = nextitem is None or nextitem.path != item.path
+    if another and "jax" in sys.modules and MAPS.exists():
+        with MAPS.open("rb") as file:
+            count = sum(1 for _ in file)
+        if count > MOST_MAPS:
+            sys.modules["jax"].clear_caches()
+            gc.collect()
 
 
 def pytest_collection_modifyitems(items):
