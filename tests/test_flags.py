@@ -246,7 +246,7 @@ def test_a_negated_old_flag_switches_off():
 @pytest.mark.parametrize("name", ["images", "pewm_2b"])
 def test_a_whole_file_of_an_earlier_version_takes_the_place_of_any_preset(name):
     file = VERSION_1 / f"{name}.json"
-    assert parse("--config", file, default=presets.load("demo")) == configuration.load(file)
+    assert parse("--config", file, default=presets.load("pixels")) == configuration.load(file)
 
 
 def test_a_kind_may_need_another_setting_to_fit(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from pewm_jax import rollouts, worlds
 from pewm_jax.config import UserError
 from pewm_jax.geometry import actions as action_geometry
-from pewm_jax.memory import voxel_map
+from pewm_jax.memory import memories, voxel_map
 from pewm_jax.models import encoders
 from pewm_jax.types import Frames
 from tests.helpers import init_world, random_frames, randomise, tiny_config
@@ -49,11 +49,12 @@ def test_discrete_and_continuous_actions_agree(params):
     np.testing.assert_array_equal(by_name.rgb_THWC, by_number.rgb_THWC)
 
 
-def test_imagined_frames_enter_the_map_exactly_as_observed_ones(params):
+def test_imagined_frames_enter_the_map_as_observed_ones_where_they_are_trusted(params):
     state = a_state(params)
     after, frames = roll(CONFIG, params, state, ACTIONS[:8], jax.random.key(1))
     features = encoders.encode(MODEL.memory.encoder, {}, frames.rgb_THWC)
-    expected = voxel_map.insert_frames(MODEL.memory, state.map, frames, features)
+    trusted = memories.trusted(MODEL, frames)
+    expected = voxel_map.insert_frames(MODEL.memory, state.map, trusted, features)
     for name in ("cell_of_slot_V", "features_VF", "occupied"):
         np.testing.assert_array_equal(getattr(after.map, name), getattr(expected, name))
     assert int(after.map.occupied) > int(state.map.occupied)

@@ -138,6 +138,8 @@ def _memory(old: Values, under: Kinds) -> Values:
         _move(old, name, reader, name)
     if kind in ("voxel", "map2d", "points", "none"):
         old.pop("snapshots", None)
+    if reader:
+        reader = {"kind": "attend", **reader}  # there was no other
     parts = {"encoder": encoder, "reader": reader}
     return new | old | {name: part for name, part in parts.items() if part}
 

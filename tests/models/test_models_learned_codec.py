@@ -49,9 +49,9 @@ def test_frames_are_coded_each_by_itself_under_jit_or_not(params):
     for b in range(2):
         for t in range(3):
             one = codecs.encode(TINY, params, video[b : b + 1, t : t + 1])
-            np.testing.assert_allclose(one[0, 0], latents[b, t], atol=1e-5)
+            np.testing.assert_allclose(one[0, 0], latents[b, t], atol=1e-5, rtol=1e-5)
             back = codecs.decode(TINY, params, one)
-            np.testing.assert_allclose(back[0, 0], made[b, t], atol=1e-5)
+            np.testing.assert_allclose(back[0, 0], made[b, t], atol=1e-4, rtol=1e-4)
 
 
 def test_normalised_latents_have_mean_0_and_variance_1_and_decode_the_same(params):
