@@ -33,7 +33,7 @@ SMALLER = {
         "--train.preview_every 0 --train.mesh.fsdp 1"
     ),
     "python -m pewm_jax.convert import cogvideox CogVideoX-2b world": shlex.split(
-        "--height 48 --width 48 --config small_memory.json"
+        "--height 64 --width 64 --config small_memory.json"
     ),
     "python -m pewm_jax.memory cache": ["--size", "28"],
     "python -m pewm_jax.convert export stablehlo": ["--what", "denoise", "--no_check"],
