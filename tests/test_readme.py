@@ -152,7 +152,7 @@ def test_the_commands_and_then_the_example_work_as_written(folder):
     (example,) = blocks("python")
     assert len([line for line in example.splitlines() if line.strip()]) <= 15
     out = run([sys.executable, "-c", example], folder)
-    assert out.startswith("(8, 48, 48, 3) (8, 48, 48)\n")
+    assert out.startswith("(8, 64, 64, 3) (8, 64, 64)\n")
     assert "cells remembered" in out
 
 
