@@ -8,6 +8,7 @@ leaf, is an error that lists them.
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -154,6 +155,16 @@ def require_like(tree: Any, like: Any, what: str) -> None:
     wrong = mismatches(tree, like)
     if wrong:
         raise TreeError(f"{what} does not fit this configuration: {listing(wrong)}.")
+
+
+def digest(tree: Any) -> str:
+    """Return a hash of paths, shapes and values as float32, whatever dtype they are stored in."""
+    found = hashlib.sha256()
+    for path, leaf in sorted(flatten(tree).items()):
+        values = np.ascontiguousarray(jax.device_get(leaf), np.float32)
+        found.update(f"{path} {values.shape}".encode())
+        found.update(values.data)
+    return found.hexdigest()
 
 
 def listing(items: Iterable[str], most: int = _LISTED) -> str:

@@ -28,6 +28,9 @@ class DataConfig:
     """Clips that are encoded, and their memories built and shown, once before the first step, kept
     in main memory, and drawn again and again; 0 does this at every step, each time with new clips.
     A CPU needs longer for that than for the step itself."""
+    prepared_path: str = ""
+    """Folder that keeps prepared clips on disk (about 1 MB each at 64 × 64), for this run when it
+    is resumed and for others that prepare the same; empty: in main memory alone."""
     workers: int = 0
     """Threads that read and decode data ahead of training; 0 means one."""
     bad_records: int = 0
@@ -79,6 +82,9 @@ class TrainSettings:
     """Folder with weights to start from, made by `python -m pewm_jax.convert import … --rgbd
     --camera` or an earlier run; if empty, weights are random. Weights that the first stage does not
     use, such as memory blocks in stage 1, are not loaded and start afresh later."""
+    optimizer: Literal["adam", "muon"] = "adam"
+    """`adam`, or `muon` for the matrices of hidden layers (orthogonalised momentum, with Adam's
+    size of step) and Adam for the rest; Muon needs fewer steps, and keeps one moment less."""
     weight_decay: float = 0.0
     """Decoupled weight decay on matrices."""
     clip_norm: float = 1.0
@@ -109,6 +115,9 @@ class TrainSettings:
     depth_noise: float = 0.0
     """Size of the noise on the observed first frame's depth, as a share of the depth; the size of
     each clip's is drawn up to this. Imagined depth is as wrong as that, or it drifts."""
+    hidden: float = 0.0
+    """Share of clips from which the memory is hidden while it is read in training, so that the
+    model stays good without; for stages that train the backbone with a memory."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
     """If a loss or gradient is not finite: `stop` training, or `skip` the update and count it."""
     grace_s: float = 30.0
@@ -133,6 +142,9 @@ class TrainSettings:
             0 <= self.depth_noise < 1,
             f"train.depth_noise is {self.depth_noise}: use a share of the depth in [0, 1).",
         )
+        require(
+            0 <= self.hidden < 1, f"train.hidden is {self.hidden}: use a share of clips in [0, 1)."
+        )
         for pattern in self.fresh:
             require(is_pattern(pattern), f"train.fresh: {pattern!r} is no regular expression.")
         require(self.seed >= 0, f"train.seed is {self.seed}: use 0 or a positive number.")
@@ -147,12 +159,14 @@ class TrainSettings:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig(TrainSettings):
-    """Training of PEWM in two stages, as in the paper."""
+    """Training of PEWM in two stages, as in the paper, and an optional third."""
 
     stage1: StageConfig = StageConfig()
     """The backbone learns without memory: domain, camera control, RGB-D."""
     stage2: StageConfig = StageConfig()
     """Only the memory blocks learn; all other weights stay bit-identical."""
+    joint: StageConfig = StageConfig(steps=0)
+    """Backbone and memory blocks learn together (not in the paper); by default left out."""
 
     def __post_init__(self):
         """Validate."""

@@ -246,9 +246,15 @@ class _Worker:
         """Prepare clips, the same however often training stopped, and draw from them."""
         seed = self.stage.data_seed(self.config)
         batch = self.settings.batch
-        fresh = loader.clips(self.config, "train", seed=seed, batch=batch, bad=self.bad)
+
+        def read(first: int) -> Iterator[Clip]:
+            chosen = prepared.seed(self.config, self.stage)
+            return loader.clips(
+                self.config, "train", seed=chosen, batch=batch, bad=self.bad, start_step=first
+            )
+
         clips = prepared.gather(
-            self.config, self.stage, state.params, iter(fresh), self.stop.unless_requested
+            self.config, self.stage, state.params, read, self.stop.unless_requested
         )
         if clips is None:
             raise self.stop.interrupted(self.stage.title, done)

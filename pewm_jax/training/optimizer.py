@@ -1,18 +1,21 @@
-"""Adam with warm-up, clipping and decoupled weight decay, masked to what a stage trains.
+"""Adam or Muon with warm-up, clipping and decoupled weight decay, masked to what a stage trains.
 
-``optax.partition`` sends every leaf to one of two transformations by the stage's labels: to Adam,
-with the clipping inside, or to zero. So frozen leaves have no moments and their gradients do not
-enter the norm that is clipped. (``optax.masked`` alone would pass raw gradients through to them.)
+``optax.partition`` sends every leaf to one of two transformations by the stage's labels: to the
+optimizer, with the clipping inside, or to zero. So frozen leaves have no moments and their
+gradients do not enter the norm that is clipped. (``optax.masked`` alone would pass raw gradients
+through to them.)
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from optax.contrib import MuonDimensionNumbers, scale_by_muon
 
 from pewm_jax import tree
 from pewm_jax.config import Config, StageConfig
@@ -59,14 +62,70 @@ def make(config: Config, stage: Stage) -> optax.GradientTransformation:
     def decayed(trained: Params) -> Params:
         return tree.assign(DECAYED, trained, "weight-decay mask")
 
-    adam = optax.chain(
+    trains = optax.chain(
         optax.clip_by_global_norm(config.train.clip_norm),
-        optax.scale_by_adam(),
+        muon() if config.train.optimizer == "muon" else optax.scale_by_adam(),
         optax.add_decayed_weights(config.train.weight_decay, mask=decayed),
         optax.scale_by_learning_rate(schedule(stage.settings(config))),
         *([_rates(stage)] if stage.rates else []),
     )
-    return optax.partition({TRAIN: adam, FREEZE: optax.set_to_zero()}, stage.labels)
+    return optax.partition({TRAIN: trains, FREEZE: optax.set_to_zero()}, stage.labels)
+
+
+MATRICES = (
+    (
+        r"(.*/)?(embed|patch_embed|text_embed|proj_out|modulate_out|into|out|direct)[^/]*/kernel",
+        False,
+    ),
+    (r"(.*/)?kernel", True),
+    (r".*", False),
+)
+"""Which leaves Muon changes: matrices between hidden layers, and not the first and the last."""
+STACKED = "blocks"
+"""Folder of parameters whose first axis counts layers."""
+MUON_RMS = 0.2
+"""Root mean square of Muon's updates, as Adam's are in practice, so that one learning rate does for
+both (Liu et al. 2025, "Muon is scalable for LLM training", Eq. 4)."""
+
+
+def muon() -> optax.GradientTransformation:
+    """Return Muon for the matrices of hidden layers, and Adam for everything else.
+
+    Muon steps along the nearest orthogonal matrix to the momentum (Jordan 2024; ``optax.contrib``).
+    A convolution is a matrix from all its inputs to its outputs; layers that are stacked count one
+    by one.
+    """
+
+    def names(trained: Params) -> Params:
+        matrices = tree.assign(MATRICES, trained, "Muon's matrices")
+        return jax.tree.map(lambda is_matrix: "muon" if is_matrix else "adam", matrices)
+
+    def sized(updates: Any, params: Any = None) -> Any:
+        del params
+        return jax.tree_util.tree_map_with_path(_sized, updates)
+
+    hidden = optax.chain(scale_by_muon(weight_dimension_numbers=_axes), optax.stateless(sized))
+    return optax.partition({"muon": hidden, "adam": optax.scale_by_adam()}, names)
+
+
+def _axes(updates: Params) -> Params:
+    """Return which axes of each matrix are inputs and which outputs."""
+
+    def of(path: Any, leaf: Array) -> MuonDimensionNumbers:
+        return MuonDimensionNumbers(tuple(range(_first(path), leaf.ndim - 1)), leaf.ndim - 1)
+
+    return jax.tree_util.tree_map_with_path(of, updates)
+
+
+def _sized(path: Any, update: Array) -> Array:
+    """Give an orthogonal update the size of Adam's."""
+    inputs = math.prod(update.shape[_first(path) : -1])
+    return MUON_RMS * math.sqrt(max(inputs, update.shape[-1])) * update
+
+
+def _first(path: Any) -> int:
+    """Return the first axis of a matrix that is at this path: 1 where layers are stacked."""
+    return int(any(getattr(key, "key", None) == STACKED for key in path))
 
 
 def _rates(stage: Stage) -> optax.GradientTransformation:

@@ -3,23 +3,34 @@
 What a step computes with frozen weights, before anything that is trained, is the same each time a
 clip is drawn: its latents, its memory, what the memory shows. On a CPU that takes longer than the
 step itself. With ``data.prepared`` that many clips are prepared before the first step, kept in this
-process's main memory, and batches are drawn from them.
+process's main memory, and batches are drawn from them. With ``data.prepared_path`` they lie in that
+folder instead, a file for each batch: the next run that prepares the same finds them, and one that
+was stopped goes on where it stopped. A subfolder is named by a hash of all that they depend on.
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
 import itertools
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from pewm_jax import config as configuration
+from pewm_jax import tensor_files, tree
 from pewm_jax.config import Config, UserError
+from pewm_jax.data.dataset import read_manifest
 from pewm_jax.data.progress import Meter
 from pewm_jax.training.stages import Stage
 from pewm_jax.types import Clip, Params
+
+VERSION = 1
+"""Of what prepared clips hold; another one prepares them again."""
 
 
 def applies(config: Config, stage: Stage) -> bool:
@@ -47,50 +58,113 @@ def gather(
     config: Config,
     stage: Stage,
     params: Params,
-    batches: Iterator[Clip],
+    read: Callable[[int], Iterator[Clip]],
     unless_stopped: Callable[[Callable[[], Any]], Any],
-) -> Clip | None:
-    """Prepare at least ``data.prepared`` clips.
+) -> list[Clip] | None:
+    """Prepare at least ``data.prepared`` clips, or find them prepared.
 
     Args:
         config: the experiment.
         stage: says how (``Stage.prepare``).
         params: the weights; those that prepare clips are frozen.
-        batches: where the clips come from.
+        read: returns the batches of clips to prepare, from that of the given number on.
         unless_stopped: calls what it is given, or returns None when training shall stop.
 
     Returns:
-        All clips as one batch of NumPy arrays; None if training shall stop.
+        Batches of NumPy arrays, in memory or in files that are mapped; None if training shall stop.
     """
     assert stage.prepare is not None
     make = jax.jit(functools.partial(stage.prepare, config.model))
-    kept: list[Clip] = []
     count = -(-config.data.prepared // stage.settings(config).batch)
-    with Meter(f"preparing {stage.title}'s clips", count, "batches") as meter:
-        for _ in range(count):
+    folder = _folder(config, stage, params) if config.data.prepared_path else None
+    kept: list[Clip] = []
+    if folder is not None:
+        like = jax.eval_shape(make, params, next(read(0)))
+        while len(kept) < count and (file := _file(folder, len(kept))).is_file():
+            kept.append(_mapped(file, like))
+    if len(kept) == count:
+        return kept
+    batches = read(len(kept))
+    with Meter(f"preparing {stage.title}'s clips", count - len(kept), "batches") as meter:
+        for number in range(len(kept), count):
             batch = unless_stopped(lambda: next(batches))
             if batch is None:
                 return None
-            kept.append(jax.device_get(make(params, batch)))
+            clip = jax.device_get(make(params, batch))
+            if folder is not None:
+                leaves = tree.flatten(clip)
+                file = _file(folder, number)
+                tensor_files.write(file, leaves, leaves.items(), tensor_files.header({}))
+                clip = _mapped(file, like)
+            kept.append(clip)
             meter.advance(1)
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *kept)
+    return kept
 
 
-def draw(clips: Clip, batch: int, seed: int, start: int = 0) -> Iterator[Clip]:
+def seed(config: Config, stage: Stage) -> int:
+    """Return the seed by which clips to prepare are chosen, alike in stages that read a memory."""
+    return config.train.seed + 1 + stage.memory
+
+
+def _folder(config: Config, stage: Stage, params: Params) -> Path:
+    """Return the folder of these clips, named after all that they depend on."""
+    model = configuration.to_dict(config.model)
+    for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
+        model.pop(part, None)
+    data = configuration.to_dict(config.data)
+    split = read_manifest(Path(config.data.path) / "train")
+    for setting in ("path", "features", "prepared", "prepared_path", "workers", "bad_records"):
+        data.pop(setting)
+    frozen = {name: params[name] for name in ("codec", "encoder") if name in params}
+    facts = {
+        "version": VERSION,
+        "model": model,
+        "data": data,
+        "split": [shard.sha256 for shard in split.shards],
+        "weights": tree.digest(frozen),
+        "memory": stage.memory,
+        "seed": seed(config, stage),
+        "batch": stage.settings(config).batch,
+    }
+    text = json.dumps(facts, sort_keys=True)
+    kind = "memory" if stage.memory else "frames"
+    name = f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    return Path(config.data.prepared_path) / name
+
+
+def _file(folder: Path, number: int) -> Path:
+    return folder / f"{number:05}.safetensors"
+
+
+def _mapped(file: Path, like: Clip) -> Clip:
+    """Map a file of prepared clips, and refuse one of other shapes."""
+    found, names = tensor_files.mapped(file), tree.flatten(like)
+    for name, leaf in names.items():
+        if name not in found or found[name].shape != leaf.shape or found[name].dtype != leaf.dtype:
+            raise UserError(
+                f"{file} does not hold the prepared clips that this run needs ({name} differs): "
+                "remove its folder, and they are prepared again."
+            )
+    return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name in names])
+
+
+def draw(prepared: Sequence[Clip], batch: int, seed: int, start: int = 0) -> Iterator[Clip]:
     """Draw batches without end; batch k depends on the seed and on k alone.
 
     Every clip comes once before any comes again, in another order each time.
 
     Args:
-        clips: from ``gather``, N of them.
+        prepared: from ``gather``: batches that hold N clips in all.
         batch: clips in a batch, at most N.
         seed: of the order.
         start: number of the first batch.
     """
-    count = len(jax.tree.leaves(clips)[0])
+    sizes = [len(jax.tree.leaves(part)[0]) for part in prepared]
+    places = [(part, row) for part, size in enumerate(sizes) for row in range(size)]
     for number in itertools.count(start):
-        chosen = _rows(count, batch, seed, number)
-        yield jax.tree.map(lambda x, chosen=chosen: x[chosen], clips)
+        chosen = [places[row] for row in _rows(len(places), batch, seed, number)]
+        clips = (jax.tree.map(lambda x, r=row: x[r], prepared[part]) for part, row in chosen)
+        yield jax.tree.map(lambda *rows: np.stack(rows), *clips)
 
 
 def rows(config: Config, stage: Stage, number: int) -> list[int]:

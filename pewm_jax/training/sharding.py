@@ -39,7 +39,7 @@ def rules(model: WorldSettings) -> tuple[tuple[str, P], ...]:
     parameters = worlds.sharding(model)
     return (
         *((rf"(params|ema|opt_state/.+)/{path}", spec) for path, spec in parameters),
-        (r"opt_state/.*count", WHOLE),
+        (r"opt_state/.*(count|ns_coeffs)", WHOLE),
         (r"step", WHOLE),
     )
 

@@ -10,8 +10,15 @@ __all__ = ["FREEZE", "TRAIN", "Stage", "all_stages", "planned"]
 
 
 def all_stages(config: Config) -> tuple[Stage, ...]:
-    """Return all stages that the experiment's world names, in order."""
-    return worlds.stages(config.model)
+    """Return the stages that the experiment's world names, in order.
+
+    Optional ones without steps are left out.
+    """
+    return tuple(
+        stage
+        for stage in worlds.stages(config.model)
+        if not stage.optional or stage.settings(config).steps > 0
+    )
 
 
 def planned(config: Config) -> tuple[Stage, ...]:

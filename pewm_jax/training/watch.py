@@ -134,13 +134,14 @@ class Watch:
 
     def _records(self, step: int) -> dict[str, object]:
         """Return the names of the records in a step's batch, or why they cannot be found."""
-        seed, batch = self.stage.data_seed(self.config), self.settings.batch
+        once, batch = self.config.data.prepared > 0, self.settings.batch
+        seed = prepared.seed(self.config, self.stage) if once else self.stage.data_seed(self.config)
 
         def read(number: int) -> list[str]:
             return loader.records(self.config, "train", seed=seed, batch=batch, step=number)
 
         try:
-            if self.config.data.prepared:
+            if once:
                 rows = prepared.rows(self.config, self.stage, step - 1)
                 names = [read(row // batch)[row % batch] for row in rows]
             else:

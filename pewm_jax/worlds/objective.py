@@ -128,6 +128,9 @@ def loss(
     sight = clip.sight if memory else None
     if memory and sight is None:
         sight = clip_sight(model, params, clip)
+    if sight is not None and train.hidden:
+        kept = jax.random.bernoulli(jax.random.fold_in(key, 4), 1 - train.hidden, (batch,))
+        sight = shown(sight, kept)
     inputs, network_time = noises.shown(model.noise, x_t, times)
     prediction = world_model.apply(model, params, inputs, conditioning, network_time, sight)
 
@@ -142,6 +145,17 @@ def loss(
     channels = error.shape[-1]
     total = (rgb * split + depth * (channels - split)) / channels
     return total, {"loss_rgb": rgb, "loss_depth": depth}
+
+
+def shown(sight: Sight, kept_B: Array) -> Sight:
+    """Hide what the memory shows from the clips of a batch that are not kept."""
+    tokens, view = sight.tokens, sight.view
+    if tokens is not None:
+        tokens = dataclasses.replace(tokens, valid_M=tokens.valid_M & kept_B[:, None])
+    if view is not None:
+        seen = view.seen_THW & kept_B[:, None, None, None]
+        view = dataclasses.replace(view, seen_THW=seen)
+    return Sight(tokens, view)
 
 
 def wrong(key: Array, shape: tuple[int, ...], most: float) -> Array:

@@ -45,13 +45,24 @@ STAGES = (
         memory=True,
         prepare=functools.partial(objective.prepare, memory=True),
     ),
+    Stage(
+        name="joint",
+        number=3,
+        rules=((r"(backbone|control|memory)/.*", TRAIN), (r"(codec|encoder|text)/.*", FREEZE)),
+        init=world_model.init,
+        loss=objective.with_memory,
+        memory=True,
+        prepare=functools.partial(objective.prepare, memory=True),
+        optional=True,
+    ),
 )
 """Stage 1 adapts the backbone to the domain, the control and RGB-D, without memory. Stage 2 adds
-the memory reader, which has no effect at first, and trains only that."""
+the memory reader, which has no effect at first, and trains only that. Stage ``joint``, which is
+ours and is left out unless it has steps, then trains both."""
 
 
 def stages(model: ModelConfig) -> tuple[Stage, ...]:
-    """Return the paper's two stages."""
+    """Return the paper's two stages, and the optional third."""
     del model
     return STAGES
 

@@ -114,7 +114,7 @@ def test_every_value_moves_to_its_place_and_none_is_lost_or_invented(memory, enc
     values["codec"]["kind"] = codec
     values["memory"] |= {"kind": memory, "encoder": encoder}
     before = flat(configuration.upgrade(values, "here"))
-    arrived = {"version"}
+    arrived = {"version", "model.memory.reader.kind"}  # version 1 knew one reader, unnamed
     for path in flat(values):
         there = now_called(path, memory, encoder, codec)
         if path in ("codec.kind", "memory.kind", "memory.encoder"):
