@@ -108,7 +108,7 @@ def muon() -> optax.GradientTransformation:
     return optax.partition({"muon": hidden, "adam": optax.scale_by_adam()}, names)
 
 
-def _axes(updates: Params) -> Params:
+def _axes(updates: Any) -> Any:
     """Return which axes of each matrix are inputs and which outputs."""
 
     def of(path: Any, leaf: Array) -> MuonDimensionNumbers:
