@@ -167,6 +167,8 @@ class TrainConfig(TrainSettings):
     """Only the memory blocks learn; all other weights stay bit-identical."""
     joint: StageConfig = StageConfig(steps=0)
     """Backbone and memory blocks learn together (not in the paper); by default left out."""
+    gate: StageConfig = StageConfig(steps=0)
+    """The codec's gate learns on what the model imagines (not the paper's); left out too."""
 
     def __post_init__(self):
         """Validate."""

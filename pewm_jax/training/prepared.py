@@ -109,13 +109,14 @@ def seed(config: Config, stage: Stage) -> int:
 def _folder(config: Config, stage: Stage, params: Params) -> Path:
     """Return the folder of these clips, named after all that they depend on."""
     model = configuration.to_dict(config.model)
-    for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
-        model.pop(part, None)
+    if "backbone" not in stage.prepares_by:
+        for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
+            model.pop(part, None)
     data = configuration.to_dict(config.data)
     split = read_manifest(Path(config.data.path) / "train")
     for setting in ("path", "features", "prepared", "prepared_path", "workers", "bad_records"):
         data.pop(setting)
-    frozen = {name: params[name] for name in ("codec", "encoder") if name in params}
+    frozen = {name: params[name] for name in stage.prepares_by if name in params}
     facts = {
         "version": VERSION,
         "model": model,
@@ -123,6 +124,7 @@ def _folder(config: Config, stage: Stage, params: Params) -> Path:
         "split": [shard.sha256 for shard in split.shards],
         "weights": tree.digest(frozen),
         "memory": stage.memory,
+        "by": stage.prepares_by,
         "seed": seed(config, stage),
         "batch": stage.settings(config).batch,
     }

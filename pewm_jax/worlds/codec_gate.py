@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -63,30 +65,53 @@ def mix(
     level = jax.random.uniform(level_key, (len(latents), 1, 1, 1, 1), maxval=train.gate_noise)
     noisy = latents + level * jax.random.normal(noise_key, latents.shape)
     rgb, depth = codecs.decode_rgbd(model, params, noisy)  # type: ignore[arg-type]
-    decoded = _four(model, rgb, depth)
-    truth = _four(model, later.rgb_THWC, later.depth_THW)
+    return score(model, params["codec"]["gate"], rgb, depth, shown_BTHWC, seen_BTHW, later)
 
-    shape = (-1, *truth.shape[-3:])
-    decoded, shown, truth = (x.reshape(shape) for x in (decoded, shown_BTHWC, truth))
+
+def score(
+    model: Any,
+    gate: Params,
+    rgb_BTHWC: Array,
+    depth_BTHW: Array,
+    shown_BTHWC: Array,
+    seen_BTHW: Array,
+    truth: Frames,
+) -> tuple[Array, dict[str, Array]]:
+    """Return the loss of what a gate makes of decoded frames and of the rendered memory; see above.
+
+    Args:
+        model: the model; its clip says what depth is as a signal.
+        gate: the gate's parameters.
+        rgb_BTHWC: decoded colours.
+        depth_BTHW: decoded depth, metres.
+        shown_BTHWC: colour and depth signal of the memory, 4 channels.
+        seen_BTHW: where it shows anything.
+        truth: the recorded frames, colours in [−1, 1].
+    """
+    decoded = _four(model, rgb_BTHWC, depth_BTHW)
+    wanted = _four(model, truth.rgb_THWC, truth.depth_THW)
+    shape = (-1, *wanted.shape[-3:])
+    decoded, shown, wanted = (x.reshape(shape) for x in (decoded, shown_BTHWC, wanted))
     decoded = jax.lax.stop_gradient(decoded)
-    seen = seen_BTHW.reshape(-1, *truth.shape[1:3])
-    made = gates.apply(params["codec"]["gate"], decoded, shown, seen)
-    measured = (later.depth_THW.reshape(seen.shape) > 0).astype(made.dtype)
+    seen = seen_BTHW.reshape(-1, *wanted.shape[1:3])
+    made = gates.apply(gate, decoded, shown, seen)
+    depth = truth.depth_THW.reshape(seen.shape)
+    measured = (depth > 0).astype(made.dtype)
     counts = jnp.stack([jnp.ones_like(measured)] * 3 + [measured], -1)
-    error = (made - truth) * counts
+    error = (made - wanted) * counts
     loss = (jnp.square(error).sum() + ABSOLUTE * jnp.abs(error).sum()) / counts.sum()
-    off = jnp.abs(depth_from_signal(model.clip, made[..., 3]) - later.depth_THW.reshape(seen.shape))
+    off = jnp.abs(depth_from_signal(model.clip, made[..., 3]) - depth)
     hit = seen[..., None].astype(made.dtype)
     return loss, {
-        "psnr_rgb": _psnr(made, truth, jnp.ones_like(hit)),
-        "psnr_decoded": _psnr(decoded, truth, jnp.ones_like(hit)),
-        "psnr_seen": _psnr(made, truth, hit),
-        "psnr_rendered": _psnr(shown, truth, hit),
+        "psnr_rgb": _psnr(made, wanted, jnp.ones_like(hit)),
+        "psnr_decoded": _psnr(decoded, wanted, jnp.ones_like(hit)),
+        "psnr_seen": _psnr(made, wanted, hit),
+        "psnr_rendered": _psnr(shown, wanted, hit),
         "depth_m": (off * measured).sum() / jnp.maximum(measured.sum(), 1),
     }
 
 
-def _four(model: CodecWorldConfig, rgb: Array, depth: Array) -> Array:
+def _four(model: Any, rgb: Array, depth: Array) -> Array:
     """Return colour and depth signal in 4 channels."""
     return jnp.concatenate([rgb, signal_from_depth(model.clip, depth)[..., None]], -1)
 

@@ -22,15 +22,16 @@ FINE = 0.3
 """The noise on depth that differs from pixel to pixel, as a share of the broad noise."""
 
 
-def clip_sight(model: ModelConfig, params: Params, clip: Clip) -> Sight:
+def clip_sight(model: ModelConfig, params: Params, clip: Clip, *, pictures: bool = False) -> Sight:
     """Build every clip's memory from its context and return what it shows, leading axis B.
 
-    Pictures are rendered clip by clip: one by itself fits a processor's cache.
+    Pictures are rendered clip by clip: one by itself fits a processor's cache. They are made even
+    if the reader needs none where ``pictures`` asks for them.
     """
 
     def of_clip(context: Frames, valid_S: Array, features: Array, camera: Camera) -> Sight:
         memory = memories.from_context(model, {}, context, valid_S, features)
-        return memories.look(model, memory, camera)
+        return memories.look(model, memory, camera, pictures=pictures)
 
     def of_batch(weights: Params, clip: Clip) -> Sight:
         features = clip.context_features_ShwF
@@ -38,7 +39,7 @@ def clip_sight(model: ModelConfig, params: Params, clip: Clip) -> Sight:
             features = _encode(model, weights, clip.context.rgb_THWC)
         context = as_signal(clip.context)
         parts = context, clip.context_valid_S, features, clip.frames.camera
-        if model.memory.reader.READS_VIEW:
+        if pictures or model.memory.reader.READS_VIEW:
             return jax.lax.map(lambda one: of_clip(*one), parts)
         return jax.vmap(of_clip)(*parts)
 

@@ -15,16 +15,16 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import ModelConfig, UserError, functions
-from pewm_jax.diffusion import noise as noises
 from pewm_jax.memory import memories
 from pewm_jax.models import codecs, encoders, world_model
 from pewm_jax.models.signals import as_signal
-from pewm_jax.types import Array, Control, Frames, Params, Sight, WorldState
-from pewm_jax.worlds import objective, pewm_costs
+from pewm_jax.types import Array, Control, Frames, Params, WorldState
+from pewm_jax.worlds import objective, pewm_costs, pewm_gate, sampling
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 init = world_model.init
+sample = sampling.sample
 costs = pewm_costs.costs
 
 STAGES = (
@@ -55,14 +55,26 @@ STAGES = (
         prepare=functools.partial(objective.prepare, memory=True),
         optional=True,
     ),
+    Stage(
+        name="gate",
+        number=4,
+        rules=((r"codec/gate/.*", TRAIN), (r".*", FREEZE)),
+        init=world_model.init,
+        loss=pewm_gate.loss,
+        memory=True,
+        prepare=pewm_gate.prepare,
+        prepares_by=("backbone", "control", "memory", "codec", "encoder", "text"),
+        optional=True,
+    ),
 )
 """Stage 1 adapts the backbone to the domain, the control and RGB-D, without memory. Stage 2 adds
-the memory reader, which has no effect at first, and trains only that. Stage ``joint``, which is
-ours and is left out unless it has steps, then trains both."""
+the memory reader, which has no effect at first, and trains only that. Stages ``joint``
+and ``gate``, which are ours and are left out unless they have steps, then train both, and the
+codec's gate on what the model imagines."""
 
 
 def stages(model: ModelConfig) -> tuple[Stage, ...]:
-    """Return the paper's two stages, and the optional third."""
+    """Return the paper's two stages, and two optional ones."""
     del model
     return STAGES
 
@@ -174,7 +186,7 @@ def imagine_clip(
     if memory and "memory" in params:
         shown = memories.look(model, state.map, camera, pictures=memories.gated(model))
         sight = jax.tree.map(lambda x: x[None], shown)
-    latents = _sample(model, params, conditioning, sight, key)
+    latents = sampling.draw(model, params, conditioning, sight, key)
     rgb, depth = codecs.decode_rgbd(model, params, latents)
     if sight is not None and memories.gated(model):
         rgb, depth = codecs.mix(model, params, rgb, depth, sight.view)
@@ -186,62 +198,6 @@ def imagine_clip(
     last = frames.depth_THW.shape[0] - 1 if valid_T is None else valid_T.sum() - 1
     present = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, last, 1), frames)
     return WorldState(present, remembered), frames
-
-
-def _sample(
-    model: ModelConfig,
-    params: Params,
-    conditioning: world_model.ClipConditioning,
-    sight: Sight | None,
-    key: Array,
-) -> Array:
-    """Sample the latents of one clip, (1, t, h, w, C)."""
-    noise = jax.random.normal(key, (1, *model.latent_shape, model.codec.channels))
-    return sample(model, params, conditioning, sight, noise, jax.random.fold_in(key, 1))
-
-
-def sample(
-    model: ModelConfig,
-    params: Params,
-    conditioning: world_model.ClipConditioning,
-    sight: Sight | None,
-    noise_BthwC: Array,
-    key: Array | None = None,
-) -> Array:
-    """Sample one batch of clips' latents with the configured noise and sampler.
-
-    With ``noise.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map)); DDPM
-    lets g vary with the step (``noise.dynamic_guidance``).
-
-    Args:
-        model: the model.
-        params: the world model's parameters.
-        conditioning: observed frame, control, text.
-        sight: what the memory shows the clips, or None for no memory.
-        noise_BthwC: standard normal start.
-        key: randomness of the steps, if the sampler draws noise.
-
-    Returns:
-        (B, t, h, w, C) latents.
-
-    Raises:
-        ValueError: the sampler draws noise at every step and there is no key.
-    """
-    noise = model.noise
-
-    def x0(x: Array, times: Array, sight: Sight | None) -> Array:
-        inputs, network_time = noises.shown(noise, x, times)
-        out = world_model.apply(model, params, inputs, conditioning, network_time, sight)
-        return noises.to_x0(noise, out, x, times)
-
-    def denoise(x: Array, times: Array, weight: Array) -> Array:
-        with_map = x0(x, times, sight)
-        if sight is None or noise.guidance == 1:
-            return with_map
-        without = x0(x, times, None)
-        return without + weight * (with_map - without)
-
-    return noises.sample(noise, denoise, noise_BthwC, key)
 
 
 def _remember(

@@ -38,6 +38,7 @@ class Stage:
         prepare: ``prepare(model, params, clip) -> clip``: does beforehand what the loss computes of
             a batch with frozen weights alone, and leaves out what that no longer needs; the loss is
             the same.
+        prepares_by: the top-level parameters that ``prepare`` reads.
         optional: whether it is left out where its settings give it no steps.
         rates: (pattern, factor) over the paths of trained parameters, the first match wins: the
             learning rate there is the stage's times the factor; elsewhere it is the stage's.
@@ -50,6 +51,7 @@ class Stage:
     loss: Loss
     memory: bool = False
     prepare: Callable[[Any, Params, Clip], Clip] | None = None
+    prepares_by: tuple[str, ...] = ("codec", "encoder")
     optional: bool = False
     rates: tuple[tuple[str, float], ...] = ()
 

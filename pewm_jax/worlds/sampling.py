@@ -1,0 +1,66 @@
+"""Sampling the latents of clips: the noise, the sampler's steps, guidance by the memory."""
+
+from __future__ import annotations
+
+import jax
+
+from pewm_jax.config import ModelConfig
+from pewm_jax.diffusion import noise as noises
+from pewm_jax.models import world_model
+from pewm_jax.types import Array, Params, Sight
+
+
+def draw(
+    model: ModelConfig,
+    params: Params,
+    conditioning: world_model.ClipConditioning,
+    sight: Sight | None,
+    key: Array,
+) -> Array:
+    """Sample the latents of one clip, (1, t, h, w, C), from noise of its own."""
+    noise = jax.random.normal(key, (1, *model.latent_shape, model.codec.channels))
+    return sample(model, params, conditioning, sight, noise, jax.random.fold_in(key, 1))
+
+
+def sample(
+    model: ModelConfig,
+    params: Params,
+    conditioning: world_model.ClipConditioning,
+    sight: Sight | None,
+    noise_BthwC: Array,
+    key: Array | None = None,
+) -> Array:
+    """Sample one batch of clips' latents with the configured noise and sampler.
+
+    With ``noise.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map)); DDPM
+    lets g vary with the step (``noise.dynamic_guidance``).
+
+    Args:
+        model: the model.
+        params: the world model's parameters.
+        conditioning: observed frame, control, text.
+        sight: what the memory shows the clips, or None for no memory.
+        noise_BthwC: standard normal start.
+        key: randomness of the steps, if the sampler draws noise.
+
+    Returns:
+        (B, t, h, w, C) latents.
+
+    Raises:
+        ValueError: the sampler draws noise at every step and there is no key.
+    """
+    noise = model.noise
+
+    def x0(x: Array, times: Array, sight: Sight | None) -> Array:
+        inputs, network_time = noises.shown(noise, x, times)
+        out = world_model.apply(model, params, inputs, conditioning, network_time, sight)
+        return noises.to_x0(noise, out, x, times)
+
+    def denoise(x: Array, times: Array, weight: Array) -> Array:
+        with_map = x0(x, times, sight)
+        if sight is None or noise.guidance == 1:
+            return with_map
+        without = x0(x, times, None)
+        return without + weight * (with_map - without)
+
+    return noises.sample(noise, denoise, noise_BthwC, key)
