@@ -1,5 +1,7 @@
 """Inserting one clip into the voxel map, beside NumPy and torch; bytes, points, extents.
 
+Rendering follows, as ``benchmarks/surfels.py`` alone prints it.
+
 Run with ``python benchmarks/memory.py`` (a few minutes); ``--record`` rewrites its section of
 ``RESULTS.md``. One clip of the paper's size: 9 frames of 512 × 512 pixels in a furnished room,
 37 × 37 × 384 features per frame, into a map of 4,096 cells. Everyone does the same: upsample the
@@ -21,6 +23,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+import surfels
 import torch
 from memory_peers import (
     CHANNELS,
@@ -238,6 +241,7 @@ def main() -> None:
             third,
         ]
         record("memory", "\n\n".join(text))
+    surfels.show(chosen.repeats, chosen.record)
 
 
 if __name__ == "__main__":

@@ -108,17 +108,22 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--record", action="store_true", help="rewrite this section of RESULTS.md")
     chosen = parser.parse_args()
-    times, words = measure(chosen.repeats)
+    show(chosen.repeats, chosen.record)
+
+
+def show(repeats: int, recorded: bool) -> None:
+    """Measure, print, and rewrite the section of ``RESULTS.md`` if asked."""
+    times, words = measure(repeats)
     ours, rows = times["ours, splat"], []
     for name, spent in times.items():
         ratio = statistics.median(a / b for a, b in zip(spent, ours, strict=True))
         rows.append([name, f"{statistics.median(spent) * 1e3:.0f} ms", f"{ratio:.1f}×"])
     text = table(["what", "one clip", "time over ours, splat"], rows)
     print(text, words, sep="\n", flush=True)
-    if chosen.record:
+    if recorded:
         how = (
             f"`python benchmarks/surfels.py --record`: {T} frames of {SIZE} × {SIZE} pixels from "
-            f"{POINTS:,} points; medians of {chosen.repeats}; torch on "
+            f"{POINTS:,} points; medians of {repeats}; torch on "
             f"{torch.get_num_threads()} threads. {machine('jax', 'torch', 'numpy')}."
         )
         title = "## Rendering a memory of points"

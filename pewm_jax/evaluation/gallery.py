@@ -21,7 +21,7 @@ from pewm_jax.evaluation.pictures import (
 from pewm_jax.evaluation.protocol import ClipChoice, load_clip
 from pewm_jax.evaluation.scoring import LongRollouts
 from pewm_jax.evaluation.seen import seen_masks
-from pewm_jax.evaluation.video import encode_h264, side_by_side
+from pewm_jax.evaluation.video import encode_gif, encode_h264, side_by_side, small_frames
 from pewm_jax.geometry.actions import heading
 from pewm_jax.memory import memories
 from pewm_jax.types import Frames
@@ -42,6 +42,7 @@ class Gallery:
         videos: (caption, MP4) of each long rollout.
         strip: frames of one rollout in rows: truth, with its map, empty map, reprojected.
         strip_note: which rollout and which frames they are.
+        moving: all frames of that rollout side by side, a GIF.
         masks: the same true frames with never-seen pixels greyed out.
         above: the map from above, before and after that rollout.
     """
@@ -49,6 +50,7 @@ class Gallery:
     videos: list[tuple[str, bytes]]
     strip: np.ndarray
     strip_note: str
+    moving: bytes
     masks: np.ndarray
     above: np.ndarray
 
@@ -92,6 +94,7 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
             f"{', '.join(str(step) for step in steps[1:])} of {count}. Of the {long.shown} "
             "rollouts shown above it is the one with the most pixels seen before."
         ),
+        moving=_moving(rollout),
         masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
         above=_above(config, long, best, rollout),
     )
@@ -144,6 +147,13 @@ def _video(config: Config, long: LongRollouts, item: _Rollout) -> tuple[str, byt
         f"{config.evaluate.seeds[0]}."
     )
     return caption, encode_h264([pictures[0]] * (HOLD - 1) + pictures)
+
+
+def _moving(item: _Rollout) -> bytes:
+    columns = [("truth", as_bytes(item.truth.rgb_THWC))]
+    columns += [(CAPTIONS[method], rgb) for method, (rgb, _) in item.imagined.items()]
+    frames = small_frames([(name, _with_present(item.context, rgb)) for name, rgb in columns])
+    return encode_gif([frames[0]] * (HOLD - 1) + frames)
 
 
 def _above(config: Config, long: LongRollouts, index: int, item: _Rollout) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The report of a trained run: ``report/`` with metrics.json, index.html and strip.png."""
+"""The report of a trained run: ``report/`` with metrics.json, index.html and its pictures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TRAINED_ON = "train"
 """The split that training reads."""
 REPORT_VERSION = 3
 """Increase it whenever the same scores would give another report."""
-PAGE, METRICS, STRIP = "index.html", "metrics.json", "strip.png"
+PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 
 
 def override(config: Config, **changes: Any) -> Config:
@@ -132,6 +132,7 @@ def evaluate(
     gallery = make_gallery(config, episodes, long)
     (folder / METRICS).unlink(missing_ok=True)
     save_png(folder / STRIP, gallery.strip)
+    (folder / MOVING).write_bytes(gallery.moving)
     page = render(metrics, gallery)
     atomic.write_text(folder / PAGE, page)
     metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()

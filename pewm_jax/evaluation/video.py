@@ -1,4 +1,4 @@
-"""Side-by-side videos in H.264, which every browser plays."""
+"""Side-by-side videos: H.264, which every browser plays, and GIF, which every page shows."""
 
 from __future__ import annotations
 
@@ -48,6 +48,47 @@ def side_by_side(
         write(draw, (size[0] / 2, size[1] - footer / 2), line, colour=QUIET, anchor="mm")
         pictures.append(np.asarray(canvas))
     return pictures
+
+
+def small_frames(columns: Sequence[tuple[str, np.ndarray]], *, cell: int = 160) -> list[np.ndarray]:
+    """Draw the colours of several versions side by side, for a small video.
+
+    Args:
+        columns: caption and colours (T, H, W, 3) of each version.
+        cell: width of a picture, pixels.
+
+    Returns:
+        T uint8 pictures of one size.
+    """
+    height, width = columns[0][1].shape[1:3]
+    header, gap = 20, 4
+    size = (gap + len(columns) * (cell + gap), header + round(height * cell / width) + gap)
+    pictures = []
+    for t in range(len(columns[0][1])):
+        canvas = Image.new("RGB", size, PAPER)
+        draw = ImageDraw.Draw(canvas)
+        for j, (caption, rgb) in enumerate(columns):
+            x = gap + j * (cell + gap)
+            write(draw, (x + cell / 2, header / 2), caption, size=13, anchor="mm")
+            canvas.paste(Image.fromarray(enlarge(as_bytes(rgb[t]), cell)), (x, header))
+        pictures.append(np.asarray(canvas))
+    return pictures
+
+
+def encode_gif(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> bytes:
+    """Encode uint8 pictures (H, W, 3), all of one size, as a GIF that begins again at its end."""
+    buffer = io.BytesIO()
+    first, *others = [Image.fromarray(picture) for picture in pictures]
+    first.save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=others,
+        duration=round(1000 / frames_per_second),
+        loop=0,
+        optimize=True,
+    )
+    return buffer.getvalue()
 
 
 def encode_h264(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> bytes:

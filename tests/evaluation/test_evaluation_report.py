@@ -162,6 +162,9 @@ def test_video_in_the_page_plays(run):
 def test_strip_is_a_picture(run):
     with Image.open(run / "report" / "strip.png") as picture:
         assert picture.width > 600
+    with Image.open(run / "report" / "strip.gif") as film:
+        assert film.n_frames > 2 * 4  # still frames at the beginning are joined
+        assert film.width > 4 * 100
 
 
 def test_a_complete_report_is_left_alone(run, command, capsys, monkeypatch):

@@ -10,20 +10,23 @@ import pytest
 import pewm_jax
 from pewm_jax import shipped, tree, worlds
 from pewm_jax.config import (
+    AttentionConfig,
     ClipConfig,
     CodecTrainConfig,
     CodecWorldConfig,
     Config,
     DataConfig,
     LearnedCodecConfig,
+    RenderConfig,
     StageConfig,
     SurfelConfig,
+    UserError,
 )
 from pewm_jax.data import abstract
 from pewm_jax.models import learned_codec
 from pewm_jax.rollouts import load_finished
 from pewm_jax.training import loop
-from tests.helpers import random_camera
+from tests.helpers import TINY, init_world, random_camera, randomise, tiny_config
 
 CODEC = LearnedCodecConfig(
     latent_channels=4, fine=8, coarse=8, fine_blocks=1, coarse_blocks=1, gate=8
@@ -118,3 +121,45 @@ def test_weights_that_come_with_the_library_are_found_by_name(tmp_path, monkeypa
             video = jnp.zeros((1, 2, 16, 24, 3))
             latents = learned_codec.encode(config.model.codec, params["codec"], video)
             assert latents.shape == (1, 2, 2, 3, 16)
+
+
+def imagining(reader=None):
+    """A tiny world model whose memory is mixed in by a gate."""
+    memory = SurfelConfig(capacity=2048, cell_m=(0.05, 0.05, 0.05), tokens=16)
+    memory = dataclasses.replace(memory, reader=reader or RenderConfig(picture_width=8))
+    backbone = dataclasses.replace(TINY.backbone, patch=1)
+    return tiny_config(
+        codec=CODEC, backbone=backbone, memory=memory, data=DataConfig(context=2, prepared=2)
+    )
+
+
+LAST = worlds.stages(tiny_config())[3]
+
+
+@pytest.mark.parametrize("reader", [None, AttentionConfig(heads=4, head_dim=8)])
+def test_the_gate_learns_alone_on_what_the_model_imagines(reader):
+    config = imagining(reader)
+    params = randomise(init_world(config.model))
+    clip = batch(config, 2)
+    ready = jax.device_get(jax.jit(lambda p, c: LAST.prepare(config.model, p, c))(params, clip))
+    assert ready.latents_thwC.shape[:2] == (2, 9)
+    assert ready.sight.view.seen_THW.any()
+    trained = {
+        path for path, label in tree.flatten(LAST.labels(params)).items() if label == "train"
+    }
+    assert trained == {path for path in tree.flatten(params) if path.startswith("codec/gate/")}
+
+    def loss(gate, clip):
+        whole = {**params, "codec": {**params["codec"], "gate": gate}}
+        return LAST.loss(config.model, config.train, whole, clip, jax.random.key(0))[0]
+
+    compiled = jax.jit(jax.value_and_grad(loss))
+    once, gradient = compiled(params["codec"]["gate"], ready)
+    np.testing.assert_allclose(compiled(params["codec"]["gate"], clip)[0], once, rtol=1e-5)
+    assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient))
+
+
+def test_without_a_gate_there_is_nothing_to_learn():
+    config = tiny_config()
+    with pytest.raises(UserError, match=r"train\.gate\.steps is above 0, but this model has no"):
+        LAST.prepare(config.model, {}, batch(config, 1))
