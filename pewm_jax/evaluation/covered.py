@@ -32,8 +32,8 @@ def score_coverage(
     """Count over the first clip of every chain that is scored; kept with the partial results.
 
     Returns:
-        The shares of the pixels seen before: ``held``, ``chosen``, ``attended``, ``rendered`` (see
-        ``memory.coverage.Coverage``); None if no pixel was seen before.
+        The shares of the pixels seen before: ``held``, ``chosen``, ``attended``, ``rendered``,
+        ``looked_at`` (see ``memory.coverage.Coverage``); None if no pixel was seen before.
 
     Raises:
         UserError: as for ``scoring.score_table``.
@@ -41,7 +41,7 @@ def score_coverage(
     choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
     counts = []
     for first in range(0, len(choices), config.evaluate.batch):
-        name = f"coverage-clip{first:04d}"
+        name = f"coverage2-clip{first:04d}"
         found = partials.get(name)
         if found is None:
             if not counts:
@@ -60,7 +60,7 @@ def _names() -> list[str]:
 
 
 def _count(config: ModelConfig, model: Imagination, batch: Batch) -> np.ndarray:
-    """Return (clips, 5) pixels, in the order of ``Coverage``'s fields."""
+    """Return (clips, 6) pixels, in the order of ``Coverage``'s fields."""
     state, length = model.begin(batch.context), config.clip.frames - 1
     targets, seen = jax.tree.map(lambda x: x[:, :length], (batch.targets, batch.seen))
     present = jax.tree.map(lambda x: x[:, -1:], batch.context)

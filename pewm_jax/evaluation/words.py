@@ -30,9 +30,10 @@ METRIC_NAMES = {
 """Heading and digits of each metric."""
 COVERAGE_NAMES = {
     "held": "held by the map",
-    "chosen": "among the tokens chosen",
-    "attended": "looked at",
+    "looked_at": "looked at by the model's reader",
     "rendered": "shown by the rendered map",
+    "chosen": "among the tokens chosen for attention",
+    "attended": "among those that the frame's own camera would attend to",
 }
 """What becomes of the pixels seen before, each a share of them."""
 NONE_HOW = (

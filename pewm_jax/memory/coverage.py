@@ -34,6 +34,8 @@ class Coverage:
         attended: whose place is among the tokens that the frame's camera attends to; with positions
             that know no cameras all that are chosen.
         rendered: where the rendered memory's depth agrees with the true one.
+        looked_at: what the memory's reader reads of these: ``attended`` where it reads tokens,
+            ``rendered`` where it reads pictures, either where it reads both.
     """
 
     seen: Array
@@ -41,6 +43,7 @@ class Coverage:
     chosen: Array
     attended: Array
     rendered: Array
+    looked_at: Array
 
 
 def coverage(
@@ -94,7 +97,10 @@ def coverage(
         return (seen & mask).sum(dtype=jnp.int32)
 
     held = among(pixel_THW, points, valid)
-    return Coverage(*map(count, (jnp.ones_like(seen), held, chosen, attended, agrees)))
+    kind = model.memory.reader
+    read = (attended & kind.READS_TOKENS) | (agrees & kind.READS_VIEW)
+    counted = (jnp.ones_like(seen), held, chosen, attended, agrees, read)
+    return Coverage(*map(count, counted))
 
 
 def _grid(config: MemorySettings) -> MemorySettings:

@@ -118,8 +118,9 @@ def test_metrics_hold_every_method_mask_and_metric(run):
     assert protocol["reproject"]["split"] == "validation"
     assert protocol["none"] is None
     shares = metrics["coverage"]
-    assert set(shares) == {"held", "chosen", "attended", "rendered"}
+    assert set(shares) == {"held", "chosen", "attended", "rendered", "looked_at"}
     assert 1 >= shares["held"] >= shares["chosen"] >= shares["attended"] > 0
+    assert shares["looked_at"] == shares["attended"]  # the reader attends
     assert len(metrics["long"]["drift"]["memory"]["quarters"]) == 4
     assert len(metrics["long"]["per_frame"]["memory"]["all"]["psnr"]["mean"]) == 8
 
