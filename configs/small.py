@@ -31,6 +31,7 @@ def config() -> Config:
             stage1=StageConfig(steps=1200, batch=16, learning_rate=1e-3, warmup=50),
             stage2=StageConfig(steps=400, batch=16, learning_rate=1e-3, warmup=30),
             joint=StageConfig(steps=2400, batch=16, learning_rate=1e-3, warmup=50),
+            gate=StageConfig(steps=300, batch=8, learning_rate=1e-3, warmup=20),
             hidden=0.1,
             ema=0.995,
         ),

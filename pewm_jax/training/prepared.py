@@ -61,7 +61,7 @@ def gather(
     read: Callable[[int], Iterator[Clip]],
     unless_stopped: Callable[[Callable[[], Any]], Any],
 ) -> list[Clip] | None:
-    """Prepare at least ``data.prepared`` clips, or find them prepared.
+    """Prepare at least ``data.prepared`` clips, no more than are drawn, or find them prepared.
 
     Args:
         config: the experiment.
@@ -75,7 +75,7 @@ def gather(
     """
     assert stage.prepare is not None
     make = jax.jit(functools.partial(stage.prepare, config.model))
-    count = -(-config.data.prepared // stage.settings(config).batch)
+    count = _batches(config, stage)
     folder = _folder(config, stage, params) if config.data.prepared_path else None
     kept: list[Clip] = []
     if folder is not None:
@@ -175,8 +175,14 @@ def rows(config: Config, stage: Stage, number: int) -> list[int]:
     Clip r was row r mod B of batch r div B of the loader, batches of B.
     """
     batch = stage.settings(config).batch
-    count = -(-config.data.prepared // batch) * batch
+    count = _batches(config, stage) * batch
     return _rows(count, batch, stage.data_seed(config), number)
+
+
+def _batches(config: Config, stage: Stage) -> int:
+    """Return how many batches of clips are prepared."""
+    settings = stage.settings(config)
+    return min(-(-config.data.prepared // settings.batch), max(settings.steps, 1))
 
 
 def _rows(count: int, batch: int, seed: int, number: int) -> list[int]:
