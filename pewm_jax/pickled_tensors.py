@@ -1,9 +1,9 @@
 """Tensors that others pickled, read as data: nothing in such a file is executed.
 
 A pickle is a program; ``pickle.load`` lets it call anything. Here the only things that it may name
-are stand-ins of our own that build tables and arrays, so neither NumPy's nor torch's code is called
-with what the file says. Two kinds of files are read: tables of NumPy arrays, and what ``torch.save``
-writes since torch 1.6 (a zip with a pickle and one member per storage); torch is not needed.
+are stand-ins of our own that build tables and arrays: neither NumPy nor torch is called with what
+the file says. Two kinds of files are read: tables of NumPy arrays, and what ``torch.save`` writes
+since torch 1.6 (a zip with a pickle and one member per storage); torch is not needed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
-import pickle  # noqa: S403 - by a restricted unpickler alone
+import pickle
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 
 from pewm_jax.config import UserError
 
-Tensors = dict[Any, Any]
+Tensors = dict[str, Any]
 """Nested tables of arrays."""
 
 _STORAGES = {
@@ -59,20 +59,14 @@ def read(path: Path) -> Tensors:
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
-                found = _read_zip(archive)
-        else:
-            found = _Reader(io.BytesIO(path.read_bytes()), {}).load()
-        if not isinstance(found, dict):
-            raise pickle.UnpicklingError("it holds no table")
-        return _finished(found, "it")
-    except UserError:
-        raise
+                return _finished(_read_zip(archive))
+        return _finished(_Reader(io.BytesIO(path.read_bytes()), {}).load())
     except Exception as error:  # a damaged pickle may raise anything
         reason = " ".join(str(error).split()) or type(error).__name__
         raise UserError(
             f"{path} cannot be read as a table of tensors ({reason[:160]}); save its tensors as "
             "safetensors, or with torch.save of torch 1.6 or newer."
-        ) from None
+        ) from error
 
 
 @dataclasses.dataclass
@@ -177,14 +171,15 @@ def _parameter(tensor: Any, *_: Any) -> Any:
     return tensor
 
 
-def _finished(found: Any, where: str) -> Any:
+def _finished(found: Any) -> Tensors:
     """Return tables of arrays, of what was read; refuse all else."""
-    if isinstance(found, dict) and all(isinstance(name, str) for name in found):
-        return {name: _finished(part, name) for name, part in found.items()}
-    array = found.array if isinstance(found, _Array) else found
-    if not isinstance(array, np.ndarray):
-        raise pickle.UnpicklingError(f"{where} is no tensor and no table of tensors")
-    return array.copy()
+    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
+        raise pickle.UnpicklingError("it holds no table of tensors by name")
+    made: Tensors = {}
+    for name, part in found.items():
+        array = part.array if isinstance(part, _Array) else part
+        made[name] = array.copy() if isinstance(array, np.ndarray) else _finished(part)
+    return made
 
 
 _NAMES: dict[tuple[str, str], Callable[..., Any]] = {

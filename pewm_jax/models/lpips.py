@@ -49,7 +49,7 @@ class Layers:
     pool: int = 0
 
 
-NETS: dict[str, tuple[Layers, ...]] = {
+NETS: dict[Net, tuple[Layers, ...]] = {
     "alex": (
         Layers((64,), side=11, stride=4, pad=2),
         Layers((192,), side=5, pad=2, pool=3),
@@ -66,8 +66,8 @@ NETS: dict[str, tuple[Layers, ...]] = {
     ),
 }
 """The networks, from the picture on."""
-NAMES = {"alex": "AlexNet", "vgg": "VGG16"}
-LEAST = {"alex": 31, "vgg": 16}
+NAMES: dict[Net, str] = {"alex": "AlexNet", "vgg": "VGG16"}
+LEAST: dict[Net, int] = {"alex": 31, "vgg": 16}
 """The smallest height and width, pixels, of which the last layer has anything left."""
 
 
@@ -137,7 +137,9 @@ def require_size(net: Net, height: int, width: int) -> None:
     if min(height, width) < least:
         raise UserError(
             f"pictures of {height}×{width} pixels are too small for LPIPS with {NAMES[net]}, which "
-            f"needs at least {least}×{least}" + "; use VGG16." * (min(height, width) >= LEAST["vgg"])
+            f"needs at least {least}×{least}"
+            + "; use VGG16."
+            * (min(height, width) >= LEAST["vgg"])
         )
 
 

