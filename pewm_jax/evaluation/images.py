@@ -19,8 +19,9 @@ PSNR_CEILING = 100.0
 """PSNR of equal images, in decibels, which keeps averages finite."""
 MASKS = ("seen", "unseen", "all")
 """Which pixels: seen before, never seen, all of them."""
-SUMS = ("squared", "colours", "ssim", "windows", "depth_abs", "depth_rel", "depths")
-"""The sums that ``error_sums`` returns, in order."""
+MEASURED = ("squared", "colours", "ssim", "windows", "depth_abs", "depth_rel", "depths")
+SUMS = (*MEASURED, "lpips", "pictures")
+"""The sums that ``error_sums`` returns, in order; the last two are 0 until ``with_lpips``."""
 
 
 def unit_colours(rgb: Array) -> Array:
@@ -91,7 +92,7 @@ def error_sums(predicted: Frames, true: Frames, seen_THW: Array, unseen_THW: Arr
         unseen_THW: (T, H, W) bool, pixels whose surface was never seen.
 
     Returns:
-        (T, 3, 7): for every frame and every mask of ``MASKS`` the sums of ``SUMS``. SSIM counts
+        (T, 3, 9): for every frame and every mask of ``MASKS`` the sums of ``SUMS``. SSIM counts
         pixels whose window lies inside the image. Depth counts pixels with both a true and a
         predicted depth (a copied frame may have holes).
     """
@@ -115,9 +116,23 @@ def error_sums(predicted: Frames, true: Frames, seen_THW: Array, unseen_THW: Arr
             jnp.where(measured, relative_THW, 0).sum((1, 2)),
             measured.sum((1, 2)),
         ]
+        sums += [jnp.zeros(len(mask))] * (len(SUMS) - len(MEASURED))
         per_mask.append(jnp.stack([s.astype(jnp.float32) for s in sums], -1))
     return jnp.stack(per_mask, 1)
 
 
 error_sums_batch = jax.jit(jax.vmap(error_sums))
-"""``error_sums`` over a batch of clips: (B, T, 3, 7)."""
+"""``error_sums`` over a batch of clips: (B, T, 3, 9)."""
+
+
+def with_lpips(sums: np.ndarray, distances: np.ndarray) -> np.ndarray:
+    """Return sums with LPIPS, which is of whole pictures: under the mask ``all`` alone.
+
+    Args:
+        sums: (..., T, 3, 9) from ``error_sums``.
+        distances: (..., T) LPIPS of every frame.
+    """
+    sums = np.array(sums)
+    sums[..., MASKS.index("all"), SUMS.index("lpips")] = distances
+    sums[..., MASKS.index("all"), SUMS.index("pictures")] = 1
+    return sums

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -26,17 +26,19 @@ QUARTERS = ("first quarter", "second", "third", "last")
 
 def scores(metrics: Mapping[str, Any]) -> str:
     """Return every method's scores, and the margins of the model with its map."""
-    heads = "".join(f"<th>{name}</th>" for name, _ in METRIC_NAMES.values())
+    measured = [name for name in METRIC_NAMES if name in metrics["results"]["memory"]["all"]]
+    heads = "".join(f"<th>{METRIC_NAMES[name][0]}</th>" for name in measured)
     rows = []
     for mask, name in MASK_NAMES.items():
-        rows.append(f'<tr class="head"><td colspan="6">{name}</td></tr>')
+        rows.append(f'<tr class="head"><td colspan="{len(measured) + 2}">{name}</td></tr>')
         for method, label in METHOD_NAMES.items():
             if method in metrics["results"]:
-                rows.append(_row(label, metrics["results"][method][mask]))
+                rows.append(_row(label, metrics["results"][method][mask], measured))
         for method in RIVALS:
             if method in metrics["margins"]:
                 label = f"map minus {METHOD_NAMES[method]}"
-                rows.append(_row(label, metrics["margins"][method][mask], gain=True))
+                entries = metrics["margins"][method][mask]
+                rows.append(_row(label, entries, measured, gain=True))
     seeds = metrics["protocol"]["seeds"]
     cover = CLUSTERS[metrics["protocol"]["clustered_by"]]
     per_seed = ", ".join(f"{value:+.2f}" for value in metrics["margin"]["seen"]["psnr"]["per_seed"])
@@ -83,10 +85,13 @@ def coverage(metrics: Mapping[str, Any]) -> str:
     )
 
 
-def _row(label: str, entries: Mapping[str, Any], *, gain: bool = False) -> str:
+def _row(
+    label: str, entries: Mapping[str, Any], measured: Sequence[str], *, gain: bool = False
+) -> str:
+    """Return a row of the table; a dash where a metric is not measured under a mask."""
     cells = "".join(
-        f"<td>{number(entries[metric], digits, sign=gain)}</td>"
-        for metric, (_, digits) in METRIC_NAMES.items()
+        f"<td>{number(entries[m], METRIC_NAMES[m][1], sign=gain) if m in entries else '–'}</td>"
+        for m in measured
     )
     kind = ' class="gain"' if gain else ""
     return f"<tr{kind}><td>{label}</td>{cells}<td>{entries['psnr']['n']}</td></tr>"

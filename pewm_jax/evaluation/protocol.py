@@ -23,7 +23,7 @@ from pewm_jax.data.episodes import Episode
 from pewm_jax.geometry.actions import PLANAR, actions_between, continuous, integrate
 from pewm_jax.types import Array, Camera, Frames
 
-VERSION = 1
+VERSION = 2
 """Increase it whenever the same settings would give other scores."""
 POSE_TOLERANCE = 2e-3
 """Largest difference between integrated and recorded poses (metres, matrix entries)."""
@@ -196,19 +196,21 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def fingerprint(config: Config, weights: str, dataset: str) -> str:
+def fingerprint(config: Config, weights: str, dataset: str, lpips: str = "") -> str:
     """Return a hash of everything that the scores depend on, except the choice of seeds and rivals.
 
     Args:
         config: the run's configuration, with overrides for the evaluation.
         weights: sha256 of the weights.
         dataset: sha256 of the data set's index.
+        lpips: sha256 of the weights of LPIPS; "" if it is left out.
     """
     settings = to_dict(config)
-    for key in ("seeds", "videos", "none"):
+    for key in ("seeds", "videos", "none", "lpips"):
         settings["evaluate"].pop(key)
     for key in ("train", "data"):
         settings.pop(key)
     settings["context"] = config.data.context
     content = {"version": VERSION, "settings": settings, "weights": weights, "data": dataset}
+    content["lpips"] = lpips
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

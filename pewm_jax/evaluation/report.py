@@ -18,6 +18,7 @@ from pewm_jax.evaluation.gallery import make_gallery
 from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.measure import measure
 from pewm_jax.evaluation.methods import Methods
+from pewm_jax.evaluation.metrics.perceptual import chosen as chosen_lpips
 from pewm_jax.evaluation.page import render
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
@@ -28,7 +29,7 @@ from pewm_jax.evaluation.words import score_lines, summary_lines
 
 TRAINED_ON = "train"
 """The split that training reads."""
-REPORT_VERSION = 4
+REPORT_VERSION = 5
 """Increase it whenever the same scores would give another report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 
@@ -46,8 +47,9 @@ def override(config: Config, **changes: Any) -> Config:
     """
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
-    if "none" in changes:
-        changes["none"] = str(changes["none"])
+    for name in ("none", "lpips"):
+        if name in changes:
+            changes[name] = str(changes[name])
     if steps is not None:
         config = config.with_model(
             noise=dataclasses.replace(config.model.noise, sample_steps=steps)
@@ -91,13 +93,18 @@ def evaluate(
     none = runs.open_none(opened, config)
     none_weights = none.weights_hash if none else ""
     data_hash = file_hash(split / MANIFEST)
-    name = fingerprint(config, opened.weights_hash, data_hash)
+    lpips, about_lpips = chosen_lpips(
+        config.evaluate.lpips, config.model.clip.height, config.model.clip.width
+    )
+    name = fingerprint(config, opened.weights_hash, data_hash, lpips.sha256 if lpips else "")
     folder = Path(out) if out else runs.report_folder(opened, config)
     if is_complete(folder, config, name, none_weights):
         say("the report is complete for these weights and this protocol; nothing to do")
         return folder / PAGE
     _make(folder)
     partials = Partials(folder / "partial", opened.weights_hash, name)
+    if lpips is None:
+        say(about_lpips)
     choice = choose_settings(config, partials, say)
     say(f"reprojection: {choice.why}")
     clips = list(long_choices(config, episodes)[0])
@@ -114,8 +121,8 @@ def evaluate(
         imagination(none, none.config) if none else None,
         none_weights,
     )
-    scored = score_table(config, episodes, methods, partials, say)
-    long = roll_long(config, episodes, methods, partials, say)
+    scored = score_table(config, episodes, methods, partials, say, lpips)
+    long = roll_long(config, episodes, methods, partials, say, lpips)
     say("drawing the report …")
     metrics = measure(config, scored, long)
     metrics["coverage"] = score_coverage(config, episodes, methods.model, partials, say)
@@ -124,6 +131,8 @@ def evaluate(
     metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {
         "reproject": choice.facts(),
         "none": runs.none_facts(none, opened) if none else None,
+        "lpips": about_lpips,
+        "lpips_weights_sha256": lpips.sha256 if lpips else None,
         "weights_sha256": opened.weights_hash,
         "dataset_sha256": data_hash,
         "fingerprint": name,

@@ -13,9 +13,10 @@ import numpy as np
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.progress import Meter
-from pewm_jax.evaluation.images import error_sums_batch, unit_colours
+from pewm_jax.evaluation.images import error_sums_batch, unit_colours, with_lpips
 from pewm_jax.evaluation.imagine import print_now
 from pewm_jax.evaluation.methods import Methods
+from pewm_jax.evaluation.metrics import Perceptual
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, stack
 from pewm_jax.evaluation.seen import seen_masks_batch
@@ -29,7 +30,7 @@ class Scored:
 
     Attributes:
         choices: the C clips.
-        sums: method → (seeds, C, N, 3, 7) as ``images.error_sums``; one seed without a network.
+        sums: method → (seeds, C, N, 3, 9) as ``images.error_sums``; one seed without a network.
     """
 
     choices: list[ClipChoice]
@@ -87,10 +88,13 @@ class Batch:
         seeds, camera = self.seeds(seed), self.targets.camera
         return methods.imagine(method, self.context, self.control, camera, seeds)
 
-    def sums(self, frames: Frames) -> np.ndarray:
-        """Return ``images.error_sums`` of the clips asked for."""
-        sums = error_sums_batch(frames, self.targets, self.seen, self.unseen)
-        return np.asarray(sums)[: self.real]
+    def sums(self, frames: Frames, lpips: Perceptual | None) -> np.ndarray:
+        """Return ``images.error_sums`` of the clips asked for, with LPIPS if it is given."""
+        sums = np.asarray(error_sums_batch(frames, self.targets, self.seen, self.unseen))
+        if lpips is not None:
+            distances = lpips.frames(frames.rgb_THWC, self.targets.rgb_THWC)
+            sums = with_lpips(sums, np.asarray(distances))
+        return sums[: self.real]
 
 
 def load_batch(
@@ -119,10 +123,11 @@ def score_table(
     methods: Methods,
     partials: Partials,
     say: Callable[[str], Any] = print_now,
+    lpips: Perceptual | None = None,
 ) -> Scored:
     """Score ``evaluate.clips`` choices, chains of ``evaluate.chain`` clips, by method and seed.
 
-    Pieces that ``partials`` already holds are reused.
+    Pieces that ``partials`` already holds are reused. Without ``lpips`` that is left out.
 
     Raises:
         UserError: no episode is long enough, the data is inconsistent or does not fit the model,
@@ -158,7 +163,7 @@ def score_table(
                 )
             batch = loaded[1]
             frames = batch.imagine(methods, method, seed)[2]
-            sums = batch.sums(frames)
+            sums = batch.sums(frames, lpips)
             partials.put(_piece(methods, method, seed, first), sums=sums)
             pieces[method, seed, first] = sums
             meter.advance(frames_each * batch.real)
@@ -202,8 +207,11 @@ def roll_long(
     methods: Methods,
     partials: Partials,
     say: Callable[[str], Any] = print_now,
+    lpips: Perceptual | None = None,
 ) -> LongRollouts:
     """Make long rollouts with every method (first seed), score all, store the first few.
+
+    Without ``lpips`` that is left out.
 
     Raises:
         UserError: as for ``score_table``.
@@ -223,7 +231,7 @@ def roll_long(
                 first, last, frames = batch.imagine(methods, method, seed)
                 colours = np.asarray(unit_colours(frames.rgb_THWC[:shown]))
                 kept = {
-                    "sums": batch.sums(frames),
+                    "sums": batch.sums(frames, lpips),
                     "rgb": np.rint(colours * 255).astype(np.uint8),
                     "depth": np.asarray(frames.depth_THW[:shown], np.float32),
                 }

@@ -17,7 +17,8 @@ import numpy as np
 from pewm_jax.evaluation.images import MASKS, PSNR_CEILING, SUMS
 
 METRICS = ("psnr", "ssim", "depth_mae", "depth_rel")
-"""dB; structural similarity; metres; share of the true depth."""
+"""dB; structural similarity; metres; share of the true depth. Under the mask ``all`` there is also
+``lpips`` where it was measured."""
 ENDS = 16
 """Frames at the start and at the end of a long rollout that are compared to tell its drift."""
 LEAST_SHARE = 0.01
@@ -28,10 +29,11 @@ def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
     """Turn sums into scores.
 
     Args:
-        sums: (..., 3, 7) from ``error_sums``, possibly summed over frames.
+        sums: (..., 3, 9) from ``error_sums``, possibly summed over frames.
 
     Returns:
-        ``scores[mask][metric]`` of shape (...), NaN if the mask covers too little.
+        ``scores[mask][metric]`` of shape (...), NaN if the mask covers too little; ``lpips`` only
+        under ``all``, and only if it was measured.
     """
     result: dict[str, dict[str, np.ndarray]] = {}
     everything = sums[..., MASKS.index("all"), SUMS.index("colours")]
@@ -50,6 +52,8 @@ def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
             "depth_mae": mean("depth_abs", "depths"),
             "depth_rel": mean("depth_rel", "depths"),
         }
+        if part["pictures"].any():
+            result[mask]["lpips"] = mean("lpips", "pictures")
     return result
 
 
@@ -83,17 +87,17 @@ def table(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any
     """Score every method under every mask.
 
     Args:
-        sums: method → (seeds, clips, T, 3, 7).
+        sums: method → (seeds, clips, T, 3, 9).
         clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
         ``results[method][mask][metric] = {mean, stderr, n}``.
     """
     results: dict[str, Any] = {}
-    for method, sums_SCT37 in sums.items():
-        by_mask = scores(sums_SCT37.sum(2))
+    for method, sums_SCT39 in sums.items():
+        by_mask = scores(sums_SCT39.sum(2))
         results[method] = {
-            mask: {m: summary(by_mask[mask][m].mean(0), clusters) for m in METRICS}
+            mask: {m: summary(values.mean(0), clusters) for m, values in by_mask[mask].items()}
             for mask in MASKS
         }
     return results
@@ -103,12 +107,12 @@ def margin(better: np.ndarray, base: np.ndarray, clusters: np.ndarray) -> dict[s
     """Compare two methods clip by clip: the same clips, seeds and noise.
 
     Args:
-        better: (seeds, clips, T, 3, 7) sums of the first method.
+        better: (seeds, clips, T, 3, 9) sums of the first method.
         base: the same of the second.
         clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
-        ``[mask][metric]``: ``mean`` of first − second (for depth errors less is better),
+        ``[mask][metric]``: ``mean`` of first − second (for depth errors and LPIPS less is better),
         ``stderr`` over clusters, ``n`` clips, ``clusters``, ``per_seed`` means and
         ``stderr_over_seeds``.
     """
@@ -116,7 +120,7 @@ def margin(better: np.ndarray, base: np.ndarray, clusters: np.ndarray) -> dict[s
     result: dict[str, Any] = {}
     for mask in MASKS:
         result[mask] = {}
-        for metric in METRICS:
+        for metric in (name for name in first[mask] if name in second[mask]):
             gain_SC = first[mask][metric] - second[mask][metric]
             known = np.isfinite(gain_SC).all(0)
             per_seed = gain_SC[:, known].mean(1) if known.any() else np.zeros(0)
@@ -145,7 +149,7 @@ def drift(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any
     """Tell how PSNR over pixels seen before changes along long rollouts.
 
     Args:
-        sums: method → (seeds, rollouts, N, 3, 7).
+        sums: method → (seeds, rollouts, N, 3, 9).
         clusters: (rollouts,) the scene (or episode) each comes from.
 
     Returns:
@@ -154,15 +158,15 @@ def drift(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any
         None where a rollout has fewer than 32 frames. Each is ``{mean, stderr, n}``.
     """
 
-    def of(sums_SCT37: np.ndarray) -> np.ndarray:
-        return scores(sums_SCT37.sum(2))["seen"]["psnr"].mean(0)
+    def of(sums_SCT39: np.ndarray) -> np.ndarray:
+        return scores(sums_SCT39.sum(2))["seen"]["psnr"].mean(0)
 
     result: dict[str, Any] = {}
-    for method, sums_SCT37 in sums.items():
-        quarters = np.array_split(sums_SCT37, 4, axis=2)
+    for method, sums_SCT39 in sums.items():
+        quarters = np.array_split(sums_SCT39, 4, axis=2)
         ends: dict[str, Any] = {"first16": None, "last16": None, "difference": None}
-        if sums_SCT37.shape[2] >= 2 * ENDS:
-            first, last = of(sums_SCT37[:, :, :ENDS]), of(sums_SCT37[:, :, -ENDS:])
+        if sums_SCT39.shape[2] >= 2 * ENDS:
+            first, last = of(sums_SCT39[:, :, :ENDS]), of(sums_SCT39[:, :, -ENDS:])
             each = {"first16": first, "last16": last, "difference": last - first}
             ends = {name: summary(values, clusters) for name, values in each.items()}
         result[method] = {"quarters": [summary(of(part), clusters) for part in quarters], **ends}
@@ -173,7 +177,7 @@ def per_frame(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str,
     """Score every frame index on its own.
 
     Args:
-        sums: method → (seeds, clips, T, 3, 7).
+        sums: method → (seeds, clips, T, 3, 9).
         clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
@@ -181,13 +185,13 @@ def per_frame(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str,
         imagined frame. Entries are None if no clip has a score.
     """
     result: dict[str, Any] = {}
-    for method, sums_SCT37 in sums.items():
-        by_mask = scores(sums_SCT37)
+    for method, sums_SCT39 in sums.items():
+        by_mask = scores(sums_SCT39)
         result[method] = {}
         for mask in MASKS:
             result[method][mask] = {}
-            for metric in METRICS:
-                values_CT = by_mask[mask][metric].mean(0)
+            for metric, values_SCT in by_mask[mask].items():
+                values_CT = values_SCT.mean(0)
                 points = [summary(values_CT[:, t], clusters) for t in range(values_CT.shape[1])]
                 result[method][mask][metric] = {
                     key: [point[key] for point in points] for key in ("mean", "stderr", "n")
@@ -195,8 +199,8 @@ def per_frame(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str,
     return result
 
 
-def seen_share(sums_SCT37: np.ndarray) -> float:
+def seen_share(sums_SCT39: np.ndarray) -> float:
     """Return the share of pixels with depth that were seen before, over all clips."""
-    pixels = sums_SCT37[0, ..., SUMS.index("colours")].sum((0, 1))
+    pixels = sums_SCT39[0, ..., SUMS.index("colours")].sum((0, 1))
     seen, unseen = (float(pixels[MASKS.index(mask)]) for mask in ("seen", "unseen"))
     return seen / max(seen + unseen, 1.0)

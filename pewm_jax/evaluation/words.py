@@ -26,8 +26,9 @@ METRIC_NAMES = {
     "ssim": ("SSIM ↑", 3),
     "depth_mae": ("depth error, m ↓", 3),
     "depth_rel": ("relative depth error ↓", 3),
+    "lpips": ("LPIPS ↓", 3),
 }
-"""Heading and digits of each metric."""
+"""Heading and digits of each metric; LPIPS is of whole pictures, where it was measured."""
 COVERAGE_NAMES = {
     "held": "held by the map",
     "looked_at": "looked at by the model's reader",
@@ -119,6 +120,15 @@ def covered(shares: Mapping[str, float]) -> str:
     return f"Of the pixels seen before: {', '.join(said)}."
 
 
+def perceived(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence on LPIPS, or on why it was left out."""
+    found = {method: masks["all"].get("lpips") for method, masks in metrics["results"].items()}
+    if not all(found.values()):
+        return metrics["protocol"]["lpips"]
+    said = (f"{label} {number(found[m], 3)}" for m, label in METHOD_NAMES.items() if m in found)
+    return f"LPIPS of whole pictures, lower is better: {', '.join(said)}."
+
+
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     """Return the report's sentences, for the terminal: against the baselines, then the map alone.
 
@@ -132,6 +142,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     ]
     lines += [comparison(margins[name], name) for name in ("reproject", "none") if name in margins]
     lines += [] if "none" in margins else [NONE_HOW]
+    lines += [perceived(metrics)]
     lines += [covered(metrics["coverage"])] if metrics["coverage"] else []
     return [*lines, drifted(metrics["long"]["drift"]["memory"])]
 

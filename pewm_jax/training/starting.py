@@ -29,7 +29,13 @@ def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]
 
 
 def require_weights(config: Config) -> None:
-    """Refuse networks that are never trained, if ``train.start`` names no weights for them."""
+    """Refuse networks that are never trained, if there are no weights for them.
+
+    Those of the model are named by ``train.start``; a stage's loss may need others.
+    """
+    for stage in all_stages(config):
+        if stage.given is not None and stage.settings(config).steps > 0:
+            stage.given(config.train)
     for where, part in _parts(config.model):
         if where in config.model.TRAINS or config.train.start:
             continue

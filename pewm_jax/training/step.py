@@ -28,7 +28,12 @@ Metrics = dict[str, Array]
 
 
 def train_step(
-    config: Config, stage: Stage, state: TrainState, clip: Clip, key: Array
+    config: Config,
+    stage: Stage,
+    state: TrainState,
+    clip: Clip,
+    key: Array,
+    given: Params | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Do one optimizer step.
 
@@ -38,6 +43,7 @@ def train_step(
         state: the state before.
         clip: a batch with leading B, uint8 colours and metric depth.
         key: the stage's PRNG key, the same for all steps; the step's number is folded in.
+        given: weights that only the loss needs, see ``Stage.given``.
 
     Returns:
         The state after, and scalars: ``loss``, ``grad_norm`` (before clipping),
@@ -49,7 +55,7 @@ def train_step(
     step_key = jax.random.fold_in(key, state.step)
 
     def loss_of(trained: Params) -> tuple[Array, Metrics]:
-        params = tree.merge(trained, frozen)
+        params = tree.merge(trained, frozen, given or {})
         return stage.loss(config.model, config.train, params, clip, step_key)
 
     (loss, measured), gradients = jax.value_and_grad(loss_of, has_aux=True)(trained)
@@ -108,23 +114,46 @@ def initial_state(
     return make(stage_key(config, stage), start)
 
 
+def given_weights(config: Config, stage: Stage, mesh: Mesh) -> Params | None:
+    """Read what only the stage's loss needs, onto every device; None for most stages.
+
+    Raises:
+        UserError: it is absent or damaged.
+    """
+    given = stage.given(config.train) if stage.given else None
+    if given is None:
+        return None
+    everywhere = sharding.replicated(mesh)
+    like = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), given
+    )
+    return sharding.place(given, like)
+
+
 def lower_step(config: Config, stage: Stage, mesh: Mesh, clip: Any) -> jax.stages.Lowered:
     """Trace ``train_step`` for one batch shape; arguments as for ``compile_step``."""
+    return _lower(config, stage, mesh, clip, given_weights(config, stage, mesh))
+
+
+def _lower(
+    config: Config, stage: Stage, mesh: Mesh, clip: Any, given: Params | None
+) -> jax.stages.Lowered:
     state = abstract_state(config, stage, mesh)
     everywhere = sharding.replicated(mesh)
     placed = jax.tree.map(lambda leaf: leaf.sharding, state)
     split = sharding.of_batch(mesh)
     batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split), clip)
     key = stage_key(config, stage)
+    extra = () if given is None else (given,)
     step = jax.jit(
         functools.partial(train_step, config, stage),
-        in_shardings=(placed, split, everywhere),
+        in_shardings=(placed, split, everywhere, *(everywhere for _ in extra)),
         out_shardings=(placed, everywhere),
         donate_argnums=0,
     )
     abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
     with jax.set_mesh(mesh):  # which ``models.placement`` asks for
-        return step.lower(state, batch, abstract_key)
+        return step.lower(state, batch, abstract_key, *extra)
 
 
 def compile_step(
@@ -142,7 +171,11 @@ def compile_step(
         The compiled ``(state, clip, key) -> (state, metrics)``; it consumes the state it is given
         (its buffers are donated) and wants clip and key placed as ``sharding`` says.
     """
-    return lower_step(config, stage, mesh, clip).compile()
+    given = given_weights(config, stage, mesh)
+    compiled = _lower(config, stage, mesh, clip, given).compile()
+    if given is None:
+        return compiled
+    return lambda state, clip, key: compiled(state, clip, key, given)
 
 
 def _norm(gradients: Params) -> Array:

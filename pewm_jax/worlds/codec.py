@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings, UserError
 from pewm_jax.geometry import holes
-from pewm_jax.models import learned_codec
+from pewm_jax.models import learned_codec, lpips, lpips_weights
 from pewm_jax.models.costs import Costs, Product, Share
 from pewm_jax.models.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.types import Array, Clip, Params
@@ -62,12 +62,13 @@ def reconstruct(
     """Return the loss of stage ``codec``: frames given back through noise on their latents.
 
     Absolute and squared error of the pixels, and absolute error of the differences between
-    neighbours, with the weights in ``train``; depth counts where it was measured. The noise of a
-    channel is relative to its deviation in the batch, so that larger latents gain nothing.
+    neighbours, with the weights in ``train``; depth counts where it was measured. Where
+    ``train.lpips_weight`` asks for it, LPIPS of colour too. The noise of a channel is relative to
+    its deviation in the batch, so that larger latents gain nothing.
 
     Returns:
-        ``(loss, measured)``: of colour ``psnr_rgb`` in decibels, of depth ``depth_m``, the mean
-        absolute error in metres; both through the noise.
+        ``(loss, measured)``: of colour ``psnr_rgb`` in decibels and ``lpips``, if it counts; of
+        depth ``depth_m``, the mean absolute error in metres; all through the noise.
     """
     assert isinstance(train, CodecTrainConfig)
     truth, counts = pictures(model, clip)
@@ -88,12 +89,29 @@ def reconstruct(
     pull = jnp.square(mean).mean() + jnp.square(jnp.log(variance)).mean()
     off = depth_from_signal(model.clip, made[1].mean(-1))
     off = jnp.abs(off - depth_from_signal(model.clip, truth[1, ..., 0])) * counts[1, ..., 0]
-    return each.mean() + PULL * pull, {
+    loss, perceived = each.mean() + PULL * pull, {}
+    if train.lpips_weight:
+        apart = lpips.apply(train.lpips_net, params["lpips"], made[0], truth[0]).mean()
+        loss, perceived = loss + train.lpips_weight * apart, {"lpips": apart}
+    return loss, perceived | {
         "loss_rgb": each[0],
         "loss_depth": each[1],
         "psnr_rgb": -10 * jnp.log10(jnp.maximum(squared[0] / 4, 1e-10)),
         "depth_m": off.sum() / jnp.maximum(counts[1].sum(), 1),
     }
+
+
+def perceptual(train: TrainSettings) -> Params | None:
+    """Return the weights of LPIPS that ``reconstruct`` needs, under ``lpips``, or None.
+
+    Raises:
+        UserError: they are asked for and absent, damaged, or of another network.
+    """
+    assert isinstance(train, CodecTrainConfig)
+    if not train.lpips_weight:
+        return None
+    file = lpips_weights.find(train.lpips_net, train.lpips_file)
+    return {"lpips": lpips_weights.read(file, train.lpips_net)[1]}
 
 
 def distribute(
@@ -138,7 +156,14 @@ STATISTICS = r"codec/latent_(mean|scale)_C"
 NETWORKS = r"codec/(encoder|decoder)/.*"
 GATE = r"codec/gate/.*"
 STAGES = (
-    Stage("codec", 1, ((STATISTICS, FREEZE), (NETWORKS, TRAIN)), _without_gate, reconstruct),
+    Stage(
+        "codec",
+        1,
+        ((STATISTICS, FREEZE), (NETWORKS, TRAIN)),
+        _without_gate,
+        reconstruct,
+        given=perceptual,
+    ),
     Stage("statistics", 2, ((STATISTICS, TRAIN), (NETWORKS, FREEZE)), _without_gate, distribute),
     Stage("gate", 3, ((GATE, TRAIN), (STATISTICS, FREEZE), (NETWORKS, FREEZE)), init, mix),
 )
@@ -175,6 +200,11 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
         )
         for part, backward in parts.items()
     ]
+    train = config.train
+    if trained and isinstance(train, CodecTrainConfig) and train.lpips_weight:
+        # Colours, those given back and the true ones; only the former have a gradient.
+        work = frames * lpips.macs(train.lpips_net, *size)
+        products.append(Product("lpips", "convolution", work, 0.5))
     if stage is STAGES[2]:
         products.append(Product("codec", "convolution", model.clip.frames * macs(model), 2.0))
     return {"codec": Costs(tuple(products))}

@@ -39,6 +39,9 @@ class Stage:
             a batch with frozen weights alone, and leaves out what that no longer needs; the loss is
             the same.
         prepares_by: the top-level parameters that ``prepare`` reads.
+        given: ``given(train) -> params`` or None: weights that the loss needs and that are no part
+            of the model, by top-level names of their own. They are read when training begins,
+            placed on every device, never trained and never saved.
         optional: whether it is left out where its settings give it no steps.
         rates: (pattern, factor) over the paths of trained parameters, the first match wins: the
             learning rate there is the stage's times the factor; elsewhere it is the stage's.
@@ -52,6 +55,7 @@ class Stage:
     memory: bool = False
     prepare: Callable[[Any, Params, Clip], Clip] | None = None
     prepares_by: tuple[str, ...] = ("codec", "encoder")
+    given: Callable[[Any], Params | None] | None = None
     optional: bool = False
     rates: tuple[tuple[str, float], ...] = ()
 

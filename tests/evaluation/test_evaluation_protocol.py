@@ -127,8 +127,9 @@ def test_fingerprint_names_what_the_numbers_depend_on(tmp_path):
         fingerprint(context, "w", "d"),
         fingerprint(config, "other", "d"),
         fingerprint(config, "w", "other"),
+        fingerprint(config, "w", "d", "lpips"),
     ]
-    assert len({base, *others}) == 5
+    assert len({base, *others}) == 6
 
 
 def test_file_hash_is_sha256(tmp_path):

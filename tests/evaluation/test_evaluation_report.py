@@ -29,7 +29,7 @@ from pewm_jax.evaluation import opened as runs
 from pewm_jax.evaluation.imagine import Imagination
 from pewm_jax.evaluation.page import introduction
 from pewm_jax.evaluation.words import comparison, drifted, number, verdict
-from pewm_jax.models import world_model
+from pewm_jax.models import lpips, world_model
 from pewm_jax.types import Frames
 from pewm_jax.worlds.pewm import STAGES
 
@@ -187,6 +187,36 @@ def test_a_damaged_page_is_drawn_again_without_imagining(copied, monkeypatch):
     assert page.read_bytes() == whole
 
 
+def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(copied, tmp_path):
+    metrics = json.loads((copied / "report" / "metrics.json").read_text())
+    assert "lpips" not in metrics["results"]["memory"]["all"]
+    assert metrics["protocol"]["lpips"].startswith("LPIPS is left out")
+    assert metrics["protocol"]["lpips_weights_sha256"] is None
+    page = (copied / "report" / "index.html").read_text()
+    assert "LPIPS is left out" in page
+    assert "LPIPS ↓" not in page
+
+    path = tmp_path / "vgg.safetensors"  # AlexNet takes no pictures this small
+    weights.save(path, jax.jit(lambda key: lpips.init("vgg", key))(jax.random.key(0)))
+    said = []
+    report.evaluate(copied, say=said.append, clips=3, seeds=(0,), lpips=path)
+    metrics = json.loads((copied / "report" / "metrics.json").read_text())
+    found = {name: masks["all"]["lpips"] for name, masks in metrics["results"].items()}
+    assert set(found) == {"memory", "empty", "reproject", "copy"}
+    assert all(entry["n"] == 3 and entry["mean"] > 0 for entry in found.values())
+    assert found["copy"] != found["memory"]
+    assert metrics["margins"]["empty"]["all"]["lpips"]["mean"] == pytest.approx(0, abs=1e-3)
+    assert len(metrics["long"]["per_frame"]["copy"]["all"]["lpips"]["mean"]) == 8
+    assert metrics["protocol"]["lpips_weights_sha256"] == report.file_hash(path)
+    page = (copied / "report" / "index.html").read_text()
+    assert "LPIPS ↓" in page
+    assert "not resized" in page
+    assert any(line.startswith("LPIPS of whole pictures, lower is better") for line in said)
+    said.clear()
+    report.evaluate(copied, say=said.append, clips=3, seeds=(0,), lpips=path)
+    assert "nothing to do" in said[-1]
+
+
 def test_more_seeds_keep_what_was_scored(copied):
     said = []
     report.evaluate(copied, say=said.append, seeds=(0, 1, 2))
@@ -305,6 +335,7 @@ def test_bad_input_ends_in_one_sentence(copied, command, capsys, tmp_path):
     assert "did you mean --clips" in refused(command, [str(copied), "--clip", "1"], capsys)
     assert "evaluate.clips" in refused(command, [str(copied), "--clips", "0"], capsys)
     assert "sample_steps" in refused(command, [str(copied), "--steps", "0"], capsys)
+    assert "weights of LPIPS" in refused(command, [str(copied), "--lpips", "gone"], capsys)
 
 
 def test_truncated_data_are_refused(copied, command, capsys, tmp_path):

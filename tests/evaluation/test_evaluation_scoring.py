@@ -50,8 +50,8 @@ def test_a_model_that_remembers_wins_by_a_mile(knowing_model, episodes, tmp_path
     scored = scoring.score_table(
         config, episodes, model, Partials(tmp_path, "e" * 64, "f" * 64), print
     )
-    assert scored.sums["memory"].shape == (2, 3, 4, 3, 7)
-    assert scored.sums["copy"].shape == (1, 3, 4, 3, 7)
+    assert scored.sums["memory"].shape == (2, 3, 4, 3, 9)
+    assert scored.sums["copy"].shape == (1, 3, 4, 3, 9)
     results = table(scored.sums, scored.clusters)
     # Only rounding of colours to 8 bits and of depth to millimetres is left.
     assert results["memory"]["all"]["psnr"]["mean"] > 50

