@@ -214,18 +214,13 @@ def test_each_token_gets_the_latents_and_the_mask_of_its_cell():
             ).added_BND
         )
     )
+    latents, seen = encoded.latents_thwC, encoded.seen_THW
     base = added(encoded).reshape(2, *GRID, -1)
     for t, h, w in ((0, 0, 0), (3, 1, 2), (4, 0, 1)):
-        latents = encoded.latents_thwC.at[1, t, h, w].add(1.0)
-        mask = encoded.seen_THW.at[1, t, 8 * h + 3, 8 * w + 5].set(
-            ~encoded.seen_THW[1, t, 8 * h + 3, 8 * w + 5]
-        )
-        for other in (EncodedView(latents, encoded.seen_THW), EncodedView(base, mask)):
-            other = EncodedView(  # noqa: PLW2901
-                other.latents_thwC if other.seen_THW is encoded.seen_THW else encoded.latents_thwC,
-                other.seen_THW,
-            )
-            moved = added(other).reshape(base.shape)
+        other = latents.at[1, t, h, w].add(1.0)
+        mask = seen.at[1, t, 8 * h + 3, 8 * w + 5].set(~seen[1, t, 8 * h + 3, 8 * w + 5])
+        for changed in (EncodedView(other, seen), EncodedView(latents, mask)):
+            moved = added(changed).reshape(base.shape)
             assert np.argwhere(np.abs(moved - base).max(-1) > 0).tolist() == [[1, t, h, w]]
 
 
