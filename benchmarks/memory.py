@@ -1,6 +1,6 @@
 """Inserting one clip into the voxel map, beside NumPy and torch; bytes, points, extents.
 
-Rendering follows, as ``benchmarks/surfels.py`` alone prints it.
+Rendering and reading what is rendered follow, as ``benchmarks/surfels.py`` alone prints them.
 
 Run with ``python benchmarks/memory.py`` (a few minutes); ``--record`` rewrites its section of
 ``RESULTS.md``. One clip of the paper's size: 9 frames of 512 × 512 pixels in a furnished room,
@@ -242,6 +242,7 @@ def main() -> None:
         ]
         record("memory", "\n\n".join(text))
     surfels.show(chosen.repeats, chosen.record)
+    surfels.show_reading(chosen.repeats, 16, chosen.record)
 
 
 if __name__ == "__main__":

@@ -4,15 +4,22 @@
 same z-buffer in torch (`scatter_reduce` with amin, then the lowest index of the nearest), of
 `rendering.splat_surfels` (points with a size, hidden surfaces, shared pixels), which has no peer
 here, and of filling the holes. Both z-buffers must agree.
+
+Then what it costs to give the demo's reader the rendered picture as pixels and as the codec's
+latents (``memory.reader.picture``): preparing a batch of its clips, and a step of stage 2 on it.
+``--only reading`` does that alone.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +28,16 @@ import torch
 from memory_peers import SIZE, T, room
 from record import machine, record, table
 
+from pewm_jax import presets
+from pewm_jax.config import Config, RenderConfig
+from pewm_jax.data.episodes import read_episode
+from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.geometry.cameras import invert_rigid, unproject
 from pewm_jax.memory import rendering
-from pewm_jax.types import Array, Camera
+from pewm_jax.training import sharding
+from pewm_jax.training.step import compile_step, initial_state, stage_key
+from pewm_jax.types import Array, Camera, Clip
+from pewm_jax.worlds.pewm import STAGES
 
 POINTS = 200_000
 
@@ -103,12 +117,87 @@ def measure(repeats: int) -> tuple[dict[str, list[float]], str]:
     return times, words
 
 
+def walk(config: Config, batch: int) -> Clip:
+    """Return clips along a walk through a generated house, each after its context."""
+    context, length = config.data.context, config.model.clip.frames
+    size = config.model.clip.height
+    settings = CollectConfig(Path("unused"), frames=batch + context + length, size=size)
+    episode = read_episode(make_episode(settings, "revisit", 0))
+
+    def frames(count: int, after: int) -> Any:
+        parts = (episode.frames(range(k + after, k + after + count)) for k in range(batch))
+        return jax.tree.map(lambda *x: np.stack(x), *parts)
+
+    return Clip(frames(length, context), frames(context, 0), np.ones((batch, context), bool))
+
+
+def readings(batch: int) -> dict[tuple[str, str], Callable[[], object]]:
+    """Return what is timed for each picture: preparing a batch, a step of stage 2 on it."""
+    found: dict[tuple[str, str], Callable[[], object]] = {}
+    for picture in ("pixels", "latents"):
+        config, stage = presets.load("demo"), STAGES[1]
+        reader = config.model.memory.reader
+        assert isinstance(reader, RenderConfig)
+        reader = dataclasses.replace(reader, picture=picture)
+        config = config.with_model(memory=dataclasses.replace(config.model.memory, reader=reader))
+        mesh = sharding.make_mesh(jax.devices()[:1])
+        state = initial_state(config, stage, mesh)
+        clips, key = jax.device_put((walk(config, batch), stage_key(config, stage)))
+        prepare = jax.jit(functools.partial(stage.prepare, config.model))
+        frozen = {name: state.params[name] for name in ("codec",)}
+        ready = prepare(frozen, clips)
+        step, states = compile_step(config, stage, mesh, ready), [state]
+
+        def prepared(prepare=prepare, frozen=frozen, clips=clips) -> object:
+            return jax.block_until_ready(prepare(frozen, clips))
+
+        def stepped(step=step, states=states, ready=ready, key=key) -> object:
+            states[0], metrics = step(states[0], ready, key)
+            return jax.block_until_ready(metrics)
+
+        found["preparing", picture] = prepared
+        found["a step", picture] = stepped
+    return found
+
+
+def show_reading(repeats: int, batch: int, recorded: bool) -> None:
+    """Measure both pictures in turn, print, and rewrite the section of ``RESULTS.md`` if asked."""
+    runs = readings(batch)
+    times: dict[tuple[str, str], list[float]] = {name: [] for name in runs}
+    for turn in range(repeats + 1):
+        for name, run in runs.items():
+            begin = time.perf_counter()
+            run()
+            if turn:  # the first warms up
+                times[name].append(time.perf_counter() - begin)
+    rows = []
+    for what in ("preparing", "a step"):
+        pixels, latents = times[what, "pixels"], times[what, "latents"]
+        ratio = statistics.median(b / a for a, b in zip(pixels, latents, strict=True))
+        middle = [f"{statistics.median(spent) * 1e3:.0f} ms" for spent in (pixels, latents)]
+        rows.append([what, *middle, f"{ratio:.2f}×"])
+    text = table([f"{batch} clips", "pixels", "latents", "latents over pixels"], rows)
+    print(text, flush=True)
+    if recorded:
+        how = (
+            f"`python benchmarks/surfels.py --only reading --record`: the demo's model and sizes, "
+            f"random weights, clips of one walk; medians of {repeats} in turn. {machine('jax')}."
+        )
+        title = "## Reading a rendered memory as pixels or as latents"
+        record("reading", "\n\n".join([title, how, text]))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--batch", type=int, default=16, help="clips that are read at once")
+    parser.add_argument("--only", choices=("points", "reading"), help="one of the two parts")
     parser.add_argument("--record", action="store_true", help="rewrite this section of RESULTS.md")
     chosen = parser.parse_args()
-    show(chosen.repeats, chosen.record)
+    if chosen.only != "reading":
+        show(chosen.repeats, chosen.record)
+    if chosen.only != "points":
+        show_reading(chosen.repeats, chosen.batch, chosen.record)
 
 
 def show(repeats: int, recorded: bool) -> None:

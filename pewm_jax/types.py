@@ -166,16 +166,32 @@ class View:
 
 @_pytree
 @dataclasses.dataclass(frozen=True)
+class EncodedView:
+    """The images of T cameras as the codec encodes them, any leading shape before t or T.
+
+    Attributes:
+        latents_thwC: (..., t, h, w, C) latents of colour and depth, holes filled.
+        seen_THW: (..., T, H, W) bool, whether a point is at the pixel.
+    """
+
+    latents_thwC: Array
+    seen_THW: Array
+
+
+@_pytree
+@dataclasses.dataclass(frozen=True)
 class Sight:
     """What a memory shows one clip, or each clip of a batch; what is not asked for is None.
 
     Attributes:
         tokens: the points that the clip's cameras see, for attention.
         view: what the memory looks like from each of the clip's cameras, at the clip's size.
+        encoded: the same, encoded by the codec.
     """
 
     tokens: MapTokens | None = None
     view: View | None = None
+    encoded: EncodedView | None = None
 
 
 @_pytree

@@ -27,6 +27,8 @@ from pewm_jax.config import (
     EvalConfig,
     FlowConfig,
     ImagesConfig,
+    LatentsConfig,
+    LearnedCodecConfig,
     ModelConfig,
     PatchColoursConfig,
     PixelConfig,
@@ -259,10 +261,13 @@ def experiments(draw):
     parts = {name: draw(some(name))() for name in sorted(names)}
     steps = dataclasses.replace(parts["noise"], sample_steps=draw(st.integers(1, 50)))
     reader = dataclasses.replace(draw(some("reader"))(), mlp_ratio=draw(st.integers(1, 4)))
+    encoder = draw(some("encoder"))()
+    if isinstance(encoder, LatentsConfig):  # fits the learned codec alone
+        parts["codec"] = LearnedCodecConfig()
     memory = dataclasses.replace(
         draw(some("memory"))(),
         cell_m=draw(st.tuples(*[st.floats(0.1, 2)] * 3)),
-        encoder=draw(some("encoder"))(),
+        encoder=encoder,
         reader=reader,
     )
     model = ModelConfig(**{**parts, "noise": steps}, memory=memory)

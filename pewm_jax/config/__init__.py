@@ -11,7 +11,12 @@ from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
 from pewm_jax.config.control import CameraConfig, ControlSettings
 from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
-from pewm_jax.config.encoder import DINOv2EncoderConfig, EncoderSettings, PatchColoursConfig
+from pewm_jax.config.encoder import (
+    DINOv2EncoderConfig,
+    EncoderSettings,
+    LatentsConfig,
+    PatchColoursConfig,
+)
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.kinds import Settings, functions, register
@@ -43,6 +48,7 @@ register("codec", "vae", VAEConfig, "pewm_jax.models.vae_codec")
 register("codec", "learned", LearnedCodecConfig, "pewm_jax.models.learned_codec")
 register("control", "camera", CameraConfig, "pewm_jax.models.camera_control")
 register("encoder", "patch_colours", PatchColoursConfig, "pewm_jax.models.patch_colours")
+register("encoder", "latents", LatentsConfig, "pewm_jax.models.latent_encoder")
 register("encoder", "dinov2", DINOv2EncoderConfig, "pewm_jax.models.dinov2_encoder")
 register("reader", "attend", AttentionConfig, "pewm_jax.models.attention_reader")
 register("reader", "render", RenderConfig, "pewm_jax.models.render_reader")
@@ -84,6 +90,7 @@ __all__ = [
     "EvalConfig",
     "FlowConfig",
     "ImagesConfig",
+    "LatentsConfig",
     "Launch",
     "LearnedCodecConfig",
     "Map2DConfig",

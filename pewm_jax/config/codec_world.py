@@ -86,3 +86,8 @@ class CodecWorldConfig(WorldSettings):
             "alone: use codec.kind learned.",
         )
         self.codec.check(self)
+        require(
+            self.memory.encoder.WEIGHTS != "codec",
+            "memory.encoder is made by the codec, and the world `codec` keeps colours alone: leave "
+            "memory.encoder.kind patch_colours.",
+        )

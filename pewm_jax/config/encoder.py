@@ -15,12 +15,13 @@ class EncoderSettings(Settings):
 
     Attributes:
         channels: F, number of features of a patch.
-        CONVERTED: whether the weights are frozen and come from ``train.start``. Such encoders are
-            large, and run clip by clip.
+        CONVERTED: whether the weights are frozen and come from ``train.start``.
+        WEIGHTS: the part of the model whose parameters it takes: its own, or the ``codec``'s.
     """
 
     SECTION: ClassVar[str] = "encoder"
     CONVERTED: ClassVar[bool] = False
+    WEIGHTS: ClassVar[str] = "encoder"
     channels: Any
 
     def grid(self, clip: Any) -> tuple[int, int]:
@@ -53,6 +54,43 @@ class PatchColoursConfig(EncoderSettings):
     def __post_init__(self):
         """Validate."""
         require_positive(self, "memory.encoder", "patch")
+
+
+@dataclasses.dataclass(frozen=True)
+class LatentsConfig(EncoderSettings):
+    """The colours' latents of each frame, as the model's own codec makes them; no other weights."""
+
+    WEIGHTS: ClassVar[str] = "codec"
+
+    channels: int = 16
+    """Latent channels of colour that the codec has."""
+    patch: int = 8
+    """Pixels per latent cell of the codec, each way."""
+
+    def grid(self, clip: Any) -> tuple[int, int]:
+        """Return the rows and columns of latents that a frame of a ``ClipConfig`` has."""
+        return clip.height // self.patch, clip.width // self.patch
+
+    def check(self, model: Any) -> None:
+        """Refuse another codec than the settings describe, and one that folds frames."""
+        codec = model.codec
+        require(
+            codec.temporal == 1,
+            f"memory.encoder.kind latents takes the latents of single frames, and the codec folds "
+            f"{codec.temporal} frames into one (codec.temporal): use codec.kind learned, or "
+            "another memory.encoder.",
+        )
+        require(
+            (self.channels, self.patch) == (codec.rgb_channels, codec.spatial),
+            f"memory.encoder describes latents of {self.channels} channels for {self.patch} pixels "
+            f"each way, and the codec makes {codec.rgb_channels} channels of {codec.spatial}: set "
+            f"memory.encoder.channels {codec.rgb_channels} and memory.encoder.patch "
+            f"{codec.spatial}.",
+        )
+
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "memory.encoder", "channels", "patch")
 
 
 @dataclasses.dataclass(frozen=True)

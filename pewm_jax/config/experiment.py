@@ -45,3 +45,10 @@ class Config:
             f"train is a {type(self.train).__name__}, and a {type(self.model).__name__} is trained "
             f"by the stages of a {self.model.TRAIN.__name__}: use that.",
         )
+        encoder = getattr(getattr(self.model, "memory", None), "encoder", None)
+        require(
+            not self.data.features or getattr(encoder, "WEIGHTS", "encoder") == "encoder",
+            f"data.features is {self.data.features}, and the memory's features are the codec's "
+            "latents, of which no cache is kept: leave data.features empty; data.prepared keeps "
+            "what is made of them.",
+        )

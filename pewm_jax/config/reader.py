@@ -15,12 +15,14 @@ class ReaderSettings(Settings):
     Attributes:
         READS_TOKENS: whether it takes the points that a clip's cameras see (``Sight.tokens``).
         READS_VIEW: whether it takes what the memory looks like from them (``Sight.view``).
+        READS_LATENTS: whether it takes that as the codec encodes it (``Sight.encoded``) instead.
         split_heads: a number that ``train.mesh.tensor`` must divide.
     """
 
     SECTION: ClassVar[str] = "reader"
     READS_TOKENS: ClassVar[bool] = True
     READS_VIEW: ClassVar[bool] = False
+    READS_LATENTS: ClassVar[bool] = False
     split_heads: Any = 1
 
 
@@ -79,6 +81,9 @@ class RenderConfig(ReaderSettings):
     READS_TOKENS: ClassVar[bool] = False
     READS_VIEW: ClassVar[bool] = True
 
+    picture: Literal["pixels", "latents"] = "pixels"
+    """What a token gets of the picture: the `pixels` that it stands for, or the `latents` that the
+    codec makes of them, holes filled; these only of memories that show colours."""
     picture_width: int = 128
     """Channels of a token's part of the picture, embedded."""
     reduced: int = 8
@@ -89,18 +94,32 @@ class RenderConfig(ReaderSettings):
     mlp_ratio: int = 2
     """Hidden channels of such a block over model width."""
 
+    @property
+    def READS_LATENTS(self) -> bool:  # noqa: N802  # type: ignore[override]
+        """Whether it takes the picture as the codec encodes it."""
+        return self.picture == "latents"
+
     def check(self, model: Any) -> None:
-        """Refuse clips that cannot be folded as the pictures are."""
+        """Refuse clips that cannot be folded as the pictures are, and latents of features."""
         clip, q = model.clip, model.codec.temporal
         require(
             (clip.frames - 1) % q == 0,
             f"clip.frames is {clip.frames}: the memory's pictures are folded by codec.temporal = "
             f"{q}, so use {q}k + 1 frames, or memory.reader.kind attend.",
         )
+        require(
+            self.picture == "pixels" or not model.memory.KEEPS_FEATURES,
+            "memory.reader.picture is latents, which the codec makes of colours, and this memory "
+            "shows features: use memory.kind surfels or points, or memory.reader.picture pixels.",
+        )
 
     def __post_init__(self):
         """Validate."""
         require_positive(self, "memory.reader", "picture_width", "reduced", "mlp_ratio")
+        require(
+            self.picture in ("pixels", "latents"),
+            f"memory.reader.picture is {self.picture!r}; choose pixels or latents.",
+        )
 
 
 @dataclasses.dataclass(frozen=True)

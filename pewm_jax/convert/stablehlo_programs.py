@@ -103,11 +103,11 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
     parts = {"conditioning": conditioning}
     if "memory" in params:
 
-        def read(c: Camera) -> Any:
-            return memories.look(model, memories.empty(model, jnp.zeros(3)), c)
+        def read(p: Params, c: Camera) -> Any:
+            return memories.look(model, memories.empty(model, jnp.zeros(3)), c, params=p)
 
-        sight = jax.eval_shape(jax.vmap(read), camera)
-        shown = {"tokens": sight.tokens, "view": sight.view}
+        sight = jax.eval_shape(jax.vmap(read, (None, 0)), params, camera)
+        shown = {"tokens": sight.tokens, "view": sight.view, "encoded": sight.encoded}
         parts |= {name: part for name, part in shown.items() if part is not None}
     noisy = like((*model.latent_shape, model.codec.channels))
 

@@ -22,6 +22,7 @@ from pewm_jax import tensor_files, tree
 from pewm_jax.config import EncoderSettings, UserError, kinds
 from pewm_jax.data.dataset import Manifest, read_manifest
 from pewm_jax.data.episodes import Episode
+from pewm_jax.models import encoders
 from pewm_jax.types import Params
 
 MANIFEST = "cache.json"
@@ -57,7 +58,11 @@ def fingerprint(config: EncoderSettings, params: Params, data: Manifest) -> dict
         config: the encoder.
         params: the encoder's parameters, empty where it has none.
         data: the split's manifest.
+
+    Raises:
+        UserError: the features are the codec's latents.
     """
+    encoders.require_own(config, "are not kept in a cache")
     shards = "\n".join(shard.sha256 for shard in data.shards)
     return {
         "encoder": kinds.of(config).name,

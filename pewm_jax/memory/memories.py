@@ -35,8 +35,8 @@ import numpy as np
 
 from pewm_jax.config import ModelConfig, functions
 from pewm_jax.memory import rendering
-from pewm_jax.models import encoders
-from pewm_jax.types import Array, Camera, Frames, MapTokens, Params, Sight, View
+from pewm_jax.models import codecs, encoders
+from pewm_jax.types import Array, Camera, EncodedView, Frames, MapTokens, Params, Sight, View
 
 Memory: TypeAlias = Any
 """A pytree, of the type that the memory's ``empty`` returns."""
@@ -69,7 +69,7 @@ def remember(
         model: the model.
         memory: from ``empty`` or from an earlier call.
         frames: T frames, colours float in [−1, 1]; pixels without depth are ignored.
-        features_ThwF: (T, h, w, F) their patch features (``encoders.encode``).
+        features_ThwF: (T, h, w, F) their patch features (``encoders.features``).
         valid_T: (T,) bool; False frames are ignored.
         observed: False where the frames were imagined: of these only what is ``trusted`` is
             remembered, and memories that tell (``TELLS_IMAGINED``) are told.
@@ -174,23 +174,54 @@ def gated(model: ModelConfig) -> bool:
     return gate and model.clip.depth and shows_colours(model)
 
 
-def look(model: ModelConfig, memory: Memory, camera: Camera, *, pictures: bool = False) -> Sight:
+def look(
+    model: ModelConfig,
+    memory: Memory,
+    camera: Camera,
+    *,
+    params: Params | None = None,
+    pictures: bool = False,
+) -> Sight:
     """Return what the memory shows one clip, as far as the reader asks for it.
 
     Args:
         model: the model.
         memory: what is remembered.
         camera: (T,) cameras of the clip, whose intrinsics are for images of its size.
-        pictures: render it even if the reader does not.
+        params: the world model's parameters; those of the codec are used if the reader takes
+            latents, and they may be left out if it does not.
+        pictures: give the view even if the reader does not take it.
     """
-    seen, view = None, None
-    if model.memory.reader.READS_TOKENS:
+    reader = model.memory.reader
+    seen, view, encoded = None, None, None
+    if reader.READS_TOKENS:
         seen = tokens(model, memory, camera)
-    if pictures or model.memory.reader.READS_VIEW:
+    if pictures or reader.READS_VIEW:
         view = render(model, memory, camera, model.clip.height, model.clip.width)
         features = view.features_THWF[..., : rendered_channels(model)]
         view = View(features, view.depth_THW, view.seen_THW)
-    return Sight(seen, view)
+        if reader.READS_LATENTS:
+            encoded = encode(model, params or {}, view)
+            view = view if pictures else None
+    return Sight(seen, view, encoded)
+
+
+def encode(model: ModelConfig, params: Params, view: View) -> EncodedView:
+    """Encode a view of colours as the clip's frames are encoded.
+
+    The codec knows whole images: a pixel that shows nothing gets colour and depth of the nearest
+    pixel of its image that shows something. An image that shows nothing is grey and at
+    ``clip.far_m``.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; those of the codec are used.
+        view: (T,) images of the clip's size; the first 3 features are colours.
+    """
+    whole = rendering.fill_nearest(view)
+    depth = jnp.where(whole.depth_THW > 0, whole.depth_THW, model.clip.far_m)
+    latents = codecs.encode_rgbd(model, params, whole.features_THWF[None, ..., :3], depth[None])
+    return EncodedView(latents[0], view.seen_THW)
 
 
 def from_context(
@@ -206,7 +237,8 @@ def from_context(
 
     Args:
         model: the model.
-        params: the world model's parameters; those of the image encoder are used.
+        params: the world model's parameters; those that make features (``encoders.weights``) are
+            used.
         context: S frames of one world, colours in [−1, 1].
         valid_S: (S,) bool, False frames are ignored.
         features_ShwF: (S, h, w, F) the encoder's features of the frames, if they are known.
@@ -214,8 +246,7 @@ def from_context(
     last = jnp.argmax(jnp.where(valid_S, jnp.arange(valid_S.shape[0]), -1))
     memory = empty(model, context.camera.world_from_camera[last, :3, 3])
     if features_ShwF is None:
-        weights = params.get("encoder", {})
-        features = encoders.encode(model.memory.encoder, weights, context.rgb_THWC)
+        features = encoders.features(model, params, context.rgb_THWC)
     else:
         features = features_ShwF.astype(jnp.float32)
     return remember(model, memory, context, features, valid_S)

@@ -15,6 +15,8 @@ separately and their channels concatenated, as in the paper. The VAE sees depth 
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
@@ -22,6 +24,7 @@ from jax.core import Tracer
 from pewm_jax.config import CodecSettings, ModelConfig, functions
 from pewm_jax.geometry import holes
 from pewm_jax.models import placement
+from pewm_jax.models.costs import Costs, Share
 from pewm_jax.models.pixel_codec import fold
 from pewm_jax.models.signals import depth_from_signal, signal_from_depth
 from pewm_jax.types import Array, Params, View
@@ -175,3 +178,20 @@ def measured(model: ModelConfig, depth_BTHW: Array) -> Array:
     valid = (depth_BTHW > 0).astype(jnp.float32)[..., None]
     share = fold(valid, model.codec.spatial, model.codec.temporal)
     return share if model.codec.PIXELWISE else share.mean(-1, keepdims=True)
+
+
+def costs_of_images(model: ModelConfig, share: Share, images: int, part: str) -> Costs:
+    """Return what it costs to encode so many more images of a clip's size.
+
+    A codec's own costs are those of T + 1 images of colour and of as many of depth.
+
+    Args:
+        model: the model.
+        share: one device's share of the step.
+        images: images that are encoded.
+        part: the part of the model that they are encoded for.
+    """
+    whole = functions(model.codec).costs(model, share)
+    times = images / (2 * (model.clip.frames + 1))
+    products = (dataclasses.replace(x, part=part, macs=x.macs * times) for x in whole.products)
+    return Costs(tuple(products), streamed=whole.streamed * times, held=whole.held * times)

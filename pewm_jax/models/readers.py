@@ -31,7 +31,7 @@ def prepare(
         model: the model.
         params: the reader's parameters.
         sight: what the memory shows each clip, leading axis B; it has what the reader's settings
-            ask for (``READS_TOKENS``, ``READS_VIEW``).
+            ask for (``READS_TOKENS``, ``READS_VIEW``, ``READS_LATENTS``).
         camera: (B, T) cameras of the clips.
         rays_BthwC: their Plücker rays at the latent rate (``camera_control.rays``).
 

@@ -2,9 +2,11 @@
 
 The memory's pictures (``Sight.view``) are gathered into the cells of the latents by space-to-depth
 and are not encoded. Each video token gets the pixels that it stands for: colours or features, depth
-and a mask. They are added to the embedded tokens through a layer that starts at zero, and given to
-a block without attention after every block of the backbone (``render_block``), by which a frozen
-backbone learns to use them. A fresh reader changes nothing, and one that sees nothing never does.
+and a mask. Or, where ``picture`` is `latents`, it gets the latents that the codec makes of the
+pictures (``Sight.encoded``), 0 in cells of which nothing is seen, and the mask. Either is added to
+the embedded tokens through a layer that starts at zero, and given to a block without attention
+after every block of the backbone (``render_block``), by which a frozen backbone learns to use it. A
+fresh reader changes nothing, and one that sees nothing never does.
 
 Parameters, under ``render``: ``reduce`` (pictures of many channels), ``embed_1``, ``embed_2``,
 ``added``, and the stacked ``blocks``.
@@ -19,7 +21,7 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import ModelConfig, RenderConfig
-from pewm_jax.models import layers
+from pewm_jax.models import codecs, layers
 from pewm_jax.models.backbones import Readers
 from pewm_jax.models.costs import (
     SPLIT,
@@ -59,7 +61,8 @@ def _settings(model: ModelConfig) -> RenderConfig:
 
 
 def _reduces(model: ModelConfig) -> bool:
-    return model.memory.rendered_channels > _settings(model).reduced
+    config = _settings(model)
+    return not config.READS_LATENTS and model.memory.rendered_channels > config.reduced
 
 
 def pixel_channels(model: ModelConfig) -> int:
@@ -67,11 +70,18 @@ def pixel_channels(model: ModelConfig) -> int:
     return min(model.memory.rendered_channels, _settings(model).reduced) + 2
 
 
+def cell_channels(model: ModelConfig) -> int:
+    """Return the channels of what is read at a cell of the latents; see ``cells``."""
+    codec = model.codec
+    pixels = codec.temporal * codec.spatial**2
+    latents = _settings(model).READS_LATENTS
+    return codec.channels + pixels if latents else pixel_channels(model) * pixels
+
+
 def token_channels(model: ModelConfig) -> int:
     """Return the channels of the part of the pictures that one video token stands for."""
-    places, codec = model.backbone.places, model.codec
-    frames, side = codec.temporal * places.patch_t, codec.spatial * places.patch
-    return pixel_channels(model) * frames * side**2
+    places = model.backbone.places
+    return cell_channels(model) * places.patch_t * places.patch**2
 
 
 def _embeddings(model: ModelConfig) -> dict[str, layers.nn.Dense]:
@@ -129,6 +139,31 @@ def pictures(model: ModelConfig, params: Params, view: View) -> Array:
     )
 
 
+def cells(model: ModelConfig, params: Params, sight: Sight) -> tuple[Array, Array]:
+    """Return what is read at each cell of the latents, and which clips see anything.
+
+    Args:
+        model: the model.
+        params: the reader's parameters under ``render``.
+        sight: of a batch; what it holds where nothing is seen is not read.
+
+    Returns:
+        ``(cells_BthwC, seen_B)``: the pixels of each cell (see ``pictures``), or its latents and
+        the mask of its pixels.
+    """
+    fold_cells = functools.partial(fold, spatial=model.codec.spatial, temporal=model.codec.temporal)
+    if not _settings(model).READS_LATENTS:
+        view = sight.view
+        assert view is not None
+        return fold_cells(pictures(model, params, view)), view.seen_THW.any((1, 2, 3))
+    encoded, dtype = sight.encoded, jnp.dtype(model.dtype)
+    assert encoded is not None
+    seen = fold_cells(encoded.seen_THW[..., None])
+    latents = jnp.where(seen.any(-1, keepdims=True), encoded.latents_thwC, 0)
+    joined = jnp.concatenate([latents.astype(dtype), seen.astype(dtype)], -1)
+    return joined, encoded.seen_THW.any((1, 2, 3))
+
+
 def _apply(model: ModelConfig, params: Params, name: str, x: Array) -> Array:
     """Apply one of the layers on the way from pictures to tokens."""
     return _embeddings(model)[name].apply({"params": params[name]}, x)
@@ -139,20 +174,17 @@ def prepare(
 ) -> Readers:
     """Embed the memory's pictures; see ``readers``."""
     del camera, rays_BthwC  # the pictures are what these cameras see
-    view = sight.view
-    assert view is not None
     config, places, weights = _settings(model), model.backbone.places, params["render"]
-    codec, embed = model.codec, functools.partial(_apply, model, weights)
+    embed = functools.partial(_apply, model, weights)
     layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
 
-    cells = fold(pictures(model, weights, view), codec.spatial, codec.temporal)
-    missing = -cells.shape[1] % places.patch_t
-    cells = jnp.concatenate([cells[:, :1]] * missing + [cells], 1)
-    patches = patchify(cells, places.patch, places.patch_t)
+    read_BthwC, seen_B = cells(model, weights, sight)
+    missing = -read_BthwC.shape[1] % places.patch_t
+    read_BthwC = jnp.concatenate([read_BthwC[:, :1]] * missing + [read_BthwC], 1)
+    patches = patchify(read_BthwC, places.patch, places.patch_t)
     picture: Array = embed("embed_2", jax.nn.silu(embed("embed_1", patches)))
     # A clip whose cameras see nothing of the memory is left alone.
-    shown = view.seen_THW.any((1, 2, 3)) | (not model.memory.REMEMBERS)
-    shown = shown[:, None, None]
+    shown = (seen_B | (not model.memory.REMEMBERS))[:, None, None]
     added = layout.spread(jnp.where(shown, embed("added", picture), 0))
     if not config.blocks:
         return Readers(added_BND=added)
@@ -167,7 +199,10 @@ def prepare(
 
 
 def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return the costs of embedding pictures and of the blocks, and roughly of rendering."""
+    """Return the costs of embedding pictures and of the blocks, and roughly of rendering.
+
+    Of latents also those of making them.
+    """
     config, places, clip = _settings(model), model.backbone.places, model.clip
     frames, patches = video_tokens(model)
     video, depth, width = frames * patches, places.count * config.blocks, places.width
@@ -188,13 +223,18 @@ def costs(model: ModelConfig, share: Share) -> Costs:
     each = share.clips * video / share.context * share.activation_bytes
     tokens, part = each * width, each * hidden / share.tensor
     drawn = share.clips * pixels * (model.memory.rendered_channels + 2) * share.activation_bytes
+    made, stays = Costs(), drawn
+    if config.READS_LATENTS:
+        made = codecs.costs_of_images(model, share, 2 * clip.frames, "memory")
+        stays = each * token_channels(model)  # the pictures are gone when the denoiser starts
     kept = 0.0 if remat else depth * (4 * tokens + 3 * part)
     block = 3 * part + 2 * tokens if remat and config.blocks else 0.0
     forward, backward = STREAMS
     return Costs(
-        products=products,
-        kept=kept + drawn,
+        products=products + made.products,
+        kept=kept + stays,
         block=block,
-        streamed=depth * tokens * (forward * (1 + remat) + backward) + 8 * drawn,
+        held=made.held,
+        streamed=depth * tokens * (forward * (1 + remat) + backward) + 8 * drawn + made.streamed,
         summed=2 * depth * (2 + remat) * tokens,
     )

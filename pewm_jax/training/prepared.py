@@ -112,6 +112,9 @@ def _folder(config: Config, stage: Stage, params: Params) -> Path:
     if "backbone" not in stage.prepares_by:
         for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
             model.pop(part, None)
+    reader = model.get("memory", {}).get("reader", {})
+    if reader.get("picture") == "pixels":  # as it was before there was a choice
+        del reader["picture"]
     data = configuration.to_dict(config.data)
     split = read_manifest(Path(config.data.path) / "train")
     for setting in ("path", "features", "prepared", "prepared_path", "workers", "bad_records"):

@@ -29,31 +29,34 @@ def clip_sight(model: ModelConfig, params: Params, clip: Clip, *, pictures: bool
     if the reader needs none where ``pictures`` asks for them.
     """
 
-    def of_clip(context: Frames, valid_S: Array, features: Array, camera: Camera) -> Sight:
-        memory = memories.from_context(model, {}, context, valid_S, features)
-        return memories.look(model, memory, camera, pictures=pictures)
-
     def of_batch(weights: Params, clip: Clip) -> Sight:
+        def of_clip(context: Frames, valid_S: Array, features: Array, camera: Camera) -> Sight:
+            memory = memories.from_context(model, weights, context, valid_S, features)
+            return memories.look(model, memory, camera, params=weights, pictures=pictures)
+
         features = clip.context_features_ShwF
         if features is None:
-            features = _encode(model, weights, clip.context.rgb_THWC)
+            features = _features(model, weights, clip.context.rgb_THWC)
         context = as_signal(clip.context)
         parts = context, clip.context_valid_S, features, clip.frames.camera
         if pictures or model.memory.reader.READS_VIEW:
             return jax.lax.map(lambda one: of_clip(*one), parts)
         return jax.vmap(of_clip)(*parts)
 
-    return placement.by_batch(of_batch, params.get("encoder", {}), clip)
+    weights = encoders.weights(model, params)
+    if model.memory.reader.READS_LATENTS and "codec" in params:
+        weights["codec"] = params["codec"]
+    return placement.by_batch(of_batch, weights, clip)
 
 
-def _encode(model: ModelConfig, weights: Params, rgb_BSHWC: Array) -> Array:
-    """Return the features of every clip's context; large encoders run clip by clip."""
-    encoder = model.memory.encoder
+def _features(model: ModelConfig, weights: Params, rgb_BSHWC: Array) -> Array:
+    """Return the features of every clip's context; encoders with weights run clip by clip."""
 
-    def encode(rgb_SHWC: Array) -> Array:
-        return encoders.encode(encoder, weights, signal_from_rgb(rgb_SHWC))
+    def of_clip(rgb_SHWC: Array) -> Array:
+        return encoders.features(model, weights, signal_from_rgb(rgb_SHWC))
 
-    return jax.lax.map(encode, rgb_BSHWC) if encoder.CONVERTED else jax.vmap(encode)(rgb_BSHWC)
+    large = encoders.weights(model, weights)
+    return jax.lax.map(of_clip, rgb_BSHWC) if large else jax.vmap(of_clip)(rgb_BSHWC)
 
 
 def prepare(model: ModelConfig, params: Params, clip: Clip, *, memory: bool) -> Clip:
@@ -150,13 +153,16 @@ def loss(
 
 def shown(sight: Sight, kept_B: Array) -> Sight:
     """Hide what the memory shows from the clips of a batch that are not kept."""
-    tokens, view = sight.tokens, sight.view
+    tokens, view, encoded = sight.tokens, sight.view, sight.encoded
     if tokens is not None:
         tokens = dataclasses.replace(tokens, valid_M=tokens.valid_M & kept_B[:, None])
     if view is not None:
         seen = view.seen_THW & kept_B[:, None, None, None]
         view = dataclasses.replace(view, seen_THW=seen)
-    return Sight(tokens, view)
+    if encoded is not None:
+        seen = encoded.seen_THW & kept_B[:, None, None, None]
+        encoded = dataclasses.replace(encoded, seen_THW=seen)
+    return Sight(tokens, view, encoded)
 
 
 def wrong(key: Array, shape: tuple[int, ...], most: float) -> Array:

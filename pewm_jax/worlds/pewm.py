@@ -184,7 +184,8 @@ def imagine_clip(
     conditioning = world_model.condition(model, params, observed, whole)
     sight = None
     if memory and "memory" in params:
-        shown = memories.look(model, state.map, camera, pictures=memories.gated(model))
+        gated = memories.gated(model)
+        shown = memories.look(model, state.map, camera, params=params, pictures=gated)
         sight = jax.tree.map(lambda x: x[None], shown)
     latents = sampling.draw(model, params, conditioning, sight, key)
     rgb, depth = codecs.decode_rgbd(model, params, latents)
@@ -210,8 +211,7 @@ def _remember(
     observed: bool = True,
 ) -> Any:
     """Put frames into the memory."""
-    weights = params.get("encoder", {})
-    features = encoders.encode(model.memory.encoder, weights, frames.rgb_THWC)
+    features = encoders.features(model, params, frames.rgb_THWC)
     return memories.remember(model, memory, frames, features, valid_T, observed=observed)
 
 

@@ -136,7 +136,14 @@ def imagining(reader=None):
 LAST = worlds.stages(tiny_config())[3]
 
 
-@pytest.mark.parametrize("reader", [None, AttentionConfig(heads=4, head_dim=8)])
+@pytest.mark.parametrize(
+    "reader",
+    [
+        None,
+        AttentionConfig(heads=4, head_dim=8),
+        RenderConfig(picture_width=8, picture="latents"),
+    ],
+)
 def test_the_gate_learns_alone_on_what_the_model_imagines(reader):
     config = imagining(reader)
     params = randomise(init_world(config.model))
