@@ -126,7 +126,7 @@ def main(folder: Path) -> None:
     fsdp = sharding.make_mesh(arranged=MESHES["fsdp 8"])
     out = {"losses": {}, "rows": {}, "moved": {}, "fresh": fresh(wide, STAGES[0], fsdp)}
     states, meshes = {}, {}
-    for stage, start in zip(STAGES, (None, backbone(config)), strict=True):
+    for stage, start in zip(STAGES[:2], (None, backbone(config)), strict=True):
         first = sharding.make_mesh(jax.devices()[:1], MESHES["one"])
         begun = jax.tree.map(np.asarray, step.initial_state(config, stage, first, start))
         for name, arranged in MESHES.items():
