@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 from pewm_jax.config import Config, LearnedCodecConfig, ModelConfig, functions
@@ -36,7 +37,19 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
         if encodes(config):
             encoder = functions(model.memory.encoder)
             found["encoder"] = encoder.costs(model, share, config.data.context)
+    if config.train.chained:
+        for part in found.keys() & {"backbone", "control", "memory"}:
+            found[part] = _once_more(found[part], config.train.chained)
     return found
+
+
+def _once_more(part: Costs, clips: float) -> Costs:
+    """Add a forward pass of a share of the clips, without gradient (``worlds.chained``)."""
+    forward = (
+        dataclasses.replace(product, macs=clips * product.macs, backward=0.0, again=0.0)
+        for product in part.products
+    )
+    return dataclasses.replace(part, products=(*part.products, *forward))
 
 
 def _gate(model: ModelConfig) -> Costs:
