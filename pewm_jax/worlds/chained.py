@@ -3,11 +3,12 @@
 In a rollout every clip but the first starts from an imagined frame, and a model that learned on
 observed ones alone believes it too much. Whole chained clips would cost a sampling for each step of
 training. Here the clip before is the same clip run backwards, from its last frame to its first, for
-which nothing more is to be read: its true latents get noise of a level drawn as in training, the
+which nothing more is to be read: its true latents get noise of a level drawn as in training; the
 model, as it is then, denoises them once, with the last frame as the observed one and the same
-memory, and the frame that it comes to last, decoded (and mixed with the memory where the codec's
-gate does that), is where the clip starts. So it lies between what the codec makes of the true frame
-and what the model imagines there of its own. No gradient goes through it.
+memory; and the clip starts from the frame that this comes to last, decoded, and mixed with the
+memory's picture by the codec's gate, where there is one and the reader reads pictures. So it lies
+between what the codec makes of the true frame and what the model imagines there of its own. No
+gradient goes through it.
 
 This is less than a rollout: one step instead of a sampling, without guidance, and the memory holds
 what was observed alone.
