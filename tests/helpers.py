@@ -40,63 +40,6 @@ TINY = ModelConfig(
 """A model of two blocks, for 9 frames of 16 × 24 pixels."""
 
 
-TINY = ModelConfig(
-    clip=ClipConfig(frames=9, height=16, width=24),
-    codec=PixelConfig(spatial=4),
-    backbone=DiTConfig(
-        layers=2, heads=2, head_dim=16, patch=2, text_length=3, text_dim=8, time_dim=16
-    ),
-    memory=VoxelConfig(
-        cell_m=(0.5, 0.5, 0.5),
-        cells=(24, 24, 8),
-        capacity=2048,
-        tokens=32,
-        imagined_edge=0.0,  # untrained models imagine nothing but edges
-        reader=AttentionConfig(heads=4, head_dim=8),
-    ),
-    noise=DDPMConfig(sample_steps=3),
-)
-"""A model of two blocks, for 9 frames of 16 × 24 pixels."""
-
-
-TINY = ModelConfig(
-    clip=ClipConfig(frames=9, height=16, width=24),
-    codec=PixelConfig(spatial=4),
-    backbone=DiTConfig(
-        layers=2, heads=2, head_dim=16, patch=2, text_length=3, text_dim=8, time_dim=16
-    ),
-    memory=VoxelConfig(
-        cell_m=(0.5, 0.5, 0.5),
-        cells=(24, 24, 8),
-        capacity=2048,
-        tokens=32,
-        imagined_edge=0.0,  # untrained models imagine nothing but edges
-        reader=AttentionConfig(heads=4, head_dim=8),
-    ),
-    noise=DDPMConfig(sample_steps=3),
-)
-"""A model of two blocks, for 9 frames of 16 × 24 pixels."""
-
-
-TINY = ModelConfig(
-    clip=ClipConfig(frames=9, height=16, width=24),
-    codec=PixelConfig(spatial=4),
-    backbone=DiTConfig(
-        layers=2, heads=2, head_dim=16, patch=2, text_length=3, text_dim=8, time_dim=16
-    ),
-    memory=VoxelConfig(
-        cell_m=(0.5, 0.5, 0.5),
-        cells=(24, 24, 8),
-        capacity=2048,
-        tokens=32,
-        imagined_edge=0.0,  # untrained models imagine nothing but edges
-        reader=AttentionConfig(heads=4, head_dim=8),
-    ),
-    noise=DDPMConfig(sample_steps=3),
-)
-"""A model of two blocks, for 9 frames of 16 × 24 pixels."""
-
-
 def tiny_config(**sections) -> Config:
     """Return a tiny experiment; sections are the model's, or data, train and evaluate."""
     of_model = {field.name for field in dataclasses.fields(ModelConfig)} & sections.keys()

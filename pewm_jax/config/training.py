@@ -118,6 +118,11 @@ class TrainSettings:
     hidden: float = 0.0
     """Share of clips from which the memory is hidden while it is read in training, so that the
     model stays good without; for stages that train the backbone with a memory."""
+    chained: float = 0.0
+    """Share of clips that start from a frame of the model's own, as all but the first do in a
+    rollout: the clip is run backwards in one denoising step from a random level of noise, and
+    starts from what the model, without gradient, makes of its first frame (`worlds/chained.py`
+    says what that leaves out). Costs a forward pass for that share."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
     """If a loss or gradient is not finite: `stop` training, or `skip` the update and count it."""
     grace_s: float = 30.0
@@ -143,7 +148,11 @@ class TrainSettings:
             f"train.depth_noise is {self.depth_noise}: use a share of the depth in [0, 1).",
         )
         require(
-            0 <= self.hidden < 1, f"train.hidden is {self.hidden}: use a share of clips in [0, 1)."
+            0 <= self.hidden <= 1, f"train.hidden is {self.hidden}: use a share of clips in [0, 1]."
+        )
+        require(
+            0 <= self.chained <= 1,
+            f"train.chained is {self.chained}: use a share of clips in [0, 1].",
         )
         for pattern in self.fresh:
             require(is_pattern(pattern), f"train.fresh: {pattern!r} is no regular expression.")

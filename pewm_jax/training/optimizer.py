@@ -77,6 +77,7 @@ MATRICES = (
         r"(.*/)?(embed|patch_embed|text_embed|proj_out|modulate_out|into|out|direct)[^/]*/kernel",
         False,
     ),
+    (r"memory/(tokens|camera)/kernel", False),
     (r"(.*/)?kernel", True),
     (r".*", False),
 )

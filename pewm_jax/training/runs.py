@@ -33,6 +33,7 @@ BASE = "base.json"
 FREE = (
     "evaluate",
     "data.features",
+    "data.prepared_path",
     "data.workers",
     "data.bad_records",
     "model.noise.sample_steps",
@@ -59,7 +60,8 @@ FREE = (
 )
 """Settings that may change between one start of a run and the next: none alters what is learnt.
 
-``data.features`` is one: the features are checked by their hashes when they are opened.
+``data.features`` is one: the features are checked by their hashes when they are opened. So is
+``data.prepared_path``: folders in it are named by what the clips in them depend on.
 """
 
 

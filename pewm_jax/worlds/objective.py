@@ -14,6 +14,7 @@ from pewm_jax.memory import memories
 from pewm_jax.models import codecs, encoders, placement, world_model
 from pewm_jax.models.signals import as_signal, signal_from_rgb
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, Params, Sight
+from pewm_jax.worlds import chained
 from pewm_jax.worlds.control import require_actions
 
 BROAD = 8
@@ -95,7 +96,8 @@ def loss(
 
     Args:
         model: the model.
-        train: the training's settings; gives the noise on the observed frame.
+        train: the training's settings; give the noise on the observed frame, the share of clips
+            that start from the model's own (``worlds.chained``), and that without memory.
         params: the world model's parameters.
         clip: a batch, leading axis B, colours uint8 or float.
         key: randomness of times, noise and image noise.
@@ -120,21 +122,24 @@ def loss(
         train.image_noise_mean
         + train.image_noise_std * jax.random.normal(level_key, (batch, 1, 1, 1))
     )
-    first = frames.rgb_THWC[:, 0]
-    first = first + level * jax.random.normal(image_key, first.shape)
-    depth = frames.depth_THW[:, :1]
-    if train.depth_noise:
-        depth = depth * wrong(jax.random.fold_in(image_key, 1), depth.shape, train.depth_noise)
-    observed = Frames(first[:, None], depth, jax.tree.map(lambda x: x[:, :1], frames.camera))
-    require_actions(model, clip.actions_TA, "the loss")
-    control = Control(frames.camera, clip.actions_TA)
-    conditioning = world_model.condition(model, params, observed, control)
     sight = clip.sight if memory else None
     if memory and sight is None:
         sight = clip_sight(model, params, clip)
     if sight is not None and train.hidden:
         kept = jax.random.bernoulli(jax.random.fold_in(key, 4), 1 - train.hidden, (batch,))
         sight = shown(sight, kept)
+    first, depth = frames.rgb_THWC[:, :1], frames.depth_THW[:, :1]
+    if train.chained:
+        again = jax.random.fold_in(key, 5)
+        first, depth = chained.first_frames(model, train.chained, params, frames, x0, sight, again)
+    first = first[:, 0]
+    first = first + level * jax.random.normal(image_key, first.shape)
+    if train.depth_noise:
+        depth = depth * wrong(jax.random.fold_in(image_key, 1), depth.shape, train.depth_noise)
+    observed = Frames(first[:, None], depth, jax.tree.map(lambda x: x[:, :1], frames.camera))
+    require_actions(model, clip.actions_TA, "the loss")
+    control = Control(frames.camera, clip.actions_TA)
+    conditioning = world_model.condition(model, params, observed, control)
     inputs, network_time = noises.shown(model.noise, x_t, times)
     prediction = world_model.apply(model, params, inputs, conditioning, network_time, sight)
 

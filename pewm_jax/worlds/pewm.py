@@ -58,8 +58,11 @@ STAGES = (
     Stage(
         name="gate",
         number=4,
-        rules=((r"codec/gate/.*", TRAIN), (r".*", FREEZE)),
-        init=world_model.init,
+        rules=(
+            (r"codec/gate/.*", TRAIN),
+            (r"(backbone|control|memory|codec|encoder|text)/.*", FREEZE),
+        ),
+        init=pewm_gate.init,
         loss=pewm_gate.loss,
         memory=True,
         prepare=pewm_gate.prepare,

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from pewm_jax.config import Config, ModelConfig, functions
-from pewm_jax.models.costs import Costs, Share
+import dataclasses
+import re
+
+from pewm_jax.config import Config, LearnedCodecConfig, ModelConfig, functions
+from pewm_jax.models import gates, learned_codec
+from pewm_jax.models.costs import Costs, Product, Share
 from pewm_jax.worlds.stages import Stage
 
 
 def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     """Return the costs of one device by part, named as the parameters are.
+
+    Of stage ``gate`` they are those of decoding and of the gate: what the model imagines for it is
+    imagined once, where clips are prepared.
 
     Args:
         config: the experiment.
@@ -17,7 +24,9 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     """
     model = config.model
     assert isinstance(model, ModelConfig)
-    trained = not stage.memory
+    if stage.name == "gate":
+        return {"codec": _gate(model)}
+    trained = any(re.fullmatch(pattern, "backbone/any") for pattern in stage.trained)
     found = {
         "backbone": functions(model.backbone).costs(model, share, trained=trained),
         "control": functions(model.control).costs(model, share, trained=trained),
@@ -28,7 +37,30 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
         if encodes(config):
             encoder = functions(model.memory.encoder)
             found["encoder"] = encoder.costs(model, share, config.data.context)
+    if config.train.chained:
+        for part in found.keys() & {"backbone", "control", "memory"}:
+            found[part] = _once_more(found[part], config.train.chained)
     return found
+
+
+def _once_more(part: Costs, clips: float) -> Costs:
+    """Add a forward pass of a share of the clips, without gradient (``worlds.chained``)."""
+    forward = (
+        dataclasses.replace(product, macs=clips * product.macs, backward=0.0, again=0.0)
+        for product in part.products
+    )
+    return dataclasses.replace(part, products=(*part.products, *forward))
+
+
+def _gate(model: ModelConfig) -> Costs:
+    """Return the costs of decoding a clip's colour and depth, and of the gate, which is trained."""
+    codec, clip = model.codec, model.clip
+    if not isinstance(codec, LearnedCodecConfig):
+        return functions(codec).costs(model, Share())
+    decoder = 2 * clip.frames * learned_codec.macs(codec, "decoder", clip.height, clip.width)
+    gate = (clip.frames - 1) * gates.macs(codec.gate, clip.height, clip.width)
+    products = Product("codec", "convolution", decoder), Product("codec", "convolution", gate, 2.0)
+    return Costs(products)
 
 
 def encodes(config: Config) -> bool:

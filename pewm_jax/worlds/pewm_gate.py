@@ -21,6 +21,25 @@ from pewm_jax.types import Array, Clip, Control, Frames, Params
 from pewm_jax.worlds import codec_gate, objective, sampling
 
 
+def init(model: ModelConfig, key: Array) -> Params:
+    """Return random parameters of the whole model.
+
+    Raises:
+        UserError: the model's codec has no gate, or its memory shows no colours.
+    """
+    _require_gate(model)
+    return world_model.init(model, key)
+
+
+def _require_gate(model: ModelConfig) -> None:
+    if not memories.gated(model):
+        raise UserError(
+            "train.gate.steps is above 0, but this model has no gate that mixes its memory's "
+            "colours in: give it a codec with a gate (codec.kind learned, codec.gate) and a memory "
+            "of colours, or set train.gate.steps 0."
+        )
+
+
 def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
     """Imagine a batch of clips with their memories; ``latents_thwC`` are those imagined.
 
@@ -29,12 +48,7 @@ def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
     Raises:
         UserError: the model's codec has no gate, or its memory shows no colours.
     """
-    if not memories.gated(model):
-        raise UserError(
-            "train.gate.steps is above 0, but this model has no gate that mixes its memory's "
-            "colours in: give it a codec with a gate (codec.kind learned, codec.gate) and a memory "
-            "of colours, or set train.gate.steps 0."
-        )
+    _require_gate(model)
     sight = objective.clip_sight(model, params, clip, pictures=True)
     frames = as_signal(clip.frames)
     observed = jax.tree.map(lambda x: x[:, :1], frames)

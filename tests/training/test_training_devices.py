@@ -19,6 +19,7 @@ SHARED = [
     ("stage2", "tensor 2 fsdp 4"),
     ("stage2", "context 4 data 2"),
 ]
+MUON = "one", "tensor 2 fsdp 4"
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,12 @@ def test_eight_devices_compute_the_losses_of_one(measured, stage, mesh):
     assert len(alone) == 20
     assert len(set(alone)) == 20
     np.testing.assert_allclose(shared, alone, rtol=1e-5)
+
+
+def test_muon_and_chained_clips_compute_on_eight_devices_what_they_do_on_one(measured):
+    alone, shared = (np.array(measured["losses"][f"muon {name}"]) for name in MUON)
+    assert len(set(alone)) == 3
+    np.testing.assert_allclose(shared, alone, rtol=1e-4)
 
 
 def test_a_batch_is_shared_over_data_and_fsdp(measured):

@@ -24,7 +24,7 @@ from pewm_jax.config import (
 from pewm_jax.training import sharding, state
 from pewm_jax.worlds.pewm import STAGES
 
-ONE, TWO = STAGES
+ONE, TWO = STAGES[:2]
 MESH = jax.sharding.AbstractMesh((1, 4, 2, 1), AXES)
 
 
@@ -69,7 +69,7 @@ def shapes(stage):
     return jax.eval_shape(functools.partial(state.create, large(), stage), jax.random.key(0))
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", STAGES[:3])
 def test_every_leaf_of_every_network_has_its_place(stage):
     placed = tree.flatten(sharding.of_state(LARGE, MESH, shapes(stage)))
     for path, leaf in tree.flatten(shapes(stage)).items():

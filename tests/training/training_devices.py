@@ -46,6 +46,9 @@ MESHES = {
 }
 STAGE_2 = ("one", "tensor 2 fsdp 4", "context 4 data 2")
 """Where stage 2 is run too, whose step takes long to compile."""
+MUON_STEPS = 3
+MUON = ("one", "tensor 2 fsdp 4")
+"""Where stage 1 is run with Muon too, and half of its clips chained."""
 MOVED = r"(all-gather|all-to-all|collective-permute|reduce-scatter|all-reduce)"
 
 
@@ -104,12 +107,12 @@ def fresh(config, stage, mesh):
     }
 
 
-def run(config, stage, mesh, state):
+def run(config, stage, mesh, state, steps=STEPS):
     step_fn = step.compile_step(config, stage, mesh, clip(config, 0))
     where, whole = sharding.of_batch(mesh), sharding.replicated(mesh)
     key = jax.device_put(step.stage_key(config, stage), whole)
     losses = []
-    for number in range(STEPS):
+    for number in range(steps):
         placed = jax.device_put(clip(config, number), where)
         state, metrics = step_fn(state, placed, key)
         losses.append(float(metrics["loss"]))
@@ -126,7 +129,7 @@ def main(folder: Path) -> None:
     fsdp = sharding.make_mesh(arranged=MESHES["fsdp 8"])
     out = {"losses": {}, "rows": {}, "moved": {}, "fresh": fresh(wide, STAGES[0], fsdp)}
     states, meshes = {}, {}
-    for stage, start in zip(STAGES, (None, backbone(config)), strict=True):
+    for stage, start in zip(STAGES[:2], (None, backbone(config)), strict=True):
         first = sharding.make_mesh(jax.devices()[:1], MESHES["one"])
         begun = jax.tree.map(np.asarray, step.initial_state(config, stage, first, start))
         for name, arranged in MESHES.items():
@@ -141,6 +144,11 @@ def main(folder: Path) -> None:
             losses, states[name], rows, moved = run(config, stage, mesh, state)
             label = f"{stage.name} {name}"
             out["losses"][label], out["rows"][label], out["moved"][label] = losses, rows, moved
+    config_muon = fakes.with_train(config, optimizer="muon", chained=0.5)
+    for name in MUON:
+        state = step.initial_state(config_muon, STAGES[0], meshes[name], backbone(config))
+        losses = run(config_muon, STAGES[0], meshes[name], state, MUON_STEPS)[0]
+        out["losses"][f"muon {name}"] = losses
     stacked = jax.tree.leaves(begun.params["backbone"]["blocks"])
     out["stacked"] = max(leaf.size for leaf in stacked)
     eight, one = states["tensor 2 fsdp 4"], step.abstract_state(config, stage, meshes["one"])
