@@ -155,8 +155,9 @@ class View:
 
     Attributes:
         features_THWF: (..., T, H, W, F) features of the nearest point at each pixel, 0 without one.
-        depth_THW: (..., T, H, W) its depth along z, metres, 0 without one.
-        seen_THW: (..., T, H, W) bool, whether a point is at the pixel.
+        depth_THW: (..., T, H, W) its depth along z, metres, 0 without one; where only the back of
+            something is known, which shows nothing, the depth of that.
+        seen_THW: (..., T, H, W) bool, whether a point is seen at the pixel.
     """
 
     features_THWF: Array

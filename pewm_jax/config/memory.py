@@ -136,6 +136,15 @@ class SurfelConfig(MemorySettings):
     """Keep the encoder's features beside the colour, and give them to the reader."""
     footprint: int = 3
     """Pixels that a surfel covers at most, across and down, when the memory is rendered."""
+    sides: bool = True
+    """Show a surfel only from the side it was seen from; from behind it hides what it hides, and
+    nobody knows what it looks like: a wall of the room next door."""
+    imagined_again: bool = False
+    """Also remember imagined pixels at which the memory showed something when they were imagined;
+    else only what is new, so that a surface does not grow with every look at it. Needs a reader or
+    a gate for which the memory is rendered."""
+    observed_first: bool = True
+    """Show what was imagined only where nothing that was observed is shown."""
 
     @property
     def KEEPS_FEATURES(self) -> bool:  # noqa: N802  # type: ignore[override]

@@ -89,6 +89,7 @@ def splat_surfels(
     *,
     most: int = 3,
     average: bool = True,
+    normals_V3: Array | None = None,
 ) -> View:
     """Return what cameras see of points that have a size, so that near surfaces hide far ones.
 
@@ -113,19 +114,31 @@ def splat_surfels(
         most: pixels that a point covers at most, across and down.
         average: show the mean of all that is not hidden, each point shared bilinearly by the four
             pixels around it; else the nearest point that falls on the pixel, as it is.
+        normals_V3: (V, 3) where points face, 0 for both ways. A point that faces away hides what is
+            behind it and is not shown: nothing is seen there, at its depth. None: all face both
+            ways.
     """
-    points_V3, features_VF, size_V, valid_V = _whole_blocks(points_V3, features_VF, size_V, valid_V)
+    sides = () if normals_V3 is None else (normals_V3,)
+    points_V3, features_VF, size_V, valid_V, *sides = _whole_blocks(
+        points_V3, features_VF, size_V, valid_V, *sides
+    )
     blocks = len(points_V3) // BLOCK
     few = int(blocks * SHARE)
 
     def one(camera: Camera) -> tuple[Array, Array, Array]:
         spots = zbuffer.look(points_V3, size_V, size_V, valid_V, camera)
+        away_V = None
+        if sides:
+            away_V = ((points_V3 - camera.world_from_camera[:3, 3]) * sides[0]).sum(-1) > 0
 
-        def drawn(spots: Spots, features_VF: Array) -> tuple[Array, Array, Array]:
-            return _draw(spots, features_VF, height, width, most, average)
+        def drawn(
+            spots: Spots, features_VF: Array, away_V: Array | None
+        ) -> tuple[Array, Array, Array]:
+            return _draw(spots, features_VF, away_V, height, width, most, average)
 
+        everything = spots, features_VF, away_V
         if few * BLOCK < WORTH_A_BRANCH:
-            return drawn(spots, features_VF)
+            return drawn(*everything)
         listed, count = _blocks_in_view(spots, height, width, most, few)
 
         def chosen(x: Array) -> Array:
@@ -135,8 +148,8 @@ def splat_surfels(
 
         return jax.lax.cond(
             count <= few,
-            lambda: drawn(*jax.tree.map(chosen, (spots, features_VF))),
-            lambda: drawn(spots, features_VF),
+            lambda: drawn(*jax.tree.map(chosen, everything)),
+            lambda: drawn(*everything),
         )
 
     # Frame after frame: what one needs fits a processor's cache, which nine do not.
@@ -216,9 +229,19 @@ def _blocks_in_view(
 
 
 def _draw(
-    spots: Spots, features_VF: Array, height: int, width: int, most: int, average: bool
+    spots: Spots,
+    features_VF: Array,
+    away_V: Array | None,
+    height: int,
+    width: int,
+    most: int,
+    average: bool,
 ) -> tuple[Array, Array, Array]:
-    """Return (H·W, F) features, (H·W,) depth and (H·W,) whether something is seen."""
+    """Return (H·W, F) features, (H·W,) depth and (H·W,) whether something is seen.
+
+    Points that face away (``away_V``) hide others and are not seen themselves, except where one
+    that does not lies as near.
+    """
     count, pixels = len(features_VF), height * width
     front_P, covering = zbuffer.cover(spots, height, width, most)
 
@@ -229,10 +252,14 @@ def _draw(
         shown = spots.there_V & inside & (spots.z_V <= front + tolerance(front))
         return jnp.where(shown, pixel, pixels), shown
 
+    behind = jnp.zeros(pixels, bool)
     if average:
-        total = _shares(spots, features_VF, visible, pixels)
+        total = _shares(spots, features_VF, away_V, visible, pixels)
         direct = total[:, -1] > LEAST
         mean = total / jnp.where(direct, total[:, -1], 1)[:, None]
+        if away_V is not None:
+            behind = ~direct & (total[:, -2] > LEAST)
+            mean = jnp.concatenate([mean[:, :-2], mean[:, -1:]], -1)
         features, depth = mean[:, :-2], mean[:, -2]
     else:
         column, row = (jnp.floor(x).astype(jnp.int32) for x in (spots.u_V, spots.v_V))
@@ -240,31 +267,48 @@ def _draw(
         depth, index = zbuffer.nearest(pixel, spots.z_V, shown, pixels)
         direct = index < count
         features = features_VF[jnp.minimum(index, count - 1)]
-    seen = direct | (covering < count)
+        if away_V is not None:
+            behind = direct & away_V[jnp.minimum(index, count - 1)]
+            direct = direct & ~behind
+    covered = (covering < count) & ~behind
+    if away_V is not None:
+        covered = covered & ~away_V[covering.clip(0, count - 1)]
+    seen = direct | covered
     features = jnp.where(direct[:, None], features, features_VF[covering.clip(0, count - 1)])
     depth = jnp.where(direct, depth, front_P)
-    return jnp.where(seen[:, None], features, 0), jnp.where(seen, depth, 0), seen
+    there = seen if away_V is None else (seen | (covering < count))
+    return jnp.where(seen[:, None], features, 0), jnp.where(there, depth, 0), seen
 
 
 def _shares(
     spots: Spots,
     features_VF: Array,
+    away_V: Array | None,
     visible: Callable[[Array, Array], tuple[Array, Array]],
     pixels: int,
 ) -> Array:
-    """Return (H·W, F + 2) sums of the features, depth and 1 of the points around each pixel."""
+    """Return (H·W, F + 2) sums of the features, depth and 1 of the points around each pixel.
+
+    With ``away_V`` they are of the points that do not face away; the last but one of then F + 3
+    sums counts those that do.
+    """
     # A place may be computed anew for each use, rounded to either side of the middle of a pixel,
     # where a point that is seen again lies: the border between two pixels is moved from there.
     u, v = spots.u_V - 0.5, spots.v_V - 0.5
     column, row = (jnp.floor(x + MIDDLE).astype(jnp.int32) for x in (u, v))
     right, below = jnp.maximum(u - column, 0), jnp.maximum(v - row, 0)
-    values = [features_VF, spots.z_V[:, None], jnp.ones((len(features_VF), 1))]
+    one_V1 = jnp.ones((len(features_VF), 1))
+    values_VC = jnp.concatenate([features_VF, spots.z_V[:, None], one_V1], -1)
+    if away_V is not None:
+        values_VC = jnp.where(away_V[:, None], 0, values_VC)
+        away_V1 = away_V[:, None].astype(values_VC.dtype)
+        values_VC = jnp.concatenate([values_VC[:, :-1], away_V1, values_VC[:, -1:]], -1)
     places = []
     for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)):
         pixel, _ = visible(column + i, row + j)
         places.append((pixel, (right if i else 1 - right) * (below if j else 1 - below)))
     # The barrier keeps XLA from computing these anew for every channel.
-    places, values_VC = jax.lax.optimization_barrier((places, jnp.concatenate(values, -1)))
+    places, values_VC = jax.lax.optimization_barrier((places, values_VC))
     total = jnp.zeros((pixels, values_VC.shape[-1]))
     for pixel, weight in places:
         total = total.at[pixel].add(values_VC * weight[:, None], mode="drop")
@@ -274,6 +318,21 @@ def _shares(
 def tolerance(depth: Array) -> Array:
     """Return how far behind the front a point may lie and still be on it, metres."""
     return jnp.maximum(TOLERANCE_M, TOLERANCE_RELATIVE * depth)
+
+
+def over(front: View, back: View) -> View:
+    """Return the first of two views of the same cameras where it shows anything, else the second.
+
+    Args:
+        front: of T cameras.
+        back: of the same.
+    """
+    seen = front.seen_THW
+    return View(
+        jnp.where(seen[..., None], front.features_THWF, back.features_THWF),
+        jnp.where(seen | (~back.seen_THW & (front.depth_THW > 0)), front.depth_THW, back.depth_THW),
+        seen | back.seen_THW,
+    )
 
 
 def fill_nearest(view: View) -> View:

@@ -20,11 +20,14 @@ import numpy as np
 
 from pewm_jax.config import ModelConfig, SurfelConfig
 from pewm_jax.geometry.cameras import unproject
+from pewm_jax.geometry.normals import normals
 from pewm_jax.memory import cells, rendering, voxel_cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
-COLOUR = 4
-"""The columns of ``sums_VC`` before the colour: how many points, and their offsets."""
+COLUMNS = 10
+"""The columns of ``sums_VC`` before features: how many points, their offsets, colours, normals."""
+TURNED = 0.5
+"""The mean of a cell's normals is at least so long, or it is seen from both sides."""
 
 
 @jax.tree_util.register_dataclass
@@ -34,8 +37,9 @@ class Surfels:
 
     Attributes:
         cell_V: (V,) int32 cells in increasing order; free slots, last, hold the number of cells.
-        sums_VC: (V, 7 + F) count of points, and sums of their offsets from the cell's lower corner
-            (metres), of their colours, and of their features where these are kept (else F = 0).
+        sums_VC: (V, 10 + F) count of points, and sums of their offsets from the cell's lower corner
+            (metres), of their colours, of their normals, and of their features where these are kept
+            (else F = 0).
         size_V: (V,) width of the finest pixel that saw it, metres at its place; 0 in free slots.
         observed_V: (V,) bool, False where a surfel is imagined or the slot is free.
         origin_3: (3,) lower corner of the grid, metres.
@@ -61,7 +65,7 @@ class Points:
 
     Attributes:
         points_P3: (P, 3) in the world, metres.
-        values_PC: (P, 3 + F) colours in [−1, 1], then features.
+        values_PC: (P, 6 + F) colours in [−1, 1], normals (0 where unknown), then features.
         size_P: (P,) width of the pixel that saw it, metres at its place.
         time_P: (P,) int32 ≥ 0, larger is newer.
         valid_P: (P,) bool; others are ignored.
@@ -78,7 +82,7 @@ def empty(model: ModelConfig, centre_3: Array) -> Surfels:
     """Return a memory of no surfels, its grid centred on a world position."""
     config = settings_of(model)
     count, zero = config.capacity, jnp.zeros((), jnp.int32)
-    columns = COLOUR + 3 + (config.encoder.channels if config.features else 0)
+    columns = COLUMNS + (config.encoder.channels if config.features else 0)
     return Surfels(
         jnp.full((count,), voxel_cells.nowhere(config), jnp.int32),
         jnp.zeros((count, columns)),
@@ -167,7 +171,8 @@ def remember(
     valid = (depth_THW > 0) & jnp.isfinite(depth_THW)
     if valid_T is not None:
         valid = valid & jnp.asarray(valid_T)[:, None, None]
-    values = jnp.asarray(frames.rgb_THWC)
+    camera = jax.tree.map(jnp.asarray, frames.camera)
+    values = jnp.concatenate([jnp.asarray(frames.rgb_THWC), normals(depth_THW, camera)], -1)
     if config.features:
         if features_ThwF is None:
             raise ValueError("memory.features is set, but no features were given.")
@@ -176,10 +181,10 @@ def remember(
         column = ((np.arange(width) + 0.5) * across / width).astype(int)
         patches = jnp.asarray(features_ThwF)[:, row][:, :, column]
         values = jnp.concatenate([values, patches.astype(values.dtype)], -1)
-    focal = jnp.asarray(frames.camera.intrinsics_4)[:, 0, None, None]
+    focal = camera.intrinsics_4[:, 0, None, None]
     time = jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32)[:, None, None], depth_THW.shape)
     new = Points(
-        unproject(depth_THW, jax.tree.map(jnp.asarray, frames.camera)).reshape(-1, 3),
+        unproject(depth_THW, camera).reshape(-1, 3),
         values.reshape(-1, values.shape[-1]),
         (depth_THW / focal).reshape(-1),
         time.reshape(-1),
@@ -188,8 +193,8 @@ def remember(
     return insert(config, surfels, new, observed)
 
 
-def means(config: SurfelConfig, surfels: Surfels) -> tuple[Array, Array, Array, Array]:
-    """Return ``(points_world_V3, colours_V3, features_VF, valid_V)``; free slots are 0.
+def means(config: SurfelConfig, surfels: Surfels) -> tuple[Array, Array, Array, Array, Array]:
+    """Return ``(points_world_V3, colours_V3, normals_V3, features_VF, valid_V)``; free slots are 0.
 
     F is 0 where features are not kept.
     """
@@ -197,7 +202,7 @@ def means(config: SurfelConfig, surfels: Surfels) -> tuple[Array, Array, Array, 
     mean = surfels.sums_VC[:, 1:] / jnp.where(valid, surfels.sums_VC[:, 0], 1)[:, None]
     corner = corners(config, surfels.origin_3, jnp.where(valid, surfels.cell_V, 0))
     points = jnp.where(valid[:, None], corner + mean[:, :3], 0)
-    return points, mean[:, 3:6], mean[:, 6:], valid
+    return points, mean[:, 3:6], mean[:, 6:9], mean[:, 9:], valid
 
 
 def to_points(model: ModelConfig, surfels: Surfels) -> tuple[Array, Array, Array]:
@@ -207,7 +212,7 @@ def to_points(model: ModelConfig, surfels: Surfels) -> tuple[Array, Array, Array
     encoder's channels.
     """
     config = settings_of(model)
-    points, colours, features, valid = means(config, surfels)
+    points, colours, _, features, valid = means(config, surfels)
     if config.features:
         return points, features, valid
     there = valid[:, None].astype(jnp.float32)
@@ -232,10 +237,8 @@ def render(
     See ``memories.render``.
     """
     config = settings_of(model)
-    if not config.features:
-        return render_colours(model, surfels, camera, height, width)
-    points, _, features, valid = means(config, surfels)
-    return _shown(config, surfels, points, features, valid, camera, height, width)
+    which = means(config, surfels)[3 if config.features else 1]
+    return _shown(config, surfels, which, camera, height, width)
 
 
 def render_colours(
@@ -243,25 +246,44 @@ def render_colours(
 ) -> rendering.View:
     """Return what cameras see, with the 3 colours alone, in [−1, 1]."""
     config = settings_of(model)
-    points, colours, _, valid = means(config, surfels)
-    return _shown(config, surfels, points, colours, valid, camera, height, width)
+    return _shown(config, surfels, means(config, surfels)[1], camera, height, width)
 
 
 def _shown(
     config: SurfelConfig,
     surfels: Surfels,
-    points_V3: Array,
     features_VF: Array,
-    valid_V: Array,
     camera: Camera,
     height: int,
     width: int,
 ) -> rendering.View:
-    """Draw surfels as wide as they are."""
-    wide_V = widths(config, surfels)
-    return rendering.splat_surfels(
-        points_V3, features_VF, wide_V, valid_V, camera, height, width, most=config.footprint
-    )
+    """Draw surfels as wide as they are, those that were observed before those imagined."""
+    points, _, normals_V3, _, valid = means(config, surfels)
+    turned = jnp.linalg.norm(normals_V3, axis=-1, keepdims=True) >= TURNED
+    sides = jnp.where(turned, normals_V3, 0) if config.sides else None
+
+    def draw(valid_V: Array) -> rendering.View:
+        return rendering.splat_surfels(
+            points,
+            features_VF,
+            widths(config, surfels),
+            valid_V,
+            camera,
+            height,
+            width,
+            most=config.footprint,
+            normals_V3=sides,
+        )
+
+    if not config.observed_first:
+        return draw(valid)
+    observed = draw(valid & surfels.observed_V)
+    imagined = valid & ~surfels.observed_V
+
+    def with_imagined() -> rendering.View:
+        return rendering.over(observed, draw(imagined))
+
+    return jax.lax.cond(imagined.any(), with_imagined, lambda: observed)
 
 
 def widths(config: SurfelConfig, surfels: Surfels) -> Array:

@@ -122,21 +122,22 @@ def init(model: ModelConfig, key: Array) -> Params:
 
 
 def pictures(model: ModelConfig, params: Params, view: View) -> Array:
-    """Return (B, T, H, W, C) what is read of pictures: features and depth where seen, the mask.
+    """Return (B, T, H, W, C) what is read of pictures: features where seen, depth, the mask.
+
+    Depth is also read where only the back of something is known, a wall of the room next door.
 
     Args:
         model: the model.
         params: the reader's parameters under ``render``.
-        view: (B, T) pictures; what they hold where nothing is seen is not read.
+        view: (B, T) pictures; features that they hold where nothing is seen are not read.
     """
     seen, dtype = view.seen_THW[..., None], jnp.dtype(model.dtype)
     features: Array = jnp.where(seen, view.features_THWF, 0).astype(dtype)
     if _reduces(model):
         features = _apply(model, params, "reduce", features)
-    depth = signal_from_depth(model.clip, view.depth_THW)[..., None]
-    return jnp.concatenate(
-        [jnp.where(seen, x, 0).astype(dtype) for x in (features, depth, seen)], -1
-    )
+    depth = signal_from_depth(model.clip, view.depth_THW)
+    depth = jnp.where(view.depth_THW > 0, depth, 0)[..., None]
+    return jnp.concatenate([x.astype(dtype) for x in (features, depth, seen)], -1)
 
 
 def cells(model: ModelConfig, params: Params, sight: Sight) -> tuple[Array, Array]:

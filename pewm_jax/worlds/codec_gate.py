@@ -15,6 +15,8 @@ from pewm_jax.types import Array, Camera, Clip, Frames, Params
 
 ABSOLUTE = 0.1
 """Weight of the absolute error beside the squared one."""
+EASY = 1e-3
+"""Errors of a frame below this no longer matter."""
 
 
 def rendered(model: CodecWorldConfig, clip: Clip) -> tuple[Array, Array]:
@@ -46,10 +48,11 @@ def mix(
     size is added to the latents, and the gate mixes what is decoded with what is rendered.
 
     Returns:
-        ``(loss, measured)``: squared error and a little absolute error of colour and of depth
-        where it was measured; PSNR of colour in decibels, of what is decoded and of what the gate
-        makes of it, and where anything was rendered also of that alone; ``depth_m``, the mean
-        absolute error of the gate's depth.
+        ``(loss, measured)``: the logarithm of each frame's squared error and a little absolute
+        error, of colour and of depth where it was measured, so that frames of which little was seen
+        before do not outweigh those of which much was; PSNR of colour in decibels, of what is
+        decoded and of what the gate makes of it, and where anything was rendered also of that
+        alone; ``depth_m``, the mean absolute error of the gate's depth.
     """
     assert isinstance(train, CodecTrainConfig)
     frames = as_signal(clip.frames)
@@ -99,7 +102,9 @@ def score(
     measured = (depth > 0).astype(made.dtype)
     counts = jnp.stack([jnp.ones_like(measured)] * 3 + [measured], -1)
     error = (made - wanted) * counts
-    loss = (jnp.square(error).sum() + ABSOLUTE * jnp.abs(error).sum()) / counts.sum()
+    each = jnp.square(error) + ABSOLUTE * jnp.abs(error)
+    each = each.sum((1, 2, 3)) / jnp.maximum(counts.sum((1, 2, 3)), 1)
+    loss = jnp.log(each + EASY).mean()
     off = jnp.abs(depth_from_signal(model.clip, made[..., 3]) - depth)
     hit = seen[..., None].astype(made.dtype)
     return loss, {

@@ -7,6 +7,7 @@ its cameras see. Imagined frames are remembered in the same way as observed ones
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -18,7 +19,7 @@ from pewm_jax.config import ModelConfig, UserError, functions
 from pewm_jax.memory import memories
 from pewm_jax.models import codecs, encoders, world_model
 from pewm_jax.models.signals import as_signal
-from pewm_jax.types import Array, Control, Frames, Params, WorldState
+from pewm_jax.types import Array, Control, Frames, Params, Sight, WorldState
 from pewm_jax.worlds import objective, pewm_costs, pewm_gate, sampling
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
@@ -198,10 +199,21 @@ def imagine_clip(
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
     remembered = state.map
     if remember:
-        remembered = _remember(model, params, state.map, frames, valid_T, observed=False)
+        new = new_surfaces(model, frames, sight)
+        remembered = _remember(model, params, state.map, new, valid_T, observed=False)
     last = frames.depth_THW.shape[0] - 1 if valid_T is None else valid_T.sum() - 1
     present = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, last, 1), frames)
     return WorldState(present, remembered), frames
+
+
+def new_surfaces(model: ModelConfig, frames: Frames, sight: Sight | None) -> Frames:
+    """Return imagined frames with a depth of 0 where the memory showed something already."""
+    again = getattr(model.memory, "imagined_again", True)
+    if again or sight is None or sight.view is None:
+        return frames
+    return dataclasses.replace(
+        frames, depth_THW=jnp.where(sight.view.seen_THW[0, 1:], 0, frames.depth_THW)
+    )
 
 
 def _remember(

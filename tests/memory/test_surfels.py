@@ -35,11 +35,11 @@ def blank(config):
 
 
 def drawn(seed, count=200, spread=1.9, frames=3):
-    """Points at random, some of them invalid; colours from −1 to 1."""
+    """Points at random, some of them invalid; colours and normals from −1 to 1."""
     rng = np.random.default_rng(seed)
     return surfels.Points(
         rng.uniform(-spread, spread, (count, 3)).astype(np.float32),
-        rng.uniform(-1, 1, (count, 3)).astype(np.float32),
+        rng.uniform(-1, 1, (count, 6)).astype(np.float32),
         rng.uniform(0.01, 0.2, count).astype(np.float32),
         np.sort(rng.integers(0, frames, count)).astype(np.int32),
         rng.random(count) < 0.9,
@@ -69,17 +69,18 @@ def by_loop(config, batches):
 
 
 def compare(config, memory, held):
-    points, colours, _, valid = (np.asarray(x) for x in surfels.means(config, memory))
+    points, colours, sides, _, valid = (np.asarray(x) for x in surfels.means(config, memory))
     assert int(memory.occupied) == valid.sum() == len(held)
     place = [tuple(x) for x in np.floor(points[valid] / 0.5).astype(int)]
     assert set(place) == set(held)
     for slot, cell in enumerate(place):
         where, colour, size, observed = held[cell]
         np.testing.assert_allclose(points[slot], where.mean(0), atol=1e-5)
-        np.testing.assert_allclose(colours[slot], colour.mean(0), atol=1e-5)
+        np.testing.assert_allclose(colours[slot], colour.mean(0)[:3], atol=1e-5)
+        np.testing.assert_allclose(sides[slot], colour.mean(0)[3:], atol=1e-5)
         assert memory.size_V[slot] == size.min()
         assert memory.observed_V[slot] == observed
-    for rest in (points, colours, memory.size_V, memory.observed_V):
+    for rest in (points, colours, sides, memory.size_V, memory.observed_V):
         assert not np.asarray(rest)[~valid].any()
 
 
