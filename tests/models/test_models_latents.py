@@ -300,7 +300,10 @@ def test_clips_prepared_before_there_was_a_choice_are_found(monkeypatch):
     ("sections", "says"),
     [
         ({"codec": PixelConfig(), "memory": VOXELS}, "the codec folds 4 frames into one"),
-        ({"memory": dataclasses.replace(VOXELS, encoder=LatentsConfig())}, "set memory.encoder.ch"),
+        (
+            {"memory": dataclasses.replace(VOXELS, encoder=LatentsConfig())},
+            "latents have 4 channels for 8 pix",
+        ),
         ({"memory": dataclasses.replace(VOXELS, reader=LATENTS)}, "this memory shows features"),
         (
             {
@@ -322,8 +325,8 @@ def test_models_that_do_not_fit_are_refused_in_a_sentence(sections, says):
 def test_what_has_no_meaning_is_refused_in_a_sentence():
     with pytest.raises(ConfigError, match=r"picture is 'words'; choose pixels or latents\."):
         RenderConfig(picture="words")
-    with pytest.raises(ConfigError, match=r"memory\.encoder\.patch"):
-        LatentsConfig(patch=0)
+    with pytest.raises(ConfigError, match=r"memory\.encoder\.spatial"):
+        LatentsConfig(spatial=0)
     model = model_of("features, rendered")
     with pytest.raises(ConfigError, match=r"no cache is kept: leave data\.features empty"):
         Config(model=model, data=DataConfig(features="kept"))
