@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax import worlds
+from pewm_jax import tree, worlds
 from pewm_jax.config import (
     AttentionConfig,
     BothConfig,
@@ -29,6 +29,7 @@ from pewm_jax.config import (
     VoxelConfig,
     kinds,
 )
+from pewm_jax.convert import stablehlo_programs
 from pewm_jax.memory import feature_cache, memories
 from pewm_jax.models import codecs, encoders, readers, world_model
 from pewm_jax.training import prepared
@@ -278,6 +279,16 @@ def nine():
     """Shapes of two clips of nine frames."""
     frames = jax.tree.map(lambda x: jnp.concatenate([x, x[:, :4]], 1), batch().frames)
     return Clip(frames, frames, jnp.ones((2, 9), bool))
+
+
+def test_an_exported_denoiser_takes_the_encoded_picture():
+    model = model_of("picture")
+    params = jax.eval_shape(functools.partial(world_model.init, model), jax.random.key(0))
+    program = stablehlo_programs.denoise_program(Config(model=model), params)
+    shown = {name for name in program.inputs if name.split("/")[0] in ("tokens", "view", "encoded")}
+    assert shown == {"encoded/latents_thwC", "encoded/seen_THW"}
+    made = jax.eval_shape(program.function, tree.flatten(params), program.inputs)
+    assert made["prediction_BthwC"].shape == (1, *GRID, 8)
 
 
 def test_clips_prepared_before_there_was_a_choice_are_found(monkeypatch):
