@@ -35,7 +35,7 @@ from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.geometry.cameras import invert_rigid, unproject
 from pewm_jax.memory import rendering
 from pewm_jax.training import sharding
-from pewm_jax.training.step import compile_step, initial_state, stage_key
+from pewm_jax.training.step import abstract_state, compile_step, stage_key
 from pewm_jax.types import Array, Camera, Clip
 from pewm_jax.worlds.pewm import STAGES
 
@@ -131,6 +131,17 @@ def walk(config: Config, batch: int) -> Clip:
     return Clip(frames(length, context), frames(context, 0), np.ones((batch, context), bool))
 
 
+def filled(like: Any) -> Any:
+    """Return small positive numbers of these shapes: drawing weights properly compiles longer."""
+    rng = np.random.default_rng(0)
+
+    def one(leaf: Any) -> Array:
+        drawn = np.abs(rng.normal(0, 0.02, leaf.shape))
+        return jax.device_put(drawn.astype(leaf.dtype), leaf.sharding)
+
+    return jax.tree.map(one, like)
+
+
 def readings(batch: int) -> dict[tuple[str, str], Callable[[], object]]:
     """Return what is timed for each picture: preparing a batch, a step of stage 2 on it."""
     found: dict[tuple[str, str], Callable[[], object]] = {}
@@ -141,10 +152,10 @@ def readings(batch: int) -> dict[tuple[str, str], Callable[[], object]]:
         reader = dataclasses.replace(reader, picture=picture)
         config = config.with_model(memory=dataclasses.replace(config.model.memory, reader=reader))
         mesh = sharding.make_mesh(jax.devices()[:1])
-        state = initial_state(config, stage, mesh)
+        state = filled(abstract_state(config, stage, mesh))
         clips, key = jax.device_put((walk(config, batch), stage_key(config, stage)))
         prepare = jax.jit(functools.partial(stage.prepare, config.model))
-        frozen = {name: state.params[name] for name in ("codec",)}
+        frozen = {"codec": jax.tree.map(jnp.copy, state.params["codec"])}
         ready = prepare(frozen, clips)
         step, states = compile_step(config, stage, mesh, ready), [state]
 

@@ -64,33 +64,32 @@ class LatentsConfig(EncoderSettings):
 
     channels: int = 16
     """Latent channels of colour that the codec has."""
-    patch: int = 8
+    spatial: int = 8
     """Pixels per latent cell of the codec, each way."""
 
     def grid(self, clip: Any) -> tuple[int, int]:
         """Return the rows and columns of latents that a frame of a ``ClipConfig`` has."""
-        return clip.height // self.patch, clip.width // self.patch
+        return clip.height // self.spatial, clip.width // self.spatial
 
     def check(self, model: Any) -> None:
         """Refuse another codec than the settings describe, and one that folds frames."""
-        codec = model.codec
+        q, channels, side = model.codec.temporal, model.codec.rgb_channels, model.codec.spatial
         require(
-            codec.temporal == 1,
+            q == 1,
             f"memory.encoder.kind latents takes the latents of single frames, and the codec folds "
-            f"{codec.temporal} frames into one (codec.temporal): use codec.kind learned, or "
-            "another memory.encoder.",
+            f"{q} frames into one (codec.temporal): use codec.kind learned, or another "
+            "memory.encoder.",
         )
         require(
-            (self.channels, self.patch) == (codec.rgb_channels, codec.spatial),
-            f"memory.encoder describes latents of {self.channels} channels for {self.patch} pixels "
-            f"each way, and the codec makes {codec.rgb_channels} channels of {codec.spatial}: set "
-            f"memory.encoder.channels {codec.rgb_channels} and memory.encoder.patch "
-            f"{codec.spatial}.",
+            (self.channels, self.spatial) == (channels, side),
+            f"memory.encoder.channels is {self.channels} and memory.encoder.spatial is "
+            f"{self.spatial}, and the codec's latents have {channels} channels for {side} pixels "
+            "each way: set them to these.",
         )
 
     def __post_init__(self):
         """Validate."""
-        require_positive(self, "memory.encoder", "channels", "patch")
+        require_positive(self, "memory.encoder", "channels", "spatial")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax import worlds
+from pewm_jax import tree, worlds
 from pewm_jax.config import (
     AttentionConfig,
     BothConfig,
@@ -29,6 +29,7 @@ from pewm_jax.config import (
     VoxelConfig,
     kinds,
 )
+from pewm_jax.convert import stablehlo_programs
 from pewm_jax.memory import feature_cache, memories
 from pewm_jax.models import codecs, encoders, readers, world_model
 from pewm_jax.training import prepared
@@ -280,6 +281,16 @@ def nine():
     return Clip(frames, frames, jnp.ones((2, 9), bool))
 
 
+def test_an_exported_denoiser_takes_the_encoded_picture():
+    model = model_of("picture")
+    params = jax.eval_shape(functools.partial(world_model.init, model), jax.random.key(0))
+    program = stablehlo_programs.denoise_program(Config(model=model), params)
+    shown = {name for name in program.inputs if name.split("/")[0] in ("tokens", "view", "encoded")}
+    assert shown == {"encoded/latents_thwC", "encoded/seen_THW"}
+    made = jax.eval_shape(program.function, tree.flatten(params), program.inputs)
+    assert made["prediction_BthwC"].shape == (1, *GRID, 8)
+
+
 def test_clips_prepared_before_there_was_a_choice_are_found(monkeypatch):
     """The name of their folder depends on the picture only where it is not the pixels."""
     told = []
@@ -300,7 +311,10 @@ def test_clips_prepared_before_there_was_a_choice_are_found(monkeypatch):
     ("sections", "says"),
     [
         ({"codec": PixelConfig(), "memory": VOXELS}, "the codec folds 4 frames into one"),
-        ({"memory": dataclasses.replace(VOXELS, encoder=LatentsConfig())}, "set memory.encoder.ch"),
+        (
+            {"memory": dataclasses.replace(VOXELS, encoder=LatentsConfig())},
+            "latents have 4 channels for 8 pix",
+        ),
         ({"memory": dataclasses.replace(VOXELS, reader=LATENTS)}, "this memory shows features"),
         (
             {
@@ -322,8 +336,8 @@ def test_models_that_do_not_fit_are_refused_in_a_sentence(sections, says):
 def test_what_has_no_meaning_is_refused_in_a_sentence():
     with pytest.raises(ConfigError, match=r"picture is 'words'; choose pixels or latents\."):
         RenderConfig(picture="words")
-    with pytest.raises(ConfigError, match=r"memory\.encoder\.patch"):
-        LatentsConfig(patch=0)
+    with pytest.raises(ConfigError, match=r"memory\.encoder\.spatial"):
+        LatentsConfig(spatial=0)
     model = model_of("features, rendered")
     with pytest.raises(ConfigError, match=r"no cache is kept: leave data\.features empty"):
         Config(model=model, data=DataConfig(features="kept"))
