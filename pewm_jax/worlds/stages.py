@@ -40,6 +40,8 @@ class Stage:
             the same.
         prepares_by: the top-level parameters that ``prepare`` reads.
         optional: whether it is left out where its settings give it no steps.
+        require: ``require(model)``, where not every model has what the stage trains: refuses one
+            that has not, before any stage is trained.
         rates: (pattern, factor) over the paths of trained parameters, the first match wins: the
             learning rate there is the stage's times the factor; elsewhere it is the stage's.
     """
@@ -53,6 +55,7 @@ class Stage:
     prepare: Callable[[Any, Params, Clip], Clip] | None = None
     prepares_by: tuple[str, ...] = ("codec", "encoder")
     optional: bool = False
+    require: Callable[[Any], None] | None = None
     rates: tuple[tuple[str, float], ...] = ()
 
     @property
