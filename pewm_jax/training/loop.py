@@ -74,7 +74,6 @@ def train(
     starting.require_weights(config)
     mesh = sharding.make_mesh(arranged=config.train.mesh)
     for stage in planned:
-        starting.shapes(config, stage)  # a stage that the model cannot have is refused now
         sharding.require_divisible(config, stage, mesh)
     run = runs.check(config)
     bad = BadRecords(config.data.bad_records)

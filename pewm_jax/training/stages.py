@@ -26,6 +26,7 @@ def planned(config: Config) -> tuple[Stage, ...]:
 
     Raises:
         ConfigError: no stage has any.
+        UserError: the model has nothing that one of them could train.
     """
     known = all_stages(config)
     stages = tuple(stage for stage in known if stage.settings(config).steps > 0)
@@ -35,4 +36,7 @@ def planned(config: Config) -> tuple[Stage, ...]:
             f"{names} are {'both' if len(known) == 2 else 'all'} 0: nothing would be trained; give "
             "one of them steps."
         )
+    for stage in stages:
+        if stage.require is not None:
+            stage.require(config.model)
     return stages

@@ -69,7 +69,7 @@ def read_weights(config: Config, stage: Stage, say: Callable[[str], None]) -> Pa
     if file.exists():  # a checkpoint has been verified while reading
         processes.first(lambda: weights.verify(file))
     for later in _later(config, stage):
-        extra = (shapes(config, later).keys() - shapes(config, stage).keys()) & params.keys()
+        extra = (_shapes(config, later).keys() - _shapes(config, stage).keys()) & params.keys()
         if extra:
             say(
                 f"{config.train.start}: its {' and '.join(sorted(extra))} blocks are left out; "
@@ -83,12 +83,8 @@ def _later(config: Config, stage: Stage) -> list[Stage]:
     return [one for one in all_stages(config) if one.number > stage.number]
 
 
-def shapes(config: Config, stage: Stage) -> Params:
-    """Return the shapes of all parameters of a stage.
-
-    Raises:
-        UserError: the model lacks what the stage trains.
-    """
+def _shapes(config: Config, stage: Stage) -> Params:
+    """Return the shapes of all parameters of a stage."""
     return jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
 
 

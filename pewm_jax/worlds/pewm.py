@@ -63,12 +63,13 @@ STAGES = (
             (r"codec/gate/.*", TRAIN),
             (r"(backbone|control|memory|codec|encoder|text)/.*", FREEZE),
         ),
-        init=pewm_gate.init,
+        init=world_model.init,
         loss=pewm_gate.loss,
         memory=True,
         prepare=pewm_gate.prepare,
         prepares_by=("backbone", "control", "memory", "codec", "encoder", "text"),
         optional=True,
+        require=pewm_gate.require_gate,
     ),
 )
 """Stage 1 adapts the backbone to the domain, the control and RGB-D, without memory. Stage 2 adds

@@ -21,17 +21,12 @@ from pewm_jax.types import Array, Clip, Control, Frames, Params
 from pewm_jax.worlds import codec_gate, objective, sampling
 
 
-def init(model: ModelConfig, key: Array) -> Params:
-    """Return random parameters of the whole model.
+def require_gate(model: ModelConfig) -> None:
+    """Refuse a model in which there is nothing to learn.
 
     Raises:
-        UserError: the model's codec has no gate, or its memory shows no colours.
+        UserError: its codec has no gate, or its memory shows no colours.
     """
-    _require_gate(model)
-    return world_model.init(model, key)
-
-
-def _require_gate(model: ModelConfig) -> None:
     if not memories.gated(model):
         raise UserError(
             "train.gate.steps is above 0, but this model has no gate that mixes its memory's "
@@ -48,7 +43,7 @@ def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
     Raises:
         UserError: the model's codec has no gate, or its memory shows no colours.
     """
-    _require_gate(model)
+    require_gate(model)
     sight = objective.clip_sight(model, params, clip, pictures=True)
     frames = as_signal(clip.frames)
     observed = jax.tree.map(lambda x: x[:, :1], frames)

@@ -43,6 +43,8 @@ class Stage:
             of the model, by top-level names of their own. They are read when training begins,
             placed on every device, never trained and never saved.
         optional: whether it is left out where its settings give it no steps.
+        require: ``require(model)``, where not every model has what the stage trains: refuses one
+            that has not, before any stage is trained.
         rates: (pattern, factor) over the paths of trained parameters, the first match wins: the
             learning rate there is the stage's times the factor; elsewhere it is the stage's.
     """
@@ -57,6 +59,7 @@ class Stage:
     prepares_by: tuple[str, ...] = ("codec", "encoder")
     given: Callable[[Any], Params | None] | None = None
     optional: bool = False
+    require: Callable[[Any], None] | None = None
     rates: tuple[tuple[str, float], ...] = ()
 
     @property

@@ -25,7 +25,7 @@ from pewm_jax.config import (
 from pewm_jax.data import abstract
 from pewm_jax.models import learned_codec
 from pewm_jax.rollouts import load_finished
-from pewm_jax.training import loop
+from pewm_jax.training import loop, stages
 from tests.helpers import TINY, init_world, random_camera, randomise, tiny_config
 
 CODEC = LearnedCodecConfig(
@@ -170,3 +170,7 @@ def test_without_a_gate_there_is_nothing_to_learn():
     config = tiny_config()
     with pytest.raises(UserError, match=r"train\.gate\.steps is above 0, but this model has no"):
         LAST.prepare(config.model, {}, batch(config, 1))
+    train = dataclasses.replace(config.train, gate=StageConfig(steps=1))
+    with pytest.raises(UserError, match=r"this model has no gate"):  # before stage 1
+        stages.planned(dataclasses.replace(config, train=train))
+    assert stages.planned(dataclasses.replace(imagining(), train=train))[-1].name == "gate"

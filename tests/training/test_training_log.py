@@ -9,7 +9,7 @@ from rich.console import Console
 from pewm_jax.training import log
 from pewm_jax.worlds.pewm import STAGES
 
-ONE, TWO = STAGES
+ONE, TWO = STAGES[:2]
 METRICS = {
     "loss": 0.5,
     "learning_rate": 1e-3,
