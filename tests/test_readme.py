@@ -23,6 +23,7 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 ICL = ROOT.parent / "shared" / "data" / "icl_livingroom"
 COLLECT = ["--train", "2", "--validation", "1", "--test", "1", "--frames", "40"]
+EVALUATE = shlex.split("--clips 2 --seeds 0 1 --videos 1 --video_clips 1 --batch 2")
 STEPS = 3
 """Steps of a stage where a command of the README names their number."""
 SMALLER = {
@@ -37,9 +38,8 @@ SMALLER = {
     ),
     "python -m pewm_jax.memory cache": ["--size", "28"],
     "python -m pewm_jax.convert export stablehlo": ["--what", "denoise", "--no_check"],
-    "python evaluate.py runs/": shlex.split(
-        "--clips 2 --seeds 0 1 --videos 1 --video_clips 1 --batch 2"
-    ),
+    "python evaluate.py runs/": EVALUATE,
+    "python evaluate.py small": EVALUATE,
 }
 """How commands of the README begin, and the flags that make them small enough for a test."""
 
