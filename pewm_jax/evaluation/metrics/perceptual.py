@@ -18,6 +18,8 @@ PIXELS = 2**17
 """Pixels of imagined pictures that are in the network at once, or one picture if it has more."""
 OFF = "off"
 """The setting that leaves LPIPS out."""
+PACKAGED: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
+"""The settings that stand for a network of the installed package."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +104,7 @@ def chosen(setting: str, height: int, width: int) -> tuple[Perceptual | None, st
     if setting == OFF:
         return None, "LPIPS is left out, as evaluate.lpips says."
     if setting:
-        net = next((name for name in lpips.NETS if name == setting), None)
+        net = PACKAGED.get(setting)
         metric = read(lpips_weights.find(net) if net else Path(setting), net)
         lpips.require_size(metric.net, height, width)
         return metric, metric.about
