@@ -136,8 +136,8 @@ def filled(like: Any) -> Any:
     rng = np.random.default_rng(0)
 
     def one(leaf: Any) -> Array:
-        drawn = np.abs(rng.normal(0, 0.02, leaf.shape))
-        return jax.device_put(drawn.astype(leaf.dtype), leaf.sharding)
+        drawn = jnp.array(np.abs(rng.normal(0, 0.02, leaf.shape)), leaf.dtype)
+        return jax.device_put(drawn, leaf.sharding)
 
     return jax.tree.map(one, like)
 
@@ -147,6 +147,7 @@ def readings(batch: int) -> dict[tuple[str, str], Callable[[], object]]:
     found: dict[tuple[str, str], Callable[[], object]] = {}
     for picture in ("pixels", "latents"):
         config, stage = presets.load("demo"), STAGES[1]
+        assert stage.prepare is not None
         reader = config.model.memory.reader
         assert isinstance(reader, RenderConfig)
         reader = dataclasses.replace(reader, picture=picture)
@@ -181,7 +182,7 @@ def show_reading(repeats: int, batch: int, recorded: bool) -> None:
             run()
             if turn:  # the first warms up
                 times[name].append(time.perf_counter() - begin)
-    rows = []
+    rows: list[list[str]] = []
     for what in ("preparing", "a step"):
         pixels, latents = times[what, "pixels"], times[what, "latents"]
         ratio = statistics.median(b / a for a, b in zip(pixels, latents, strict=True))
