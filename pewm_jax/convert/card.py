@@ -168,16 +168,26 @@ def _scores(metrics: Mapping[str, Any] | None) -> str:
     if metrics is None:
         return head + "None: these weights have no report; `python evaluate.py RUN` makes one."
     protocol = metrics["protocol"]
+    shown = {
+        metric: name
+        for metric, name in METRIC_NAMES.items()
+        if any(
+            metric in scores for masks in metrics["results"].values() for scores in masks.values()
+        )
+    }
     rows = [
-        "| pixels | method | " + " | ".join(name for name, _ in METRIC_NAMES.values()) + " |",
-        "|---|---|" + "---:|" * len(METRIC_NAMES),
+        "| pixels | method | " + " | ".join(name for name, _ in shown.values()) + " |",
+        "|---|---|" + "---:|" * len(shown),
     ]
     for mask, where in MASK_NAMES.items():
         for method, label in METHOD_NAMES.items():
             if method not in metrics["results"]:
                 continue
             scores = metrics["results"][method][mask]
-            cells = [number(scores[m], digits) for m, (_, digits) in METRIC_NAMES.items()]
+            cells = [
+                number(scores[m], digits) if m in scores else "–"
+                for m, (_, digits) in shown.items()
+            ]
             rows.append(f"| {where} | {label} | " + " | ".join(cells) + " |")
     new = {True: "none of which", False: "some of which", None: "of which it is not known which"}
     said = (

@@ -95,13 +95,13 @@ def test_an_empty_memory_changes_nothing_bit_for_bit_whatever_was_learned(kind):
 
 
 @RENDERS
-def test_what_is_not_seen_is_not_read(kind):
+def test_what_features_say_where_nothing_is_seen_is_not_read(kind):
     model, (_, sight, _) = model_of(kind), inputs()
     params = randomise(init_world(model))
     seen = sight.view.seen_THW
     junk = View(
         jnp.where(seen[..., None], sight.view.features_THWF, jnp.nan),
-        jnp.where(seen, sight.view.depth_THW, jnp.inf),
+        sight.view.depth_THW,
         seen,
     )
     base = predict(model, params, sight)
