@@ -126,7 +126,7 @@ def perceived(metrics: Mapping[str, Any]) -> str:
     if not all(found.values()):
         return metrics["protocol"]["lpips"]
     said = (f"{label} {number(found[m], 3)}" for m, label in METHOD_NAMES.items() if m in found)
-    return f"LPIPS of whole pictures, lower is better: {', '.join(said)}."
+    return f"LPIPS of whole pictures, lower is better: {'; '.join(said)}."
 
 
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
