@@ -33,7 +33,7 @@ from pewm_jax.config import Config, RenderConfig
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.geometry.cameras import invert_rigid, unproject
-from pewm_jax.memory import rendering
+from pewm_jax.memory import rendering, views
 from pewm_jax.training import sharding
 from pewm_jax.training.step import abstract_state, compile_step, stage_key
 from pewm_jax.types import Array, Camera, Clip
@@ -85,7 +85,7 @@ def measure(repeats: int) -> tuple[dict[str, list[float]], str]:
     points, colours, wide, valid, camera = scene()
     plain = jax.jit(rendering.splat, static_argnums=(4, 5))
     sized = jax.jit(rendering.splat_surfels, static_argnums=(5, 6), static_argnames=("most",))
-    fill = jax.jit(rendering.fill_nearest)
+    fill = jax.jit(views.fill_nearest)
     peer = torch_splat(points, colours, camera)
     drawn = functools.partial(sized, points, colours, wide, valid, camera, SIZE, SIZE)
     ours = functools.partial(plain, points, colours, valid, camera, SIZE, SIZE)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from pewm_jax.config.errors import require
 from pewm_jax.evaluation.images import unit_colours
 from pewm_jax.geometry.cameras import unproject
-from pewm_jax.memory import rendering
+from pewm_jax.memory import rendering, views
 from pewm_jax.types import Array, Camera, Frames
 
 
@@ -95,7 +95,7 @@ def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> F
         )
     else:
         view = rendering.splat(points, colours, there, camera, height, width)
-    view = rendering.fill_nearest(view)
+    view = views.fill_nearest(view)
     return Frames(2 * view.features_THWF - 1, view.depth_THW, camera)
 
 

@@ -34,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import ModelConfig, functions
-from pewm_jax.memory import rendering
+from pewm_jax.memory import rendering, views
 from pewm_jax.models import codecs, encoders
 from pewm_jax.types import Array, Camera, EncodedView, Frames, MapTokens, Params, Sight, View
 
@@ -218,7 +218,7 @@ def encode(model: ModelConfig, params: Params, view: View) -> EncodedView:
         params: the world model's parameters; those of the codec are used.
         view: (T,) images of the clip's size; the first 3 features are colours.
     """
-    whole = rendering.fill_nearest(view)
+    whole = views.fill_nearest(view)
     depth = jnp.where(whole.depth_THW > 0, whole.depth_THW, model.clip.far_m)
     latents = codecs.encode_rgbd(model, params, whole.features_THWF[None, ..., :3], depth[None])
     return EncodedView(latents[0], view.seen_THW)

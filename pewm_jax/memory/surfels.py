@@ -21,7 +21,7 @@ import numpy as np
 from pewm_jax.config import ModelConfig, SurfelConfig
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.normals import normals
-from pewm_jax.memory import cells, rendering, voxel_cells
+from pewm_jax.memory import cells, rendering, views, voxel_cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
 COLUMNS = 10
@@ -281,7 +281,7 @@ def _shown(
     imagined = valid & ~surfels.observed_V
 
     def with_imagined() -> rendering.View:
-        return rendering.over(observed, draw(imagined))
+        return views.over(observed, draw(imagined))
 
     return jax.lax.cond(imagined.any(), with_imagined, lambda: observed)
 

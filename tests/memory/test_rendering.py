@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pewm_jax.config import VoxelConfig
 from pewm_jax.geometry import cameras, zbuffer
-from pewm_jax.memory import memories, rendering, voxel_map
+from pewm_jax.memory import memories, rendering, views, voxel_map
 from pewm_jax.types import Camera, Frames
 from tests.helpers import random_camera, tiny_model
 from tests.memory.test_memory_rivals import ALL, KINDS, model_of, scene, seen
@@ -153,7 +153,7 @@ def test_the_map_of_a_wall_is_where_the_wall_is(yaw):
 surfels = jax.jit(
     rendering.splat_surfels, static_argnums=(5, 6), static_argnames=("most", "average")
 )
-fill = jax.jit(rendering.fill_nearest)
+fill = jax.jit(views.fill_nearest)
 
 
 def covered_by_loop(points, size, valid, camera, most):

@@ -15,7 +15,7 @@ from pewm_jax.config import ConfigError, PatchColoursConfig, SurfelConfig, Voxel
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.evaluation.seen import seen_masks
-from pewm_jax.memory import memories, rendering, surfels
+from pewm_jax.memory import memories, rendering, surfels, views
 from pewm_jax.models.signals import as_signal
 from pewm_jax.types import Frames
 from tests.helpers import TINY, random_camera, tiny_model
@@ -256,7 +256,7 @@ def test_surfels_show_a_house_better_than_the_voxel_map():
             view = memories.render(model, memory, target.camera, 64, 64)
             flat = memories.colours(model, view.features_THWF.reshape(-1, encoder.channels))
             colours, sight = flat.reshape(truth.shape), view.seen_THW
-        filled = rendering.fill_nearest(rendering.View(colours, view.depth_THW, sight))
+        filled = views.fill_nearest(rendering.View(colours, view.depth_THW, sight))
         reached[name] = decibels(filled.features_THWF, truth, seen)
         shown[name] = np.asarray(sight)[seen].mean()
         assert (np.asarray(filled.depth_THW) > 0).all()

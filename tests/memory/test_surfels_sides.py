@@ -7,7 +7,7 @@ import pytest
 
 from pewm_jax.config import SurfelConfig
 from pewm_jax.geometry.cameras import pose_from_yaw
-from pewm_jax.memory import memories, rendering, surfels
+from pewm_jax.memory import memories, rendering, surfels, views
 from pewm_jax.types import Camera, Frames, Sight, View
 from pewm_jax.worlds import pewm
 from tests.helpers import random_camera, tiny_model
@@ -103,7 +103,7 @@ def test_one_view_over_another_shows_the_first_where_it_shows_anything():
         return rendering.View(rng.normal(size=(2, 3, 4, 3)) * seen[..., None], depth, seen)
 
     front, back = view(), view()
-    made = jax.device_get(rendering.over(front, back))
+    made = jax.device_get(views.over(front, back))
     for place in np.ndindex(2, 3, 4):
         shows = front if front.seen_THW[place] or not back.seen_THW[place] else back
         np.testing.assert_array_equal(
