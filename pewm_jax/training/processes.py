@@ -13,6 +13,7 @@ import re
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn, TypeVar
 
@@ -22,6 +23,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
+from orbax.checkpoint import multihost
 
 from pewm_jax import cli
 from pewm_jax.config import Launch, UserError
@@ -35,6 +37,8 @@ GONE = (
 """What a process says when it notices that another is gone."""
 _LEAVE_S = 60
 """Seconds that a process which is done waits for the others to be done too."""
+_REPORT_S = 5
+"""Seconds that a process which has reported an error waits for the others to report theirs."""
 _COMMUNICATION = ("gloo", "nccl", "unavailable", "deadline", "connect", "coordination", "socket")
 """Parts of the messages of errors that JAX raises when another process is gone."""
 
@@ -45,9 +49,10 @@ T = TypeVar("T")
 def joined(launch: Launch) -> Iterator[None]:
     """Join the processes of a job while this is entered, if the launch asks for it.
 
-    Inside, only the first process prints. An error ends this process at once, with one sentence and
-    the exit code of ``cli.run``; the others notice within ``HEARTBEAT_S``. JAX may write more to
-    standard error, or end this process itself (SIGABRT) when the first process is gone.
+    Inside, only the first process prints. An error ends this process, with one sentence and the
+    exit code of ``cli.run``, as soon as the others have reported one too, or after ``_REPORT_S``;
+    the others notice within ``HEARTBEAT_S``. JAX may write more to standard error, or end this
+    process itself (SIGABRT) when the first process is gone.
 
     Raises:
         UserError: there is nothing to join.
@@ -59,11 +64,13 @@ def joined(launch: Launch) -> Iterator[None]:
     with _quiet_but_first():
         try:
             yield
-            wait("the end of the training")
+            _finish()
             jax.distributed.shutdown()
         except BaseException as error:  # noqa: BLE001 - reported, whatever it is
             code = _report(error)
             sys.stderr.flush()
+            if not is_lost(error):
+                _let_others_report()
             os._exit(code)  # a normal exit waits for processes that wait for this one
 
 
@@ -215,10 +222,7 @@ class Votes:
         self._last: jax.Array | None = None
         if jax.process_count() == 1:
             return
-        devices = np.asarray(jax.devices())
-        mesh = Mesh(devices, ("all",))
-        self._each = NamedSharding(mesh, P("all"))
-        self._largest = jax.jit(jnp.max, out_shardings=NamedSharding(mesh, P()))
+        self._largest = _largest_of_all()
 
     def cast(self, number: int | None) -> int | None:
         """Vote, and return the result of the previous vote.
@@ -232,12 +236,31 @@ class Votes:
         """
         if jax.process_count() == 1:
             return number
-        own = np.full(1, number or 0, np.int32)
-        everyone = jax.make_array_from_callback(
-            (jax.device_count(),), self._each, lambda _index: own
-        )
-        before, self._last = self._last, self._largest(everyone)
+        before, self._last = self._last, self._largest(number or 0)
         return None if before is None else (int(before) or None)
+
+
+def _largest_of_all() -> Callable[[int], jax.Array]:
+    """Return a function that gives the largest of all processes' numbers, on every device."""
+    mesh = Mesh(np.asarray(jax.devices()), ("all",))
+    each = NamedSharding(mesh, P("all"))
+    largest = jax.jit(jnp.max, out_shardings=NamedSharding(mesh, P()))
+
+    def ask(number: int) -> jax.Array:
+        own = np.full(1, number, np.int32)
+        shape = (jax.device_count(),)
+        return largest(jax.make_array_from_callback(shape, each, lambda _index: own))
+
+    return ask
+
+
+def _finish() -> None:
+    """Wait until all processes are done, each with all of its devices.
+
+    ``wait`` waits for the first device of each. Another one that is still connecting when JAX's
+    coordinator leaves would wait for ever, and its process with it.
+    """
+    jax.block_until_ready(_largest_of_all()(0))
 
 
 def _require_free(coordinator: str) -> None:
@@ -284,6 +307,14 @@ def _quiet_but_first() -> Iterator[None]:
         finally:
             speech.flush()
             os.dup2(before, 1)
+
+
+def _let_others_report() -> None:
+    """Wait for the other processes to report the same error: JAX aborts them without the first."""
+    with contextlib.suppress(Exception):  # it is not theirs, or they are gone
+        multihost.get_barrier_sync_fn()(key="reported", timeout_ms=1000 * _REPORT_S)
+        if is_primary():
+            time.sleep(0.5)  # the others leave first
 
 
 def _report(error: BaseException) -> int:
