@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from pewm_jax.config.errors import require
 from pewm_jax.evaluation.images import unit_colours
 from pewm_jax.geometry.cameras import unproject
+from pewm_jax.geometry.normals import normals
 from pewm_jax.memory import rendering, views
 from pewm_jax.types import Array, Camera, Frames
 
@@ -30,6 +31,8 @@ class ReprojectSettings:
     """Width of a point, in pixels of the frame that observed it."""
     average: bool = True
     """Show the mean of all that is at the front, shared bilinearly; else the nearest point."""
+    backs: bool = True
+    """Show surfaces from behind too; else a back hides what lies behind it and is filled over."""
 
     def __post_init__(self):
         """Validate."""
@@ -40,7 +43,7 @@ class ReprojectSettings:
     def name(self) -> str:
         """The settings in a word, for names of files."""
         how = "mean" if self.average else "nearest"
-        return f"{how}-{self.footprint}px-{self.width:g}"
+        return f"{how}-{self.footprint}px-{self.width:g}{'' if self.backs else '-fronts'}"
 
     def __str__(self) -> str:
         """Say the settings for people."""
@@ -48,7 +51,7 @@ class ReprojectSettings:
         if self.footprint > 1 and self.width != 1:
             size += f", {self.width:g} observed pixels wide"
         shown = "the mean of those at the front" if self.average else "the nearest is shown"
-        return f"points of {size}, {shown}"
+        return f"points of {size}, {shown}{'' if self.backs else ', backs are not'}"
 
 
 CANDIDATES = (
@@ -58,6 +61,8 @@ CANDIDATES = (
     ReprojectSettings(footprint=2),
     ReprojectSettings(footprint=3),
     ReprojectSettings(footprint=3, width=1.5),
+    ReprojectSettings(footprint=2, backs=False),
+    ReprojectSettings(footprint=3, backs=False),
 )
 """The settings that are tried on the validation split; the first is a plain z-buffer."""
 
@@ -80,7 +85,7 @@ def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> F
     points = unproject(depth_SHW, context.camera).reshape(-1, 3)
     colours = unit_colours(context.rgb_THWC).reshape(-1, 3)
     there = (depth_SHW > 0).reshape(-1)
-    if settings.average or settings.footprint > 1:
+    if settings.average or settings.footprint > 1 or not settings.backs:
         focal = jnp.asarray(context.camera.intrinsics_4)[:, 0, None, None]
         view = rendering.splat_surfels(
             points,
@@ -92,6 +97,9 @@ def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> F
             width,
             most=settings.footprint,
             average=settings.average,
+            normals_V3=None
+            if settings.backs
+            else normals(depth_SHW, context.camera).reshape(-1, 3),
         )
     else:
         view = rendering.splat(points, colours, there, camera, height, width)

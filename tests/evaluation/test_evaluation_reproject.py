@@ -56,6 +56,23 @@ def test_another_camera_sees_the_room_that_was_seen(seen, settings):
     assert np.median(np.abs((np.asarray(made.rgb_THWC[0]) + 1) / 2 - colour)) < 0.06
 
 
+def test_a_wall_seen_from_behind_is_not_shown_and_hides_what_is_behind_it():
+    """A camera beside a wall looks at a far one; a second camera looks from behind the near one."""
+    intrinsics = np.array([[12.0, 12.0, 12.0, 12.0]])
+    ahead = np.asarray(pose_from_yaw(np.zeros(3), 0.0))[None]
+    depth = np.full((1, 24, 24), 4.0)
+    depth[:, :, :12] = 2.0  # on the left something stands nearer, 2 m away
+    colour = np.where(depth[..., None] < 3, [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0])
+    context = Frames(colour, depth, Camera(intrinsics, ahead))
+    back = np.asarray(pose_from_yaw(np.array([6.0, 0.0, 0.0]), np.pi))[None]
+    camera = Camera(intrinsics, back)
+    for backs in (True, False):
+        settings = ReprojectSettings(footprint=3, backs=backs)
+        made = reproject(settings, context, camera)
+        # From behind, the far wall stands 2 m away and hides all; nothing of it was seen from here.
+        assert bool(np.asarray(made.depth_THW).any()) == backs
+
+
 def test_frames_without_depth_do_not_count(seen):
     blank = some(seen, [0, 1])
     blank = Frames(blank.rgb_THWC * 0, blank.depth_THW * 0, blank.camera)
@@ -78,7 +95,7 @@ def test_a_batch_is_its_clips(seen):
 
 
 def test_settings_have_distinct_names_and_are_checked():
-    assert len({item.name for item in CANDIDATES}) == len({str(item) for item in CANDIDATES}) == 6
+    assert len({item.name for item in CANDIDATES}) == len({str(item) for item in CANDIDATES}) == 8
     assert CANDIDATES[0] == ReprojectSettings(average=False)  # the plain z-buffer is among them
     with pytest.raises(ConfigError, match="footprint is 0"):
         ReprojectSettings(footprint=0)
