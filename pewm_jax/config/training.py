@@ -178,6 +178,9 @@ class TrainConfig(TrainSettings):
     """Backbone and memory blocks learn together (not in the paper); by default left out."""
     gate: StageConfig = StageConfig(steps=0)
     """The codec's gate learns on what the model imagines (not the paper's); left out too."""
+    gate_lpips: float = 0.0
+    """Weight of LPIPS (AlexNet's, `pip install 'pewm-jax[metrics]'`) in the loss of stage `gate`; 0
+    leaves it out."""
 
     def __post_init__(self):
         """Validate."""
@@ -188,6 +191,7 @@ class TrainConfig(TrainSettings):
             "freezes the backbone, whose output starts at zero, so nothing would be learnt; give "
             "train.stage1.steps at least 1, or name trained weights by train.start.",
         )
+        require(self.gate_lpips >= 0, f"train.gate_lpips is {self.gate_lpips}: use 0 or more.")
 
 
 @dataclasses.dataclass(frozen=True)

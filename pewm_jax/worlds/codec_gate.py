@@ -9,12 +9,14 @@ import jax.numpy as jnp
 
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, TrainSettings
 from pewm_jax.memory import memories
-from pewm_jax.models import codecs, gates
+from pewm_jax.models import codecs, gates, lpips
 from pewm_jax.models.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.types import Array, Camera, Clip, Frames, Params
 
 ABSOLUTE = 0.1
 """Weight of the absolute error beside the squared one."""
+LPIPS: lpips.Net = "alex"
+"""The network of LPIPS in the loss."""
 EASY = 1e-3
 """Errors of a frame below this no longer matter."""
 
@@ -79,6 +81,7 @@ def score(
     shown_BTHWC: Array,
     seen_BTHW: Array,
     truth: Frames,
+    perceptual: tuple[float, Params] | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of what a gate makes of decoded frames and of the rendered memory; see above.
 
@@ -90,6 +93,7 @@ def score(
         shown_BTHWC: colour and depth signal of the memory, 4 channels.
         seen_BTHW: where it shows anything.
         truth: the recorded frames, colours in [−1, 1].
+        perceptual: a weight and the weights of LPIPS, which then counts too, and is measured.
     """
     decoded = _four(model, rgb_BTHWC, depth_BTHW)
     wanted = _four(model, truth.rgb_THWC, truth.depth_THW)
@@ -105,9 +109,14 @@ def score(
     each = jnp.square(error) + ABSOLUTE * jnp.abs(error)
     each = each.sum((1, 2, 3)) / jnp.maximum(counts.sum((1, 2, 3)), 1)
     loss = jnp.log(each + EASY).mean()
+    perceived = {}
+    if perceptual is not None:
+        weight, network = perceptual
+        apart = lpips.apply(LPIPS, network, made[..., :3], wanted[..., :3]).mean()
+        loss, perceived = loss + weight * apart, {"lpips": apart}
     off = jnp.abs(depth_from_signal(model.clip, made[..., 3]) - depth)
     hit = seen[..., None].astype(made.dtype)
-    return loss, {
+    return loss, perceived | {
         "psnr_rgb": _psnr(made, wanted, jnp.ones_like(hit)),
         "psnr_decoded": _psnr(decoded, wanted, jnp.ones_like(hit)),
         "psnr_seen": _psnr(made, wanted, hit),

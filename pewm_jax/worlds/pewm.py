@@ -69,6 +69,7 @@ STAGES = (
         prepare=pewm_gate.prepare,
         prepares_by=("backbone", "control", "memory", "codec", "encoder", "text"),
         optional=True,
+        given=pewm_gate.perceptual,
         require=pewm_gate.require_gate,
     ),
 )

@@ -13,9 +13,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import ModelConfig, TrainSettings, UserError
+from pewm_jax.config import ModelConfig, TrainConfig, TrainSettings, UserError
 from pewm_jax.memory import memories
-from pewm_jax.models import codecs, world_model
+from pewm_jax.models import codecs, lpips_weights, world_model
 from pewm_jax.models.signals import as_signal, signal_from_depth
 from pewm_jax.types import Array, Clip, Control, Frames, Params
 from pewm_jax.worlds import codec_gate, objective, sampling
@@ -67,7 +67,8 @@ def loss(
     model: ModelConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of the gate on imagined frames; see ``codec_gate.score``."""
-    del train, key
+    assert isinstance(train, TrainConfig)
+    del key
     if clip.latents_thwC is None:
         clip = jax.lax.stop_gradient(prepare(model, params, clip))
     assert clip.sight is not None
@@ -90,4 +91,17 @@ def loss(
         shown[:, 1:],
         view.seen_THW[:, 1:],
         truth,
+        (train.gate_lpips, params["lpips"]) if train.gate_lpips else None,
     )
+
+
+def perceptual(train: TrainSettings) -> Params | None:
+    """Return the weights of LPIPS that ``loss`` needs, under ``lpips``, or None.
+
+    Raises:
+        UserError: they are asked for and not installed, or damaged.
+    """
+    assert isinstance(train, TrainConfig)
+    if not train.gate_lpips:
+        return None
+    return {"lpips": lpips_weights.read(lpips_weights.find(codec_gate.LPIPS), codec_gate.LPIPS)[1]}

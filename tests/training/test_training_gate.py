@@ -15,6 +15,7 @@ from pewm_jax.config import (
     CodecTrainConfig,
     CodecWorldConfig,
     Config,
+    ConfigError,
     DataConfig,
     LearnedCodecConfig,
     RenderConfig,
@@ -23,9 +24,11 @@ from pewm_jax.config import (
     UserError,
 )
 from pewm_jax.data import abstract
-from pewm_jax.models import learned_codec
+from pewm_jax.models import gates, learned_codec, lpips, lpips_weights
 from pewm_jax.rollouts import load_finished
 from pewm_jax.training import loop, stages
+from pewm_jax.types import Frames
+from pewm_jax.worlds import codec_gate
 from tests.helpers import TINY, init_world, random_camera, randomise, tiny_config
 
 CODEC = LearnedCodecConfig(
@@ -164,6 +167,35 @@ def test_the_gate_learns_alone_on_what_the_model_imagines(reader):
     once, gradient = compiled(params["codec"]["gate"], ready)
     np.testing.assert_allclose(compiled(params["codec"]["gate"], clip)[0], once, rtol=1e-5)
     assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient))
+
+
+def test_lpips_of_the_mixed_frames_counts_as_much_as_it_weighs(monkeypatch):
+    rng = np.random.default_rng(0)
+    model, shape = imagining().model, (1, 2, 32, 32)
+    network = lpips.init("alex", jax.random.key(0))
+    truth = Frames(
+        jnp.asarray(rng.uniform(-1, 1, (*shape, 3))), jnp.asarray(rng.uniform(1, 3, shape)), None
+    )
+    given = jnp.asarray(rng.uniform(-1, 1, (*shape, 3))), jnp.asarray(rng.uniform(1, 3, shape))
+    shown, seen = jnp.asarray(rng.uniform(-1, 1, (*shape, 4))), jnp.ones(shape, bool)
+    gate = gates.init(8, jax.random.key(1))
+
+    def score(perceptual):
+        return codec_gate.score(model, gate, *given, shown, seen, truth, perceptual)
+
+    without, few = score(None)
+    whole, measured = score((0.5, network))
+    assert measured["lpips"] > 0
+    assert "lpips" not in few
+    assert float(whole) == pytest.approx(float(without + 0.5 * measured["lpips"]), rel=1e-5)
+
+    train = dataclasses.replace(imagining().train, gate_lpips=0.5)
+    assert LAST.given(imagining().train) is None
+    monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
+    with pytest.raises(UserError, match="none are installed"):
+        LAST.given(train)
+    with pytest.raises(ConfigError, match=r"train\.gate_lpips is -1"):
+        dataclasses.replace(train, gate_lpips=-1)
 
 
 def test_without_a_gate_there_is_nothing_to_learn():
