@@ -10,11 +10,12 @@ def config() -> Config:
     """Return the settings of ``small``.
 
     ``pewm-jax data collect data/small --train 512 --frames 72`` makes its houses. Its size is the
-    demo's. Muon needs about two thirds of Adam's steps. In a third stage the backbone learns on with
-    the memory, in a fourth the gate learns on what the model imagines, with LPIPS in its loss
-    (``pip install 'pewm-jax[metrics]'``); neither is the paper's. Prepared clips are kept on disk, so
-    that training can be spread over as many sittings as it takes. The weights that come with the
-    library were trained in several runs that together did these steps; their card says how.
+    demo's. Muon needs about two thirds of Adam's steps. In a third stage the backbone learns on
+    with the memory, in a fourth the gate learns on what the model imagines, with LPIPS in its
+    loss (``pip install 'pewm-jax[metrics]'``); neither is the paper's. Prepared clips are kept on
+    disk, so that training can be spread over as many sittings as it takes. The weights that come
+    with the library were trained in several runs that together did these steps; their card says
+    how.
     """
     base = demo.config()
     noise = dataclasses.replace(base.model.noise, sample_steps=2)
