@@ -26,6 +26,7 @@ from tests.strangers import run as strangers
 
 HERE = Path(__file__).parent
 PARTS = ("backbone", "codec", "control", "memory", "noise")
+init = jax.jit(worlds.init, static_argnums=0)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,7 @@ def test_they_train_save_load_and_imagine(tmp_path, monkeypatch):
 
 def test_a_control_that_needs_actions_says_so():
     config = strangers.experiment()
-    params = worlds.init(config, jax.random.key(0))
+    params = init(config, jax.random.key(0))
     rng = np.random.default_rng(0)
     state = pewm_jax.start(config, params, random_frames(rng, 3, 16, 16))
     camera = random_camera(rng, 3, 16, 16)
@@ -103,7 +104,7 @@ def test_a_control_that_needs_actions_says_so():
 
 def test_many_candidates_share_one_memory():
     config = strangers.experiment()
-    params = worlds.init(config, jax.random.key(0))
+    params = init(config, jax.random.key(0))
     rng = np.random.default_rng(0)
     state = pewm_jax.start(config, params, random_frames(rng, 3, 16, 16))
     keys = jax.random.split(jax.random.key(1), 4)

@@ -4,11 +4,7 @@ import json
 import os
 
 os.environ["XLA_FLAGS"] = " ".join(
-    (
-        "--xla_force_host_platform_device_count=4",
-        "--xla_backend_optimization_level=0",  # compile quickly
-        "--xla_llvm_disable_expensive_passes=true",
-    )
+    (os.environ.get("XLA_FLAGS", ""), "--xla_force_host_platform_device_count=4")
 )
 
 import jax

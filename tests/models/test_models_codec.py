@@ -1,3 +1,4 @@
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -6,6 +7,9 @@ from hypothesis import strategies as st
 from pewm_jax.config import ClipConfig, PixelConfig
 from pewm_jax.models import codecs, signals
 from tests.helpers import TINY
+
+encode = jax.jit(codecs.encode, static_argnums=0)
+decode = jax.jit(codecs.decode, static_argnums=0)
 
 
 @settings(max_examples=15, deadline=None)
@@ -19,9 +23,9 @@ from tests.helpers import TINY
 def test_decode_inverts_encode(k, h, w, s, c):
     config = PixelConfig(spatial=s)
     video = np.random.default_rng(k).normal(size=(2, 4 * k + 1, h * s, w * s, c))
-    latents = codecs.encode(config, {}, video.astype(np.float32))
+    latents = encode(config, {}, video.astype(np.float32))
     assert latents.shape == (2, k + 1, h, w, 4 * s * s * c)
-    np.testing.assert_allclose(codecs.decode(config, {}, latents), video, atol=1e-6)
+    np.testing.assert_allclose(decode(config, {}, latents), video, atol=1e-6)
 
 
 def test_a_latent_frame_holds_only_its_own_frames():

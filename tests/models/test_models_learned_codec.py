@@ -23,11 +23,14 @@ from pewm_jax.worlds import objective
 from tests.helpers import init_world, random_frames, randomise, tiny_model
 
 TINY = LearnedCodecConfig(latent_channels=4, fine=8, coarse=12, fine_blocks=1, coarse_blocks=1)
+init = jax.jit(learned_codec.init, static_argnums=0)
+encode = jax.jit(codecs.encode, static_argnums=0)
+decode = jax.jit(codecs.decode, static_argnums=0)
 
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(learned_codec.init(TINY, jax.random.key(0)))
+    return randomise(init(TINY, jax.random.key(0)))
 
 
 def videos(*shape, seed=0):
@@ -37,15 +40,15 @@ def videos(*shape, seed=0):
 @pytest.mark.parametrize("shape", [(1, 1, 8, 8), (1, 9, 16, 24), (3, 2, 24, 8)])
 def test_latents_are_an_eighth_of_the_frame_each_way_and_come_back(params, shape):
     batch, frames, height, width = shape
-    latents = codecs.encode(TINY, params, videos(*shape))
+    latents = encode(TINY, params, videos(*shape))
     assert latents.shape == (batch, frames, height // 8, width // 8, 4)
-    assert codecs.decode(TINY, params, latents).shape == (*shape, 3)
+    assert decode(TINY, params, latents).shape == (*shape, 3)
 
 
 def test_frames_are_coded_each_by_itself_under_jit_or_not(params):
     video = videos(2, 3, 16, 24)
-    latents = jax.jit(codecs.encode, static_argnums=0)(TINY, params, video)
-    made = jax.jit(codecs.decode, static_argnums=0)(TINY, params, latents)
+    latents = encode(TINY, params, video)
+    made = decode(TINY, params, latents)
     for b in range(2):
         for t in range(3):
             one = codecs.encode(TINY, params, video[b : b + 1, t : t + 1])
@@ -56,18 +59,16 @@ def test_frames_are_coded_each_by_itself_under_jit_or_not(params):
 
 def test_normalised_latents_have_mean_0_and_variance_1_and_decode_the_same(params):
     video = videos(4, 2, 16, 24)
-    raw = np.asarray(codecs.encode(TINY, params, video))
-    fresh = learned_codec.init(TINY, jax.random.key(0))
+    raw = np.asarray(encode(TINY, params, video))
+    fresh = init(TINY, jax.random.key(0))
     unit = params | {name: fresh[name] for name in ("latent_mean_C", "latent_scale_C")}
-    raw = np.asarray(codecs.encode(TINY, unit, video))
+    raw = np.asarray(encode(TINY, unit, video))
     places = (0, 1, 2, 3)
     fitted = learned_codec.with_statistics(unit, raw.mean(places), raw.std(places))
-    latents = np.asarray(codecs.encode(TINY, fitted, video))
+    latents = np.asarray(encode(TINY, fitted, video))
     np.testing.assert_allclose(latents.mean(places), 0, atol=1e-5)
     np.testing.assert_allclose(latents.var(places), 1, atol=1e-4)
-    np.testing.assert_allclose(
-        codecs.decode(TINY, fitted, latents), codecs.decode(TINY, unit, raw), atol=1e-4
-    )
+    np.testing.assert_allclose(decode(TINY, fitted, latents), decode(TINY, unit, raw), atol=1e-4)
 
 
 @pytest.mark.parametrize(

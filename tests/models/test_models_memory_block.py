@@ -26,6 +26,7 @@ BOTH = pytest.mark.parametrize("positions", ["projective", "sinusoid"])
 VALID = 15
 """Of 20 map tokens; the others are masked."""
 apply = jax.jit(world_model.apply, static_argnums=0)
+condition = jax.jit(world_model.condition, static_argnums=0)
 
 
 def model_of(depth=True, kind=VoxelConfig, **changes):
@@ -44,7 +45,7 @@ def inputs(seed=0):
     rgb = jnp.asarray(rng.uniform(-1, 1, (2, 1, 16, 24, 3)), jnp.float32)
     depth = jnp.asarray(rng.uniform(0.5, 4, (2, 1, 16, 24)), jnp.float32)
     observed = Frames(rgb, depth, jax.tree.map(lambda x: x[:, :1], camera))
-    conditioning = world_model.condition(TINY, {}, observed, Control(camera))
+    conditioning = condition(TINY, {}, observed, Control(camera))
     tokens = MapTokens(
         jnp.asarray(rng.normal(size=(2, 20, 6)), jnp.float32),
         jnp.asarray(rng.uniform(-3, 3, (2, 20, 3)), jnp.float32),
@@ -279,7 +280,7 @@ def test_a_denoiser_without_depth_neither_sees_nor_makes_any():
     given = []
     for depth in (batch.depth_THW, batch.depth_THW + 1):
         observed = jax.tree.map(lambda x: x[:, :1], dataclasses.replace(batch, depth_THW=depth))
-        given.append(world_model.condition(model, {}, observed, Control(batch.camera)).given)
+        given.append(condition(model, {}, observed, Control(batch.camera)).given)
     jax.tree.map(np.testing.assert_array_equal, *given)
     assert np.abs(given[0].joined_BthwC[..., :split]).max() > 0.1
 

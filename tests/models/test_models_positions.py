@@ -40,7 +40,7 @@ def choose(learned):
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(dit.init(TABLE, jax.random.key(0)))
+    return randomise(jax.jit(dit.init, static_argnums=0)(TABLE, jax.random.key(0)))
 
 
 def run(config, params, shape):

@@ -21,7 +21,7 @@ TINY = VAEConfig(
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(vae.init(TINY, jax.random.key(0)), scale=0.3)
+    return randomise(jax.jit(vae.init, static_argnums=0)(TINY, jax.random.key(0)), scale=0.3)
 
 
 def video(frames, height=8, width=8, seed=0):

@@ -9,6 +9,9 @@ from pewm_jax.models import world_model
 from pewm_jax.types import Camera, Control, Frames, MapTokens, Sight
 from tests.helpers import TINY, init_world, random_camera, randomise, rigid, with_reader
 
+condition = jax.jit(world_model.condition, static_argnums=0)
+apply = jax.jit(world_model.apply, static_argnums=0)
+
 
 def setup(positions="projective", seed=0):
     model = with_reader(TINY, positions=positions)
@@ -20,7 +23,7 @@ def setup(positions="projective", seed=0):
         jnp.asarray(rng.uniform(0.5, 4, (2, 1, 16, 24)), jnp.float32),
         jax.tree.map(lambda x: x[:, :1], camera),
     )
-    conditioning = world_model.condition(model, {}, observed, Control(camera))
+    conditioning = condition(model, {}, observed, Control(camera))
     tokens = MapTokens(
         jnp.asarray(rng.normal(size=(2, 20, 6)), jnp.float32),
         jnp.asarray(rng.uniform(-3, 3, (2, 20, 3)), jnp.float32),
@@ -31,7 +34,6 @@ def setup(positions="projective", seed=0):
     return model, conditioning, tokens, noisy, jnp.array([5, 700])
 
 
-apply = jax.jit(world_model.apply, static_argnums=0)
 BOTH = pytest.mark.parametrize("positions", ["projective", "sinusoid"])
 
 

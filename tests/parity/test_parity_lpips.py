@@ -153,7 +153,7 @@ def test_the_packages_weights_give_torchs_distances(net):
 
 
 def test_the_gradient_is_finite_and_torchs_where_torch_has_one():
-    params = lpips.init("alex", jax.random.key(0))
+    params = jax.jit(lpips.init, static_argnums=0)("alex", jax.random.key(0))
     a, b = (jnp.asarray(x) for x in pictures(40, 33, 2))
     slope = jax.jit(jax.grad(lambda x: lpips.apply("alex", params, x, b).sum()))
     assert np.isfinite(slope(a)).all()
@@ -174,7 +174,7 @@ def test_parameters_have_the_shapes_of_the_table_and_costs_are_those_of_torch():
 
 
 def test_pictures_that_cannot_be_compared_are_refused():
-    params = lpips.init("alex", jax.random.key(0))
+    params = jax.jit(lpips.init, static_argnums=0)("alex", jax.random.key(0))
     a = np.zeros((1, 30, 64, 3), np.float32)
     with pytest.raises(UserError, match=r"30×64 pixels are too small .* use VGG16"):
         lpips.apply("alex", params, a, a)

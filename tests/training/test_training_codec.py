@@ -37,6 +37,7 @@ from pewm_jax.worlds import costs
 from tests.helpers import random_camera
 
 TINY = LearnedCodecConfig(latent_channels=4, fine=8, coarse=12, fine_blocks=1, coarse_blocks=1)
+init = jax.jit(worlds.init, static_argnums=0)
 
 
 def experiment(run="runs/it", steps=2, **train):
@@ -78,24 +79,28 @@ def clips(monkeypatch):
 
 
 def descend(config, params, stage, count, rate, clips_of):
-    loss = jax.jit(
-        jax.value_and_grad(
-            lambda p, clip, key: stage.loss(config.model, config.train, p, clip, key), has_aux=True
-        )
-    )
     rule = optax.masked(
         optax.adam(rate),
         lambda p: tree.assign(
             [(pattern, label == stages.TRAIN) for pattern, label in stage.rules], p, "mask"
         ),
     )
-    state, found = rule.init(params), []
-    for number in range(count):
-        (value, parts), slope = loss(params, clips_of(number), jax.random.key(number))
+
+    @jax.jit
+    def step(params, state, clip, key):
+        loss = jax.value_and_grad(
+            lambda p: stage.loss(config.model, config.train, p, clip, key), has_aux=True
+        )
+        measured, slope = loss(params)
         kept = tree.assign([(p, float(k == stages.TRAIN)) for p, k in stage.rules], slope, "mask")
         slope = jax.tree.map(lambda x, k: x * k, slope, kept)
         move, state = rule.update(slope, state, params)
-        params = optax.apply_updates(params, move)
+        return optax.apply_updates(params, move), state, measured
+
+    state, found = jax.jit(rule.init)(params), []
+    for number in range(count):
+        params, state, measured = step(params, state, clips_of(number), jax.random.key(number))
+        value, parts = measured
         found.append((float(value), {name: float(x) for name, x in parts.items()}))
     return params, found
 
@@ -103,7 +108,7 @@ def descend(config, params, stage, count, rate, clips_of):
 def test_descent_lowers_the_loss_and_then_the_latents_are_distributed_normally():
     config = experiment()
     first, second = worlds.stages(config)
-    params = worlds.init(config, jax.random.key(0))
+    params = init(config, jax.random.key(0))
     params, found = descend(config, params, first, 20, 5e-3, lambda n: batch(config, seed=n % 2))
     assert found[-1][0] < 0.8 * found[0][0]
     assert found[-1][1]["psnr_rgb"] > found[0][1]["psnr_rgb"]
@@ -118,7 +123,7 @@ def test_descent_lowers_the_loss_and_then_the_latents_are_distributed_normally()
 
 def test_depth_that_was_not_measured_does_not_count():
     config = experiment()
-    params = worlds.init(config, jax.random.key(0))
+    params = init(config, jax.random.key(0))
     clip = batch(config)
     holes = clip.frames.depth_THW.copy()
     holes[..., :8, :] = 0
@@ -151,7 +156,7 @@ def test_depth_that_was_not_measured_does_not_count():
 def perceptual(tmp_path, **train):
     """An experiment whose loss has LPIPS, with random weights, and frames that AlexNet takes."""
     file = tmp_path / "alex.safetensors"
-    weights.save(file, lpips.init("alex", jax.random.key(0)))
+    weights.save(file, jax.jit(lpips.init, static_argnums=0)("alex", jax.random.key(0)))
     settings = {"lpips_weight": 0.5, "lpips_file": str(file)} | train
     config = experiment(tmp_path / "run", **settings)
     return config.with_model(clip=ClipConfig(frames=2, height=32, width=32))
@@ -176,7 +181,7 @@ def of_32(batch):
 def test_lpips_counts_as_much_as_it_weighs_and_can_be_descended(tmp_path):
     config = perceptual(tmp_path)
     stage, make = worlds.stages(config)[0], of_32(batch)
-    params, given = worlds.init(config, jax.random.key(0)), stage.given(config.train)
+    params, given = init(config, jax.random.key(0)), stage.given(config.train)
     clip, key = make(config), jax.random.key(1)
     loss = jax.jit(stage.loss, static_argnums=(0, 1))
     whole, measured = loss(config.model, config.train, params | given, clip, key)

@@ -105,7 +105,7 @@ def test_only_the_gate_learns_in_its_stage_and_the_run_can_be_loaded(clips, tmp_
 def test_with_what_was_seen_the_gate_makes_more_of_noisy_latents_than_the_decoder():
     config = experiment()
     stage = worlds.stages(config)[2]
-    params = worlds.init(config, jax.random.key(0))
+    params = jax.jit(worlds.init, static_argnums=0)(config, jax.random.key(0))
     clip = batch(config, 2)
     loss = jax.jit(lambda p, key: stage.loss(config.model, config.train, p, clip, key))
     measured = loss(params, jax.random.key(1))[1]

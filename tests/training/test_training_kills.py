@@ -15,8 +15,7 @@ from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
 
 ROOT = Path(__file__).parents[2]
-QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-CPU = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": QUICK}
+CPU = {**os.environ, "JAX_PLATFORMS": "cpu"}
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,6 @@ from pewm_jax.training import feed, processes
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 PATIENCE_S = 120
 
 
@@ -46,12 +45,12 @@ class Job:
     """
 
     def __init__(self, argv, processes=1, devices=1, settings=(), slurm=False):
-        flags = f"{QUICK} --xla_force_host_platform_device_count={devices}"
+        quick = os.environ.get("XLA_FLAGS", "")
         shared = {
             **os.environ,
             "PYTHONPATH": f"{ROOT}:{HERE}",
             "JAX_PLATFORMS": "cpu",
-            "XLA_FLAGS": flags,
+            "XLA_FLAGS": f"{quick} --xla_force_host_platform_device_count={devices}",
         }
         self.running, self.written, self.files = [], [], contextlib.ExitStack()
         port = self.files.enter_context(held_port())
