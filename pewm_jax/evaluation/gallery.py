@@ -45,6 +45,9 @@ class Gallery:
         moving: all frames of that rollout side by side, a GIF.
         masks: the same true frames with never-seen pixels greyed out.
         above: the map from above, before and after that rollout.
+        rows: of each rollout shown the frames of ``truth`` and of each method in ``CAPTIONS`` at
+            the steps of ``strip``, side by side in one picture and as large as they are.
+        steps: those steps; 0 is the present.
     """
 
     videos: list[tuple[str, bytes]]
@@ -53,6 +56,8 @@ class Gallery:
     moving: bytes
     masks: np.ndarray
     above: np.ndarray
+    rows: list[dict[str, np.ndarray]]
+    steps: list[int]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +102,18 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
         moving=_moving(rollout),
         masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
         above=_above(config, long, best, rollout),
+        rows=[_rows(item, steps) for item in shown],
+        steps=[int(step) for step in steps],
     )
+
+
+def _rows(item: _Rollout, steps: np.ndarray) -> dict[str, np.ndarray]:
+    colours = {"truth": as_bytes(item.truth.rgb_THWC)}
+    colours |= {method: rgb for method, (rgb, _) in item.imagined.items()}
+    return {
+        name: np.concatenate(list(_with_present(item.context, rgb)[steps]), axis=1)
+        for name, rgb in colours.items()
+    }
 
 
 def _gather(

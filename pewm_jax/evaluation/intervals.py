@@ -100,7 +100,8 @@ def over_houses(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, np.nda
 def entry(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, Any]:
     """Return ``over_houses`` for JSON: numbers, or lists for more than one; None for NaN."""
     found = over_houses(values_CX, houses_C)
-    return {n: np.where(np.isfinite(array), array, None).tolist() for n, array in found.items()}
+    nothing = np.array(None)
+    return {n: np.where(np.isfinite(array), array, nothing).tolist() for n, array in found.items()}
 
 
 def table(sums: Mapping[str, np.ndarray], houses_C: np.ndarray) -> dict[str, Any]:
