@@ -43,7 +43,7 @@ def scores(metrics: Mapping[str, Any]) -> str:
     cover = CLUSTERS[metrics["protocol"]["clustered_by"]]
     per_seed = ", ".join(f"{value:+.2f}" for value in metrics["margin"]["seen"]["psnr"]["per_seed"])
     return (
-        _table(f"<th></th>{heads}<th>clips</th>", rows)
+        table(f"<th></th>{heads}<th>clips</th>", rows)
         + "<p class='quiet'>Mean ± standard error over clips. Sampling seeds are averaged within a "
         f"clip first, and the error is {cover}. "
         "Differences are taken clip by clip, among models with the same noise. "
@@ -66,7 +66,7 @@ def drift(metrics: Mapping[str, Any]) -> str:
     frames = metrics["protocol"]["long_rollouts"]["frames_each"]
     return (
         f"<h2>Drift</h2><p>PSNR over pixels seen before, dB, along rollouts of {frames} frames.</p>"
-        + _table("<th></th>" + "".join(f"<th>{head}</th>" for head in heads), rows)
+        + table("<th></th>" + "".join(f"<th>{head}</th>" for head in heads), rows)
     )
 
 
@@ -81,7 +81,7 @@ def coverage(metrics: Mapping[str, Any]) -> str:
     ]
     return (
         "<h2>What the map covers</h2><p>Of the pixels seen before, the share whose surface is</p>"
-        + _table("<th></th><th>share</th>", rows)
+        + table("<th></th><th>share</th>", rows)
     )
 
 
@@ -97,7 +97,8 @@ def _row(
     return f"<tr{kind}><td>{label}</td>{cells}<td>{entries['psnr']['n']}</td></tr>"
 
 
-def _table(heads: str, rows: list[str]) -> str:
+def table(heads: str, rows: list[str]) -> str:
+    """Return a table, which scrolls where it is too wide; cells and rows are HTML already."""
     return (
         f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>'
         + "".join(rows)

@@ -16,7 +16,7 @@ from pewm_jax.evaluation import opened as runs
 from pewm_jax.evaluation import protocol_file, samples
 from pewm_jax.evaluation.covered import score_coverage
 from pewm_jax.evaluation.fixed import decide
-from pewm_jax.evaluation.gallery import Gallery, make_gallery
+from pewm_jax.evaluation.gallery import ROWS, Gallery, make_gallery
 from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.measure import measure
 from pewm_jax.evaluation.methods import Methods
@@ -36,8 +36,6 @@ REPORT_VERSION = 6
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
 """The protocol of a report, in its folder; another run can be scored by it."""
-ROWS = "rows"
-"""Folder of the frames shown, one picture for each long rollout and method."""
 
 
 def override(config: Config, **changes: Any) -> Config:
