@@ -13,6 +13,7 @@ from pewm_jax.evaluation.words import (
     METRIC_NAMES,
     RIVALS,
     number,
+    spread,
 )
 
 CLUSTERS = {
@@ -49,6 +50,35 @@ def scores(metrics: Mapping[str, Any]) -> str:
         "Differences are taken clip by clip, among models with the same noise. "
         f"Gain of the map over an empty one on pixels seen before, seed by seed "
         f"({', '.join(map(str, seeds))}): {per_seed} dB.</p>"
+    )
+
+
+def houses(metrics: Mapping[str, Any]) -> str:
+    """Return means over houses with their intervals, and the paired differences; PSNR."""
+    found, rows = metrics["houses"], []
+    frames = metrics["protocol"]["imagined_frames"]
+    ends = sorted({0, (frames - 1) // 2, frames - 1})
+    for mask, name in MASK_NAMES.items():
+        rows.append(f'<tr class="head"><td colspan="{len(ends) + 3}">{name}</td></tr>')
+        for part, sign in (("results", False), ("margins", True)):
+            for method, label in METHOD_NAMES.items():
+                if method not in found[part]:
+                    continue
+                whole = found[part][method][mask]["psnr"]
+                steps = found["per_frame_margins" if sign else "per_frame"][method][mask]["psnr"]
+                at = [{key: steps[key][t] for key in ("mean", "low", "high")} for t in ends]
+                cells = "".join(f"<td>{spread(e, 2, sign=sign)}</td>" for e in (whole, *at))
+                kind, shown = (' class="gain"', f"map minus {label}") if sign else ("", label)
+                rows.append(f"<tr{kind}><td>{shown}</td>{cells}<td>{whole['houses']}</td></tr>")
+    heads = "".join(f"<th>frame {t + 1}</th>" for t in ends)
+    return (
+        "<h2>House by house</h2>"
+        + table(f"<th>PSNR, dB</th><th>all frames</th>{heads}<th>{found['house']}s</th>", rows)
+        + f"<p class='quiet'>Mean within a {found['house']} first, then over {found['house']}s; in "
+        f"brackets the {100 * found['how']['level']:.0f} % interval of a bootstrap over them "
+        f"({found['how']['draws']} draws). Differences are paired. This is one training: how much "
+        "another training seed would change is a question of its own (<code>pewm-jax compare "
+        "--also_a</code>).</p>"
     )
 
 
