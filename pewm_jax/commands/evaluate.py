@@ -39,6 +39,10 @@ class Settings:
     """Run trained for as many steps without a memory (same clip and codec), which gets a row."""
     lpips: str | None = None
     """Weights of LPIPS: a file, `alex` or `vgg` of the installed package, or `off`."""
+    protocol: str | None = None
+    """File made by `pewm-jax protocol`, which fixes clips, context, motion, noise and horizon;
+    `off` chooses them by the settings, also where the run names a file. Every report has its own,
+    RUN/report/protocol.json, by which other runs can be scored."""
     out: Path | None = None
     """Folder of the report; by default RUN/report, or RUN/report-NAME for other data than the
     run's own."""

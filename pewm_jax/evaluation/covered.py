@@ -15,7 +15,7 @@ from pewm_jax.config import Config, ModelConfig
 from pewm_jax.data.episodes import Episode
 from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.partial import Partials
-from pewm_jax.evaluation.protocol import choose
+from pewm_jax.evaluation.protocol import ClipChoice, choose
 from pewm_jax.evaluation.scoring import Batch, load_batch
 from pewm_jax.memory import memories
 from pewm_jax.memory.coverage import Coverage, coverage
@@ -28,8 +28,11 @@ def score_coverage(
     model: Imagination,
     partials: Partials,
     say: Callable[[str], Any] = print_now,
+    choices: Sequence[ClipChoice] | None = None,
 ) -> dict[str, float] | None:
     """Count over the first clip of every chain that is scored; kept with the partial results.
+
+    Without ``choices`` they are those of ``choose``.
 
     Returns:
         The shares of the pixels seen before: ``held``, ``chosen``, ``attended``, ``rendered``,
@@ -38,7 +41,8 @@ def score_coverage(
     Raises:
         UserError: as for ``scoring.score_table``.
     """
-    choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
+    if choices is None:
+        choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
     counts = []
     for first in range(0, len(choices), config.evaluate.batch):
         name = f"coverage2-clip{first:04d}"

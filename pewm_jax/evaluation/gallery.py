@@ -30,6 +30,8 @@ ABOVE_CAMERA_M = 0.4
 """Map cells higher than this above the camera are left out of the view from above."""
 CAPTIONS = {"memory": "with its map", "empty": "empty map", "reproject": "reprojected"}
 """The methods in images, in their order, and their names."""
+ROWS = "rows"
+"""Folder of a report with ``Gallery.rows``: ``00-truth.png``, ``00-memory.png`` and so on."""
 HOLD = 4
 """Video frames for which the observed image is held."""
 
@@ -45,6 +47,8 @@ class Gallery:
         moving: all frames of that rollout side by side, a GIF.
         masks: the same true frames with never-seen pixels greyed out.
         above: the map from above, before and after that rollout.
+        rows: of each rollout shown the frames of ``truth`` and of each method in ``CAPTIONS`` at
+            the steps of ``strip``, side by side in one picture and as large as they are.
     """
 
     videos: list[tuple[str, bytes]]
@@ -53,6 +57,7 @@ class Gallery:
     moving: bytes
     masks: np.ndarray
     above: np.ndarray
+    rows: list[dict[str, np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +71,11 @@ class _Rollout:
     imagined: dict[str, tuple[np.ndarray, np.ndarray]]
 
 
+def picture_steps(frames: int) -> np.ndarray:
+    """Return the steps of a rollout that are shown as pictures; 0 is the present."""
+    return np.unique(np.round(np.linspace(0, frames, 8)).astype(int))
+
+
 def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts) -> Gallery:
     """Draw the images and encode the videos.
 
@@ -76,7 +86,7 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
     best = max(range(len(shown)), key=lambda index: float(shown[index].seen_THW.mean()))
     rollout = shown[best]
     count = len(rollout.truth.depth_THW)
-    steps = np.unique(np.round(np.linspace(0, count, 8)).astype(int))
+    steps = picture_steps(count)
     names = ["observed" if step == 0 else f"step {step}" for step in steps]
     truth = _with_present(rollout.context, as_bytes(rollout.truth.rgb_THWC))
     rows = [("truth", [truth[step] for step in steps])]
@@ -97,7 +107,17 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
         moving=_moving(rollout),
         masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
         above=_above(config, long, best, rollout),
+        rows=[_rows(item, steps) for item in shown],
     )
+
+
+def _rows(item: _Rollout, steps: np.ndarray) -> dict[str, np.ndarray]:
+    colours = {"truth": as_bytes(item.truth.rgb_THWC)}
+    colours |= {method: rgb for method, (rgb, _) in item.imagined.items()}
+    return {
+        name: np.concatenate(list(_with_present(item.context, rgb)[steps]), axis=1)
+        for name, rgb in colours.items()
+    }
 
 
 def _gather(

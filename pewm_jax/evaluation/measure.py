@@ -8,25 +8,37 @@ from typing import Any
 import jax
 
 from pewm_jax.config import Config, kinds, to_dict
-from pewm_jax.evaluation import statistics
+from pewm_jax.evaluation import intervals, statistics
 from pewm_jax.evaluation.scoring import LongRollouts, Scored
+
+SCHEMA = 1
+"""Version of the layout of ``metrics.json``, which ``docs/evaluation.md`` describes. Entries may be
+added; increase it when one goes or comes to mean something else."""
 
 
 def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
     """Turn errors into the content of ``metrics.json``, except for hashes.
 
     Returns:
-        ``protocol``; ``results[method][mask][metric] = {mean, stderr, n}``;
+        ``schema``; ``protocol``; ``results[method][mask][metric] = {mean, stderr, n}``;
         ``margins[method][mask][metric]``, memory minus that method, clip by clip, and ``margin``,
         the one over ``empty``; ``per_frame[method][mask][metric]``; ``long`` with the same of long
-        rollouts and ``drift[method]`` (see ``statistics.drift``).
+        rollouts and ``drift[method]`` (see ``statistics.drift``); ``houses``, means over houses
+        with 95 % intervals (see ``intervals.table``), with the same of long rollouts in ``long``.
     """
     return {
+        "schema": SCHEMA,
         "protocol": protocol_of(config, scored, long),
         **_scores(scored),
         "long": {
             **_scores(long.scored),
             "drift": statistics.drift(long.scored.sums, long.scored.clusters),
+        },
+        "houses": {
+            "how": intervals.how(),
+            "house": scored.clustered_by,
+            **intervals.table(scored.sums, scored.clusters),
+            "long": intervals.table(long.scored.sums, long.scored.clusters),
         },
     }
 
@@ -49,6 +61,7 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "scenes": len(scenes),
         "episodes": len({choice.episode for choice in choices}),
         "clips": len(choices),
+        "training_seed": getattr(config.train, "seed", None),
         "seeds": list(config.evaluate.seeds),
         "chain": config.evaluate.chain,
         "context": config.data.context,

@@ -87,6 +87,7 @@ def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         _stills(gallery),
         "<h2>Scores</h2>",
         page_tables.scores(metrics),
+        page_tables.houses(metrics),
         _curves(metrics),
         page_tables.drift(metrics),
         page_tables.coverage(metrics),

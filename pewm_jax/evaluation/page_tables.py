@@ -13,6 +13,7 @@ from pewm_jax.evaluation.words import (
     METRIC_NAMES,
     RIVALS,
     number,
+    spread,
 )
 
 CLUSTERS = {
@@ -43,12 +44,41 @@ def scores(metrics: Mapping[str, Any]) -> str:
     cover = CLUSTERS[metrics["protocol"]["clustered_by"]]
     per_seed = ", ".join(f"{value:+.2f}" for value in metrics["margin"]["seen"]["psnr"]["per_seed"])
     return (
-        _table(f"<th></th>{heads}<th>clips</th>", rows)
+        table(f"<th></th>{heads}<th>clips</th>", rows)
         + "<p class='quiet'>Mean ± standard error over clips. Sampling seeds are averaged within a "
         f"clip first, and the error is {cover}. "
         "Differences are taken clip by clip, among models with the same noise. "
         f"Gain of the map over an empty one on pixels seen before, seed by seed "
         f"({', '.join(map(str, seeds))}): {per_seed} dB.</p>"
+    )
+
+
+def houses(metrics: Mapping[str, Any]) -> str:
+    """Return means over houses with their intervals, and the paired differences; PSNR."""
+    found, rows = metrics["houses"], []
+    frames = metrics["protocol"]["imagined_frames"]
+    ends = sorted({0, (frames - 1) // 2, frames - 1})
+    for mask, name in MASK_NAMES.items():
+        rows.append(f'<tr class="head"><td colspan="{len(ends) + 3}">{name}</td></tr>')
+        for part, sign in (("results", False), ("margins", True)):
+            for method, label in METHOD_NAMES.items():
+                if method not in found[part]:
+                    continue
+                whole = found[part][method][mask]["psnr"]
+                steps = found["per_frame_margins" if sign else "per_frame"][method][mask]["psnr"]
+                at = [{key: steps[key][t] for key in ("mean", "low", "high")} for t in ends]
+                cells = "".join(f"<td>{spread(e, 2, sign=sign)}</td>" for e in (whole, *at))
+                kind, shown = (' class="gain"', f"map minus {label}") if sign else ("", label)
+                rows.append(f"<tr{kind}><td>{shown}</td>{cells}<td>{whole['houses']}</td></tr>")
+    heads = "".join(f"<th>frame {t + 1}</th>" for t in ends)
+    return (
+        "<h2>House by house</h2>"
+        + table(f"<th>PSNR, dB</th><th>all frames</th>{heads}<th>{found['house']}s</th>", rows)
+        + f"<p class='quiet'>Mean within a {found['house']} first, then over {found['house']}s; in "
+        f"brackets the {100 * found['how']['level']:.0f} % interval of a bootstrap over them "
+        f"({found['how']['draws']} draws). Differences are paired. This is one training: how much "
+        "another training seed would change is a question of its own (<code>pewm-jax compare "
+        "--also_a</code>).</p>"
     )
 
 
@@ -66,7 +96,7 @@ def drift(metrics: Mapping[str, Any]) -> str:
     frames = metrics["protocol"]["long_rollouts"]["frames_each"]
     return (
         f"<h2>Drift</h2><p>PSNR over pixels seen before, dB, along rollouts of {frames} frames.</p>"
-        + _table("<th></th>" + "".join(f"<th>{head}</th>" for head in heads), rows)
+        + table("<th></th>" + "".join(f"<th>{head}</th>" for head in heads), rows)
     )
 
 
@@ -81,7 +111,7 @@ def coverage(metrics: Mapping[str, Any]) -> str:
     ]
     return (
         "<h2>What the map covers</h2><p>Of the pixels seen before, the share whose surface is</p>"
-        + _table("<th></th><th>share</th>", rows)
+        + table("<th></th><th>share</th>", rows)
     )
 
 
@@ -97,7 +127,8 @@ def _row(
     return f"<tr{kind}><td>{label}</td>{cells}<td>{entries['psnr']['n']}</td></tr>"
 
 
-def _table(heads: str, rows: list[str]) -> str:
+def table(heads: str, rows: list[str]) -> str:
+    """Return a table, which scrolls where it is too wide; cells and rows are HTML already."""
     return (
         f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>'
         + "".join(rows)

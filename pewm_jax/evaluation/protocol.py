@@ -27,6 +27,8 @@ VERSION = 2
 """Increase it whenever the same settings would give other scores."""
 POSE_TOLERANCE = 2e-3
 """Largest difference between integrated and recorded poses (metres, matrix entries)."""
+ROLLOUTS = 16
+"""The most long rollouts, one per episode."""
 T = TypeVar("T")
 
 
@@ -116,6 +118,25 @@ def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) 
     return [choice for _, choice in ranked[:clips]]
 
 
+def long_choices(config: Config, episodes: Sequence[Episode]) -> list[ClipChoice]:
+    """Choose one long rollout per episode, from the start of its way back.
+
+    Returns:
+        At most ``ROLLOUTS`` of ``evaluate.video_clips`` clips, or of fewer if the episodes are too
+        short.
+
+    Raises:
+        UserError: no episode is long enough for one clip.
+    """
+    count = min(ROLLOUTS, len(episodes))
+    for chain in range(config.evaluate.video_clips, 1, -1):
+        try:
+            return choose(config, episodes, count, chain)
+        except UserError:
+            continue
+    return choose(config, episodes, count, 1)
+
+
 def needs_cameras(episodes: Sequence[Episode], choices: Sequence[ClipChoice]) -> bool:
     """Tell whether clips must be driven by cameras: some motion is not upright (by hand, say)."""
     for choice in choices:
@@ -196,7 +217,9 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def fingerprint(config: Config, weights: str, dataset: str, lpips: str = "") -> str:
+def fingerprint(
+    config: Config, weights: str, dataset: str, lpips: str = "", protocol: str = ""
+) -> str:
     """Return a hash of everything that the scores depend on, except the choice of seeds and rivals.
 
     Args:
@@ -204,13 +227,17 @@ def fingerprint(config: Config, weights: str, dataset: str, lpips: str = "") -> 
         weights: sha256 of the weights.
         dataset: sha256 of the data set's index.
         lpips: sha256 of the weights of LPIPS; "" if it is left out.
+        protocol: hash of the choices in a protocol's file, except for seeds; "" if clips are chosen
+            by the settings.
     """
     settings = to_dict(config)
-    for key in ("seeds", "videos", "none", "lpips"):
+    for key in ("seeds", "videos", "none", "lpips", "protocol"):
         settings["evaluate"].pop(key)
     for key in ("train", "data"):
         settings.pop(key)
     settings["context"] = config.data.context
     content = {"version": VERSION, "settings": settings, "weights": weights, "data": dataset}
     content["lpips"] = lpips
+    if protocol:
+        content |= {"protocol": protocol, "data": ""}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -13,8 +13,10 @@ from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import opened as runs
+from pewm_jax.evaluation import protocol_file, samples
 from pewm_jax.evaluation.covered import score_coverage
-from pewm_jax.evaluation.gallery import make_gallery
+from pewm_jax.evaluation.fixed import decide
+from pewm_jax.evaluation.gallery import ROWS, Gallery, make_gallery
 from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.measure import measure
 from pewm_jax.evaluation.methods import Methods
@@ -22,16 +24,18 @@ from pewm_jax.evaluation.metrics.perceptual import chosen as chosen_lpips
 from pewm_jax.evaluation.page import render
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
-from pewm_jax.evaluation.protocol import choose, file_hash, fingerprint, needs_cameras
+from pewm_jax.evaluation.protocol import file_hash, fingerprint
 from pewm_jax.evaluation.reproject_choice import choose_settings
-from pewm_jax.evaluation.scoring import long_choices, roll_long, score_table
+from pewm_jax.evaluation.scoring import roll_long, score_table
 from pewm_jax.evaluation.words import score_lines, summary_lines
 
 TRAINED_ON = "train"
 """The split that training reads."""
-REPORT_VERSION = 5
+REPORT_VERSION = 6
 """Increase it whenever the same scores would give another report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
+PROTOCOL = "protocol.json"
+"""The protocol of a report, in its folder; another run can be scored by it."""
 
 
 def override(config: Config, **changes: Any) -> Config:
@@ -47,7 +51,7 @@ def override(config: Config, **changes: Any) -> Config:
     """
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
-    for name in ("none", "lpips"):
+    for name in ("none", "lpips", "protocol"):
         if name in changes:
             changes[name] = str(changes[name])
     if steps is not None:
@@ -76,7 +80,7 @@ def evaluate(
         out: the folder to write; by default ``RUN/report``, or ``RUN/report-NAME`` for other data
             or another split than the run's own.
         say: shows a progress line.
-        changes: as for ``override``.
+        changes: as for ``override``; beside a protocol's file not what it fixes.
 
     Returns:
         The path of the page.
@@ -87,7 +91,7 @@ def evaluate(
     opened = runs.open_run(run)
     runs.require_memory(opened)
     trained_on = Path(opened.config.data.path) / TRAINED_ON
-    config = override(opened.config, **changes)
+    config, fixed = protocol_file.given(override(opened.config, **changes), changes)
     split = Path(config.data.path) / config.evaluate.split
     episodes = EpisodeSource(split)
     none = runs.open_none(opened, config)
@@ -96,7 +100,13 @@ def evaluate(
     lpips, about_lpips = chosen_lpips(
         config.evaluate.lpips, config.model.clip.height, config.model.clip.width
     )
-    name = fingerprint(config, opened.weights_hash, data_hash, lpips.sha256 if lpips else "")
+    name = fingerprint(
+        config,
+        opened.weights_hash,
+        data_hash,
+        lpips.sha256 if lpips else "",
+        fixed.pieces_sha256 if fixed else "",
+    )
     folder = Path(out) if out else runs.report_folder(opened, config)
     if is_complete(folder, config, name, none_weights):
         say("the report is complete for these weights and this protocol; nothing to do")
@@ -107,9 +117,9 @@ def evaluate(
         say(about_lpips)
     choice = choose_settings(config, partials, say)
     say(f"reprojection: {choice.why}")
-    clips = list(long_choices(config, episodes)[0])
-    clips += choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
-    cameras = needs_cameras(episodes, clips)
+    protocol, clips, rollouts = decide(config, episodes, fixed, str(split))
+    cameras = protocol.control == "cameras"
+    say(f"protocol {protocol.sha256[:12]}: {len(clips)} clips, {len(rollouts)} long rollouts")
 
     def imagination(which: runs.Opened, settings: Config) -> Imagination:
         batch, context = config.evaluate.batch, config.data.context
@@ -121,11 +131,11 @@ def evaluate(
         imagination(none, none.config) if none else None,
         none_weights,
     )
-    scored = score_table(config, episodes, methods, partials, say, lpips)
-    long = roll_long(config, episodes, methods, partials, say, lpips)
+    scored = score_table(config, episodes, methods, partials, say, lpips, clips)
+    long = roll_long(config, episodes, methods, partials, say, lpips, rollouts)
     say("drawing the report …")
     metrics = measure(config, scored, long)
-    metrics["coverage"] = score_coverage(config, episodes, methods.model, partials, say)
+    metrics["coverage"] = score_coverage(config, episodes, methods.model, partials, say, clips)
     if cameras:
         metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
     metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {
@@ -135,13 +145,18 @@ def evaluate(
         "lpips_weights_sha256": lpips.sha256 if lpips else None,
         "weights_sha256": opened.weights_hash,
         "dataset_sha256": data_hash,
+        "protocol_sha256": protocol.sha256,
+        "protocol_file": config.evaluate.protocol if fixed else None,
         "fingerprint": name,
         "report_version": REPORT_VERSION,
     }
     gallery = make_gallery(config, episodes, long)
     (folder / METRICS).unlink(missing_ok=True)
-    save_png(folder / STRIP, gallery.strip)
-    (folder / MOVING).write_bytes(gallery.moving)
+    protocol_file.save(folder / PROTOCOL, protocol, {"data": str(split)})
+    names = ("protocol_sha256", "weights_sha256", "lpips_weights_sha256", "seeds")
+    facts = {name: metrics["protocol"][name] for name in names}
+    samples.save(folder, samples.gather(scored, long, **facts))
+    _save_pictures(folder, gallery)
     page = render(metrics, gallery)
     atomic.write_text(folder / PAGE, page)
     metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()
@@ -149,6 +164,16 @@ def evaluate(
     for line in [*score_lines(metrics), *summary_lines(metrics)]:
         say(line)
     return folder / PAGE
+
+
+def _save_pictures(folder: Path, gallery: Gallery) -> None:
+    """Write the strip, still and moving, and the frames of each long rollout and method."""
+    save_png(folder / STRIP, gallery.strip)
+    (folder / MOVING).write_bytes(gallery.moving)
+    atomic.remove(folder / ROWS)
+    for index, row in enumerate(gallery.rows):
+        for name, picture in row.items():
+            save_png(folder / ROWS / f"{index:02d}-{name}.png", picture)
 
 
 def _make(folder: Path) -> None:
@@ -180,7 +205,7 @@ def is_complete(folder: Path, config: Config, name: str, none_weights: str = "")
             and (protocol["none"] or {}).get("weights_sha256", "") == none_weights
             and protocol["config"]["evaluate"]["videos"] == config.evaluate.videos
             and metrics["page_sha256"] == file_hash(folder / PAGE)
-            and (folder / STRIP).is_file()
+            and all((folder / file).is_file() for file in (STRIP, PROTOCOL, samples.SAMPLES))
         )
     except (OSError, ValueError, KeyError, TypeError):
         return False

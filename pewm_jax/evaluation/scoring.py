@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax.config import Config, UserError
+from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation.images import error_sums_batch, unit_colours, with_lpips
@@ -18,7 +18,7 @@ from pewm_jax.evaluation.imagine import print_now
 from pewm_jax.evaluation.methods import Methods
 from pewm_jax.evaluation.metrics import Perceptual
 from pewm_jax.evaluation.partial import Partials
-from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, stack
+from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, long_choices, stack
 from pewm_jax.evaluation.seen import seen_masks_batch
 from pewm_jax.memory import memories
 from pewm_jax.types import Frames
@@ -124,16 +124,19 @@ def score_table(
     partials: Partials,
     say: Callable[[str], Any] = print_now,
     lpips: Perceptual | None = None,
+    choices: list[ClipChoice] | None = None,
 ) -> Scored:
     """Score ``evaluate.clips`` choices, chains of ``evaluate.chain`` clips, by method and seed.
 
-    Pieces that ``partials`` already holds are reused. Without ``lpips`` that is left out.
+    Pieces that ``partials`` already holds are reused. Without ``lpips`` that is left out. Without
+    ``choices`` they are those of ``choose``.
 
     Raises:
         UserError: no episode is long enough, the data is inconsistent or does not fit the model,
             or the model's output is not finite.
     """
-    choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
+    if choices is None:
+        choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
     starts = range(0, len(choices), config.evaluate.batch)
     pieces: dict[tuple[str, int, int], np.ndarray] = {}
     todo: list[tuple[str, int, int]] = []
@@ -185,22 +188,6 @@ def _piece(methods: Methods, method: str, seed: int, first: int) -> str:
     return f"table-{methods.piece(method)}-seed{seed}-clip{first:04d}"
 
 
-def long_choices(config: Config, episodes: Sequence[Episode]) -> tuple[list[ClipChoice], int]:
-    """Choose one long rollout per episode, from the start of its way back.
-
-    Returns:
-        ``(choices, chain)``: at most one batch of choices, and the number of clips per rollout:
-        ``evaluate.video_clips``, or fewer if the episodes are too short.
-    """
-    count = min(config.evaluate.batch, len(episodes))
-    for chain in range(config.evaluate.video_clips, 1, -1):
-        try:
-            return choose(config, episodes, count, chain), chain
-        except UserError:
-            continue
-    return choose(config, episodes, count, 1), 1
-
-
 def roll_long(
     config: Config,
     episodes: Sequence[Episode],
@@ -208,42 +195,74 @@ def roll_long(
     partials: Partials,
     say: Callable[[str], Any] = print_now,
     lpips: Perceptual | None = None,
+    choices: list[ClipChoice] | None = None,
 ) -> LongRollouts:
     """Make long rollouts with every method (first seed), score all, store the first few.
 
-    Without ``lpips`` that is left out.
+    Without ``lpips`` that is left out. Without ``choices`` they are those of ``long_choices``.
 
     Raises:
         UserError: as for ``score_table``.
     """
-    choices, chain = long_choices(config, episodes)
+    if choices is None:
+        choices = long_choices(config, episodes)
+    count = len(choices[0].targets_N)
     shown = min(config.evaluate.videos, len(choices))
-    seed = config.evaluate.seeds[0]
+    seed, size = config.evaluate.seeds[0], config.evaluate.batch
     name = {method: f"long-{methods.piece(method)}-seed{seed}" for method in methods.names}
     pieces = {method: partials.get(name[method]) for method in methods.names}
-    todo = [m for m in methods.names if (p := pieces[m]) is None or len(p["rgb"]) < shown]
+    todo = [m for m in methods.names if not _holds(pieces[m], len(choices), shown)]
     if todo:
         methods.prepare(todo)
-        batch = load_batch(config, episodes, choices, 0, cameras=methods.model.cameras)
-        count = chain * (config.model.clip.frames - 1)
-        with Meter("long rollouts", len(todo) * count * batch.real, "frames") as meter:
+        cameras = methods.model.cameras
+        batches = [
+            load_batch(config, episodes, choices[first : first + size], first, cameras=cameras)
+            for first in range(0, len(choices), size)
+        ]
+        with Meter("long rollouts", len(todo) * count * len(choices), "frames") as meter:
             for method in todo:
-                first, last, frames = batch.imagine(methods, method, seed)
-                colours = np.asarray(unit_colours(frames.rgb_THWC[:shown]))
-                kept = {
-                    "sums": batch.sums(frames, lpips),
-                    "rgb": np.rint(colours * 255).astype(np.uint8),
-                    "depth": np.asarray(frames.depth_THW[:shown], np.float32),
+                parts = []
+                for batch in batches:
+                    here = min(max(shown - int(batch.numbers_B[0]), 0), batch.real)
+                    parts.append(_roll(config, methods, method, batch, here, lpips))
+                    meter.advance(count * batch.real)
+                joined = {
+                    key: np.concatenate([part[key] for part in parts if key in part])
+                    for key in parts[0]
                 }
-                if method == "memory":
-                    kept |= _map_points(config, first.map, shown, "first")
-                    kept |= _map_points(config, last.map, shown, "last")
-                pieces[method] = partials.put(name[method], **kept)
-                meter.advance(count * batch.real)
+                pieces[method] = partials.put(name[method], **joined)
         say(meter.summary())
-    kept_all = {method: piece for method, piece in pieces.items() if piece is not None}
-    sums = {method: piece["sums"][None] for method, piece in kept_all.items()}
-    return LongRollouts(Scored(choices, sums), chain, shown, kept_all)
+    kept = {method: piece for method, piece in pieces.items() if piece is not None}
+    sums = {method: piece["sums"][None] for method, piece in kept.items()}
+    chain = count // (config.model.clip.frames - 1)
+    return LongRollouts(Scored(choices, sums), chain, shown, kept)
+
+
+def _holds(piece: dict[str, np.ndarray] | None, rollouts: int, shown: int) -> bool:
+    """Tell whether a piece has all the rollouts, and the frames of those that are shown."""
+    return piece is not None and len(piece["sums"]) == rollouts and len(piece["rgb"]) >= shown
+
+
+def _roll(
+    config: Config,
+    methods: Methods,
+    method: str,
+    batch: Batch,
+    shown: int,
+    lpips: Perceptual | None,
+) -> dict[str, np.ndarray]:
+    """Imagine a batch of long rollouts; frames and maps of the first ``shown`` are kept."""
+    first, last, frames = batch.imagine(methods, method, config.evaluate.seeds[0])
+    colours = np.asarray(unit_colours(frames.rgb_THWC[:shown]))
+    kept = {
+        "sums": batch.sums(frames, lpips),
+        "rgb": np.rint(colours * 255).astype(np.uint8),
+        "depth": np.asarray(frames.depth_THW[:shown], np.float32),
+    }
+    if method == "memory" and shown:
+        kept |= _map_points(config, first.map, shown, "first")
+        kept |= _map_points(config, last.map, shown, "last")
+    return kept
 
 
 def _map_points(config: Config, maps: Any, shown: int, when: str) -> dict[str, np.ndarray]:

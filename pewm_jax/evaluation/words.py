@@ -52,6 +52,17 @@ def number(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
     return text if entry["stderr"] is None else f"{text} ± {entry['stderr']:.{digits}f}"
 
 
+def spread(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
+    """Format an entry as ``mean [low, high]``, or as a dash."""
+    if entry["mean"] is None:
+        return "–"
+    plus = "+" if sign else ""
+    text = f"{entry['mean']:{plus}.{digits}f}"
+    if entry["low"] is None:
+        return text
+    return f"{text} [{entry['low']:{plus}.{digits}f}, {entry['high']:{plus}.{digits}f}]"
+
+
 def verdict(entry: Mapping[str, Any], where: str) -> str:
     """Return a sentence on what the map changes (PSNR of memory minus empty)."""
     mean, stderr = entry["mean"], entry["stderr"]

@@ -21,10 +21,11 @@ import pytest
 from evaluation_scene import tiny, write_split
 from PIL import Image
 
+from pewm_jax import cli, weights
 from pewm_jax import config as configs
-from pewm_jax import weights
+from pewm_jax.commands import protocol as protocol_command
 from pewm_jax.config import StageConfig, TrainConfig, UserError
-from pewm_jax.evaluation import imagine, preview, report
+from pewm_jax.evaluation import compare, imagine, preview, report
 from pewm_jax.evaluation import opened as runs
 from pewm_jax.evaluation.imagine import Imagination
 from pewm_jax.evaluation.page import introduction
@@ -123,6 +124,90 @@ def test_metrics_hold_every_method_mask_and_metric(run):
     assert shares["looked_at"] == shares["attended"]  # the reader attends
     assert len(metrics["long"]["drift"]["memory"]["quarters"]) == 4
     assert len(metrics["long"]["per_frame"]["memory"]["all"]["psnr"]["mean"]) == 8
+
+
+def test_metrics_hold_means_over_houses_with_intervals(run):
+    metrics = json.loads((run / "report" / "metrics.json").read_text())
+    assert metrics["schema"] == 1
+    houses = metrics["houses"]
+    assert (houses["house"], houses["how"]["level"]) == ("scene", 0.95)
+    for part, horizon in ((houses, 4), (houses["long"], 8)):
+        assert set(part["margins"]) == {"empty", "reproject", "copy"}
+        for method in ("memory", "empty", "reproject", "copy"):
+            entry = part["results"][method]["all"]["psnr"]
+            assert set(entry) == {"mean", "low", "high", "houses"}
+            assert entry["low"] <= entry["mean"] <= entry["high"]
+            assert entry["houses"] == 2
+            assert len(part["per_frame"][method]["seen"]["psnr"]["high"]) == horizon
+        assert len(part["per_frame_margins"]["copy"]["all"]["ssim"]["low"]) == horizon
+    # As many clips in each house: the mean over houses is that over clips.
+    clips = metrics["results"]["memory"]["all"]["psnr"]["mean"]
+    assert houses["results"]["memory"]["all"]["psnr"]["mean"] == pytest.approx(clips)
+    assert "House by house" in (run / "report" / "index.html").read_text()
+
+
+def test_the_page_on_evaluation_names_every_entry(run):
+    page = (ROOT / "docs" / "evaluation.md").read_text()
+    metrics = json.loads((run / "report" / "metrics.json").read_text())
+    protocol = json.loads((run / "report" / "protocol.json").read_text())
+    found = [*metrics, *metrics["houses"], *metrics["houses"]["results"]["memory"]["all"]["psnr"]]
+    found += [*protocol, *protocol["protocol"], *protocol["protocol"]["clips"][0]]
+    for name in found:
+        assert re.search(rf"[`.]{name}[`.]", page), name
+
+
+def test_the_protocol_of_a_report_scores_another_run_which_is_compared(run, copied, command):
+    metrics = json.loads((run / "report" / "metrics.json").read_text())
+    protocol = run / "report" / "protocol.json"
+    name = metrics["protocol"]["protocol_sha256"]
+    assert metrics["protocol"]["protocol_file"] is None
+    assert name == json.loads(protocol.read_text())["sha256"]
+    assert name in (run / "report" / "index.html").read_text()
+    params = weights.load(copied / "weights.safetensors")
+    changed = jax.tree.map(lambda leaf: leaf + np.float32(0.02), params)
+    weights.save(copied / "weights.safetensors", changed)
+    assert command([str(copied), "--protocol", str(protocol)]) == 0
+    other = json.loads((copied / "report" / "metrics.json").read_text())
+    assert other["protocol"]["protocol_sha256"] == name
+    assert other["protocol"]["protocol_file"] == str(protocol)
+    assert other["protocol"]["clip_list"] == metrics["protocol"]["clip_list"]
+    assert other["results"]["copy"] == metrics["results"]["copy"]
+    assert other["results"]["memory"] != metrics["results"]["memory"]
+
+    said = []
+    page = compare.compare(copied, run, say=said.append)
+    found = json.loads(page.with_name("comparison.json").read_text())
+    both = [m["houses"]["results"]["memory"]["seen"]["psnr"] for m in (other, metrics)]
+    assert [found[side]["clips"]["seen"]["psnr"] for side in "ab"] == both
+    difference = found["differences"]["clips"]["seen"]["psnr"]["mean"]
+    assert difference == pytest.approx(both[0]["mean"] - both[1]["mean"])
+    assert page.read_text().count("data:image/png") == 1
+    report.evaluate(copied, say=lambda _: None, clips=3)
+    with pytest.raises(UserError, match="3 and 4 clips"):
+        compare.compare(copied, run)
+
+
+def test_a_protocol_is_written_before_training_and_followed(run, copied, tmp_path, capsys):
+    path = tmp_path / "protocol.json"
+    assert cli.run(protocol_command.main, [str(run), "--out", str(path)]) == 0
+    metrics = json.loads((run / "report" / "metrics.json").read_text())
+    assert metrics["protocol"]["protocol_sha256"] in capsys.readouterr().out
+    other = tmp_path / "other.json"
+    flags = ["--clips", "3", "--seeds", "5", "--out", str(other)]
+    assert cli.run(protocol_command.main, [str(run), *flags]) == 0
+    settings = json.loads((copied / "config.json").read_text())
+    settings["evaluate"]["protocol"] = str(other)
+    (copied / "config.json").write_text(json.dumps(settings))
+    report.evaluate(copied, say=lambda _: None)
+    followed = json.loads((copied / "report" / "metrics.json").read_text())["protocol"]
+    assert (followed["clips"], followed["seeds"]) == (3, [5])
+    with pytest.raises(UserError, match="--clips cannot be chosen beside"):
+        report.evaluate(copied, say=lambda _: None, clips=2)
+    report.evaluate(copied, say=lambda _: None, protocol="off")
+    own = json.loads((copied / "report" / "metrics.json").read_text())["protocol"]
+    assert own["protocol_sha256"] == metrics["protocol"]["protocol_sha256"]
+    assert cli.run(protocol_command.main, ["nothing"]) == 2
+    assert cli.run(protocol_command.main, ["codec"]) == 2
 
 
 def test_untrained_memory_changes_nothing(run):

@@ -1,0 +1,180 @@
+"""Means over houses with 95 % intervals: mean within a house first, then a bootstrap over houses.
+
+Clips of one house show the same rooms, so a house is what is drawn again, with all its clips
+(the percentile bootstrap of Efron & Tibshirani 1993, chapter 13). Training seeds are another
+matter: what another training would give says nothing about other houses, and has an interval of
+its own, Student's.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.evaluation.images import MASKS
+from pewm_jax.evaluation.statistics import scores
+
+DRAWS, SEED, LEVEL = 10_000, 0, 0.95
+"""Bootstrap samples, the seed that they are drawn from, and the share that an interval holds."""
+STUDENT = (
+    *(12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228),
+    *(2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086),
+    *(2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042),
+)
+"""The 97.5 % quantiles of Student's distribution with 1 to 30 degrees of freedom; the last one
+stands for more, which makes an interval wider by up to 4 %."""
+
+
+def how() -> dict[str, Any]:
+    """Return how intervals are made, for ``metrics.json``."""
+    return {
+        "mean": "over houses, of the means within a house, sampling seeds averaged within a clip",
+        "interval": "percentile bootstrap over houses",
+        "level": LEVEL,
+        "draws": DRAWS,
+        "seed": SEED,
+    }
+
+
+def within_houses(values_CX: np.ndarray, houses_C: np.ndarray) -> np.ndarray:
+    """Average the clips of each house.
+
+    Args:
+        values_CX: (C, …) a number per clip; NaN where a clip has none.
+        houses_C: (C,) the number of each clip's house.
+
+    Returns:
+        (H, …) in the order of the houses' numbers; NaN where no clip of a house has a number.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a mean of nothing is NaN
+        means = [np.nanmean(values_CX[houses_C == house], axis=0) for house in np.unique(houses_C)]
+    return np.stack(means)
+
+
+@functools.cache
+def drawn(houses: int) -> np.ndarray:
+    """Return how often each house is in each bootstrap sample, (draws, houses)."""
+    indices = np.random.default_rng(SEED).integers(houses, size=(DRAWS, houses))
+    counts = np.zeros((DRAWS, houses))
+    np.add.at(counts, (np.arange(DRAWS)[:, None], indices), 1)
+    return counts
+
+
+def over_houses(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the mean over houses and its interval.
+
+    The same houses are drawn whatever the values are, so that intervals of methods that are scored
+    in the same houses can be set side by side.
+
+    Args:
+        values_CX: (C, …) a number per clip; NaN where a clip has none.
+        houses_C: (C,) the number of each clip's house.
+
+    Returns:
+        ``mean``, ``low``, ``high`` and ``houses``, each (…): NaN where there is nothing, and for
+        ``low`` and ``high`` where fewer than two houses have a number.
+    """
+    means_HX = within_houses(np.asarray(values_CX, np.float64), np.asarray(houses_C))
+    shape, means_HN = means_HX.shape[1:], means_HX.reshape(len(means_HX), -1)
+    known_HN = np.isfinite(means_HN)
+    houses_N, filled_HN = known_HN.sum(0), np.where(known_HN, means_HN, 0)
+    counts_DH = drawn(len(means_HN))
+    with np.errstate(invalid="ignore"):
+        mean_N = filled_HN.sum(0) / houses_N
+        sample_DN = (counts_DH @ filled_HN) / (counts_DH @ known_HN)
+    tail = (1 - LEVEL) / 2
+    ends_2N = np.full((2, len(mean_N)), np.nan)
+    for n in np.flatnonzero(houses_N > 1):
+        sample_D = sample_DN[np.isfinite(sample_DN[:, n]), n]  # some draw houses without a number
+        ends_2N[:, n] = np.quantile(sample_D, [tail, 1 - tail])
+    found = {"mean": mean_N, "low": ends_2N[0], "high": ends_2N[1], "houses": houses_N}
+    return {name: array.reshape(shape) for name, array in found.items()}
+
+
+def entry(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, Any]:
+    """Return ``over_houses`` for JSON: numbers, or lists for more than one; None for NaN."""
+    found = over_houses(values_CX, houses_C)
+    nothing = np.array(None)
+    return {n: np.where(np.isfinite(array), array, nothing).tolist() for n, array in found.items()}
+
+
+def table(sums: Mapping[str, np.ndarray], houses_C: np.ndarray) -> dict[str, Any]:
+    """Return every method's scores, and the differences from the model with its map, paired.
+
+    Args:
+        sums: method → (seeds, clips, T, 3, 9) as ``images.error_sums``.
+        houses_C: (clips,) the number of each clip's house.
+
+    Returns:
+        ``results[method][mask][metric]`` and ``margins[method][mask][metric]`` (memory minus that
+        method, clip by clip) as ``entry``; ``per_frame`` and ``per_frame_margins`` the same with a
+        list over imagined frames in the place of each number.
+    """
+    whole = {method: scores(sums_SCT39.sum(2)) for method, sums_SCT39 in sums.items()}
+    frame = {method: scores(sums_SCT39) for method, sums_SCT39 in sums.items()}
+    return {
+        "results": _each(whole, houses_C),
+        "margins": _each(_minus(whole), houses_C),
+        "per_frame": _each(frame, houses_C),
+        "per_frame_margins": _each(_minus(frame), houses_C),
+    }
+
+
+def _minus(by_method: Mapping[str, Any]) -> dict[str, Any]:
+    """Subtract every other method's scores from those of ``memory``; sampling seeds averaged."""
+    ours = by_method["memory"]
+    return {
+        method: {
+            mask: {
+                metric: ours[mask][metric].mean(0)[None] - values.mean(0)[None]
+                for metric, values in by_mask[mask].items()
+                if metric in ours[mask]
+            }
+            for mask in MASKS
+        }
+        for method, by_mask in by_method.items()
+        if method != "memory"
+    }
+
+
+def _each(by_method: Mapping[str, Any], houses_C: np.ndarray) -> dict[str, Any]:
+    return {
+        method: {
+            mask: {
+                metric: entry(values.mean(0), houses_C) for metric, values in by_mask[mask].items()
+            }
+            for mask in MASKS
+        }
+        for method, by_mask in by_method.items()
+    }
+
+
+def over_seeds(values: Sequence[float], others: Sequence[float] = ()) -> dict[str, Any]:
+    """Return the mean over training seeds and Student's 95 % interval; or a difference of means.
+
+    Args:
+        values: a number per training seed.
+        others: numbers of another model's training seeds, which need not be as many; if given,
+            the difference first − second is meant (Welch 1947, degrees of freedom rounded down).
+
+    Returns:
+        ``mean``, ``low`` and ``high``; the last two are None unless both have two seeds or more.
+    """
+    groups = [np.asarray(group, np.float64) for group in (values, others) if len(group)]
+    mean = float(groups[0].mean() - (groups[1].mean() if len(groups) > 1 else 0))
+    if min(map(len, groups)) < 2:
+        return {"mean": mean, "low": None, "high": None}
+    squares = [float(group.var(ddof=1)) / len(group) for group in groups]
+    total = sum(squares)
+    if total == 0:
+        return {"mean": mean, "low": mean, "high": mean}
+    parts = zip(squares, groups, strict=True)
+    freedom = int(total**2 / sum(s**2 / (len(group) - 1) for s, group in parts) + 1e-9)
+    half = STUDENT[min(max(freedom, 1), len(STUDENT)) - 1] * math.sqrt(total)
+    return {"mean": mean, "low": mean - half, "high": mean + half}

@@ -1,0 +1,196 @@
+"""The protocol's file: its hash follows from the choices alone, and it is found in any data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from evaluation_scene import record, tiny, write_split
+
+from pewm_jax.config import ConfigError, UserError
+from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.episodes import read_episode
+from pewm_jax.evaluation import fixed, protocol_file
+from pewm_jax.evaluation.protocol import choose, long_choices
+
+
+@pytest.fixture(scope="module")
+def episodes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "revisit"
+    return EpisodeSource(write_split(folder, episodes=3))
+
+
+def protocol(config, episodes):
+    return fixed.fix(config, episodes, *fixed.chosen(config, episodes))
+
+
+def test_it_finds_the_clips_that_it_was_made_of(episodes, tmp_path):
+    config = tiny(tmp_path)
+    made = protocol(config, episodes)
+    clips, rollouts = fixed.find(made, episodes, "data")
+    assert clips == choose(config, episodes, 4, 1)
+    assert rollouts == long_choices(config, episodes)
+    assert (made.horizon, made.long_horizon, made.control) == (4, 8, "actions")
+    # In another order and among others, the same clips of the same episodes.
+    mixed = [read_episode(record(7)), *(episodes[i] for i in (2, 0, 1))]
+    moved, _ = fixed.find(made, mixed, "data")
+    assert [clip.name for clip in moved] == [clip.name for clip in clips]
+    assert [mixed[clip.episode].name for clip in moved] == [clip.name for clip in clips]
+
+
+def test_every_choice_changes_the_hash(episodes, tmp_path):
+    config = tiny(tmp_path)
+    base = protocol(config, episodes)
+
+    def with_(**changes):
+        return dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, **changes))
+
+    settings = [
+        with_(clips=3),
+        with_(seeds=(0, 2)),
+        with_(chain=2),
+        with_(stride=2),
+        with_(video_clips=1),
+        with_(split="validation"),
+        dataclasses.replace(config, data=dataclasses.replace(config.data, context=5)),
+    ]
+    others = [protocol(changed, episodes) for changed in settings]
+    first = base.clips[0]
+    later = dataclasses.replace(first, start=first.start + 1)
+    others += [
+        dataclasses.replace(base, control="cameras"),
+        dataclasses.replace(base, clips=(later, *base.clips[1:])),
+        dataclasses.replace(base, clips=base.clips[::-1]),
+        dataclasses.replace(base, rollouts=base.rollouts[:1]),
+        dataclasses.replace(base, scoring=base.scoring + 1),
+    ]
+    assert len({item.sha256 for item in (base, *others)}) == 1 + len(others)
+    assert all(fixed.difference(base, other) for other in others)
+    assert {item.pieces_sha256 for item in (base, others[1])} == {base.pieces_sha256}
+    assert others[0].pieces_sha256 != base.pieces_sha256
+
+
+def test_what_is_not_chosen_does_not_change_the_hash(episodes, tmp_path):
+    config = tiny(tmp_path)
+    evaluate = dataclasses.replace(config.evaluate, batch=3, videos=2, lpips="off", none="runs/x")
+    other = dataclasses.replace(config, evaluate=evaluate).with_model(
+        noise=dataclasses.replace(config.model.noise, sample_steps=7)
+    )
+    copy = [episodes[index] for index in range(3)]
+    assert protocol(other, copy).sha256 == protocol(config, episodes).sha256
+    assert fixed.difference(protocol(other, copy), protocol(config, episodes)) == ""
+
+
+def test_the_content_of_an_episode_is_part_of_it(episodes, tmp_path):
+    config = tiny(tmp_path)
+    made = protocol(config, episodes)
+    changed = list(episodes)
+    last = read_episode(record(2, nod=0.2))
+    changed[2] = last
+    assert protocol(config, changed).sha256 != made.sha256
+    with pytest.raises(UserError, match="holds another one of that name"):
+        fixed.find(made, changed, "data/mine")
+    with pytest.raises(UserError, match=r"room-0/revisit .*does not hold it; name the folder"):
+        fixed.find(made, changed[1:], "data/mine")
+
+
+def test_motion_is_that_between_start_and_targets(episodes, tmp_path):
+    choice = choose(tiny(tmp_path), episodes, 1, 1)[0]
+    episode = episodes[choice.episode]
+    base = fixed.motion_hash(episode, choice)
+    for where, same in ((choice.start, False), (choice.targets_N[-1], True), (0, True)):
+        actions = episode.actions.copy()
+        actions[where] += 0.01
+        moved = dataclasses.replace(episode, actions=actions)
+        assert (fixed.motion_hash(moved, choice) == base) == same
+    poses = np.array(episode.world_from_camera)
+    poses[choice.targets_N[1], 0, 3] += 0.01
+    assert fixed.motion_hash(dataclasses.replace(episode, world_from_camera=poses), choice) != base
+
+
+def test_a_file_gives_back_what_was_written(episodes, tmp_path):
+    made = protocol(tiny(tmp_path), episodes)
+    path = tmp_path / "kept" / "protocol.json"
+    protocol_file.save(path, made, {"data": "somewhere"})
+    assert protocol_file.load(path) == made
+    assert protocol_file.load(path).sha256 == json.loads(path.read_text())["sha256"]
+    value = json.loads(path.read_text())
+    value["notes"] = {}
+    path.write_text(json.dumps(dict(reversed(value.items()))))
+    assert protocol_file.load(path).sha256 == made.sha256
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda value: value["protocol"]["clips"].pop(), "was changed after it was written"),
+        (lambda value: value["protocol"].update(seeds=[9]), "was changed after it was written"),
+        (lambda value: value.update(version=9), "versions 9 .file."),
+        (lambda value: value["protocol"].update(scoring=1), "and 1 .scoring."),
+        (lambda value: value.update(format="other"), "is no protocol"),
+        (lambda value: value.pop("protocol"), "is no protocol"),
+        (lambda value: value.update(protocol=[]), "is no protocol"),
+    ],
+)
+def test_a_file_that_cannot_be_trusted_is_refused(episodes, tmp_path, change, said):
+    path = tmp_path / "protocol.json"
+    protocol_file.save(path, protocol(tiny(tmp_path), episodes), {})
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+    with pytest.raises(UserError, match=said):
+        protocol_file.load(path)
+
+
+def test_a_file_that_is_absent_or_no_json_is_refused(tmp_path):
+    with pytest.raises(UserError, match="cannot be read"):
+        protocol_file.load(tmp_path / "gone.json")
+    (tmp_path / "x.json").write_text("{")
+    with pytest.raises(UserError, match="is not JSON"):
+        protocol_file.load(tmp_path / "x.json")
+
+
+def test_it_stands_above_the_settings(episodes, tmp_path):
+    made = protocol(tiny(tmp_path, seeds=(3, 4), chain=2, clips=3), episodes)
+    path = tmp_path / "protocol.json"
+    protocol_file.save(path, made, {})
+    plain = tiny(tmp_path)
+    named = dataclasses.replace(
+        plain, evaluate=dataclasses.replace(plain.evaluate, protocol=str(path))
+    )
+    config, found = protocol_file.given(named, {"clips": None})
+    assert found == made
+    settings = config.evaluate
+    assert (settings.seeds, settings.chain, settings.clips) == ((3, 4), 2, 3)
+    assert protocol(config, episodes) == made
+    assert protocol_file.given(named, {"split": "theirs"})[0].evaluate.split == "theirs"
+    assert protocol_file.given(plain, {}) == (plain, None)
+    off = dataclasses.replace(plain, evaluate=dataclasses.replace(plain.evaluate, protocol="off"))
+    assert protocol_file.given(off, {"clips": 2})[1] is None
+    with pytest.raises(ConfigError, match="--clips and --seeds cannot be chosen beside"):
+        protocol_file.given(named, {"clips": 2, "seeds": (1,)})
+    longer = named.with_model(clip=dataclasses.replace(plain.model.clip, frames=4))
+    with pytest.raises(UserError, match="8 imagined frames and this model imagines 3 at once"):
+        protocol_file.given(longer, {})
+    taller = named.with_model(clip=dataclasses.replace(plain.model.clip, height=24))
+    with pytest.raises(UserError, match="16×16 and this model makes 24×16"):
+        protocol_file.given(taller, {})
+
+
+def test_another_protocol_is_not_written_over(episodes, tmp_path):
+    config = tiny(tmp_path)
+    config = dataclasses.replace(
+        config, data=dataclasses.replace(config.data, path=str(episodes.path.parent))
+    )
+    path, said = tmp_path / "protocol.json", []
+    made = protocol_file.write(config, path, said.append)
+    assert made.sha256 in said[-1]
+    before = path.stat().st_mtime_ns
+    protocol_file.write(config, path, said.append)
+    assert path.stat().st_mtime_ns == before
+    assert "holds this protocol already" in said[-2]
+    fewer = dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, clips=2))
+    with pytest.raises(UserError, match=r"another protocol \(4 and 2 clips\)"):
+        protocol_file.write(fewer, path, said.append)
