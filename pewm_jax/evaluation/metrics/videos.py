@@ -17,7 +17,6 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from pewm_jax.config import UserError
 from pewm_jax.evaluation.metrics import distributions
 from pewm_jax.evaluation.metrics.distributions import Distance, Spread
 from pewm_jax.evaluation.metrics.pictures import colours
@@ -158,24 +157,3 @@ def read(path: Path, kind: Kind) -> VideoDistance:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return VideoDistance(kind, jax.device_put(params), digest)
-
-
-def chosen(setting: str, frames: int) -> tuple[VideoDistance | None, str]:
-    """Return the FVD that a setting asks for, and a sentence on it or on why there is none.
-
-    Args:
-        setting: ``off``; ``on`` for the weights of the installed package; or a file of weights.
-        frames: of the clips that are scored.
-
-    Raises:
-        UserError: what is asked for is not there, is damaged, or cannot take such clips.
-    """
-    if setting == "off":
-        return None, "FVD and KVD are left out: --fvd on measures them."
-    metric = read(i3d_weights.find() if setting == "on" else Path(setting), "fvd")
-    if frames < i3d.LEAST:
-        raise UserError(
-            f"FVD needs clips of at least {i3d.LEAST} frames and these have {frames}: leave out "
-            "--fvd, or score longer clips (--chain)."
-        )
-    return metric, metric.about
