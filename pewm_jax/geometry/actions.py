@@ -104,3 +104,22 @@ def actions_between(world_from_camera_T: Array) -> Array:
     body = jnp.einsum("tji,tj->ti", rotation_z(yaw[:-1]), delta)
     turn = (yaw[1:] - yaw[:-1] + jnp.pi) % (2 * jnp.pi) - jnp.pi
     return jnp.stack([body[:, 0], body[:, 1], turn], -1)
+
+
+def there_and_back(actions_T3: Array) -> Array:
+    """Return planar actions followed by those that lead back through the same poses.
+
+    Args:
+        actions_T3: (..., T, 3) planar actions.
+
+    Returns:
+        (..., 2 T, 3): after k of them the agent is where it is after 2 T − k.
+    """
+    out = jnp.asarray(actions_T3)
+    turn = -out[..., 2:]
+    move = (
+        rotation_z(turn[..., 0])
+        @ jnp.concatenate([out[..., :2], jnp.zeros_like(turn)], -1)[..., None]
+    )
+    back = jnp.concatenate([-move[..., :2, 0], turn], -1)
+    return jnp.concatenate([out, back[..., ::-1, :]], -2)

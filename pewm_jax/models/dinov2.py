@@ -113,6 +113,24 @@ def apply(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
     """
     images = jnp.asarray(images_BHWC)
     height, width = _grid(config, images.shape, images.dtype)
+    tokens = _tokens(config, params, images)[:, 1 + config.registers :]
+    normed: Array = _norm(config).apply({"params": params["norm"]}, tokens)
+    return normed.reshape(-1, height, width, config.width).astype(tokens.dtype)
+
+
+def summary(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
+    """Return the class token after the final layer norm, (B, D): one vector for a whole image.
+
+    Arguments and errors are those of ``apply``; this is ``transformers``' ``pooler_output``.
+    """
+    tokens = _tokens(config, params, jnp.asarray(images_BHWC))[:, 0]
+    normed: Array = _norm(config).apply({"params": params["norm"]}, tokens)
+    return normed.astype(tokens.dtype)
+
+
+def _tokens(config: DINOv2Config, params: Params, images: Array) -> Array:
+    """Return all tokens before the final norm: the class token, registers, patches row by row."""
+    height, width = _grid(config, images.shape, images.dtype)
     dtype = images.dtype
     patches = nn.Dense(config.width, dtype=dtype).apply(
         {"params": params["patch_embed"]}, patchify(images, config.patch)
@@ -123,12 +141,7 @@ def apply(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
     if config.registers:  # registers have no position
         first = jnp.concatenate([first, params["register_tokens"].astype(dtype)])
     first = jnp.broadcast_to(first, (images.shape[0], *first.shape))
-    tokens = jnp.concatenate([first, tokens], 1)
-
-    tokens = _blocks(config, params["blocks"], tokens)
-    patch_tokens = tokens[:, 1 + config.registers :]
-    normed: Array = _norm(config).apply({"params": params["norm"]}, patch_tokens)
-    return normed.reshape(-1, height, width, config.width).astype(dtype)
+    return _blocks(config, params["blocks"], jnp.concatenate([first, tokens], 1))
 
 
 def _blocks(config: DINOv2Config, blocks: Params, tokens_BND: Array) -> Array:

@@ -20,6 +20,17 @@ def test_actions_between_inverts_integrate(seed):
     np.testing.assert_allclose(actions.actions_between(poses), moves, atol=2e-4)
 
 
+def test_the_way_back_leads_through_the_same_poses():
+    moves = np.random.default_rng(0).uniform([-1, -1, -3], [1, 1, 3], (5, 3)).astype(np.float32)
+    both = actions.there_and_back(moves)
+    assert both.shape == (10, 3)
+    poses = actions.integrate(START, both)
+    np.testing.assert_allclose(poses, poses[::-1], atol=1e-5)
+    np.testing.assert_allclose(poses[:6], actions.integrate(START, moves), atol=1e-6)
+    batch = actions.there_and_back(np.stack([moves, -moves]))
+    np.testing.assert_allclose(batch[0], both, atol=1e-6)
+
+
 def test_action_k_leads_from_frame_k_to_frame_k_plus_1():
     moves = jnp.zeros((4, 3)).at[2, 0].set(1.0)
     poses = np.asarray(actions.integrate(START, moves))

@@ -139,6 +139,16 @@ def test_patch_tokens_equal_the_reference_at_every_size(pair):
         assert np.abs(got - want).max() <= 1e-5 * np.abs(want).max(), size
 
 
+def test_the_class_token_equals_the_reference(pair):
+    network, _, (config, params) = pair
+    batch = images((42, 98))
+    with torch.no_grad():
+        want = network(torch.tensor(batch).permute(0, 3, 1, 2)).pooler_output.numpy()
+    got = jax.jit(model.summary, static_argnums=0)(config, params, batch)
+    assert got.shape == (2, config.width)
+    assert np.abs(got - want).max() <= 1e-5 * np.abs(want).max()
+
+
 def test_an_original_state_dict_gives_the_same_parameters(pair, tmp_path):
     network, _, (config, params) = pair
     torch.save(original_words(network), tmp_path / "dinov2_pretrain.pth")

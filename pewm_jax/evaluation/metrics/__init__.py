@@ -4,31 +4,61 @@
     each_B = metric(imagined_BTHWC, truth_BTHWC)
 
 Every metric takes clips of one shape, colours as floats in [−1, 1] (what exceeds that is clipped)
-or uint8, and returns one number per clip, whatever else is in the batch.
+or uint8, and returns one number per clip, whatever else is in the batch; ``fvd`` and ``kvd`` return
+one per set.
 
-============ ======= ==============================================================================
-psnr         higher  decibels, of the mean squared error of all pixels of a clip; at most 100
-ssim         higher  structural similarity, 11 × 11 Gaussian windows, averaged over a clip
-lpips_alex   lower   LPIPS with AlexNet, averaged over a clip's frames; pictures are not resized
-lpips_vgg    lower   LPIPS with VGG16, the same
-============ ======= ==============================================================================
+================ ====== ===========================================================================
+psnr             higher decibels, of the mean squared error of all pixels of a clip; at most 100
+ssim             higher structural similarity, 11 × 11 Gaussian windows, averaged over a clip
+lpips_alex       lower  LPIPS with AlexNet, averaged over a clip's frames; pictures are not resized
+lpips_vgg        lower  LPIPS with VGG16, the same
+fvd              lower  Fréchet distance of the 400 logits of I3D; 9 frames or more; with its floor
+kvd              lower  kernel distance of the same: no bias by the number of clips; may be negative
+src              higher clips that go and come back: cosine × 100 of DINOv2's features of both
+                        visits of a place, of the imagined clip alone; with its floor and ceiling
+src[alex]        higher the same with LPIPS's AlexNet for an encoder; and src[vgg]
+mirror[METRIC]   as     clips that go and come back: the way back against the way out by ``psnr``,
+                 METRIC ``ssim``, ``lpips_alex`` or ``lpips_vgg``; with its floor and ceiling
+================ ====== ===========================================================================
+
+Errors of depth are in ``evaluation.images.error_sums``.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from pewm_jax.config import UserError
+from pewm_jax.evaluation.metrics import similarity, videos
 from pewm_jax.evaluation.metrics.perceptual import Perceptual
 from pewm_jax.evaluation.metrics.perceptual import read as read_lpips
 from pewm_jax.evaluation.metrics.pictures import PLAIN, Metric
-from pewm_jax.models import lpips_weights
+from pewm_jax.evaluation.metrics.revisits import Revisit, RevisitScore
+from pewm_jax.evaluation.metrics.similarity import Similarity
+from pewm_jax.evaluation.metrics.videos import SetScore, VideoDistance
+from pewm_jax.models import i3d_weights, lpips_weights
 from pewm_jax.models.lpips import Net
 
-__all__ = ["NAMES", "Metric", "Perceptual", "load"]
+__all__ = [
+    "NAMES",
+    "Metric",
+    "Perceptual",
+    "Revisit",
+    "RevisitScore",
+    "SetScore",
+    "Similarity",
+    "VideoDistance",
+    "load",
+    "load_all",
+]
 
 _NETS: dict[str, Net] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
-NAMES = (*PLAIN, *_NETS)
+_ENCODERS = {"src": "dinov2", "src[alex]": "alex", "src[vgg]": "vgg"}
+_PICTURES = (*PLAIN, *_NETS)
+NAMES = (*_PICTURES, *videos.DISTANCES, *_ENCODERS, *(f"mirror[{name}]" for name in _PICTURES))
+_MIRROR = re.compile(r"mirror\[(.+)\]")
 
 
 def load(name: str, weights: str | Path | None = None) -> Metric:
@@ -36,16 +66,59 @@ def load(name: str, weights: str | Path | None = None) -> Metric:
 
     Args:
         name: one of ``NAMES``.
-        weights: a file of weights for a metric that is a network (``models.lpips_weights`` says of
-            which kinds); by default those of the installed package.
+        weights: a file of weights for a metric that is a network (``models.lpips_weights`` and
+            ``models.i3d_weights`` say of which kinds; for ``src`` a folder of DINOv2); by default
+            those of the installed package.
 
     Raises:
         UserError: there is no such metric, it takes no weights, or it needs some and has none.
     """
+    if name == "dreamsim":
+        raise UserError(
+            "DreamSim cannot be measured yet: of its three encoders (DINO, CLIP and OpenCLIP, "
+            "ViT-B/16 each) none is in this library; take lpips_alex, or src."
+        )
+    if name not in NAMES:
+        raise UserError(f"there is no metric {name!r}; there is {', '.join(NAMES)}.")
+    mirrored = _MIRROR.fullmatch(name)
+    if mirrored:
+        return Revisit(name, load(mirrored[1], weights))
+    if name in _ENCODERS:
+        compare = similarity.read(_ENCODERS[name], weights)
+        return Revisit(f"src[{compare.encoder}]", compare)
     if name in _NETS:
         return read_lpips(lpips_weights.find(_NETS[name], weights), _NETS[name])
-    if name not in PLAIN:
-        raise UserError(f"there is no metric {name!r}; there is {', '.join(NAMES)}.")
+    for kind in videos.DISTANCES:
+        if name == kind:
+            return videos.read(i3d_weights.find(weights), kind)
     if weights is not None:
         raise UserError(f"the metric {name} is no network and takes no weights, got {weights}.")
     return PLAIN[name]
+
+
+def load_all(
+    names: Iterable[str] = NAMES, weights: Mapping[str, str | Path] | None = None
+) -> tuple[dict[str, Metric], dict[str, str]]:
+    """Return the metrics whose weights are at hand, and why the others are left out.
+
+    Args:
+        names: some of ``NAMES``.
+        weights: metric → file or folder of weights.
+
+    Returns:
+        ``(found, left_out)``: name → metric, and name → the reason, a sentence.
+
+    Raises:
+        UserError: there is no such metric, or weights that are named are absent or damaged.
+    """
+    found: dict[str, Metric] = {}
+    left_out: dict[str, str] = {}
+    for name in names:
+        given = (weights or {}).get(name)
+        try:
+            found[name] = load(name, given)
+        except UserError as error:
+            if given is not None or name not in (*NAMES, "dreamsim"):
+                raise
+            left_out[name] = f"{name} is left out: {error}"
+    return found, left_out
