@@ -17,8 +17,7 @@ settings.load_profile("untimed")
 QUICK = {
     "xla_backend_optimization_level": "0",
     "xla_llvm_disable_expensive_passes": "true",
-    "xla_cpu_parallel_codegen_split_count": "1",
-    "xla_cpu_use_fusion_emitters": "false",  # the older ones compile in a third of the time
+    "xla_cpu_parallel_codegen_split_count": "1",  # a program in many parts takes longer in all
 }
 
 

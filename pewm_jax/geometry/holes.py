@@ -30,30 +30,28 @@ def nearest(known_THW: Array) -> tuple[Array, Array]:
     row, column = np.divmod(place, width)
     most = max(height, width)
     steps = [2**k for k in range(max(most - 1, 1).bit_length() - 1, -1, -1)] + [1]
-    edge, far = steps[0], np.int32(2 * most * most)
+    far = np.int32(2 * most * most)
 
     def off(source_HW: Array) -> Array:
         distance = (source_HW // width - row) ** 2 + (source_HW % width - column) ** 2
         return jnp.where(source_HW >= 0, distance, far)
 
-    def flood(padded: Array, step: Array) -> Any:
-        source = jax.lax.dynamic_slice(padded, (edge, edge), (height, width))
+    def flood(source: Array, step: Array) -> Any:
+        padded = jnp.pad(source, steps[0], constant_values=-1)
         best, found = off(source), source
         for move in np.ndindex(3, 3):
-            start = edge + (np.array(move) - 1) * step
+            start = steps[0] + (np.array(move) - 1) * step
             other = jax.lax.dynamic_slice(padded, start, (height, width))
             distance = off(other)
             better = (distance < best) | ((distance == best) & (other < found))
             better = better & (other >= 0)
             best = jnp.where(better, distance, best)
             found = jnp.where(better, other, found)
-        return jax.lax.dynamic_update_slice(padded, found, (edge, edge)), None
+        return found, None
 
     def one(known_HW: Array) -> Array:
         # A scan, so that each pass is computed once and not anew by all that read it.
-        padded = jnp.pad(jnp.where(known_HW, place, -1), edge, constant_values=-1)
-        padded = jax.lax.scan(flood, padded, jnp.array(steps))[0]
-        return padded[edge:-edge, edge:-edge]
+        return jax.lax.scan(flood, jnp.where(known_HW, place, -1), jnp.array(steps))[0]
 
     source = jax.vmap(one)(jnp.asarray(known_THW)).reshape(frames, -1)
     return jnp.maximum(source, 0), source >= 0
