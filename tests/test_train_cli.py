@@ -220,6 +220,8 @@ COMMANDS = {
     "memory": ("python -m pewm_jax.memory", ["-m", "pewm_jax.memory"]),
     "convert": ("python -m pewm_jax.convert", ["-m", "pewm_jax.convert"]),
     "plan": ("pewm-jax plan", ["-m", "pewm_jax", "plan"]),
+    "protocol": ("pewm-jax protocol", ["-m", "pewm_jax", "protocol"]),
+    "compare": ("pewm-jax compare", ["-m", "pewm_jax", "compare"]),
 }
 """Each subcommand: the words it is called by without ``pewm-jax``, and how to call it so."""
 INTERRUPTED_AT_JAX = """
