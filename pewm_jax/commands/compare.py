@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pewm_jax import cli
+from pewm_jax.commands import imports
 
 ABOUT = (
     "Set two runs side by side that `pewm-jax evaluate` has scored by the same protocol, and write "
@@ -38,13 +39,15 @@ def main(argv: Sequence[str], prog: str = "pewm-jax compare") -> int:
     Returns:
         The exit code.
     """
+    argv = imports.take(argv)
     asks = any(word in ("-h", "--help") for word in argv)
     named = [word for word in argv[:2] if not word.startswith("-")]
     if not asks and len(named) < 2:
         raise cli.ConfigError(f"Name two scored runs first: {prog} runs/a runs/b.")
     flags = ["--help"] if asks else argv[2:]
     named_prog = f"{prog} RUN_A RUN_B"
-    settings = cli.parse(Settings, flags, default=Settings(), prog=named_prog, description=ABOUT)
+    about = f"{ABOUT} Beside these settings:\n{imports.HELP}"
+    settings = cli.parse(Settings, flags, default=Settings(), prog=named_prog, description=about)
     # Imported here and not above: help and refusals come at once.
     from pewm_jax.evaluation.compare import compare
 

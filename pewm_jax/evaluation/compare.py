@@ -130,6 +130,11 @@ def read(name: str | Path) -> Report:
         raise UserError(f"{name} has no report in {folder}: {again}.") from None
     except ValueError as error:
         raise UserError(f"{folder / METRICS} is not JSON ({error}): {again}.") from None
+    if isinstance(metrics, dict) and "protocol_sha256" not in (metrics.get("protocol") or {}):
+        raise UserError(
+            f"the report in {folder} holds no protocol: it is of a codec, whose frames are not "
+            f"compared, or of an earlier version of the library; in that case {again}."
+        )
     if not isinstance(metrics, dict) or metrics.get("schema") != REPORT_SCHEMA:
         raise UserError(f"the report in {folder} is of another version of the library: {again}.")
     report = Report(
@@ -155,6 +160,8 @@ def _require_same_protocol(one: Report, two: Report) -> None:
 
 def _require_seeds(group: Sequence[Report]) -> None:
     """Refuse runs that are not trainings of the same, each with a seed of its own."""
+    if len(group) == 1:
+        return
     settings = [
         runs.identity(configuration.from_dict(Config, dict(report.metrics["protocol"]["config"])))
         for report in group
@@ -186,7 +193,7 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
         See ``docs/evaluation.md``; differences are first − second.
     """
     reports = [*one, *two]
-    nets = {report.metrics["protocol"]["lpips_weights_sha256"] for report in reports}
+    nets = {report.metrics["protocol"]["lpips_weights_sha256"] for report in reports} - {None}
     skip = {"lpips"} if len(nets) > 1 else set()
     content: dict[str, Any] = {
         "schema": SCHEMA,

@@ -74,8 +74,8 @@ def houses(metrics: Mapping[str, Any]) -> str:
     return (
         "<h2>House by house</h2>"
         + table(f"<th>PSNR, dB</th><th>all frames</th>{heads}<th>{found['house']}s</th>", rows)
-        + f"<p class='quiet'>Mean within a {found['house']} first, then over {found['house']}s; in "
-        f"brackets the {100 * found['how']['level']:.0f} % interval of a bootstrap over them "
+        + f"<p class='quiet'>Mean within each {found['house']} first, then over {found['house']}s; "
+        f"in brackets the {100 * found['how']['level']:.0f} % interval of a bootstrap over them "
         f"({found['how']['draws']} draws). Differences are paired. This is one training: how much "
         "another training seed would change is a question of its own (<code>pewm-jax compare "
         "--also_a</code>).</p>"

@@ -218,7 +218,12 @@ def file_hash(path: Path) -> str:
 
 
 def fingerprint(
-    config: Config, weights: str, dataset: str, lpips: str = "", protocol: str = ""
+    config: Config,
+    weights: str,
+    dataset: str,
+    lpips: str = "",
+    protocol: str = "",
+    baseline: str = "",
 ) -> str:
     """Return a hash of everything that the scores depend on, except the choice of seeds and rivals.
 
@@ -229,6 +234,8 @@ def fingerprint(
         lpips: sha256 of the weights of LPIPS; "" if it is left out.
         protocol: hash of the choices in a protocol's file, except for seeds; "" if clips are chosen
             by the settings.
+        baseline: with a protocol, sha256 of the index of the split that chooses the reprojection's
+            settings; "" if there is none.
     """
     settings = to_dict(config)
     for key in ("seeds", "videos", "none", "lpips", "protocol"):
@@ -239,5 +246,5 @@ def fingerprint(
     content = {"version": VERSION, "settings": settings, "weights": weights, "data": dataset}
     content["lpips"] = lpips
     if protocol:
-        content |= {"protocol": protocol, "data": ""}
+        content |= {"protocol": protocol, "data": baseline}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

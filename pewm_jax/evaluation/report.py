@@ -25,6 +25,7 @@ from pewm_jax.evaluation.page import render
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
 from pewm_jax.evaluation.protocol import file_hash, fingerprint
+from pewm_jax.evaluation.reproject_choice import SPLIT as BASELINE_SPLIT
 from pewm_jax.evaluation.reproject_choice import choose_settings
 from pewm_jax.evaluation.scoring import roll_long, score_table
 from pewm_jax.evaluation.words import score_lines, summary_lines
@@ -100,12 +101,14 @@ def evaluate(
     lpips, about_lpips = chosen_lpips(
         config.evaluate.lpips, config.model.clip.height, config.model.clip.width
     )
+    chooses = Path(config.data.path) / BASELINE_SPLIT / MANIFEST
     name = fingerprint(
         config,
         opened.weights_hash,
         data_hash,
         lpips.sha256 if lpips else "",
         fixed.pieces_sha256 if fixed else "",
+        file_hash(chooses) if fixed and chooses.is_file() else "",
     )
     folder = Path(out) if out else runs.report_folder(opened, config)
     if is_complete(folder, config, name, none_weights):

@@ -18,7 +18,7 @@ from pewm_jax.evaluation.images import unit_colours
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.normals import normals
 from pewm_jax.memory import rendering, views
-from pewm_jax.types import Array, Camera, Frames
+from pewm_jax.types import Array, Camera, Frames, View
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +80,12 @@ def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> F
         N frames, colours float32 in [−1, 1], depth in metres. Where nothing was observed anywhere
         in an image, it is black and has no depth.
     """
+    view = views.fill_nearest(draw(settings, context, camera))
+    return Frames(2 * view.features_THWF - 1, view.depth_THW, camera)
+
+
+def draw(settings: ReprojectSettings, context: Frames, camera: Camera) -> View:
+    """Return the same with its holes, colours in [0, 1]."""
     depth_SHW = jnp.asarray(context.depth_THW)
     height, width = depth_SHW.shape[1:]
     points = unproject(depth_SHW, context.camera).reshape(-1, 3)
@@ -87,7 +93,7 @@ def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> F
     there = (depth_SHW > 0).reshape(-1)
     if settings.average or settings.footprint > 1 or not settings.backs:
         focal = jnp.asarray(context.camera.intrinsics_4)[:, 0, None, None]
-        view = rendering.splat_surfels(
+        return rendering.splat_surfels(
             points,
             colours,
             settings.width * (depth_SHW / focal).reshape(-1),
@@ -101,10 +107,7 @@ def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> F
             if settings.backs
             else normals(depth_SHW, context.camera).reshape(-1, 3),
         )
-    else:
-        view = rendering.splat(points, colours, there, camera, height, width)
-    view = views.fill_nearest(view)
-    return Frames(2 * view.features_THWF - 1, view.depth_THW, camera)
+    return rendering.splat(points, colours, there, camera, height, width)
 
 
 @functools.partial(jax.jit, static_argnums=0)

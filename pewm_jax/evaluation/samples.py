@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -113,7 +114,14 @@ def load(folder: Path) -> Samples:
             about = json.loads(str(arrays.pop("about")))
     except FileNotFoundError:
         raise UserError(f"{folder} has no {SAMPLES}, the scores clip by clip: {again}.") from None
-    except (zipfile.BadZipFile, ValueError, EOFError, KeyError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        NotImplementedError,  # of a method of compression that there is not
+        ValueError,
+        EOFError,
+        KeyError,
+    ) as error:
         raise UserError(f"{path} is damaged ({error}): {again}.") from None
     if about.get("version") != VERSION:
         raise UserError(

@@ -69,9 +69,11 @@ def joined(launch: Launch) -> Iterator[None]:
         except BaseException as error:  # noqa: BLE001 - reported, whatever it is
             code = _report(error)
             sys.stderr.flush()
-            if not is_lost(error):
-                _let_others_report()
-            os._exit(code)  # a normal exit waits for processes that wait for this one
+            try:
+                if not is_lost(error):
+                    _let_others_report()
+            finally:
+                os._exit(code)  # a normal exit waits for processes that wait for this one
 
 
 def start(launch: Launch) -> None:

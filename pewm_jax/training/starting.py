@@ -35,7 +35,7 @@ def require_weights(config: Config) -> None:
     """
     for stage in all_stages(config):
         if stage.given is not None and stage.settings(config).steps > 0:
-            stage.given(config.train)
+            stage.given(config.model, config.train)
     for where, part in _parts(config.model):
         if where in config.model.TRAINS or config.train.start:
             continue

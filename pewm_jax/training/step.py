@@ -120,7 +120,7 @@ def given_weights(config: Config, stage: Stage, mesh: Mesh) -> Params | None:
     Raises:
         UserError: it is absent or damaged.
     """
-    given = stage.given(config.train) if stage.given else None
+    given = stage.given(config.model, config.train) if stage.given else None
     if given is None:
         return None
     everywhere = sharding.replicated(mesh)

@@ -101,17 +101,20 @@ def reconstruct(
     }
 
 
-def perceptual(train: TrainSettings) -> Params | None:
+def perceptual(model: CodecWorldConfig, train: TrainSettings) -> Params | None:
     """Return the weights of LPIPS that ``reconstruct`` needs, under ``lpips``, or None.
 
     Raises:
-        UserError: they are asked for and absent, damaged, or of another network.
+        UserError: they are asked for and absent, damaged, or of another network, or the frames are
+            too small for it.
     """
     assert isinstance(train, CodecTrainConfig)
     if not train.lpips_weight:
         return None
     file = lpips_weights.find(train.lpips_net, train.lpips_file)
-    return {"lpips": lpips_weights.read(file, train.lpips_net)[1]}
+    found = {"lpips": lpips_weights.read(file, train.lpips_net)[1]}
+    lpips.require_size(train.lpips_net, model.clip.height, model.clip.width)
+    return found
 
 
 def distribute(

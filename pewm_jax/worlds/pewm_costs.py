@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import re
 
-from pewm_jax.config import Config, LearnedCodecConfig, ModelConfig, functions
-from pewm_jax.models import gates, learned_codec
+from pewm_jax.config import Config, LearnedCodecConfig, ModelConfig, TrainConfig, functions
+from pewm_jax.models import gates, learned_codec, lpips
 from pewm_jax.models.costs import Costs, Product, Share
+from pewm_jax.worlds import codec_gate
 from pewm_jax.worlds.stages import Stage
 
 
@@ -25,7 +26,8 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     model = config.model
     assert isinstance(model, ModelConfig)
     if stage.name == "gate":
-        return {"codec": _gate(model)}
+        assert isinstance(config.train, TrainConfig)
+        return {"codec": _gate(model, config.train.gate_lpips > 0)}
     trained = any(re.fullmatch(pattern, "backbone/any") for pattern in stage.trained)
     found = {
         "backbone": functions(model.backbone).costs(model, share, trained=trained),
@@ -52,15 +54,22 @@ def _once_more(part: Costs, clips: float) -> Costs:
     return dataclasses.replace(part, products=(*part.products, *forward))
 
 
-def _gate(model: ModelConfig) -> Costs:
-    """Return the costs of decoding a clip's colour and depth, and of the gate, which is trained."""
+def _gate(model: ModelConfig, perceptual: bool) -> Costs:
+    """Return the costs of decoding a clip's colour and depth, and of the gate, which is trained.
+
+    With ``perceptual`` also of LPIPS: of colours imagined, which have a gradient, and true ones.
+    """
     codec, clip = model.codec, model.clip
     if not isinstance(codec, LearnedCodecConfig):
         return functions(codec).costs(model, Share())
     decoder = 2 * clip.frames * learned_codec.macs(codec, "decoder", clip.height, clip.width)
     gate = (clip.frames - 1) * gates.macs(codec.gate, clip.height, clip.width)
-    products = Product("codec", "convolution", decoder), Product("codec", "convolution", gate, 2.0)
-    return Costs(products)
+    products = [Product("codec", "convolution", decoder)]
+    products.append(Product("codec", "convolution", gate, 2.0))
+    if perceptual:
+        work = 2 * (clip.frames - 1) * lpips.macs(codec_gate.LPIPS, clip.height, clip.width)
+        products.append(Product("lpips", "convolution", work, 0.5))
+    return Costs(tuple(products))
 
 
 def encodes(config: Config) -> bool:

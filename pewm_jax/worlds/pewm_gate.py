@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import ModelConfig, TrainConfig, TrainSettings, UserError
 from pewm_jax.memory import memories
-from pewm_jax.models import codecs, lpips_weights, world_model
+from pewm_jax.models import codecs, lpips, lpips_weights, world_model
 from pewm_jax.models.signals import as_signal, signal_from_depth
 from pewm_jax.types import Array, Clip, Control, Frames, Params
 from pewm_jax.worlds import codec_gate, objective, sampling
@@ -95,13 +95,16 @@ def loss(
     )
 
 
-def perceptual(train: TrainSettings) -> Params | None:
+def perceptual(model: ModelConfig, train: TrainSettings) -> Params | None:
     """Return the weights of LPIPS that ``loss`` needs, under ``lpips``, or None.
 
     Raises:
-        UserError: they are asked for and not installed, or damaged.
+        UserError: they are asked for and not installed, or damaged, or frames are too small.
     """
     assert isinstance(train, TrainConfig)
     if not train.gate_lpips:
         return None
-    return {"lpips": lpips_weights.read(lpips_weights.find(codec_gate.LPIPS), codec_gate.LPIPS)[1]}
+    file = lpips_weights.find(codec_gate.LPIPS)
+    found = {"lpips": lpips_weights.read(file, codec_gate.LPIPS)[1]}
+    lpips.require_size(codec_gate.LPIPS, model.clip.height, model.clip.width)
+    return found

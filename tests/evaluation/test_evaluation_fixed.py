@@ -171,11 +171,11 @@ def test_it_stands_above_the_settings(episodes, tmp_path):
     assert protocol_file.given(off, {"clips": 2})[1] is None
     with pytest.raises(ConfigError, match="--clips and --seeds cannot be chosen beside"):
         protocol_file.given(named, {"clips": 2, "seeds": (1,)})
-    longer = named.with_model(clip=dataclasses.replace(plain.model.clip, frames=4))
-    with pytest.raises(UserError, match="8 imagined frames and this model imagines 3 at once"):
+    longer = named.with_model(clip=dataclasses.replace(plain.model.clip, frames=13))
+    with pytest.raises(UserError, match="8 imagined frames and this model imagines 12 at once"):
         protocol_file.given(longer, {})
-    taller = named.with_model(clip=dataclasses.replace(plain.model.clip, height=24))
-    with pytest.raises(UserError, match="16×16 and this model makes 24×16"):
+    taller = named.with_model(clip=dataclasses.replace(plain.model.clip, height=32))
+    with pytest.raises(UserError, match="16×16 and this model makes 32×16"):
         protocol_file.given(taller, {})
 
 

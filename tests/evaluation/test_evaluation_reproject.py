@@ -17,6 +17,7 @@ from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.reproject import (
     CANDIDATES,
     ReprojectSettings,
+    draw,
     reproject,
     reproject_batch,
 )
@@ -57,20 +58,27 @@ def test_another_camera_sees_the_room_that_was_seen(seen, settings):
 
 
 def test_a_wall_seen_from_behind_is_not_shown_and_hides_what_is_behind_it():
-    """A camera beside a wall looks at a far one; a second camera looks from behind the near one."""
-    intrinsics = np.array([[12.0, 12.0, 12.0, 12.0]])
-    ahead = np.asarray(pose_from_yaw(np.zeros(3), 0.0))[None]
-    depth = np.full((1, 24, 24), 4.0)
-    depth[:, :, :12] = 2.0  # on the left something stands nearer, 2 m away
-    colour = np.where(depth[..., None] < 3, [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0])
-    context = Frames(colour, depth, Camera(intrinsics, ahead))
+    """A red wall, seen from its other side; beyond it, a green one, seen from its front."""
+    intrinsics = np.array([[12.0, 12.0, 12.0, 12.0]] * 2)
+    ahead, there = pose_from_yaw(np.zeros(3), 0.0), pose_from_yaw(np.array([3.0, 0, 0]), np.pi)
+    depth = np.stack([np.full((24, 24), 4.0), np.full((24, 24), 5.0)])
+    depth[0, :, :12] = 0  # of the red one half was seen
+    colour = np.stack([np.full((24, 24, 3), [1.0, -1, -1]), np.full((24, 24, 3), [-1.0, 1, -1])])
+    context = Frames(colour, depth, Camera(intrinsics, np.stack([ahead, there])))
     back = np.asarray(pose_from_yaw(np.array([6.0, 0.0, 0.0]), np.pi))[None]
-    camera = Camera(intrinsics, back)
+    camera = Camera(intrinsics[:1], back)
+
+    def green(settings, context):
+        points = draw(settings, context, camera)
+        return np.asarray(points.seen_THW & (points.features_THWF[..., 1] > 0.5))
+
+    alone = jax.tree.map(lambda x: x[1:], context)
     for backs in (True, False):
         settings = ReprojectSettings(footprint=3, backs=backs)
-        made = reproject(settings, context, camera)
-        # From behind, the far wall stands 2 m away and hides all; nothing of it was seen from here.
-        assert bool(np.asarray(made.depth_THW).any()) == backs
+        red = np.asarray(draw(settings, context, camera).features_THWF[..., 0] > 0.5)
+        assert red.any() == backs  # shown from behind, or not
+        hidden = green(settings, alone) & ~green(settings, context)
+        assert 0.2 < hidden.sum() / green(settings, alone).sum() < 0.8  # by its half
 
 
 def test_frames_without_depth_do_not_count(seen):

@@ -181,13 +181,13 @@ def of_32(batch):
 def test_lpips_counts_as_much_as_it_weighs_and_can_be_descended(tmp_path):
     config = perceptual(tmp_path)
     stage, make = worlds.stages(config)[0], of_32(batch)
-    params, given = init(config, jax.random.key(0)), stage.given(config.train)
+    params, given = init(config, jax.random.key(0)), stage.given(config.model, config.train)
     clip, key = make(config), jax.random.key(1)
     loss = jax.jit(stage.loss, static_argnums=(0, 1))
     whole, measured = loss(config.model, config.train, params | given, clip, key)
     plain = dataclasses.replace(config.train, lpips_weight=0.0)
     without, few = loss(config.model, plain, params, clip, key)
-    assert stage.given(plain) is None
+    assert stage.given(config.model, plain) is None
     assert "lpips" not in few
     assert measured["lpips"] > 0
     assert whole == pytest.approx(float(without + 0.5 * measured["lpips"]), rel=1e-5)

@@ -190,10 +190,17 @@ def test_lpips_of_the_mixed_frames_counts_as_much_as_it_weighs(monkeypatch):
     assert float(whole) == pytest.approx(float(without + 0.5 * measured["lpips"]), rel=1e-5)
 
     train = dataclasses.replace(imagining().train, gate_lpips=0.5)
-    assert LAST.given(imagining().train) is None
+    clip = dataclasses.replace(model.clip, height=32, width=32)
+    large = dataclasses.replace(model, clip=clip)
+    assert LAST.given(model, imagining().train) is None
     monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
     with pytest.raises(UserError, match="none are installed"):
-        LAST.given(train)
+        LAST.given(large, train)
+    monkeypatch.setattr(lpips_weights, "find", lambda _: None)
+    monkeypatch.setattr(lpips_weights, "read", lambda _, net: (net, network))
+    assert LAST.given(large, train) == {"lpips": network}
+    with pytest.raises(UserError, match="too small for LPIPS"):  # before any stage
+        LAST.given(model, train)
     with pytest.raises(ConfigError, match=r"train\.gate_lpips is -1"):
         dataclasses.replace(train, gate_lpips=-1)
 
