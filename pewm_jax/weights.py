@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pewm_jax import tensor_files, tree
+from pewm_jax import pickled_tensors, tensor_files, tree
 from pewm_jax.config import UserError
 from pewm_jax.types import Array, Params
 
@@ -65,6 +65,23 @@ def lazy(path: Path) -> Params:
     Like ``load`` otherwise, but checksums are not compared; ``verify`` does that.
     """
     return tree.unflatten(tensor_files.mapped(path))
+
+
+def read_others(path: Path, of: str) -> dict[str, np.ndarray]:
+    """Read the tensors of a file that others wrote, by their names.
+
+    Args:
+        path: a safetensors file, or a pickle of tensors (``pickled_tensors.read``).
+        of: whose weights they are, for the refusal.
+
+    Raises:
+        UserError: the file is absent or damaged.
+    """
+    if not path.is_file():
+        raise UserError(f"{path} does not exist; name a file with the weights of {of}.")
+    if path.suffix == ".safetensors":
+        return dict(tensor_files.read(path))
+    return dict(tree.flatten(pickled_tensors.read(path)))
 
 
 def verify(path: Path) -> None:

@@ -18,7 +18,7 @@ from pewm_jax.evaluation.fixed import Protocol, difference
 from pewm_jax.evaluation.images import MASKS
 from pewm_jax.evaluation.measure import SCHEMA as REPORT_SCHEMA
 from pewm_jax.evaluation.opened import OWN
-from pewm_jax.evaluation.report import METRICS, PAGE, PROTOCOL
+from pewm_jax.evaluation.report import METRICS, PAGE, PROTOCOL, make_folder
 from pewm_jax.training import runs
 
 SCHEMA = 1
@@ -95,12 +95,7 @@ def compare(
         _require_seeds(group)
     content = content_of(*groups)
     folder = Path(out) if out else first.folder.parent / f"compare-{_short(groups[1][0])}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"{folder} cannot be made ({error.strerror}); choose another folder with --out."
-        ) from None
+    make_folder(folder)
     pictures = compare_page.side_by_side(first.protocol, first.folder, groups[1][0].folder)
     atomic.write_text(folder / PAGE, compare_page.render(content, pictures))
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)

@@ -114,7 +114,7 @@ def evaluate(
     if is_complete(folder, config, name, none_weights):
         say("the report is complete for these weights and this protocol; nothing to do")
         return folder / PAGE
-    _make(folder)
+    make_folder(folder)
     partials = Partials(folder / "partial", opened.weights_hash, name)
     if lpips is None:
         say(about_lpips)
@@ -179,8 +179,12 @@ def _save_pictures(folder: Path, gallery: Gallery) -> None:
             save_png(folder / ROWS / f"{index:02d}-{name}.png", picture)
 
 
-def _make(folder: Path) -> None:
-    """Make the report's folder."""
+def make_folder(folder: Path) -> None:
+    """Make the folder of a report.
+
+    Raises:
+        UserError: it cannot be made.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

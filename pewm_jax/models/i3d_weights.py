@@ -23,7 +23,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pewm_jax import pickled_tensors, tensor_files, tree, weights
+from pewm_jax import tree, weights
 from pewm_jax.config import UserError
 from pewm_jax.models.i3d import shapes
 from pewm_jax.types import Params
@@ -96,12 +96,7 @@ def read(path: Path) -> Params:
     Raises:
         UserError: the file is absent or damaged, or holds other tensors.
     """
-    if not path.is_file():
-        raise UserError(f"{path} does not exist; name a file with the weights of I3D.")
-    if path.suffix == ".safetensors":
-        flat = dict(tensor_files.read(path))
-    else:
-        flat = tree.flatten(pickled_tensors.read(path))
+    flat = weights.read_others(path, "I3D")
     where = f"{path}, weights of I3D,"
     if any(name.startswith(_THEIRS) for name in flat):
         flat = _folded(_from_flax(flat), where)

@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pewm_jax import pickled_tensors, tensor_files, tree, weights
+from pewm_jax import tree, weights
 from pewm_jax.config import UserError
 from pewm_jax.models.lpips import NAMES, Net, shapes
 from pewm_jax.types import Params
@@ -72,12 +72,7 @@ def read(path: Path, net: Net | None = None) -> tuple[Net, Params]:
     Raises:
         UserError: the file is absent or damaged, or holds other tensors.
     """
-    if not path.is_file():
-        raise UserError(f"{path} does not exist; name a file with the weights of LPIPS.")
-    if path.suffix == ".safetensors":
-        flat = dict(tensor_files.read(path))
-    else:
-        flat = tree.flatten(pickled_tensors.read(path))
+    flat = weights.read_others(path, "LPIPS")
     if any(name.startswith(_THEIRS) for name in flat):
         flat = _from_flax(flat)
     elif any(_TRUNK.fullmatch(name) for name in flat):
