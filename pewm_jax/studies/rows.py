@@ -1,0 +1,254 @@
+"""The rows of Table 1: memories, each with the readers that apply, and the paper's ablations.
+
+A row is a memory's settings; all else is the same for all rows. What the paper's rows are called
+stands beside them. Rows whose reader has a size to choose get the one that comes nearest to the
+number of parameters of ``AttentionConfig`` in the base settings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+
+from pewm_jax.config import (
+    AttentionConfig,
+    Config,
+    ImagesConfig,
+    LatentsConfig,
+    Map2DConfig,
+    MemorySettings,
+    NoMemoryConfig,
+    PointsConfig,
+    ReaderSettings,
+    RenderConfig,
+    SurfelConfig,
+    UserError,
+    VoxelConfig,
+)
+from pewm_jax.models import world_model
+
+POINTS, SURFELS = (0.4, 4), (0.12, 24)
+"""Size of a cell over the shortest side of a voxel, and capacity over that of voxels."""
+PATCHES = 64
+"""Tokens of a snapshot in the image memory, at least."""
+PAPER_FORM = "voxel-attend-sinusoid"
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One row of the table.
+
+    Attributes:
+        name: of its folders.
+        memory: what it remembers, and how it reads that.
+        depth: whether the model imagines depth.
+        paper: what the paper's Table 1 calls it; "" if it is not there.
+        times: how many times the others' training time it gets.
+    """
+
+    name: str
+    memory: MemorySettings
+    depth: bool = True
+    paper: str = ""
+    times: float = 1.0
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it has a memory."""
+        return self.memory.REMEMBERS
+
+    @property
+    def label(self) -> str:
+        """The row's name for people: memory, reader, what is unusual."""
+        kind, *rest = self.name.split("-")
+        return f"{kind} · {', '.join(rest)}" if rest else kind
+
+
+def main_rows(base: Config) -> tuple[Row, ...]:
+    """Return the rows of the table.
+
+    Args:
+        base: the settings that all rows share; its memory is the paper's.
+    """
+    memory, attend = base.model.memory, _attend(base)
+    sinusoid = dataclasses.replace(attend, positions="sinusoid", frame="world")
+    voxel = _as(memory, VoxelConfig, attend)
+    points, surfels = (
+        _finer(memory, kind, attend, *scale)
+        for kind, scale in ((PointsConfig, POINTS), (SurfelConfig, SURFELS))
+    )
+    snapshots = max(1, memory.tokens // PATCHES)
+    return (
+        Row("none", _as(memory, NoMemoryConfig, attend), paper="NWM"),
+        Row(
+            "images-attend",
+            _as(memory, ImagesConfig, attend, snapshots=snapshots),
+            paper="Image Memory",
+        ),
+        Row("voxel-attend-without_depth", voxel, depth=False, paper="Ours (w/o depth)"),
+        Row("map2d-attend", _as(memory, Map2DConfig, attend), paper="Ours (2D map)"),
+        Row(PAPER_FORM, dataclasses.replace(voxel, reader=sinusoid), paper="Ours"),
+        Row("voxel-attend", voxel),
+        Row("voxel-render", _rendered(base, voxel)),
+        Row("points-attend", points),
+        Row("points-render", _rendered(base, points)),
+        Row("surfels-attend", surfels),
+        Row("surfels-render", _rendered(base, surfels)),
+    )
+
+
+def _as(
+    memory: MemorySettings, kind: type[MemorySettings], reader: ReaderSettings, **changes: Any
+) -> MemorySettings:
+    """Return a memory of another kind with the settings that all kinds share."""
+    given: dict[str, Any] = {
+        field.name: getattr(memory, field.name) for field in dataclasses.fields(MemorySettings)
+    }
+    given["reader"] = reader
+    given.update(changes)
+    return kind(**given)
+
+
+def _finer(
+    memory: MemorySettings,
+    kind: type[MemorySettings],
+    reader: ReaderSettings,
+    scale: float,
+    more: int,
+) -> MemorySettings:
+    """Return a memory of coloured points: cells are cubes, and the extent stays."""
+    side = round(scale * min(memory.cell_m), 4)
+    sizes = zip(memory.cell_m, memory.cells, strict=True)
+    cells = tuple(math.ceil(size * count / side) for size, count in sizes)
+    return _as(
+        memory,
+        kind,
+        reader,
+        cell_m=(side, side, side),
+        cells=cells,
+        capacity=more * memory.capacity,
+    )
+
+
+def _attend(base: Config) -> AttentionConfig:
+    reader = base.model.memory.reader
+    if not isinstance(reader, AttentionConfig) or isinstance(reader, RenderConfig):
+        raise UserError("the settings of Table 1 need memory.reader.kind attend to start from.")
+    return reader
+
+
+def _rendered(base: Config, memory: MemorySettings) -> MemorySettings:
+    """Return the memory read by rendering, with about as many parameters as by attention."""
+    width = base.model.backbone.width
+
+    def with_ratio(ratio: int) -> MemorySettings:
+        reader = RenderConfig(picture_width=width, mlp_ratio=ratio)
+        return dataclasses.replace(memory, reader=reader)
+
+    first, second = (parameters(base, with_ratio(ratio)) for ratio in (1, 2))
+    missing = (parameters(base, memory) - first) / (second - first)  # it is linear in the ratio
+    return with_ratio(max(1, 1 + round(missing)))
+
+
+def parameters(base: Config, memory: MemorySettings) -> int:
+    """Return how many parameters a memory's reader has; those that stage 2 trains."""
+    model = base.with_model(memory=memory).model
+    shapes = jax.eval_shape(functools.partial(world_model.init, model), jax.random.key(0))
+    return sum(leaf.size for leaf in jax.tree.leaves(shapes.get("memory", {})))
+
+
+def _cell(base: Config, side: str) -> MemorySettings:
+    """Another size of a cell on the ground; the extent stays, and so does the height."""
+    memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    x, y, z = memory.cell_m
+    scale = float(side) / x
+    cells = (*(math.ceil(n / scale) for n in memory.cells[:2]), memory.cells[2])
+    return dataclasses.replace(memory, cell_m=(x * scale, y * scale, z), cells=cells)
+
+
+def _extent(base: Config, side: str) -> MemorySettings:
+    """Another extent of the map on the ground, metres."""
+    memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    x, y, _ = memory.cell_m
+    cells = (math.ceil(float(side) / x), math.ceil(float(side) / y), memory.cells[2])
+    return dataclasses.replace(memory, cells=cells)
+
+
+def _tokens(base: Config, count: str) -> MemorySettings:
+    """Another number of tokens that condition a clip."""
+    memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    most = max(memory.capacity, int(count))
+    return dataclasses.replace(memory, tokens=int(count), capacity=most)
+
+
+def _features(base: Config, kind: str) -> MemorySettings:
+    """Other features in the map: colours of patches, the codec's latents, or none (points)."""
+    memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    if kind == "points":
+        return _as(memory, PointsConfig, memory.reader)
+    if kind == "latents":
+        codec = base.model.codec
+        latents = LatentsConfig(channels=codec.rgb_channels, spatial=codec.spatial)
+        return dataclasses.replace(memory, encoder=latents)
+    if kind == "colours":
+        return memory
+    raise UserError(f"there are no features {kind!r}; choose colours, latents or points.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Ablation:
+    """A setting of the paper's map that is varied.
+
+    Attributes:
+        make: the memory with one of its values.
+        values: those tried unless others are given.
+        about: what it is, with its unit.
+    """
+
+    make: Callable[[Config, str], MemorySettings]
+    values: tuple[str, ...]
+    about: str
+
+
+ABLATIONS: Mapping[str, Ablation] = {
+    "cell": Ablation(_cell, ("0.125", "0.25", "0.5", "1.0"), "side of a cell on the ground, m"),
+    "extent": Ablation(_extent, ("4", "8", "16", "32"), "side of the map, m"),
+    "tokens": Ablation(_tokens, ("96", "192", "384", "768"), "tokens that condition a clip"),
+    "features": Ablation(_features, ("colours", "latents", "points"), "what a cell holds"),
+    "time": Ablation(lambda base, _: main_rows(base)[4].memory, ("4",), "times the others' time"),
+}
+"""The paper's ablations, of the voxel map read by attention; ``time`` trains the paper's own form
+(``PAPER_FORM``) longer."""
+
+
+def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row, ...]:
+    """Return the rows of an ablation.
+
+    Args:
+        base: the settings that all rows share.
+        name: of an ablation.
+        values: those to try; by default the ablation's own.
+
+    Raises:
+        UserError: there is no such ablation, or a value cannot be used.
+    """
+    if name not in ABLATIONS:
+        raise UserError(f"there is no ablation {name!r}; choose {', '.join(ABLATIONS)}.")
+    ablation = ABLATIONS[name]
+    found = []
+    for value in values or ablation.values:
+        try:
+            memory = ablation.make(base, value)
+            times = float(value) if name == "time" else 1.0
+        except ValueError:
+            raise UserError(
+                f"the ablation {name} cannot take {value!r}: give {ablation.about}."
+            ) from None
+        start = PAPER_FORM if name == "time" else "voxel-attend"
+        found.append(Row(f"{start}-{name}_{value}", memory, times=times))
+    return tuple(found)

@@ -1,0 +1,248 @@
+"""Scores of Table 1: one set of held-out clips, the same for every row, every seed and no network.
+
+Of each clip: PSNR, SSIM, LPIPS and errors of depth over pixels seen before, never seen and all; the
+logits of I3D, of the observed frame and those imagined, for FVD and KVD; and of a walk half as far
+and back, SRC. Each row's numbers are a file beside its weights.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax.config import Config
+from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.progress import Meter
+from pewm_jax.evaluation import protocol_file
+from pewm_jax.evaluation.fixed import Protocol, decide, lay
+from pewm_jax.evaluation.imagine import Imagination, copy_last
+from pewm_jax.evaluation.metrics import load_all
+from pewm_jax.evaluation.partial import Partials
+from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.evaluation.reproject import reproject_batch
+from pewm_jax.evaluation.reproject_choice import choose_settings
+from pewm_jax.evaluation.scoring import Batch, load_batch
+from pewm_jax.geometry.actions import there_and_back
+from pewm_jax.models.lpips import LEAST
+from pewm_jax.rollouts import load_finished
+from pewm_jax.training.runs import WEIGHTS
+from pewm_jax.types import Camera, Frames
+
+NETWORKS = ("lpips_alex", "fvd", "kvd", "src[alex]", "dreamsim")
+"""Measures that need weights; those that are not at hand are left out, and said."""
+SRC = "src[alex]"
+SHORTEST = 9
+"""Frames of the shortest clip that I3D takes."""
+BASELINES = ("reproject", "copy")
+PROTOCOL, SCORES = "protocol.json", "scores"
+Arrays = dict[str, np.ndarray]
+Model = Callable[[Frames, Any, Camera, np.ndarray], Frames]
+"""``(context, control, camera, seeds_B2) -> (B, N) frames``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scorer:
+    """The clips and measures that everything is scored by.
+
+    Attributes:
+        config: the settings that all rows share, with the protocol laid on them.
+        protocol: what is scored.
+        batches: the clips.
+        nets: the measures that need weights, as far as they are at hand.
+        left_out: name → why a measure is left out.
+        name: a hash of all that scores depend on beside the weights.
+        say: shows a line.
+    """
+
+    config: Config
+    protocol: Protocol
+    batches: tuple[Batch, ...]
+    nets: Mapping[str, Any]
+    left_out: Mapping[str, str]
+    name: str
+    say: Callable[[str], Any]
+
+    @property
+    def house_of_clip(self) -> np.ndarray:
+        """The number of each clip's house: its scene, or its episode if there is one scene."""
+        clips, episodes = self.protocol.clips, self.protocol.episodes
+        scenes = [episodes[clip.episode].scene for clip in clips]
+        if len(set(scenes)) == 1:
+            scenes = [episodes[clip.episode].name for clip in clips]
+        return np.unique(scenes, return_inverse=True)[1]
+
+    @property
+    def frames(self) -> int:
+        """The frames of a clip with the observed one."""
+        return self.config.model.clip.frames
+
+    def row(self, config: Config, *, memory: bool) -> Arrays:
+        """Score a trained row, or find it scored.
+
+        Args:
+            config: of its training.
+            memory: whether it is given its memory; if not, an empty one.
+
+        Raises:
+            UserError: its weights are absent or damaged, or what it imagines is not finite.
+        """
+        run = Path(config.train.run)
+        found = Partials(run / SCORES, file_hash(run / WEIGHTS), self.name)
+        piece = "memory" if memory else "empty"
+        kept = found.get(piece)
+        if kept is not None:
+            return kept
+        laid = lay(self.protocol, config)
+        batch, context = self.config.evaluate.batch, self.config.data.context
+        model = Imagination(laid, load_finished(run)[1], batch, context, self.say)
+
+        def imagine(context: Frames, control: Any, camera: Camera, seeds_B2: np.ndarray) -> Frames:
+            del camera
+            return model.run(context, control, seeds_B2, memory=memory)[2]
+
+        return found.put(piece, **self._score(imagine, f"scoring {run.name} ({piece})"))
+
+    def baseline(self, name: str, out: Path) -> Arrays:
+        """Score ``reproject`` or ``copy``, which have no network, or find it scored."""
+        found = Partials(out / SCORES, "no weights", self.name)
+        kept = found.get(name)
+        if kept is not None:
+            return kept
+        if name == "reproject":
+            chosen = choose_settings(self.config, found, self.say).settings
+
+        def imagine(context: Frames, control: Any, camera: Camera, seeds_B2: np.ndarray) -> Frames:
+            del control, seeds_B2
+            if name == "copy":
+                return copy_last(context, camera.intrinsics_4.shape[1])
+            return reproject_batch(chosen, context, camera)
+
+        return found.put(name, **self._score(imagine, f"scoring {name}"))
+
+    def truth(self, out: Path) -> Arrays:
+        """Return the truth's own logits, and the ceiling and floor of SRC."""
+        found = Partials(out / SCORES, "no weights", self.name)
+        kept = found.get("truth")
+        if kept is not None:
+            return kept
+        parts: dict[str, list[np.ndarray]] = {}
+        with Meter("the truth's own numbers", len(self.protocol.clips), "clips") as meter:
+            for batch in self.batches:
+                for key, values in self._truth_of(batch).items():
+                    parts.setdefault(key, []).append(values[: batch.real])
+                meter.advance(batch.real)
+        return found.put("truth", **{key: np.concatenate(each) for key, each in parts.items()})
+
+    def _truth_of(self, batch: Batch) -> Arrays:
+        video = _joined(batch.context, batch.targets)
+        values: dict[str, np.ndarray] = {}
+        if "fvd" in self.nets:
+            values["logits"] = self.nets["fvd"].features(video)
+        if SRC in self.nets:
+            back = _there_and_back(video, self.frames // 2)
+            score = self.nets[SRC].score(back, back)
+            values["src_ceiling"] = np.asarray(score.ceiling_B)
+            values["src_floor"] = np.asarray(score.floor_B)
+        return values
+
+    def _score(self, imagine: Model, label: str) -> Arrays:
+        parts: dict[str, list[np.ndarray]] = {}
+        half = (self.frames - 1) // 2
+        with Meter(label, len(self.protocol.clips), "clips") as meter:
+            for batch in self.batches:
+                seeds, camera = batch.seeds(self.config.evaluate.seeds[0]), batch.targets.camera
+                frames = imagine(batch.context, batch.control, camera, seeds)
+                values = {"sums": batch.sums(frames, self.nets.get("lpips_alex"))}
+                if "fvd" in self.nets:
+                    video = _joined(batch.context, frames)
+                    values["logits"] = self.nets["fvd"].features(video)
+                if SRC in self.nets:
+                    control = there_and_back(batch.control[:, :half])
+                    whole = jax.tree.map(
+                        lambda a, b: np.concatenate([a[:, -1:], b], 1), batch.context.camera, camera
+                    )
+                    there = jax.tree.map(lambda x: _there_and_back(x, half)[:, 1:], whole)
+                    walk = _joined(batch.context, imagine(batch.context, control, there, seeds))
+                    values["src"] = np.asarray(self.nets[SRC](walk, walk))
+                for key, value in values.items():
+                    parts.setdefault(key, []).append(value[: batch.real])
+                meter.advance(batch.real)
+        self.say(meter.summary())
+        return {key: np.concatenate(each) for key, each in parts.items()}
+
+
+def open_scorer(config: Config, out: Path, say: Callable[[str], Any]) -> Scorer:
+    """Fix what is scored, before anything is trained, and read it.
+
+    Args:
+        config: the settings that all rows share.
+        out: the folder of the table; its ``protocol.json`` is written, or followed.
+        say: shows a line.
+
+    Raises:
+        UserError: the data are absent or have changed, or another protocol lies there.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    protocol = protocol_file.write(config, out / PROTOCOL, say)
+    config = lay(protocol, config)
+    split = Path(config.data.path) / config.evaluate.split
+    episodes = EpisodeSource(split)
+    clips = decide(config, episodes, protocol, str(split))[1]
+    nets, left_out = _measures(config)
+    for sentence in left_out.values():
+        say(sentence)
+    size = config.evaluate.batch
+    batches = []
+    with Meter("reading held-out clips", len(clips), "clips") as meter:
+        for first in range(0, len(clips), size):
+            some = clips[first : first + size]
+            batches.append(load_batch(config, episodes, some, first, cameras=False))
+            meter.advance(len(some))
+    facts = {
+        "protocol": protocol.sha256,
+        "seed": config.evaluate.seeds[0],
+        "sampler": config.model.noise.sample_steps,
+        "nets": {name: getattr(net, "sha256", name) for name, net in nets.items()},
+    }
+    name = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+    return Scorer(config, protocol, tuple(batches), nets, left_out, name, say)
+
+
+def _measures(config: Config) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the measures that need weights and can be taken, and why others cannot."""
+    nets, left_out = load_all(NETWORKS)
+    clip = config.model.clip
+    small = min(clip.height, clip.width) < LEAST["alex"]
+    for name in ("lpips_alex", SRC) if small else ():
+        if nets.pop(name, None) is not None:
+            size = f"{LEAST['alex']} pixels each way and these have {clip.width} × {clip.height}"
+            left_out[name] = f"{name} is left out: AlexNet needs pictures of {size}."
+    for name in ("fvd", "kvd") if clip.frames < SHORTEST else ():
+        if nets.pop(name, None) is not None:
+            size = f"{SHORTEST} frames or more, and these have {clip.frames}"
+            left_out[name] = f"{name} is left out: I3D needs clips of {size}."
+    return nets, left_out
+
+
+def _joined(context: Frames, frames: Frames) -> np.ndarray:
+    """Return the observed frame and those after it, (B, N + 1, H, W, 3) float32 in [−1, 1]."""
+    parts = (_signal(context.rgb_THWC[:, -1:]), _signal(frames.rgb_THWC))
+    return np.concatenate(parts, 1)
+
+
+def _signal(rgb: Any) -> np.ndarray:
+    rgb = np.asarray(rgb)
+    return rgb.astype(np.float32) / 127.5 - 1 if rgb.dtype == np.uint8 else rgb.astype(np.float32)
+
+
+def _there_and_back(x_BT: Any, half: int) -> np.ndarray:
+    """Return frames 0 … half and back to 0 again, (B, 2 half + 1, …)."""
+    x = np.asarray(x_BT)
+    return np.concatenate([x[:, : half + 1], x[:, :half][:, ::-1]], 1)

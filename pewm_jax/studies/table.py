@@ -1,0 +1,155 @@
+"""Table 1 as numbers: means with intervals over houses, paired differences, training seeds."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.evaluation import intervals
+from pewm_jax.evaluation.images import MASKS
+from pewm_jax.evaluation.statistics import scores
+from pewm_jax.studies.scorer import SRC, Arrays
+
+SETS = ("fvd", "kvd")
+"""Measures of whole sets of clips, which have no number per clip."""
+LOWER = ("lpips", "depth_mae", "depth_rel", *SETS)
+"""Measures of which less is better."""
+CHAIN = (
+    "none",
+    "images-attend",
+    "voxel-attend-without_depth",
+    "map2d-attend",
+    "voxel-attend-sinusoid",
+)
+"""The paper's order, worst first."""
+AGAINST = ("none", "voxel-attend-sinusoid", "voxel-attend", "reproject")
+"""What every row is compared with, clip by clip."""
+
+
+def by_clip(arrays: Arrays) -> dict[str, np.ndarray]:
+    """Return a number per clip of each measure, (C,), under names such as ``psnr/seen``."""
+    found = {
+        f"{metric}/{mask}": values
+        for mask, by_metric in scores(arrays["sums"].sum(1)).items()
+        for metric, values in by_metric.items()
+        if metric != "lpips" or mask == MASKS[-1]
+    }
+    if "src" in arrays:
+        found["src"] = arrays["src"]
+    return found
+
+
+def per_frame(arrays: Arrays) -> dict[str, np.ndarray]:
+    """Return PSNR of each frame, (C, T), by mask."""
+    return {f"psnr/{mask}": found["psnr"] for mask, found in scores(arrays["sums"]).items()}
+
+
+def summary(
+    pieces: Mapping[str, Sequence[Arrays]],
+    truth: Arrays,
+    houses_C: np.ndarray,
+    nets: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Turn scores into the numbers of the table.
+
+    Args:
+        pieces: row → its scores, one for each training seed; methods without a network have one.
+        truth: from ``Scorer.truth``.
+        houses_C: the number of each clip's house.
+        nets: the measures that need weights.
+
+    Returns:
+        ``rows[name]``: ``seeds``; ``measures[name]`` as ``intervals.entry`` (training seeds are
+        averaged within a clip), with ``over_seeds`` where there are several; ``per_frame``; ``fvd``
+        and ``kvd`` with ``per_seed``. ``floors``; and ``differences[against][row][measure]``,
+        paired, row − against, with both intervals.
+    """
+    values = {name: _stacked([by_clip(each) for each in group]) for name, group in pieces.items()}
+    rows: dict[str, Any] = {}
+    for name, group in pieces.items():
+        frames = _stacked([per_frame(each) for each in group])
+        rows[name] = {
+            "seeds": len(group),
+            "measures": {
+                measure: _entry(values_KC, houses_C) for measure, values_KC in values[name].items()
+            },
+            "per_frame": {
+                measure: intervals.entry(values_KCT.mean(0), houses_C)
+                for measure, values_KCT in frames.items()
+            },
+        }
+        for kind in SETS:
+            if kind in nets and "logits" in truth:
+                rows[name]["measures"][kind] = _set_distance(nets[kind], group, truth)
+    floors: dict[str, Any] = {}
+    if "src_floor" in truth:
+        floors[SRC] = {
+            "floor": float(truth["src_floor"].mean()),
+            "ceiling": float(truth["src_ceiling"].mean()),
+        }
+    for kind in SETS:
+        if kind in nets and "logits" in truth:
+            score = nets[kind].score(truth["logits"], truth["logits"])
+            floors[kind] = {"floor": score.facts()["floor"], "half_clips": score.half_clips}
+    differences = {
+        against: {
+            name: _differences(values[name], values[against], houses_C)
+            for name in pieces
+            if name != against
+        }
+        for against in AGAINST
+        if against in pieces
+    }
+    chain = [name for name in CHAIN if name in pieces]
+    order = [
+        {
+            "worse": worse,
+            "better": better,
+            "differences": _differences(values[better], values[worse], houses_C),
+        }
+        for worse, better in itertools.pairwise(chain)
+    ]
+    return {"rows": rows, "floors": floors, "differences": differences, "order": order}
+
+
+def _stacked(each: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Join the numbers of training seeds along a first axis."""
+    return {key: np.stack([one[key] for one in each]) for key in each[0]}
+
+
+def _entry(values_KC: np.ndarray, houses_C: np.ndarray) -> dict[str, Any]:
+    found = intervals.entry(values_KC.mean(0), houses_C)
+    per_seed = [float(intervals.over_houses(one_C, houses_C)["mean"]) for one_C in values_KC]
+    if np.isfinite(per_seed).all():
+        found["per_seed"] = per_seed
+        found["over_seeds"] = intervals.over_seeds(per_seed)
+    return found
+
+
+def _set_distance(net: Any, group: Sequence[Arrays], truth: Arrays) -> dict[str, Any]:
+    """Return FVD or KVD of each training seed, their mean and Student's interval."""
+    per_seed = [float(net.distance(each["logits"], truth["logits"])) for each in group]
+    over = intervals.over_seeds(per_seed)
+    return {"mean": over["mean"], "per_seed": per_seed, "over_seeds": over}
+
+
+def _differences(
+    first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray], houses_C: np.ndarray
+) -> dict[str, Any]:
+    """Return first − second, clip by clip; what has no training seeds counts for each."""
+    found = {}
+    for measure in first:
+        if measure not in second:
+            continue
+        a_KC, b_KC = first[measure], second[measure]
+        found[measure] = intervals.entry(a_KC.mean(0) - b_KC.mean(0), houses_C)
+        means = [
+            [float(intervals.over_houses(one_C, houses_C)["mean"]) for one_C in group]
+            for group in (a_KC, b_KC)
+        ]
+        if np.isfinite(np.concatenate(means)).all() and min(map(len, means)) > 1:
+            found[measure]["over_seeds"] = intervals.over_seeds(*means)
+    return found

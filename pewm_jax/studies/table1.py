@@ -1,0 +1,186 @@
+"""Table 1 by one command: which memory works? Everything is kept, and found again.
+
+The order is: fix what is scored, time the trainings, then seed by seed train and score every row;
+after each seed the table is written, so that it is there early and grows more certain.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from pewm_jax import atomic
+from pewm_jax.config import Config, UserError
+from pewm_jax.evaluation import intervals
+from pewm_jax.studies import rows as table_rows
+from pewm_jax.studies import table, table_page
+from pewm_jax.studies.rows import Row
+from pewm_jax.studies.scorer import BASELINES, Arrays, Scorer, open_scorer
+from pewm_jax.studies.trainings import Study, backbone_of, planned, settings, train
+from pewm_jax.worlds.pewm import STAGES
+
+RESULTS, HOURS = "results.json", "hours.json"
+EMPTY = "backbone"
+"""The row of the backbone alone: what every row's weights give with an empty memory."""
+
+
+def run(
+    base: Config,
+    out: Path,
+    *,
+    minutes: tuple[float, float],
+    steps: tuple[int, int] | None = None,
+    seeds: Sequence[int] = (0, 1, 2),
+    only: Sequence[str] = (),
+    ablation: str = "",
+    values: tuple[str, ...] = (),
+    say: Callable[[str], Any] = print,
+) -> Path:
+    """Train and score the rows of Table 1, or of an ablation, and write the table.
+
+    Args:
+        base: the settings that all rows share, such as the preset ``table1``.
+        out: the folder that everything is kept in.
+        minutes: processor minutes of training steps, of a backbone and of a row.
+        steps: the numbers of steps instead: equal steps and not equal time.
+        seeds: of the trainings.
+        only: names of rows; by default all.
+        ablation: one of ``rows.ABLATIONS`` instead of the table.
+        values: of the ablation; by default its own.
+        say: shows a line.
+
+    Returns:
+        The path of the table in Markdown; beside it are ``.tex``, ``.csv``, ``.png`` and
+        ``results.json``.
+
+    Raises:
+        UserError: the data are absent or do not fit, a name is unknown, a training diverged.
+        Interrupted: what is done is kept; the same call goes on.
+    """
+    chosen = _rows(base, only, ablation, values)
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise UserError(f"seeds are {list(seeds)}: give each training seed once, one at least.")
+    study = Study(base, out, minutes, steps)
+    scorer = open_scorer(base, out, say)
+    plan = planned(study, chosen, say)
+    title = f"table1-{ablation}" if ablation else "table1"
+    pieces: dict[str, list[Arrays]] = {}
+    for name in BASELINES:
+        pieces[name] = [scorer.baseline(name, out)]
+    truth = scorer.truth(out)
+    page = out / f"{title}.md"
+    for number, seed in enumerate(seeds):
+        for row in chosen:
+            with _timed(out, f"seed{seed}/{row.name}"):
+                found = _one(study, scorer, row, seed, plan, say)
+            for name, arrays in found.items():
+                group = pieces.setdefault(name, [])
+                if len(group) == number:
+                    group.append(arrays)
+        numbers = table.summary(pieces, truth, scorer.house_of_clip, scorer.nets)
+        facts = _facts(study, scorer, chosen, plan, seeds[: number + 1], ablation)
+        results = {"about": facts, **numbers}
+        text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
+        atomic.write_text(out / f"{title}-{RESULTS}", text + "\n")
+        table_page.write(results, page)
+        say(f"{number + 1} of {len(seeds)} training seeds: {page}")
+    return page
+
+
+def _rows(
+    base: Config, only: Sequence[str], ablation: str, values: tuple[str, ...]
+) -> tuple[Row, ...]:
+    if ablation:
+        return table_rows.ablated(base, ablation, values)
+    if values:
+        raise UserError("values are of an ablation: name one, or leave them out.")
+    every = table_rows.main_rows(base)
+    unknown = sorted(set(only) - {row.name for row in every})
+    if unknown:
+        names = ", ".join(row.name for row in every)
+        raise UserError(f"there are no rows {', '.join(unknown)}; choose of {names}.")
+    return tuple(row for row in every if not only or row.name in only)
+
+
+def _one(
+    study: Study, scorer: Scorer, row: Row, seed: int, plan: dict[str, Any], say: Callable
+) -> dict[str, Arrays]:
+    """Train and score a row; also its backbone, where that is a row of the table."""
+    config = train(study, row, seed, {name: entry["steps"] for name, entry in plan.items()}, say)
+    found = {row.name: scorer.row(config, memory=row.remembers)}
+    if row.depth:
+        before = settings(study, backbone_of(study.base, row), seed, plan[EMPTY]["steps"], start="")
+        found[EMPTY] = scorer.row(before, memory=False)
+    return found
+
+
+class _timed:  # noqa: N801  # used as a function
+    """Add up the hours that a piece took, over all calls, in ``hours.json``."""
+
+    def __init__(self, out: Path, name: str):
+        self.path, self.name = out / HOURS, name
+
+    def __enter__(self) -> None:
+        self.began, self.worked = time.monotonic(), time.process_time()
+
+    def __exit__(self, *error: object) -> None:
+        kept = read_hours(self.path)
+        wall, worked = kept.get(self.name, (0.0, 0.0))
+        wall += (time.monotonic() - self.began) / 3600
+        worked += (time.process_time() - self.worked) / 3600
+        kept[self.name] = (wall, worked)
+        atomic.write_text(self.path, json.dumps(kept, indent=1) + "\n")
+
+
+def read_hours(path: Path) -> dict[str, tuple[float, float]]:
+    """Return for each piece its hours on the clock and of the processor."""
+    try:
+        return {name: (pair[0], pair[1]) for name, pair in json.loads(path.read_text()).items()}
+    except (FileNotFoundError, ValueError):
+        return {}
+
+
+def _facts(
+    study: Study,
+    scorer: Scorer,
+    rows: Sequence[Row],
+    plan: dict[str, Any],
+    seeds: Sequence[int],
+    ablation: str,
+) -> dict[str, Any]:
+    """Return how the table was made."""
+    hours = read_hours(study.out / HOURS).values()
+    names = [EMPTY, *(row.name for row in rows)]
+    described = {
+        row.name: {
+            "label": row.label,
+            "paper": row.paper,
+            "depth": row.depth,
+            "times": row.times,
+            "parameters": table_rows.parameters(study.base, row.memory) if row.remembers else 0,
+            "settings": dataclasses.asdict(row.memory),
+        }
+        for row in rows
+    }
+    return {
+        "date": dt.datetime.now(dt.UTC).date().isoformat(),
+        "ablation": ablation,
+        "seeds": list(seeds),
+        "minutes": list(study.minutes) if study.steps is None else None,
+        "trainings": {name: plan[name] for name in names if name in plan},
+        "rows": described,
+        "protocol_sha256": scorer.protocol.sha256,
+        "clips": len(scorer.protocol.clips),
+        "houses": len(set(scorer.house_of_clip.tolist())),
+        "frames": scorer.frames,
+        "context": scorer.config.data.context,
+        "batch": STAGES[0].settings(study.base).batch,
+        "left_out": dict(scorer.left_out),
+        "hours": {"clock": sum(pair[0] for pair in hours), "cpu": sum(p[1] for p in hours)},
+        "how": intervals.how(),
+    }

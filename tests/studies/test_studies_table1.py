@@ -1,0 +1,211 @@
+"""Table 1: the whole of it on a tiny setting, its rows, equal time, and what its numbers mean."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from pewm_jax import presets
+from pewm_jax.commands import table1 as command
+from pewm_jax.config import AttentionConfig, UserError
+from pewm_jax.data.__main__ import main as data_command
+from pewm_jax.evaluation.images import MASKS, SUMS
+from pewm_jax.geometry.actions import integrate, there_and_back
+from pewm_jax.geometry.cameras import pose_from_yaw
+from pewm_jax.studies import rows, scorer, table, table1, table_page, trainings
+
+SIZE = ["--size", "16", "--frames", "30"]
+
+
+ROWS = ("none", "voxel-attend-without_depth", "voxel-attend-sinusoid", "surfels-render")
+"""One of each kind: no memory, another backbone, attention, rendering."""
+
+
+def small(data):
+    """The preset of the tests, made smaller still."""
+    base = presets.load("tiny")
+    backbone = dataclasses.replace(base.model.backbone, layers=1, heads=1)
+    memory = dataclasses.replace(base.model.memory, reader=AttentionConfig(heads=4, head_dim=8))
+    return dataclasses.replace(
+        base.with_model(backbone=backbone, memory=memory),
+        data=dataclasses.replace(base.data, path=str(data), prepared=4),
+        evaluate=dataclasses.replace(base.evaluate, clips=4),
+    )
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A whole table, one seed, two steps of each training, and what was said on the way."""
+    folder = tmp_path_factory.mktemp("table1")
+    few = ["--train", "2", "--validation", "0", "--test", "2"]
+    assert data_command(["collect", str(folder / "data"), *few, *SIZE]) == 0
+    said = []
+    page = table1.run(
+        small(folder / "data"),
+        folder / "out",
+        minutes=(1, 1),
+        steps=(2, 2),
+        seeds=[0],
+        only=ROWS,
+        say=said.append,
+    )
+    return folder, page, said
+
+
+def test_the_whole_table_is_made(made):
+    _, page, said = made
+    text = page.read_text()
+    results = json.loads((page.parent / "table1-results.json").read_text())
+    assert set(results["rows"]) == {*ROWS, "backbone", "reproject", "copy"}
+    for name in results["rows"]:
+        assert f"\n| {table_page.label(results, name)} | " in text
+        assert np.isfinite(results["rows"][name]["measures"]["psnr/all"]["mean"])
+    assert "512 × 512 pictures of scanned houses" in text  # what is not comparable
+    assert "lpips_alex is left out: " in text
+    assert any(line.startswith("fvd is left out: ") for line in said)
+    blind = next(line for line in text.splitlines() if "without depth |" in line)
+    assert blind.endswith("| – |")
+    with page.with_suffix(".csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert {line["row"] for line in lines} == set(results["rows"])
+    tex = page.with_suffix(".tex").read_text()
+    assert tex.count(r"\\") == len(results["rows"]) + 1
+    assert page.with_suffix(".png").stat().st_size > 0
+    assert results["about"]["hours"]["clock"] > 0
+
+
+def test_what_is_done_is_not_done_again(made):
+    folder = made[0]
+    files = sorted((folder / "out").glob("seed0/*/*.safetensors"))
+    files += sorted((folder / "out").rglob("*.npz"))
+    before = [file.stat().st_mtime_ns for file in files]
+    said = []
+    table1.run(
+        small(folder / "data"),
+        folder / "out",
+        minutes=(1, 1),
+        steps=(2, 2),
+        seeds=[0],
+        only=ROWS,
+        say=said.append,
+    )
+    assert [file.stat().st_mtime_ns for file in files] == before
+    assert len(files) >= 2 * len(ROWS)
+    assert not any("compil" in line for line in said)
+
+
+def test_all_rows_start_from_one_backbone_and_keep_it(made):
+    from pewm_jax import tree, weights
+
+    out = made[0] / "out" / "seed0"
+    before = tree.flatten(weights.load(out / "backbone" / "weights.safetensors"))
+    for name in ("voxel-attend-sinusoid", "surfels-render"):
+        after = tree.flatten(weights.load(out / name / "weights.safetensors"))
+        assert all(np.array_equal(after[leaf], value) for leaf, value in before.items())
+        assert any(leaf.startswith("memory/") for leaf in after)
+
+
+def test_rows_have_about_the_same_parameters_and_the_same_extent():
+    base = presets.load("table1")
+    every = rows.main_rows(base)
+    counts = {row.name: rows.parameters(base, row.memory) for row in every if row.remembers}
+    assert max(counts.values()) <= 1.07 * min(counts.values()), counts
+    for row in every:
+        size = np.multiply(row.memory.cell_m, row.memory.cells)
+        np.testing.assert_allclose(size, (32, 32, 16), atol=0.1)
+    assert {row.paper for row in every if row.paper} == set(table_page.PAPER)
+    assert set(table.CHAIN) <= {row.name for row in every}
+
+
+@pytest.mark.parametrize("name", rows.ABLATIONS)
+def test_an_ablation_varies_what_it_says_and_nothing_else(name):
+    base = presets.load("table1")
+    found = rows.ablated(base, name)
+    assert len(found) == len(rows.ABLATIONS[name].values) == len({row.name for row in found})
+    plain = {row.name: row for row in rows.main_rows(base)}
+    if name == "time":
+        assert found[0].memory == plain[rows.PAPER_FORM].memory
+        assert found[0].times == 4
+        return
+    voxel = plain["voxel-attend"].memory
+    varied = {"cell": {"cell_m", "cells"}, "extent": {"cells"}, "tokens": {"tokens"}}
+    for row in found:
+        if name in varied:
+            fields = {field.name for field in dataclasses.fields(voxel)}
+            differing = {f for f in fields if getattr(row.memory, f) != getattr(voxel, f)}
+            assert differing <= varied[name] | {"capacity"}
+            assert row.memory.cell_m[2] == voxel.cell_m[2]
+    assert any(row.memory == voxel for row in found)  # the table's own value is among them
+
+
+def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
+    base = presets.load("table1")
+    chosen = [row for row in rows.main_rows(base) if row.name in ("none", "voxel-attend")]
+    chosen += rows.ablated(base, "time")
+    seconds = {"backbone": 0.5, "none": 0.5, "voxel-attend": 1.0}
+    asked = []
+
+    def measured(study, which, say):
+        asked.extend(row.name for row in which)
+        return {row.name: seconds.get(row.name, 1.0) for row in which}
+
+    monkeypatch.setattr(trainings, "_measure", measured)
+    study = trainings.Study(base, tmp_path, (2, 1))
+    plan = trainings.planned(study, chosen, print)
+    steps = {name: entry["steps"] for name, entry in plan.items()}
+    assert steps["backbone"] == 2 * 60 / 0.5
+    assert (steps["none"], steps["voxel-attend"]) == (120, 60)
+    assert steps["voxel-attend-sinusoid-time_4"] == 240
+    assert trainings.planned(study, chosen, print) == plan
+    assert sorted(asked) == sorted(plan)  # each was timed once
+    longer = dataclasses.replace(study, minutes=(2, 2))
+    assert trainings.planned(longer, chosen[:1], print)["none"]["steps"] == 240
+
+
+def test_differences_are_paired_by_clip_and_seeds_are_averaged_first():
+    rng, houses = np.random.default_rng(0), np.array([0, 0, 1, 1, 2, 2])
+
+    def arrays(shift):
+        sums = np.ones((6, 2, len(MASKS), len(SUMS)))
+        sums[..., SUMS.index("squared")] = 10 ** -(shift + noise[:, None, None] / 10)
+        return {"sums": sums, "src": 50 + shift + 0 * noise}
+
+    noise = rng.normal(size=6)
+    pieces = {"none": [arrays(1.0), arrays(1.1)], "images-attend": [arrays(1.2), arrays(1.3)]}
+    found = table.summary(pieces, {}, houses, {})
+    gain = found["differences"]["none"]["images-attend"]["psnr/all"]
+    assert gain["mean"] == pytest.approx(2)
+    assert gain["low"] == pytest.approx(2)  # the same noise in both: paired away
+    assert found["rows"]["none"]["measures"]["psnr/all"]["per_seed"][1] == pytest.approx(
+        found["rows"]["none"]["measures"]["psnr/all"]["per_seed"][0] + 1
+    )
+    (step,) = found["order"]
+    assert (step["worse"], step["better"]) == ("none", "images-attend")
+    assert step["differences"]["psnr/all"]["over_seeds"]["mean"] == pytest.approx(2)
+    spread = found["rows"]["none"]["measures"]["psnr/all"]
+    assert spread["low"] < spread["mean"] < spread["high"]
+
+
+def test_the_walk_back_passes_the_same_cameras():
+    actions = np.array([[0.2, 0.1, 0.3]] * 4)
+    start = pose_from_yaw(np.zeros(3), 0.4)
+    out = np.asarray(integrate(start, actions))[None]
+    walk = np.asarray(integrate(start, there_and_back(actions)))
+    np.testing.assert_allclose(walk, scorer._there_and_back(out, 4)[0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--rows", "nothing"], "there are no rows nothing; choose of none, "),
+        (["--values", "3"], "values are of an ablation"),
+        (["--ablate", "cell", "--values", "wide"], "the ablation cell cannot take 'wide'"),
+        (["--seeds", "1", "1"], "give each training seed once"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):
+    with pytest.raises(UserError, match=words):
+        command.main([*argv, "--out", str(tmp_path / "out"), "--data", str(tmp_path / "none")])
+    assert not (tmp_path / "out" / "protocol.json").exists()
