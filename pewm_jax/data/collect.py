@@ -35,7 +35,7 @@ def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
         raise UserError(f"{config.out} is a file; give a folder to write the dataset to.")
     wanted = [split for split in SPLITS if config.episodes(split)]
     settings = {split: settings_of(config, split) for split in wanted}
-    states = {
+    states: dict[str, unfinished.State] = {
         split: unfinished.examine(config.out / split, settings[split], overwrite=config.overwrite)
         for split in wanted
     }
