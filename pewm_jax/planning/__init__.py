@@ -6,7 +6,7 @@ it acts, and how it chooses.
 Places, in reading order:
 
 * ``house_config``, ``tasks``, ``house``: the environment ``pewm_jax/House-v0``, a Gymnasium
-  environment over the library's renderer, with goals;
+  environment over the library's renderer, with goals; ``oracle`` knows the way;
 * ``observations``: what environments show, and observations as the frames that worlds take;
 * ``imagined``, ``imagined_env``: any world as an environment, as pure functions and as a Gymnasium
   environment that looks like a house;

@@ -31,6 +31,7 @@ import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.data.make_episode import SPLITS
+from pewm_jax.data.navigation import NavGrid
 from pewm_jax.data.simulator import Simulator, move, open_simulator
 from pewm_jax.planning import observations, scores, tasks
 from pewm_jax.planning.extra import gymnasium
@@ -111,7 +112,8 @@ class HouseEnv(gymnasium.Env):
         Raises:
             UserError: an action that is not of the space, or there is no episode.
         """
-        if self._task is None or self._over:
+        task = self._task
+        if task is None or self._over:
             raise UserError("step() was called outside of an episode: call reset() first.")
         moved = observations.require_action(self.config, action)
         before = self._planar
@@ -120,7 +122,7 @@ class HouseEnv(gymnasium.Env):
         )
         self._steps += 1
         self._walked += float(np.linalg.norm(self._planar[:2] - before[:2]))
-        nearer, self._left = self._left, self._task.ways.length(self._planar[:2])
+        nearer, self._left = self._left, task.ways.length(self._planar[:2])
         nearer -= self._left
         self._look()
         info = self._info()
@@ -138,8 +140,7 @@ class HouseEnv(gymnasium.Env):
         """
         if self.render_mode is None:
             return None
-        if self._task is None:
-            raise UserError("render() was called before the first reset().")
+        _ = self.task
         return self._seen.rgb_THWC[0].copy()
 
     def look_around(self) -> Frames:
@@ -150,10 +151,8 @@ class HouseEnv(gymnasium.Env):
         Raises:
             UserError: before the first ``reset``.
         """
-        if self._task is None:
-            raise UserError("look_around() was called before the first reset().")
         turns = max(1, round(360 / self.config.turn_deg))
-        planar = np.tile(self._planar, (turns, 1))
+        planar = np.tile(self.planar, (turns, 1))
         planar[:-1, 2] += 2 * np.pi * np.arange(1, turns) / turns
         return self._simulator.frames(planar)
 
@@ -163,9 +162,34 @@ class HouseEnv(gymnasium.Env):
         Raises:
             UserError: before the first ``reset``.
         """
-        if self._task is None:
-            raise UserError("goal_frame() was called before the first reset().")
+        _ = self.task
         return self._goal
+
+    @property
+    def grid(self) -> NavGrid:
+        """Return where the agent can stand; the cell of its centre is always free."""
+        return self._simulator.grid
+
+    @property
+    def task(self) -> tasks.Task:
+        """Return the episode's task.
+
+        Raises:
+            UserError: before the first ``reset``.
+        """
+        if self._task is None:
+            raise UserError("the house has no episode yet: call reset() first.")
+        return self._task
+
+    @property
+    def planar(self) -> np.ndarray:
+        """Return a copy of where the agent is: x, y, yaw in (−π, π], float64.
+
+        Raises:
+            UserError: before the first ``reset``.
+        """
+        _ = self.task
+        return self._planar.copy()
 
     def _open(self, house: int) -> Simulator:
         config = self.config
@@ -183,8 +207,7 @@ class HouseEnv(gymnasium.Env):
         self._seen = self._simulator.frames(self._planar[None])
 
     def _observation(self) -> dict[str, np.ndarray]:
-        assert self._task is not None
-        goal = observations.goal_in_frame(self._planar, self._task.goal_3[:2])
+        goal = observations.goal_in_frame(self._planar, self.task.goal_3[:2])
         if self.config.task == "image":
             goal = self._goal.rgb_THWC[0].copy()
         return {
@@ -195,8 +218,8 @@ class HouseEnv(gymnasium.Env):
         }
 
     def _info(self) -> dict[str, Any]:
-        assert self._task is not None
-        goal, config = self._task.goal_3, self.config
+        task, config = self.task, self.config
+        goal = task.goal_3
         turned = scores.yaw_error(self._planar, goal)
         success = self._left <= config.success_m and np.degrees(turned) <= config.success_deg
         return {
@@ -207,8 +230,8 @@ class HouseEnv(gymnasium.Env):
             "collision": self._collided,
             "steps": self._steps,
             "path_length": self._walked,
-            "shortest_path": self._task.shortest_m,
-            "spl": scores.spl(success, self._task.shortest_m, self._walked),
+            "shortest_path": task.shortest_m,
+            "spl": scores.spl(success, task.shortest_m, self._walked),
             "goal_pose": self._goal.camera.world_from_camera[0].copy(),
             "scene": self._simulator.scene.name,
         }

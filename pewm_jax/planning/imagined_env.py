@@ -67,13 +67,18 @@ class WorldModelEnv(gymnasium.Env):
             render_mode: None or "rgb_array".
 
         Raises:
-            UserError: the render mode is not known.
+            UserError: the render mode is not known, or the world has no actions.
         """
         if render_mode not in (None, "rgb_array"):
             raise UserError(f"the world has no render_mode {render_mode!r}; there is 'rgb_array'.")
         self._model = model.model if isinstance(model, Config) else model
         self._params = params
-        clip, actions = self._model.clip, self._model.actions
+        clip, actions = (getattr(self._model, name, None) for name in ("clip", "actions"))
+        if clip is None or actions is None:
+            raise UserError(
+                f"a {type(self._model).__name__} is no world to walk in: it has no actions; give "
+                "one that imagines, such as pewm_jax.load('small')."
+            )
         self.config = dataclasses.replace(
             house or HouseConfig(),
             height=clip.height,
