@@ -56,7 +56,7 @@ class CollectEnvConfig:
     policy: str = ""
     """MODULE:FUNCTION, from observation to action; empty: random actions that persist."""
     persistence: float = 0.7
-    """Without a policy: probability of doing once more what was done last."""
+    """Without a policy: probability of doing once more what was done last, if it had an effect."""
     train: int = 320
     """Episodes to train on."""
     validation: int = 8
@@ -169,6 +169,8 @@ def _walk(
                 f"--env {config.env} changed its intrinsics or image size within an episode: an "
                 "episode has one camera."
             )
+        if isinstance(act, _Persistent) and np.array_equal(frame["pose"], seen[-1]["pose"]):
+            act.forget()  # what was done had no effect: it stands before a wall
         seen.append(frame)
         if terminated or truncated:
             break
@@ -239,6 +241,10 @@ class _Persistent:
         if self._last is None or self._rng.random() >= self._persistence:
             self._last = self._space.sample()
         return self._last
+
+    def forget(self) -> None:
+        """Draw the next action anew."""
+        self._last = None
 
 
 def open_env(config: CollectEnvConfig) -> Any:

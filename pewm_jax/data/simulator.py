@@ -23,7 +23,7 @@ from pewm_jax.data.trajectories import advance
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera, Frames
 
-KEPT = 4
+KEPT_HOUSES, KEPT_MESHES = 16, 2
 """Scenes kept in memory by a process, so that environments of one scene share it."""
 
 
@@ -143,13 +143,13 @@ def _passable(grid: NavGrid, start_xy: np.ndarray, end_xy: np.ndarray) -> bool:
     return line_is_free(grid, start_xy, end_xy) and bool(is_free(grid, end_xy))
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=KEPT_HOUSES)
 def _house(seed: int, camera_height: float) -> tuple[Scene, NavGrid]:
     scene = house(seed)
     return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
 
 
-@functools.lru_cache(maxsize=KEPT)
+@functools.lru_cache(maxsize=KEPT_MESHES)
 def _mesh(
     path: Path, changed: int, up: Literal["auto", "y", "z"], camera_height: float
 ) -> tuple[Scene, NavGrid]:
