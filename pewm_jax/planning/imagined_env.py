@@ -9,7 +9,8 @@ step is the metres by which it brought the agent nearer to the goal in a straigh
 of that cost, and the goal is reached where it is at most ``cost_at_most``.
 
 ``info`` holds ``position_error``, ``yaw_error``, ``success``, ``steps``, ``path_length`` and
-``goal_pose`` as the house does, and ``cost`` where one is given. There are no collisions.
+``goal_pose`` as the house does, and ``cost`` where one is given. There are no collisions, and a
+goal on the other side of a wall may count as reached.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
-from pewm_jax.config import Config, UserError
+from pewm_jax import worlds
+from pewm_jax.config import Config, UserError, WorldSettings
 from pewm_jax.data.episodes import DEPTH_LIMIT_M
 from pewm_jax.models.signals import rgb_from_signal
 from pewm_jax.planning import imagined, observations, scores
@@ -46,7 +48,7 @@ class WorldModelEnv(gymnasium.Env):
 
     def __init__(
         self,
-        model: Config,
+        model: Config | WorldSettings,
         params: Params,
         house: HouseConfig | None = None,
         *,
@@ -71,13 +73,13 @@ class WorldModelEnv(gymnasium.Env):
         """
         if render_mode not in (None, "rgb_array"):
             raise UserError(f"the world has no render_mode {render_mode!r}; there is 'rgb_array'.")
-        self._model = model.model if isinstance(model, Config) else model
-        self._params = params
-        clip, actions = (getattr(self._model, name, None) for name in ("clip", "actions"))
+        self._model, self._params = model, params
+        world = worlds.model_of(model)
+        clip, actions = (getattr(world, name, None) for name in ("clip", "actions"))
         if clip is None or actions is None:
             raise UserError(
-                f"a {type(self._model).__name__} is no world to walk in: it has no actions; give "
-                "one that imagines, such as pewm_jax.load('small')."
+                f"a {type(world).__name__} is no world to walk in: it has no actions; give one "
+                "that imagines, such as pewm_jax.load('small')."
             )
         self.config = dataclasses.replace(
             house or HouseConfig(),
