@@ -11,7 +11,8 @@ from pewm_jax.config import UserError
 USAGE = """usage: {prog} COMMAND …
 
 commands:
-  collect   walk an agent through houses and write what it sees as episodes
+  collect   walk an agent through houses and write what it sees as episodes; with
+            --env MODULE:NAME, through an environment of your own
   import    import a recording: a folder of colour, depth and a trajectory
   validate  check a dataset: files, counts, units, poses, geometry
   show      draw an episode as a contact sheet and its path from above
@@ -51,7 +52,11 @@ def _main(argv: Sequence[str], prog: str) -> int:
 def _run(command: str, flags: Sequence[str], prog: str) -> int:
     """Run one command; returns the exit code."""
     # Imported here and not above: help comes at once, and only collecting loads the renderer.
-    if command == "collect":
+    if command == "collect" and any(flag.split("=")[0] == "--env" for flag in flags):
+        from pewm_jax.data.collect_env import CollectEnvConfig, collect_env
+
+        collect_env(cli.parse_command(CollectEnvConfig, flags, f"{prog} --env"))
+    elif command == "collect":
         from pewm_jax.data.collect import collect
         from pewm_jax.data.make_episode import CollectConfig
 

@@ -34,7 +34,11 @@ HEADROOM_M = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class CollectConfig:
-    """Walk an agent through houses and write what it sees as episodes."""
+    """Walk an agent through houses and write what it sees as episodes.
+
+    With --env MODULE:NAME an environment of your own takes their place; `collect --env --help`
+    explains.
+    """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder to write; gets train/, validation/ and revisit/."""

@@ -201,26 +201,50 @@ def distance_field(grid: NavGrid, source_xy: np.ndarray) -> np.ndarray:
 
 
 def shortest_path(grid: NavGrid, start_xy: np.ndarray, goal_xy: np.ndarray) -> np.ndarray | None:
-    """Return (N, 2) world points from start to goal around obstacles.
+    """Return (N, 2) world points from start to goal around obstacles; see ``WaysTo.path``."""
+    return WaysTo(grid, goal_xy).path(start_xy)
 
-    Corners of the path are pulled tight wherever the straight line is free.
 
-    Returns:
-        The polyline, or None where start or goal is not in a free cell.
+class WaysTo:
+    """The shortest ways from everywhere to one goal; found once, then looked up.
+
+    Attributes:
+        grid: where the agent can stand.
+        goal_xy: (2,) the goal, metres.
+        distance_YX: (Y, X) metres to the goal from cell to cell, as ``distance_field``.
     """
-    ends = np.stack([np.asarray(start_xy, float), np.asarray(goal_xy, float)])
-    if not is_free(grid, ends).all():
-        return None
-    _, previous = _dijkstra(grid, ends[1])
-    width = grid.free_YX.shape[1]
-    row, column = grid.cell_of(ends[0])
-    node, nodes = int(row * width + column), []
-    while node >= 0:
-        nodes.append(node)
-        node = int(previous[node])
-    cells = np.stack(np.divmod(np.array(nodes), width), -1)
-    points = np.concatenate([ends[:1], grid.centre_of(cells[1:-1]), ends[1:]])
-    return _pull_tight(grid, points)
+
+    def __init__(self, grid: NavGrid, goal_xy: np.ndarray):
+        self.grid, self.goal_xy = grid, np.asarray(goal_xy, float)
+        self.distance_YX, self._previous = _dijkstra(grid, self.goal_xy)
+
+    def path(self, start_xy: np.ndarray) -> np.ndarray | None:
+        """Return (N, 2) world points from a start to the goal around obstacles.
+
+        Corners of the path are pulled tight wherever the straight line is free.
+
+        Returns:
+            The polyline, or None where start or goal is not in a free cell.
+        """
+        grid, ends = self.grid, np.stack([np.asarray(start_xy, float), self.goal_xy])
+        if not is_free(grid, ends).all():
+            return None
+        width = grid.free_YX.shape[1]
+        row, column = grid.cell_of(ends[0])
+        node, nodes = int(row * width + column), []
+        while node >= 0:
+            nodes.append(node)
+            node = int(self._previous[node])
+        cells = np.stack(np.divmod(np.array(nodes), width), -1)
+        points = np.concatenate([ends[:1], grid.centre_of(cells[1:-1]), ends[1:]])
+        return _pull_tight(grid, points)
+
+    def length(self, start_xy: np.ndarray) -> float:
+        """Return the length of ``path``, metres; infinite where there is none."""
+        path = self.path(start_xy)
+        if path is None:
+            return float("inf")
+        return float(np.linalg.norm(np.diff(path, axis=0), axis=-1).sum())
 
 
 def line_is_free(grid: NavGrid, start_xy: np.ndarray, end_xy: np.ndarray) -> bool:

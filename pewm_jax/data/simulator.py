@@ -1,0 +1,159 @@
+"""The simulator: an agent in a scene, from planar poses to posed RGB-D frames, and its collisions.
+
+This is what environments are made of. It holds no agent: a pose goes in, frames come out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pewm_jax.data.episodes import DEPTH_LIMIT_M
+from pewm_jax.data.lighting import require_embree
+from pewm_jax.data.make_episode import HEADROOM_M
+from pewm_jax.data.navigation import NavGrid, is_free, line_is_free, navigable
+from pewm_jax.data.render import render
+from pewm_jax.data.scenes import Scene, house, load_scene
+from pewm_jax.data.trajectories import advance
+from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+from pewm_jax.types import Camera, Frames
+
+KEPT_HOUSES, KEPT_MESHES = 16, 2
+"""Scenes kept in memory by a process, so that environments of one scene share it."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Simulator:
+    """A scene, where an agent can stand in it, and the agent's camera.
+
+    Attributes:
+        scene: the world.
+        grid: the cells in which the agent's centre may be.
+        intrinsics_4: (4,) fx, fy, cx, cy in pixels, centres at +0.5.
+        height: of the images, pixels.
+        width: of the images, pixels.
+        camera_height: above the floor, metres.
+    """
+
+    scene: Scene
+    grid: NavGrid
+    intrinsics_4: np.ndarray
+    height: int
+    width: int
+    camera_height: float
+
+    def world_from_camera(self, planar_3: np.ndarray) -> np.ndarray:
+        """Return the (4, 4) float32 level camera of a planar pose x, y, yaw."""
+        x, y, yaw = (float(value) for value in planar_3)
+        return pose_from_yaw(np.array([x, y, self.grid.floor_z + self.camera_height]), yaw)
+
+    def frames(self, planar_T3: np.ndarray) -> Frames:
+        """Render what is seen from planar poses.
+
+        Args:
+            planar_T3: (T, 3) x, y, yaw in the world, metres and radians.
+
+        Returns:
+            T NumPy frames: rgb uint8, depth in metres; 0 where nothing is hit, or beyond what
+            episodes can store (65.534 m).
+        """
+        poses = np.stack([self.world_from_camera(pose) for pose in np.asarray(planar_T3)])
+        intrinsics = np.tile(self.intrinsics_4, (len(poses), 1))
+        camera = Camera(intrinsics, poses)
+        seen = render(self.scene, camera, self.height, self.width)
+        depth = np.where(seen.depth_THW <= DEPTH_LIMIT_M, seen.depth_THW, np.float32(0))
+        return Frames(seen.rgb_THWC, depth, camera)
+
+
+def open_simulator(
+    *,
+    house_seed: int = 0,
+    scene: Path | None = None,
+    up: Literal["auto", "y", "z"] = "auto",
+    height: int = 64,
+    width: int = 64,
+    hfov: float = 90.0,
+    camera_height: float = 1.25,
+) -> Simulator:
+    """Open a mesh, or the generated house of a seed.
+
+    Args:
+        house_seed: seed of the house, where no mesh is given.
+        scene: a mesh (GLB, OBJ, PLY, …) in metres.
+        up: which axis of the mesh points up; ``auto``: y for GLB and glTF, z for the others.
+        height: of the images, pixels.
+        width: of the images, pixels.
+        hfov: horizontal field of view, degrees.
+        camera_height: above the floor, metres.
+
+    Raises:
+        UserError: there is no renderer, or a mesh does not load or has no place to stand.
+    """
+    require_embree()
+    world, grid = (
+        _house(house_seed, camera_height)
+        if scene is None
+        else _mesh(scene, scene.stat().st_mtime_ns if scene.is_file() else 0, up, camera_height)
+    )
+    intrinsics = intrinsics_from_fov(height, width, hfov)
+    return Simulator(world, grid, intrinsics, height, width, camera_height)
+
+
+def move(
+    grid: NavGrid, planar_3: np.ndarray, action_3: np.ndarray, *, sliding: bool = False
+) -> tuple[np.ndarray, bool]:
+    """Carry out an action where there is room for it: first move, then turn.
+
+    A move is made if the whole straight way is free. Otherwise the agent stays where it is, or
+    slides: of the two parts of the way along the grid's axes it goes the longer one that is free.
+    The turn is made in either case.
+
+    Args:
+        grid: where the agent can stand.
+        planar_3: x, y, yaw; x and y lie in a free cell.
+        action_3: dx, dy, dyaw: metres forward, metres left, radians counter-clockwise.
+        sliding: see above.
+
+    Returns:
+        ``(planar_3, collided)``: the next pose, yaw in (−π, π], in a free cell; and whether the
+        way was not free.
+    """
+    planar = np.asarray(planar_3, np.float64)
+    after = advance(planar, np.asarray(action_3, np.float64))
+    after[2] = math.pi - (math.pi - after[2]) % (2 * math.pi)
+    collided = not _passable(grid, planar[:2], after[:2])
+    if collided:
+        way, after[:2] = after[:2] - planar[:2], planar[:2]
+        for axis in np.argsort(-np.abs(way), kind="stable") if sliding else ():
+            there = planar[:2].copy()
+            there[axis] += way[axis]
+            if way[axis] and _passable(grid, planar[:2], there):
+                after[:2] = there
+                break
+    return after, collided
+
+
+def _passable(grid: NavGrid, start_xy: np.ndarray, end_xy: np.ndarray) -> bool:
+    """Tell whether the way is free, its end included whatever rounding does."""
+    return line_is_free(grid, start_xy, end_xy) and bool(is_free(grid, end_xy))
+
+
+@functools.lru_cache(maxsize=KEPT_HOUSES)
+def _house(seed: int, camera_height: float) -> tuple[Scene, NavGrid]:
+    scene = house(seed)
+    return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
+
+
+@functools.lru_cache(maxsize=KEPT_MESHES)
+def _mesh(
+    path: Path, changed: int, up: Literal["auto", "y", "z"], camera_height: float
+) -> tuple[Scene, NavGrid]:
+    """Open a mesh; one that has changed on disk is read again."""
+    del changed
+    scene = load_scene(path, up)
+    return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)

@@ -1,0 +1,237 @@
+"""``pewm_jax/House-v0``: an agent with an RGB-D camera in a house, which has to get somewhere.
+
+Reward of a step: the metres by which it brought the agent nearer to the goal, on foot (negative
+where it led away), and ``success_reward`` where it reached the goal. The sum over an episode that
+succeeds is the shortest distance at the start, less what was left, plus ``success_reward``.
+
+An episode ends where the goal is reached (``terminated``): nearer than ``success_m`` on foot and
+``success_deg`` in heading; it is cut off after ``max_steps`` (``truncated``).
+
+``info`` holds
+
+    geodesic_distance  metres to the goal on foot
+    position_error     metres to the goal, straight
+    yaw_error          radians between the heading and the goal's, from 0 to π
+    success            whether the goal is reached
+    collision          whether the last move was not free; the agent never leaves the free area
+    steps              steps made
+    path_length        metres walked
+    shortest_path      metres from start to goal on foot
+    spl                success weighted by path length (Anderson et al., arXiv:1807.06757)
+    goal_pose          (4, 4) the camera at the goal
+    scene              name of the scene
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from pewm_jax.config import UserError
+from pewm_jax.data.make_episode import SPLITS
+from pewm_jax.data.navigation import NavGrid
+from pewm_jax.data.simulator import Simulator, move, open_simulator
+from pewm_jax.planning import observations, scores, tasks
+from pewm_jax.planning.extra import gymnasium
+from pewm_jax.planning.house_config import HouseConfig, settings
+from pewm_jax.types import Frames
+
+
+class HouseEnv(gymnasium.Env):
+    """A house to walk in. ``gymnasium.make("pewm_jax/House-v0", **settings)`` makes one.
+
+    The same seed gives the same episode, bit for bit. Spaces: see ``planning.observations``.
+
+    Attributes:
+        config: the settings.
+        intrinsics_4: (4,) fx, fy, cx, cy of the camera, pixels, centres at +0.5.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 8}
+
+    def __init__(
+        self, config: HouseConfig | None = None, render_mode: str | None = None, **given: Any
+    ):
+        """Open the house.
+
+        Args:
+            config: the settings; or give them by name.
+            render_mode: None or "rgb_array".
+            given: settings of ``HouseConfig``.
+
+        Raises:
+            UserError: settings that cannot work, a mesh that does not load or has no place to
+                stand, or no renderer.
+        """
+        if render_mode not in (None, "rgb_array"):
+            raise UserError(f"House has no render_mode {render_mode!r}; there is 'rgb_array'.")
+        if config is not None and given:
+            raise UserError("House got a HouseConfig and settings beside it; give one of the two.")
+        self.config = settings(given) if config is None else config
+        self.render_mode = render_mode
+        self.observation_space = observations.observation_space(self.config)
+        self.action_space = observations.action_space(self.config)
+        self._simulator = self._open(self.config.house)
+        self.intrinsics_4 = self._simulator.intrinsics_4.copy()
+        self._task: tasks.Task | None = None
+        self._over = True
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: fixes everything random from here on.
+            options: none are known.
+
+        Raises:
+            UserError: the scene has no room for the task.
+        """
+        super().reset(seed=seed)
+        if options:
+            raise UserError(f"House.reset() knows no options, got {', '.join(options)}.")
+        config = self.config
+        if not config.scene and config.houses > 1:
+            number = int(self.np_random.integers(config.houses))
+            self._simulator = self._open(config.house + len(SPLITS) * number)
+        simulator = self._simulator
+        self._task = tasks.draw(config, simulator.grid, self.np_random, simulator.scene.name)
+        self._planar = self._task.start_3
+        self._goal = simulator.frames(self._task.goal_3[None])
+        self._steps, self._walked, self._collided, self._over = 0, 0.0, False, False
+        self._left = self._task.shortest_m
+        self._look()
+        return self._observation(), self._info()
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Carry out an action; see the module for reward, end and ``info``.
+
+        Raises:
+            UserError: an action that is not of the space, or there is no episode.
+        """
+        task = self._task
+        if task is None or self._over:
+            raise UserError("step() was called outside of an episode: call reset() first.")
+        moved = observations.require_action(self.config, action)
+        before = self._planar
+        self._planar, self._collided = move(
+            self._simulator.grid, before, moved, sliding=self.config.sliding
+        )
+        self._steps += 1
+        self._walked += float(np.linalg.norm(self._planar[:2] - before[:2]))
+        nearer, self._left = self._left, task.ways.length(self._planar[:2])
+        nearer -= self._left
+        self._look()
+        info = self._info()
+        success = info["success"]
+        truncated = not success and self._steps >= self.config.max_steps
+        self._over = success or truncated
+        reward = nearer + (self.config.success_reward if success else 0.0)
+        return self._observation(), reward, success, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """Return what is seen, (H, W, 3) uint8, with render mode "rgb_array".
+
+        Raises:
+            UserError: before the first ``reset``.
+        """
+        if self.render_mode is None:
+            return None
+        _ = self.task
+        return self._seen.rgb_THWC[0].copy()
+
+    def look_around(self) -> Frames:
+        """Return what the agent sees while it turns once around where it stands; nothing changes.
+
+        The last frame is the present one, so that a world started with them begins here.
+
+        Raises:
+            UserError: before the first ``reset``.
+        """
+        turns = max(1, round(360 / self.config.turn_deg))
+        planar = np.tile(self.planar, (turns, 1))
+        planar[:-1, 2] += 2 * np.pi * np.arange(1, turns) / turns
+        return self._simulator.frames(planar)
+
+    def goal_frame(self) -> Frames:
+        """Return the one frame that is seen at the goal.
+
+        Raises:
+            UserError: before the first ``reset``.
+        """
+        _ = self.task
+        return self._goal
+
+    @property
+    def grid(self) -> NavGrid:
+        """Return where the agent can stand; the cell of its centre is always free."""
+        return self._simulator.grid
+
+    @property
+    def task(self) -> tasks.Task:
+        """Return the episode's task.
+
+        Raises:
+            UserError: before the first ``reset``.
+        """
+        if self._task is None:
+            raise UserError("the house has no episode yet: call reset() first.")
+        return self._task
+
+    @property
+    def planar(self) -> np.ndarray:
+        """Return a copy of where the agent is: x, y, yaw in (−π, π], float64.
+
+        Raises:
+            UserError: before the first ``reset``.
+        """
+        _ = self.task
+        return self._planar.copy()
+
+    def _open(self, house: int) -> Simulator:
+        config = self.config
+        return open_simulator(
+            house_seed=house,
+            scene=Path(config.scene) if config.scene else None,
+            up=config.up,
+            height=config.height,
+            width=config.width,
+            hfov=config.hfov,
+            camera_height=config.camera_height,
+        )
+
+    def _look(self) -> None:
+        self._seen = self._simulator.frames(self._planar[None])
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        goal = observations.goal_in_frame(self._planar, self.task.goal_3[:2])
+        if self.config.task == "image":
+            goal = self._goal.rgb_THWC[0].copy()
+        return {
+            "rgb": self._seen.rgb_THWC[0].copy(),
+            "depth": self._seen.depth_THW[0].copy(),
+            "pose": self._seen.camera.world_from_camera[0].copy(),
+            "goal": goal,
+        }
+
+    def _info(self) -> dict[str, Any]:
+        task, config = self.task, self.config
+        goal = task.goal_3
+        turned = scores.yaw_error(self._planar, goal)
+        success = self._left <= config.success_m and np.degrees(turned) <= config.success_deg
+        return {
+            "geodesic_distance": self._left,
+            "position_error": scores.position_error(self._planar, goal),
+            "yaw_error": turned,
+            "success": bool(success),
+            "collision": self._collided,
+            "steps": self._steps,
+            "path_length": self._walked,
+            "shortest_path": task.shortest_m,
+            "spl": scores.spl(success, task.shortest_m, self._walked),
+            "goal_pose": self._goal.camera.world_from_camera[0].copy(),
+            "scene": self._simulator.scene.name,
+        }

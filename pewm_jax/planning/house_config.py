@@ -1,0 +1,127 @@
+"""The settings of the environment ``pewm_jax/House-v0``."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+from pewm_jax.config import ActionConfig, ConfigError
+from pewm_jax.config.errors import require
+
+
+@dataclasses.dataclass(frozen=True)
+class HouseConfig:
+    """Where an agent walks, what it sees, how it moves, and where it has to go."""
+
+    scene: str | Path = ""
+    """A mesh to walk in (GLB, OBJ, PLY, …), in metres; empty: a generated house."""
+    up: Literal["auto", "y", "z"] = "auto"
+    """Which axis of the mesh points up; `auto`: y for GLB and glTF, z for the others."""
+    house: int = 0
+    """Seed of the generated house. `pewm-jax data collect` trains on 0, 3, 6, …, watches training
+    on 1, 4, 7, … and tests on 2, 5, 8, …"""
+    houses: int = 1
+    """Each episode is in one of so many houses: `house`, `house` + 3, …, of one split all."""
+    height: int = 64
+    """Height of the images, pixels."""
+    width: int = 64
+    """Width of the images, pixels."""
+    hfov: float = 90.0
+    """Horizontal field of view, degrees."""
+    camera_height: float = 1.25
+    """Height of the camera above the floor, metres."""
+    actions: Literal["discrete", "continuous"] = "discrete"
+    """`discrete`: 0 forward, 1 turn left, 2 turn right. `continuous`: (dx, dy, dyaw), metres
+    forward, metres left, radians counter-clockwise."""
+    step_m: float = 0.25
+    """Length of a forward step, metres; continuous: the largest |dx| and |dy|."""
+    turn_deg: float = 30.0
+    """Angle of a turn, degrees; continuous: the largest |dyaw|."""
+    sliding: bool = False
+    """Where the way is not free: slide along the obstacle, instead of staying."""
+    task: Literal["point", "image"] = "point"
+    """What is known of the goal. `point`: where it is, seen from the agent. `image`: what is seen
+    there."""
+    min_distance_m: float = 1.0
+    """The goal is at least so far from the start, on foot, metres."""
+    max_distance_m: float = 30.0
+    """The goal is at most so far from the start, on foot, metres."""
+    success_m: float = 0.5
+    """The goal is reached this near to it, on foot, metres."""
+    success_deg: float = 180.0
+    """… and with a heading this near to the goal's, degrees; 180: any."""
+    success_reward: float = 2.5
+    """Reward for reaching the goal, beside that for coming nearer, 1 per metre."""
+    max_steps: int = 200
+    """An episode is cut off after so many steps."""
+
+    def __post_init__(self):
+        """Validate."""
+        for name in ("height", "width", "houses", "max_steps"):
+            value = getattr(self, name)
+            require(
+                isinstance(value, int) and value >= 1,
+                f"House.{name} is {value!r}: use a whole number from 1 on.",
+            )
+        require(
+            isinstance(self.house, int) and self.house >= 0,
+            f"House.house is {self.house!r}: use a whole number from 0 on.",
+        )
+        choices = {
+            "up": ("auto", "y", "z"),
+            "actions": ("discrete", "continuous"),
+            "task": ("point", "image"),
+        }
+        for name, known in choices.items():
+            value = getattr(self, name)
+            require(value in known, f"House.{name} is {value!r}: use {' or '.join(known)}.")
+        self._check_numbers()
+
+    def _check_numbers(self) -> None:
+        numbers = ("hfov", "camera_height", "success_m", "success_deg", "success_reward")
+        for name in (*numbers, "min_distance_m", "max_distance_m"):
+            value = getattr(self, name)
+            require(
+                isinstance(value, (int, float)) and math.isfinite(value),
+                f"House.{name} is {value!r}: use a number.",
+            )
+        _ = self.action_config
+        require(1 <= self.hfov < 180, f"House.hfov is {self.hfov}: use 1 up to below 180 degrees.")
+        require(
+            self.camera_height > 0,
+            f"House.camera_height is {self.camera_height}: use metres above 0.",
+        )
+        require(self.success_m > 0, f"House.success_m is {self.success_m}: use metres above 0.")
+        require(
+            0 < self.success_deg <= 180,
+            f"House.success_deg is {self.success_deg}: use degrees above 0, up to 180 (any).",
+        )
+        require(
+            self.success_m < self.min_distance_m <= self.max_distance_m,
+            f"House.min_distance_m is {self.min_distance_m} and max_distance_m is "
+            f"{self.max_distance_m}: the first must be above success_m ({self.success_m}), so that "
+            "no episode begins at its goal, and at most the second.",
+        )
+
+    @property
+    def action_config(self) -> ActionConfig:
+        """What one action does."""
+        return ActionConfig(self.step_m, self.turn_deg)
+
+
+def settings(given: dict[str, Any]) -> HouseConfig:
+    """Return settings from keyword arguments.
+
+    Raises:
+        ConfigError: a setting that does not exist, or has a value that cannot work.
+    """
+    known = [field.name for field in dataclasses.fields(HouseConfig)]
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1, 0.5)
+            meant = f" (did you mean {near[0]}?)" if near else ""
+            raise ConfigError(f"House has no setting {name!r}{meant}; there is {', '.join(known)}.")
+    return HouseConfig(**given)

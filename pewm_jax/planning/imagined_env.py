@@ -1,0 +1,217 @@
+"""A world as a Gymnasium environment with the spaces of ``pewm_jax/House-v0``.
+
+A policy that was written for the house runs in it unchanged: what it sees is imagined. An episode
+begins with frames that were really seen, in the house of the settings or given by the caller.
+
+Reward and goal differ from the house's, as walls are not known in imagination: the reward of a
+step is the metres by which it brought the agent nearer to the goal in a straight line, and
+``success_reward`` where it reached the goal. With a cost of one's own, the reward is the decrease
+of that cost, and the goal is reached where it is at most ``cost_at_most``.
+
+``info`` holds ``position_error``, ``yaw_error``, ``success``, ``steps``, ``path_length`` and
+``goal_pose`` as the house does, and ``cost`` where one is given. There are no collisions, and a
+goal on the other side of a wall may count as reached.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+
+from pewm_jax import worlds
+from pewm_jax.config import Config, UserError, WorldSettings
+from pewm_jax.data.episodes import DEPTH_LIMIT_M
+from pewm_jax.models.signals import rgb_from_signal
+from pewm_jax.planning import imagined, observations, scores
+from pewm_jax.planning.extra import gymnasium
+from pewm_jax.planning.house import HouseEnv
+from pewm_jax.planning.house_config import HouseConfig
+from pewm_jax.types import Frames, Params
+
+_reset = jax.jit(imagined.reset, static_argnums=0)
+_step = jax.jit(imagined.step, static_argnums=0)
+
+
+class WorldModelEnv(gymnasium.Env):
+    """A world to walk in, imagined; spaces and settings are the house's.
+
+    Attributes:
+        config: the settings, with the image size and the actions of the model.
+        intrinsics_4: (4,) of the camera that has seen the first frames.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 8}
+
+    def __init__(
+        self,
+        model: Config | WorldSettings,
+        params: Params,
+        house: HouseConfig | None = None,
+        *,
+        cost: Callable[[np.ndarray], float] | None = None,
+        cost_at_most: float = 0.0,
+        render_mode: str | None = None,
+    ):
+        """Take a trained world, as ``pewm_jax.load`` returns it.
+
+        Args:
+            model: the experiment; or the model's settings.
+            params: its parameters.
+            house: where episodes begin and what they ask for. Image size, step and turn are
+                replaced by the model's. The house opens at the first ``reset`` that needs it.
+            cost: the goal as a number: image (H, W, 3) uint8 → cost. By default the goal is a
+                pose.
+            cost_at_most: the goal is reached where the cost is at most this.
+            render_mode: None or "rgb_array".
+
+        Raises:
+            UserError: the render mode is not known, or the world has no actions.
+        """
+        if render_mode not in (None, "rgb_array"):
+            raise UserError(f"the world has no render_mode {render_mode!r}; there is 'rgb_array'.")
+        self._model, self._params = model, params
+        world = worlds.model_of(model)
+        clip, actions = (getattr(world, name, None) for name in ("clip", "actions"))
+        if clip is None or actions is None:
+            raise UserError(
+                f"a {type(world).__name__} is no world to walk in: it has no actions; give one "
+                "that imagines, such as pewm_jax.load('small')."
+            )
+        self.config = dataclasses.replace(
+            house or HouseConfig(),
+            height=clip.height,
+            width=clip.width,
+            step_m=actions.step_m,
+            turn_deg=actions.turn_deg,
+        )
+        self.render_mode = render_mode
+        self.observation_space = observations.observation_space(self.config)
+        self.action_space = observations.action_space(self.config)
+        self._cost, self._cost_at_most = cost, cost_at_most
+        self._house: HouseEnv | None = None
+        self._house_seed: int | None = None
+        self._state: imagined.ImaginedState | None = None
+        self._over = True
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode with what was really seen.
+
+        Args:
+            seed: fixes everything random from here on, the sampling noise too; the house's episode
+                is the one that it begins with this seed.
+            options: ``frames``: S ≥ 1 posed frames (an episode's, or ``frames_of`` of a house's
+                observations), with ``goal``: the one frame at the goal. Without options an episode
+                of the house begins, where the agent first looks around.
+
+        Raises:
+            UserError: the frames do not fit the model, or there is no goal.
+        """
+        super().reset(seed=seed)
+        self._house_seed = self._house_seed if seed is None else seed
+        frames, self._goal = self._begin(options or {})
+        self.intrinsics_4 = np.asarray(frames.camera.intrinsics_4[-1], np.float32)
+        self._key = jax.random.key(int(self.np_random.integers(2**31)))
+        state = _reset(self._model, self._params, frames, self._key)
+        self._steps, self._walked, self._over = 0, 0.0, False
+        self._look(imagined.observation(state))
+        self._state = state
+        self._left = self._measure()
+        return self._observation(), self._info()
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Imagine what is seen after an action; see the module for reward, end and ``info``.
+
+        Raises:
+            UserError: an action that is not of the space, or there is no episode.
+        """
+        if self._state is None or self._over:
+            raise UserError("step() was called outside of an episode: call reset() first.")
+        move = observations.require_action(self.config, action).astype(np.float32)
+        key = jax.random.fold_in(self._key, self._steps)
+        self._state, seen = _step(self._model, self._params, self._state, move, key)
+        before = self._seen["pose"]
+        self._look(seen)
+        self._steps += 1
+        self._walked += scores.position_error(before, self._seen["pose"])
+        nearer, self._left = self._left, self._measure()
+        info = self._info()
+        success = info["success"]
+        truncated = not success and self._steps >= self.config.max_steps
+        self._over = success or truncated
+        reward = nearer - self._left + (self.config.success_reward if success else 0.0)
+        return self._observation(), reward, success, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """Return what is seen, (H, W, 3) uint8, with render mode "rgb_array".
+
+        Raises:
+            UserError: before the first ``reset``.
+        """
+        if self.render_mode is None:
+            return None
+        if self._state is None:
+            raise UserError("render() was called before the first reset().")
+        return self._seen["rgb"].copy()
+
+    def _begin(self, options: dict[str, Any]) -> tuple[Frames, Frames]:
+        """Return the frames to begin with, and the one at the goal."""
+        unknown = options.keys() - {"frames", "goal"}
+        if unknown or (options and len(options) < 2):
+            raise UserError(
+                f"the world's reset() got the options {', '.join(sorted(options))}: give frames "
+                "(posed RGB-D frames) and goal (the one frame at the goal), or no options to begin "
+                "in the house."
+            )
+        if options:
+            return options["frames"], options["goal"]
+        if self._house is None:
+            self._house = HouseEnv(self.config)
+        self._house.reset(seed=self._house_seed)
+        self._house_seed = None
+        return self._house.look_around(), self._house.goal_frame()
+
+    def _look(self, seen: dict[str, Any]) -> None:
+        """Take over what is seen, within the space."""
+        found = {name: np.array(value) for name, value in seen.items()}
+        found["depth"] = np.clip(np.nan_to_num(found["depth"], posinf=0.0), 0, DEPTH_LIMIT_M)
+        self._seen = found
+
+    @property
+    def _goal_pose(self) -> np.ndarray:
+        return np.array(self._goal.camera.world_from_camera[-1], np.float32)
+
+    def _measure(self) -> float:
+        """Return what has to become small: the cost, or the distance to the goal."""
+        if self._cost is not None:
+            return float(self._cost(self._seen["rgb"]))
+        return scores.position_error(self._seen["pose"], self._goal_pose)
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        planar = observations.planar_of(self._seen["pose"])
+        goal = observations.goal_in_frame(planar, self._goal_pose[:2, 3])
+        if self.config.task == "image":
+            image = self._goal.rgb_THWC[-1]
+            whole = np.issubdtype(image.dtype, np.integer)
+            goal = np.array(image if whole else rgb_from_signal(image))
+        return {**{name: value.copy() for name, value in self._seen.items()}, "goal": goal}
+
+    def _info(self) -> dict[str, Any]:
+        pose, goal = self._seen["pose"], self._goal_pose
+        success = scores.success(pose, goal, self.config.success_m, self.config.success_deg)
+        info: dict[str, Any] = {
+            "position_error": scores.position_error(pose, goal),
+            "yaw_error": scores.yaw_error(pose, goal),
+            "success": success,
+            "steps": self._steps,
+            "path_length": self._walked,
+            "goal_pose": goal,
+        }
+        if self._cost is not None:
+            info |= {"cost": self._left, "success": self._left <= self._cost_at_most}
+        return info

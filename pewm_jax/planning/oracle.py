@@ -1,0 +1,113 @@
+"""An oracle for the house: it knows the map and walks a shortest way to the goal.
+
+It bounds what any policy can reach, and walks where demonstrations are wanted::
+
+    for action in oracle.actions(env):
+        observation, reward, terminated, truncated, info = env.step(action)
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.config import UserError
+from pewm_jax.data.simulator import move
+from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT, discrete_table
+from pewm_jax.planning import scores
+from pewm_jax.planning.extra import gymnasium
+from pewm_jax.planning.house import HouseEnv
+
+TURN_STEPS = 0.25
+"""Cost of a turn, in forward steps."""
+HURRY = 1.3
+"""Weight of what is left: above 1 the search is much faster, and its way a little longer."""
+SAME_M = 0.05
+"""Places this near to each other, with one heading, are one place to the search, metres."""
+
+
+def actions(env: gymnasium.Env) -> list[Any]:
+    """Return the actions that lead from where the agent is to the goal.
+
+    A* over forward steps and turns, guided by the distance on foot; as nothing in the house is
+    random, they reach it. In a house with continuous actions they are the rows of the discrete
+    table.
+
+    Args:
+        env: a house within an episode, wrapped or not.
+
+    Raises:
+        UserError: it is no house, no episode has begun, or steps of this length and angle do not
+            get there.
+    """
+    house = env.unwrapped
+    if not isinstance(house, HouseEnv):
+        raise UserError(f"the oracle knows the way in House alone, got a {type(house).__name__}.")
+    found = _search(house)
+    if house.config.actions == "discrete":
+        return found
+    return list(discrete_table(house.config.action_config)[found])
+
+
+def _search(house: HouseEnv) -> list[int]:
+    """Return discrete actions to the goal."""
+    config, ways = house.config, house.task.ways
+    table = discrete_table(config.action_config).astype(np.float64)
+    order = itertools.count()  # the heap never compares poses
+    start = house.planar
+    waiting = [(_estimate(house, start), next(order), 0.0, start, 0)]
+    came: dict[int, tuple[int, int]] = {}
+    numbers, closed = itertools.count(1), set()
+    while waiting:
+        _, _, cost, planar, number = heapq.heappop(waiting)
+        key = _key(planar, config.turn_deg)
+        if key in closed:
+            continue
+        closed.add(key)
+        # From cell to cell a way is up to 8 % longer; only where that is near is it measured.
+        row, column = house.grid.cell_of(planar[:2])
+        near = ways.distance_YX[row, column] <= 1.1 * config.success_m + 2 * house.grid.cell_m
+        near = near and ways.length(planar[:2]) <= config.success_m
+        turned = math.degrees(scores.yaw_error(planar, house.task.goal_3))
+        if near and turned <= config.success_deg:
+            return _traced(came, number)
+        for action in (FORWARD, TURN_LEFT, TURN_RIGHT):
+            after, collided = move(house.grid, planar, table[action], sliding=False)
+            if collided or _key(after, config.turn_deg) in closed:
+                continue
+            child, paid = next(numbers), cost + (1.0 if action == FORWARD else TURN_STEPS)
+            came[child] = (number, action)
+            waiting_for = paid + _estimate(house, after)
+            heapq.heappush(waiting, (waiting_for, next(order), paid, after, child))
+    raise UserError(
+        f"steps of {config.step_m:g} m and turns of {config.turn_deg:g} degrees do not lead to "
+        "this goal: use smaller ones, or a larger success_m and success_deg."
+    )
+
+
+def _estimate(house: HouseEnv, planar: np.ndarray) -> float:
+    """Return the forward steps that are left, from cell to cell."""
+    ways = house.task.ways
+    row, column = house.grid.cell_of(planar[:2])
+    left = float(ways.distance_YX[row, column]) - house.config.success_m
+    return HURRY * max(0.0, left) / house.config.step_m
+
+
+def _key(planar: np.ndarray, turn_deg: float) -> tuple[int, int, int]:
+    """Return what tells places and headings apart."""
+    around = max(1, round(360 / turn_deg))
+    heading = round(planar[2] / math.radians(turn_deg)) % around
+    return round(planar[0] / SAME_M), round(planar[1] / SAME_M), heading
+
+
+def _traced(came: dict[int, tuple[int, int]], number: int) -> list[int]:
+    """Return the actions that led to a node of the search."""
+    done = []
+    while number:
+        number, action = came[number]
+        done.append(action)
+    return done[::-1]
