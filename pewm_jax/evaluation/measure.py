@@ -21,8 +21,8 @@ def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any
 
     Returns:
         ``schema``; ``protocol``; ``results[method][mask][metric] = {mean, stderr, n}``;
-        ``margins[method][mask][metric]``, memory minus that method, clip by clip, and ``margin``,
-        the one over ``empty``; ``per_frame[method][mask][metric]``; ``long`` with the same of long
+        ``margins[method][mask][metric]``, the model minus that method, clip by clip, and
+        ``margin``, the one over ``empty`` (None of a model without a memory); ``per_frame[method][mask][metric]``; ``long`` with the same of long
         rollouts and ``drift[method]`` (see ``statistics.drift``); ``houses``, means over houses
         with 95 % intervals (see ``intervals.table``), with the same of long rollouts in ``long``.
     """
@@ -47,7 +47,7 @@ def _scores(scored: Scored) -> dict[str, Any]:
     margins = statistics.margins(scored.sums, scored.clusters)
     return {
         "results": statistics.table(scored.sums, scored.clusters),
-        "margin": margins["empty"],
+        "margin": margins.get("empty"),
         "margins": margins,
         "per_frame": statistics.per_frame(scored.sums, scored.clusters),
     }
@@ -55,7 +55,8 @@ def _scores(scored: Scored) -> dict[str, Any]:
 
 def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
     """Describe the measurement completely enough to repeat it."""
-    clip, choices = config.model.clip, scored.choices
+    clip, choices, own = config.model.clip, scored.choices, statistics.ours(scored.sums)
+    remembers = own == "memory"
     scenes = sorted({choice.scene for choice in choices + long.scored.choices})
     return {
         "scenes": len(scenes),
@@ -73,21 +74,21 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "sampling_steps": config.model.noise.sample_steps,
         "guidance": config.model.noise.guidance,
         "resolution": f"{clip.width} × {clip.height} pixels",
-        "memory": kinds.of(config.model.memory).name,
-        "encoder": kinds.of(config.model.memory.encoder).name,
-        "reader": kinds.of(config.model.memory.reader).name,
-        "positions": getattr(config.model.memory.reader, "positions", ""),
-        "map": f"{config.model.memory.capacity} cells of {config.model.memory.cell_m} m, "
-        f"{config.model.memory.tokens} read per clip",
+        "method": own,
+        **_memory_of(config, remembers=remembers),
         "dataset": config.data.path,
         "split": config.evaluate.split,
         "starts": "spread evenly over the way back of every episode; no randomness",
         "observed": "context frames spread evenly over the episode's past, the present one last; "
-        "all go into the map, and the model also sees the present one itself",
+        + (
+            "all go into the map, and the model also sees the present one itself"
+            if remembers
+            else "the model has no memory and sees the present one alone"
+        ),
         "motion": "the recorded one; poses integrated from actions agree with the recorded poses",
         "seen": "a pixel whose true point projects into an observed frame where the true depth "
         "agrees (nearest pixel or interpolated, larger of 5 cm and 3 %)",
-        "seen_share": round(statistics.seen_share(scored.sums["memory"]), 4),
+        "seen_share": round(statistics.seen_share(scored.sums[own]), 4),
         "psnr": "of colours in [0, 1], from the mean squared error of all masked pixels of a clip; "
         "equal images count as 100 dB",
         "ssim": "11 × 11 Gaussian window, σ 1.5, valid windows, averaged over masked pixels",
@@ -105,6 +106,20 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "scene_names": scenes,
         "clip_list": [[choice.name, choice.start] for choice in choices],
         "config": to_dict(config),
+    }
+
+
+def _memory_of(config: Config, *, remembers: bool) -> dict[str, Any]:
+    """Return what is said of the memory; nulls where the model has none."""
+    memory = config.model.memory
+    if not remembers:
+        return {"memory": "none"} | dict.fromkeys(("encoder", "reader", "positions", "map"))
+    return {
+        "memory": kinds.of(memory).name,
+        "encoder": kinds.of(memory.encoder).name,
+        "reader": kinds.of(memory.reader).name,
+        "positions": getattr(memory.reader, "positions", ""),
+        "map": f"{memory.capacity} cells of {memory.cell_m} m, {memory.tokens} read per clip",
     }
 
 

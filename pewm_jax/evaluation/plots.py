@@ -10,11 +10,13 @@ from html import escape
 COLOURS = {
     "memory": "#1f6feb",
     "empty": "#e8731a",
+    "model": "#1f6feb",
     "none": "#b8479c",
     "reproject": "#1a9a6c",
     "copy": "#8a8f98",
 }
-"""The colour of each method; distinguishable for the colour-blind."""
+"""The colour of each method; distinguishable for the colour-blind. The model itself has one colour,
+with a memory or without."""
 WIDTH, HEIGHT = 440, 280
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 36, 44
 

@@ -32,7 +32,7 @@ from pewm_jax.evaluation.words import score_lines, summary_lines
 
 TRAINED_ON = "train"
 """The split that training reads."""
-REPORT_VERSION = 6
+REPORT_VERSION = 7
 """Increase it whenever the same scores would give another report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
@@ -90,7 +90,7 @@ def evaluate(
         UserError: the run, its weights or the data are absent, damaged, or do not fit together.
     """
     opened = runs.open_run(run)
-    runs.require_memory(opened)
+    remembers = runs.remembers(opened)
     trained_on = Path(opened.config.data.path) / TRAINED_ON
     config, fixed = protocol_file.given(override(opened.config, **changes), changes)
     split = Path(config.data.path) / config.evaluate.split
@@ -133,12 +133,15 @@ def evaluate(
         choice.settings,
         imagination(none, none.config) if none else None,
         none_weights,
+        remembers,
     )
     scored = score_table(config, episodes, methods, partials, say, lpips, clips)
     long = roll_long(config, episodes, methods, partials, say, lpips, rollouts)
     say("drawing the report …")
     metrics = measure(config, scored, long)
-    metrics["coverage"] = score_coverage(config, episodes, methods.model, partials, say, clips)
+    metrics["coverage"] = None
+    if remembers:
+        metrics["coverage"] = score_coverage(config, episodes, methods.model, partials, say, clips)
     if cameras:
         metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
     metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {
