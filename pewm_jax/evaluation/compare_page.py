@@ -146,8 +146,8 @@ def _stills(pictures: Sequence[np.ndarray]) -> str:
     )
     return (
         "<h2>Side by side</h2><p>Long rollouts, the first of the protocol and not chosen: the "
-        "truth, then each model (with its map, if it has one), going on from its own last frame.</p>"
-        + figures
+        "truth, then each model (with its map, if it has one), going on from its own last "
+        "frame.</p>" + figures
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
+from pewm_jax.evaluation.long_rollouts import LongRollouts
 from pewm_jax.evaluation.pictures import (
     as_bytes,
     dim,
@@ -19,7 +20,6 @@ from pewm_jax.evaluation.pictures import (
     map_bounds,
 )
 from pewm_jax.evaluation.protocol import ClipChoice, load_clip
-from pewm_jax.evaluation.scoring import LongRollouts
 from pewm_jax.evaluation.seen import seen_masks
 from pewm_jax.evaluation.video import encode_gif, encode_h264, side_by_side, small_frames
 from pewm_jax.geometry.actions import heading

@@ -48,7 +48,7 @@ class Imagination:
         say: Callable[[str], Any] = print_now,
         *,
         cameras: bool = False,
-        devices: Sequence[jax.Device] = (),
+        devices: Sequence[Any] = (),
     ):
         self.cameras = cameras
         self.config, self.batch, self.context = config, batch, context
@@ -184,7 +184,7 @@ class Imagination:
         return abstract.frames(self.batch, self.context, height=clip.height, width=clip.width)
 
 
-def mesh_of(devices: Sequence[jax.Device], batch: int) -> Mesh | None:
+def mesh_of(devices: Sequence[Any], batch: int) -> Mesh | None:
     """Return the devices that a batch is split over, or None for the one that JAX takes.
 
     Args:

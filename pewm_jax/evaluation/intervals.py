@@ -113,8 +113,8 @@ def table(sums: Mapping[str, np.ndarray], houses_C: np.ndarray) -> dict[str, Any
 
     Returns:
         ``results[method][mask][metric]`` and ``margins[method][mask][metric]`` (the model minus
-        that method, clip by clip) as ``entry``; ``per_frame`` and ``per_frame_margins`` the same with a
-        list over imagined frames in the place of each number.
+        that method, clip by clip) as ``entry``; ``per_frame`` and ``per_frame_margins`` the same
+        with a list over imagined frames in the place of each number.
     """
     whole = {method: scores(sums_SCT39.sum(2)) for method, sums_SCT39 in sums.items()}
     frame = {method: scores(sums_SCT39) for method, sums_SCT39 in sums.items()}

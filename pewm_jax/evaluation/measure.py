@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+import dataclasses
 from importlib import metadata
 from typing import Any
 
 import jax
 
 from pewm_jax.config import Config, kinds, to_dict
-from pewm_jax.evaluation import intervals, statistics
-from pewm_jax.evaluation.scoring import LongRollouts, Scored
+from pewm_jax.evaluation import intervals, mirror, statistics
+from pewm_jax.evaluation.long_rollouts import LongRollouts
+from pewm_jax.evaluation.metrics import VideoDistance
+from pewm_jax.evaluation.metrics.videos import DISTANCES
+from pewm_jax.evaluation.mirror import Mirror
+from pewm_jax.evaluation.scoring import TRUTH, Scored
 
 SCHEMA = 1
 """Version of the layout of ``metrics.json``, which ``docs/evaluation.md`` describes. Entries may be
 added; increase it when one goes or comes to mean something else."""
 
 
-def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
+def measure(
+    config: Config,
+    scored: Scored,
+    long: LongRollouts,
+    back: Mirror | None = None,
+    i3d: VideoDistance | None = None,
+) -> dict[str, Any]:
     """Turn errors into the content of ``metrics.json``, except for hashes.
 
     Returns:
         ``schema``; ``protocol``; ``results[method][mask][metric] = {mean, stderr, n}``;
         ``margins[method][mask][metric]``, the model minus that method, clip by clip, and
-        ``margin``, the one over ``empty`` (None of a model without a memory); ``per_frame[method][mask][metric]``; ``long`` with the same of long
-        rollouts and ``drift[method]`` (see ``statistics.drift``); ``houses``, means over houses
-        with 95 % intervals (see ``intervals.table``), with the same of long rollouts in ``long``.
+        ``margin``, the one over ``empty`` (None of a model without a memory);
+        ``per_frame[method][mask][metric]``; ``long`` with the same of long rollouts,
+        ``drift[method]`` (see ``statistics.drift``) and ``growth``, what the map holds; ``houses``,
+        means over houses with 95 % intervals (see ``intervals.table``), with the same of long
+        rollouts in ``long``; ``videos``, FVD and KVD; ``mirror``, the mirror test (see
+        ``mirror.facts``); None where something was not measured.
     """
     return {
         "schema": SCHEMA,
@@ -33,7 +47,10 @@ def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any
         "long": {
             **_scores(long.scored),
             "drift": statistics.drift(long.scored.sums, long.scored.clusters),
+            "growth": growth(config, long),
         },
+        "videos": videos(config, scored, i3d) if i3d else None,
+        "mirror": mirror.facts(back) if back else None,
         "houses": {
             "how": intervals.how(),
             "house": scored.clustered_by,
@@ -50,6 +67,41 @@ def _scores(scored: Scored) -> dict[str, Any]:
         "margin": margins.get("empty"),
         "margins": margins,
         "per_frame": statistics.per_frame(scored.sums, scored.clusters),
+    }
+
+
+def growth(config: Config, long: LongRollouts) -> dict[str, Any] | None:
+    """Return how much the map holds along long rollouts, or None where there is none."""
+    held = long.kept.get("memory", {}).get("occupied")
+    if held is None:
+        return None
+    each = config.model.clip.frames - 1
+    clusters = long.scored.clusters
+    return {
+        "frames": [each * clip for clip in range(long.chain + 1)],
+        "occupied": intervals.entry(held, clusters),
+        "per_frame": intervals.entry((held[:, -1] - held[:, 0]) / (each * long.chain), clusters),
+        "capacity": config.model.memory.capacity,
+    }
+
+
+def videos(config: Config, scored: Scored, i3d: VideoDistance) -> dict[str, Any] | None:
+    """Return FVD and KVD of every method with their floors; None of fewer than two clips."""
+    features = dict(scored.features)
+    truth, clips = features.pop(TRUTH), len(scored.choices)
+    if clips < 2:
+        return None
+    frames = len(scored.choices[0].targets_N) + 1
+    kinds_of = {kind: dataclasses.replace(i3d, kind=kind) for kind in DISTANCES}
+    return {
+        "frames": frames,
+        "clips": clips,
+        "seed": config.evaluate.seeds[0],
+        "names": {kind: metric.name(frames, clips) for kind, metric in kinds_of.items()},
+        "results": {
+            method: {kind: metric.score(found, truth).facts() for kind, metric in kinds_of.items()}
+            for method, found in features.items()
+        },
     }
 
 

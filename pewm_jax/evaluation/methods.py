@@ -107,7 +107,7 @@ class Methods:
             return None, None, copy_last(context, camera.intrinsics_4.shape[1])
         if method == "reproject":
             return None, None, reproject_batch(self.reproject, context, camera)
-        given = {} if watch is None else {"watch": watch}
+        given: dict[str, Any] = {} if watch is None else {"watch": watch}
         model = self.none if method == "none" and self.none is not None else self.model
         first, last, frames = model.run(context, control, seeds_B2, memory=method in OURS, **given)
         if not all(np.isfinite(leaf).all() for leaf in (frames.rgb_THWC, frames.depth_THW)):

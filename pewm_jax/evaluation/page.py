@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from pewm_jax.evaluation import page_tables
+from pewm_jax.evaluation import page_long, page_tables
 from pewm_jax.evaluation.gallery import ABOVE_CAMERA_M, Gallery
 from pewm_jax.evaluation.pictures import png
 from pewm_jax.evaluation.plots import COLOURS, Line, chart
@@ -103,8 +103,11 @@ def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         "<h2>Scores</h2>",
         page_tables.scores(metrics),
         page_tables.houses(metrics),
+        page_long.videos(metrics),
         _curves(metrics),
         page_tables.drift(metrics),
+        page_long.growth(metrics),
+        page_long.mirror(metrics),
         page_tables.coverage(metrics),
         _map(gallery),
         _protocol(metrics["protocol"]),
@@ -129,10 +132,10 @@ def _videos(gallery: Gallery) -> str:
     return (
         "<h2>Long rollouts, side by side</h2><p>From left to right the recording, "
         f"{SHOWN['model' if gallery.above is None else 'memory']}, and what was observed "
-        "reprojected without a network. Above colour, below depth (bright is near). All start from the same observed "
-        "picture and follow the same actions; after each clip the model goes on from its own last "
-        "frame, while the reprojection only ever shows what was observed. The first episodes of "
-        "the split, not chosen.</p>" + "".join(figures)
+        "reprojected without a network. Above colour, below depth (bright is near). All start from "
+        "the same observed picture and follow the same actions; after each clip the model goes on "
+        "from its own last frame, while the reprojection only ever shows what was observed. The "
+        "first episodes of the split, not chosen.</p>" + "".join(figures)
     )
 
 

@@ -225,7 +225,7 @@ def fingerprint(
     protocol: str = "",
     baseline: str = "",
 ) -> str:
-    """Return a hash of everything that the scores depend on, except the choice of seeds and rivals.
+    """Return a hash of all that scores depend on, but the choice of seeds, rivals and measures.
 
     Args:
         config: the run's configuration, with overrides for the evaluation.
@@ -238,7 +238,7 @@ def fingerprint(
             settings; "" if there is none.
     """
     settings = to_dict(config)
-    for key in ("seeds", "videos", "none", "lpips", "protocol"):
+    for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src"):
         settings["evaluate"].pop(key)
     for key in ("train", "data"):
         settings.pop(key)

@@ -19,8 +19,9 @@ import numpy as np
 
 from pewm_jax import atomic
 from pewm_jax.config import UserError
+from pewm_jax.evaluation.long_rollouts import LongRollouts
 from pewm_jax.evaluation.protocol import ClipChoice
-from pewm_jax.evaluation.scoring import LongRollouts, Scored
+from pewm_jax.evaluation.scoring import Scored
 from pewm_jax.evaluation.statistics import ours, scores
 
 SAMPLES, VERSION = "samples.npz", 1

@@ -25,8 +25,8 @@ RIVALS = {
 OUR_NAMES = {"memory": "The model with its map", "model": "The model, which has no memory,"}
 """The model itself in sentences, by its row."""
 NO_MEMORY = (
-    "This model was trained without a memory: there is no map, and no row with an empty one; what a "
-    "memory brings is seen beside a run that has one (`pewm-jax compare`, or --none of that run)."
+    "This model was trained without a memory: there is no map, and no row with an empty one; what "
+    "a memory brings is seen beside a run that has one (`pewm-jax compare`, or --none of that run)."
 )
 MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
 """Names of the masks."""
@@ -150,6 +150,52 @@ def perceived(metrics: Mapping[str, Any]) -> str:
     return f"LPIPS of whole pictures, lower is better: {'; '.join(said)}."
 
 
+def far_apart(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence on FVD and KVD, or on why they were left out."""
+    found = metrics["videos"]
+    if not found:
+        return metrics["protocol"]["fvd"]
+    said = []
+    for kind, name in found["names"].items():
+        values = (
+            f"{label} {found['results'][method][kind]['value']:.4g}"
+            for method, label in METHOD_NAMES.items()
+            if method in found["results"]
+        )
+        said.append(f"{name}, lower is better: {'; '.join(values)}")
+    return f"{'. '.join(said)}."
+
+
+def came_back(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence on the mirror test, or on why it was left out."""
+    found = metrics["mirror"]
+    if not found:
+        return metrics["protocol"]["mirror"]
+    said = []
+    for method, pairs in found["by_distance"].items():
+        values = pairs["again"]["mean"]
+        known = [(value, at) for value, at in zip(values, found["distances"], strict=True) if value]
+        ends = " and ".join(f"{value:.2f} dB after {at}" for value, at in (known[0], known[-1]))
+        said.append(f"{METHOD_NAMES[method]} {ends}")
+    return (
+        "There and back, the second visit against the first, by frames between them: "
+        f"{'; '.join(said)}."
+    )
+
+
+def grew(metrics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on how the map grows, if there is one."""
+    found = metrics["long"]["growth"]
+    if not found:
+        return []
+    held = found["occupied"]["mean"]
+    said = (
+        f"Along long rollouts the map grows from {held[0]:.0f} to {held[-1]:.0f} points in "
+        f"{found['frames'][-1]} imagined frames, of {found['capacity']} that it has room for."
+    )
+    return [said]
+
+
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     """Return the report's sentences, for the terminal: against the baselines, then the map alone.
 
@@ -166,9 +212,10 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     rivals = [name for name in ("reproject", "none") if name in margins]
     lines += [comparison(margins[name], name, own) for name in rivals]
     lines += [NONE_HOW] if own == "memory" and "none" not in margins else []
-    lines += [perceived(metrics)]
+    lines += [perceived(metrics), far_apart(metrics)]
     lines += [covered(metrics["coverage"])] if metrics["coverage"] else []
-    return [*lines, drifted(metrics["long"]["drift"][own])]
+    lines += [drifted(metrics["long"]["drift"][own]), *grew(metrics)]
+    return [*lines, came_back(metrics)]
 
 
 def score_lines(metrics: Mapping[str, Any]) -> list[str]:
