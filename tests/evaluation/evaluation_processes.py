@@ -22,15 +22,12 @@ def score(folder, devices):
     from pewm_jax.evaluation import imagine
     from pewm_jax.evaluation.long_rollouts import roll_long
     from pewm_jax.evaluation.methods import Methods
-    from pewm_jax.evaluation.metrics import chosen
-    from pewm_jax.evaluation.mirror import look_back
     from pewm_jax.evaluation.partial import Partials
-    from pewm_jax.evaluation.protocol import long_choices
     from pewm_jax.evaluation.reproject import ReprojectSettings
     from pewm_jax.evaluation.scoring import score_table
     from pewm_jax.evaluation.shares import first_alone
 
-    config = tiny(folder, batch=4, clips=6, mirror=8, src=("off",))
+    config = tiny(folder, batch=4, clips=6)
     episodes = EpisodeSource(folder / "data" / "revisit")
     imagine.rollout = knowing_rollout
     params = {"offset": np.float32(0)}
@@ -41,15 +38,9 @@ def score(folder, devices):
     partials = first_alone(lambda: Partials(place, "e" * 64, "f" * 64), "folder")
     scored = score_table(config, episodes, methods, partials)
     long = roll_long(config, episodes, methods, partials)
-    visits = chosen.revisits(config.evaluate.src, None, 16, 16)[0]
-    rollouts = long_choices(config, episodes)
-    back = look_back(config, episodes, methods, partials, rollouts, visits)
     found = {f"table/{name}": array for name, array in scored.sums.items()}
     found |= {f"long/{name}": array for name, array in long.scored.sums.items()}
-    found["occupied"] = long.kept["memory"]["occupied"]
-    for method, pairs in back.pairs.items():
-        found |= {f"pairs/{method}/{name}": array for name, array in pairs.items()}
-    return found | {f"floor/{name}": array for name, array in back.floor.items()}
+    return found | {"occupied": long.kept["memory"]["occupied"]}
 
 
 def main(argv):
