@@ -507,7 +507,8 @@ def test_help_names_every_setting(command, capsys):
         command(["--help"])
     assert stop.value.code == 0
     said = capsys.readouterr().out
-    for flag in ("--clips", "--seeds", "--steps", "--data", "--video_clips", "--stride"):
+    flags = ("--clips", "--seeds", "--steps", "--data", "--video_clips", "--stride")
+    for flag in (*flags, "--fvd", "--mirror", "--src", "--distributed", "--coordinator"):
         assert flag in said
 
 
