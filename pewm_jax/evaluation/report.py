@@ -119,7 +119,10 @@ def evaluate(
         file_hash(chooses) if fixed and chooses.is_file() else "",
     )
     folder = Path(out) if out else runs.report_folder(opened, config)
-    if processes.first(lambda: is_complete(folder, config, name, none_weights, measures.hashes)):
+    processes.meet("evaluate: begin")
+    complete = is_complete(folder, config, name, none_weights, measures.hashes)
+    processes.meet("evaluate: decided")  # nobody writes before all have looked
+    if complete:
         say("the report is complete for these weights and this protocol; nothing to do")
         return folder / PAGE
     make_folder(folder)
@@ -160,6 +163,7 @@ def evaluate(
     if remembers:
         covered = score_coverage(config, episodes, methods.model, partials, say, clips)
     if not processes.is_primary():
+        processes.meet("evaluate: report")  # devices that wait for one another would give up
         return folder / PAGE
     say("drawing the report …")
     metrics = measure(config, scored, long, back, measures.i3d)
@@ -181,6 +185,7 @@ def evaluate(
     }
     protocol_file.save(folder / PROTOCOL, protocol, {"data": str(split)})
     _write(folder, metrics, make_gallery(config, episodes, long), scored, long)
+    processes.meet("evaluate: report")
     for line in [*score_lines(metrics), *summary_lines(metrics)]:
         say(line)
     return folder / PAGE
