@@ -9,6 +9,7 @@ from pathlib import Path
 from pewm_jax import cli, shipped
 from pewm_jax import config as configuration
 from pewm_jax.commands import imports
+from pewm_jax.config import Join
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +44,16 @@ class Settings:
     """File made by `pewm-jax protocol`, which fixes clips, context, motion, noise and horizon;
     `off` chooses them by the settings, also where the run names a file. Every report has its own,
     RUN/report/protocol.json, by which other runs can be scored."""
+    fvd: str | None = None
+    """FVD and KVD of whole clips: a file with weights of I3D, `on` for those of the installed
+    package, or `off`. By default they are measured where those weights are installed and there is
+    an accelerator: on processors it takes longer than imagining the clips."""
+    mirror: int | None = None
+    """Frames that the agent goes before it comes back the same way, in the mirror test of the long
+    rollouts, such as 32; 0 leaves it out. By default 32 where long rollouts have 64 frames."""
+    src: tuple[str, ...] | None = None
+    """Encoders of SRC in the mirror test: `alex` or `vgg` of LPIPS, folders with DINOv2, or `off`.
+    By default that of LPIPS, where LPIPS is measured."""
     out: Path | None = None
     """Folder of the report; by default RUN/report, or RUN/report-NAME for other data than the
     run's own."""
@@ -61,27 +72,38 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
     argv = imports.take(argv)
     about = (
         "Score a trained run on held-out scenes and write RUN/report/index.html. Beside these "
-        f"settings:\n{imports.HELP}"
+        "settings, several processes can share the work; all must see the same folders:\n"
+        f"{cli.list_flags(Join)}\n{imports.HELP}"
     )
     asks = bool(argv) and argv[0] in ("-h", "--help")
     if not asks and (not argv or argv[0].startswith("-")):
         raise cli.ConfigError(f"Name a run folder first: {prog} runs/demo.")
+    join, argv = cli.take(Join, argv)
     prog = f"{prog} {'RUN' if asks else argv[0]}"
     flags = ["--help"] if asks else argv[1:]
     settings = cli.parse(Settings, flags, default=Settings(), prog=prog, description=about)
-    # Imported here and not above: help and refusals come at once, and Ctrl-C is clean meanwhile.
-    from pewm_jax.evaluation import report
-
-    cli.cache_compilation(Path(argv[0]).parent)
     if _is_codec(Path(argv[0])):
+        if join.distributed:
+            raise cli.ConfigError(
+                f"{argv[0]} holds a codec: one process scores it; leave out --distributed."
+            )
+        cli.cache_compilation(Path(argv[0]).parent)
         return _codec(argv[0], settings)
-    try:
-        changes = {name: value for name, value in vars(settings).items() if name != "out"}
-        page = report.evaluate(argv[0], out=settings.out, **changes)
-    except KeyboardInterrupt:
-        again = "Interrupted; what is scored is kept, run the same command again to go on."
-        raise KeyboardInterrupt(again) from None
-    print(f"report: {page}")
+    # Imported here and not above: help and refusals come at once, and Ctrl-C is clean meanwhile.
+    from pewm_jax.training import processes
+
+    with processes.joined(join):
+        # After joining: these imports take seconds, and JAX must not be used before it.
+        from pewm_jax.evaluation import report
+
+        cli.cache_compilation(Path(argv[0]).parent)
+        try:
+            changes = {name: value for name, value in vars(settings).items() if name != "out"}
+            page = report.evaluate(argv[0], out=settings.out, **changes)
+        except KeyboardInterrupt:
+            again = "Interrupted; what is scored is kept, run the same command again to go on."
+            raise KeyboardInterrupt(again) from None
+        print(f"report: {page}")
     return 0
 
 

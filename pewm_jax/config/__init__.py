@@ -20,7 +20,7 @@ from pewm_jax.config.encoder import (
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.kinds import Settings, functions, register
-from pewm_jax.config.launch import Launch
+from pewm_jax.config.launch import Join, Launch
 from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.memory import (
     ImagesConfig,
@@ -90,6 +90,7 @@ __all__ = [
     "EvalConfig",
     "FlowConfig",
     "ImagesConfig",
+    "Join",
     "LatentsConfig",
     "Launch",
     "LearnedCodecConfig",

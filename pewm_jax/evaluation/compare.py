@@ -24,8 +24,6 @@ from pewm_jax.training import runs
 SCHEMA = 1
 """Version of the layout of ``comparison.json``, which ``docs/evaluation.md`` describes."""
 COMPARISON = "comparison.json"
-METHOD = "memory"
-"""The method that is compared: each model with its map."""
 SEED, DATA = "train.seed", "data.path"
 """Settings in which seeds of one training may differ; in a report the path is that of the data that
 were scored, which may lie anywhere."""
@@ -56,6 +54,7 @@ class Report:
         return {
             "run": self.name,
             "report": str(self.folder),
+            "method": self.samples.own,
             "weights_sha256": said["weights_sha256"],
             "training_seed": said["training_seed"],
         }
@@ -233,7 +232,7 @@ def _facts(report: Report) -> dict[str, Any]:
 
 def _values(group: Sequence[Report], part: str, skip: set[str]) -> dict[str, dict[str, Any]]:
     """Return ``[mask][metric]`` as (K, C, …): training seeds, clips; sampling seeds averaged."""
-    tables = [report.samples.table(part, METHOD) for report in group]
+    tables = [report.samples.table(part, report.samples.own) for report in group]
     return {
         mask: {
             metric: np.stack([table[mask][metric].mean(0) for table in tables])

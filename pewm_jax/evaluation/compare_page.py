@@ -16,6 +16,7 @@ from pewm_jax.evaluation.page import STYLE, embed
 from pewm_jax.evaluation.page_tables import table
 from pewm_jax.evaluation.pictures import grid, png
 from pewm_jax.evaluation.plots import Line, chart
+from pewm_jax.evaluation.statistics import OURS
 from pewm_jax.evaluation.words import MASK_NAMES, METRIC_NAMES, spread
 
 INTRODUCTION = (
@@ -45,8 +46,8 @@ def side_by_side(protocol: Protocol, one: Path, two: Path) -> list[np.ndarray]:
         index = len(drawn)
         files = {
             "truth": one / ROWS / f"{index:02d}-truth.png",
-            "a": one / ROWS / f"{index:02d}-memory.png",
-            "b": two / ROWS / f"{index:02d}-memory.png",
+            "a": _own(one, index),
+            "b": _own(two, index),
         }
         if not all(file.is_file() for file in files.values()):
             return drawn
@@ -56,6 +57,12 @@ def side_by_side(protocol: Protocol, one: Path, two: Path) -> list[np.ndarray]:
                 whole = np.asarray(picture.convert("RGB"))
             rows.append((caption, np.split(whole, len(steps), axis=1)))
         drawn.append(grid(rows, names))
+
+
+def _own(report: Path, index: int) -> Path:
+    """Return the file with the model's own frames: with its map, or of one without a memory."""
+    files = [report / ROWS / f"{index:02d}-{method}.png" for method in OURS]
+    return next((file for file in files if file.is_file()), files[0])
 
 
 def sentences(content: Mapping[str, Any]) -> list[str]:
@@ -139,7 +146,8 @@ def _stills(pictures: Sequence[np.ndarray]) -> str:
     )
     return (
         "<h2>Side by side</h2><p>Long rollouts, the first of the protocol and not chosen: the "
-        "truth, then each model with its map, going on from its own last frame.</p>" + figures
+        "truth, then each model (with its map, if it has one), going on from its own last "
+        "frame.</p>" + figures
     )
 
 

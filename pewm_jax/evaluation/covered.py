@@ -17,6 +17,7 @@ from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import ClipChoice, choose
 from pewm_jax.evaluation.scoring import Batch, load_batch
+from pewm_jax.evaluation.shares import gathered, share
 from pewm_jax.memory import memories
 from pewm_jax.memory.coverage import Coverage, coverage
 from pewm_jax.types import Array, Frames
@@ -43,17 +44,18 @@ def score_coverage(
     """
     if choices is None:
         choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
-    counts = []
-    for first in range(0, len(choices), config.evaluate.batch):
-        name = f"coverage2-clip{first:04d}"
-        found = partials.get(name)
-        if found is None:
-            if not counts:
-                say("counting what the map covers …")
-            chosen = choices[first : first + config.evaluate.batch]
-            batch = load_batch(config, episodes, chosen, first, cameras=model.cameras)
-            found = partials.put(name, counts=_count(config.model, model, batch))
-        counts.append(found["counts"].sum(0))
+    starts = range(0, len(choices), config.evaluate.batch)
+    names = {first: f"coverage2-clip{first:04d}" for first in starts}
+    known = {first: piece for first in starts if (piece := partials.get(names[first])) is not None}
+    todo = [first for first in share(starts) if first not in known]
+    if todo:
+        say("counting what the map covers …")
+    for first in todo:
+        chosen = choices[first : first + config.evaluate.batch]
+        batch = load_batch(config, episodes, chosen, first, cameras=model.cameras)
+        known[first] = partials.put(names[first], counts=_count(config.model, model, batch))
+    found = gathered(partials, names, known, "coverage")
+    counts = [found[first]["counts"].sum(0) for first in starts]
     total = dict(zip(_names(), np.sum(counts, 0).astype(float), strict=True))
     seen = total.pop("seen")
     return {name: count / seen for name, count in total.items()} if seen else None

@@ -9,6 +9,7 @@ import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
+from pewm_jax.evaluation.long_rollouts import LongRollouts
 from pewm_jax.evaluation.pictures import (
     as_bytes,
     dim,
@@ -19,7 +20,6 @@ from pewm_jax.evaluation.pictures import (
     map_bounds,
 )
 from pewm_jax.evaluation.protocol import ClipChoice, load_clip
-from pewm_jax.evaluation.scoring import LongRollouts
 from pewm_jax.evaluation.seen import seen_masks
 from pewm_jax.evaluation.video import encode_gif, encode_h264, side_by_side, small_frames
 from pewm_jax.geometry.actions import heading
@@ -28,7 +28,12 @@ from pewm_jax.types import Frames
 
 ABOVE_CAMERA_M = 0.4
 """Map cells higher than this above the camera are left out of the view from above."""
-CAPTIONS = {"memory": "with its map", "empty": "empty map", "reproject": "reprojected"}
+CAPTIONS = {
+    "memory": "with its map",
+    "empty": "empty map",
+    "model": "no memory",
+    "reproject": "reprojected",
+}
 """The methods in images, in their order, and their names."""
 ROWS = "rows"
 """Folder of a report with ``Gallery.rows``: ``00-truth.png``, ``00-memory.png`` and so on."""
@@ -42,11 +47,12 @@ class Gallery:
 
     Attributes:
         videos: (caption, MP4) of each long rollout.
-        strip: frames of one rollout in rows: truth, with its map, empty map, reprojected.
+        strip: frames of one rollout in rows: truth, with its map, empty map, reprojected; of a
+            model without a memory one row in the place of two.
         strip_note: which rollout and which frames they are.
         moving: all frames of that rollout side by side, a GIF.
         masks: the same true frames with never-seen pixels greyed out.
-        above: the map from above, before and after that rollout.
+        above: the map from above, before and after that rollout; None without a memory.
         rows: of each rollout shown the frames of ``truth`` and of each method in ``CAPTIONS`` at
             the steps of ``strip``, side by side in one picture and as large as they are.
     """
@@ -56,7 +62,7 @@ class Gallery:
     strip_note: str
     moving: bytes
     masks: np.ndarray
-    above: np.ndarray
+    above: np.ndarray | None
     rows: list[dict[str, np.ndarray]]
 
 
@@ -106,7 +112,7 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
         ),
         moving=_moving(rollout),
         masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
-        above=_above(config, long, best, rollout),
+        above=_above(config, long, best, rollout) if "memory" in long.kept else None,
         rows=[_rows(item, steps) for item in shown],
     )
 
@@ -129,6 +135,7 @@ def _gather(
     imagined = {
         method: (long.kept[method]["rgb"][index], long.kept[method]["depth"][index])
         for method in CAPTIONS
+        if method in long.kept
     }
     return _Rollout(choice, context, truth, np.asarray(seen), imagined)
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.evaluation.images import MASKS
-from pewm_jax.evaluation.statistics import scores
+from pewm_jax.evaluation.statistics import ours, scores
 
 DRAWS, SEED, LEVEL = 10_000, 0, 0.95
 """Bootstrap samples, the seed that they are drawn from, and the share that an interval holds."""
@@ -105,16 +105,16 @@ def entry(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, Any]:
 
 
 def table(sums: Mapping[str, np.ndarray], houses_C: np.ndarray) -> dict[str, Any]:
-    """Return every method's scores, and the differences from the model with its map, paired.
+    """Return every method's scores, and the differences from the model itself, paired.
 
     Args:
         sums: method → (seeds, clips, T, 3, 9) as ``images.error_sums``.
         houses_C: (clips,) the number of each clip's house.
 
     Returns:
-        ``results[method][mask][metric]`` and ``margins[method][mask][metric]`` (memory minus that
-        method, clip by clip) as ``entry``; ``per_frame`` and ``per_frame_margins`` the same with a
-        list over imagined frames in the place of each number.
+        ``results[method][mask][metric]`` and ``margins[method][mask][metric]`` (the model minus
+        that method, clip by clip) as ``entry``; ``per_frame`` and ``per_frame_margins`` the same
+        with a list over imagined frames in the place of each number.
     """
     whole = {method: scores(sums_SCT39.sum(2)) for method, sums_SCT39 in sums.items()}
     frame = {method: scores(sums_SCT39) for method, sums_SCT39 in sums.items()}
@@ -127,19 +127,20 @@ def table(sums: Mapping[str, np.ndarray], houses_C: np.ndarray) -> dict[str, Any
 
 
 def _minus(by_method: Mapping[str, Any]) -> dict[str, Any]:
-    """Subtract every other method's scores from those of ``memory``; sampling seeds averaged."""
-    ours = by_method["memory"]
+    """Subtract every other method's scores from the model's own; sampling seeds averaged."""
+    own = ours(by_method)
+    mine = by_method[own]
     return {
         method: {
             mask: {
-                metric: ours[mask][metric].mean(0)[None] - values.mean(0)[None]
+                metric: mine[mask][metric].mean(0)[None] - values.mean(0)[None]
                 for metric, values in by_mask[mask].items()
-                if metric in ours[mask]
+                if metric in mine[mask]
             }
             for mask in MASKS
         }
         for method, by_mask in by_method.items()
-        if method != "memory"
+        if method != own
     }
 
 

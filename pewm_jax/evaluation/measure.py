@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+import dataclasses
 from importlib import metadata
 from typing import Any
 
 import jax
 
 from pewm_jax.config import Config, kinds, to_dict
-from pewm_jax.evaluation import intervals, statistics
-from pewm_jax.evaluation.scoring import LongRollouts, Scored
+from pewm_jax.evaluation import intervals, mirror, statistics
+from pewm_jax.evaluation.long_rollouts import LongRollouts
+from pewm_jax.evaluation.metrics import VideoDistance
+from pewm_jax.evaluation.metrics.videos import DISTANCES
+from pewm_jax.evaluation.mirror import Mirror
+from pewm_jax.evaluation.scoring import TRUTH, Scored
 
 SCHEMA = 1
 """Version of the layout of ``metrics.json``, which ``docs/evaluation.md`` describes. Entries may be
 added; increase it when one goes or comes to mean something else."""
 
 
-def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
+def measure(
+    config: Config,
+    scored: Scored,
+    long: LongRollouts,
+    back: Mirror | None = None,
+    i3d: VideoDistance | None = None,
+) -> dict[str, Any]:
     """Turn errors into the content of ``metrics.json``, except for hashes.
 
     Returns:
         ``schema``; ``protocol``; ``results[method][mask][metric] = {mean, stderr, n}``;
-        ``margins[method][mask][metric]``, memory minus that method, clip by clip, and ``margin``,
-        the one over ``empty``; ``per_frame[method][mask][metric]``; ``long`` with the same of long
-        rollouts and ``drift[method]`` (see ``statistics.drift``); ``houses``, means over houses
-        with 95 % intervals (see ``intervals.table``), with the same of long rollouts in ``long``.
+        ``margins[method][mask][metric]``, the model minus that method, clip by clip, and
+        ``margin``, the one over ``empty`` (None of a model without a memory);
+        ``per_frame[method][mask][metric]``; ``long`` with the same of long rollouts,
+        ``drift[method]`` (see ``statistics.drift``) and ``growth``, what the map holds; ``houses``,
+        means over houses with 95 % intervals (see ``intervals.table``), with the same of long
+        rollouts in ``long``; ``videos``, FVD and KVD; ``mirror``, the mirror test (see
+        ``mirror.facts``); None where something was not measured.
     """
     return {
         "schema": SCHEMA,
@@ -33,7 +47,10 @@ def measure(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any
         "long": {
             **_scores(long.scored),
             "drift": statistics.drift(long.scored.sums, long.scored.clusters),
+            "growth": growth(config, long),
         },
+        "videos": videos(config, scored, i3d) if i3d else None,
+        "mirror": mirror.facts(back) if back else None,
         "houses": {
             "how": intervals.how(),
             "house": scored.clustered_by,
@@ -47,15 +64,51 @@ def _scores(scored: Scored) -> dict[str, Any]:
     margins = statistics.margins(scored.sums, scored.clusters)
     return {
         "results": statistics.table(scored.sums, scored.clusters),
-        "margin": margins["empty"],
+        "margin": margins.get("empty"),
         "margins": margins,
         "per_frame": statistics.per_frame(scored.sums, scored.clusters),
     }
 
 
+def growth(config: Config, long: LongRollouts) -> dict[str, Any] | None:
+    """Return how much the map holds along long rollouts, or None where there is none."""
+    held = long.kept.get("memory", {}).get("occupied")
+    if held is None:
+        return None
+    each = config.model.clip.frames - 1
+    clusters = long.scored.clusters
+    return {
+        "frames": [each * clip for clip in range(long.chain + 1)],
+        "occupied": intervals.entry(held, clusters),
+        "per_frame": intervals.entry((held[:, -1] - held[:, 0]) / (each * long.chain), clusters),
+        "capacity": config.model.memory.capacity,
+    }
+
+
+def videos(config: Config, scored: Scored, i3d: VideoDistance) -> dict[str, Any] | None:
+    """Return FVD and KVD of every method with their floors; None of fewer than two clips."""
+    features = dict(scored.features)
+    truth, clips = features.pop(TRUTH), len(scored.choices)
+    if clips < 2:
+        return None
+    frames = len(scored.choices[0].targets_N) + 1
+    kinds_of = {kind: dataclasses.replace(i3d, kind=kind) for kind in DISTANCES}
+    return {
+        "frames": frames,
+        "clips": clips,
+        "seed": config.evaluate.seeds[0],
+        "names": {kind: metric.name(frames, clips) for kind, metric in kinds_of.items()},
+        "results": {
+            method: {kind: metric.score(found, truth).facts() for kind, metric in kinds_of.items()}
+            for method, found in features.items()
+        },
+    }
+
+
 def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
     """Describe the measurement completely enough to repeat it."""
-    clip, choices = config.model.clip, scored.choices
+    clip, choices, own = config.model.clip, scored.choices, statistics.ours(scored.sums)
+    remembers = own == "memory"
     scenes = sorted({choice.scene for choice in choices + long.scored.choices})
     return {
         "scenes": len(scenes),
@@ -73,21 +126,21 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "sampling_steps": config.model.noise.sample_steps,
         "guidance": config.model.noise.guidance,
         "resolution": f"{clip.width} × {clip.height} pixels",
-        "memory": kinds.of(config.model.memory).name,
-        "encoder": kinds.of(config.model.memory.encoder).name,
-        "reader": kinds.of(config.model.memory.reader).name,
-        "positions": getattr(config.model.memory.reader, "positions", ""),
-        "map": f"{config.model.memory.capacity} cells of {config.model.memory.cell_m} m, "
-        f"{config.model.memory.tokens} read per clip",
+        "method": own,
+        **_memory_of(config, remembers=remembers),
         "dataset": config.data.path,
         "split": config.evaluate.split,
         "starts": "spread evenly over the way back of every episode; no randomness",
         "observed": "context frames spread evenly over the episode's past, the present one last; "
-        "all go into the map, and the model also sees the present one itself",
+        + (
+            "all go into the map, and the model also sees the present one itself"
+            if remembers
+            else "the model has no memory and sees the present one alone"
+        ),
         "motion": "the recorded one; poses integrated from actions agree with the recorded poses",
         "seen": "a pixel whose true point projects into an observed frame where the true depth "
         "agrees (nearest pixel or interpolated, larger of 5 cm and 3 %)",
-        "seen_share": round(statistics.seen_share(scored.sums["memory"]), 4),
+        "seen_share": round(statistics.seen_share(scored.sums[own]), 4),
         "psnr": "of colours in [0, 1], from the mean squared error of all masked pixels of a clip; "
         "equal images count as 100 dB",
         "ssim": "11 × 11 Gaussian window, σ 1.5, valid windows, averaged over masked pixels",
@@ -105,6 +158,20 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "scene_names": scenes,
         "clip_list": [[choice.name, choice.start] for choice in choices],
         "config": to_dict(config),
+    }
+
+
+def _memory_of(config: Config, *, remembers: bool) -> dict[str, Any]:
+    """Return what is said of the memory; nulls where the model has none."""
+    memory = config.model.memory
+    if not remembers:
+        return {"memory": "none"} | dict.fromkeys(("encoder", "reader", "positions", "map"))
+    return {
+        "memory": kinds.of(memory).name,
+        "encoder": kinds.of(memory.encoder).name,
+        "reader": kinds.of(memory.reader).name,
+        "positions": getattr(memory.reader, "positions", ""),
+        "map": f"{memory.capacity} cells of {memory.cell_m} m, {memory.tokens} read per clip",
     }
 
 

@@ -1,8 +1,9 @@
-"""Who imagines: the model with its map and without, a model that has none, and two without a net.
+"""Who imagines: the model with its map and without, models that have none, and two without a net.
 
 ============= ====================================================================================
 memory        the model with its map
 empty         the same weights with an empty map
+model         in the place of both, a model that was trained without a memory
 none          another model, trained for as many steps without a memory (if one is given)
 reproject     no network: what was observed, moved to where the camera looks now
 copy          no network: the last observed frame, repeated
@@ -12,7 +13,7 @@ copy          no network: the last observed frame, repeated
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,12 @@ import numpy as np
 from pewm_jax.config import UserError
 from pewm_jax.evaluation.imagine import Imagination, copy_last
 from pewm_jax.evaluation.reproject import ReprojectSettings, reproject_batch
+from pewm_jax.evaluation.statistics import OURS
 from pewm_jax.types import Array, Camera, Frames
 
-METHODS = ("memory", "empty", "none", "reproject", "copy")
+METHODS = ("memory", "empty", "model", "none", "reproject", "copy")
 """All methods, in the order of the tables."""
-SAMPLED = ("memory", "empty", "none")
+SAMPLED = ("memory", "empty", "model", "none")
 """Those that draw noise, and so are scored with every seed."""
 
 
@@ -37,17 +39,26 @@ class Methods:
         reproject: settings of the reprojection.
         none: a model trained without a memory, or None.
         none_weights: hash of its weights.
+        remembers: whether the model that is scored has a memory.
     """
 
     model: Imagination
     reproject: ReprojectSettings
     none: Imagination | None = None
     none_weights: str = ""
+    remembers: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
         """The methods that there are."""
-        return tuple(name for name in METHODS if name != "none" or self.none is not None)
+        left_out = {"model"} if self.remembers else {"memory", "empty"}
+        left_out |= {"none"} if self.none is None else set()
+        return tuple(name for name in METHODS if name not in left_out)
+
+    @property
+    def own(self) -> str:
+        """The method that is the model itself: ``memory``, or ``model`` if it has none."""
+        return "memory" if self.remembers else "model"
 
     def piece(self, method: str) -> str:
         """Return the method's name in partial results: with all that only its scores depend on."""
@@ -61,7 +72,8 @@ class Methods:
     def prepare(self, methods: Iterable[str]) -> None:
         """Compile what some methods need."""
         methods = set(methods)
-        self.model.prepare([name == "memory" for name in ("empty", "memory") if name in methods])
+        known = ("empty", "memory", "model")
+        self.model.prepare([name in OURS for name in known if name in methods])
         if self.none is not None and "none" in methods:
             self.none.prepare([False])
 
@@ -72,6 +84,7 @@ class Methods:
         control: Array | Camera,
         camera: Camera,
         seeds_B2: np.ndarray,
+        watch: Callable[[Any], Any] | None = None,
     ) -> tuple[Any, Any, Frames]:
         """Imagine N frames for every clip of a batch.
 
@@ -81,6 +94,7 @@ class Methods:
             control: what drives the model, see ``Imagination.run``.
             camera: (B, N) the cameras of the frames to imagine, where the control leads.
             seeds_B2: sampling seed and clip number.
+            watch: of a network, see ``Imagination.run``.
 
         Returns:
             ``(first, last, frames)``: the states before and after, None without a network, and
@@ -93,8 +107,9 @@ class Methods:
             return None, None, copy_last(context, camera.intrinsics_4.shape[1])
         if method == "reproject":
             return None, None, reproject_batch(self.reproject, context, camera)
+        given: dict[str, Any] = {} if watch is None else {"watch": watch}
         model = self.none if method == "none" and self.none is not None else self.model
-        first, last, frames = model.run(context, control, seeds_B2, memory=method == "memory")
+        first, last, frames = model.run(context, control, seeds_B2, memory=method in OURS, **given)
         if not all(np.isfinite(leaf).all() for leaf in (frames.rgb_THWC, frames.depth_THW)):
             raise UserError(
                 "the model imagines values that are not finite: its weights are damaged or its "

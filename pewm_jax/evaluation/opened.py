@@ -80,13 +80,37 @@ def open_run(run: str | Path) -> Opened:
     return Opened(folder, home, config, params, file_hash(folder / WEIGHTS))
 
 
-def require_memory(opened: Opened) -> None:
-    """Refuse weights that lack memory blocks."""
+def remembers(opened: Opened) -> bool:
+    """Tell whether a run's model has a memory; False where it was trained without one on purpose.
+
+    That is, its memory is of kind ``none``, or no stage that trains one was asked for.
+
+    Raises:
+        UserError: training is not finished.
+    """
+    known = stages.all_stages(opened.config)
+    asked = [stage for stage in known if stage.memory and stage.settings(opened.config).steps > 0]
     if "memory" not in opened.params:
-        raise UserError(
-            f"{opened.folder / WEIGHTS} has no memory blocks yet, only stage 1 is trained; finish "
-            "training with `python train.py`, which goes on where it stopped."
-        )
+        if asked:
+            raise UserError(
+                f"{opened.folder / WEIGHTS} has no memory blocks yet, only stage 1 is trained; "
+                "finish training with `python train.py`, which goes on where it stopped."
+            )
+        _require_all_steps(opened)
+        return False
+    return opened.config.model.memory.REMEMBERS
+
+
+def _require_all_steps(opened: Opened) -> None:
+    """Refuse a run of which a stage was trained for fewer steps than its settings ask for."""
+    for stage in stages.all_stages(opened.config):
+        wanted = stage.settings(opened.config).steps
+        done = opened.steps.get(stage.name, wanted if not opened.steps else 0)
+        if done < wanted:
+            raise UserError(
+                f"{opened.folder / WEIGHTS} is of step {done} and {wanted} of {stage.name} were "
+                "asked for; finish training with `python train.py`, which goes on where it stopped."
+            )
 
 
 def report_folder(opened: Opened, config: Config) -> Path:

@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from pewm_jax.evaluation import page_tables
+from pewm_jax.evaluation import page_long, page_tables
 from pewm_jax.evaluation.gallery import ABOVE_CAMERA_M, Gallery
 from pewm_jax.evaluation.pictures import png
 from pewm_jax.evaluation.plots import COLOURS, Line, chart
 from pewm_jax.evaluation.seen import TOLERANCE_M, TOLERANCE_RELATIVE
+from pewm_jax.evaluation.statistics import ours
 from pewm_jax.evaluation.words import METHOD_NAMES, summary_lines
 
 STYLE = """
@@ -45,9 +46,17 @@ code { font-size: .9em; overflow-wrap: anywhere; }
 """
 INTRODUCTION = (
     "An agent walks through {places}, goes out and comes back. "
-    "From what it observed on the way, the model imagines what comes next: with the 3D map it has "
-    "drawn up, and with the same weights and an empty map."
+    "From what it observed on the way, the model imagines what comes next: {how}."
 )
+HOWS = {
+    "memory": "with the 3D map it has drawn up, and with the same weights and an empty map",
+    "model": "it has no memory, and knows the last picture alone",
+}
+"""How the model imagines, by its own row."""
+TITLES = {
+    "memory": "Does the model remember what it saw?",
+    "model": "What does a model without a memory imagine?",
+}
 PLACES = {
     True: "places that the model was never trained on",
     False: "places of which the model was trained in {shared} of {scenes} (so this does not show "
@@ -55,6 +64,11 @@ PLACES = {
     None: "places that the model may have been trained on (its training data is not there to tell)",
 }
 """A phrase for each value of ``held_out`` in the protocol."""
+SHOWN = {
+    "memory": "the model with its map, the same model with an empty map",
+    "model": "the model, which has no memory",
+}
+"""The model's columns in videos, by its own row."""
 
 
 def introduction(protocol: Mapping[str, Any]) -> str:
@@ -62,7 +76,7 @@ def introduction(protocol: Mapping[str, Any]) -> str:
     places = PLACES[protocol["held_out"]].format(
         shared=len(protocol["trained_scenes"]), scenes=len(protocol["scene_names"])
     )
-    return INTRODUCTION.format(places=places)
+    return INTRODUCTION.format(places=places, how=HOWS[protocol.get("method", "memory")])
 
 
 def embed(kind: str, content: bytes) -> str:
@@ -78,8 +92,9 @@ def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         gallery: images and videos.
     """
     seen, *others = summary_lines(metrics)
+    title = TITLES[ours(metrics["results"])]
     sections = [
-        "<h1>Does the model remember what it saw?</h1>",
+        f"<h1>{title}</h1>",
         f'<p class="quiet">{introduction(metrics["protocol"])}</p>',
         f'<p class="lead"><strong>{escape(seen)}</strong></p>',
         f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in others)}</ul>",
@@ -88,8 +103,11 @@ def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         "<h2>Scores</h2>",
         page_tables.scores(metrics),
         page_tables.houses(metrics),
+        page_long.videos(metrics),
         _curves(metrics),
         page_tables.drift(metrics),
+        page_long.growth(metrics),
+        page_long.mirror(metrics),
         page_tables.coverage(metrics),
         _map(gallery),
         _protocol(metrics["protocol"]),
@@ -98,7 +116,7 @@ def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         [
             '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>Does the model remember?</title>\n<style>{STYLE}</style>\n</head>\n<body>",
+            f"<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n<body>",
             *sections,
             "</body>\n</html>\n",
         ]
@@ -112,18 +130,18 @@ def _videos(gallery: Gallery) -> str:
         for caption, film in gallery.videos
     ]
     return (
-        "<h2>Long rollouts, side by side</h2><p>From left to right the recording, the model with "
-        "its map, the same model with an empty map, and what was observed reprojected without a "
-        "network. Above colour, below depth (bright is near). All start from the same observed "
-        "picture and follow the same actions; after each clip the model goes on from its own last "
-        "frame, while the reprojection only ever shows what was observed. The first episodes of "
-        "the split, not chosen.</p>" + "".join(figures)
+        "<h2>Long rollouts, side by side</h2><p>From left to right the recording, "
+        f"{SHOWN['model' if gallery.above is None else 'memory']}, and what was observed "
+        "reprojected without a network. Above colour, below depth (bright is near). All start from "
+        "the same observed picture and follow the same actions; after each clip the model goes on "
+        "from its own last frame, while the reprojection only ever shows what was observed. The "
+        "first episodes of the split, not chosen.</p>" + "".join(figures)
     )
 
 
 def _stills(gallery: Gallery) -> str:
     return (
-        f'<figure><img alt="truth, with its map, empty map, reprojected" '
+        f'<figure><img alt="truth, imagined, reprojected" '
         f'src="{embed("image/png", png(gallery.strip))}">'
         f"<figcaption>{escape(gallery.strip_note)}</figcaption></figure>"
         f'<figure><img alt="seen before" src="{embed("image/png", png(gallery.masks))}">'
@@ -171,6 +189,8 @@ def _curves(metrics: Mapping[str, Any]) -> str:
 
 
 def _map(gallery: Gallery) -> str:
+    if gallery.above is None:
+        return ""
     return (
         "<h2>The map, from above</h2>"
         f'<figure><img alt="the map from above" src="{embed("image/png", png(gallery.above))}">'

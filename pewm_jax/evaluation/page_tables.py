@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
+from pewm_jax.evaluation.statistics import ours
 from pewm_jax.evaluation.words import (
     COVERAGE_NAMES,
     MASK_NAMES,
@@ -22,12 +23,16 @@ CLUSTERS = {
     "differ cannot be said",
 }
 """A phrase for each value of ``clustered_by`` in the protocol: what a standard error covers."""
+MINUS = {"memory": "map", "model": "the model"}
+"""What others are subtracted from in the tables, by the model's own row."""
 QUARTERS = ("first quarter", "second", "third", "last")
 
 
 def scores(metrics: Mapping[str, Any]) -> str:
-    """Return every method's scores, and the margins of the model with its map."""
-    measured = [name for name in METRIC_NAMES if name in metrics["results"]["memory"]["all"]]
+    """Return every method's scores, and the margins of the model."""
+    own = ours(metrics["results"])
+    minus = MINUS[own]
+    measured = [name for name in METRIC_NAMES if name in metrics["results"][own]["all"]]
     heads = "".join(f"<th>{METRIC_NAMES[name][0]}</th>" for name in measured)
     rows = []
     for mask, name in MASK_NAMES.items():
@@ -37,25 +42,30 @@ def scores(metrics: Mapping[str, Any]) -> str:
                 rows.append(_row(label, metrics["results"][method][mask], measured))
         for method in RIVALS:
             if method in metrics["margins"]:
-                label = f"map minus {METHOD_NAMES[method]}"
+                label = f"{minus} minus {METHOD_NAMES[method]}"
                 entries = metrics["margins"][method][mask]
                 rows.append(_row(label, entries, measured, gain=True))
     seeds = metrics["protocol"]["seeds"]
     cover = CLUSTERS[metrics["protocol"]["clustered_by"]]
-    per_seed = ", ".join(f"{value:+.2f}" for value in metrics["margin"]["seen"]["psnr"]["per_seed"])
+    gain = ""
+    if metrics["margin"]:
+        each = metrics["margin"]["seen"]["psnr"]["per_seed"]
+        gain = (
+            " Gain of the map over an empty one on pixels seen before, seed by seed "
+            f"({', '.join(map(str, seeds))}): {', '.join(f'{value:+.2f}' for value in each)} dB."
+        )
     return (
         table(f"<th></th>{heads}<th>clips</th>", rows)
         + "<p class='quiet'>Mean ± standard error over clips. Sampling seeds are averaged within a "
         f"clip first, and the error is {cover}. "
-        "Differences are taken clip by clip, among models with the same noise. "
-        f"Gain of the map over an empty one on pixels seen before, seed by seed "
-        f"({', '.join(map(str, seeds))}): {per_seed} dB.</p>"
+        f"Differences are taken clip by clip, among models with the same noise.{gain}</p>"
     )
 
 
 def houses(metrics: Mapping[str, Any]) -> str:
     """Return means over houses with their intervals, and the paired differences; PSNR."""
     found, rows = metrics["houses"], []
+    minus = MINUS[ours(found["results"])]
     frames = metrics["protocol"]["imagined_frames"]
     ends = sorted({0, (frames - 1) // 2, frames - 1})
     for mask, name in MASK_NAMES.items():
@@ -68,7 +78,7 @@ def houses(metrics: Mapping[str, Any]) -> str:
                 steps = found["per_frame_margins" if sign else "per_frame"][method][mask]["psnr"]
                 at = [{key: steps[key][t] for key in ("mean", "low", "high")} for t in ends]
                 cells = "".join(f"<td>{spread(e, 2, sign=sign)}</td>" for e in (whole, *at))
-                kind, shown = (' class="gain"', f"map minus {label}") if sign else ("", label)
+                kind, shown = (' class="gain"', f"{minus} minus {label}") if sign else ("", label)
                 rows.append(f"<tr{kind}><td>{shown}</td>{cells}<td>{whole['houses']}</td></tr>")
     heads = "".join(f"<th>frame {t + 1}</th>" for t in ends)
     return (

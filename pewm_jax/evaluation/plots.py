@@ -10,11 +10,13 @@ from html import escape
 COLOURS = {
     "memory": "#1f6feb",
     "empty": "#e8731a",
+    "model": "#1f6feb",
     "none": "#b8479c",
     "reproject": "#1a9a6c",
     "copy": "#8a8f98",
 }
-"""The colour of each method; distinguishable for the colour-blind."""
+"""The colour of each method; distinguishable for the colour-blind. The model itself has one colour,
+with a memory or without."""
 WIDTH, HEIGHT = 440, 280
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 36, 44
 
@@ -45,14 +47,22 @@ def ticks(low: float, high: float, about: int = 5) -> list[float]:
     return [index * step for index in range(first, max(last, first + 1) + 1)]
 
 
-def chart(title: str, x_label: str, lines: Sequence[Line], *, unit: str = "") -> str:
-    """Draw curves over the frame index, which starts at 1.
+def chart(
+    title: str,
+    x_label: str,
+    lines: Sequence[Line],
+    *,
+    unit: str = "",
+    places: Sequence[int] = (),
+) -> str:
+    """Draw curves over the frame index, which starts at 1, or over other numbers.
 
     Args:
         title: what is drawn.
         x_label: under the horizontal axis.
         lines: the curves, with the same number of values.
         unit: of the values, shown in the title.
+        places: what stands under each value, evenly spread; by default 1, 2, 3, …
 
     Returns:
         An ``<svg>`` element, or a sentence if there is nothing to draw.
@@ -83,8 +93,9 @@ def chart(title: str, x_label: str, lines: Sequence[Line], *, unit: str = "") ->
         ]
     every = max(1, round(count / 8))
     for index in range(0, count, every):
+        under = places[index] if places else index + 1
         parts.append(
-            f'<text x="{x(index):.1f}" y="{HEIGHT - BOTTOM + 18}" class="m">{index + 1}</text>'
+            f'<text x="{x(index):.1f}" y="{HEIGHT - BOTTOM + 18}" class="m">{under}</text>'
         )
     parts.append(
         f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 8}" class="m">'

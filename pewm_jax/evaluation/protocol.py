@@ -184,14 +184,18 @@ def load_clip(
         [context.camera.world_from_camera[-1:], targets.camera.world_from_camera]
     )
     actions_N3 = np.asarray(actions_between(poses))
-    _check_motion(np.asarray(integrate(poses[0], actions_N3)), poses, choice, "upright motion")
+    _check_motion(np.asarray(_followed(poses[0], actions_N3)), poses, choice, "upright motion")
     if episode.actions is not None and episode.actions.shape[1] == PLANAR:
         recorded = np.asarray(continuous(config.model.actions, episode.actions))
         steps = recorded[choice.start : choice.targets_N[-1]]
-        every = np.asarray(integrate(poses[0], steps))
+        every = np.asarray(_followed(poses[0], steps))
         taken = every[[index - choice.start for index in (choice.start, *choice.targets_N)]]
         _check_motion(taken, poses, choice, "recorded actions")
     return context, targets, actions_N3
+
+
+_followed = jax.jit(integrate)
+"""``integrate``, compiled once for each length and not for each clip."""
 
 
 def _check_motion(integrated: np.ndarray, poses: np.ndarray, choice: ClipChoice, what: str) -> None:
@@ -225,7 +229,7 @@ def fingerprint(
     protocol: str = "",
     baseline: str = "",
 ) -> str:
-    """Return a hash of everything that the scores depend on, except the choice of seeds and rivals.
+    """Return a hash of all that scores depend on, but the choice of seeds, rivals and measures.
 
     Args:
         config: the run's configuration, with overrides for the evaluation.
@@ -238,7 +242,7 @@ def fingerprint(
             settings; "" if there is none.
     """
     settings = to_dict(config)
-    for key in ("seeds", "videos", "none", "lpips", "protocol"):
+    for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src"):
         settings["evaluate"].pop(key)
     for key in ("train", "data"):
         settings.pop(key)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import jax
 
 from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
@@ -18,21 +20,25 @@ from pewm_jax.evaluation.covered import score_coverage
 from pewm_jax.evaluation.fixed import decide
 from pewm_jax.evaluation.gallery import ROWS, Gallery, make_gallery
 from pewm_jax.evaluation.imagine import Imagination, print_now
+from pewm_jax.evaluation.long_rollouts import LongRollouts, roll_long
 from pewm_jax.evaluation.measure import measure
 from pewm_jax.evaluation.methods import Methods
-from pewm_jax.evaluation.metrics.perceptual import chosen as chosen_lpips
+from pewm_jax.evaluation.metrics import chosen
+from pewm_jax.evaluation.mirror import look_back, way_out
 from pewm_jax.evaluation.page import render
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
 from pewm_jax.evaluation.protocol import file_hash, fingerprint
 from pewm_jax.evaluation.reproject_choice import SPLIT as BASELINE_SPLIT
 from pewm_jax.evaluation.reproject_choice import choose_settings
-from pewm_jax.evaluation.scoring import roll_long, score_table
+from pewm_jax.evaluation.scoring import Scored, score_table
+from pewm_jax.evaluation.shares import first_alone
 from pewm_jax.evaluation.words import score_lines, summary_lines
+from pewm_jax.training import processes
 
 TRAINED_ON = "train"
 """The split that training reads."""
-REPORT_VERSION = 6
+REPORT_VERSION = 7
 """Increase it whenever the same scores would give another report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
@@ -52,7 +58,7 @@ def override(config: Config, **changes: Any) -> Config:
     """
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
-    for name in ("none", "lpips", "protocol"):
+    for name in ("none", "lpips", "protocol", "fvd"):
         if name in changes:
             changes[name] = str(changes[name])
     if steps is not None:
@@ -73,6 +79,9 @@ def evaluate(
 ) -> Path:
     """Score a trained run and write its report.
 
+    Several processes (``training.processes``) share the work, and several devices of one process
+    its batches; the first process writes the report.
+
     After an interruption, finished scores are reused. A report that is complete for these weights
     and this protocol is not written again.
 
@@ -90,7 +99,7 @@ def evaluate(
         UserError: the run, its weights or the data are absent, damaged, or do not fit together.
     """
     opened = runs.open_run(run)
-    runs.require_memory(opened)
+    remembers = runs.remembers(opened)
     trained_on = Path(opened.config.data.path) / TRAINED_ON
     config, fixed = protocol_file.given(override(opened.config, **changes), changes)
     split = Path(config.data.path) / config.evaluate.split
@@ -98,9 +107,8 @@ def evaluate(
     none = runs.open_none(opened, config)
     none_weights = none.weights_hash if none else ""
     data_hash = file_hash(split / MANIFEST)
-    lpips, about_lpips = chosen_lpips(
-        config.evaluate.lpips, config.model.clip.height, config.model.clip.width
-    )
+    measures = chosen.choose(config, accelerator=jax.default_backend() != "cpu")
+    lpips = measures.lpips
     chooses = Path(config.data.path) / BASELINE_SPLIT / MANIFEST
     name = fingerprint(
         config,
@@ -111,14 +119,19 @@ def evaluate(
         file_hash(chooses) if fixed and chooses.is_file() else "",
     )
     folder = Path(out) if out else runs.report_folder(opened, config)
-    if is_complete(folder, config, name, none_weights):
+    processes.meet("evaluate: begin")
+    complete = is_complete(folder, config, name, none_weights, measures.hashes)
+    processes.meet("evaluate: decided")  # nobody writes before all have looked
+    if complete:
         say("the report is complete for these weights and this protocol; nothing to do")
         return folder / PAGE
     make_folder(folder)
-    partials = Partials(folder / "partial", opened.weights_hash, name)
+    partials = first_alone(
+        lambda: Partials(folder / "partial", opened.weights_hash, name), "folder"
+    )
     if lpips is None:
-        say(about_lpips)
-    choice = choose_settings(config, partials, say)
+        say(measures.about["lpips"])
+    choice = first_alone(lambda: choose_settings(config, partials, say), "reprojection")
     say(f"reprojection: {choice.why}")
     protocol, clips, rollouts = decide(config, episodes, fixed, str(split))
     cameras = protocol.control == "cameras"
@@ -126,26 +139,43 @@ def evaluate(
 
     def imagination(which: runs.Opened, settings: Config) -> Imagination:
         batch, context = config.evaluate.batch, config.data.context
-        return Imagination(settings, which.params, batch, context, say, cameras=cameras)
+        return Imagination(
+            settings,
+            which.params,
+            batch,
+            context,
+            say,
+            cameras=cameras,
+            devices=jax.local_devices(),
+        )
 
     methods = Methods(
         imagination(opened, config),
         choice.settings,
         imagination(none, none.config) if none else None,
         none_weights,
+        remembers,
     )
-    scored = score_table(config, episodes, methods, partials, say, lpips, clips)
+    scored = score_table(config, episodes, methods, partials, say, lpips, clips, measures.i3d)
     long = roll_long(config, episodes, methods, partials, say, lpips, rollouts)
+    back = look_back(config, episodes, methods, partials, rollouts, measures.visits, say)
+    covered = None
+    if remembers:
+        covered = score_coverage(config, episodes, methods.model, partials, say, clips)
+    if not processes.is_primary():
+        processes.meet("evaluate: report")  # devices that wait for one another would give up
+        return folder / PAGE
     say("drawing the report …")
-    metrics = measure(config, scored, long)
-    metrics["coverage"] = score_coverage(config, episodes, methods.model, partials, say, clips)
+    metrics = measure(config, scored, long, back, measures.i3d)
+    metrics["coverage"] = covered
     if cameras:
         metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
     metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {
         "reproject": choice.facts(),
         "none": runs.none_facts(none, opened) if none else None,
-        "lpips": about_lpips,
-        "lpips_weights_sha256": lpips.sha256 if lpips else None,
+        **measures.about,
+        "mirror": way_out(config, rollouts)[1],
+        **measures.hashes,
         "weights_sha256": opened.weights_hash,
         "dataset_sha256": data_hash,
         "protocol_sha256": protocol.sha256,
@@ -153,9 +183,23 @@ def evaluate(
         "fingerprint": name,
         "report_version": REPORT_VERSION,
     }
-    gallery = make_gallery(config, episodes, long)
-    (folder / METRICS).unlink(missing_ok=True)
     protocol_file.save(folder / PROTOCOL, protocol, {"data": str(split)})
+    _write(folder, metrics, make_gallery(config, episodes, long), scored, long)
+    processes.meet("evaluate: report")
+    for line in [*score_lines(metrics), *summary_lines(metrics)]:
+        say(line)
+    return folder / PAGE
+
+
+def _write(
+    folder: Path,
+    metrics: dict[str, Any],
+    gallery: Gallery,
+    scored: Scored,
+    long: LongRollouts,
+) -> None:
+    """Write all files of a report but its protocol; ``metrics.json``, which says so, at the end."""
+    (folder / METRICS).unlink(missing_ok=True)
     names = ("protocol_sha256", "weights_sha256", "lpips_weights_sha256", "seeds")
     facts = {name: metrics["protocol"][name] for name in names}
     samples.save(folder, samples.gather(scored, long, **facts))
@@ -164,9 +208,6 @@ def evaluate(
     atomic.write_text(folder / PAGE, page)
     metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()
     atomic.write_text(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")
-    for line in [*score_lines(metrics), *summary_lines(metrics)]:
-        say(line)
-    return folder / PAGE
 
 
 def _save_pictures(folder: Path, gallery: Gallery) -> None:
@@ -193,7 +234,13 @@ def make_folder(folder: Path) -> None:
         ) from None
 
 
-def is_complete(folder: Path, config: Config, name: str, none_weights: str = "") -> bool:
+def is_complete(
+    folder: Path,
+    config: Config,
+    name: str,
+    none_weights: str = "",
+    extras: Mapping[str, Any] | None = None,
+) -> bool:
     """Tell whether a folder holds the complete report for a fingerprint, seeds, videos and rival.
 
     Args:
@@ -201,6 +248,7 @@ def is_complete(folder: Path, config: Config, name: str, none_weights: str = "")
         config: the run's configuration, with overrides for the evaluation.
         name: the fingerprint of weights and protocol.
         none_weights: sha256 of the weights of the model without a memory; "" if there is none.
+        extras: entries of the protocol on measures that can be left out.
     """
     try:
         metrics = json.loads((folder / METRICS).read_text("utf-8"))
@@ -211,6 +259,8 @@ def is_complete(folder: Path, config: Config, name: str, none_weights: str = "")
             and protocol["seeds"] == list(config.evaluate.seeds)
             and (protocol["none"] or {}).get("weights_sha256", "") == none_weights
             and protocol["config"]["evaluate"]["videos"] == config.evaluate.videos
+            and protocol["config"]["evaluate"]["mirror"] == config.evaluate.mirror
+            and {key: protocol[key] for key in extras or {}} == (extras or {})
             and metrics["page_sha256"] == file_hash(folder / PAGE)
             and all((folder / file).is_file() for file in (STRIP, PROTOCOL, samples.SAMPLES))
         )

@@ -19,9 +19,10 @@ import numpy as np
 
 from pewm_jax import atomic
 from pewm_jax.config import UserError
+from pewm_jax.evaluation.long_rollouts import LongRollouts
 from pewm_jax.evaluation.protocol import ClipChoice
-from pewm_jax.evaluation.scoring import LongRollouts, Scored
-from pewm_jax.evaluation.statistics import scores
+from pewm_jax.evaluation.scoring import Scored
+from pewm_jax.evaluation.statistics import ours, scores
 
 SAMPLES, VERSION = "samples.npz", 1
 PARTS = ("clips", "frames", "rollouts")
@@ -42,6 +43,11 @@ class Samples:
 
     about: Mapping[str, Any]
     arrays: Mapping[str, np.ndarray] = dataclasses.field(repr=False)
+
+    @property
+    def own(self) -> str:
+        """The method that is the model itself: ``memory``, or ``model`` if it has none."""
+        return ours(name.split("/")[1] for name in self.arrays)
 
     def table(self, part: str, method: str) -> dict[str, dict[str, np.ndarray]]:
         """Return ``[mask][metric]`` of one of ``PARTS``; empty where there is no such method."""

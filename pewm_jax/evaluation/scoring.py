@@ -1,13 +1,16 @@
-"""Scoring: imagine every chosen clip with every method and sum the errors; can be resumed."""
+"""Scoring: imagine every chosen clip with every method and sum the errors; can be resumed.
+
+Every piece of work is a file of its own: one batch of clips, one method, one sampling seed. Several
+processes share them (``shares``).
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import Config
@@ -15,13 +18,16 @@ from pewm_jax.data.episodes import Episode
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation.images import error_sums_batch, unit_colours, with_lpips
 from pewm_jax.evaluation.imagine import print_now
-from pewm_jax.evaluation.methods import Methods
-from pewm_jax.evaluation.metrics import Perceptual
+from pewm_jax.evaluation.methods import SAMPLED, Methods
+from pewm_jax.evaluation.metrics import Perceptual, VideoDistance
 from pewm_jax.evaluation.partial import Partials
-from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, long_choices, stack
+from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, stack
 from pewm_jax.evaluation.seen import seen_masks_batch
-from pewm_jax.memory import memories
-from pewm_jax.types import Frames
+from pewm_jax.evaluation.shares import gathered, share
+from pewm_jax.types import Array, Frames
+
+TRUTH = "truth"
+"""Whose features are kept beside the methods'."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,10 +37,13 @@ class Scored:
     Attributes:
         choices: the C clips.
         sums: method → (seeds, C, N, 3, 9) as ``images.error_sums``; one seed without a network.
+        features: where video distances are measured, method → (C, 400) features of the clips of
+            the first seed (``metrics.videos``), and those of ``truth``.
     """
 
     choices: list[ClipChoice]
     sums: dict[str, np.ndarray]
+    features: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def clustered_by(self) -> str:
@@ -46,25 +55,6 @@ class Scored:
         """(C,) the cluster number of every clip; clips of one cluster show the same rooms."""
         names = [getattr(choice, self.clustered_by) for choice in self.choices]
         return np.unique(names, return_inverse=True)[1]
-
-
-@dataclasses.dataclass(frozen=True)
-class LongRollouts:
-    """Scored long rollouts; the frames of the first few are stored, to be shown.
-
-    Attributes:
-        scored: errors over all of them.
-        chain: clips generated one after the other.
-        shown: number of rollouts whose frames are stored.
-        kept: per method ``rgb`` (shown, N, H, W, 3) uint8 and ``depth`` (shown, N, H, W) metres;
-            for ``memory`` also the map at the start and the end: ``first_points``,
-            ``first_features``, ``first_valid``, and the same with ``last``.
-    """
-
-    scored: Scored
-    chain: int
-    shown: int
-    kept: dict[str, dict[str, np.ndarray]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,10 +73,21 @@ class Batch:
         """Return what the sampler's noise is drawn from: sampling seed, clip number."""
         return np.stack([np.full_like(self.numbers_B, seed), self.numbers_B], -1)
 
-    def imagine(self, methods: Methods, method: str, seed: int) -> tuple[Any, Any, Frames]:
+    def imagine(
+        self,
+        methods: Methods,
+        method: str,
+        seed: int,
+        watch: Callable[[Any], Any] | None = None,
+    ) -> tuple[Any, Any, Frames]:
         """Imagine the clips, see ``Methods.imagine``."""
         seeds, camera = self.seeds(seed), self.targets.camera
-        return methods.imagine(method, self.context, self.control, camera, seeds)
+        return methods.imagine(method, self.context, self.control, camera, seeds, watch)
+
+    def whole(self, rgb_BTHWC: Any) -> Array:
+        """Return colours in [−1, 1] with the present frame before them, of padded clips too."""
+        parts = self.context.rgb_THWC[:, -1:], rgb_BTHWC
+        return jnp.concatenate([2 * unit_colours(part) - 1 for part in parts], 1)
 
     def sums(self, frames: Frames, lpips: Perceptual | None) -> np.ndarray:
         """Return ``images.error_sums`` of the clips asked for, with LPIPS if it is given."""
@@ -117,6 +118,29 @@ def load_batch(
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A piece of the table: one batch of clips, one method, one seed, and what is kept of them.
+
+    Attributes:
+        method: one of ``Methods.names``, or ``truth``.
+        seed: of the sampling noise.
+        first: number of the batch's first clip.
+        kept: ``sums`` of the errors, or ``features`` for the distances of videos.
+    """
+
+    method: str
+    seed: int
+    first: int
+    kept: str
+
+    def name(self, methods: Methods, i3d: VideoDistance | None) -> str:
+        """Return the name of its file, which says what its content depends on beside the clips."""
+        who = "truth" if self.method == TRUTH else methods.piece(self.method)
+        kind = f"i3d-{i3d.sha256[:16]}" if i3d and self.kept == "features" else "table"
+        return f"{kind}-{who}-seed{self.seed}-clip{self.first:04d}"
+
+
 def score_table(
     config: Config,
     episodes: Sequence[Episode],
@@ -125,11 +149,13 @@ def score_table(
     say: Callable[[str], Any] = print_now,
     lpips: Perceptual | None = None,
     choices: list[ClipChoice] | None = None,
+    i3d: VideoDistance | None = None,
 ) -> Scored:
     """Score ``evaluate.clips`` choices, chains of ``evaluate.chain`` clips, by method and seed.
 
-    Pieces that ``partials`` already holds are reused. Without ``lpips`` that is left out. Without
-    ``choices`` they are those of ``choose``.
+    Pieces that ``partials`` already holds are reused. Without ``lpips`` that is left out, and
+    without ``i3d`` the features of whole clips. Without ``choices`` they are those of ``choose``.
+    Several processes share the work, and all return the whole table.
 
     Raises:
         UserError: no episode is long enough, the data is inconsistent or does not fit the model,
@@ -137,140 +163,75 @@ def score_table(
     """
     if choices is None:
         choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
-    starts = range(0, len(choices), config.evaluate.batch)
-    pieces: dict[tuple[str, int, int], np.ndarray] = {}
-    todo: list[tuple[str, int, int]] = []
-    for first in starts:
-        for method in methods.names:
-            for seed in methods.seeds(method, config.evaluate.seeds):
-                found = partials.get(_piece(methods, method, seed, first))
-                if found is None:
-                    todo.append((method, seed, first))
-                else:
-                    pieces[method, seed, first] = found["sums"]
-    if pieces:
-        say(f"{len(pieces)} of {len(pieces) + len(todo)} pieces were scored before and are kept")
-    methods.prepare(method for method, _, _ in todo)
+    size, starts = config.evaluate.batch, range(0, len(choices), config.evaluate.batch)
+    tasks = _tasks(config, methods, starts, i3d)
+    names = {task: task.name(methods, i3d) for task in tasks}
+    known = {task: piece for task in tasks if (piece := partials.get(names[task])) is not None}
+    # What is kept of one imagination is one process's, so that nothing is imagined twice.
+    groups = list(dict.fromkeys((task.first, task.method, task.seed) for task in tasks))
+    own = set(share(groups, lambda group: group[1] not in SAMPLED))
+    todo = [t for t in tasks if t not in known and (t.first, t.method, t.seed) in own]
+    if known:
+        say(f"{len(known)} of {len(tasks)} pieces were scored before and are kept")
+    methods.prepare(task.method for task in todo)
     frames_each = config.evaluate.chain * (config.model.clip.frames - 1)
-    total = sum(
-        frames_each * min(config.evaluate.batch, len(choices) - first) for _, _, first in todo
-    )
+    total = sum(frames_each * min(size, len(choices) - task.first) for task in todo)
     with Meter("scoring", total, "frames") as meter:
         loaded: tuple[int, Batch] | None = None
-        for method, seed, first in todo:
-            if loaded is None or loaded[0] != first:
-                chosen = choices[first : first + config.evaluate.batch]
-                loaded = (
-                    first,
-                    load_batch(config, episodes, chosen, first, cameras=methods.model.cameras),
-                )
-            batch = loaded[1]
-            frames = batch.imagine(methods, method, seed)[2]
-            sums = batch.sums(frames, lpips)
-            partials.put(_piece(methods, method, seed, first), sums=sums)
-            pieces[method, seed, first] = sums
+        made: tuple[tuple[Any, ...], Any] | None = None
+        for task in todo:
+            if loaded is None or loaded[0] != task.first:
+                chosen = choices[task.first : task.first + size]
+                cameras = methods.model.cameras
+                batch = load_batch(config, episodes, chosen, task.first, cameras=cameras)
+                loaded, made = (task.first, batch), None
+            batch, group = loaded[1], (task.method, task.seed)
+            if task.method == TRUTH:
+                made = group, batch.targets
+            elif made is None or made[0] != group:
+                made = group, batch.imagine(methods, task.method, task.seed)[2]
+            known[task] = partials.put(names[task], **_kept(task, batch, made[1], lpips, i3d))
             meter.advance(frames_each * batch.real)
     if todo:
         say(meter.summary())
-    table = {
-        method: np.stack(
-            [
-                np.concatenate([pieces[method, seed, first] for first in starts])
-                for seed in methods.seeds(method, config.evaluate.seeds)
-            ]
-        )
-        for method in methods.names
-    }
-    return Scored(choices, table)
+    found = gathered(partials, names, known, "table")
+
+    def joined(method: str, seed: int, kept: str) -> np.ndarray:
+        return np.concatenate([found[Task(method, seed, f, kept)][kept] for f in starts])
+
+    seeds = {method: methods.seeds(method, config.evaluate.seeds) for method in methods.names}
+    sums = {name: np.stack([joined(name, seed, "sums") for seed in seeds[name]]) for name in seeds}
+    features = {}
+    if i3d is not None:
+        firsts = {name: some[0] for name, some in seeds.items()} | {TRUTH: 0}
+        features = {name: joined(name, seed, "features") for name, seed in firsts.items()}
+    return Scored(choices, sums, features)
 
 
-def _piece(methods: Methods, method: str, seed: int, first: int) -> str:
-    return f"table-{methods.piece(method)}-seed{seed}-clip{first:04d}"
+def _tasks(
+    config: Config, methods: Methods, starts: Sequence[int], i3d: VideoDistance | None
+) -> list[Task]:
+    """Return all pieces, those of one batch and of one imagination beside each other."""
+    tasks = []
+    for first in starts:
+        for method in methods.names:
+            for place, seed in enumerate(methods.seeds(method, config.evaluate.seeds)):
+                tasks.append(Task(method, seed, first, "sums"))
+                if i3d is not None and place == 0:
+                    tasks.append(Task(method, seed, first, "features"))
+        if i3d is not None:
+            tasks.append(Task(TRUTH, 0, first, "features"))
+    return tasks
 
 
-def roll_long(
-    config: Config,
-    episodes: Sequence[Episode],
-    methods: Methods,
-    partials: Partials,
-    say: Callable[[str], Any] = print_now,
-    lpips: Perceptual | None = None,
-    choices: list[ClipChoice] | None = None,
-) -> LongRollouts:
-    """Make long rollouts with every method (first seed), score all, store the first few.
-
-    Without ``lpips`` that is left out. Without ``choices`` they are those of ``long_choices``.
-
-    Raises:
-        UserError: as for ``score_table``.
-    """
-    if choices is None:
-        choices = long_choices(config, episodes)
-    count = len(choices[0].targets_N)
-    shown = min(config.evaluate.videos, len(choices))
-    seed, size = config.evaluate.seeds[0], config.evaluate.batch
-    name = {method: f"long-{methods.piece(method)}-seed{seed}" for method in methods.names}
-    pieces = {method: partials.get(name[method]) for method in methods.names}
-    todo = [m for m in methods.names if not _holds(pieces[m], len(choices), shown)]
-    if todo:
-        methods.prepare(todo)
-        cameras = methods.model.cameras
-        batches = [
-            load_batch(config, episodes, choices[first : first + size], first, cameras=cameras)
-            for first in range(0, len(choices), size)
-        ]
-        with Meter("long rollouts", len(todo) * count * len(choices), "frames") as meter:
-            for method in todo:
-                parts = []
-                for batch in batches:
-                    here = min(max(shown - int(batch.numbers_B[0]), 0), batch.real)
-                    parts.append(_roll(config, methods, method, batch, here, lpips))
-                    meter.advance(count * batch.real)
-                joined = {
-                    key: np.concatenate([part[key] for part in parts if key in part])
-                    for key in parts[0]
-                }
-                pieces[method] = partials.put(name[method], **joined)
-        say(meter.summary())
-    kept = {method: piece for method, piece in pieces.items() if piece is not None}
-    sums = {method: piece["sums"][None] for method, piece in kept.items()}
-    chain = count // (config.model.clip.frames - 1)
-    return LongRollouts(Scored(choices, sums), chain, shown, kept)
-
-
-def _holds(piece: dict[str, np.ndarray] | None, rollouts: int, shown: int) -> bool:
-    """Tell whether a piece has all the rollouts, and the frames of those that are shown."""
-    return piece is not None and len(piece["sums"]) == rollouts and len(piece["rgb"]) >= shown
-
-
-def _roll(
-    config: Config,
-    methods: Methods,
-    method: str,
+def _kept(
+    task: Task,
     batch: Batch,
-    shown: int,
+    frames: Frames,
     lpips: Perceptual | None,
+    i3d: VideoDistance | None,
 ) -> dict[str, np.ndarray]:
-    """Imagine a batch of long rollouts; frames and maps of the first ``shown`` are kept."""
-    first, last, frames = batch.imagine(methods, method, config.evaluate.seeds[0])
-    colours = np.asarray(unit_colours(frames.rgb_THWC[:shown]))
-    kept = {
-        "sums": batch.sums(frames, lpips),
-        "rgb": np.rint(colours * 255).astype(np.uint8),
-        "depth": np.asarray(frames.depth_THW[:shown], np.float32),
-    }
-    if method == "memory" and shown:
-        kept |= _map_points(config, first.map, shown, "first")
-        kept |= _map_points(config, last.map, shown, "last")
-    return kept
-
-
-def _map_points(config: Config, maps: Any, shown: int, when: str) -> dict[str, np.ndarray]:
-    maps = jax.tree.map(lambda leaf: leaf[:shown], maps)
-    to_points = functools.partial(memories.to_points, config.model)
-    points, features, valid = jax.vmap(to_points)(maps)
-    return {
-        f"{when}_points": np.asarray(points),
-        f"{when}_features": np.asarray(features),
-        f"{when}_valid": np.asarray(valid),
-    }
+    if task.kept == "sums":
+        return {"sums": batch.sums(frames, lpips)}
+    assert i3d is not None
+    return {"features": i3d.features(batch.whole(frames.rgb_THWC))[: batch.real]}

@@ -9,7 +9,7 @@ score more precise but say nothing about new places.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,17 @@ METRICS = ("psnr", "ssim", "depth_mae", "depth_rel")
 ``lpips`` where it was measured."""
 ENDS = 16
 """Frames at the start and at the end of a long rollout that are compared to tell its drift."""
+OURS = ("memory", "model")
+"""The rows of the model itself: with its map, or of a model that has no memory; one report has one
+of them."""
 LEAST_SHARE = 0.01
 """The smallest share of pixels that a mask must cover for a clip or frame to get a score."""
+
+
+def ours(names: Iterable[str]) -> str:
+    """Return which of the methods is the model itself: ``memory``, or ``model`` if it has none."""
+    found = set(names)
+    return next(name for name in OURS if name in found)
 
 
 def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
@@ -137,11 +146,12 @@ def margin(better: np.ndarray, base: np.ndarray, clusters: np.ndarray) -> dict[s
 
 
 def margins(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
-    """Compare the model with its map with every other method, as ``margin`` does."""
+    """Compare the model itself (``ours``) with every other method, as ``margin`` does."""
+    own = ours(sums)
     return {
-        method: margin(sums["memory"], other, clusters)
+        method: margin(sums[own], other, clusters)
         for method, other in sums.items()
-        if method != "memory"
+        if method != own
     }
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from pewm_jax.evaluation.statistics import ours
+
 METHOD_NAMES = {
     "memory": "with its map",
     "empty": "same weights, empty map",
+    "model": "the model, which has no memory",
     "none": "trained as long without a memory",
     "reproject": "reprojection, no network",
     "copy": "copying the last frame",
@@ -18,7 +21,13 @@ RIVALS = {
     "none": "a model trained as long without a memory",
     "empty": "an empty map",
 }
-"""What the model with its map is compared with, in sentences."""
+"""What the model is compared with, in sentences."""
+OUR_NAMES = {"memory": "The model with its map", "model": "The model, which has no memory,"}
+"""The model itself in sentences, by its row."""
+NO_MEMORY = (
+    "This model was trained without a memory: there is no map, and no row with an empty one; what "
+    "a memory brings is seen beside a run that has one (`pewm-jax compare`, or --none of that run)."
+)
 MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
 """Names of the masks."""
 METRIC_NAMES = {
@@ -82,12 +91,13 @@ def verdict(entry: Mapping[str, Any], where: str) -> str:
     return f"On pixels {where} the map makes no clear difference ({mean:+.2f} ± {stderr:.2f} dB)."
 
 
-def comparison(margin: Mapping[str, Any], rival: str) -> str:
-    """Return a sentence on whether the model with its map beats another method, mask by mask.
+def comparison(margin: Mapping[str, Any], rival: str, own: str = "memory") -> str:
+    """Return a sentence on whether the model beats another method, mask by mask.
 
     Args:
-        margin: ``[mask]["psnr"]`` of memory minus the rival.
+        margin: ``[mask]["psnr"]`` of the model minus the rival.
         rival: key of ``RIVALS``.
+        own: key of ``OUR_NAMES``.
     """
     places = {
         "seen": "over pixels seen before",
@@ -95,7 +105,7 @@ def comparison(margin: Mapping[str, Any], rival: str) -> str:
         "all": "over all",
     }
     said = [f"{where} {_outcome(margin[mask]['psnr'])}" for mask, where in places.items()]
-    return f"The model with its map against {RIVALS[rival]}: {'; '.join(said)}."
+    return f"{OUR_NAMES[own]} against {RIVALS[rival]}: {'; '.join(said)}."
 
 
 def _outcome(entry: Mapping[str, Any]) -> str:
@@ -111,10 +121,10 @@ def _outcome(entry: Mapping[str, Any]) -> str:
 
 
 def drifted(drift: Mapping[str, Any]) -> str:
-    """Return a sentence on how long rollouts of the model with its map change.
+    """Return a sentence on how long rollouts of the model change.
 
     Args:
-        drift: ``statistics.drift`` of the method ``memory``.
+        drift: ``statistics.drift`` of the model's own row.
     """
     if drift["difference"] is None:
         return "Long rollouts have fewer than 32 frames: their drift is not measured."
@@ -140,22 +150,72 @@ def perceived(metrics: Mapping[str, Any]) -> str:
     return f"LPIPS of whole pictures, lower is better: {'; '.join(said)}."
 
 
+def far_apart(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence on FVD and KVD, or on why they were left out."""
+    found = metrics["videos"]
+    if not found:
+        return metrics["protocol"]["fvd"]
+    said = []
+    for kind, name in found["names"].items():
+        values = (
+            f"{label} {found['results'][method][kind]['value']:.4g}"
+            for method, label in METHOD_NAMES.items()
+            if method in found["results"]
+        )
+        said.append(f"{name}, lower is better: {'; '.join(values)}")
+    return f"{'. '.join(said)}."
+
+
+def came_back(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence on the mirror test, or on why it was left out."""
+    found = metrics["mirror"]
+    if not found:
+        return metrics["protocol"]["mirror"]
+    said = []
+    for method, pairs in found["by_distance"].items():
+        values = pairs["again"]["mean"]
+        known = [(value, at) for value, at in zip(values, found["distances"], strict=True) if value]
+        ends = " and ".join(f"{value:.2f} dB after {at}" for value, at in (known[0], known[-1]))
+        said.append(f"{METHOD_NAMES[method]} {ends}")
+    return (
+        "There and back, the second visit against the first, by frames between them: "
+        f"{'; '.join(said)}."
+    )
+
+
+def grew(metrics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on how the map grows, if there is one."""
+    found = metrics["long"]["growth"]
+    if not found:
+        return []
+    held = found["occupied"]["mean"]
+    said = (
+        f"Along long rollouts the map grows from {held[0]:.0f} to {held[-1]:.0f} points in "
+        f"{found['frames'][-1]} imagined frames, of {found['capacity']} that it has room for."
+    )
+    return [said]
+
+
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     """Return the report's sentences, for the terminal: against the baselines, then the map alone.
 
     Args:
         metrics: the content of ``metrics.json``.
     """
-    margins = metrics["margins"]
-    lines = [
-        verdict(margins["empty"]["seen"]["psnr"], "seen before"),
-        verdict(margins["empty"]["unseen"]["psnr"], "never seen"),
-    ]
-    lines += [comparison(margins[name], name) for name in ("reproject", "none") if name in margins]
-    lines += [] if "none" in margins else [NONE_HOW]
-    lines += [perceived(metrics)]
+    margins, own = metrics["margins"], ours(metrics["results"])
+    lines = [NO_MEMORY]
+    if own == "memory":
+        lines = [
+            verdict(margins["empty"]["seen"]["psnr"], "seen before"),
+            verdict(margins["empty"]["unseen"]["psnr"], "never seen"),
+        ]
+    rivals = [name for name in ("reproject", "none") if name in margins]
+    lines += [comparison(margins[name], name, own) for name in rivals]
+    lines += [NONE_HOW] if own == "memory" and "none" not in margins else []
+    lines += [perceived(metrics), far_apart(metrics)]
     lines += [covered(metrics["coverage"])] if metrics["coverage"] else []
-    return [*lines, drifted(metrics["long"]["drift"]["memory"])]
+    lines += [drifted(metrics["long"]["drift"][own]), *grew(metrics)]
+    return [*lines, came_back(metrics)]
 
 
 def score_lines(metrics: Mapping[str, Any]) -> list[str]:

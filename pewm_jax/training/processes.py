@@ -26,13 +26,13 @@ from jax.sharding import PartitionSpec as P
 from orbax.checkpoint import multihost
 
 from pewm_jax import cli
-from pewm_jax.config import Launch, UserError
+from pewm_jax.config import Join, UserError
 
 HEARTBEAT_S = 20
 """Seconds of silence after which a process counts as dead, and all others end."""
 GONE = (
-    "Another process of this training is gone, or cannot be reached: see what the others say, and "
-    "start all of them again to go on from the last checkpoint."
+    "Another process of this job is gone, or cannot be reached: see what the others say, and start "
+    "all of them again to go on from what was kept (the last checkpoint)."
 )
 """What a process says when it notices that another is gone."""
 _LEAVE_S = 60
@@ -42,11 +42,14 @@ _REPORT_S = 5
 _COMMUNICATION = ("gloo", "nccl", "unavailable", "deadline", "connect", "coordination", "socket")
 """Parts of the messages of errors that JAX raises when another process is gone."""
 
+MEET_S = 7 * 24 * 3600
+"""Seconds that processes wait for one another in ``meet``: one that is gone is noticed sooner."""
+
 T = TypeVar("T")
 
 
 @contextlib.contextmanager
-def joined(launch: Launch) -> Iterator[None]:
+def joined(launch: Join) -> Iterator[None]:
     """Join the processes of a job while this is entered, if the launch asks for it.
 
     Inside, only the first process prints. An error ends this process, with one sentence and the
@@ -76,7 +79,7 @@ def joined(launch: Launch) -> Iterator[None]:
                 os._exit(code)  # a normal exit waits for processes that wait for this one
 
 
-def start(launch: Launch) -> None:
+def start(launch: Join) -> None:
     """Join the other processes of the job, if the launch asks for it; before any device is used.
 
     If the launch names no coordinator, JAX reads it from the environment (SLURM, Kubernetes, Cloud
@@ -113,7 +116,7 @@ def start(launch: Launch) -> None:
         reason = " ".join(str(error).split())[:160]
         raise UserError(
             f"--distributed found no processes to join ({reason}): name them with --coordinator, "
-            "--processes and --process, or train without --distributed."
+            "--processes and --process, or leave out --distributed."
         ) from None
     finally:
         late.cancel()
@@ -128,6 +131,16 @@ def wait(name: str) -> None:
     """Wait until all processes have reached the barrier of this name."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(name)
+
+
+def meet(name: str, patience_s: float = MEET_S) -> None:
+    """Wait until all processes have reached the barrier of this name, however long one takes.
+
+    ``wait`` is for steps of one program: it uses devices, whose collectives give up after a while.
+    This one is for processes whose shares of some work take minutes or hours.
+    """
+    if jax.process_count() > 1:
+        multihost.get_barrier_sync_fn()(key=name, timeout_ms=int(1000 * patience_s))
 
 
 def agree(value: Any) -> Any:
@@ -280,7 +293,7 @@ def _require_free(coordinator: str) -> None:
         ) from None
 
 
-def _give_up(launch: Launch) -> NoReturn:
+def _give_up(launch: Join) -> NoReturn:
     """Print that the processes have not met, and exit; JAX would print a stack trace."""
     where = f" at {launch.coordinator}" if launch.coordinator else ""
     who = f"process {launch.process} of {launch.processes}" if launch.coordinator else "this one"

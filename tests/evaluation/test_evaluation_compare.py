@@ -19,8 +19,9 @@ from pewm_jax.commands import compare as command
 from pewm_jax.config import UserError
 from pewm_jax.evaluation import compare, protocol_file, samples
 from pewm_jax.evaluation.fixed import ClipKey, EpisodeKey, Protocol
+from pewm_jax.evaluation.long_rollouts import LongRollouts
 from pewm_jax.evaluation.protocol import ClipChoice
-from pewm_jax.evaluation.scoring import LongRollouts, Scored
+from pewm_jax.evaluation.scoring import Scored
 
 CLIPS, FRAMES, LONG = 12, 4, 8
 

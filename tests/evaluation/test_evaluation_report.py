@@ -11,6 +11,7 @@ import json
 import re
 import shutil
 import sys
+import types
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from pewm_jax.config import StageConfig, TrainConfig, UserError
 from pewm_jax.evaluation import compare, imagine, preview, report
 from pewm_jax.evaluation import opened as runs
 from pewm_jax.evaluation.imagine import Imagination
+from pewm_jax.evaluation.methods import Methods
 from pewm_jax.evaluation.page import introduction
 from pewm_jax.evaluation.words import comparison, drifted, number, verdict
 from pewm_jax.models import lpips, world_model
@@ -35,6 +37,7 @@ from pewm_jax.types import Frames
 from pewm_jax.worlds.pewm import STAGES
 
 ROOT = Path(__file__).parents[2]
+FLAT = Frames(np.zeros((1, 1, 2, 2, 3)), np.zeros((1, 1, 2, 2)), None)
 
 
 @pytest.fixture(scope="module")
@@ -375,6 +378,60 @@ def test_a_rival_that_cannot_be_compared_is_refused(copied, command, capsys, tmp
     assert "does not exist" in refused(command, [str(copied), "--none", "gone"], capsys)
 
 
+def test_a_run_without_a_memory_is_scored_and_compared_under_its_own_name(run, tmp_path, command):
+    own, said = rival(run, tmp_path / "own", steps=3), []
+    report.evaluate(own, say=said.append, protocol=run / "report" / "protocol.json")
+    metrics = json.loads((own / "report" / "metrics.json").read_text())
+    assert set(metrics["results"]) == {"model", "reproject", "copy"}
+    assert set(metrics["margins"]) == {"reproject", "copy"}
+    assert (metrics["margin"], metrics["coverage"]) == (None, None)
+    assert (metrics["protocol"]["method"], metrics["protocol"]["memory"]) == ("model", "none")
+    assert any("trained without a memory" in line for line in said)
+    page = (own / "report" / "index.html").read_text()
+    assert "trained without a memory" in page
+    assert not re.search("with its map|empty map<|seed by seed|from above", page)
+    assert (own / "report" / "rows" / "00-model.png").is_file()
+
+    found = compare.compare(run, own, say=said.append)
+    content = json.loads(found.with_name("comparison.json").read_text())
+    assert [content[side]["runs"][0]["method"] for side in "ab"] == ["memory", "model"]
+    theirs = json.loads((run / "report" / "metrics.json").read_text())
+    both = [m["houses"]["results"] for m in (theirs, metrics)]
+    assert content["a"]["clips"]["seen"]["psnr"] == both[0]["memory"]["seen"]["psnr"]
+    assert content["b"]["clips"]["seen"]["psnr"] == both[1]["model"]["seen"]["psnr"]
+    assert found.read_text().count("data:image/png") == 1
+    shutil.rmtree(found.parent)
+
+
+def test_a_memory_of_kind_none_is_no_memory_and_its_blocks_are_used(run, tmp_path):
+    none = configs.load(run / "config.json").model.memory
+    memory = configs.NoMemoryConfig(capacity=none.capacity, tokens=none.tokens, reader=none.reader)
+    config = configs.load(run / "config.json").with_model(memory=memory)
+    (tmp_path / "none").mkdir()
+    configs.save(config, tmp_path / "none" / "config.json")
+    params = weights.load(run / "weights.safetensors")
+    weights.save(tmp_path / "none" / "weights.safetensors", params, {"stage": "2", "step": "1000"})
+    opened = runs.open_run(tmp_path / "none")
+    assert not runs.remembers(opened)
+    backbone = {name: part for name, part in params.items() if name != "memory"}
+    with pytest.raises(UserError, match="no memory blocks yet"):
+        runs.remembers(
+            dataclasses.replace(opened, params=backbone)
+        )  # of stage 2, which was asked for
+    ran = []
+    model = types.SimpleNamespace(run=lambda *_, memory: (ran.append(memory), None, FLAT))
+    Methods(model, None, remembers=False).imagine("model", None, None, None, None)
+    assert ran == [True]
+
+
+def test_a_training_without_a_memory_that_is_not_finished_is_refused(run, tmp_path):
+    short = rival(run, tmp_path / "short", steps=3)
+    params = weights.load(short / "weights.safetensors")
+    weights.save(short / "weights.safetensors", params, {"stage": "1", "step": "2"})
+    with pytest.raises(UserError, match="step 2 and 3 of stage1"):
+        report.evaluate(short, say=lambda _: None)
+
+
 def test_other_data_get_a_report_of_their_own(copied, tmp_path):
     own = (copied / "report" / "metrics.json").read_bytes()
     write_split(tmp_path / "walks" / "revisit", episodes=1, scene="theirs")
@@ -450,7 +507,8 @@ def test_help_names_every_setting(command, capsys):
         command(["--help"])
     assert stop.value.code == 0
     said = capsys.readouterr().out
-    for flag in ("--clips", "--seeds", "--steps", "--data", "--video_clips", "--stride"):
+    flags = ("--clips", "--seeds", "--steps", "--data", "--video_clips", "--stride")
+    for flag in (*flags, "--fvd", "--mirror", "--src", "--distributed", "--coordinator"):
         assert flag in said
 
 

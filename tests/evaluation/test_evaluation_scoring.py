@@ -11,7 +11,7 @@ from evaluation_scene import knowing_rollout, record, tiny, write_split
 
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.evaluation import imagine, scoring
+from pewm_jax.evaluation import imagine, long_rollouts, scoring
 from pewm_jax.evaluation.imagine import Imagination
 from pewm_jax.evaluation.methods import Methods
 from pewm_jax.evaluation.partial import Partials
@@ -158,7 +158,7 @@ def test_long_rollouts_keep_pictures_and_the_map(monkeypatch, knowing_model, epi
     config = tiny(tmp_path, video_clips=9)
     model = knowing_model()
     partials = Partials(tmp_path, "e" * 64, "f" * 64)
-    long = scoring.roll_long(config, episodes, model, partials, print)
+    long = long_rollouts.roll_long(config, episodes, model, partials, print)
     assert long.chain == 5  # 5 × 4 frames after a start fit into 24 frames; 6 do not
     assert long.shown == 1
     assert long.kept["memory"]["rgb"].shape == (1, 20, 16, 16, 3)
@@ -168,7 +168,7 @@ def test_long_rollouts_keep_pictures_and_the_map(monkeypatch, knowing_model, epi
     off = truth.rgb_THWC.astype(int) - long.kept["memory"]["rgb"][0]
     assert np.abs(off).max() <= 3
     monkeypatch.setattr(Imagination, "run", None)
-    again = scoring.roll_long(config, episodes, model, partials, print)
+    again = long_rollouts.roll_long(config, episodes, model, partials, print)
     np.testing.assert_array_equal(again.kept["empty"]["rgb"], long.kept["empty"]["rgb"])
 
 

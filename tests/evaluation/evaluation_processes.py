@@ -1,0 +1,62 @@
+"""One of several processes that score together, for ``test_evaluation_processes``.
+
+Arguments: a folder with the data set, and the flags of ``Join``. The first process writes what all
+found to ``found.npz`` there.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from evaluation_scene import knowing_rollout, tiny
+
+from pewm_jax import cli
+from pewm_jax.config import Join
+
+
+def score(folder, devices):
+    """Return all scores of a model that knows the room, as arrays by name."""
+    from pewm_jax.data.dataset import EpisodeSource
+    from pewm_jax.evaluation import imagine
+    from pewm_jax.evaluation.long_rollouts import roll_long
+    from pewm_jax.evaluation.methods import Methods
+    from pewm_jax.evaluation.partial import Partials
+    from pewm_jax.evaluation.reproject import ReprojectSettings
+    from pewm_jax.evaluation.scoring import score_table
+    from pewm_jax.evaluation.shares import first_alone
+
+    config = tiny(folder, batch=4, clips=6)
+    episodes = EpisodeSource(folder / "data" / "revisit")
+    imagine.rollout = knowing_rollout
+    params = {"offset": np.float32(0)}
+    context = config.data.context
+    model = imagine.Imagination(config, params, 4, context, lambda _: None, devices=devices)
+    methods = Methods(model, ReprojectSettings())
+    place = folder / f"partial-{len(devices)}"
+    partials = first_alone(lambda: Partials(place, "e" * 64, "f" * 64), "folder")
+    scored = score_table(config, episodes, methods, partials)
+    long = roll_long(config, episodes, methods, partials)
+    found = {f"table/{name}": array for name, array in scored.sums.items()}
+    found |= {f"long/{name}": array for name, array in long.scored.sums.items()}
+    return found | {"occupied": long.kept["memory"]["occupied"]}
+
+
+def main(argv):
+    """Join, score, and write."""
+    join, (folder,) = cli.take(Join, argv)
+    from pewm_jax.training import processes
+
+    with processes.joined(join):
+        import jax
+
+        found = score(Path(folder), jax.local_devices())
+        if processes.is_primary():
+            np.savez(Path(folder) / "found.npz", **found)
+        print(f"{jax.process_count()} processes, {len(jax.devices())} devices")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))
