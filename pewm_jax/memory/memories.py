@@ -181,6 +181,7 @@ def look(
     *,
     params: Params | None = None,
     pictures: bool = False,
+    view: View | None = None,
 ) -> Sight:
     """Return what the memory shows one clip, as far as the reader asks for it.
 
@@ -191,13 +192,17 @@ def look(
         params: the world model's parameters; those of the codec are used if the reader takes
             latents, and they may be left out if it does not.
         pictures: give the view even if the reader does not take it.
+        view: what ``render`` gives for these cameras, if it was made beforehand.
     """
     reader = model.memory.reader
-    seen, view, encoded = None, None, None
+    seen, encoded = None, None
     if reader.READS_TOKENS:
         seen = tokens(model, memory, camera)
-    if pictures or reader.READS_VIEW:
-        view = render(model, memory, camera, model.clip.height, model.clip.width)
+    if not (pictures or reader.READS_VIEW):
+        view = None
+    else:
+        if view is None:
+            view = render(model, memory, camera, model.clip.height, model.clip.width)
         features = view.features_THWF[..., : rendered_channels(model)]
         view = View(features, view.depth_THW, view.seen_THW)
         if reader.READS_LATENTS:
