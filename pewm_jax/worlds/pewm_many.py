@@ -147,9 +147,7 @@ def look(model: ModelConfig, remembered: Any, camera: Camera, params: Params) ->
     """
     pictures = memories.gated(model)
     reader = model.memory.reader
-    each = functools.partial(
-        memories.look, model, remembered, params=params, pictures=pictures
-    )
+    each = functools.partial(memories.look, model, remembered, params=params, pictures=pictures)
     if not (pictures or reader.READS_VIEW):
         return jax.vmap(each)(camera)
 
