@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.planning.settings import MPPI, Box, Discrete, PlanConfig, Planner, RandomShooting
+from pewm_jax.planning.settings import CEM, MPPI, Box, Discrete, PlanConfig, Planner, RandomShooting
 from pewm_jax.types import Array
 
 
@@ -48,11 +48,16 @@ class Search:
         belief: (H, A) probabilities of discrete actions, or ``Normals``.
         best: (H,) or (H, A) the best choices so far; at first the belief's mode.
         cost: () their cost, inf before the first round.
+        kept_EH: (E, H) or (E, H, A) the best different choices so far, which count in the next
+            round, too.
+        kept_costs_E: (E,) their costs, inf in free places.
     """
 
     belief: Any
     best: Array
     cost: Array
+    kept_EH: Array
+    kept_costs_E: Array
 
 
 def init(planner: Planner, config: PlanConfig, start: Array | None = None) -> Search:
@@ -80,8 +85,15 @@ def init(planner: Planner, config: PlanConfig, start: Array | None = None) -> Se
         )
     if start is not None:
         belief = _around(planner, belief, jnp.asarray(start), blocks)
-    best = mode(belief)
-    return Search(belief, best, jnp.asarray(jnp.inf, jnp.float32))
+    best, count = mode(belief), kept(planner, config)
+    kept_EH = jnp.zeros((count, *best.shape), best.dtype)
+    inf = jnp.asarray(jnp.inf, jnp.float32)
+    return Search(belief, best, inf, kept_EH, jnp.full((count,), inf))
+
+
+def kept(planner: Planner, config: PlanConfig) -> int:
+    """Return E, the candidates that a planner keeps from round to round."""
+    return round(getattr(planner, "keep", 0.0) * config.elites)
 
 
 WARM = 0.5
@@ -147,7 +159,8 @@ def update(
         config: how many elites.
         search: the search so far.
         choices_KH: (K, H) or (K, H, A) choices.
-        costs_K: (K,) their costs, the lower the better; NaN and inf count as worst.
+        costs_K: (K,) their costs, the lower the better; NaN and inf count as worst. Choices that
+            are the same count once.
     """
     costs = jnp.where(jnp.isfinite(costs_K), costs_K, jnp.inf).astype(jnp.float32)
     least = jnp.argmin(costs)
@@ -155,27 +168,37 @@ def update(
     best = jnp.where(better, choices_KH[least], search.best)
     cost = jnp.where(better, costs[least], search.cost)
     if isinstance(planner, RandomShooting):
-        return Search(search.belief, best, cost)
-    weights_K = importance(planner, config, costs)
-    kept, learned = planner.momentum, 1 - planner.momentum
+        return dataclasses.replace(search, best=best, cost=cost)
+    choices = jnp.concatenate([choices_KH, search.kept_EH])
+    costs = jnp.concatenate([costs, search.kept_costs_E])
+    costs = jnp.where(repeated(choices), jnp.inf, costs)
+    weights = importance(planner, config, costs)
+    belief = _fitted(planner, search.belief, choices, weights)
+    some = jnp.isfinite(costs).any()  # or nothing was learned
+    belief = jax.tree.map(lambda new, old: jnp.where(some, new, old), belief, search.belief)
+    stays = jnp.argsort(costs, stable=True)[: kept(planner, config)]
+    return Search(belief, best, cost, choices[stays], costs[stays])
 
+
+def repeated(choices: Array) -> Array:
+    """Return which of (n, …) choices are equal to one before them, (n,) bool."""
+    flat = choices.reshape(len(choices), -1)
+    return jnp.tril((flat[:, None] == flat[None]).all(-1), -1).any(1)
+
+
+def _fitted(planner: CEM | MPPI, belief: Any, choices_KH: Array, weights_K: Array) -> Any:
+    """Return the belief that is fitted to weighted choices, with momentum."""
+    stays, learned = planner.momentum, 1 - planner.momentum
     if isinstance(planner.space, Discrete):
         count = planner.space.count
         fitted = jnp.einsum("k,kha->ha", weights_K, jax.nn.one_hot(choices_KH, count))
         fitted = (1 - planner.smoothing) * fitted + planner.smoothing / count
-        belief = kept * search.belief + learned * fitted
-    else:
-        low, high = bounds(planner.space)
-        mean = jnp.einsum("k,kha->ha", weights_K, choices_KH)
-        std = jnp.sqrt(jnp.einsum("k,kha->ha", weights_K, jnp.square(choices_KH - mean)))
-        std = kept * search.belief.std_HA + learned * std
-        belief = Normals(
-            kept * search.belief.mean_HA + learned * mean,
-            jnp.maximum(std, planner.min_std * (high - low) / 2),
-        )
-    some = jnp.isfinite(costs).any()  # or nothing was learned
-    belief = jax.tree.map(lambda new, old: jnp.where(some, new, old), belief, search.belief)
-    return Search(belief, best, cost)
+        return stays * belief + learned * fitted
+    low, high = bounds(planner.space)
+    mean = jnp.einsum("k,kha->ha", weights_K, choices_KH)
+    std = jnp.sqrt(jnp.einsum("k,kha->ha", weights_K, jnp.square(choices_KH - mean)))
+    std = jnp.maximum(stays * belief.std_HA + learned * std, planner.min_std * (high - low) / 2)
+    return Normals(stays * belief.mean_HA + learned * mean, std)
 
 
 def importance(planner: Planner, config: PlanConfig, costs_K: Array) -> Array:

@@ -110,6 +110,9 @@ class Refined:
     momentum: float = 0.1
     """Share of the last round's distribution that stays: new = momentum · old + (1 − momentum) ·
     fitted."""
+    keep: float = 0.3
+    """Candidates that are kept and count in the next round, too, over the elites (Pinneri et al.
+    2020); 0 forgets them, which costs that change from round to round need."""
     smoothing: float = 0.05
     """Share of the uniform distribution that is mixed into a fitted one, so that no discrete action
     dies out."""
@@ -124,6 +127,10 @@ class Refined:
         require(
             0 <= self.momentum < 1,
             f"planner.momentum is {self.momentum}: use a share from 0 to below 1.",
+        )
+        require(
+            0 <= self.keep <= 1,
+            f"planner.keep is {self.keep}: use a share of the elites from 0 to 1.",
         )
         require(
             0 <= self.smoothing <= 1,
