@@ -97,7 +97,8 @@ class Imagination:
             )
             made.append(frames)
         back = np.argsort(order)  # what was filled in lies behind
-        return jax.tree.map(lambda *x: jnp.concatenate(x)[back], *made)
+        # On the host: the number of candidates changes, and would be compiled for anew.
+        return jax.tree.map(lambda *x: np.concatenate(x)[back], *jax.device_get(made))
 
 
 @dataclasses.dataclass(eq=False)
@@ -130,14 +131,18 @@ class Judged:
         actions = np.asarray(actions_KN)
         self.asked += len(actions)
         if not np.issubdtype(actions.dtype, np.integer):
-            return self._costs(actions)
+            return self._costs(actions, len(actions))
         names = [row.tobytes() for row in actions]
         new = {name: k for k, name in enumerate(names) if name not in self._known}
         if new:
-            costs = self._costs(actions[list(new.values())])
+            costs = self._costs(actions[list(new.values())], len(actions))
             self._known |= dict(zip(new, costs.tolist(), strict=True))
         return np.array([self._known[name] for name in names], np.float32)
 
-    def _costs(self, actions: np.ndarray) -> np.ndarray:
+    def _costs(self, actions: np.ndarray, count: int) -> np.ndarray:
+        """Return the costs of actions, judged as that many, of which the last are repeated."""
         self.rolled_out += len(actions)
-        return np.asarray(self.cost(self.rollout(actions), self.goal), np.float32)
+        frames, missing = self.rollout(actions), count - len(actions)
+        if missing:  # so that a cost is compiled once
+            frames = jax.tree.map(lambda x: np.concatenate([x, [x[-1]] * missing]), frames)
+        return np.asarray(self.cost(frames, self.goal), np.float32)[: len(actions)]

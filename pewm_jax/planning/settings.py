@@ -107,13 +107,13 @@ class Refined:
 
     space: Space = Discrete()
     """The actions to choose from."""
-    momentum: float = 0.1
+    momentum: float = 0.0
     """Share of the last round's distribution that stays: new = momentum · old + (1 − momentum) ·
     fitted."""
     keep: float = 0.3
     """Candidates that are kept and count in the next round, too, over the elites (Pinneri et al.
     2020); 0 forgets them, which costs that change from round to round need."""
-    smoothing: float = 0.05
+    smoothing: float = 0.2
     """Share of the uniform distribution that is mixed into a fitted one, so that no discrete action
     dies out."""
     initial_std: float = 0.5

@@ -41,16 +41,15 @@ class Grid:
         return found
 
     def distances(self, goal):
-        """(Y, X) steps to a cell past the walls, inf where there is no way."""
-        out = np.full(self.free.shape, np.inf, np.float32)
-        out[goal], edge = 0, collections.deque([goal])
-        while edge:
-            here = edge.popleft()
-            for move in AHEAD:
-                there = tuple(move + here)
-                if self.free[there] and np.isinf(out[there]):
-                    out[there] = out[here] + 1
-                    edge.append(there)
+        """(Y, X, 4) the fewest actions from every place to a cell, inf where there is no way."""
+        places = [(*map(int, cell), heading) for cell in self.starts for heading in range(4)]
+        out = np.full((*self.free.shape, 4), np.inf, np.float32)
+        out[goal], before = 0, None
+        while before is None or not np.array_equal(out, before):
+            before = out.copy()
+            for place in places:
+                ahead = min(before[self.step(place, action)] for action in range(3))
+                out[place] = min(out[place], 1 + ahead)
         return out
 
     def ends(self, start_3, actions_KN):

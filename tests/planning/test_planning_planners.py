@@ -25,9 +25,9 @@ def successes(planner, seen=True):
 
     def one(start, goal, distance, key):
         def cost(actions, key):
-            row, column = GRID.ends(start, actions)[:, :2].T
+            row, column, heading = GRID.ends(start, actions).T
             random = jax.random.uniform(key, (len(actions),))
-            return distance[row, column] if seen else random
+            return distance[row, column, heading] if seen else random
 
         actions = search(planner, DEFAULT, cost, key).actions
         return (GRID.ends(start, actions[None])[0, :2] == goal).all()
@@ -85,7 +85,7 @@ def test_every_planner_beats_random_shooting_at_equal_budget(kind, space):
 
 
 def test_smoothing_and_momentum_by_hand():
-    planner = CEM(Discrete(2), momentum=0.25, smoothing=0.2)
+    planner = CEM(Discrete(2), momentum=0.25, smoothing=0.2, keep=0)
     config = PlanConfig(horizon=2, receding_horizon=1, candidates=4, elites=2, rounds=1)
     begun = planners.init(planner, config)
     np.testing.assert_allclose(begun.belief, 0.5)
@@ -102,7 +102,7 @@ def test_smoothing_and_momentum_by_hand():
 
 
 def test_means_deviations_and_their_floor_by_hand():
-    planner = CEM(Box((0, 0), (2, 4)), momentum=0.5, initial_std=1.0, min_std=0.25)
+    planner = CEM(Box((0, 0), (2, 4)), momentum=0.5, initial_std=1.0, min_std=0.25, keep=0)
     config = PlanConfig(horizon=1, receding_horizon=1, candidates=3, elites=2, rounds=1)
     begun = planners.init(planner, config)
     np.testing.assert_allclose(begun.belief.mean_HA, [[1, 2]])
@@ -116,6 +116,23 @@ def test_means_deviations_and_their_floor_by_hand():
     )
     again = planners.update(planner, config, again, jnp.repeat(choices[:1], 3, 0), jnp.ones(3))
     np.testing.assert_allclose(again.belief.std_HA, [[0.25, 0.5]])  # the floor, of half widths
+
+
+def test_the_best_different_candidates_stay_and_the_same_count_once():
+    planner = CEM(Discrete(2), momentum=0, smoothing=0, keep=1.0)
+    config = PlanConfig(horizon=1, receding_horizon=1, candidates=3, elites=2, rounds=1)
+    choices = jnp.array([[1], [1], [0]])
+    begun = planners.init(planner, config)
+    after = planners.update(planner, config, begun, choices, jnp.array([1.0, 1.0, 3.0]))
+    np.testing.assert_allclose(after.belief, [[0.5, 0.5]])  # 1 and 0, not 1 and 1
+    np.testing.assert_array_equal(after.kept_EH, [[1], [0]])
+    np.testing.assert_array_equal(after.kept_costs_E, [1, 3])
+    worse = planners.update(planner, config, after, choices[2:].repeat(3, 0), jnp.full(3, 3.0))
+    np.testing.assert_allclose(worse.belief, [[0.5, 0.5]])  # the kept 1 still counts
+    forgets = CEM(Discrete(2), momentum=0, smoothing=0, keep=0)
+    begun = planners.init(forgets, config)
+    after = planners.update(forgets, config, begun, choices[2:].repeat(3, 0), jnp.full(3, 3.0))
+    np.testing.assert_allclose(after.belief, [[1, 0]])
 
 
 def test_path_integrals_weigh_by_hand():
