@@ -158,6 +158,15 @@ def render(
     return rendering.splat_cells(points, shown, cell_m, valid, camera, height, width)
 
 
+def trimmed(model: ModelConfig, memory: Memory) -> Memory:
+    """Return a memory to look at and not to add to: smaller if it can be, and the same to see.
+
+    On the host, not under jit.
+    """
+    own = getattr(functions(model.memory), "trimmed", None)
+    return memory if own is None else own(memory)
+
+
 def rendered_channels(model: ModelConfig) -> int:
     """Return the channels of the pictures that ``render`` gives."""
     return model.memory.rendered_channels

@@ -72,6 +72,7 @@ class Imagination:
         require(
             self.batch >= 1, f"batch is {self.batch}: imagine at least one candidate at a time."
         )
+        object.__setattr__(self, "state", worlds.to_compare(self.config, self.state))
 
     def __call__(self, actions_KN: Any) -> Frames:
         """Return the frames of K candidates, (K, N) or (K, 1).

@@ -188,9 +188,7 @@ def mpc(
             present = _joined(seen)
             state = mind.observe(state, present)
             frames.append(present)
-            rest = (
-                shifted(config, found.choices) if config.receding_horizon < config.horizon else None
-            )
+            rest = shifted(config, found.choices)
     costs = np.array([float(found.cost) for found in plans])
     return Trajectory(np.stack(actions), _joined(frames), tuple(plans), costs, bool(reached), state)
 

@@ -245,8 +245,8 @@ def actions_of(config: PlanConfig, choices: Array) -> Array:
 
 
 def shifted(config: PlanConfig, choices_H: Array) -> Array:
-    """Return the blocks of a plan that are left when its first ones were carried out."""
-    return choices_H[config.receding_horizon :]
+    """Return the blocks of a plan that are left when its first ones were carried out, or none."""
+    return choices_H[config.receding_horizon or config.horizon :]
 
 
 def bounds(space: Box) -> tuple[np.ndarray, np.ndarray]:

@@ -52,7 +52,7 @@ def read(path: Path, who: str, like: Search, kind: type) -> tuple[Search, list[A
         UserError: the file is damaged, or of another search.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         found = str(arrays["who"])
         leaves, tree = jax.tree.flatten(like)

@@ -18,8 +18,8 @@ class PlanConfig:
 
     horizon: int = 8
     """Blocks of a plan."""
-    receding_horizon: int = 8
-    """Blocks of it that are carried out before planning anew."""
+    receding_horizon: int = 0
+    """Blocks of it that are carried out before planning anew; 0 for all."""
     action_block: int = 1
     """Equal actions that make a block."""
     candidates: int = 60
@@ -37,16 +37,16 @@ class PlanConfig:
     @property
     def carried_out(self) -> int:
         """The actions of a plan that are carried out before planning anew."""
-        return self.receding_horizon * self.action_block
+        return (self.receding_horizon or self.horizon) * self.action_block
 
     def __post_init__(self):
         """Validate."""
-        names = [field.name for field in dataclasses.fields(self)]
-        require_positive(self, "plan", *names)
+        names = {field.name for field in dataclasses.fields(self)} - {"receding_horizon"}
+        require_positive(self, "plan", *sorted(names))
         require(
-            self.receding_horizon <= self.horizon,
-            f"plan.receding_horizon is {self.receding_horizon}, more than the {self.horizon} "
-            "blocks of a plan (plan.horizon): carry out at most as many as are planned.",
+            0 <= self.receding_horizon <= self.horizon,
+            f"plan.receding_horizon is {self.receding_horizon}, and a plan has {self.horizon} "
+            "blocks (plan.horizon): carry out at most as many as are planned, or 0 for all.",
         )
         require(
             self.elites <= self.candidates,

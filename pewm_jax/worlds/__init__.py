@@ -16,8 +16,8 @@ A world is a ``WorldSettings`` and a module (or object) with these three functio
     split_heads(model, stage) -> {name: n}   numbers that ``train.mesh.tensor`` must divide
     costs(config, stage, share) -> {part: Costs}   see ``models.costs``
 
-and, if it can share work among candidates, an ``imagine_many`` of its own. ``worlds.pewm`` is an
-example.
+and, if it can share work among candidates, an ``imagine_many`` and a ``to_compare`` of its own.
+``worlds.pewm`` is an example.
 """
 
 from __future__ import annotations
@@ -147,6 +147,16 @@ def imagine_many(
     many = jax.vmap(candidate, (None, None, 0, 0), (shared, 0))
     after, frames = many(params, state, controls, keys)
     return after, jax.tree.map(lambda x: x[:, -1:], frames) if last else frames
+
+
+def to_compare(model: Config | WorldSettings, state: WorldState) -> WorldState:
+    """Return a state for ``imagine_many`` alone, whose memory may be smaller and looks the same.
+
+    On the host, not under jit; a world that can do no such thing gives the state as it is.
+    """
+    model = model_of(model)
+    own = getattr(functions(model), "to_compare", None)
+    return state if own is None else own(model, state)
 
 
 def init(model: Config | WorldSettings, key: Array) -> Params:

@@ -27,6 +27,7 @@ from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 init = world_model.init
 sample = sampling.sample
 imagine_many = pewm_many.imagine_many
+to_compare = pewm_many.to_compare
 costs = pewm_costs.costs
 
 STAGES = (

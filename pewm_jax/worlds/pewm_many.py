@@ -64,6 +64,11 @@ def imagine_many(
     return WorldState(present, state.map), frames
 
 
+def to_compare(model: ModelConfig, state: WorldState) -> WorldState:
+    """Return a state whose memory has no more room than it needs; see ``worlds.to_compare``."""
+    return WorldState(state.frame, memories.trimmed(model, state.map))
+
+
 def _filled(x_KT: Array, length: int) -> Array:
     """Repeat the last camera up to a clip's length: there the agent stands still."""
     missing = length - x_KT.shape[1]

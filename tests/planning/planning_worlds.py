@@ -10,7 +10,7 @@ AHEAD = np.array([[-1, 0], [0, -1], [1, 0], [0, 1]])  # up, left, down, right: t
 
 
 class Grid:
-    """An agent on cells (row, column) that steps forward, turns left, turns right; walls stop it."""
+    """An agent on cells (row, column) that steps forward or turns left or right; walls stop it."""
 
     def __init__(self, seed=0, side=9, walls=0.2):
         rng = np.random.default_rng(seed)
