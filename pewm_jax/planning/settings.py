@@ -110,7 +110,7 @@ class Refined:
     momentum: float = 0.0
     """Share of the last round's distribution that stays: new = momentum · old + (1 − momentum) ·
     fitted."""
-    keep: float = 0.3
+    keep: float = 1.0
     """Candidates that are kept and count in the next round, too, over the elites (Pinneri et al.
     2020); 0 forgets them, which costs that change from round to round need."""
     smoothing: float = 0.2

@@ -15,7 +15,7 @@ from tests.planning.planning_worlds import Grid
 
 KEY = jax.random.key(0)
 GRID, HORIZON, TASKS = Grid(), 8, 120
-DEFAULT = PlanConfig(horizon=HORIZON)
+DEFAULT = PlanConfig(horizon=HORIZON, rounds=20)
 
 
 @functools.cache
