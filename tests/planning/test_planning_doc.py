@@ -22,7 +22,7 @@ def test_twenty_lines_plan_with_the_model_that_ships(tmp_path, monkeypatch):
     )
     assert smaller != code
     names = {}
-    exec(compile(smaller, str(PAGE), "exec"), names)  # noqa: S102
+    exec(compile(smaller, str(PAGE), "exec"), names)
     found = names["found"]
     assert found.actions.shape == (8,)
     assert np.isfinite(float(found.cost))
