@@ -19,7 +19,7 @@ from pewm_jax.config import (
 from pewm_jax.data.navigation import is_free, navigable, sample_free
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
-from pewm_jax.geometry.actions import discrete_table, integrate
+from pewm_jax.geometry.actions import discrete_table, rotation_z
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.models import lpips, lpips_weights
 from pewm_jax.planning import candidates, costs
@@ -52,7 +52,8 @@ def gated():
 
 @functools.cache
 def world(kind):
-    model = CONFIG.model if kind == "tiny" else gated()
+    memory = dataclasses.replace(CONFIG.model.memory, capacity=2048)
+    model = dataclasses.replace(CONFIG.model, memory=memory) if kind == "tiny" else gated()
     params = randomise(init_world(model), scale=0.1)
     frames = random_frames(np.random.default_rng(0), 3, 16, 16)
     return model, params, jax.jit(worlds.start, static_argnums=0)(model, params, frames)
@@ -265,14 +266,18 @@ def home():
 def truly(pose_44, actions_KN):
     """Poses (K, 4, 4) after actions, forward steps into what is not free left out."""
     _, grid = home()
-    ends = np.repeat(np.asarray(pose_44)[None], len(actions_KN), 0)
-    step = jax.vmap(lambda pose, move: integrate(pose, move[None])[1])
-    for action in np.asarray(actions_KN).T:
-        after = np.asarray(step(ends, TABLE[action]))
-        along = np.linspace(0, 1, 6)[1:, None, None]
-        between = ends[:, :2, 3] + along * (after[:, :2, 3] - ends[:, :2, 3])
-        free = is_free(grid, between).all(0)
-        ends = np.where(free[:, None, None], after, ends)
+    pose = np.asarray(pose_44)
+    begin = np.arctan2(pose[1, 2], pose[0, 2])
+    xy, turn = np.repeat(pose[None, :2, 3], len(actions_KN), 0), np.zeros(len(actions_KN))
+    for dx, _, dyaw in TABLE[np.asarray(actions_KN)].transpose(1, 2, 0):
+        yaw = begin + turn
+        after = xy + dx[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], 1)
+        between = xy + np.linspace(0, 1, 6)[1:, None, None] * (after - xy)
+        xy = np.where(is_free(grid, between).all(0)[:, None], after, xy)
+        turn = turn + dyaw
+    ends = np.repeat(pose[None], len(actions_KN), 0)
+    ends[:, :3, :3] = np.asarray(rotation_z(turn)) @ pose[:3, :3]
+    ends[:, :2, 3] = xy
     return ends
 
 
