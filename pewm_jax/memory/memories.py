@@ -158,6 +158,15 @@ def render(
     return rendering.splat_cells(points, shown, cell_m, valid, camera, height, width)
 
 
+def trimmed(model: ModelConfig, memory: Memory) -> Memory:
+    """Return a memory to look at and not to add to: smaller if it can be, and the same to see.
+
+    On the host, not under jit.
+    """
+    own = getattr(functions(model.memory), "trimmed", None)
+    return memory if own is None else own(memory)
+
+
 def rendered_channels(model: ModelConfig) -> int:
     """Return the channels of the pictures that ``render`` gives."""
     return model.memory.rendered_channels
@@ -181,6 +190,7 @@ def look(
     *,
     params: Params | None = None,
     pictures: bool = False,
+    view: View | None = None,
 ) -> Sight:
     """Return what the memory shows one clip, as far as the reader asks for it.
 
@@ -191,13 +201,17 @@ def look(
         params: the world model's parameters; those of the codec are used if the reader takes
             latents, and they may be left out if it does not.
         pictures: give the view even if the reader does not take it.
+        view: what ``render`` gives for these cameras, if it was made beforehand.
     """
     reader = model.memory.reader
-    seen, view, encoded = None, None, None
+    seen, encoded = None, None
     if reader.READS_TOKENS:
         seen = tokens(model, memory, camera)
-    if pictures or reader.READS_VIEW:
-        view = render(model, memory, camera, model.clip.height, model.clip.width)
+    if not (pictures or reader.READS_VIEW):
+        view = None
+    else:
+        if view is None:
+            view = render(model, memory, camera, model.clip.height, model.clip.width)
         features = view.features_THWF[..., : rendered_channels(model)]
         view = View(features, view.depth_THW, view.seen_THW)
         if reader.READS_LATENTS:

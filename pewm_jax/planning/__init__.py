@@ -12,6 +12,12 @@ Places, in reading order:
   environment that looks like a house;
 * ``scores``: how near an agent came, and by which way.
 
+How it chooses:
+
+* ``settings``, ``planners``, ``plan``: CEM, MPPI and random shooting, apart from model and cost;
+* ``costs``, ``candidates``: what is imagined of many actions, and how far that is from the goal;
+* ``mpc``, ``ranking``: acting and planning in turn; which of a policy's proposals is best.
+
 Importing this chapter registers ``pewm_jax/House-v0`` where Gymnasium is installed
 (``pip install 'pewm-jax[planning]'``)::
 

@@ -16,6 +16,7 @@ A world is a ``WorldSettings`` and a module (or object) with these three functio
     split_heads(model, stage) -> {name: n}   numbers that ``train.mesh.tensor`` must divide
     costs(config, stage, share) -> {part: Costs}   see ``models.costs``
 
+and, if it can share work among candidates, an ``imagine_many`` and a ``to_compare`` of its own.
 ``worlds.pewm`` is an example.
 """
 
@@ -120,6 +121,7 @@ def imagine_many(
     keys: Array,
     *,
     memory: bool = True,
+    last: bool = False,
 ) -> tuple[WorldState, Frames]:
     """Imagine K candidate controls from one state, without remembering any.
 
@@ -130,14 +132,31 @@ def imagine_many(
         controls: as for ``imagine``, with a leading axis K.
         keys: (K,) randomness of each candidate; equal keys give equal noise.
         memory: see ``imagine``.
+        last: give only the last frame of each, (K, 1); a world may then leave the others undecoded.
 
     Returns:
         ``(state, frames)``: K present frames with the shared memory, which is not copied, and
         (K, n) imagined frames.
     """
+    model = model_of(model)
+    own = getattr(functions(model), "imagine_many", None)
+    if own is not None:
+        return own(model, params, state, controls, keys, memory=memory, last=last)
     candidate = functools.partial(imagine, model, remember=False, memory=memory)
     shared = WorldState(0, None)  # type: ignore[arg-type]
-    return jax.vmap(candidate, (None, None, 0, 0), (shared, 0))(params, state, controls, keys)
+    many = jax.vmap(candidate, (None, None, 0, 0), (shared, 0))
+    after, frames = many(params, state, controls, keys)
+    return after, jax.tree.map(lambda x: x[:, -1:], frames) if last else frames
+
+
+def to_compare(model: Config | WorldSettings, state: WorldState) -> WorldState:
+    """Return a state for ``imagine_many`` alone, whose memory may be smaller and looks the same.
+
+    On the host, not under jit; a world that can do no such thing gives the state as it is.
+    """
+    model = model_of(model)
+    own = getattr(functions(model), "to_compare", None)
+    return state if own is None else own(model, state)
 
 
 def init(model: Config | WorldSettings, key: Array) -> Params:

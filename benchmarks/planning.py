@@ -1,0 +1,203 @@
+"""What a plan costs: the paper's 60 candidates × 8 frames × 12 rounds, with the model that ships.
+
+`python benchmarks/planning.py` prints the time of one plan by the cross-entropy method, where it
+went, and what imagining the same candidates one by one takes. Houses are made on the way; nothing
+is read from disk but the weights. With ``--record`` the section of ``RESULTS.md`` is rewritten.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from record import machine, record, table
+
+import pewm_jax
+from pewm_jax import worlds
+from pewm_jax.data.collect import CollectConfig
+from pewm_jax.data.episodes import read_episode
+from pewm_jax.data.make_episode import make_episode
+from pewm_jax.memory import memories
+from pewm_jax.models import codecs, world_model
+from pewm_jax.planning import costs
+from pewm_jax.planning.candidates import Imagination, Judged
+from pewm_jax.planning.plan import plan
+from pewm_jax.planning.settings import CEM, PlanConfig
+from pewm_jax.types import Control, Frames, Sight
+from pewm_jax.worlds import pewm_many, sampling
+from pewm_jax.worlds.control import control_of
+
+CONTEXT = 24
+"""Frames that are seen before; the goal is 8 frames on."""
+
+
+class Clock:
+    """Seconds on the wall and of the processors, summed over calls of one thing."""
+
+    def __init__(self) -> None:
+        self.wall = self.cpu = 0.0
+        self.calls = 0
+
+    def __call__(self, run: Callable[[], Any]) -> Any:
+        """Run something to its end and add its time."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        out = jax.block_until_ready(run())
+        self.wall += time.perf_counter() - wall
+        self.cpu += time.process_time() - cpu
+        self.calls += 1
+        return out
+
+
+def scene(config, params) -> tuple[Any, Frames]:
+    """Return a state in a house that the model has never seen, and a goal 8 frames on."""
+    from pathlib import Path
+
+    size = config.model.clip.height
+    settings = CollectConfig(Path("unused"), frames=CONTEXT + 8, size=size)
+    episode = read_episode(make_episode(settings, "revisit", 0))
+    state = jax.jit(worlds.start, static_argnums=0)(config, params, episode.frames(range(CONTEXT)))
+    return state, episode.frames([CONTEXT + 7])
+
+
+def parts(model, params, state, actions_KN, key) -> dict[str, Clock]:
+    """Time the parts of imagining one batch: as ``pewm_many`` does it, in pieces."""
+    count = len(actions_KN)
+    keys = jnp.stack([key] * count)
+
+    def cameras(actions):
+        asked = jax.vmap(lambda a: control_of(model, state.frame.camera, a))(actions)
+        first = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), state.frame.camera)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b], 1), first, asked.camera)
+
+    def look(params, memory, actions):
+        return pewm_many.look(model, memory, cameras(actions), params)
+
+    def condition(params, frame, actions):
+        def one(camera):
+            given = jax.tree.map(lambda x: x[None], (frame, Control(camera)))
+            return world_model.condition(model, params, *given)
+
+        return jax.vmap(one)(cameras(actions))
+
+    def draw(params, conditioning, sight, keys):
+        batched = jax.tree.map(lambda x: x[:, None], sight)
+        one = functools.partial(sampling.draw, model, params)
+        return jax.vmap(one)(conditioning, batched, keys)[:, 0]
+
+    def decode(params, latents, sight):
+        rgb, depth = codecs.decode_rgbd(model, params, latents[:, -1:])
+        if memories.gated(model):
+            view = jax.tree.map(lambda x: x[:, -1:], sight.view)
+            rgb, depth = codecs.mix(model, params, rgb, depth, view)
+        return rgb, depth
+
+    looking, conditioning, drawing, decoding = (jax.jit(f) for f in (look, condition, draw, decode))
+    clocks: dict[str, Clock] = {}
+    sight: Sight = jax.block_until_ready(looking(params, state.map, actions_KN))
+    given = jax.block_until_ready(conditioning(params, state.frame, actions_KN))
+    latents = jax.block_until_ready(drawing(params, given, sight, keys))
+    for name, run in {
+        "the sampler (denoiser, 2 steps)": lambda: drawing(params, given, sight, keys),
+        "rendering the memory": lambda: looking(params, state.map, actions_KN),
+        "the present frame and the rays": lambda: conditioning(params, state.frame, actions_KN),
+        "decoding and the gate, last frame": lambda: decoding(params, latents, sight),
+    }.items():
+        jax.block_until_ready(run())
+        clocks[name] = Clock()
+        for _ in range(3):
+            clocks[name](run)
+    return clocks
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--rounds", type=int, default=12)
+    parser.add_argument("--batch", type=int, default=12)
+    parser.add_argument("--alone", type=int, default=48, help="candidates imagined one by one")
+    parser.add_argument("--record", action="store_true", help="rewrite this section of RESULTS.md")
+    chosen = parser.parse_args()
+    config, params = pewm_jax.load("small")
+    params = jax.device_put(params)
+    model, settings = config.model, PlanConfig(rounds=chosen.rounds)
+    state, goal = scene(config, params)
+    cost, key = costs.perceptual(), jax.random.key(0)
+
+    rollout, imagining, comparing = (
+        Imagination(config, params, state, key, chosen.batch),
+        Clock(),
+        Clock(),
+    )
+    asked: list[np.ndarray] = []
+
+    def rolled(actions):
+        asked.append(np.asarray(actions))
+        return imagining(lambda: rollout(actions))
+
+    def compared(frames, goal):
+        return comparing(lambda: cost(frames, goal))
+
+    begun = np.random.default_rng(0).integers(0, 3, (settings.candidates, settings.horizon))
+    jax.block_until_ready(cost(rollout(begun), goal))  # compiles
+    judged = Judged(rolled, compared, goal)
+    plan(CEM(), settings, lambda *_: np.zeros(settings.candidates), key, progress=False)  # too
+    whole = Clock()
+    found = whole(lambda: plan(CEM(), settings, judged, jax.random.key(1)))
+
+    one = jax.jit(functools.partial(worlds.imagine, remember=False), static_argnums=0)
+    tried = np.concatenate(asked)
+    each = np.random.default_rng(1).permutation(len(tried))[: chosen.alone]
+    jax.block_until_ready(one(model, params, state, tried[0], key))
+    alone, alone_cost, last = Clock(), Clock(), []
+    for number in each:
+        frames = alone(lambda n=number: one(model, params, state, tried[n], key)[1])
+        frames = jax.tree.map(lambda x: x[None], frames)
+        last.append(alone_cost(lambda f=frames: cost(f, goal))[0])
+    together = np.array([judged(tried[n][None])[0] for n in each])
+    apart = np.abs(together - np.array(last)).max()
+
+    clocks = parts(model, params, state, tried[: chosen.batch], key)
+    total = settings.rounds * settings.candidates
+    wall = (alone.wall + alone_cost.wall) / len(each) * total
+    cpu = (alone.cpu + alone_cost.cpu) / len(each) * total
+    rest = whole.wall - imagining.wall - comparing.wall
+    rows = [
+        [f"a plan: {total} candidates, {judged.rolled_out} different", whole.wall, whole.cpu],
+        ["— of it imagining", imagining.wall, imagining.cpu],
+        ["— of it LPIPS", comparing.wall, comparing.cpu],
+        ["— of it the planner", rest, whole.cpu - imagining.cpu - comparing.cpu],
+        [f"the {total} one by one, from {len(each)}", wall, cpu],
+    ]
+    text = [
+        table(
+            ["what", "seconds", "processor seconds"],
+            [[a, f"{b:.1f}", f"{c:.1f}"] for a, b, c in rows],
+        )
+    ]
+    spent = sum(clock.cpu for clock in clocks.values())
+    split = [
+        [name, f"{clock.cpu / 3 / chosen.batch * 1e3:.1f} ms", f"{clock.cpu / spent:.0%}"]
+        for name, clock in clocks.items()
+    ]
+    text.append(table(["imagining a candidate", "processor time", "share"], split))
+    per = whole.wall / judged.rolled_out, wall / total
+    text.append(
+        f"The plan is {wall / whole.wall:.1f} times as fast as one candidate after the other "
+        f"({cpu / whole.cpu:.1f} times by processor time), {per[1] / per[0]:.1f} times for each "
+        f"candidate that is imagined. The costs differ by at most {apart:.1e}. LPIPS "
+        f"{float(found.rounds.least_R[0]):.3f} after the first round and {float(found.cost):.3f} "
+        "after the last."
+    )
+    print("\n\n".join(text), flush=True)
+    if chosen.record:
+        how = f"`python benchmarks/planning.py --record`: the model `small`. {machine('jax')}."
+        record("planning", "\n\n".join(["## A plan by the cross-entropy method", how, *text]))
+
+
+if __name__ == "__main__":
+    main()

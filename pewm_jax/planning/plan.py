@@ -1,0 +1,222 @@
+"""Plan: round after round of candidates, their costs, and what the planner learns from them.
+
+``search`` is pure and jitted whole, for costs that JAX can trace. ``plan`` is the same loop on the
+host, for costs of any kind: it shows progress, refuses costs that are no numbers, and goes on where
+it was interrupted. Both draw a round's randomness from the key and the round's number alone: the
+same key gives the same plan.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import UserError
+from pewm_jax.data.progress import Meter
+from pewm_jax.planning import planners, rounds_file
+from pewm_jax.planning.planners import Search
+from pewm_jax.planning.settings import PlanConfig, Planner
+from pewm_jax.types import Array
+
+Cost: TypeAlias = Callable[[Array, Array], Array]
+"""``(actions_KN, key) -> costs_K``, the lower the better; continuous actions are (K, N, A)."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Rounds:
+    """What every round found.
+
+    Attributes:
+        least_R: (R,) the lowest cost of the round.
+        mean_R: (R,) the mean of its finite costs.
+        best_R: (R,) the lowest cost so far.
+        spread_R: (R,) how undecided the planner is afterwards: entropy over the uniform one's, or
+            the mean standard deviation.
+    """
+
+    least_R: Array
+    mean_R: Array
+    best_R: Array
+    spread_R: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """The best candidate of all rounds.
+
+    Attributes:
+        actions: (N,) discrete or (N, A) continuous actions.
+        choices: (H,) or (H, A) the same, block by block.
+        cost: () its cost.
+        rounds: statistics of every round.
+    """
+
+    actions: Array
+    choices: Array
+    cost: Array
+    rounds: Rounds
+
+
+def _keys(key: Array, number: Array | int) -> tuple[Array, Array]:
+    """Return a round's keys: of the proposals, of the costs."""
+    drawn, judged = jax.random.split(jax.random.fold_in(key, number))
+    return drawn, judged
+
+
+def _learn(
+    planner: Planner, config: PlanConfig, search: Search, choices: Array, costs: Array
+) -> tuple[Search, Rounds]:
+    """Update the search; return also the round's statistics."""
+    after = planners.update(planner, config, search, choices, costs)
+    finite = jnp.isfinite(costs)
+    mean = jnp.where(finite, costs, 0).sum() / jnp.maximum(finite.sum(), 1)
+    least = jnp.where(finite, costs, jnp.inf).min()
+    mean = jnp.where(finite.any(), mean, jnp.inf)
+    undecided = planners.spread(planner.space, after.belief)
+    return after, Rounds(least, mean, after.cost, undecided)
+
+
+def search(
+    planner: Planner,
+    config: PlanConfig,
+    cost_of_actions: Cost,
+    key: Array,
+    start: Array | None = None,
+) -> Plan:
+    """Plan with a cost that JAX can trace; pure: jit it, vmap it over keys and goals.
+
+    Costs that are no numbers count as worst; ``plan`` refuses them.
+
+    Args:
+        planner: the planner.
+        config: the size of the search.
+        cost_of_actions: see ``Cost``.
+        key: randomness.
+        start: see ``planners.init``.
+    """
+
+    def step(search: Search, number: Array) -> tuple[Search, Rounds]:
+        drawn, judged = _keys(key, number)
+        choices = planners.propose(planner, config, search, drawn)
+        costs = cost_of_actions(planners.actions_of(config, choices), judged)
+        return _learn(planner, config, search, choices, costs)
+
+    begun = planners.init(planner, config, start)
+    found, rounds = jax.lax.scan(step, begun, jnp.arange(config.rounds))
+    return _finished(config, found, rounds)
+
+
+def _finished(config: PlanConfig, found: Search, rounds: Rounds) -> Plan:
+    actions = planners.actions_of(config, found.best[None])[0]
+    return Plan(actions, found.best, found.cost, rounds)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _proposed(
+    planner: Planner, config: PlanConfig, search: Search, key: Array, number: Array
+) -> tuple[Array, Array, Array]:
+    """Return a round's choices, their actions, and the key of their costs."""
+    drawn, judged = _keys(key, number)
+    choices = planners.propose(planner, config, search, drawn)
+    return choices, planners.actions_of(config, choices), judged
+
+
+_learned = jax.jit(_learn, static_argnums=(0, 1))
+
+
+def plan(
+    planner: Planner,
+    config: PlanConfig,
+    cost_of_actions: Cost,
+    key: Array,
+    start: Array | None = None,
+    *,
+    checkpoint: Path | None = None,
+    about: str = "",
+    progress: bool = True,
+) -> Plan:
+    """Plan with any cost, on the host.
+
+    It may be interrupted at any time; the same arguments give the same plan.
+
+    Args:
+        planner: the planner.
+        config: the size of the search.
+        cost_of_actions: see ``Cost``; it is called once a round and may do what it likes. inf means
+            that a candidate is out of the question.
+        key: randomness.
+        start: see ``planners.init``.
+        checkpoint: a file that is rewritten after every round; a search goes on from it, and a
+            finished one is read from it. It belongs to one search: one of other settings, key,
+            start or ``about`` is refused.
+        about: what the cost is about, for the checkpoint, such as a hash of state and goal.
+        progress: show it.
+
+    Raises:
+        UserError: costs are NaN or −inf or of another shape, no candidate has a finite cost, or the
+            checkpoint is damaged or of another search.
+    """
+    begun = planners.init(planner, config, start)
+    made: list[Rounds] = []
+    identity = rounds_file.identity(planner, config, key, begun, about) if checkpoint else ""
+    if checkpoint is not None and checkpoint.exists():
+        begun, made = rounds_file.read(checkpoint, identity, begun, Rounds)
+    meter = Meter("plan", config.rounds * config.candidates, "candidates") if progress else None
+    found = begun
+    with meter or contextlib.nullcontext():
+        if meter is not None:
+            meter.advance(len(made) * config.candidates)
+        for number in range(len(made), config.rounds):
+            choices, actions, judged = _proposed(planner, config, found, key, number)
+            costs = checked(cost_of_actions(actions, judged), config.candidates, number)
+            found, statistics = _learned(planner, config, found, choices, costs)
+            made.append(jax.tree.map(np.asarray, statistics))
+            if checkpoint is not None:
+                rounds_file.write(checkpoint, identity, found, made)
+            if meter is not None:
+                meter.advance(config.candidates)
+    if not np.isfinite(float(found.cost)):
+        raise UserError(
+            f"no candidate of {config.rounds} rounds has a finite cost, so there is nothing to "
+            "choose: look at the cost, or allow other actions."
+        )
+    return _finished(config, found, jax.tree.map(lambda *x: jnp.stack(x), *made))
+
+
+def checked(costs: Any, count: int, number: int | None = None) -> np.ndarray:
+    """Return costs as (K,) float32 numbers.
+
+    Args:
+        costs: what a cost returned.
+        count: K.
+        number: the round, for the message, if there are rounds.
+
+    Raises:
+        UserError: they are of another shape, NaN, or −inf.
+    """
+    values = np.asarray(costs, np.float32)
+    where = "" if number is None else f"in round {number} "
+    if values.shape != (count,):
+        raise UserError(
+            f"{where}the cost of {count} candidates has shape {values.shape}: return one number "
+            "for each."
+        )
+    wrong = np.flatnonzero(np.isnan(values) | (values == -np.inf))
+    if len(wrong):
+        named = ", ".join(map(str, wrong[:8])) + (" …" if len(wrong) > 8 else "")
+        raise UserError(
+            f"{where}the cost of {len(wrong)} of {count} candidates ({named}) is no number: the "
+            "model imagined, or the cost made, NaN or −inf of their actions; look at what is "
+            "imagined of them by pewm_jax.imagine, and at the cost of one frame."
+        )
+    return values
