@@ -12,11 +12,12 @@ NEWEST = tests/parity tests/diffusion tests/training/test_training_sharding.py \
   tests/training/test_training_loop.py tests/training/test_training_two_stages.py \
   tests/test_train_cli.py
 
-.PHONY: help demo table1 test test-newest lint format bench clean
+.PHONY: help demo table1 table2 test test-newest lint format bench clean
 
 help:
 	@echo "make demo         collect, train, imagine and score; ends with the path of a report page"
 	@echo "make table1       which memory works? trains and scores them all, in hours; goes on where it was"
+	@echo "make table2       does a world model help to decide? policies, rankings, plans, in hours"
 	@echo "make test         the whole test suite"
 	@echo "make test-newest  a quick part of it on the newest Python that is there, with the newest JAX"
 	@echo "make lint         ruff (format and rules) and pyright"
@@ -51,6 +52,10 @@ table1: .venv/installed
 	@$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[metrics]'
 	@$(PY) -m pewm_jax.data collect $(DATA) $(COLLECT)
 	@$(PY) -m pewm_jax table1 --data $(DATA) $(ARGS)
+
+table2: .venv/installed
+	@$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[metrics]'
+	@$(PY) -m pewm_jax table2 $(ARGS)
 
 test: .venv/installed-dev
 	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)

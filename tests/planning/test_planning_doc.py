@@ -10,7 +10,6 @@ from tests.helpers import init_world
 from tests.planning.planning_page import blocks
 
 
-
 def test_twenty_lines_plan(tmp_path, monkeypatch):
     code = blocks("Plan with a world model", "python")
     assert len(code.splitlines()) <= 22

@@ -1,0 +1,105 @@
+"""``pewm-jax table2``: does a world model help to decide, and does its memory?"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pewm_jax import cli
+from pewm_jax.commands import imports
+
+ABOUT = (
+    "Let a policy alone, its proposals ranked by a world model, and plans (MPC) decide the same "
+    "tasks in held-out houses, each with an empty memory, with the memory, and with the renderer "
+    "itself as the model, and write a table, a plot and videos. What is decided is kept: the same "
+    "command goes on."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What is decided, and how."""
+
+    model: str = "small"
+    """A run's folder, or a model that comes with the library."""
+    out: Path = Path("runs/table2")
+    """Folder that everything is kept in."""
+    tasks: int = 48
+    """Tasks; they take the houses in turn."""
+    houses: int = 24
+    """Held-out houses."""
+    proposals: tuple[int, ...] = (8, 16)
+    """Numbers of a policy's proposals that are ranked."""
+    candidates: int = 60
+    """Candidates of a round of planning."""
+    elites: int = 18
+    """The best of them, which the next round is drawn from."""
+    rounds: int = 12
+    """Rounds of planning."""
+    horizon: int = 8
+    """Actions of a walk and of a plan, a multiple of what the model imagines at once."""
+    policy: str = "wander"
+    """`wander` (walks that know nothing) or MODULE:FUNCTION, see `studies.deciders.Policy`."""
+    cost: Literal["lpips", "pixels"] = "lpips"
+    """How far the last frame is from the goal's picture."""
+    videos: int = 3
+    """Tasks whose plan is shown beside what happened."""
+
+
+def main(argv: Sequence[str], prog: str = "pewm-jax table2") -> int:
+    """Make the table and print its path.
+
+    Args:
+        argv: the arguments.
+        prog: the words that the command was called by, for help and refusals.
+
+    Returns:
+        The exit code.
+    """
+    argv = imports.take(argv)
+    about = f"{ABOUT} Beside these settings:\n{imports.HELP}"
+    settings = cli.parse(Settings, argv, default=Settings(), prog=prog, description=about)
+    for name in ("tasks", "houses", "videos"):
+        if getattr(settings, name) < (name != "videos"):
+            raise cli.ConfigError(f"--{name} is {getattr(settings, name)}: give at least 1.")
+    if not settings.proposals or min(settings.proposals) < 1:
+        raise cli.ConfigError("--proposals needs numbers from 1 on, such as --proposals 8 16.")
+    # Imported here and not above: help and refusals come at once.
+    from pewm_jax.planning import costs
+    from pewm_jax.planning.settings import PlanConfig
+    from pewm_jax.studies import table2
+
+    plan = PlanConfig(
+        horizon=settings.horizon,
+        candidates=settings.candidates,
+        elites=settings.elites,
+        rounds=settings.rounds,
+    )
+    shared = ("tasks", "houses", "proposals", "policy", "cost", "videos")
+    errand = table2.Errand(plan=plan, **{name: getattr(settings, name) for name in shared})
+    policy = _policy(settings.policy)
+    cost = costs.perceptual() if settings.cost == "lpips" else costs.Pixels()
+    cli.cache_compilation(settings.out)
+    page = table2.run(settings.model, settings.out, errand, policy, cost)
+    print(f"table: {page}")
+    return 0
+
+
+def _policy(name: str) -> Callable[..., Any]:
+    """Return a policy by its name, or MODULE:FUNCTION."""
+    from pewm_jax.studies.deciders import POLICIES
+
+    if name in POLICIES:
+        return POLICIES[name]
+    module, _, function = name.partition(":")
+    try:
+        return getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError):
+        known = ", ".join(POLICIES)
+        raise cli.ConfigError(
+            f"--policy {name} is neither one of {known} nor a function MODULE:FUNCTION that can "
+            "be imported."
+        ) from None

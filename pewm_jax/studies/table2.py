@@ -1,0 +1,260 @@
+"""Table 2 by one command: does a world model help to decide, and does its memory?
+
+Every method meets the same tasks. A finished decision is a file; the same command goes on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pewm_jax import atomic, shipped
+from pewm_jax.config import Config, UserError
+from pewm_jax.data.progress import Meter
+from pewm_jax.evaluation import intervals
+from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.planning import scores
+from pewm_jax.planning.costs import FrameCost
+from pewm_jax.planning.settings import PlanConfig
+from pewm_jax.rollouts import load_finished
+from pewm_jax.studies import deciders, table2_page
+from pewm_jax.studies.deciders import Minds, Policy
+from pewm_jax.studies.goals import Goal, open_goal
+from pewm_jax.training.runs import WEIGHTS
+from pewm_jax.types import Params
+
+WITHIN_M, WITHIN_DEG = 0.25, 30.0
+"""A goal is reached this near to it, and with a heading this near to its own."""
+Say = Callable[[str], Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Errand:
+    """The settings of a table.
+
+    Attributes:
+        tasks: how many.
+        houses: held-out houses, which tasks take in turn.
+        proposals: numbers of a policy's proposals that are ranked.
+        plan: of the planner.
+        policy: its name.
+        cost: its name.
+        videos: tasks that are shown.
+    """
+
+    tasks: int = 48
+    houses: int = 24
+    proposals: tuple[int, ...] = (8, 16)
+    plan: PlanConfig = dataclasses.field(default_factory=PlanConfig)
+    policy: str = "wander"
+    cost: str = "lpips"
+    videos: int = 3
+
+
+def run(
+    model: str | Path,
+    out: Path,
+    errand: Errand,
+    policy: Policy,
+    cost: FrameCost,
+    say: Say = print,
+) -> Path:
+    """Let every method decide every task, and write the table.
+
+    Args:
+        model: a run folder, or the name of weights that come with the library.
+        out: the folder that everything is kept in.
+        errand: the settings.
+        policy: that of their name.
+        cost: that of their name.
+        say: shows a line.
+
+    Returns:
+        The path of the table in Markdown; beside it .tex, .csv, .png, videos and ``results.json``.
+
+    Raises:
+        UserError: the weights are absent, the folder holds decisions of other settings, a cost is
+            no number, or a house has no room.
+    """
+    folder = shipped.find(model)
+    config, params = load_finished(folder)
+    if errand.plan.actions % (config.model.clip.frames - 1):
+        raise UserError(
+            f"plans have {errand.plan.actions} actions, and {model} imagines "
+            f"{config.model.clip.frames - 1} frames at once: use a multiple."
+        )
+    about = dataclasses.asdict(errand) | {"weights": file_hash(folder / WEIGHTS)}
+    _require_same(out, about)
+    minds = Minds(config, params)
+    methods = deciders.names(errand.proposals)
+    made: dict[str, list[dict[str, Any]]] = {name: [] for name in methods}
+    with Meter("deciding", errand.tasks * len(methods), "decisions") as meter:
+        for number in range(errand.tasks):
+            goal: Goal | None = None
+            for name in methods:
+                file = out / _folder(name, errand) / f"{number:04d}.json"
+                kept = _kept(file)
+                if kept is None:
+                    goal = goal or _goal(errand, config, number)
+                    kept = _decided(name, goal, minds, policy, cost, errand)
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    atomic.write_text(file, json.dumps(kept) + "\n")
+                made[name].append(kept)
+                meter.advance(1)
+    say(meter.summary())
+    results = summary(made) | {
+        "about": about
+        | {"date": dt.datetime.now(dt.UTC).date().isoformat(), "how": intervals.how()}
+        | {"within_m": WITHIN_M, "within_deg": WITHIN_DEG, "model": str(model)}
+    }
+    text = json.dumps(results, indent=1, allow_nan=False)
+    atomic.write_text(out / "results.json", text + "\n")
+    videos = _videos(out, errand, config, params, made)
+    page = out / "table2.md"
+    table2_page.write(results, page, videos)
+    return page
+
+
+ADDED = ("tasks", "videos", "policy", "proposals")
+"""Settings that may change from call to call: decisions of others are found again."""
+
+
+def _folder(name: str, errand: Errand) -> str:
+    """Return the folder of a method's decisions; plans do not depend on the policy."""
+    whose = "" if name.startswith("mpc") else f"{errand.policy.replace(':', '.')}/"
+    return f"decisions/{whose}{name}"
+
+
+def _require_same(out: Path, about: Mapping[str, Any]) -> None:
+    """Refuse a folder with decisions of other settings, or weights."""
+    file = out / "settings.json"
+    now = json.dumps({name: value for name, value in about.items() if name not in ADDED}, indent=1)
+    if file.exists():
+        before = json.loads(file.read_text())
+        wrong = [name for name, value in json.loads(now).items() if before.get(name) != value]
+        if wrong:
+            raise UserError(
+                f"{out} holds decisions of other settings ({', '.join(wrong)}): name another "
+                "folder by --out, or put them back."
+            )
+    out.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(file, now + "\n")
+
+
+def _goal(errand: Errand, config: Config, number: int) -> Goal:
+    clip = config.model.clip
+    if clip.height != clip.width:
+        raise UserError(
+            f"the model's pictures are {clip.width}×{clip.height}: Table 2 needs square ones."
+        )
+    return open_goal(
+        number,
+        houses=errand.houses,
+        actions=errand.plan.actions,
+        context=config.data.context,
+        motion=config.model.actions,
+        size=clip.height,
+    )
+
+
+def _kept(file: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads(file.read_text())
+    except (FileNotFoundError, ValueError):
+        return None
+
+
+def _decided(
+    name: str, goal: Goal, minds: Minds, policy: Policy, cost: FrameCost, errand: Errand
+) -> dict[str, Any]:
+    """Return what a method chose, where it led, and how good that is."""
+    began = time.perf_counter()
+    choice = deciders.decide(name, goal, minds, policy, cost, errand.plan)
+    seconds = time.perf_counter() - began
+    curve = {str(n): _scored(goal, actions)["sim"] for n, actions in choice.found.items()}
+    return {
+        "house": goal.house,
+        "actions": [int(action) for action in choice.actions_N],
+        "foreseen": choice.foreseen,
+        "seconds": seconds,
+        "scores": _scored(goal, choice.actions_N),
+        "curve": curve,
+    }
+
+
+def _scored(goal: Goal, actions_N: np.ndarray) -> dict[str, float]:
+    """Return how near actions led to the goal, and by which way."""
+    made, true = goal.walked(actions_N), goal.walk_T3
+    reached = scores.success(made[-1], true[-1], WITHIN_M, WITHIN_DEG)
+    return {
+        "ate": scores.ate(true, made),
+        "rpe": scores.rpe(true, made),
+        "position_error": scores.position_error(made[-1], true[-1]),
+        "yaw_error": float(np.degrees(scores.yaw_error(made[-1], true[-1]))),
+        "sim": scores.sim(true[0], made[-1], true[-1]),
+        "success": 100.0 * reached,
+        "spl": 100.0 * scores.spl(reached, goal.shortest_m, scores.path_length(made)),
+    }
+
+
+def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """Return means over houses with intervals, what memory adds, paired by task, and curves."""
+    houses = np.unique([each["house"] for each in next(iter(made.values()))], return_inverse=True)[
+        1
+    ]
+    values = {
+        name: {m: np.array([one["scores"][m] for one in each]) for m in each[0]["scores"]}
+        for name, each in made.items()
+    }
+    memory = {}
+    for name in made:
+        what, _, mind = name.partition("-")
+        if mind == "memory":
+            other = values[f"{what}-empty"]
+            memory[what] = {
+                m: intervals.entry(values[name][m] - other[m], houses) for m in values[name]
+            }
+    curves = {}
+    for name, each in made.items():
+        if each[0]["curve"]:
+            curves[name] = {
+                n: intervals.entry(np.array([one["curve"][n] for one in each]), houses)
+                for n in each[0]["curve"]
+            }
+    return {
+        "rows": {
+            name: {m: intervals.entry(x, houses) for m, x in by.items()}
+            | {"seconds": float(np.median([one["seconds"] for one in made[name]]))}
+            for name, by in values.items()
+        },
+        "memory_minus_empty": memory,
+        "curves": curves,
+        "tasks": len(houses),
+        "houses": len(set(houses.tolist())),
+    }
+
+
+def _videos(
+    out: Path,
+    errand: Errand,
+    config: Config,
+    params: Params,
+    made: Mapping[str, list[dict[str, Any]]],
+) -> list[Path]:
+    """Write videos of what was planned and what happened, side by side."""
+    files = []
+    for number in range(min(errand.videos, errand.tasks)):
+        actions = np.array(made["mpc-memory"][number]["actions"])
+        file = out / f"plan{number}.mp4"
+        if not file.exists():
+            goal = _goal(errand, config, number)
+            table2_page.video(file, goal, config, params, actions)
+        files.append(file)
+    return files

@@ -1,0 +1,144 @@
+"""Table 2: the whole of it on a tiny setting, tasks that can be done, and scores that mean it."""
+
+import csv
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from pewm_jax import config as configuration
+from pewm_jax import presets, weights
+from pewm_jax.commands import table2 as command
+from pewm_jax.config import ActionConfig, ConfigError, UserError
+from pewm_jax.planning import costs, scores
+from pewm_jax.planning.settings import PlanConfig
+from pewm_jax.studies import deciders, goals, table2
+from tests.helpers import init_world
+
+MOTION = ActionConfig()
+PLAN = PlanConfig(horizon=4, candidates=6, elites=2, rounds=2)
+ERRAND = table2.Errand(
+    tasks=3, houses=2, proposals=(2,), plan=PLAN, policy="wander", cost="pixels", videos=1
+)
+
+
+def task(number, actions=6):
+    return goals.open_goal(number, houses=2, actions=actions, context=4, motion=MOTION, size=16)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A table of a tiny model with random weights."""
+    folder = tmp_path_factory.mktemp("table2")
+    config = presets.load("tiny")
+    weights.save(folder / "run" / "weights.safetensors", init_world(config, jax.random.key(0)))
+    configuration.save(config, folder / "run" / "config.json")
+    page = table2.run(
+        folder / "run", folder / "out", ERRAND, deciders.wanderer, costs.Pixels(), lambda _: None
+    )
+    return folder, page
+
+
+def test_the_whole_table_is_made(made):
+    _, page = made
+    results = json.loads((page.parent / "results.json").read_text())
+    names = deciders.names((2,))
+    assert tuple(results["rows"]) == names
+    assert set(results["memory_minus_empty"]) == {"rank2", "mpc"}
+    assert set(results["curves"]["mpc-memory"]) == {"6", "12"}
+    text = page.read_text()
+    assert text.count("\n| MPC · ") == 3
+    assert "The paper does not say how far its goals are" in text
+    with page.with_suffix(".csv").open() as file:
+        assert {line["method"] for line in csv.DictReader(file)} == set(names)
+    assert page.with_suffix(".tex").read_text().count(r"\\") == len(names) + 1
+    assert page.with_suffix(".png").stat().st_size > 0
+    assert (page.parent / "plan0.mp4").stat().st_size > 0
+
+
+def test_what_is_decided_is_kept_and_more_can_be_added(made):
+    folder, page = made
+    files = sorted((folder / "out").glob("decisions/**/*.json"))
+    before = [file.stat().st_mtime_ns for file in files]
+    assert len(files) == 3 * len(deciders.names((2,)))
+
+    def other(goal, count):
+        return deciders.wanderer(goal, count, seed=1)
+
+    more = dataclasses.replace(ERRAND, policy="mine:other")
+    table2.run(folder / "run", folder / "out", more, other, costs.Pixels(), lambda _: None)
+    assert [file.stat().st_mtime_ns for file in files] == before
+    new = set((folder / "out").glob("decisions/**/*.json")) - set(files)
+    assert {file.parent.parent.name for file in new} == {"mine.other"}  # plans are found again
+    wrong = dataclasses.replace(ERRAND, cost="lpips")
+    with pytest.raises(UserError, match="holds decisions of other settings"):
+        table2.run(folder / "run", folder / "out", wrong, other, costs.Pixels(), lambda _: None)
+    assert "mine:other" in page.read_text()
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_a_task_can_be_done_and_its_goal_was_not_seen_from_there(number):
+    goal = task(number)
+    assert np.array_equal(goal.walked(goal.expert_N), goal.walk_T3)
+    assert scores.sim(goal.walk_T3[0], goal.walk_T3[-1], goal.walk_T3[-1]) == pytest.approx(100)
+    seen = goal.seen(goal.expert_N[None])
+    np.testing.assert_array_equal(seen.rgb_THWC[0], goal.frame.rgb_THWC)
+    poses = goal.context.camera.world_from_camera
+    assert not any(np.allclose(pose, goal.frame.camera.world_from_camera[0]) for pose in poses)
+    start = goal.simulator.world_from_camera(goal.walk_T3[0])
+    np.testing.assert_allclose(poses[-1], start, atol=1e-6)  # the present frame is where it begins
+    again = task(number)
+    np.testing.assert_array_equal(again.context.rgb_THWC, goal.context.rgb_THWC)
+
+
+def test_a_perfect_mind_and_a_true_cost_reach_what_a_policy_does_not():
+    straight = costs.Distance(costs.straight)
+    plan = PlanConfig(horizon=6, candidates=60, elites=12, rounds=8)
+    reached, alone = [], []
+    for number in range(6):
+        goal = task(number)
+        for name, kept in (("mpc-truth", reached), ("policy", alone)):
+            found = deciders.decide(name, goal, _Truth(), _by_truth, straight, plan)
+            kept.append(table2._scored(goal, found.actions_N)["sim"])
+    assert np.mean(reached) > 97
+    assert np.mean(alone) < 80
+
+
+class _Truth:
+    def rollout(self, mind, goal):
+        assert mind == "truth"
+        return goal.seen
+
+
+def _by_truth(goal, count):
+    return deciders.wanderer(goal, count)
+
+
+def test_ranking_takes_the_best_proposal():
+    goal = task(1)
+
+    def policy(goal, count):
+        walks = deciders.wanderer(goal, count)
+        walks[2] = goal.expert_N
+        return walks
+
+    found = deciders.decide("rank5-truth", goal, _Truth(), policy, costs.Pixels(), PLAN)
+    np.testing.assert_array_equal(found.actions_N, goal.expert_N)
+    assert found.foreseen == pytest.approx(0)
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--policy", "nothing:here"], "--policy nothing:here is neither one of wander"),
+        (["--tasks", "0"], "--tasks is 0"),
+        (["--proposals", "0"], "--proposals needs numbers from 1 on"),
+        (["--elites", "99"], "plan.elites is 99"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):
+    with pytest.raises(ConfigError, match=words):
+        command.main([*argv, "--cost", "pixels", "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
