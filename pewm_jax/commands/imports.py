@@ -40,8 +40,13 @@ def take(argv: Sequence[str]) -> list[str]:
                 f"--import needs the name of a module, such as my_parts for my_parts.py, got "
                 f"{name!r}."
             )
-        here = str(Path.cwd())
-        if here not in sys.path:
-            sys.path.append(here)
+        look_here()
         kinds.imported(name, "--import")
     return rest
+
+
+def look_here() -> None:
+    """Let modules be found in the current folder too, after all others."""
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)

@@ -44,6 +44,8 @@ class Settings:
     """Values to try in the place of the ablation's own."""
     clips: int | None = None
     """Held-out clips; by default the preset's."""
+    dreamsim: Path | None = None
+    """Folder with the weights of DreamSim 0.2 (ensemble), which no package has."""
 
 
 def main(argv: Sequence[str], prog: str = "pewm-jax table1") -> int:
@@ -79,6 +81,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax table1") -> int:
         only=settings.rows,
         ablation=settings.ablate or "",
         values=settings.values,
+        weights={"dreamsim": settings.dreamsim} if settings.dreamsim else None,
     )
     print(f"table: {page}")
     return 0

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pewm_jax import cli
 from pewm_jax.commands import imports
+from pewm_jax.config import kinds
 
 ABOUT = (
     "Let a policy alone, its proposals ranked by a world model, and plans (MPC) decide the same "
@@ -95,11 +95,12 @@ def _policy(name: str) -> Callable[..., Any]:
     if name in POLICIES:
         return POLICIES[name]
     module, _, function = name.partition(":")
-    try:
-        return getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError, ValueError):
-        known = ", ".join(POLICIES)
+    if not function.isidentifier() or not all(part.isidentifier() for part in module.split(".")):
         raise cli.ConfigError(
-            f"--policy {name} is neither one of {known} nor a function MODULE:FUNCTION that can "
-            "be imported."
-        ) from None
+            f"--policy {name} is neither one of {', '.join(POLICIES)} nor MODULE:FUNCTION."
+        )
+    imports.look_here()
+    found = getattr(kinds.imported(module, "--policy"), function, None)
+    if not callable(found):
+        raise cli.ConfigError(f"--policy {name}: {module} has no function {function}.")
+    return found

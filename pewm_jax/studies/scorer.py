@@ -171,6 +171,11 @@ class Scorer:
                     there = jax.tree.map(lambda x: _there_and_back(x, half)[:, 1:], whole)
                     walk = _joined(batch.context, imagine(batch.context, control, there, seeds))
                     values["src"] = np.asarray(self.nets[SRC](walk, walk))
+                if "dreamsim" in self.nets:
+                    truth = batch.targets.rgb_THWC
+                    values["dreamsim"] = np.asarray(
+                        self.nets["dreamsim"](frames.rgb_THWC, _signal(truth))
+                    )
                 for key, value in values.items():
                     parts.setdefault(key, []).append(value[: batch.real])
                 meter.advance(batch.real)
@@ -178,13 +183,19 @@ class Scorer:
         return {key: np.concatenate(each) for key, each in parts.items()}
 
 
-def open_scorer(config: Config, out: Path, say: Callable[[str], Any]) -> Scorer:
+def open_scorer(
+    config: Config,
+    out: Path,
+    say: Callable[[str], Any],
+    weights: Mapping[str, str | Path] | None = None,
+) -> Scorer:
     """Fix what is scored, before anything is trained, and read it.
 
     Args:
         config: the settings that all rows share.
         out: the folder of the table; its ``protocol.json`` is written, or followed.
         say: shows a line.
+        weights: measure → its file or folder of weights, for those that no package has.
 
     Raises:
         UserError: the data are absent or have changed, or another protocol lies there.
@@ -195,7 +206,7 @@ def open_scorer(config: Config, out: Path, say: Callable[[str], Any]) -> Scorer:
     split = Path(config.data.path) / config.evaluate.split
     episodes = EpisodeSource(split)
     clips = decide(config, episodes, protocol, str(split))[1]
-    nets, left_out = _measures(config)
+    nets, left_out = _measures(config, weights)
     for sentence in left_out.values():
         say(sentence)
     size = config.evaluate.batch
@@ -215,9 +226,11 @@ def open_scorer(config: Config, out: Path, say: Callable[[str], Any]) -> Scorer:
     return Scorer(config, protocol, tuple(batches), nets, left_out, name, say)
 
 
-def _measures(config: Config) -> tuple[dict[str, Any], dict[str, str]]:
+def _measures(
+    config: Config, weights: Mapping[str, str | Path] | None
+) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the measures that need weights and can be taken, and why others cannot."""
-    nets, left_out = load_all(NETWORKS)
+    nets, left_out = load_all(NETWORKS, weights)
     clip = config.model.clip
     small = min(clip.height, clip.width) < LEAST["alex"]
     for name in ("lpips_alex", SRC) if small else ():

@@ -15,7 +15,7 @@ from pewm_jax.studies.scorer import SRC, Arrays
 
 SETS = ("fvd", "kvd")
 """Measures of whole sets of clips, which have no number per clip."""
-LOWER = ("lpips", "depth_mae", "depth_rel", *SETS)
+LOWER = ("lpips", "dreamsim", "depth_mae", "depth_rel", *SETS)
 """Measures of which less is better."""
 CHAIN = (
     "none",
@@ -37,8 +37,7 @@ def by_clip(arrays: Arrays) -> dict[str, np.ndarray]:
         for metric, values in by_metric.items()
         if metric != "lpips" or mask == MASKS[-1]
     }
-    if "src" in arrays:
-        found["src"] = arrays["src"]
+    found |= {name: arrays[name] for name in ("src", "dreamsim") if name in arrays}
     return found
 
 

@@ -10,7 +10,7 @@ import dataclasses
 import datetime as dt
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ def run(
     only: Sequence[str] = (),
     ablation: str = "",
     values: tuple[str, ...] = (),
+    weights: Mapping[str, str | Path] | None = None,
     say: Callable[[str], Any] = print,
 ) -> Path:
     """Train and score the rows of Table 1, or of an ablation, and write the table.
@@ -52,6 +53,7 @@ def run(
         only: names of rows; by default all.
         ablation: one of ``rows.ABLATIONS`` instead of the table.
         values: of the ablation; by default its own.
+        weights: see ``scorer.open_scorer``.
         say: shows a line.
 
     Returns:
@@ -66,7 +68,7 @@ def run(
     if not seeds or len(set(seeds)) < len(seeds):
         raise UserError(f"seeds are {list(seeds)}: give each training seed once, one at least.")
     study = Study(base, out, minutes, steps)
-    scorer = open_scorer(base, out, say)
+    scorer = open_scorer(base, out, say, weights)
     plan = planned(study, chosen, say)
     title = f"table1-{ablation}" if ablation else "table1"
     pieces: dict[str, list[Arrays]] = {}

@@ -24,6 +24,7 @@ COLUMNS: Mapping[str, tuple[str, int]] = {
     "lpips/all": ("LPIPS", 3),
     "fvd": ("FVD", 1),
     "kvd": ("KVD", 2),
+    "dreamsim": ("DreamSim", 3),
     "src": ("SRC[alex]", 1),
     "depth_mae/all": ("depth, m", 3),
 }
@@ -37,14 +38,14 @@ PAPER: Mapping[str, tuple[float, ...]] = {
 }
 """The paper's Table 1 (arXiv 2505.05495): PSNR, SSIM, LPIPS, FVD, DreamSim, SRC."""
 PAPER_HEADINGS = ("PSNR, dB", "SSIM", "LPIPS", "FVD", "DreamSim", "SRC")
-OURS = ("psnr/all", "ssim/all", "lpips/all", "fvd", "", "src")
+OURS = ("psnr/all", "ssim/all", "lpips/all", "fvd", "dreamsim", "src")
 """Our measure in the place of each of the paper's."""
 NOT_COMPARABLE = (
     "The numbers of the paper are of 512 × 512 pictures of scanned houses, a model of about 3 "
     "billion parameters trained on 8 GPUs for days, DINOv2 features, and an FVD and an LPIPS whose "
     "networks are not named; ours are of 64 × 64 pictures of generated houses and a model of about "
     "2 million. Only the order of the rows, and the signs of differences, can be compared. SRC is "
-    "by AlexNet here and by DINOv2 there; DreamSim's encoders are not in this library."
+    "by AlexNet here and by DINOv2 there."
 )
 
 
@@ -214,7 +215,7 @@ def _paper(results: Mapping[str, Any]) -> str:
     for name, described in results["about"]["rows"].items():
         if described["paper"]:
             theirs = PAPER[described["paper"]]
-            ours = [_cell(results, name, measure)[0] if measure else "–" for measure in OURS]
+            ours = [_cell(results, name, measure)[0] for measure in OURS]
             pairs = [f"{a:g} / {b}" for a, b in zip(theirs, ours, strict=True)]
             rows.append([described["paper"], label(results, name), *pairs])
     text = _table(["the paper's row", "ours", *PAPER_HEADINGS], rows)

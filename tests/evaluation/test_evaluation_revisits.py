@@ -104,18 +104,18 @@ def test_what_cannot_work_is_refused_in_a_sentence(files, monkeypatch, tmp_path)
         metrics.load("mirror[fvd]")
     with pytest.raises(UserError, match="psnr is no network and takes no weights"):
         metrics.load("mirror[psnr]", tmp_path)
-    with pytest.raises(UserError, match="DreamSim cannot be measured yet"):
+    with pytest.raises(UserError, match="DreamSim needs weights"):
         metrics.load("dreamsim")
 
 
 def test_metrics_without_weights_are_left_out_and_it_is_said(files, monkeypatch, tmp_path):
     monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
     monkeypatch.setattr(i3d_weights, "installed", lambda: None)
-    found, left_out = metrics.load_all((*metrics.NAMES, "dreamsim"), {"src": files["src"]})
+    found, left_out = metrics.load_all(metrics.NAMES, {"src": files["src"]})
     assert list(found) == ["psnr", "ssim", "src", "mirror[psnr]", "mirror[ssim]"]
     assert {"lpips_alex", "lpips_vgg", "fvd", "kvd", "src[alex]", "dreamsim"} < set(left_out)
     assert left_out["fvd"].startswith("fvd is left out: I3D needs weights, and none are installed")
-    assert "DreamSim cannot be measured yet" in left_out["dreamsim"]
+    assert "DreamSim needs weights" in left_out["dreamsim"]
     with pytest.raises(UserError, match="gone does not exist"):
         metrics.load_all(["fvd"], {"fvd": tmp_path / "gone"})
     with pytest.raises(UserError, match="no metric 'fid'"):

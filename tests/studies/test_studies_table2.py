@@ -132,7 +132,8 @@ def test_ranking_takes_the_best_proposal():
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        (["--policy", "nothing:here"], "--policy nothing:here is neither one of wander"),
+        (["--policy", "nothing"], "--policy nothing is neither one of wander"),
+        (["--policy", "json:nothing"], "json has no function nothing"),
         (["--tasks", "0"], "--tasks is 0"),
         (["--proposals", "0"], "--proposals needs numbers from 1 on"),
         (["--elites", "99"], "plan.elites is 99"),

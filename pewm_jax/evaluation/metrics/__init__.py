@@ -12,6 +12,7 @@ psnr             higher decibels, of the mean squared error of all pixels of a c
 ssim             higher structural similarity, 11 × 11 Gaussian windows, averaged over a clip
 lpips_alex       lower  LPIPS with AlexNet, averaged over a clip's frames; pictures are not resized
 lpips_vgg        lower  LPIPS with VGG16, the same
+dreamsim         lower  DreamSim (0.2, ensemble), averaged over a clip's frames
 fvd              lower  Fréchet distance of the 400 logits of I3D; 9 frames or more; with its floor
 kvd              lower  kernel distance of the same: no bias by the number of clips; may be negative
 src              higher clips that go and come back: cosine × 100 of DINOv2's features of both
@@ -31,7 +32,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from pewm_jax.config import UserError
-from pewm_jax.evaluation.metrics import similarity, videos
+from pewm_jax.evaluation.metrics import dreams, similarity, videos
+from pewm_jax.evaluation.metrics.dreams import DreamSim
 from pewm_jax.evaluation.metrics.perceptual import Perceptual
 from pewm_jax.evaluation.metrics.perceptual import read as read_lpips
 from pewm_jax.evaluation.metrics.pictures import PLAIN, Metric
@@ -43,6 +45,7 @@ from pewm_jax.models.lpips import Net
 
 __all__ = [
     "NAMES",
+    "DreamSim",
     "Metric",
     "Perceptual",
     "Revisit",
@@ -57,7 +60,13 @@ __all__ = [
 _NETS: dict[str, Net] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
 _ENCODERS = {"src": "dinov2", "src[alex]": "alex", "src[vgg]": "vgg"}
 _PICTURES = (*PLAIN, *_NETS)
-NAMES = (*_PICTURES, *videos.DISTANCES, *_ENCODERS, *(f"mirror[{name}]" for name in _PICTURES))
+NAMES = (
+    *_PICTURES,
+    "dreamsim",
+    *videos.DISTANCES,
+    *_ENCODERS,
+    *(f"mirror[{name}]" for name in _PICTURES),
+)
 _MIRROR = re.compile(r"mirror\[(.+)\]")
 
 
@@ -73,11 +82,6 @@ def load(name: str, weights: str | Path | None = None) -> Metric:
     Raises:
         UserError: there is no such metric, it takes no weights, or it needs some and has none.
     """
-    if name == "dreamsim":
-        raise UserError(
-            "DreamSim cannot be measured yet: of its three encoders (DINO, CLIP and OpenCLIP, "
-            "ViT-B/16 each) none is in this library; take lpips_alex, or src."
-        )
     if name not in NAMES:
         raise UserError(f"there is no metric {name!r}; there is {', '.join(NAMES)}.")
     mirrored = _MIRROR.fullmatch(name)
@@ -86,6 +90,8 @@ def load(name: str, weights: str | Path | None = None) -> Metric:
     if name in _ENCODERS:
         compare = similarity.read(_ENCODERS[name], weights)
         return Revisit(f"src[{compare.encoder}]", compare)
+    if name == "dreamsim":
+        return dreams.read(weights)
     if name in _NETS:
         return read_lpips(lpips_weights.find(_NETS[name], weights), _NETS[name])
     for kind in videos.DISTANCES:
@@ -118,7 +124,7 @@ def load_all(
         try:
             found[name] = load(name, given)
         except UserError as error:
-            if given is not None or name not in (*NAMES, "dreamsim"):
+            if given is not None or name not in NAMES:
                 raise
             left_out[name] = f"{name} is left out: {error}"
     return found, left_out
