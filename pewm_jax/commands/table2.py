@@ -65,8 +65,11 @@ def main(argv: Sequence[str], prog: str = "pewm-jax table2") -> int:
     for name in ("tasks", "houses", "videos"):
         if getattr(settings, name) < (name != "videos"):
             raise cli.ConfigError(f"--{name} is {getattr(settings, name)}: give at least 1.")
-    if not settings.proposals or min(settings.proposals) < 1:
-        raise cli.ConfigError("--proposals needs numbers from 1 on, such as --proposals 8 16.")
+    counts = settings.proposals
+    if not counts or min(counts) < 1 or len(set(counts)) < len(counts):
+        raise cli.ConfigError(
+            "--proposals needs different numbers from 1 on, such as --proposals 8 16."
+        )
     # Imported here and not above: help and refusals come at once.
     from pewm_jax.planning import costs
     from pewm_jax.planning.settings import PlanConfig

@@ -144,10 +144,10 @@ def make(
     for attempt in range(TRIES):
         draw = np.random.default_rng([config.seed, SPLITS.index(split), index, attempt])
         act = policy or _Persistent(env.action_space, config.persistence, draw)
-        seen, intrinsics = _walk(env, act, config, int(draw.integers(2**31)))
+        seen, intrinsics, scene = _walk(env, act, config, int(draw.integers(2**31)))
         longest = max(longest, len(seen))
         if len(seen) >= config.min_frames:
-            return _record(seen, intrinsics, config, f"{split}-{index:06d}")
+            return _record(seen, intrinsics, config, f"{split}-{index:06d}", scene)
     raise UserError(
         f"--env {config.env} ended {TRIES} episodes in a row after at most {longest} frames: let "
         f"its episodes last longer, or lower --min-frames ({config.min_frames})."
@@ -156,13 +156,14 @@ def make(
 
 def _walk(
     env: Any, act: Callable[[Any], Any], config: CollectEnvConfig, seed: int
-) -> tuple[list[dict[str, np.ndarray]], np.ndarray]:
-    """Return the frames of an episode, and the intrinsics."""
-    observation, info = env.reset(seed=seed)
+) -> tuple[list[dict[str, np.ndarray]], np.ndarray, str]:
+    """Return the frames of an episode, the intrinsics, and the scene's name."""
+    observation, info = _called(config, "reset", env.reset, seed=seed)
     first, intrinsics = _look(env, observation, info, config)
     seen = [first]
     while len(seen) < config.frames:
-        observation, _, terminated, truncated, info = env.step(act(observation))
+        action = _called(config, "the policy", act, observation)
+        observation, _, terminated, truncated, info = _called(config, "step", env.step, action)
         frame, same = _look(env, observation, info, config)
         if not np.array_equal(same, intrinsics) or frame["rgb"].shape != first["rgb"].shape:
             raise UserError(
@@ -174,7 +175,21 @@ def _walk(
         seen.append(frame)
         if terminated or truncated:
             break
-    return seen, intrinsics
+    shown = info.get("scene") if isinstance(info, Mapping) else None
+    return seen, intrinsics, str(shown or config.env.partition(":")[2])
+
+
+def _called(config: CollectEnvConfig, what: str, function: Callable, *given: Any, **named: Any):
+    """Call what is a user's own, which may raise anything."""
+    try:
+        return function(*given, **named)
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(
+            f"--env {config.env}: {what} failed ({type(error).__name__}: "
+            f"{' '.join(str(error).split())}); mend it."
+        ) from error
 
 
 def _look(
@@ -210,16 +225,20 @@ def _look(
         what = ", ".join(f"{name} {frame[name].shape} {frame[name].dtype}" for name in wrong)
         raise UserError(f"--env {config.env} shows {what}: provide {FORM}.")
     # Copied: an environment may use its buffers again.
-    return {name: frame[name].copy() for name in ("rgb", "depth", "pose")}, frame["intrinsics"]
+    kept = {name: frame[name].copy() for name in ("rgb", "depth", "pose")}
+    return kept, frame["intrinsics"]
 
 
 def _record(
-    seen: list[dict[str, np.ndarray]], intrinsics: np.ndarray, config: CollectEnvConfig, name: str
+    seen: list[dict[str, np.ndarray]],
+    intrinsics: np.ndarray,
+    config: CollectEnvConfig,
+    name: str,
+    scene: str,
 ) -> bytes:
     """Encode an episode, after the checks that ``data validate`` makes."""
     rgb, depth, pose = (np.stack([frame[key] for frame in seen]) for key in seen[0])
     arrays = EpisodeArrays(rgb, depth, intrinsics, pose, planar_actions(pose))
-    scene = config.env.partition(":")[2]
     record = write_episode(arrays, name, scene, {"policy": config.policy or "random-persistent"})
     problems = check_episode(read_episode(record), f"--env {config.env}, episode {name}")
     if problems:

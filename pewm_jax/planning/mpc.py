@@ -127,6 +127,7 @@ def mpc(
     *,
     budget: int,
     folder: Path | None = None,
+    about: str = "",
     progress: bool = True,
 ) -> Trajectory:
     """Act until the goal is reached or the budget is spent.
@@ -147,13 +148,21 @@ def mpc(
         folder: where plans are kept while they are searched for and afterwards. The same call again
             then reads them, acts anew by them, and goes on with the plan that was interrupted; what
             was seen must be the same.
+        about: with ``folder``: what plans depend on beside settings, key and what is seen, such as
+            hashes of the cost and of the model's weights. Plans of something else are refused.
         progress: show it.
 
     Raises:
-        UserError: the budget allows no action, or a plan is refused; see ``plan.plan``.
+        UserError: the budget allows no action, there is a folder and not what its plans are about,
+            or a plan is refused; see ``plan.plan``.
     """
     if budget < 1:
         raise UserError(f"budget is {budget}: allow at least one action.")
+    if folder is not None and not about:
+        raise UserError(
+            "plans are kept in a folder: say by about=… what they depend on, such as the names of "
+            "the model and of the cost, so that plans of another are not taken for them."
+        )
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     state, rest = mind.start(observed), None
@@ -172,7 +181,7 @@ def mpc(
                 searched,
                 rest,
                 checkpoint=folder and folder / f"plan_{len(plans):04d}.npz",
-                about=_hash(present, goal) if folder else "",
+                about=f"{about} {_hash(present, goal)}" if folder else "",
                 progress=False,
             )
             plans.append(found)

@@ -15,19 +15,19 @@ import jax
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config
+from pewm_jax.config import Config, UserError
 from pewm_jax.planning.candidates import Imagination, Judged, Rollout
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.plan import plan
 from pewm_jax.planning.ranking import rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig
-from pewm_jax.studies.goals import Goal, wander
+from pewm_jax.studies.goals import Asked, Goal, wander
 from pewm_jax.types import Params
 
 MINDS = ("empty", "memory", "truth")
-Policy: TypeAlias = Callable[[Goal, int], np.ndarray]
-"""``policy(goal, count) -> (count, N)`` discrete actions: proposals, the policy's own choice first;
-it may look at ``goal.context`` and ``goal.frame``."""
+Policy: TypeAlias = Callable[[Asked, int], np.ndarray]
+"""``policy(asked, count) -> (count, N)`` discrete actions: proposals, the policy's own choice
+first."""
 _start = jax.jit(worlds.start, static_argnums=0)
 
 
@@ -98,10 +98,10 @@ def decide(
     """
     what, _, mind = name.partition("-")
     if what == "policy":
-        return Decision(policy(goal, 1)[0])
+        return Decision(proposed(policy, goal, 1)[0])
     rollout = minds.rollout(mind, goal)
     if what.startswith("rank"):
-        proposals = policy(goal, int(what.removeprefix("rank")))
+        proposals = proposed(policy, goal, int(what.removeprefix("rank")))
         ranking = rank_by(rollout, proposals, cost, goal.frame)
         best = ranking.order_K[0]
         return Decision(proposals[best], float(ranking.costs_K[best]))
@@ -127,10 +127,27 @@ class _Watched:
         return costs
 
 
-def wanderer(goal: Goal, count: int, *, seed: int = 0) -> np.ndarray:
+def proposed(policy: Policy, goal: Goal, count: int) -> np.ndarray:
+    """Return a policy's proposals for a task, (count, N).
+
+    Raises:
+        UserError: they have another shape, or are no discrete actions.
+    """
+    asked = goal.asked
+    proposals = np.asarray(policy(asked, count))
+    known = proposals.dtype.kind in "iu" and proposals.shape == (count, asked.actions)
+    if not known or not ((proposals >= 0) & (proposals < len(goal.table_A3))).all():
+        raise UserError(
+            f"the policy proposed {proposals.dtype} of shape {proposals.shape} for {goal.house}: "
+            f"give ({count}, {asked.actions}) whole numbers below {len(goal.table_A3)}."
+        )
+    return proposals
+
+
+def wanderer(asked: Asked, count: int, *, seed: int = 0) -> np.ndarray:
     """Propose walks that know nothing; see ``goals.wander``. A ``Policy``."""
-    rng = np.random.default_rng((seed, goal.number))
-    return np.stack([wander(rng, len(goal.expert_N)) for _ in range(count)])
+    rng = np.random.default_rng((seed, asked.number))
+    return np.stack([wander(rng, asked.actions) for _ in range(count)])
 
 
 POLICIES: Mapping[str, Policy] = {"wander": functools.partial(wanderer)}

@@ -27,6 +27,23 @@ TEST = 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class Asked:
+    """What a policy is told of a task.
+
+    Attributes:
+        number: of the task, to draw from.
+        actions: N, how many actions to propose.
+        context: what was seen before; the last frame is the present one.
+        frame: what is seen at the goal, T = 1.
+    """
+
+    number: int
+    actions: int
+    context: Frames
+    frame: Frames
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Goal:
     """A task.
 
@@ -54,6 +71,11 @@ class Goal:
     def house(self) -> str:
         """The house's name."""
         return self.simulator.scene.name
+
+    @property
+    def asked(self) -> Asked:
+        """What a policy may know of it."""
+        return Asked(self.number, len(self.expert_N), self.context, self.frame)
 
     def walked(self, actions_N: np.ndarray) -> np.ndarray:
         """Return the poses (N + 1, 3) that actions lead through; walls hold."""

@@ -163,12 +163,15 @@ def parameters(base: Config, memory: MemorySettings) -> int:
 
 
 def _cell(base: Config, side: str) -> MemorySettings:
-    """Another size of a cell on the ground; the extent stays, and so does the height."""
+    """Another size of a cell on the ground; extent and height stay, smaller ones are more."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
     x, y, z = memory.cell_m
     scale = float(side) / x
     cells = (*(math.ceil(n / scale) for n in memory.cells[:2]), memory.cells[2])
-    return dataclasses.replace(memory, cell_m=(x * scale, y * scale, z), cells=cells)
+    room = math.ceil(memory.capacity / min(1.0, scale) ** 2)
+    return dataclasses.replace(
+        memory, cell_m=(x * scale, y * scale, z), cells=cells, capacity=room
+    )
 
 
 def _extent(base: Config, side: str) -> MemorySettings:
@@ -227,7 +230,7 @@ ABLATIONS: Mapping[str, Ablation] = {
 
 
 def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row, ...]:
-    """Return the rows of an ablation.
+    """Return the rows of an ablation; one that is a row of the table has its name.
 
     Args:
         base: the settings that all rows share.
@@ -240,15 +243,20 @@ def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row,
     if name not in ABLATIONS:
         raise UserError(f"there is no ablation {name!r}; choose {', '.join(ABLATIONS)}.")
     ablation = ABLATIONS[name]
-    found = []
+    plain = _as(base.model.memory, VoxelConfig, _attend(base))
+    found: list[Row] = []
     for value in values or ablation.values:
         try:
             memory = ablation.make(base, value)
             times = float(value) if name == "time" else 1.0
-        except ValueError:
-            raise UserError(
-                f"the ablation {name} cannot take {value!r}: give {ablation.about}."
-            ) from None
+        except UserError:
+            raise
+        except (ValueError, ArithmeticError):
+            times, memory = math.nan, plain
+        if not (math.isfinite(times) and times > 0):
+            raise UserError(f"the ablation {name} cannot take {value!r}: give {ablation.about}.")
         start = PAPER_FORM if name == "time" else "voxel-attend"
-        found.append(Row(f"{start}-{name}_{value}", memory, times=times))
+        own = name != "time" and memory == plain
+        row = Row(start if own else f"{start}-{name}_{value}", memory, times=times)
+        found.append(row)
     return tuple(found)

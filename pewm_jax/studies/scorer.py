@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax.config import Config
+from pewm_jax.config import Config, to_dict
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation import protocol_file
@@ -219,7 +219,7 @@ def open_scorer(
     facts = {
         "protocol": protocol.sha256,
         "seed": config.evaluate.seeds[0],
-        "sampler": config.model.noise.sample_steps,
+        "noise": to_dict(config.model.noise),
         "nets": {name: getattr(net, "sha256", name) for name, net in nets.items()},
     }
     name = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
@@ -237,6 +237,8 @@ def _measures(
         if nets.pop(name, None) is not None:
             size = f"{LEAST['alex']} pixels each way and these have {clip.width} × {clip.height}"
             left_out[name] = f"{name} is left out: AlexNet needs pictures of {size}."
+    if clip.frames % 2 == 0 and nets.pop(SRC, None) is not None:
+        left_out[SRC] = f"{SRC} is left out: a walk half as far and back needs an odd clip.frames."
     for name in ("fvd", "kvd") if clip.frames < SHORTEST else ():
         if nets.pop(name, None) is not None:
             size = f"{SHORTEST} frames or more, and these have {clip.frames}"

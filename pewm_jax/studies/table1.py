@@ -6,11 +6,12 @@ after each seed the table is written, so that it is there early and grows more c
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime as dt
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.evaluation import intervals
 from pewm_jax.studies import rows as table_rows
-from pewm_jax.studies import table, table_page
+from pewm_jax.studies import table, table_page, timing
 from pewm_jax.studies.rows import Row
 from pewm_jax.studies.scorer import BASELINES, Arrays, Scorer, open_scorer
-from pewm_jax.studies.trainings import Study, backbone_of, planned, settings, train
+from pewm_jax.studies.timing import planned
+from pewm_jax.studies.trainings import Study, backbone_of, settings, train
 from pewm_jax.worlds.pewm import STAGES
 
 RESULTS, HOURS = "results.json", "hours.json"
@@ -69,16 +71,17 @@ def run(
         raise UserError(f"seeds are {list(seeds)}: give each training seed once, one at least.")
     study = Study(base, out, minutes, steps)
     scorer = open_scorer(base, out, say, weights)
-    plan = planned(study, chosen, say)
-    title = f"table1-{ablation}" if ablation else "table1"
+    title = "-".join(["table1", *([ablation] if ablation else []), *(["part"] if only else [])])
     pieces: dict[str, list[Arrays]] = {}
-    for name in BASELINES:
-        pieces[name] = [scorer.baseline(name, out)]
-    truth = scorer.truth(out)
+    with _timing(out, "before"):
+        plan = planned(study, chosen, say)
+        for name in BASELINES:
+            pieces[name] = [scorer.baseline(name, out)]
+        truth = scorer.truth(out)
     page = out / f"{title}.md"
     for number, seed in enumerate(seeds):
         for row in chosen:
-            with _timed(out, f"seed{seed}/{row.name}"):
+            with _timing(out, f"seed{seed}/{row.name}"):
                 found = _one(study, scorer, row, seed, plan, say)
             for name, arrays in found.items():
                 group = pieces.setdefault(name, [])
@@ -121,22 +124,18 @@ def _one(
     return found
 
 
-class _timed:  # noqa: N801  # used as a function
+@contextlib.contextmanager
+def _timing(out: Path, name: str) -> Iterator[None]:
     """Add up the hours that a piece took, over all calls, in ``hours.json``."""
-
-    def __init__(self, out: Path, name: str):
-        self.path, self.name = out / HOURS, name
-
-    def __enter__(self) -> None:
-        self.began, self.worked = time.monotonic(), time.process_time()
-
-    def __exit__(self, *error: object) -> None:
-        kept = read_hours(self.path)
-        wall, worked = kept.get(self.name, (0.0, 0.0))
-        wall += (time.monotonic() - self.began) / 3600
-        worked += (time.process_time() - self.worked) / 3600
-        kept[self.name] = (wall, worked)
-        atomic.write_text(self.path, json.dumps(kept, indent=1) + "\n")
+    began, worked = time.monotonic(), time.process_time()
+    try:
+        yield
+    finally:
+        kept = read_hours(out / HOURS)
+        wall, cpu = kept.get(name, (0.0, 0.0))
+        wall += (time.monotonic() - began) / 3600
+        cpu += (time.process_time() - worked) / 3600
+        atomic.write_text(out / HOURS, json.dumps(kept | {name: (wall, cpu)}, indent=1) + "\n")
 
 
 def read_hours(path: Path) -> dict[str, tuple[float, float]]:
@@ -156,8 +155,9 @@ def _facts(
     ablation: str,
 ) -> dict[str, Any]:
     """Return how the table was made."""
-    hours = read_hours(study.out / HOURS).values()
-    names = [EMPTY, *(row.name for row in rows)]
+    pieces = ["before", *(f"seed{seed}/{row.name}" for seed in seeds for row in rows)]
+    kept = read_hours(study.out / HOURS)
+    hours = [kept[name] for name in pieces if name in kept]
     described = {
         row.name: {
             "label": row.label,
@@ -174,12 +174,14 @@ def _facts(
         "ablation": ablation,
         "seeds": list(seeds),
         "minutes": list(study.minutes) if study.steps is None else None,
-        "trainings": {name: plan[name] for name in names if name in plan},
+        "trainings": plan,
         "rows": described,
         "protocol_sha256": scorer.protocol.sha256,
         "clips": len(scorer.protocol.clips),
         "houses": len(set(scorer.house_of_clip.tolist())),
         "frames": scorer.frames,
+        "pixels": [study.base.model.clip.height, study.base.model.clip.width],
+        "clock": "processor" if timing.clock() is time.process_time else "wall",
         "context": scorer.config.data.context,
         "batch": STAGES[0].settings(study.base).batch,
         "left_out": dict(scorer.left_out),

@@ -15,23 +15,22 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax import atomic, shipped
+from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation import intervals
-from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.evaluation.opened import open_run, remembers
 from pewm_jax.planning import scores
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.settings import PlanConfig
-from pewm_jax.rollouts import load_finished
 from pewm_jax.studies import deciders, table2_page
 from pewm_jax.studies.deciders import Minds, Policy
 from pewm_jax.studies.goals import Goal, open_goal
-from pewm_jax.training.runs import WEIGHTS
 from pewm_jax.types import Params
 
-WITHIN_M, WITHIN_DEG = 0.25, 30.0
-"""A goal is reached this near to it, and with a heading this near to its own."""
+WITHIN_M, WITHIN_DEG = 0.35, 45.0
+"""A goal is reached this near to it, and with a heading this near to its own: one step or one turn
+of the usual 0.25 m and 30° short, and no more."""
 Say = Callable[[str], Any]
 
 
@@ -83,14 +82,19 @@ def run(
         UserError: the weights are absent, the folder holds decisions of other settings, a cost is
             no number, or a house has no room.
     """
-    folder = shipped.find(model)
-    config, params = load_finished(folder)
+    opened = open_run(model)
+    config, params = opened.config, opened.params
+    if not remembers(opened):
+        raise UserError(f"{model} has no memory, and what a memory adds is the question.")
     if errand.plan.actions % (config.model.clip.frames - 1):
         raise UserError(
             f"plans have {errand.plan.actions} actions, and {model} imagines "
             f"{config.model.clip.frames - 1} frames at once: use a multiple."
         )
-    about = dataclasses.asdict(errand) | {"weights": file_hash(folder / WEIGHTS)}
+    about = dataclasses.asdict(errand) | {"weights": opened.weights_hash}
+    if config.model.clip.height != config.model.clip.width:
+        size = f"{config.model.clip.width}×{config.model.clip.height}"
+        raise UserError(f"{model} imagines pictures of {size}, and Table 2 needs square ones.")
     _require_same(out, about)
     minds = Minds(config, params)
     methods = deciders.names(errand.proposals)
@@ -101,12 +105,12 @@ def run(
             for name in methods:
                 file = out / _folder(name, errand) / f"{number:04d}.json"
                 kept = _kept(file)
+                goal = goal or _goal(errand, config, number)
                 if kept is None:
-                    goal = goal or _goal(errand, config, number)
                     kept = _decided(name, goal, minds, policy, cost, errand)
                     file.parent.mkdir(parents=True, exist_ok=True)
                     atomic.write_text(file, json.dumps(kept) + "\n")
-                made[name].append(kept)
+                made[name].append(kept | {"scores": _scored(goal, np.array(kept["actions"]))})
                 meter.advance(1)
     say(meter.summary())
     results = summary(made) | {
@@ -144,23 +148,18 @@ def _require_same(out: Path, about: Mapping[str, Any]) -> None:
                 f"{out} holds decisions of other settings ({', '.join(wrong)}): name another "
                 "folder by --out, or put them back."
             )
-    out.mkdir(parents=True, exist_ok=True)
+    file.parent.mkdir(parents=True, exist_ok=True)
     atomic.write_text(file, now + "\n")
 
 
 def _goal(errand: Errand, config: Config, number: int) -> Goal:
-    clip = config.model.clip
-    if clip.height != clip.width:
-        raise UserError(
-            f"the model's pictures are {clip.width}×{clip.height}: Table 2 needs square ones."
-        )
     return open_goal(
         number,
         houses=errand.houses,
         actions=errand.plan.actions,
         context=config.data.context,
         motion=config.model.actions,
-        size=clip.height,
+        size=config.model.clip.height,
     )
 
 
@@ -184,7 +183,6 @@ def _decided(
         "actions": [int(action) for action in choice.actions_N],
         "foreseen": choice.foreseen,
         "seconds": seconds,
-        "scores": _scored(goal, choice.actions_N),
         "curve": curve,
     }
 

@@ -43,9 +43,9 @@ OURS = ("psnr/all", "ssim/all", "lpips/all", "fvd", "dreamsim", "src")
 NOT_COMPARABLE = (
     "The numbers of the paper are of 512 × 512 pictures of scanned houses, a model of about 3 "
     "billion parameters trained on 8 GPUs for days, DINOv2 features, and an FVD and an LPIPS whose "
-    "networks are not named; ours are of 64 × 64 pictures of generated houses and a model of about "
-    "2 million. Only the order of the rows, and the signs of differences, can be compared. SRC is "
-    "by AlexNet here and by DINOv2 there."
+    "networks are not named; ours are of small pictures and a small model (above). Only the order "
+    "of the rows, and the signs of differences, can be compared. SRC is by AlexNet here and by "
+    "DINOv2 there."
 )
 
 
@@ -140,14 +140,16 @@ def _title(about: Mapping[str, Any]) -> str:
 def how(results: Mapping[str, Any]) -> str:
     """Return in words how the numbers were made."""
     about = results["about"]
-    equal = "equal steps"
+    equal, size = "equal steps", about["pixels"]
     if about["minutes"]:
         first, second = about["minutes"]
-        equal = f"equal time ({first:g} + {second:g} processor minutes of training steps)"
+        clock = "processor " if about["clock"] == "processor" else ""
+        equal = f"equal time ({first:g} + {second:g} {clock}minutes of training steps)"
     return (
         f"{len(about['seeds'])} training seed(s), {equal}, batches of {about['batch']}; "
-        f"{about['clips']} clips of {about['frames'] - 1} imagined frames in {about['houses']} "
-        f"held-out houses, {about['context']} frames of context. Means over houses; ± is half of "
+        f"pictures of {size[0]} × {size[1]}; {about['clips']} clips of {about['frames'] - 1} "
+        f"imagined frames in {about['houses']} held-out houses, {about['context']} "
+        "frames of context. Means over houses; ± is half of "
         "the 95 % interval over houses (bootstrap), of FVD and KVD over training seeds "
         f"(Student's). Protocol {about['protocol_sha256'][:12]}. The run took "
         f"{about['hours']['clock']:.1f} hours on the clock, {about['hours']['cpu']:.1f} of the "
@@ -229,7 +231,7 @@ def _trainings(about: Mapping[str, Any]) -> str:
         took = "–" if training["seconds"] is None else f"{training['seconds']:.3f}"
         count = f"{described['parameters'] / 1e6:.2f} M" if described else "–"
         rows.append([name, count, took, str(training["steps"])])
-    header = ["training", "parameters of the reader", "processor seconds a step", "steps"]
+    header = ["training", "parameters of the reader", "seconds a step", "steps"]
     return f"## What was trained\n\n{_table(header, rows)}"
 
 

@@ -111,7 +111,7 @@ def test_the_command_walks_a_registered_house(tmp_path, capsys):
     turned = np.abs(episode.actions[:, 2])
     assert ((np.abs(moved - 0.25) < 1e-4) | (moved < 1e-4)).all()
     assert ((moved > 0.2) | (turned > 0.5)).mean() > 0.6, "the agent walked"
-    assert episode.scene == "pewm_jax/House-v0"
+    assert episode.scene == "house-000000"  # as it says in info
 
 
 def test_an_environment_and_a_policy_of_ones_own(tmp_path):

@@ -243,9 +243,13 @@ def test_an_agent_remembers_what_it_really_sees_and_can_be_interrupted(tmp_path)
     )
     step, _ = walk(limit=3)
     with pytest.raises(KeyboardInterrupt):
-        act(step, budget=9, folder=tmp_path)
+        act(step, budget=9, folder=tmp_path, about="truth, straight")
     step, _ = walk()
-    resumed = act(step, budget=9, folder=tmp_path)
+    with pytest.raises(UserError, match="belongs to a search of other"):
+        act(step, budget=9, folder=tmp_path, about="truth, something else")
+    with pytest.raises(UserError, match="say by about="):
+        act(step, budget=9, folder=tmp_path)
+    resumed = act(step, budget=9, folder=tmp_path, about="truth, straight")
     equal(resumed.actions, done.actions)
     equal(resumed.costs, done.costs)
     assert len(act(walk()[0], budget=3).actions) == 3

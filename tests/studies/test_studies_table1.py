@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax.commands import table1 as command
 from pewm_jax.config import AttentionConfig, UserError
@@ -14,7 +15,7 @@ from pewm_jax.data.__main__ import main as data_command
 from pewm_jax.evaluation.images import MASKS, SUMS
 from pewm_jax.geometry.actions import integrate, there_and_back
 from pewm_jax.geometry.cameras import pose_from_yaw
-from pewm_jax.studies import rows, scorer, table, table1, table_page, trainings
+from pewm_jax.studies import rows, scorer, table, table1, table_page, timing, trainings
 
 SIZE = ["--size", "16", "--frames", "30"]
 
@@ -42,22 +43,13 @@ def made(tmp_path_factory):
     few = ["--train", "2", "--validation", "0", "--test", "2"]
     assert data_command(["collect", str(folder / "data"), *few, *SIZE]) == 0
     said = []
-    page = table1.run(
-        small(folder / "data"),
-        folder / "out",
-        minutes=(1, 1),
-        steps=(2, 2),
-        seeds=[0],
-        only=ROWS,
-        say=said.append,
-    )
-    return folder, page, said
+    return folder, whole(folder, said.append), said
 
 
 def test_the_whole_table_is_made(made):
     _, page, said = made
     text = page.read_text()
-    results = json.loads((page.parent / "table1-results.json").read_text())
+    results = json.loads((page.parent / "table1-part-results.json").read_text())
     assert set(results["rows"]) == {*ROWS, "backbone", "reproject", "copy"}
     for name in results["rows"]:
         assert f"\n| {table_page.label(results, name)} | " in text
@@ -76,21 +68,19 @@ def test_the_whole_table_is_made(made):
     assert results["about"]["hours"]["clock"] > 0
 
 
+def whole(folder, say):
+    """Make the table."""
+    base, out = small(folder / "data"), folder / "out"
+    return table1.run(base, out, minutes=(1, 1), steps=(2, 2), seeds=[0], only=ROWS, say=say)
+
+
 def test_what_is_done_is_not_done_again(made):
     folder = made[0]
     files = sorted((folder / "out").glob("seed0/*/*.safetensors"))
     files += sorted((folder / "out").rglob("*.npz"))
     before = [file.stat().st_mtime_ns for file in files]
     said = []
-    table1.run(
-        small(folder / "data"),
-        folder / "out",
-        minutes=(1, 1),
-        steps=(2, 2),
-        seeds=[0],
-        only=ROWS,
-        say=said.append,
-    )
+    whole(folder, said.append)
     assert [file.stat().st_mtime_ns for file in files] == before
     assert len(files) >= 2 * len(ROWS)
     assert not any("compil" in line for line in said)
@@ -105,6 +95,48 @@ def test_all_rows_start_from_one_backbone_and_keep_it(made):
         after = tree.flatten(weights.load(out / name / "weights.safetensors"))
         assert all(np.array_equal(after[leaf], value) for leaf, value in before.items())
         assert any(leaf.startswith("memory/") for leaf in after)
+
+
+def test_a_step_is_timed(made):
+    folder = made[0]
+    study = trainings.Study(small(folder / "data"), folder / "timed", (1, 1))
+    said = []
+    kinds = [row for row in rows.main_rows(study.base) if row.name == "none"]
+    plan = timing.planned(study, kinds, said.append)
+    assert plan["backbone"]["seconds"] == plan["none"]["seconds"] > 0
+    assert plan["none"]["steps"] == round(60 / plan["none"]["seconds"])
+    assert any(": compiled in " in line for line in said)
+
+
+def test_what_was_made_from_other_weights_is_refused(made):
+    folder = made[0]
+    mark = folder / "out" / "seed0" / "surfels-render" / trainings.MADE_FROM
+    before = mark.read_text()
+    mark.write_text(before.replace('"start": "', '"start": "0'))
+    with pytest.raises(UserError, match="was made from other weights or data"):
+        whole(folder, [].append)
+    mark.write_text(before)
+
+
+def test_the_memory_is_what_differs_from_an_empty_one(made):
+    from pewm_jax import weights
+    from tests.helpers import randomise
+
+    folder = made[0]
+    out, run = folder / "random", folder / "out" / "seed0" / "surfels-render"
+    base = small(folder / "data")
+    judge = scorer.open_scorer(base, out, print)
+    row = next(row for row in rows.main_rows(base) if row.name == "surfels-render")
+    study = trainings.Study(base, folder / "out", (1, 1))
+    config = trainings.settings(study, row, 0, 2, start="x")
+    params = randomise(weights.load(run / "weights.safetensors"), scale=0.3)
+    weights.save(out / "run" / "weights.safetensors", params)
+    configuration.save(config, out / "run" / "config.json")
+    config = dataclasses.replace(
+        config, train=dataclasses.replace(config.train, run=str(out / "run"))
+    )
+    memory, empty = (judge.row(config, memory=memory)["sums"] for memory in (True, False))
+    assert not np.allclose(memory, empty)
 
 
 def test_rows_have_about_the_same_parameters_and_the_same_extent():
@@ -144,24 +176,40 @@ def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
     base = presets.load("table1")
     chosen = [row for row in rows.main_rows(base) if row.name in ("none", "voxel-attend")]
     chosen += rows.ablated(base, "time")
-    seconds = {"backbone": 0.5, "none": 0.5, "voxel-attend": 1.0}
-    asked = []
+    seconds = {"backbone": 0.5, "none": 0.5, "voxel-attend": 1.0, "map2d-attend": 2.0}
+    seconds["voxel-attend-sinusoid-time_4"] = 1.0
+    asked, pace = [], 1.0
 
     def measured(study, which, say):
-        asked.extend(row.name for row in which)
-        return {row.name: seconds.get(row.name, 1.0) for row in which}
+        asked.extend(row.name for row in which.values())
+        return {model: pace * seconds[row.name] for model, row in which.items()}
 
-    monkeypatch.setattr(trainings, "_measure", measured)
+    monkeypatch.setattr(timing, "_measure", measured)
     study = trainings.Study(base, tmp_path, (2, 1))
-    plan = trainings.planned(study, chosen, print)
+    plan = timing.planned(study, chosen, print)
     steps = {name: entry["steps"] for name, entry in plan.items()}
     assert steps["backbone"] == 2 * 60 / 0.5
     assert (steps["none"], steps["voxel-attend"]) == (120, 60)
     assert steps["voxel-attend-sinusoid-time_4"] == 240
-    assert trainings.planned(study, chosen, print) == plan
-    assert sorted(asked) == sorted(plan)  # each was timed once
+    assert timing.planned(study, chosen, print) == plan
+    assert len(asked) == 3  # each once; the row without a memory trains what the backbone does
     longer = dataclasses.replace(study, minutes=(2, 2))
-    assert trainings.planned(longer, chosen[:1], print)["none"]["steps"] == 240
+    assert timing.planned(longer, chosen[:1], print)["none"]["steps"] == 240
+    assert timing.planned(study, chosen, print) == plan  # other minutes have changed nothing
+    pace = 3.0  # what is timed on a busier machine is scaled by what was timed before
+    late = [row for row in rows.main_rows(base) if row.name == "map2d-attend"]
+    assert timing.planned(study, late, print)["map2d-attend"]["steps"] == 30
+    equal = dataclasses.replace(study, steps=(7, 5))
+    steps = {name: entry["steps"] for name, entry in timing.planned(equal, chosen, print).items()}
+    assert steps == {
+        "backbone": 7,
+        "none": 5,
+        "voxel-attend": 5,
+        "voxel-attend-sinusoid-time_4": 20,
+    }
+    (tmp_path / "plan.json").write_text("{")
+    with pytest.raises(UserError, match=r"plan\.json is damaged"):
+        timing.planned(study, chosen, print)
 
 
 def test_differences_are_paired_by_clip_and_seeds_are_averaged_first():
@@ -202,6 +250,10 @@ def test_the_walk_back_passes_the_same_cameras():
         (["--rows", "nothing"], "there are no rows nothing; choose of none, "),
         (["--values", "3"], "values are of an ablation"),
         (["--ablate", "cell", "--values", "wide"], "the ablation cell cannot take 'wide'"),
+        (["--ablate", "cell", "--values", "0"], "the ablation cell cannot take '0'"),
+        (["--ablate", "time", "--values", "-4"], "the ablation time cannot take '-4'"),
+        (["--minutes", "nan", "1"], "minutes are"),
+        (["--steps", "0", "1"], "steps are"),
         (["--seeds", "1", "1"], "give each training seed once"),
     ],
 )

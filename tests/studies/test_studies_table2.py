@@ -15,7 +15,7 @@ from pewm_jax.config import ActionConfig, ConfigError, UserError
 from pewm_jax.planning import costs, scores
 from pewm_jax.planning.settings import PlanConfig
 from pewm_jax.studies import deciders, goals, table2
-from tests.helpers import init_world
+from tests.helpers import init_world, randomise
 
 MOTION = ActionConfig()
 PLAN = PlanConfig(horizon=4, candidates=6, elites=2, rounds=2)
@@ -64,8 +64,8 @@ def test_what_is_decided_is_kept_and_more_can_be_added(made):
     before = [file.stat().st_mtime_ns for file in files]
     assert len(files) == 3 * len(deciders.names((2,)))
 
-    def other(goal, count):
-        return deciders.wanderer(goal, count, seed=1)
+    def other(asked, count):
+        return deciders.wanderer(asked, count, seed=1)
 
     more = dataclasses.replace(ERRAND, policy="mine:other")
     table2.run(folder / "run", folder / "out", more, other, costs.Pixels(), lambda _: None)
@@ -93,6 +93,40 @@ def test_a_task_can_be_done_and_its_goal_was_not_seen_from_there(number):
     np.testing.assert_array_equal(again.context.rgb_THWC, goal.context.rgb_THWC)
 
 
+def test_a_step_or_a_turn_short_is_there_and_two_are_not():
+    start = np.array([0.3, -1.2, 0.7])
+    ends = [[0.25, 0, 0], [0, 0, np.pi / 6], [0.5, 0, 0], [0, 0, np.pi / 3]]
+    reached = [
+        scores.success(start, start + end, table2.WITHIN_M, table2.WITHIN_DEG) for end in ends
+    ]
+    assert reached == [True, True, False, False]
+
+
+def test_only_the_mind_with_a_memory_sees_the_past():
+    config = presets.load("tiny")
+    minds = deciders.Minds(config, randomise(init_world(config, jax.random.key(0)), scale=0.3))
+    goal = task(0, actions=4)
+    blind = dataclasses.replace(
+        goal,
+        context=jax.tree.map(lambda x: np.concatenate([x[-1:]] * len(x)), goal.context),
+    )
+    walks = deciders.wanderer(goal.asked, 3)
+    seen = {
+        (mind, name): np.asarray(minds.rollout(mind, which)(walks).rgb_THWC)
+        for mind in ("empty", "memory")
+        for name, which in (("whole", goal), ("present", blind))
+    }
+    np.testing.assert_allclose(seen["empty", "whole"], seen["empty", "present"], atol=1e-5)
+    assert not np.allclose(seen["memory", "whole"], seen["memory", "present"], atol=1e-3)
+    assert not np.allclose(seen["memory", "whole"], seen["empty", "whole"], atol=1e-3)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((2, 3), int), np.zeros((2, 4)), np.full((2, 4), 3)])
+def test_proposals_that_are_none_are_refused(wrong):
+    with pytest.raises(UserError, match=r"give \(2, 4\) whole numbers below 3"):
+        deciders.proposed(lambda asked, count: wrong, task(0, actions=4), 2)
+
+
 def test_a_perfect_mind_and_a_true_cost_reach_what_a_policy_does_not():
     straight = costs.Distance(costs.straight)
     plan = PlanConfig(horizon=6, candidates=60, elites=12, rounds=8)
@@ -112,15 +146,15 @@ class _Truth:
         return goal.seen
 
 
-def _by_truth(goal, count):
-    return deciders.wanderer(goal, count)
+def _by_truth(asked, count):
+    return deciders.wanderer(asked, count)
 
 
 def test_ranking_takes_the_best_proposal():
     goal = task(1)
 
-    def policy(goal, count):
-        walks = deciders.wanderer(goal, count)
+    def policy(asked, count):
+        walks = deciders.wanderer(asked, count)
         walks[2] = goal.expert_N
         return walks
 
@@ -135,7 +169,8 @@ def test_ranking_takes_the_best_proposal():
         (["--policy", "nothing"], "--policy nothing is neither one of wander"),
         (["--policy", "json:nothing"], "json has no function nothing"),
         (["--tasks", "0"], "--tasks is 0"),
-        (["--proposals", "0"], "--proposals needs numbers from 1 on"),
+        (["--proposals", "0"], "--proposals needs different numbers from 1 on"),
+        (["--proposals", "8", "8"], "--proposals needs different numbers from 1 on"),
         (["--elites", "99"], "plan.elites is 99"),
     ],
 )
