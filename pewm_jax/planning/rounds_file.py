@@ -66,7 +66,7 @@ def read(path: Path, who: str, like: Search, kind: type) -> tuple[Search, list[A
         ) from None
     if found != who:
         raise UserError(
-            f"{path} belongs to a search of other settings, key, start, goal or cost: name another file, "
-            "or remove it."
+            f"{path} belongs to a search of other settings, key, start, goal or cost: name another "
+            "file, or remove it."
         )
     return jax.tree.unflatten(tree, saved), rounds
