@@ -169,9 +169,7 @@ def _cell(base: Config, side: str) -> MemorySettings:
     scale = float(side) / x
     cells = (*(math.ceil(n / scale) for n in memory.cells[:2]), memory.cells[2])
     room = math.ceil(memory.capacity / min(1.0, scale) ** 2)
-    return dataclasses.replace(
-        memory, cell_m=(x * scale, y * scale, z), cells=cells, capacity=room
-    )
+    return dataclasses.replace(memory, cell_m=(x * scale, y * scale, z), cells=cells, capacity=room)
 
 
 def _extent(base: Config, side: str) -> MemorySettings:
