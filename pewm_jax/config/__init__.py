@@ -37,6 +37,7 @@ from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettings
 from pewm_jax.config.reader import AttentionConfig, BothConfig, ReaderSettings, RenderConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
+from pewm_jax.config.svd_unet import SVDUNetConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.vae import VAEConfig
 
@@ -106,6 +107,7 @@ __all__ = [
     "PointsConfig",
     "ReaderSettings",
     "RenderConfig",
+    "SVDUNetConfig",
     "Settings",
     "StageConfig",
     "SurfelConfig",

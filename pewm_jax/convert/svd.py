@@ -1,0 +1,59 @@
+"""Stable Video Diffusion in the layout of diffusers: read its networks and write them back.
+
+A pipeline's folder has ``unet/``, ``vae/``, ``image_encoder/`` and ``scheduler/``. Every tensor of
+a folder must be used.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pewm_jax.config import SVDUNetConfig
+from pewm_jax.convert import cogvideox, output, svd_unet
+from pewm_jax.convert.cogvideox import Network
+from pewm_jax.models import svd_unet as unet_model
+from pewm_jax.types import Params
+
+UNET = Network("unet", svd_unet.CLASS, SVDUNetConfig, svd_unet, unet_model.init)
+
+
+def read_unet(folder: str | Path, dtype: str | None = None) -> tuple[SVDUNetConfig, Params]:
+    """Read the U-Net of a checkpoint.
+
+    Args:
+        folder: a diffusers pipeline's folder, or the U-Net's folder in it.
+        dtype: of the parameters, ``float32``, ``bfloat16`` or ``float16``; by default the stored
+            one.
+
+    Returns:
+        ``(config, params)`` for ``pewm_jax.models.svd_unet.apply``, NumPy arrays.
+
+    Raises:
+        UserError: a tensor that is missing, left over or of another shape, a damaged file, a
+            class or setting that is not known.
+    """
+    return cogvideox.read_network(UNET, Path(folder), dtype)
+
+
+def write_unet(
+    config: SVDUNetConfig, params: Params, folder: str | Path, dtype: str | None = None
+) -> None:
+    """Write the U-Net as diffusers' ``from_pretrained`` reads it; the inverse of ``read_unet``.
+
+    Args:
+        config: the network.
+        params: its parameters.
+        folder: to make.
+        dtype: of the tensors; by default that of the parameters.
+
+    Raises:
+        UserError: the folder exists.
+    """
+    _write(UNET, config, params, Path(folder), dtype)
+
+
+def _write(network: Network, config: Any, params: Params, dst: Path, dtype: str | None) -> None:
+    values = network.converter.config_to_diffusers(config)
+    with output.new_folder(dst) as whole:
+        cogvideox.write_diffusers(network, values, params, whole, dtype)
