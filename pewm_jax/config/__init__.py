@@ -38,6 +38,7 @@ from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettin
 from pewm_jax.config.reader import AttentionConfig, BothConfig, ReaderSettings, RenderConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
 from pewm_jax.config.svd_unet import SVDUNetConfig
+from pewm_jax.config.svd_vae import SVDVAEConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.vae import VAEConfig
 
@@ -108,6 +109,7 @@ __all__ = [
     "ReaderSettings",
     "RenderConfig",
     "SVDUNetConfig",
+    "SVDVAEConfig",
     "Settings",
     "StageConfig",
     "SurfelConfig",

@@ -9,13 +9,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pewm_jax.config import SVDUNetConfig
-from pewm_jax.convert import cogvideox, output, svd_unet
+from pewm_jax.config import SVDUNetConfig, SVDVAEConfig
+from pewm_jax.convert import cogvideox, output, svd_unet, svd_vae
 from pewm_jax.convert.cogvideox import Network
 from pewm_jax.models import svd_unet as unet_model
+from pewm_jax.models import svd_vae as vae_model
 from pewm_jax.types import Params
 
 UNET = Network("unet", svd_unet.CLASS, SVDUNetConfig, svd_unet, unet_model.init)
+VAE = Network("vae", svd_vae.CLASS, SVDVAEConfig, svd_vae, vae_model.init)
 
 
 def read_unet(folder: str | Path, dtype: str | None = None) -> tuple[SVDUNetConfig, Params]:
@@ -51,6 +53,22 @@ def write_unet(
         UserError: the folder exists.
     """
     _write(UNET, config, params, Path(folder), dtype)
+
+
+def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[SVDVAEConfig, Params]:
+    """Read the autoencoder of a checkpoint; see ``read_unet``.
+
+    Returns:
+        ``(config, params)`` for ``pewm_jax.models.svd_vae.encode`` and ``decode``.
+    """
+    return cogvideox.read_network(VAE, Path(folder), dtype)
+
+
+def write_vae(
+    config: SVDVAEConfig, params: Params, folder: str | Path, dtype: str | None = None
+) -> None:
+    """Write the autoencoder as diffusers' ``from_pretrained`` reads it; see ``write_unet``."""
+    _write(VAE, config, params, Path(folder), dtype)
 
 
 def _write(network: Network, config: Any, params: Params, dst: Path, dtype: str | None) -> None:
