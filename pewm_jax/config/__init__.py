@@ -6,6 +6,7 @@ is built, in a sentence that names the fix; other code does not check them again
 
 from pewm_jax.config.backbone import BackboneSettings, Places
 from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
+from pewm_jax.config.clip_vision import CLIPVisionConfig
 from pewm_jax.config.codec import CodecSettings, PixelConfig
 from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
 from pewm_jax.config.control import CameraConfig, ControlSettings
@@ -74,6 +75,7 @@ __all__ = [
     "AttentionConfig",
     "BackboneSettings",
     "BothConfig",
+    "CLIPVisionConfig",
     "CameraConfig",
     "ClipConfig",
     "CodecSettings",

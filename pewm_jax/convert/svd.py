@@ -9,9 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pewm_jax.config import SVDUNetConfig, SVDVAEConfig
-from pewm_jax.convert import cogvideox, output, svd_unet, svd_vae
+import jax
+
+from pewm_jax import tensor_files
+from pewm_jax.config import CLIPVisionConfig, SVDUNetConfig, SVDVAEConfig
+from pewm_jax.convert import assemble, clip_vision, cogvideox, output, sources, svd_unet, svd_vae
 from pewm_jax.convert.cogvideox import Network
+from pewm_jax.models import clip_vision as clip_model
 from pewm_jax.models import svd_unet as unet_model
 from pewm_jax.models import svd_vae as vae_model
 from pewm_jax.types import Params
@@ -69,6 +73,38 @@ def write_vae(
 ) -> None:
     """Write the autoencoder as diffusers' ``from_pretrained`` reads it; see ``write_unet``."""
     _write(VAE, config, params, Path(folder), dtype)
+
+
+def read_image_encoder(
+    folder: str | Path, dtype: str | None = None
+) -> tuple[CLIPVisionConfig, Params]:
+    """Read the image encoder of a checkpoint, in the layout of transformers; see ``read_unet``.
+
+    Returns:
+        ``(config, params)`` for ``pewm_jax.models.clip_vision.apply``.
+    """
+    inside = sources.component(Path(folder), "image_encoder")
+    path = inside / "config.json"
+    config = clip_vision.config_from_transformers(sources.read_json(path), str(path))
+    source = sources.open_folder(inside)
+    total = sum(place.size for _, place in source.places.values())
+    like = jax.eval_shape(lambda: clip_model.init(config, jax.random.key(0)))
+    with output.megabytes("read image_encoder", total) as progress:
+        kept = clip_vision.without_positions(source)
+        return config, assemble.read(clip_vision.entries(config), kept, like, dtype, progress)
+
+
+def write_image_encoder(
+    config: CLIPVisionConfig, params: Params, folder: str | Path, dtype: str | None = None
+) -> None:
+    """Write the image encoder as transformers' ``from_pretrained`` reads it; see ``write_unet``."""
+    entries = clip_vision.entries(config)
+    specs = assemble.specs(entries, params, dtype)
+    with output.new_folder(Path(folder)) as whole:
+        output.write_json(whole / "config.json", clip_vision.config_to_transformers(config))
+        path, tensors = whole / "model.safetensors", assemble.write(entries, params, dtype)
+        with output.megabytes("write image_encoder", tensor_files.size(specs)) as progress:
+            tensor_files.write(path, specs, tensors, {"format": "pt"}, progress)
 
 
 def _write(network: Network, config: Any, params: Params, dst: Path, dtype: str | None) -> None:

@@ -172,21 +172,21 @@ def attend(params: Params, x_BTHWC: Array, image_BMD: Array, heads: int, layers_
 
 def _spatial(params: Params, x_NPC: Array, context: Array, heads: int, frames: int) -> Array:
     """Run a layer on the pixels of every frame: self-attention, the image, feed-forward."""
-    normed = _layer_norm(params["norm1"], x_NPC)
+    normed = layer_norm(params["norm1"], x_NPC)
     x = x_NPC + attention(params["attn1"], normed, normed, heads)
     x = x + _look(params, x, context, heads, frames)
-    return x + _feed_forward(params["ff"], _layer_norm(params["norm3"], x))
+    return x + _feed_forward(params["ff"], layer_norm(params["norm3"], x))
 
 
 def _temporal(params: Params, x_BTPC: Array, image_BMD: Array, heads: int) -> Array:
     """Run a layer on the frames of every pixel; also a feed-forward layer at its start."""
     batch, frames, pixels, channels = x_BTPC.shape
-    x = x_BTPC + _feed_forward(params["ff_in"], _layer_norm(params["norm_in"], x_BTPC))
-    normed = _layer_norm(params["norm1"], x)
+    x = x_BTPC + _feed_forward(params["ff_in"], layer_norm(params["norm_in"], x_BTPC))
+    normed = layer_norm(params["norm1"], x)
     x = x + _over_frames(params["attn1"], normed, heads)
     flat = x.reshape(batch, frames * pixels, channels)
     x = (flat + _look(params, flat, image_BMD, heads, 1)).reshape(x.shape)
-    return x + _feed_forward(params["ff"], _layer_norm(params["norm3"], x))
+    return x + _feed_forward(params["ff"], layer_norm(params["norm3"], x))
 
 
 def _look(params: Params, x_NPC: Array, context: Array, heads: int, repeats: int) -> Array:
@@ -197,7 +197,7 @@ def _look(params: Params, x_NPC: Array, context: Array, heads: int, repeats: int
     inside = params["attn2"]
     context = context.astype(x_NPC.dtype)
     if context.shape[1] > 1:
-        return attention(inside, _layer_norm(params["norm2"], x_NPC), context, heads)
+        return attention(inside, layer_norm(params["norm2"], x_NPC), context, heads)
     return jnp.repeat(linear(inside["to_out"], linear(inside["to_v"], context)), repeats, 0)
 
 
@@ -217,12 +217,12 @@ def _over_frames(params: Params, x_BTPC: Array, heads: int) -> Array:
     return out.reshape(batch, pixels, frames, channels).swapaxes(1, 2)
 
 
-def _layer_norm(params: Params, x: Array) -> Array:
+def layer_norm(params: Params, x: Array, eps: float = 1e-5) -> Array:
     """Layer norm in float32, returned in x's dtype."""
     value = x.astype(jnp.float32)
     mean = value.mean(-1, keepdims=True)
     near = value - mean
-    scale = jax.lax.rsqrt(jnp.square(near).mean(-1, keepdims=True) + 1e-5)
+    scale = jax.lax.rsqrt(jnp.square(near).mean(-1, keepdims=True) + eps)
     return (near * scale * params["scale"] + params["bias"]).astype(x.dtype)
 
 
