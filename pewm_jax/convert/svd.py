@@ -12,8 +12,17 @@ from typing import Any
 import jax
 
 from pewm_jax import tensor_files
-from pewm_jax.config import CLIPVisionConfig, SVDUNetConfig, SVDVAEConfig
-from pewm_jax.convert import assemble, clip_vision, cogvideox, output, sources, svd_unet, svd_vae
+from pewm_jax.config import CLIPVisionConfig, EDMConfig, SVDUNetConfig, SVDVAEConfig
+from pewm_jax.convert import (
+    assemble,
+    clip_vision,
+    cogvideox,
+    output,
+    sources,
+    svd_scheduler,
+    svd_unet,
+    svd_vae,
+)
 from pewm_jax.convert.cogvideox import Network
 from pewm_jax.models import clip_vision as clip_model
 from pewm_jax.models import svd_unet as unet_model
@@ -105,6 +114,19 @@ def write_image_encoder(
         path, tensors = whole / "model.safetensors", assemble.write(entries, params, dtype)
         with output.megabytes("write image_encoder", tensor_files.size(specs)) as progress:
             tensor_files.write(path, specs, tensors, {"format": "pt"}, progress)
+
+
+def read_scheduler(folder: str | Path) -> EDMConfig:
+    """Read the scheduler of a checkpoint: settings only, it has no weights.
+
+    Args:
+        folder: a diffusers pipeline's folder, or the scheduler's folder in it.
+
+    Raises:
+        UserError: a class or setting that is not known.
+    """
+    path = sources.component(Path(folder), "scheduler") / "scheduler_config.json"
+    return svd_scheduler.config_from_diffusers(sources.read_config(path, [svd_scheduler.CLASS]))
 
 
 def _write(network: Network, config: Any, params: Params, dst: Path, dtype: str | None) -> None:
