@@ -138,7 +138,7 @@ def main() -> None:
     widths, heads, shape = (128, 256, 512, 512), (2, 4, 8, 8), (4, 24, 24)
     codec, clip = (128, 256, 512, 512), (4, 96)
     if options.smoke:
-        widths, heads, shape = (32, 32, 32, 32), (1, 1, 1, 1), (2, 8, 8)
+        widths, heads, shape = (64, 64, 64, 64), (1, 1, 1, 1), (2, 16, 16)
         codec, clip = (32, 32, 32, 32), (2, 16)
     rows: list[Row] = []
     if options.only != "vae":
