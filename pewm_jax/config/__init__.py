@@ -6,6 +6,7 @@ is built, in a sentence that names the fix; other code does not check them again
 
 from pewm_jax.config.backbone import BackboneSettings, Places
 from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
+from pewm_jax.config.clip_vision import CLIPVisionConfig
 from pewm_jax.config.codec import CodecSettings, PixelConfig
 from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
 from pewm_jax.config.control import CameraConfig, ControlSettings
@@ -37,6 +38,8 @@ from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettings
 from pewm_jax.config.reader import AttentionConfig, BothConfig, ReaderSettings, RenderConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
+from pewm_jax.config.svd_unet import SVDUNetConfig
+from pewm_jax.config.svd_vae import SVDVAEConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.vae import VAEConfig
 
@@ -72,6 +75,7 @@ __all__ = [
     "AttentionConfig",
     "BackboneSettings",
     "BothConfig",
+    "CLIPVisionConfig",
     "CameraConfig",
     "ClipConfig",
     "CodecSettings",
@@ -106,6 +110,8 @@ __all__ = [
     "PointsConfig",
     "ReaderSettings",
     "RenderConfig",
+    "SVDUNetConfig",
+    "SVDVAEConfig",
     "Settings",
     "StageConfig",
     "SurfelConfig",

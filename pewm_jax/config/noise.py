@@ -110,6 +110,10 @@ class EDMConfig(NoiseSettings):
     """Mean of log σ in training."""
     log_std: float = 1.2
     """Standard deviation of log σ in training."""
+    target: Literal["edm", "v"] = "edm"
+    """What the network predicts. `edm`: F of the paper; `v`: −F, as in Stable Video Diffusion
+    (with sigma_data 1 it is v of DDPM). Samples then start with deviation √(σ_max² + sigma_data²),
+    that of noisy latents, instead of σ_max."""
     sample_steps: int = 18
     """Steps of the sampler."""
     sampler: Literal["euler", "heun"] = "euler"

@@ -98,7 +98,7 @@ def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[DiTC
         UserError: a tensor that is missing, left over or of another shape, a damaged file, a
             class or setting that is not known.
     """
-    return _read(TRANSFORMER, Path(folder), dtype)
+    return read_network(TRANSFORMER, Path(folder), dtype)
 
 
 def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[VAEConfig, Params]:
@@ -107,7 +107,7 @@ def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[VAEConfig, P
     Returns:
         ``(config, params)`` for ``pewm_jax.models.vae.encode`` and ``decode``.
     """
-    return _read(VAE, Path(folder), dtype)
+    return read_network(VAE, Path(folder), dtype)
 
 
 def read_scheduler(folder: str | Path) -> DDPMConfig:
@@ -153,7 +153,12 @@ def scheduler_settings(folder: Path) -> dict[str, Any]:
     return sources.read_config(path, sorted(scheduler.CLASSES))
 
 
-def _read(network: Network, folder: Path, dtype: str | None) -> tuple[Any, Params]:
+def read_network(network: Network, folder: Path, dtype: str | None) -> tuple[Any, Params]:
+    """Read the settings and weights of a network from a pipeline's folder or its own.
+
+    Raises:
+        UserError: see ``read_transformer``.
+    """
     inside = sources.component(folder, network.folder)
     config = network.config(settings(network, folder), str(inside / CONFIG))
     entries, source = network.entries(config), sources.open_folder(inside)
@@ -222,10 +227,10 @@ def write_diffusers(
         network: which.
         values: its settings as diffusers names them.
         params: our parameters.
-        folder: to make.
+        folder: to make, or an empty one.
         dtype: of the tensors; by default that of the parameters.
     """
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     output.write_json(folder / CONFIG, values)
     entries = network.entries(network.config(values, "base.json"))
     specs = assemble.specs(entries, params, dtype)
@@ -249,7 +254,7 @@ def import_pipeline(
     """
     with output.new_folder(dst) as folder:
         for network in (TRANSFORMER, VAE):
-            write_network(*_read(network, src, dtype), folder / network.folder)
+            write_network(*read_network(network, src, dtype), folder / network.folder)
         (folder / "scheduler").mkdir()
         configuration.save(read_scheduler(src), folder / "scheduler" / CONFIG)
         if prompts:

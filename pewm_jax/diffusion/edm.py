@@ -1,7 +1,7 @@
 """EDM: continuous noise σ with preconditioning (Karras et al. 2022, arXiv 2206.00364).
 
 The network F gets c_in x and log σ / 4. Clean latents are c_skip x + c_out F (Eq. 7 and Table 1
-there), so input and target have unit variance at every σ.
+there), so input and target have unit variance at every σ. A network may predict v = −F instead.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ def shown(config: EDMConfig, x_t: Array, time_B: Array) -> tuple[Array, Array]:
 
 
 def target(config: EDMConfig, x0: Array, noise: Array, time_B: Array) -> Array:
-    """Return (x0 − c_skip x_t) / c_out."""
+    """Return F = (x0 − c_skip x_t) / c_out, or v = −F."""
     skip, out, _ = _scales(config, spread(time_B, x0.ndim))
-    return (x0 - skip * corrupt(config, x0, noise, time_B)) / out
+    return _sign(config) * (x0 - skip * corrupt(config, x0, noise, time_B)) / out
 
 
 def weight(config: EDMConfig, time_B: Array) -> Array:
@@ -53,9 +53,14 @@ def weight(config: EDMConfig, time_B: Array) -> Array:
 
 
 def to_x0(config: EDMConfig, prediction: Array, x_t: Array, time_B: Array) -> Array:
-    """Return c_skip x + c_out F."""
+    """Return c_skip x + c_out F, where F is the prediction or, of v, its negative."""
     skip, out, _ = _scales(config, spread(time_B, x_t.ndim))
-    return skip * x_t + out * prediction
+    return skip * x_t + _sign(config) * out * prediction
+
+
+def _sign(config: EDMConfig) -> int:
+    """Return the factor between F and what the network predicts."""
+    return {"edm": 1, "v": -1}[config.target]
 
 
 def levels(config: EDMConfig) -> np.ndarray:
@@ -82,6 +87,9 @@ def sample(config: EDMConfig, denoise: Denoiser, noise: Array, key: Array | None
             moved = x + (then - now) * (first + slope(moved, then)) / 2
         return moved.astype(x.dtype), None
 
-    start = (noise * sigmas[0]).astype(noise.dtype)
+    deviation = sigmas[0]
+    if config.target == "v":
+        deviation = np.sqrt(deviation**2 + np.float32(config.sigma_data) ** 2)
+    start = (noise * deviation).astype(noise.dtype)
     x, _ = jax.lax.scan(step, start, (jnp.asarray(sigmas[:-1]), jnp.asarray(sigmas[1:])))
     return (x - sigmas[-1] * slope(x, sigmas[-1])).astype(noise.dtype)  # Euler's, to σ = 0

@@ -241,8 +241,11 @@ def interpolate_positions(
     return jnp.concatenate([position_embed[:1], grid])
 
 
-def resize_matrix(old: int, new: int, antialias: bool) -> np.ndarray:
+def resize_matrix(old: int, new: int, antialias: bool, *, corners: bool = False) -> np.ndarray:
     """Return the (new, old) float32 weights of torch's bicubic interpolation along one axis.
+
+    With ``corners`` (without antialiasing only) the first and last pixels fall onto each other, as
+    with torch's ``align_corners``.
 
     Without antialiasing the kernel is Keys' with a = −0.75 on four samples; with it a = −0.5, and
     the kernel is widened by the factor of reduction.
@@ -258,7 +261,8 @@ def resize_matrix(old: int, new: int, antialias: bool) -> np.ndarray:
             weights = _keys((taps - centre + 0.5) / stretch, -0.5)
             weights /= weights.sum()
         else:
-            centre = scale * (row + 0.5) - 0.5
+            last = max(new - 1, 1)
+            centre = row * (old - 1) / last if corners else scale * (row + 0.5) - 0.5
             taps = math.floor(centre) + np.arange(-1, 3)
             weights = _keys(taps - centre, -0.75)
             taps = np.clip(taps, 0, old - 1)

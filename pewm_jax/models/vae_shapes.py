@@ -9,7 +9,7 @@ from latents to its channels.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +36,13 @@ def init(config: VAEConfig, key: Array) -> Params:
     Returns:
         ``{"encoder": …, "decoder": …}``.
     """
+    return draw(layout(config), key)
+
+
+def draw(layout: Mapping[str, tuple[int, ...]], key: Array) -> Params:
+    """Return random parameters of ``{path: shape}``: ``kernel`` drawn, ``scale`` 1, others 0."""
     leaves = {}
-    for index, (path, shape) in enumerate(layout(config).items()):
+    for index, (path, shape) in enumerate(layout.items()):
         name = path.rsplit("/", 1)[1]
         if name == "kernel":
             spread = 1 / math.sqrt(math.prod(shape[:-1]))

@@ -21,6 +21,7 @@ KINDS = {
     "ddpm_v": DDPMConfig(target="v"),
     "ddpm_eps": DDPMConfig(target="eps", zero_terminal_snr=False),
     "edm": EDMConfig(),
+    "edm_v": EDMConfig(target="v"),
     "edm_heun": EDMConfig(sampler="heun"),
     "flow": FlowConfig(),
     "flow_shifted": FlowConfig(shift=3.0, times="logit_normal"),

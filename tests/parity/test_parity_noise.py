@@ -1,11 +1,14 @@
 """EDM and flow matching beside EDMEulerScheduler and FlowMatchEulerDiscreteScheduler."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import EDMConfig, FlowConfig
+from pewm_jax.config import EDMConfig, FlowConfig, UserError
+from pewm_jax.convert import svd, svd_scheduler
 from pewm_jax.diffusion import noise
 
 torch = pytest.importorskip("torch")
@@ -49,6 +52,70 @@ def test_edm_equals_the_reference(steps, settings):
         x = theirs.step(network(shown, t, torch), t, x, return_dict=False)[0]
     got = our_path(config)
     assert np.abs(got - x.numpy()).max() <= 1e-5 * max(1, np.abs(x.numpy()).max(), most / 20)
+
+
+SVD = {
+    "beta_start": 0.00085,
+    "beta_end": 0.012,
+    "beta_schedule": "scaled_linear",
+    "prediction_type": "v_prediction",
+    "sigma_min": 0.002,
+    "sigma_max": 700.0,
+    "steps_offset": 1,
+    "timestep_spacing": "leading",
+    "timestep_type": "continuous",
+    "use_karras_sigmas": True,
+}
+"""The published settings of Stable Video Diffusion's scheduler."""
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # the reference's
+@pytest.mark.parametrize("settings", [{}, {"sigma_max": 5.0}], ids=str)
+@pytest.mark.parametrize("steps", [1, 25])
+def test_edm_of_v_equals_stable_video_diffusion_s_scheduler(steps, settings, tmp_path):
+    theirs = diffusers.EulerDiscreteScheduler(**SVD | settings)
+    theirs.save_pretrained(tmp_path / "scheduler")
+    config = svd.read_scheduler(tmp_path)
+    assert config.sample_steps == 25
+    config = dataclasses.replace(config, sample_steps=steps)
+    theirs.set_timesteps(steps)
+    np.testing.assert_allclose(noise.levels(config), theirs.sigmas[:-1].numpy(), rtol=1e-5)
+    x = torch.from_numpy(START) * theirs.init_noise_sigma
+    for i, t in enumerate(theirs.timesteps):
+        sigma = theirs.sigmas[i].numpy()[None].repeat(2)
+        shown = theirs.scale_model_input(x, t)
+        ours, told = noise.shown(config, x.numpy(), sigma)
+        np.testing.assert_allclose(ours, shown.numpy(), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(told, float(t), rtol=1e-5, atol=1e-6)
+        v = network(shown, t, torch)
+        clean = noise.to_x0(config, v.numpy(), x.numpy(), sigma)
+        x, found = theirs.step(v, t, x, return_dict=False)
+        np.testing.assert_allclose(clean, found.numpy(), rtol=1e-5, atol=1e-5)
+    got = our_path(config)
+    # A single step leads from samples as large as sigma_max, with their rounding, to small ones.
+    large = config.sigma_max / 20 if steps == 1 else 1
+    assert np.abs(got - x.numpy()).max() <= 1e-5 * max(1, np.abs(x.numpy()).max(), large)
+
+
+def public(settings):
+    return {key: value for key, value in settings.items() if not key.startswith("_")}
+
+
+def test_stable_video_diffusion_s_scheduler_is_written_back(tmp_path):
+    theirs = diffusers.EulerDiscreteScheduler(**SVD)
+    theirs.save_pretrained(tmp_path)
+    values = svd_scheduler.config_to_diffusers(svd.read_scheduler(tmp_path))
+    again = diffusers.EulerDiscreteScheduler.from_config(values)
+    assert public(again.config) == public(theirs.config)
+    for key, value in (("prediction_type", "epsilon"), ("timestep_spacing", "trailing")):
+        with pytest.raises(UserError, match=f"{key} is '{value}'; only"):
+            svd_scheduler.config_from_diffusers(values | {key: value})
+    with pytest.raises(UserError, match="sigma_max is None"):
+        svd_scheduler.config_from_diffusers(values | {"sigma_max": None})
+    with pytest.raises(UserError, match="not known: rho"):
+        svd_scheduler.config_from_diffusers(values | {"rho": 7})
+    with pytest.raises(UserError, match=r"sigma_data is 0\.5"):
+        svd_scheduler.config_to_diffusers(EDMConfig(target="v"))
 
 
 @pytest.mark.parametrize("steps", [1, 4, 20])

@@ -1,0 +1,67 @@
+"""The settings of Stable Video Diffusion's U-Net; the defaults are the published sizes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pewm_jax.config.errors import require, require_positive
+
+GROUPS = 32
+"""Groups of every group norm in the reference."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SVDUNetConfig:
+    """A U-Net over space and time in the form of Stable Video Diffusion (arXiv 2311.15127)."""
+
+    in_channels: int = 8
+    """Channels of the input: noisy latents and the latents of the image, joined."""
+    out_channels: int = 4
+    """Channels of the prediction."""
+    widths: tuple[int, ...] = (320, 640, 1280, 1280)
+    """Channels of each level; each level but the last halves height and width."""
+    heads: tuple[int, ...] = (5, 10, 20, 20)
+    """Attention heads of each level; the bottom has those of the last level."""
+    attends: tuple[bool, ...] = (True, True, True, False)
+    """Whether a level has attention; the bottom always has."""
+    resnets: tuple[int, ...] = (2, 2, 2, 2)
+    """Residual blocks of each level on the way down; one more on the way up."""
+    layers: tuple[int, ...] = (1, 1, 1, 1)
+    """Transformer layers per attention of each level; the bottom has those of the last level."""
+    image_dim: int = 1024
+    """Channels of the image embedding."""
+    added: int = 3
+    """Scalars beside the noise level: frames per second, motion bucket, noise of the image."""
+    added_dim: int = 256
+    """Channels of the sinusoid of each of these scalars; even."""
+
+    @property
+    def time_dim(self) -> int:
+        """Channels of the time embedding, to which a modulation is added."""
+        return 4 * self.widths[0]
+
+    def __post_init__(self):
+        """Validate."""
+        require(len(self.widths) > 0, "unet.widths is empty: name at least one level's channels.")
+        require_positive(self, "unet", "in_channels", "out_channels", "image_dim", "added")
+        for name in ("heads", "attends", "resnets", "layers"):
+            values = getattr(self, name)
+            require(
+                len(values) == len(self.widths),
+                f"unet.{name} names {len(values)} levels and unet.widths {len(self.widths)}: "
+                "name one value per level.",
+            )
+            require(
+                name == "attends" or min(values) >= 1,
+                f"unet.{name} holds {min(values)}: use at least 1.",
+            )
+        for width, heads in zip(self.widths, self.heads, strict=True):
+            require(
+                width >= 1 and width % GROUPS == 0 and width % heads == 0,
+                f"unet.widths holds {width}, which is not a multiple of {GROUPS} groups and of "
+                f"the level's {heads} heads.",
+            )
+        require(
+            self.added_dim >= 2 and self.added_dim % 2 == 0,
+            f"unet.added_dim is {self.added_dim}: use an even number.",
+        )

@@ -1,0 +1,52 @@
+"""The settings of Stable Video Diffusion's autoencoder; the defaults are the published sizes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pewm_jax.config.errors import require, require_positive
+from pewm_jax.config.svd_unet import GROUPS
+
+
+@dataclasses.dataclass(frozen=True)
+class SVDVAEConfig:
+    """An image encoder and a decoder over space and time (arXiv 2311.15127, appendix D)."""
+
+    in_channels: int = 3
+    """Channels of an input frame."""
+    out_channels: int = 3
+    """Channels of an output frame."""
+    latent_channels: int = 4
+    """Channels of a latent."""
+    widths: tuple[int, ...] = (128, 256, 512, 512)
+    """Channels of each level of the encoder; each level but the last halves height and width."""
+    resnets: int = 2
+    """Residual blocks per level of the encoder; the decoder has one more."""
+    scaling_factor: float = 0.18215
+    """Factor that gives latents unit variance for the diffusion model. Neither encoding nor
+    decoding applies it; the latents of the conditioning image stay without it."""
+
+    @property
+    def spatial(self) -> int:
+        """Pixels per latent cell, along height and along width."""
+        return 2 ** (len(self.widths) - 1)
+
+    def __post_init__(self):
+        """Validate."""
+        require(len(self.widths) > 0, "vae.widths is empty: name at least one level's channels.")
+        require_positive(self, "vae", "in_channels", "out_channels", "latent_channels")
+        require(
+            self.resnets >= 2,
+            f"vae.resnets is {self.resnets}: use at least 2, or the decoder's bottom has no "
+            "attention.",
+        )
+        for width in self.widths:
+            require(
+                width >= 1 and width % GROUPS == 0,
+                f"vae.widths holds {width}, which is not a multiple of {GROUPS} groups.",
+            )
+        require(
+            self.scaling_factor > 0,
+            f"vae.scaling_factor is {self.scaling_factor}: use the checkpoint's positive factor "
+            "(0.18215).",
+        )
