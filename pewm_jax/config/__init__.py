@@ -35,6 +35,7 @@ from pewm_jax.config.mesh import AXES, MeshConfig
 from pewm_jax.config.migrations import upgrade
 from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettings
+from pewm_jax.config.nomad import NomadConfig, NomadTrainConfig, NomadWorldConfig
 from pewm_jax.config.reader import AttentionConfig, BothConfig, ReaderSettings, RenderConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
@@ -99,6 +100,9 @@ __all__ = [
     "ModelConfig",
     "NoMemoryConfig",
     "NoiseSettings",
+    "NomadConfig",
+    "NomadTrainConfig",
+    "NomadWorldConfig",
     "PatchColoursConfig",
     "PixelConfig",
     "Places",
