@@ -43,6 +43,7 @@ from pewm_jax.config.vae import VAEConfig
 
 register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
 register("world", "codec", CodecWorldConfig, "pewm_jax.worlds.codec")
+register("world", "nomad", NomadWorldConfig, "pewm_jax.worlds.nomad")
 register("backbone", "dit", DiTConfig, "pewm_jax.models.dit_backbone")
 register("codec", "pixel", PixelConfig, "pewm_jax.models.pixel_codec")
 register("codec", "vae", VAEConfig, "pewm_jax.models.vae_codec")

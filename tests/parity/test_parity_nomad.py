@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from pewm_jax.config import NomadConfig, UserError
 from pewm_jax.convert import nomad as converter
+from pewm_jax.diffusion import squared_cosine
 from pewm_jax.models import efficientnet, nomad
 
 nn = torch.nn
@@ -365,3 +366,32 @@ def test_an_incomplete_file_is_refused(pair, tmp_path):
     torch.save(state, tmp_path / "nomad.pth")
     with pytest.raises(UserError, match=r"lacks noise_pred_net\.final_conv\.1\.bias"):
         converter.read(tmp_path / "nomad.pth", SMALL)
+
+
+@pytest.mark.parametrize("levels", [10, 3])
+def test_levels_and_steps_equal_those_of_diffusers(levels):
+    diffusers = pytest.importorskip("diffusers")
+    theirs = diffusers.DDPMScheduler(
+        num_train_timesteps=levels,
+        beta_schedule="squaredcos_cap_v2",
+        clip_sample=True,
+        prediction_type="epsilon",
+    )
+    theirs.set_timesteps(levels)
+    assert np.allclose(squared_cosine.alphas_cumprod(levels), theirs.alphas_cumprod, atol=1e-7)
+    rng = np.random.default_rng(0)
+    draw = lambda: rng.normal(size=(3, 4, 2)).astype(np.float32)  # noqa: E731
+    clean, noise, at = draw(), draw(), np.array([0, levels // 2, levels - 1])
+    noisy = theirs.add_noise(*map(torch.from_numpy, (clean, noise, at)))
+    assert np.allclose(squared_cosine.corrupt(levels, clean, noise, at), noisy, atol=1e-6)
+    back, x = jax.jit(squared_cosine.back, static_argnums=0), draw()
+    for time in theirs.timesteps.tolist():
+        predicted, noise = np.tanh(x) + 0.1 * time, draw()
+        module = "diffusers.schedulers.scheduling_ddpm.randn_tensor"
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(module, lambda *_, given=noise, **__: torch.from_numpy(given))
+            want = theirs.step(torch.from_numpy(predicted), time, torch.from_numpy(x)).prev_sample
+        got = np.array(back(levels, predicted, x, time, noise))
+        assert np.abs(got - want.numpy()).max() < 1e-5 * max(1, np.abs(x).max())
+        x = got
+    assert np.abs(x).max() <= 1

@@ -1,0 +1,157 @@
+"""NoMaD is trained by the trainer of world models: it learns, goes on where it stopped, is read."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import pewm_jax
+from pewm_jax import presets, tree, worlds
+from pewm_jax.commands import evaluate
+from pewm_jax.config import (
+    ClipConfig,
+    Config,
+    ConfigError,
+    DataConfig,
+    NomadTrainConfig,
+    NomadWorldConfig,
+    StageConfig,
+    UserError,
+)
+from pewm_jax.data import abstract, loader
+from pewm_jax.geometry.actions import discrete_table, integrate
+from pewm_jax.geometry.cameras import pose_from_yaw
+from pewm_jax.planning import nomad_policy
+from pewm_jax.training import loop
+from pewm_jax.worlds import nomad as world
+from tests.planning.test_planning_nomad import STEPS
+from tests.planning.test_planning_nomad import TINY as POLICY
+
+TINY = dataclasses.replace(POLICY, lowest=(-1.2, -1.2), highest=(1.2, 1.2))
+MODEL = NomadWorldConfig(clip=ClipConfig(frames=8, height=12, width=16), policy=TINY)
+WALKS = [0, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [2, 0, 0, 2, 0, 0]
+"""Of the toy, after the present picture: straight, to the left, to the right."""
+
+
+def experiment(run="runs/it", steps=3):
+    stage = StageConfig(steps=steps, batch=4, warmup=0, learning_rate=3e-3, decay="constant")
+    return Config(
+        model=MODEL,
+        data=DataConfig(context=1),
+        train=NomadTrainConfig(run=str(run), save_every=1, log_every=1, ema=0.0, policy=stage),
+    )
+
+
+def batch(config, rows, seed=0):
+    """Walks whose colour says where they lead."""
+    rng = np.random.default_rng(seed)
+    clip = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), abstract.clip(config, rows))
+    kinds = rng.integers(0, 3, rows)
+    rgb = rng.integers(0, 60, clip.frames.rgb_THWC.shape, dtype=np.uint8)
+    rgb += (180 * np.eye(3)[kinds]).astype(np.uint8)[:, None, None, None]
+    poses = []
+    for kind in kinds:
+        start = pose_from_yaw(rng.uniform(-2, 2, 3), rng.uniform(-3, 3), 0.0)
+        walk = discrete_table(STEPS)[[0, *WALKS[kind]]]
+        poses.append(np.asarray(integrate(start, walk)))
+    camera = dataclasses.replace(clip.frames.camera, world_from_camera=np.stack(poses))
+    frames = dataclasses.replace(clip.frames, rgb_THWC=rgb, camera=camera)
+    return dataclasses.replace(clip, frames=frames), kinds
+
+
+@pytest.fixture
+def clips(monkeypatch):
+    def endless(config, split="train", *, seed, batch: int, start_step=0, **_options):
+        for number in range(start_step, 1000):
+            yield make(config, batch, 1000 * seed + number)[0]
+
+    make = batch
+    monkeypatch.setattr(loader, "clips", endless)
+
+
+def test_waypoints_are_the_places_of_the_next_steps():
+    clip, kinds = batch(experiment(), 6)
+    found = np.asarray(world.waypoints(MODEL, clip))
+    start = pose_from_yaw(np.zeros(3), 0.0, 0.0)
+    for each, kind in zip(found, kinds, strict=True):
+        walk = discrete_table(STEPS)[WALKS[kind][:4]]
+        assert np.allclose(each, np.asarray(integrate(start, walk))[1:, :2, 3], atol=1e-4)
+
+
+def test_it_learns_to_walk_as_it_was_shown():
+    config = experiment()
+    train = dataclasses.replace(config.train, nearest=0)
+    params = jax.jit(worlds.init, static_argnums=0)(config, jax.random.key(0))
+    rule = optax.adam(3e-3)
+
+    @jax.jit
+    def many(carry, batches):
+        def step(carry, given):
+            params, state = carry
+            clip, number = given
+            loss = jax.value_and_grad(world.imitate, 2, has_aux=True)
+            (value, parts), slope = loss(MODEL, train, params, clip, jax.random.key(number))
+            move, state = rule.update(slope, state, params)
+            return (optax.apply_updates(params, move), state), (value, parts["noise"])
+
+        return jax.lax.scan(step, carry, batches)
+
+    made = [batch(config, 16, seed)[0] for seed in range(10)]
+    stacked = jax.tree.map(lambda *x: np.stack(x), *made)
+    carry, found = (params, jax.jit(rule.init)(params)), []
+    for turn in range(40):
+        carry, (values, _) = many(carry, (stacked, 10 * turn + jnp.arange(10)))
+        found += np.asarray(values).tolist()
+    assert np.mean(found[-20:]) < 0.5 * np.mean(found[:10])
+    learned = carry[0]["policy"]
+    propose = nomad_policy.compiled
+    clip, kinds = batch(config, 12, 99)
+    sides = []
+    for seen in clip.frames.rgb_THWC:
+        way = propose(TINY, learned, seen[:2], None, jax.random.key(1), 8)
+        sides.append(float(np.median(np.asarray(way)[:, -1, 1])))
+    want = np.array([0, 1, 2])[kinds]
+    told = np.where(np.array(sides) > 0.1, 1, np.where(np.array(sides) < -0.1, 2, 0))
+    assert (told == want).mean() > 0.8  # chance: a third
+
+
+def test_training_goes_on_and_what_comes_out_is_read(tmp_path, clips):
+    whole = loop.train(experiment(tmp_path / "whole"))
+    short = experiment(tmp_path / "halves")
+    with pytest.MonkeyPatch.context() as patch:
+        real = loader.clips
+
+        def ending(*arguments, **options):
+            for number, clip in enumerate(real(*arguments, **options)):
+                if number == 2:
+                    raise KeyboardInterrupt
+                yield clip
+
+        patch.setattr(loader, "clips", ending)
+        with pytest.raises(KeyboardInterrupt):
+            loop.train(short)
+    halves = loop.train(short)
+    (config, one), (_, other) = pewm_jax.load(whole), pewm_jax.load(halves)
+    assert config.model == MODEL
+    for path, leaf in tree.flatten(one).items():
+        assert np.array_equal(leaf, tree.flatten(other)[path]), path
+    with pytest.raises(UserError, match="trained a policy"):
+        pewm_jax.start(config, one, None)
+    with pytest.raises(UserError, match="nomad_policy"):
+        evaluate.main([str(whole)])
+
+
+def test_the_preset_can_be_read():
+    config = presets.load("nomad")
+    assert isinstance(config.model, NomadWorldConfig)
+    assert config.model.farthest >= config.model.policy.waypoints
+
+
+def test_settings_that_cannot_work_are_refused():
+    with pytest.raises(ConfigError, match="waypoints need"):
+        dataclasses.replace(MODEL, clip=ClipConfig(frames=5))
+    with pytest.raises(ConfigError, match="use 2 or more"):
+        NomadTrainConfig(policy=StageConfig(batch=1))
