@@ -207,7 +207,7 @@ class Policy:
         self.seen.append(np.asarray(observation["rgb"]))
         if not self.waiting:
             goal = observation.get("goal")
-            goal = goal if np.ndim(goal) == 3 else None
+            goal = goal if goal is not None and np.ndim(goal) == 3 else None
             key, self.made = jax.random.fold_in(self.key, self.made), self.made + 1
             seen = history(self.config, np.stack(list(self.seen)))
             way = np.asarray(compiled(self.config, self.params, seen, goal, key, 1))[0]
