@@ -9,7 +9,6 @@ import pytest
 
 import pewm_jax
 from pewm_jax import presets, tree
-from pewm_jax.commands import evaluate
 from pewm_jax.config import (
     ClipConfig,
     Config,
@@ -21,6 +20,7 @@ from pewm_jax.config import (
     UserError,
 )
 from pewm_jax.data import abstract, loader
+from pewm_jax.evaluation import opened
 from pewm_jax.geometry.actions import discrete_table, integrate
 from pewm_jax.geometry.cameras import pose_from_yaw
 from pewm_jax.planning import nomad_policy
@@ -100,7 +100,7 @@ def test_it_learns_to_walk_as_it_was_shown(tmp_path, clips):
 
 
 def test_training_goes_on_and_what_comes_out_is_read(tmp_path, clips):
-    whole = loop.train(experiment(tmp_path / "whole"))
+    whole = loop.train(experiment(tmp_path / "whole"), say=lambda _: None)
     short = experiment(tmp_path / "halves")
     with pytest.MonkeyPatch.context() as patch:
         real = loader.clips
@@ -113,8 +113,8 @@ def test_training_goes_on_and_what_comes_out_is_read(tmp_path, clips):
 
         patch.setattr(loader, "clips", ending)
         with pytest.raises(KeyboardInterrupt):
-            loop.train(short)
-    halves = loop.train(short)
+            loop.train(short, say=lambda _: None)
+    halves = loop.train(short, say=lambda _: None)
     (config, one), (_, other) = pewm_jax.load(whole), pewm_jax.load(halves)
     assert config.model == MODEL
     for path, leaf in tree.flatten(one).items():
@@ -122,7 +122,7 @@ def test_training_goes_on_and_what_comes_out_is_read(tmp_path, clips):
     with pytest.raises(UserError, match="trained a policy"):
         pewm_jax.start(config, one, None)
     with pytest.raises(UserError, match="nomad_policy"):
-        evaluate.main([str(whole)])
+        opened.open_run(whole)
 
 
 def test_the_preset_can_be_read():
