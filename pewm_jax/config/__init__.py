@@ -36,6 +36,7 @@ from pewm_jax.config.mesh import AXES, MeshConfig
 from pewm_jax.config.migrations import upgrade
 from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettings
+from pewm_jax.config.nomad import NomadConfig, NomadTrainConfig, NomadWorldConfig
 from pewm_jax.config.reader import AttentionConfig, BothConfig, ReaderSettings, RenderConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
 from pewm_jax.config.svd_unet import SVDUNetConfig
@@ -45,6 +46,7 @@ from pewm_jax.config.vae import VAEConfig
 
 register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
 register("world", "codec", CodecWorldConfig, "pewm_jax.worlds.codec")
+register("world", "nomad", NomadWorldConfig, "pewm_jax.worlds.nomad")
 register("backbone", "dit", DiTConfig, "pewm_jax.models.dit_backbone")
 register("codec", "pixel", PixelConfig, "pewm_jax.models.pixel_codec")
 register("codec", "vae", VAEConfig, "pewm_jax.models.vae_codec")
@@ -104,6 +106,9 @@ __all__ = [
     "ModelConfig",
     "NoMemoryConfig",
     "NoiseSettings",
+    "NomadConfig",
+    "NomadTrainConfig",
+    "NomadWorldConfig",
     "PatchColoursConfig",
     "PixelConfig",
     "Places",

@@ -26,7 +26,7 @@ import numpy as np
 
 from pewm_jax import __version__, rollouts, tensor_files, tree, weights
 from pewm_jax import config as configuration
-from pewm_jax.config import Config, UserError
+from pewm_jax.config import Config, NomadWorldConfig, UserError
 from pewm_jax.convert import card, output, sources
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.evaluation.report import METRICS
@@ -55,13 +55,18 @@ def export(
         ``dst``.
 
     Raises:
-        UserError: ``dst`` exists; or the run is absent, damaged, or has no weights yet.
+        UserError: ``dst`` exists; or the run is absent, damaged, a policy, or has no weights yet.
     """
     if not run.is_dir():
         raise UserError(f"{run} is not a folder; name a run made by train.py.")
     with output.new_folder(dst) as folder:
         say(f"reading {run} …")
         config, params = rollouts.load_finished(run)
+        if isinstance(config.model, NomadWorldConfig):
+            raise UserError(
+                f"{run} holds a policy, of which no smaller form is written: its config.json and "
+                "weights.safetensors are what pewm_jax.load reads, copy those."
+            )
         origin = _base(run, config)
         metadata = weights.metadata(run / runs.WEIGHTS)
         facts = card.Facts(

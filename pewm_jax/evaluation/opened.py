@@ -75,7 +75,8 @@ def open_run(run: str | Path) -> Opened:
     if not isinstance(config.model, ModelConfig):
         raise UserError(
             f"{run} holds a world of kind {kinds.of(config.model).name}, of which there is no "
-            "report: of a codec, pewm_jax.evaluation.codec_score.score gives the numbers."
+            "report: of a codec, pewm_jax.evaluation.codec_score.score gives the numbers; a policy "
+            "proposes ways by pewm_jax.planning.nomad_policy, which a world model ranks."
         )
     return Opened(folder, home, config, params, file_hash(folder / WEIGHTS))
 

@@ -10,6 +10,7 @@ Places, in reading order:
 * ``observations``: what environments show, and observations as the frames that worlds take;
 * ``imagined``, ``imagined_env``: any world as an environment, as pure functions and as a Gymnasium
   environment that looks like a house;
+* ``nomad_policy``: ways to go on, proposed by a learned policy (``models.nomad``);
 * ``scores``: how near an agent came, and by which way.
 
 How it chooses:

@@ -110,7 +110,7 @@ def compile_stage(config: Config, stage: Stage, devices: Sequence[Any]) -> Compi
 
 def _as_on_chips(config: Config) -> Config:
     """Choose the form of the VAE's convolutions that accelerators use."""
-    codec = config.model.codec
+    codec = getattr(config.model, "codec", None)  # a policy has none
     if not isinstance(codec, VAEConfig) or codec.convolution != "auto":
         return config
     return config.with_model(codec=dataclasses.replace(codec, convolution="volume"))
