@@ -21,6 +21,7 @@ from pewm_jax.studies import practice as study
 from pewm_jax.types import Frames
 from pewm_jax.worlds import nomad as nomad_world
 from tests.helpers import init_world, randomise
+from tests.planning.planning_page import blocks
 from tests.training.test_training_nomad import experiment
 
 MOTION = ActionConfig()
@@ -104,6 +105,18 @@ def test_what_it_learns_from_are_whole_walks_of_its_own_actions(made):
         np.testing.assert_allclose(moved[~stepped], 0, atol=1e-5)
         if how != "real":  # where no wall holds
             np.testing.assert_allclose(moved[stepped], MOTION.step_m, atol=1e-4)
+
+
+def test_the_page_runs_as_it_is_written(made, world, home):
+    folder, _ = made
+    config, params = world
+    opened = policies.open_policy(folder / "policy")
+    given = {"config": config, "params": params, "frames": home.context}
+    given |= {"policy": opened.config.model.policy, "weights": opened.weights}
+    exec(compile(blocks("Practice in imagination", "python"), "docs/planning.md", "exec"), given)
+    first, second = given["walks"]
+    assert first.frames.rgb_THWC.shape == (1 + 2 * 4, 16, 16, 3)
+    assert len(second.actions_N) == 2 * 4
 
 
 def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
