@@ -94,7 +94,7 @@ def test_rate_times_and_masks_matter(pair):
         changed = list(arguments)
         changed[k] = 1 - changed[k]
         others.append(compiled()(config, params, *changed, 16))
-    assert all(distance(other, base) > 0.01 for other in others)
+    assert min(distance(other, base) for other in others) > 20 * TOLERANCE
     zero = compiled()(config, params, *arguments[:4], None, 16)
     want = reference(network, *arguments[:4], 0 * arguments[4], 16)
     assert distance(zero, want) < TOLERANCE
@@ -168,6 +168,7 @@ def test_experts_run_after_every_block_and_tokens_can_be_added(pair):
         seen.append((video.shape, time.shape))
         return video * gain
 
+    @jax.jit
     def run(gains, added):
         return model.apply(
             config, params, *arguments, 16, expert=expert, expert_params=gains, added_BND=added
@@ -178,21 +179,15 @@ def test_experts_run_after_every_block_and_tokens_can_be_added(pair):
     got = run(jnp.ones(config.layers), 0 * added)
     np.testing.assert_allclose(got, plain, rtol=1e-4, atol=1e-4)
     assert seen == [(tokens, (2, 3, config.width))]
-    assert distance(run(jnp.array([1.0, 2.0]), 0 * added), plain) > 0.01
+    assert distance(run(jnp.array([1.0, -1.0]), 0 * added), plain) > 0.01
     assert distance(run(jnp.ones(config.layers), added), plain) > 0.01
 
 
-def test_what_is_recomputed_does_not_change_the_result(pair):
-    config, params = pair[2]
-    arguments = inputs()
-    again = dataclasses.replace(config, remat=True)
-
-    def loss(config, params):
-        return jnp.sum(model.apply(config, params, *arguments, 16) ** 2)
-
-    one, other = (jax.grad(loss, 1)(c, params) for c in (config, again))
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * np.abs(a).max())
+@pytest.mark.parametrize("remat", [True, False])
+def test_activations_are_recomputed_if_asked_for(pair, remat):
+    config = dataclasses.replace(pair[2][0], remat=remat)
+    traced = jax.make_jaxpr(functools.partial(model.apply, config))(pair[2][1], *inputs())
+    assert ("remat" in str(traced)) == remat
 
 
 def test_what_is_written_back_is_what_was_read(pair, tmp_path):
