@@ -156,6 +156,9 @@ def test_modulation_is_added_per_frame_wherever_the_time_modulates(pair, per_fra
     plain = reference(network, *arguments, 16)
     assert distance(plain, want) > 0.01
     assert distance(steered(0 * modulation), plain) < TOLERANCE
+    # Attention over time is not causal: the last frame's modulation reaches the first.
+    late = np.concatenate([modulation[:, :2], -modulation[:, 2:]], 1)
+    assert distance(steered(late)[:, :1], want[:, :1]) > 0.001
 
 
 def test_experts_run_after_every_block_and_tokens_can_be_added(pair):
