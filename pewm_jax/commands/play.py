@@ -12,8 +12,8 @@ from pewm_jax.commands import imports
 from pewm_jax.play.settings import Serve, Start
 
 ABOUT = (
-    "Drive through a world that a model imagines, in the browser: W, A, S, D or the arrows, the map "
-    "in 3D, boxes to erase and move in it. It begins in a generated house, unless a mesh, an "
+    "Drive through a world that a model imagines, in the browser: W, A, S, D or the arrows, the "
+    "map in 3D, boxes to erase and move in it. It begins in a generated house, unless a mesh, an "
     "episode or a recording is named. Ctrl-C ends it."
 )
 

@@ -20,8 +20,9 @@ DARK, PATH, IMAGINED, BOX, GOAL = (
 )
 """Background, path, what was imagined, the chosen box, and where it goes."""
 HEADROOM_M = 0.35
-"""Points so far above the camera are ceiling, which one looks through from above."""
-FRUSTUM_M = 0.3
+"""Points so far above the camera are ceiling, which one looks through from above, metres."""
+FRUSTUM_M, WIDE = 0.3, 1.5
+"""Length of the agent's camera, metres; and width of a point, in cells."""
 
 
 class MapView:
@@ -72,8 +73,8 @@ class MapView:
         self._target = scene.add_box("/target/box", GOAL, wireframe=True)
 
     @property
-    def points_N3(self) -> np.ndarray:
-        """Return the points that are shown, metres."""
+    def points(self) -> np.ndarray:
+        """Return the (N, 3) points that are shown, metres."""
         return self._points
 
     def show(self, engine: Engine, session: Session, image: np.ndarray | None = None) -> None:
@@ -106,9 +107,8 @@ class MapView:
                 node.visible = box_23 is not None
             if box_23 is None:
                 return
-            size = tuple(float(x) for x in box_23[1] - box_23[0])
-            middle = tuple(float(x) for x in box_23.mean(0))
-            self._source.dimensions = self._target.dimensions = size  # type: ignore[assignment]
+            size, middle = box_23[1] - box_23[0], box_23.mean(0)
+            self._source.dimensions = self._target.dimensions = size
             self._source.position = self.target.position = middle
             self.target.wxyz = (1.0, 0.0, 0.0, 0.0)
 
@@ -136,7 +136,7 @@ class MapView:
         self._points = points
         if len(points):
             self._cloud.points, self._cloud.colors = points, colours
-        self._cloud.point_size = float(max(self._engine.model.memory.cell_m[:2])) * 0.8
+        self._cloud.point_size = float(max(self._engine.model.memory.cell_m[:2])) * WIDE
         self._cloud.visible = bool(len(points))
 
     def _draw_agent(self, image: np.ndarray | None) -> None:
@@ -147,7 +147,7 @@ class MapView:
         self._agent.fov = float(2 * np.arctan(height / 2 / intrinsics[1]))
         self._agent.aspect = width / height
         turn = viser.transforms.SO3.from_matrix(camera[:3, :3].astype(np.float64))
-        place = tuple(float(x) for x in camera[:3, 3])
+        place = camera[:3, 3].astype(np.float64)
         self._agent.wxyz, self._agent.position = turn.wxyz, place
         if image is not None:
             self._agent.image = image

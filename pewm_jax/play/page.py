@@ -40,6 +40,15 @@ STEPS = {
     "step right": (0, -1, 0),
 }
 """What one may do, as parts of a step forward, a step left and a turn counter-clockwise."""
+SIGNS = {
+    "◀": "step left",
+    "▲": "forward",
+    "▼": "back",
+    "▶": "step right",
+    "↶ left": "turn left",
+    "right ↷": "turn right",
+}
+"""What the buttons do."""
 HOTKEYS = {
     "forward": ("W", "arrowup"),
     "back": ("S", "arrowdown"),
@@ -135,7 +144,7 @@ class Page:
             facts.append(f"{shown.engine.sampler_steps} sampler steps")
         if self._seconds is not None:
             facts.append(f"last step {self._seconds:.2f} s")
-        count = len(self._map.points_N3)
+        count = len(self._map.points)
         if count:
             facts.append(f"{count:,} points")
         if shown.recording:
@@ -170,10 +179,9 @@ class Page:
                 "<b>W S</b> or <b>↑ ↓</b> go, <b>A D</b> or <b>← →</b> turn, <b>Q E</b> step aside."
                 " Or drag the camera in the map by its arrows and ring.</div>"
             )
-            turns = gui.add_button_group("", ("turn left", "forward", "turn right"))
-            goes = gui.add_button_group("", ("step left", "back", "step right"))
-            for group in (turns, goes):
-                group.on_click(lambda event: self._act(event.target.value))
+            for name, signs in (("Go", ("◀", "▲", "▼", "▶")), ("Turn", ("↶ left", "right ↷"))):
+                group = gui.add_button_group(name, signs)
+                group.on_click(lambda event: self._act(SIGNS[event.target.value]))
             walls = gui.add_checkbox("Walls stop me", initial_value=True)
             walls.on_update(lambda _: self._put(session.Walls(walls.value)))
             follow = gui.add_checkbox("The map follows me", initial_value=True)
@@ -207,7 +215,7 @@ class Page:
                 "box. Drag the green box to where it shall go.</div>"
             )
             self._middle = gui.add_vector3("Middle", (0.0, 0.0, 0.0), step=0.05)
-            self._size = gui.add_vector3("Size", (0.9, 0.9, 1.1), step=0.05, min=(0.05,) * 3)
+            self._size = gui.add_vector3("Size", (0.9, 0.9, 1.1), step=0.05, min=(0.05, 0.05, 0.05))
             for part in (self._middle, self._size):
                 part.on_update(self._typed)
             erase = gui.add_button("Erase", icon=viser.Icon.ERASER, color="red")
@@ -222,13 +230,13 @@ class Page:
         @scene.on_rect_select(modifier="shift")
         def _(event: Any) -> None:
             eye = eye_of(event.client.camera)
-            box = picking.in_rectangle(self._map.points_N3, eye, event.screen_min, event.screen_max)
+            box = picking.in_rectangle(self._map.points, eye, event.screen_min, event.screen_max)
             self._choose(box)
 
         @scene.on_click(modifier="shift")
         def _(event: Any) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-            self._choose(picking.at_click(self._map.points_N3, origin, direction))
+            self._choose(picking.at_click(self._map.points, origin, direction))
 
     def _choose(self, box_23: np.ndarray | None) -> None:
         """Choose a box, and write its numbers into the fields."""
@@ -285,7 +293,7 @@ class Page:
         with gui.add_folder("Worlds and videos", expand_by_default=False):
             name = gui.add_text("Name", "my world")
             save = gui.add_button("Save this world", icon=viser.Icon.DEVICE_FLOPPY)
-            self._worlds = gui.add_dropdown("Saved", ("none yet",))
+            self._worlds: Any = gui.add_dropdown("Saved", ("none yet",))
             load = gui.add_button("Go on in it", icon=viser.Icon.FOLDER_OPEN)
             self._record = gui.add_button("Record a video", icon=viser.Icon.VIDEO, color="red")
             self._file = gui.add_button("Download", icon=viser.Icon.DOWNLOAD, visible=False)

@@ -62,8 +62,8 @@ def in_rectangle(
     chosen = points_N3[standing if standing.any() else inside]
     if not len(chosen):
         return None
-    box = np.percentile(chosen, [EDGE, 100 - EDGE], axis=0) + [[-PAD_M], [PAD_M]]
-    return box.astype(np.float64)
+    low, high = np.percentile(chosen.astype(np.float64), [EDGE, 100 - EDGE], axis=0)
+    return np.stack([low - PAD_M, high + PAD_M])
 
 
 def at_click(
