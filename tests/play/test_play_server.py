@@ -1,0 +1,122 @@
+"""The page without a browser: it is served, tabs come and go, and it ends."""
+
+import contextlib
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import pytest
+import viser
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from pewm_jax.commands import play
+from pewm_jax.config import ConfigError, UserError
+from pewm_jax.play import driver, page
+from pewm_jax.play.settings import Serve, Start
+from tests.play.tiny_drive import FORWARD, a_place, an_engine
+
+LONG = 120
+
+
+@contextlib.contextmanager
+def a_page(folder, load=an_engine):
+    one = page.Page(load, Start(house=2), Serve(port=0, ahead=False), folder, "tiny")
+    try:
+        yield one
+    finally:
+        one.close()
+
+
+def a_tab(one):
+    protocol = f"viser-v{viser.__version__}"
+    return connect(one.url.replace("http", "ws"), subprotocols=[protocol], max_size=None)
+
+
+def heard(tab):
+    """Bytes that a tab was sent until it is quiet for a moment."""
+    count = 0
+    with contextlib.suppress(TimeoutError):
+        while True:
+            count += len(tab.recv(timeout=1.0))
+    return count
+
+
+def test_it_is_served_and_tabs_that_go_take_nothing_with_them(tmp_path):
+    a_place()
+    with a_page(tmp_path) as one:
+        with urllib.request.urlopen(one.url, timeout=30) as answer:
+            assert answer.status == 200
+            assert b"<html" in answer.read().lower()
+        assert one.driver.wait(LONG)
+        first, second = a_tab(one), a_tab(one)
+        assert min(heard(first), heard(second)) > 10_000  # the picture and the map, at once
+        one.driver.put(FORWARD)
+        assert one.driver.wait(LONG)
+        assert min(heard(first), heard(second)) > 5_000
+        first.socket.close()  # lost, without a word
+        one.driver.put(FORWARD)
+        assert one.driver.wait(LONG)
+        assert heard(second) > 5_000
+        second.close()
+        one.driver.put(FORWARD)
+        assert one.driver.wait(LONG)
+        assert one.driver._session.steps == 3
+        third = a_tab(one)
+        assert heard(third) > 10_000
+    with pytest.raises((urllib.error.URLError, ConnectionError)):
+        urllib.request.urlopen(one.url, timeout=5)
+    with contextlib.suppress(ConnectionClosed):
+        heard(third)
+
+
+def test_what_goes_wrong_is_on_the_page(tmp_path):
+    def load():
+        raise UserError("runs/<none> holds no weights.")
+
+    with a_page(tmp_path, load) as one:
+        assert one.driver.wait(LONG)
+        assert "runs/&lt;none&gt; holds no weights." in one._status.content
+        one.driver.put(FORWARD)
+        assert one.driver.wait(LONG)
+        assert "no world yet" in one._status.content
+        one._edit("erase")
+        assert "Choose a box first" in one._status.content
+
+
+def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so():
+    assert Serve().host == "127.0.0.1"
+    assert page.warning(Serve()) == ""
+    assert "no password" in page.warning(Serve(host="0.0.0.0"))
+    with pytest.raises(ConfigError, match="cannot be served on"):
+        page._serve(Serve(host="203.0.113.7"))  # an address of nobody
+
+
+def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
+    for argv, says in (
+        ([], "Name a model"),
+        (["runs/none"], "is no run"),
+        (["x", "--port", "a"], ""),
+    ):
+        with pytest.raises(UserError, match=says):
+            play.main(argv)
+    code = (
+        "import sys; sys.modules['viser'] = None\n"
+        "from pewm_jax.commands.main import main\n"
+        "sys.exit(main(['play', 'small']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines() == [
+        "error: the live viewer needs viser, which is not installed: pip install 'pewm-jax[play]'."
+    ]
+
+
+def test_settings_of_a_page_are_those_of_its_parts():
+    settings = play.Settings(house=5, port=0)
+    assert play._part(Start, settings).house == 5
+    assert play._part(Serve, settings).port == 0
+    with pytest.raises(ConfigError):
+        play.Settings(port=-1)
+    assert driver.Begin(Start()).start.house == 2
