@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -57,7 +58,8 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
     serve, start = _part(Serve, settings), _part(Start, settings)
     home = shipped.home(argv[0])
     folder = settings.worlds or home / "worlds"
-    page = pages.Page(lambda: _load(argv[0], home), start, serve, folder, Path(argv[0]).name)
+    name, say = Path(argv[0]).name, functools.partial(print, flush=True)
+    page = pages.Page(lambda: _load(argv[0], home), start, serve, folder, name, say)
     print(f"drive: {page.url}  (Ctrl-C ends)", flush=True)
     if pages.warning(serve):
         print(pages.warning(serve), flush=True)

@@ -356,7 +356,7 @@ class Driver:
 
     def _make(self, engine: Engine, now: Session, action: np.ndarray) -> None:
         made = session.ahead(engine, now, action)
-        made.frame.rgb_THWC.block_until_ready()
+        _ = np.asarray(made.frame.rgb_THWC)  # waits for it
         self._made[action.tobytes()] = made
 
     def _board(self) -> np.ndarray:

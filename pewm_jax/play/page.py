@@ -12,6 +12,7 @@ import html
 import io
 import math
 import os
+import socket
 import sys
 import webbrowser
 from collections.abc import Callable
@@ -61,7 +62,7 @@ KEYS = (
     "<img alt='' style='display:none' src='data:,' onerror=\"if(!window.drives){window.drives=1;"
     "const k=/^(Key[WASDQE]|Arrow(Up|Down|Left|Right))$/;"
     "document.documentElement.addEventListener('keydown',e=>{"
-    "if(k.test(e.code)&&!/^(INPUT|TEXTAREA|SELECT)$/.test(e.target.tagName))"
+    "if(k.test(e.code)&&!e.ctrlKey&&!e.metaKey&&!e.altKey&&!/^(INPUT|TEXTAREA|SELECT)$/.test(e.target.tagName))"
     '{e.stopPropagation();e.preventDefault()}})}">'
 )
 """Keeps the keys that drive from listeners of the document, which move the 3D camera; those of the
@@ -77,7 +78,13 @@ class Page:
     """
 
     def __init__(
-        self, load: Callable[[], Any], start: Start, serve: Serve, folder: Path, name: str
+        self,
+        load: Callable[[], Any],
+        start: Start,
+        serve: Serve,
+        folder: Path,
+        name: str,
+        say: Callable[[str], None] = lambda _: None,
     ):
         """Serve the page, and begin to load the model.
 
@@ -87,15 +94,17 @@ class Page:
             serve: address and port.
             folder: of saved worlds and videos.
             name: of the model, for the title.
+            say: told what the page waits for, and what goes wrong, once each.
 
         Raises:
             ConfigError: the address cannot be served on.
         """
-        self._name, self._start, self._seconds = name, start, None
+        self._start, self._seconds, self._say, self._phase = start, None, say, ""
         self._server = _serve(serve)
         # Sharing asks a server elsewhere for a public address; this page is local.
         self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
-        self.url = f"http://{serve.host}:{self._server.get_port()}"
+        host = f"[{serve.host}]" if ":" in serve.host else serve.host
+        self.url = f"http://{host}:{self._server.get_port()}"
         self._map = MapView(self._server)
         gui = self._server.gui
         gui.configure_theme(
@@ -121,11 +130,13 @@ class Page:
     def close(self) -> None:
         """End the drive and the server."""
         self.driver.close()
-        self._server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
 
     def show(self, shown: Shown) -> None:
         """Show what the driver tells; called in its thread."""
         self._seconds = shown.seconds if shown.seconds is not None else self._seconds
+        self._tell(shown)
         with self._server.atomic():
             if shown.picture is not None:
                 self._view.image = shown.picture
@@ -135,6 +146,15 @@ class Page:
             seen = as_bytes(np.asarray(shown.session.world.frame.rgb_THWC[0]))
             self._map.show(shown.engine, shown.session, seen)
         self._show_files(shown)
+
+    def _tell(self, shown: Shown) -> None:
+        """Tell the terminal what the page begins to wait for, and what went wrong."""
+        phase = shown.said.partition(" …")[0] if shown.busy or shown.failed else ""
+        if phase and phase != self._phase:
+            self._say(f"{phase} …" if shown.busy else f"error: {phase}")
+        if self._phase and not phase:
+            self._say("Ready.")
+        self._phase = phase
 
     def _status_of(self, shown: Shown) -> str:
         colour = "#ff8a80" if shown.failed else "#60c8ff" if shown.busy else "#7fe0a0"
@@ -275,8 +295,7 @@ class Page:
             house = gui.add_number("House", start.house, min=0, step=1)
             seed = gui.add_number("Seed", start.seed, min=0, step=1)
             begin = gui.add_button("New drive", icon=viser.Icon.PLAYER_PLAY)
-            steps = gui.add_dropdown("Sampler steps", SAMPLER, initial_value="2")
-            self._steps = steps
+            steps: Any = gui.add_dropdown("Sampler steps", SAMPLER)
 
         def anew(_: Any) -> None:
             changes: dict[str, Any] = {"house": int(house.value), "seed": int(seed.value)}
@@ -287,6 +306,8 @@ class Page:
 
         begin.on_click(anew)
         steps.on_update(lambda event: event.client and self._put(driver.Sampler(int(steps.value))))
+
+        self._steps = steps
 
     def _add_keeping(self) -> None:
         gui = self._server.gui
@@ -310,8 +331,12 @@ class Page:
 
     def _show_files(self, shown: Shown) -> None:
         """Show which worlds there are, and what was written."""
-        if not hasattr(self, "_file"):
+        if not hasattr(self, "_file"):  # the page is still being made
             return
+        count = str(shown.engine.sampler_steps) if shown.engine is not None else "0"
+        if count not in ("0", self._steps.value):
+            self._steps.options = tuple(sorted({*SAMPLER, count}, key=int))
+            self._steps.value = count
         options = shown.worlds or ("none yet",)
         if options != self._worlds.options:
             self._worlds.options = options
@@ -340,11 +365,19 @@ def warning(serve: Serve) -> str:
 
 
 def _serve(serve: Serve) -> viser.ViserServer:
-    """Begin to serve, without viser's own message."""
+    """Begin to serve, without viser's own message.
+
+    Raises:
+        ConfigError: the host is no address of this machine; viser would wait for it forever.
+    """
     try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            return viser.ViserServer(host=serve.host, port=serve.port, verbose=False)
-    except (OSError, OverflowError) as error:
+        kind, *_, address = socket.getaddrinfo(serve.host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(kind) as probe:
+            probe.bind(address)
+    except OSError as error:
         raise ConfigError(
-            f"--host {serve.host} --port {serve.port} cannot be served on ({error}); take another."
+            f"--host {serve.host} is no address that this machine can serve on ({error}); take "
+            "127.0.0.1, or 0.0.0.0 to be reached by others."
         ) from None
+    with contextlib.redirect_stdout(io.StringIO()):
+        return viser.ViserServer(host=serve.host, port=serve.port, verbose=False)

@@ -185,16 +185,15 @@ def _edited(engine: Engine, session: Session, event: Erase | Move) -> Session:
             "remembers surfels or voxels."
         )
     box = np.asarray(event.box, np.float32)
-    before = int(session.world.map.occupied)
+    before = len(engine.points(session.world)[0])
     if isinstance(event, Erase):
         world = engine.erase(session.world, box)
-        count = before - int(world.map.occupied)
-        said = f"Erased {count} cells of the map."
+        said = f"Erased {before - len(engine.points(world)[0])} points of the map."
     else:
         transform = about_middle(box, event.shift, event.turn_deg)
         world = engine.move(session.world, box, transform, leave=event.leave)
         done = "Copied" if event.leave else "Moved"
-        said = f"{done} the box; the map has {int(world.map.occupied)} cells."
+        said = f"{done} the box; the map has {len(engine.points(world)[0])} points."
     changed = dataclasses.replace(session, world=world)
     seen = ahead(engine, changed, STILL)
     return _after(engine, changed, seen, STILL, session.planar_3, said)

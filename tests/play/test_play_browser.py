@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from pewm_jax.play.settings import Serve, Start
-from tests.play.tiny_drive import a_place, an_engine
+from tests.play.tiny_drive import a_place, a_toy
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = [
@@ -45,7 +45,7 @@ def served(tmp_path_factory):
 
     a_place()
     folder = tmp_path_factory.mktemp("worlds")
-    one = page.Page(an_engine, Start(house=2), Serve(port=0, ahead=False), folder, "tiny")
+    one = page.Page(a_toy, Start(house=2), Serve(port=0, ahead=False), folder, "toy")
     assert one.driver.wait(LONG)
     yield one
     one.close()

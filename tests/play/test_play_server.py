@@ -15,14 +15,14 @@ from pewm_jax.commands import play
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.play import driver, page
 from pewm_jax.play.settings import Serve, Start
-from tests.play.tiny_drive import FORWARD, a_place, an_engine
+from tests.play.tiny_drive import FORWARD, a_place, a_toy
 
 LONG = 120
 
 
 @contextlib.contextmanager
-def a_page(folder, load=an_engine):
-    one = page.Page(load, Start(house=2), Serve(port=0, ahead=False), folder, "tiny")
+def a_page(folder, load=a_toy):
+    one = page.Page(load, Start(house=2), Serve(port=0, ahead=False), folder, "toy")
     try:
         yield one
     finally:
@@ -89,16 +89,18 @@ def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so(
     assert Serve().host == "127.0.0.1"
     assert page.warning(Serve()) == ""
     assert "no password" in page.warning(Serve(host="0.0.0.0"))
-    with pytest.raises(ConfigError, match="cannot be served on"):
+    with pytest.raises(ConfigError, match="no address that this machine"):
         page._serve(Serve(host="203.0.113.7"))  # an address of nobody
 
 
 def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
-    for argv, says in (
+    wrong = (
         ([], "Name a model"),
         (["runs/none"], "is no run"),
-        (["x", "--port", "a"], ""),
-    ):
+        (["small", "--port", "a"], "whole number"),
+        (["small", "--scene", "a.glb", "--episode", "b"], "one place"),
+    )
+    for argv, says in wrong:
         with pytest.raises(UserError, match=says):
             play.main(argv)
     code = (

@@ -118,7 +118,7 @@ def test_what_is_erased_is_gone_from_the_map_and_from_what_is_seen():
     assert changed[8, 12]
     assert not changed.all()
     after = session.apply(model, now, session.Erase(box))
-    assert after.said == f"Erased {inside.sum()} cells of the map."
+    assert after.said == f"Erased {inside.sum()} points of the map."
     assert after.steps == now.steps + 1
     np.testing.assert_allclose(session.pose(after), session.pose(now), atol=1e-6)
 
