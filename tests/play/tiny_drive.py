@@ -14,7 +14,7 @@ from pewm_jax.models.signals import as_signal
 from pewm_jax.play import engine, places, session
 from pewm_jax.play.settings import Start
 from pewm_jax.types import Camera, WorldState
-from tests.helpers import init_world, randomise, tiny_model
+from tests.helpers import TINY, init_world, randomise, tiny_model
 
 MODEL = tiny_model(
     memory=SurfelConfig(
@@ -25,6 +25,8 @@ MODEL = tiny_model(
         imagined_edge=0.0,
         imagined_again=True,
     ),
+    backbone=dataclasses.replace(TINY.backbone, layers=1),
+    clip=dataclasses.replace(TINY.clip, frames=5),
     noise=DDPMConfig(sample_steps=1),
 )
 FORWARD = session.Drive((0.25, 0.0, 0.0))
