@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 
 import numpy as np
@@ -66,11 +67,16 @@ class MapView:
             opacity=0.7,
             visible=False,
         )
-        self._source = scene.add_box("/box", BOX, wireframe=True, visible=False)
+        edges = box_edges(np.ones(3))
+        self._source = scene.add_line_segments(
+            "/box", edges, BOX, thickness=2.5, thickness_units="screen", visible=False
+        )
         self.target = scene.add_transform_controls(
             "/target", scale=0.7, depth_test=False, opacity=0.8, visible=False
         )
-        self._target = scene.add_box("/target/box", GOAL, wireframe=True)
+        self._target = scene.add_line_segments(
+            "/target/box", edges, GOAL, thickness=2.5, thickness_units="screen"
+        )
 
     @property
     def points(self) -> np.ndarray:
@@ -107,8 +113,8 @@ class MapView:
                 node.visible = box_23 is not None
             if box_23 is None:
                 return
-            size, middle = box_23[1] - box_23[0], box_23.mean(0)
-            self._source.dimensions = self._target.dimensions = size
+            edges, middle = box_edges(box_23[1] - box_23[0]), box_23.mean(0)
+            self._source.points = self._target.points = edges
             self._source.position = self.target.position = middle
             self.target.wxyz = (1.0, 0.0, 0.0, 0.0)
 
@@ -185,6 +191,13 @@ class MapView:
         cameras += [client.camera for client in self._server.get_clients().values()]
         for one in cameras:
             one.position, one.look_at = tuple(position), tuple(look_at)
+
+
+def box_edges(size_3: np.ndarray) -> np.ndarray:
+    """Return (12, 2, 3) the edges of a box around the origin, metres."""
+    corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+    pairs = [(a, b) for a, b in itertools.combinations(range(8), 2) if (a ^ b).bit_count() == 1]
+    return (corners[np.array(pairs)] * size_3).astype(np.float32)
 
 
 def eye_of(camera: viser.CameraHandle) -> picking.Eye:

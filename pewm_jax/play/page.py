@@ -152,7 +152,7 @@ class Page:
         phase = shown.said.partition(" …")[0] if shown.busy or shown.failed else ""
         if phase and phase != self._phase:
             self._say(f"{phase} …" if shown.busy else f"error: {phase}")
-        if self._phase and not phase:
+        if self._phase.startswith("Preparing") and not phase:
             self._say("Ready.")
         self._phase = phase
 

@@ -12,6 +12,9 @@ CLICK_M = (0.9, 0.9, 1.1)
 """Size of the box around a click, metres."""
 NEAR_RAY_M = 0.12
 """A click means a point this near to its ray."""
+FIELDS, BEHIND_M = 12, 0.3
+"""A rectangle is looked at in so many fields across and down; what is farther behind the nearest
+point of its field is hidden, metres."""
 EDGE = 2.0
 """Percent of the points of a rectangle that may lie outside of its box, at each end."""
 
@@ -43,7 +46,7 @@ def in_rectangle(
 ) -> np.ndarray | None:
     """Return the (2, 3) box of what is seen in a rectangle of the screen; None if nothing is.
 
-    The floor does not count, unless there is nothing else.
+    The floor does not count, unless there is nothing else, nor does what is hidden by other things.
 
     Args:
         points_N3: what the map shows, metres.
@@ -59,11 +62,30 @@ def in_rectangle(
     inside = (across >= low_2[0]) & (across <= high_2[0]) & np.isfinite(depth)
     inside &= (down >= low_2[1]) & (down <= high_2[1])
     standing = inside & (points_N3[:, 2] > floor_of(points_N3) + FLOOR_M)
-    chosen = points_N3[standing if standing.any() else inside]
-    if not len(chosen):
+    taken = standing if standing.any() else inside
+    if not taken.any():
         return None
+    front = _in_front(across[taken], down[taken], depth[taken], low_2, high_2)
+    chosen = points_N3[taken][front]
     low, high = np.percentile(chosen.astype(np.float64), [EDGE, 100 - EDGE], axis=0)
     return np.stack([low - PAD_M, high + PAD_M])
+
+
+def _in_front(
+    across_P: np.ndarray,
+    down_P: np.ndarray,
+    depth_P: np.ndarray,
+    low_2: tuple[float, float],
+    high_2: tuple[float, float],
+) -> np.ndarray:
+    """Return (P,) bool: which points of a rectangle are not hidden, field by field."""
+    fields = np.zeros(len(depth_P), int)
+    for place, low, high in zip((across_P, down_P), low_2, high_2, strict=True):
+        share = (place - low) / max(high - low, 1e-9)
+        fields = fields * FIELDS + np.clip(share * FIELDS, 0, FIELDS - 1).astype(int)
+    nearest = np.full(FIELDS**2, np.inf)
+    np.minimum.at(nearest, fields, depth_P)
+    return depth_P <= nearest[fields] + BEHIND_M
 
 
 def at_click(

@@ -265,6 +265,11 @@ def test_a_rectangle_on_the_screen_chooses_what_stands_in_it():
     at = 0.5 + np.array([[0.4, -1.3], [1.8, -0.3]]) / 10
     box = picking.in_rectangle(points, eye, tuple(at[0]), tuple(at[1]))
     np.testing.assert_allclose(box, [[0.5, 0.5, 0.1], [1.5, 1.0, 0.8]], atol=0.1)
+    wall = rng.uniform((3.0, 0.6, 0.3), (3.1, 0.9, 0.6), (800, 3))  # behind, from the side
+    ahead = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    side = picking.Eye(np.array([-5.0, 0.75, 0.45]), ahead, np.pi / 2, 1.0)
+    front = picking.in_rectangle(np.concatenate([points, wall]), side, (0.45, 0.45), (0.55, 0.55))
+    assert front[1, 0] < 1.7
     only_floor = picking.in_rectangle(points, eye, (0.25, 0.25), (0.35, 0.35))
     assert only_floor[1, 2] < 0.1
     assert picking.in_rectangle(points, eye, (1.5, 1.5), (1.6, 1.6)) is None
