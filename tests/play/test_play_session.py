@@ -2,6 +2,8 @@
 
 import dataclasses
 import io
+import re
+from pathlib import Path
 
 import cv2
 import jax
@@ -11,7 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax import worlds
+import pewm_jax
+from pewm_jax import cli, worlds
+from pewm_jax.commands import play
 from pewm_jax.config import (
     CodecTrainConfig,
     CodecWorldConfig,
@@ -33,6 +37,8 @@ from tests.play.tiny_drive import (
     same,
 )
 
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "play.md").read_text()
 CODEC = Config(model=CodecWorldConfig(), train=CodecTrainConfig())
 
 
@@ -72,6 +78,29 @@ def test_a_step_is_what_the_world_imagines_and_what_was_imagined_ahead_is_the_sa
     assert len(now.path_P3) == 3
     assert not np.array_equal(now.world.frame.rgb_THWC, now.blind.frame.rgb_THWC)
     same(now.blind.map, a_session().world.map)  # without memory nothing is added to it
+
+
+def test_the_code_of_the_documentation_runs(monkeypatch, capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    tiny = an_engine()
+    monkeypatch.setattr(pewm_jax, "load", lambda _: (tiny.config, tiny.params), raising=False)
+    exec(compile(code, "docs/play.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("Erased ")
+
+
+def test_the_commands_of_the_documentation_can_be_read_and_its_buttons_are_there():
+    lines = re.findall(r"^pewm-jax play (.+)$", PAGE, re.MULTILINE)
+    assert len(lines) >= 5
+    for line in lines:
+        _, *flags = line.split()
+        cli.parse(play.Settings, flags, default=play.Settings(), prog="pewm-jax play")
+    for flag in set(re.findall(r"`(--[\w-]+)", PAGE)):
+        value = {"--host": ["0.0.0.0"], "--frames": ["8"], "--worlds": ["here"]}.get(flag, [])
+        cli.parse(play.Settings, [flag, *value], default=play.Settings(), prog="pewm-jax play")
+    code = (ROOT / "pewm_jax" / "play" / "page.py").read_text()
+    for button in re.findall(r"(?<!\*)\*([A-Z][^*\n]+)\*(?!\*)", PAGE):
+        assert f'"{button}"' in code, button
+    assert (ROOT / "docs" / "play.png").stat().st_size < 400_000
 
 
 def test_walls_stop_and_can_be_walked_through():

@@ -10,11 +10,12 @@ import numpy as np
 from pewm_jax.config import Config, DDPMConfig, SurfelConfig
 from pewm_jax.evaluation.pictures import as_bytes
 from pewm_jax.geometry.cameras import pose_from_yaw, unproject
+from pewm_jax.models import world_model
 from pewm_jax.models.signals import as_signal
 from pewm_jax.play import engine, places, session
 from pewm_jax.play.settings import Start
 from pewm_jax.types import Camera, WorldState
-from tests.helpers import TINY, init_world, randomise, tiny_model
+from tests.helpers import TINY, tiny_model
 
 MODEL = tiny_model(
     memory=SurfelConfig(
@@ -35,7 +36,9 @@ LEFT = session.Drive((0.0, 0.0, float(np.pi / 6)))
 
 @functools.cache
 def an_engine():
-    params = randomise(init_world(MODEL), scale=0.05)
+    shapes = jax.eval_shape(functools.partial(world_model.init, MODEL), jax.random.key(0))
+    rng = np.random.default_rng(0)
+    params = jax.tree.map(lambda x: rng.normal(0, 0.2, x.shape).astype(np.float32), shapes)
     return engine.open_engine("tiny", Config(model=MODEL), params)
 
 
