@@ -312,7 +312,9 @@ class Driver:
     def _drive(self, step: Drive, asked: float) -> None:
         assert self._engine is not None
         assert self._session is not None
-        action, _, _ = session.wanted(self._session, step)
+        action, _, collided = session.wanted(self._session, step)
+        if collided:
+            self._todo.clear()  # the rest of the way begins elsewhere
         made = self._made.get(action.tobytes())
         after = session.apply(self._engine, self._session, step, made)
         self._last = step.action

@@ -6,8 +6,10 @@ import sys
 import urllib.error
 import urllib.request
 
+import numpy as np
 import pytest
 import viser
+import viser.transforms
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -83,6 +85,32 @@ def test_what_goes_wrong_is_on_the_page(tmp_path):
         assert "no world yet" in one._status.content
         one._edit("erase")
         assert "Choose a box first" in one._status.content
+
+
+def test_a_box_goes_where_it_was_dragged_and_the_agent_too(tmp_path):
+    with a_page(tmp_path) as one:
+        assert one.driver.wait(LONG)
+        view, begun = one._map, one.driver._session
+        low, high = (begun.planar_3[0] - 1, begun.planar_3[1] - 1), (4.0, 4.0)
+        box = np.array([[*low, 0.2], [low[0] + high[0], low[1] + high[1], 1.0]])
+        inside = ((view.points >= box[0]) & (view.points < box[1])).all(-1)
+        assert 0 < inside.sum() < len(view.points)
+        one._choose(box)
+        view.target.position = view.target.position + np.array([0.0, 0.0, -20.0])
+        view.target.wxyz = viser.transforms.SO3.from_z_radians(np.pi / 2).wxyz
+        one._edit("copy")
+        assert one.driver.wait(LONG)
+        assert (view.points[:, 2] < -10).sum() == inside.sum()
+        assert view.box_23 is None
+        x, y, yaw = begun.planar_3
+        view.handle.position = np.array([x, y, 0.0])
+        view.handle.wxyz = viser.transforms.SO3.from_z_radians(yaw + 0.4).wxyz
+        one._put(driver.GoTo(view.dragged()))
+        assert one.driver.wait(LONG)
+        assert np.cos(one.driver._session.planar_3[2] - yaw - 0.4) > 1 - 1e-6
+        view.ceiling = view.tint = True
+        view.redraw()
+        assert len(view.points) == len(one.driver.engine.points(one.driver._session.world)[0])
 
 
 def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so():

@@ -90,6 +90,15 @@ class Toy(engine.Engine):
         kept = ~((world.map["points"] >= low) & (world.map["points"] < high)).all(-1)
         return WorldState(world.frame, jax.tree.map(lambda x: x[kept], world.map))
 
+    def move(self, world, box_23, transform, *, leave):
+        low, high = np.asarray(box_23)
+        inside = ((world.map["points"] >= low) & (world.map["points"] < high)).all(-1)
+        piece = {name: values[inside] for name, values in world.map.items()}
+        piece["points"] = piece["points"] @ transform[:3, :3].T + transform[:3, 3]
+        rest = world if leave else self.erase(world, box_23)
+        both = {name: np.concatenate([rest.map[name], piece[name]]) for name in piece}
+        return WorldState(world.frame, both)
+
 
 def seen(frames):
     """The points of frames in the world, and their colours."""
