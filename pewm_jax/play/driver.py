@@ -31,6 +31,8 @@ MOST_UNDO, MOST_WAITING = 4, 32
 """Edits that can be undone, and events that may wait."""
 TICK_S = 1.0
 """Seconds between two messages while something takes long."""
+PAUSE_S = 0.1
+"""Seconds for a browser on the same machine to draw before the next step is imagined ahead."""
 PATIENCE_S = 5.0
 """Seconds to wait for the thread at the end."""
 FPS = 6
@@ -209,6 +211,11 @@ class Driver:
                 self._idle.set()
                 self._changed.wait()
 
+    def _asked_within(self, seconds: float) -> bool:
+        """Wait a moment; tells, at once, if something is asked for."""
+        with self._changed:
+            return self._changed.wait_for(lambda: bool(self._waiting) or self._ended, seconds)
+
     def _guarded(self, work: Callable[[], None]) -> None:
         """Do something; an error becomes a sentence."""
         try:
@@ -352,6 +359,8 @@ class Driver:
         for step in ([self._last] if self._last else []) + likely:
             action, _, _ = session.wanted(now, Drive(step))
             if action.tobytes() not in self._made and np.abs(action).max() > 0:
+                if self._asked_within(PAUSE_S):
+                    return True
                 self._guarded(lambda a=action: self._make(engine, now, a))
                 return action.tobytes() in self._made
         return False
