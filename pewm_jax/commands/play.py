@@ -60,9 +60,6 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
     folder = settings.worlds or home / "worlds"
     name, say = Path(argv[0]).name, functools.partial(print, flush=True)
     page = pages.Page(lambda: _load(argv[0], home), start, serve, folder, name, say)
-    print(f"drive: {page.url}  (Ctrl-C ends)", flush=True)
-    if pages.warning(serve):
-        print(pages.warning(serve), flush=True)
     try:
         if settings.open:
             pages.open_in_browser(page.url)

@@ -94,7 +94,7 @@ class Page:
             serve: address and port.
             folder: of saved worlds and videos.
             name: of the model, for the title.
-            say: told what the page waits for, and what goes wrong, once each.
+            say: told where the page is, what it waits for, and what goes wrong, once each.
 
         Raises:
             ConfigError: the address cannot be served on.
@@ -103,8 +103,10 @@ class Page:
         self._server = _serve(serve)
         # Sharing asks a server elsewhere for a public address; this page is local.
         self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
-        host = f"[{serve.host}]" if ":" in serve.host else serve.host
-        self.url = f"http://{host}:{self._server.get_port()}"
+        self.url = f"http://{_here(serve.host)}:{self._server.get_port()}"
+        say(f"drive: {self.url}  (Ctrl-C ends)")
+        if warning(serve):
+            say(warning(serve))
         self._map = MapView(self._server)
         gui = self._server.gui
         gui.configure_theme(
@@ -362,6 +364,13 @@ def warning(serve: Serve) -> str:
         f"Anyone who reaches this machine at {serve.host} can drive, and load and save worlds: "
         "there is no password."
     )
+
+
+def _here(host: str) -> str:
+    """Return what this machine calls a host in an address."""
+    if host in ("0.0.0.0", "::"):  # noqa: S104 - it is not served on here
+        return "127.0.0.1"
+    return f"[{host}]" if ":" in host else host
 
 
 def _serve(serve: Serve) -> viser.ViserServer:

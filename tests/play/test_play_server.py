@@ -117,6 +117,7 @@ def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so(
     assert Serve().host == "127.0.0.1"
     assert page.warning(Serve()) == ""
     assert "no password" in page.warning(Serve(host="0.0.0.0"))
+    assert [page._here(host) for host in ("0.0.0.0", "::1", "me")] == ["127.0.0.1", "[::1]", "me"]
     with pytest.raises(ConfigError, match="no address that this machine"):
         page._serve(Serve(host="203.0.113.7"))  # an address of nobody
 
