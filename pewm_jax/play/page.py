@@ -23,10 +23,11 @@ import numpy as np
 
 from pewm_jax.config import ActionConfig, ConfigError
 from pewm_jax.evaluation.pictures import as_bytes
-from pewm_jax.play import board, driver, picking, session
-from pewm_jax.play.driver import Driver, Request, Shown
+from pewm_jax.play import board, picking, requests, session
+from pewm_jax.play.driver import Driver
 from pewm_jax.play.extra import viser
 from pewm_jax.play.map_view import MapView, eye_of
+from pewm_jax.play.requests import Request, Shown
 from pewm_jax.play.settings import LOOPBACK, Serve, Start
 
 VIEW_WIDTH, PANEL_WIDTH = 540, 310
@@ -222,7 +223,7 @@ class Page:
         @self._map.handle.on_update
         def _(event: Any) -> None:
             if event.phase == "end":
-                self._put(driver.GoTo(self._map.dragged()))
+                self._put(requests.GoTo(self._map.dragged()))
 
     def _redraw(self, name: str, value: bool) -> None:
         setattr(self._map, name, value)
@@ -247,7 +248,7 @@ class Page:
         erase.on_click(lambda _: self._edit("erase"))
         move.on_click(lambda _: self._edit("move"))
         copy.on_click(lambda _: self._edit("copy"))
-        undo.on_click(lambda _: self._put(driver.Undo()))
+        undo.on_click(lambda _: self._put(requests.Undo()))
 
         @scene.on_rect_select(modifier="shift")
         def _(event: Any) -> None:
@@ -304,10 +305,12 @@ class Page:
             if source.value == sources[0]:
                 changes |= {"scene": "", "episode": "", "recording": ""}
             self._map.choose(None)
-            self._put(driver.Begin(dataclasses.replace(start, **changes)))
+            self._put(requests.Begin(dataclasses.replace(start, **changes)))
 
         begin.on_click(anew)
-        steps.on_update(lambda event: event.client and self._put(driver.Sampler(int(steps.value))))
+        steps.on_update(
+            lambda event: event.client and self._put(requests.Sampler(int(steps.value)))
+        )
 
         self._steps = steps
 
@@ -322,9 +325,9 @@ class Page:
             self._file = gui.add_button("Download", icon=viser.Icon.DOWNLOAD, visible=False)
         self._link: Path | None = None
         self._recording = False
-        save.on_click(lambda _: self._put(driver.Save(name.value)))
-        load.on_click(lambda _: self._put(driver.Load(self._worlds.value)))
-        self._record.on_click(lambda _: self._put(driver.Record(not self._recording)))
+        save.on_click(lambda _: self._put(requests.Save(name.value)))
+        load.on_click(lambda _: self._put(requests.Load(self._worlds.value)))
+        self._record.on_click(lambda _: self._put(requests.Record(not self._recording)))
 
         @self._file.on_click
         def _(event: Any) -> None:

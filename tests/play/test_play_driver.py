@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import UserError
-from pewm_jax.play import board, driver, kept, session
+from pewm_jax.play import board, driver, kept, requests, session
 from pewm_jax.play.settings import Start
 from tests.play.tiny_drive import FORWARD, LEFT, Telling, Toy, a_toy
 
@@ -74,7 +74,7 @@ def test_of_steps_asked_for_meanwhile_the_last_one_wins(drives):
     assert slow.begun.wait(LONG)
     for _ in range(10):
         one.put(LEFT)
-    one.put(driver.Save("between"))
+    one.put(requests.Save("between"))
     one.put(session.Drive((0.0, 0.0, -float(np.pi / 6))))
     slow.go.set()
     assert one.wait(LONG)
@@ -132,7 +132,7 @@ def test_a_model_that_does_not_load_is_a_sentence_and_can_be_tried_again(drives)
     one.put(FORWARD)
     assert one.wait(LONG)
     assert "no world yet" in told.told[-1].said
-    one.put(driver.Begin(Start(house=2)))
+    one.put(requests.Begin(Start(house=2)))
     assert one.wait(LONG)
     assert told.session.steps == 0
 
@@ -152,25 +152,25 @@ def test_edits_are_taken_back_and_worlds_kept_and_gone_on_in(drives):
     begun = told.session
     here = begun.planar_3
     box = ((here[0] - 3.0, here[1] - 3.0, -1.0), (here[0] + 3.0, here[1] + 3.0, 3.0))
-    one.put(driver.Save("before"))
+    one.put(requests.Save("before"))
     one.put(session.Erase(box))
     assert one.wait(LONG)
     assert told.session.steps == 1
     before, after = (len(one.engine.points(now.world)[0]) for now in (begun, told.session))
     assert after < before
-    one.put(driver.Undo())
+    one.put(requests.Undo())
     assert one.wait(LONG)
     assert told.session.world is begun.world
-    one.put(driver.Undo())
+    one.put(requests.Undo())
     assert one.wait(LONG)
     assert told.told[-1].said == "There is nothing to take back."
-    one.put(driver.Load("before"))
+    one.put(requests.Load("before"))
     assert one.wait(LONG)
     assert told.session.said == "This is the world 'before'."
-    one.put(driver.Sampler(2))
+    one.put(requests.Sampler(2))
     assert one.wait(LONG)
     assert one.engine.sampler_steps == 2
-    one.put(driver.Sampler(0))
+    one.put(requests.Sampler(0))
     assert one.wait(LONG)
     assert told.told[-1].failed
     assert one.engine.sampler_steps == 2
@@ -180,7 +180,7 @@ def test_it_drives_to_a_place_in_steps_and_a_key_stops_it(drives):
     one, told = drives()
     x, y, yaw = told.session.planar_3
     ahead = 0.3
-    one.put(driver.GoTo((x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), yaw + 0.3)))
+    one.put(requests.GoTo((x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), yaw + 0.3)))
     assert one.wait(LONG)
     assert told.session.steps == 2
     there = told.session.planar_3
@@ -191,12 +191,12 @@ def test_it_drives_to_a_place_in_steps_and_a_key_stops_it(drives):
 @pytest.mark.parametrize("ended", ["asked", "closed"])
 def test_a_video_has_a_frame_for_each_step_and_is_whole_however_it_ends(drives, tmp_path, ended):
     one, told = drives()
-    one.put(driver.Record(on=True))
+    one.put(requests.Record(on=True))
     for event in (FORWARD, LEFT):
         one.put(event)
         assert one.wait(LONG)
     assert told.told[-1].recording
-    one.put(driver.Record(on=False)) if ended == "asked" else one.close()
+    one.put(requests.Record(on=False)) if ended == "asked" else one.close()
     one.wait(LONG)
     one.close()
     (path,) = tmp_path.glob("*.mp4")

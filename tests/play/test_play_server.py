@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 from pewm_jax.commands import play
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.play import driver, page
+from pewm_jax.play import page, requests
 from pewm_jax.play.settings import Serve, Start
 from tests.play.tiny_drive import FORWARD, a_place, a_toy
 
@@ -105,7 +105,7 @@ def test_a_box_goes_where_it_was_dragged_and_the_agent_too(tmp_path):
         x, y, yaw = begun.planar_3
         view.handle.position = np.array([x, y, 0.0])
         view.handle.wxyz = viser.transforms.SO3.from_z_radians(yaw + 0.4).wxyz
-        one._put(driver.GoTo(view.dragged()))
+        one._put(requests.GoTo(view.dragged()))
         assert one.driver.wait(LONG)
         assert np.cos(one.driver._session.planar_3[2] - yaw - 0.4) > 1 - 1e-6
         view.ceiling = view.tint = True
@@ -150,4 +150,4 @@ def test_settings_of_a_page_are_those_of_its_parts():
     assert play._part(Serve, settings).port == 0
     with pytest.raises(ConfigError):
         play.Settings(port=-1)
-    assert driver.Begin(Start()).start.house == 2
+    assert requests.Begin(Start()).start.house == 2
