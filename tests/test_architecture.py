@@ -36,6 +36,7 @@ CHAPTERS = [
     "convert",
     "presets",
     "studies",
+    "play",
     "commands",
     "__main__",
 ]
@@ -63,6 +64,7 @@ HOMES = {
     "transformers": {"convert"},
     "trimesh": {"data", "houses"},
     "tyro": {"cli", "config", "convert/commands", "data", "memory/feature_command"},
+    "viser": {"play/extra"},
 }
 """Libraries and the only places that import them."""
 BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}

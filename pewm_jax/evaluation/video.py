@@ -94,26 +94,50 @@ def encode_gif(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> by
 def encode_h264(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> bytes:
     """Encode pictures as an MP4 with H.264, yuv420p; equal pictures give equal bytes.
 
-    x264 is used without its macroblock tree, whose vectorised code reads memory that nobody wrote:
-    with it, a few bits differ from run to run.
-
     Args:
         pictures: uint8 (H, W, 3) with even sides, all of one size.
         frames_per_second: playing speed.
     """
     buffer = io.BytesIO()
-    height, width = pictures[0].shape[:2]
-    with av.open(buffer, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=frames_per_second)
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {
+    film = Film(buffer, pictures[0].shape[:2], frames_per_second)
+    for picture in pictures:
+        film.add(picture)
+    film.close()
+    return buffer.getvalue()
+
+
+class Film:
+    """An MP4 with H.264 that is written picture by picture, so that none has to be kept.
+
+    x264 is used without its macroblock tree, whose vectorised code reads memory that nobody wrote:
+    with it, a few bits differ from run to run.
+    """
+
+    def __init__(self, where: io.BytesIO | str, size: tuple[int, int], frames_per_second: int = 4):
+        """Begin.
+
+        Args:
+            where: a buffer, or the name of a file to write.
+            size: height and width, even.
+            frames_per_second: playing speed.
+        """
+        self._container = av.open(where, "w", format="mp4")
+        self._stream = self._container.add_stream("libx264", rate=frames_per_second)
+        self._stream.height, self._stream.width = size
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.options = {
             "crf": "21",
             "preset": "medium",
             "threads": "1",
             "x264-params": "mbtree=0",
         }
-        for picture in pictures:
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return buffer.getvalue()
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append a uint8 (H, W, 3) picture of the film's size."""
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        """Write what is left; the film can be played."""
+        self._container.mux(self._stream.encode())
+        self._container.close()

@@ -39,6 +39,13 @@ def keys(config: MemorySettings, origin_3: Array, points_3: Array) -> Array:
     return jnp.where(inside, (x * ny + y) * nz + z, math.prod(config.cells))
 
 
+def corners(config: MemorySettings, origin_3: Array, cell_P: Array) -> Array:
+    """Return (P, 3) the lower corners of cells by their numbers, metres."""
+    _, ny, nz = config.cells
+    place = jnp.stack([cell_P // (ny * nz), cell_P // nz % ny, cell_P % nz], -1)
+    return origin_3 + place.astype(jnp.float32) * np.asarray(config.cell_m, np.float32)
+
+
 def grid_of(height: int, width: int, most: int) -> tuple[int, int]:
     """Return rows and columns of an even grid over an image with at most ``most`` fields."""
     rows = min(max(int(math.sqrt(most * height / width)), 1), height, most)

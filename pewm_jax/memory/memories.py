@@ -19,9 +19,9 @@ surfels      a coloured surfel per small cell             none: ours alone
 
 A memory is a ``MemorySettings`` and a module (or object) with the functions ``empty``,
 ``remember``, ``tokens`` and ``to_points``, as they are called below, and optionally ``render``, if
-it can show more than its points. All memories are pytrees of static size. Their tokens have the
-same shapes, so a reader has the same parameters with any of them. The functions are pure and handle
-one world: jit and vmap them.
+it can show more than its points, and ``erase`` and ``move``, if it can be edited. All memories are
+pytrees of static size. Their tokens have the same shapes, so a reader has the same parameters with
+any of them. The functions are pure and handle one world: jit and vmap them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import ModelConfig, functions
+from pewm_jax.config import ModelConfig, UserError, functions, kinds
 from pewm_jax.memory import rendering, views
 from pewm_jax.models import codecs, encoders
 from pewm_jax.types import Array, Camera, EncodedView, Frames, MapTokens, Params, Sight, View
@@ -165,6 +165,56 @@ def trimmed(model: ModelConfig, memory: Memory) -> Memory:
     """
     own = getattr(functions(model.memory), "trimmed", None)
     return memory if own is None else own(memory)
+
+
+def editable(model: ModelConfig) -> bool:
+    """Tell whether boxes of the memory can be erased and moved."""
+    return hasattr(functions(model.memory), "erase") and hasattr(functions(model.memory), "move")
+
+
+def erase(model: ModelConfig, memory: Memory, box_23: Array) -> Memory:
+    """Forget what is in a box, as if nothing had ever been seen there.
+
+    Args:
+        model: the model.
+        memory: what is remembered.
+        box_23: (2, 3) lower and upper corner in the world, metres; a point on an upper face is
+            outside.
+
+    Raises:
+        UserError: the box is not a box, or this memory cannot be edited.
+    """
+    _require_editable(model)
+    return functions(model.memory).erase(model, memory, box_23)
+
+
+def move(
+    model: ModelConfig, memory: Memory, box_23: Array, transform: Array, *, leave: bool = False
+) -> Memory:
+    """Move what is in a box, and what the model imagines there with it.
+
+    Args:
+        model: the model.
+        memory: what is remembered.
+        box_23: as for ``erase``.
+        transform: (4, 4) rigid, from old to new positions, metres.
+        leave: leave what is in the box where it is, too: a copy.
+
+    Raises:
+        UserError: as for ``erase``, or the transform is not a rigid 4×4.
+    """
+    _require_editable(model)
+    return functions(model.memory).move(model, memory, box_23, transform, leave=leave)
+
+
+def _require_editable(model: ModelConfig) -> None:
+    """Refuse a memory without the two functions of editing."""
+    if not editable(model):
+        name = kinds.of(model.memory).name
+        raise UserError(
+            f"the memory {name!r} keeps no places that could be edited: use a model that remembers "
+            "surfels or voxels."
+        )
 
 
 def rendered_channels(model: ModelConfig) -> int:

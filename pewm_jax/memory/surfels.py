@@ -21,7 +21,7 @@ import numpy as np
 from pewm_jax.config import ModelConfig, SurfelConfig
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.normals import normals
-from pewm_jax.memory import cells, rendering, views, voxel_cells
+from pewm_jax.memory import boxes, cells, rendering, surfel_edit, views, voxel_cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
 COLUMNS = 10
@@ -127,7 +127,7 @@ def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool =
     if config.keep == "mean":
         stays = stays | (known & was_observed if observed else known)
 
-    corner = corners(config, surfels.origin_3, jnp.where(taken, cell_P, 0))
+    corner = cells.corners(config, surfels.origin_3, jnp.where(taken, cell_P, 0))
     offset = jnp.where(taken[:, None], new.points_P3 - corner, 0)
     values = jnp.where(taken[:, None], new.values_PC, 0)
     rows = jnp.concatenate([taken[:, None].astype(jnp.float32), offset, values], -1)
@@ -200,7 +200,7 @@ def means(config: SurfelConfig, surfels: Surfels) -> tuple[Array, Array, Array, 
     """
     valid = surfels.cell_V < voxel_cells.nowhere(config)
     mean = surfels.sums_VC[:, 1:] / jnp.where(valid, surfels.sums_VC[:, 0], 1)[:, None]
-    corner = corners(config, surfels.origin_3, jnp.where(valid, surfels.cell_V, 0))
+    corner = cells.corners(config, surfels.origin_3, jnp.where(valid, surfels.cell_V, 0))
     points = jnp.where(valid[:, None], corner + mean[:, :3], 0)
     return points, mean[:, 3:6], mean[:, 6:9], mean[:, 9:], valid
 
@@ -304,11 +304,21 @@ def widths(config: SurfelConfig, surfels: Surfels) -> Array:
     return jnp.maximum(surfels.size_V, max(config.cell_m))
 
 
-def corners(config: SurfelConfig, origin_3: Array, cell_P: Array) -> Array:
-    """Return (P, 3) the lower corners of cells by their numbers, metres."""
-    _, ny, nz = config.cells
-    place = jnp.stack([cell_P // (ny * nz), cell_P // nz % ny, cell_P % nz], -1)
-    return origin_3 + place.astype(jnp.float32) * np.asarray(config.cell_m, np.float32)
+def erase(model: ModelConfig, surfels: Surfels, box_23: Array) -> Surfels:
+    """Forget a box; see ``memories.erase``."""
+    config = settings_of(model)
+    points, *_, valid = means(config, surfels)
+    return surfel_edit.erase(config, surfels, boxes.within(points, valid, box_23))
+
+
+def move(
+    model: ModelConfig, surfels: Surfels, box_23: Array, transform: Array, *, leave: bool = False
+) -> Surfels:
+    """Move or copy what is in a box; see ``memories.move``."""
+    config, transform = settings_of(model), boxes.rigid(transform, "move")
+    points, *_, valid = means(config, surfels)
+    taken = boxes.within(points, valid, box_23)
+    return surfel_edit.move(config, surfels, points, taken, transform, leave=leave)
 
 
 def settings_of(model: ModelConfig) -> SurfelConfig:

@@ -16,11 +16,10 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
-from pewm_jax.config import MemorySettings, UserError
+from pewm_jax.config import MemorySettings
 from pewm_jax.geometry.cameras import invert_rigid, transform_points
-from pewm_jax.memory import cells, voxel_cells, voxel_core
+from pewm_jax.memory import boxes, cells, voxel_cells, voxel_core
 from pewm_jax.types import Array, VoxelMap
 
 
@@ -76,11 +75,7 @@ def paste(
     Raises:
         UserError: the transform is not a rigid 4×4.
     """
-    transform = jnp.eye(4) if transform is None else jnp.asarray(transform, jnp.float32)
-    if transform.shape != (4, 4):
-        raise UserError(f"paste() got a transform of shape {transform.shape}; give a rigid 4×4.")
-    if not isinstance(transform, Tracer) and not _is_rigid(np.asarray(transform)):
-        raise UserError("paste() got a transform that is not rigid; give a rotation and a shift.")
+    transform = boxes.rigid(transform, "paste")
     no_cell, back = voxel_cells.nowhere(config), invert_rigid(transform)
 
     def source(cell: Array) -> tuple[Array, Array]:
@@ -126,25 +121,9 @@ def move(config: MemorySettings, voxels: VoxelMap, box_23: Array, transform: Arr
     return paste(config, erase(config, voxels, box_23), piece, transform)
 
 
-def _is_rigid(transform: np.ndarray) -> bool:
-    turn = transform[:3, :3]
-    turns = np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0
-    return bool(turns and (transform[3] == (0, 0, 0, 1)).all() and np.isfinite(transform).all())
-
-
 def _within(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> Array:
-    box_23 = jnp.asarray(box_23, jnp.float32)
-    if box_23.shape != (2, 3):
-        raise UserError(
-            f"a box is its lower and its upper corner, shape (2, 3), in metres; got {box_23.shape}."
-        )
-    if not isinstance(box_23, Tracer) and not np.all(box_23[0] <= box_23[1]):
-        raise UserError(
-            f"the box's lower corner {box_23[0]} is not below its upper corner {box_23[1]}; give "
-            "the lower one first."
-        )
     points, _, valid = voxel_core.to_points(config, voxels)
-    return valid & ((points >= box_23[0]) & (points < box_23[1])).all(-1)
+    return boxes.within(points, valid, box_23)
 
 
 def _only(config: MemorySettings, voxels: VoxelMap, keep_V: Array) -> VoxelMap:

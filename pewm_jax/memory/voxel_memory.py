@@ -31,3 +31,17 @@ def tokens(model: ModelConfig, voxels: VoxelMap, camera: Camera) -> MapTokens:
 def to_points(model: ModelConfig, voxels: VoxelMap) -> tuple[Array, Array, Array]:
     """Return centre, features and validity of all slots."""
     return voxel_map.to_points(model.memory, voxels)
+
+
+def erase(model: ModelConfig, voxels: VoxelMap, box_23: Array) -> VoxelMap:
+    """Forget a box; see ``voxel_map.erase``."""
+    return voxel_map.erase(model.memory, voxels, box_23)
+
+
+def move(
+    model: ModelConfig, voxels: VoxelMap, box_23: Array, transform: Array, *, leave: bool = False
+) -> VoxelMap:
+    """Move or copy what is in a box; see ``memories.move``."""
+    piece = voxel_map.copy(model.memory, voxels, box_23)
+    rest = voxels if leave else voxel_map.erase(model.memory, voxels, box_23)
+    return voxel_map.paste(model.memory, rest, piece, transform)

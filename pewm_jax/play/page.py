@@ -1,0 +1,395 @@
+"""The page: pictures, buttons, keys and the map, in the browser; served by viser.
+
+Keys are commands with a hotkey. viser's own page moves its 3D camera by the same keys; a listener
+that the page installs (``KEYS``) keeps them from it, so that they drive and do nothing else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import html
+import io
+import math
+import os
+import socket
+import sys
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.config import ActionConfig, ConfigError
+from pewm_jax.evaluation.pictures import as_bytes
+from pewm_jax.play import board, picking, requests, session
+from pewm_jax.play.driver import Driver
+from pewm_jax.play.extra import viser
+from pewm_jax.play.map_view import MapView, eye_of
+from pewm_jax.play.requests import Request, Shown
+from pewm_jax.play.settings import LOOPBACK, Serve, Start
+
+VIEW_WIDTH, PANEL_WIDTH = 540, 310
+"""Widths of the pictures and of the controls, pixels."""
+SAMPLER = ("1", "2", "4", "8", "16")
+STEPS = {
+    "forward": (1, 0, 0),
+    "back": (-1, 0, 0),
+    "turn left": (0, 0, 1),
+    "turn right": (0, 0, -1),
+    "step left": (0, 1, 0),
+    "step right": (0, -1, 0),
+}
+"""What one may do, as parts of a step forward, a step left and a turn counter-clockwise."""
+SIGNS = {
+    "◀": "step left",
+    "▲": "forward",
+    "▼": "back",
+    "▶": "step right",
+    "↶ left": "turn left",
+    "right ↷": "turn right",
+}
+"""What the buttons do."""
+HOTKEYS = {
+    "forward": ("W", "arrowup"),
+    "back": ("S", "arrowdown"),
+    "turn left": ("A", "arrowleft"),
+    "turn right": ("D", "arrowright"),
+    "step left": ("Q",),
+    "step right": ("E",),
+}
+KEYS = (
+    "<img alt='' style='display:none' src='data:,' onerror=\"if(!window.drives){window.drives=1;"
+    "const k=/^(Key[WASDQE]|Arrow(Up|Down|Left|Right))$/;"
+    "document.documentElement.addEventListener('keydown',e=>{"
+    "if(k.test(e.code)&&!e.ctrlKey&&!e.metaKey&&!e.altKey&&!/^(INPUT|TEXTAREA|SELECT)$/.test(e.target.tagName))"
+    '{e.stopPropagation();e.preventDefault()}})}">'
+)
+"""Keeps the keys that drive from listeners of the document, which move the 3D camera; those of the
+root element, which are the hotkeys, have had them by then."""
+
+
+class Page:
+    """A page that is being served; ``close`` ends it.
+
+    Attributes:
+        url: where.
+        driver: what drives.
+    """
+
+    def __init__(
+        self,
+        load: Callable[[], Any],
+        start: Start,
+        serve: Serve,
+        folder: Path,
+        name: str,
+        say: Callable[[str], None] = lambda _: None,
+    ):
+        """Serve the page, and begin to load the model.
+
+        Args:
+            load: gives the model, an ``Engine``.
+            start: where the drive begins.
+            serve: address and port.
+            folder: of saved worlds and videos.
+            name: of the model, for the title.
+            say: told where the page is, what it waits for, and what goes wrong, once each.
+
+        Raises:
+            ConfigError: the address cannot be served on.
+        """
+        self._start, self._seconds, self._say, self._phase = start, None, say, ""
+        self._server = _serve(serve)
+        # Sharing asks a server elsewhere for a public address; this page is local.
+        self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
+        self.url = f"http://{_here(serve.host)}:{self._server.get_port()}"
+        say(f"drive: {self.url}  (Ctrl-C ends)")
+        if warning(serve):
+            say(warning(serve))
+        self._map = MapView(self._server)
+        gui = self._server.gui
+        gui.configure_theme(
+            dark_mode=True, show_logo=False, show_share_button=False, brand_color=(96, 200, 255)
+        )
+        gui.set_panel_label(f"pewm_jax · {name}")
+        view = gui.add_panel()
+        with view.add_tab("What is seen"):
+            self._view = gui.add_image(board.waiting("opening …"), format="jpeg", jpeg_quality=90)
+        view.dock_left()
+        view.set_width(VIEW_WIDTH)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL_WIDTH)
+        self._status = gui.add_html("")
+        self._busy = gui.add_progress_bar(100, animated=True, visible=False)
+        gui.add_html(KEYS)
+        self.driver = Driver(load, start, self.show, folder, ahead=serve.ahead)
+        self._add_driving()
+        self._add_editing()
+        self._add_starting()
+        self._add_keeping()
+
+    def close(self) -> None:
+        """End the drive and the server."""
+        self.driver.close()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def show(self, shown: Shown) -> None:
+        """Show what the driver tells; called in its thread."""
+        self._seconds = shown.seconds if shown.seconds is not None else self._seconds
+        self._tell(shown)
+        with self._server.atomic():
+            if shown.picture is not None:
+                self._view.image = shown.picture
+            self._busy.visible = shown.busy
+            self._status.content = self._status_of(shown)
+        if shown.session is not None and shown.engine is not None:
+            seen = as_bytes(np.asarray(shown.session.world.frame.rgb_THWC[0]))
+            self._map.show(shown.engine, shown.session, seen)
+        self._show_files(shown)
+
+    def _tell(self, shown: Shown) -> None:
+        """Tell the terminal what the page begins to wait for, and what went wrong."""
+        phase = shown.said.partition(" …")[0] if shown.busy or shown.failed else ""
+        if phase and phase != self._phase:
+            self._say(f"{phase} …" if shown.busy else f"error: {phase}")
+        if self._phase.startswith("Preparing") and not phase:
+            self._say("Ready.")
+        self._phase = phase
+
+    def _status_of(self, shown: Shown) -> str:
+        colour = "#ff8a80" if shown.failed else "#60c8ff" if shown.busy else "#7fe0a0"
+        said = html.escape(shown.said)
+        facts = []
+        if shown.engine is not None and shown.engine.sampler_steps:
+            facts.append(f"{shown.engine.sampler_steps} sampler steps")
+        if self._seconds is not None:
+            facts.append(f"last step {self._seconds:.2f} s")
+        count = len(self._map.points)
+        if count:
+            facts.append(f"{count:,} points")
+        if shown.recording:
+            facts.append("<span style='color:#ff8a80'>● recording</span>")
+        return (
+            "<div style='padding:2px 12px 6px;min-height:74px'>"
+            f"<div style='display:flex;gap:8px;line-height:1.35;font-size:14px'>"
+            f"<span style='color:{colour}'>●</span><span>{said or 'Drive on.'}</span></div>"
+            "<div style='opacity:.6;font-size:12px;margin:6px 0 0 17px'>"
+            f"{' · '.join(facts)}</div></div>"
+        )
+
+    def _put(self, request: Request) -> None:
+        self.driver.put(request)
+
+    def _act(self, name: str) -> None:
+        """Ask for one of ``STEPS``."""
+        forward, left, turn = STEPS[name]
+        actions = self._actions()
+        angle = math.radians(actions.turn_deg)
+        self._put(session.Drive((forward * actions.step_m, left * actions.step_m, turn * angle)))
+
+    def _actions(self) -> Any:
+        engine = self.driver.engine
+        return ActionConfig() if engine is None else engine.model.actions
+
+    def _add_driving(self) -> None:
+        gui = self._server.gui
+        with gui.add_folder("Drive"):
+            gui.add_html(
+                "<div style='padding:0 12px 4px;opacity:.75;font-size:12.5px;line-height:1.45'>"
+                "<b>W S</b> or <b>↑ ↓</b> go, <b>A D</b> or <b>← →</b> turn, <b>Q E</b> step aside."
+                " Or drag the camera in the map by its arrows and ring.</div>"
+            )
+            for name, signs in (("Go", ("◀", "▲", "▼", "▶")), ("Turn", ("↶ left", "right ↷"))):
+                group = gui.add_button_group(name, signs)
+                group.on_click(lambda event: self._act(SIGNS[event.target.value]))
+            walls = gui.add_checkbox("Walls stop me", initial_value=True)
+            walls.on_update(lambda _: self._put(session.Walls(walls.value)))
+            follow = gui.add_checkbox("The map follows me", initial_value=True)
+            follow.on_update(lambda _: setattr(self._map, "follow", follow.value))
+            ceiling = gui.add_checkbox("Show ceilings", initial_value=False)
+            ceiling.on_update(lambda _: self._redraw("ceiling", ceiling.value))
+            tint = gui.add_checkbox("Mark what was imagined", initial_value=False)
+            tint.on_update(lambda _: self._redraw("tint", tint.value))
+            above = gui.add_button("Look from above", icon=viser.Icon.EYE)
+            above.on_click(lambda _: self._map.look_from_above())
+        for name, keys in HOTKEYS.items():
+            for key in keys:
+                command = gui.add_command(f"{name} ({key})", hotkey=key)  # type: ignore[arg-type]
+                command.on_trigger(lambda _, name=name: self._act(name))
+
+        @self._map.handle.on_update
+        def _(event: Any) -> None:
+            if event.phase == "end":
+                self._put(requests.GoTo(self._map.dragged()))
+
+    def _redraw(self, name: str, value: bool) -> None:
+        setattr(self._map, name, value)
+        self._map.redraw()
+
+    def _add_editing(self) -> None:
+        gui, scene = self._server.gui, self._server.scene
+        with gui.add_folder("Edit the world"):
+            gui.add_html(
+                "<div style='padding:0 12px 4px;opacity:.75;font-size:12.5px;line-height:1.45'>"
+                "<b>Shift + drag</b> a rectangle in the map, or <b>shift + click</b>, to choose a "
+                "box. Drag the green box to where it shall go.</div>"
+            )
+            self._middle = gui.add_vector3("Middle", (0.0, 0.0, 0.0), step=0.05)
+            self._size = gui.add_vector3("Size", (0.9, 0.9, 1.1), step=0.05, min=(0.05, 0.05, 0.05))
+            for part in (self._middle, self._size):
+                part.on_update(self._typed)
+            erase = gui.add_button("Erase", icon=viser.Icon.ERASER, color="red")
+            move = gui.add_button("Move to the green box", icon=viser.Icon.ARROWS_MOVE)
+            copy = gui.add_button("Copy to the green box", icon=viser.Icon.COPY)
+            undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray")
+        erase.on_click(lambda _: self._edit("erase"))
+        move.on_click(lambda _: self._edit("move"))
+        copy.on_click(lambda _: self._edit("copy"))
+        undo.on_click(lambda _: self._put(requests.Undo()))
+
+        @scene.on_rect_select(modifier="shift")
+        def _(event: Any) -> None:
+            eye = eye_of(event.client.camera)
+            box = picking.in_rectangle(self._map.points, eye, event.screen_min, event.screen_max)
+            self._choose(box)
+
+        @scene.on_click(modifier="shift")
+        def _(event: Any) -> None:
+            origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+            self._choose(picking.at_click(self._map.points, origin, direction))
+
+    def _choose(self, box_23: np.ndarray | None) -> None:
+        """Choose a box, and write its numbers into the fields."""
+        self._map.choose(box_23)
+        if box_23 is not None:
+            x, y, z = (round(float(v), 2) for v in box_23.mean(0))
+            self._middle.value = (x, y, z)
+            x, y, z = (round(float(v), 2) for v in box_23[1] - box_23[0])
+            self._size.value = (x, y, z)
+
+    def _typed(self, event: Any) -> None:
+        """Choose the box that was typed; what the page itself writes is no choice."""
+        if event.client is not None:
+            middle, half = np.array(self._middle.value), np.array(self._size.value) / 2
+            self._map.choose(np.stack([middle - half, middle + half]))
+
+    def _edit(self, how: str) -> None:
+        if self._map.box_23 is None:
+            self.driver.tell("Choose a box first: shift + drag a rectangle in the map.")
+            return
+        low, high = self._map.box_23.tolist()
+        box = (tuple(low), tuple(high))
+        if how == "erase":
+            self._put(session.Erase(box))
+        else:
+            shift, turn = self._map.moved()
+            self._put(session.Move(box, shift, turn, leave=how == "copy"))
+        self._map.choose(None)
+
+    def _add_starting(self) -> None:
+        gui, start = self._server.gui, self._start
+        given = start.scene or start.episode or start.recording
+        with gui.add_folder("Begin elsewhere", expand_by_default=False):
+            sources = ("a generated house", *([Path(given).name] if given else []))
+            source = gui.add_dropdown("From", sources, initial_value=sources[-1])
+            house = gui.add_number("House", start.house, min=0, step=1)
+            seed = gui.add_number("Seed", start.seed, min=0, step=1)
+            begin = gui.add_button("New drive", icon=viser.Icon.PLAYER_PLAY)
+            steps: Any = gui.add_dropdown("Sampler steps", SAMPLER)
+
+        def anew(_: Any) -> None:
+            changes: dict[str, Any] = {"house": int(house.value), "seed": int(seed.value)}
+            if source.value == sources[0]:
+                changes |= {"scene": "", "episode": "", "recording": ""}
+            self._map.choose(None)
+            self._put(requests.Begin(dataclasses.replace(start, **changes)))
+
+        begin.on_click(anew)
+        steps.on_update(
+            lambda event: event.client and self._put(requests.Sampler(int(steps.value)))
+        )
+
+        self._steps = steps
+
+    def _add_keeping(self) -> None:
+        gui = self._server.gui
+        with gui.add_folder("Worlds and videos", expand_by_default=False):
+            name = gui.add_text("Name", "my world")
+            save = gui.add_button("Save this world", icon=viser.Icon.DEVICE_FLOPPY)
+            self._worlds: Any = gui.add_dropdown("Saved", ("none yet",))
+            load = gui.add_button("Go on in it", icon=viser.Icon.FOLDER_OPEN)
+            self._record = gui.add_button("Record a video", icon=viser.Icon.VIDEO, color="red")
+            self._file = gui.add_button("Download", icon=viser.Icon.DOWNLOAD, visible=False)
+        self._link: Path | None = None
+        self._recording = False
+        save.on_click(lambda _: self._put(requests.Save(name.value)))
+        load.on_click(lambda _: self._put(requests.Load(self._worlds.value)))
+        self._record.on_click(lambda _: self._put(requests.Record(not self._recording)))
+
+        @self._file.on_click
+        def _(event: Any) -> None:
+            if self._link is not None and self._link.is_file() and event.client is not None:
+                event.client.send_file_download(self._link.name, self._link.read_bytes())
+
+    def _show_files(self, shown: Shown) -> None:
+        """Show which worlds there are, and what was written."""
+        if not hasattr(self, "_file"):  # the page is still being made
+            return
+        count = str(shown.engine.sampler_steps) if shown.engine is not None else "0"
+        if count not in ("0", self._steps.value):
+            self._steps.options = tuple(sorted({*SAMPLER, count}, key=int))
+            self._steps.value = count
+        options = shown.worlds or ("none yet",)
+        if options != self._worlds.options:
+            self._worlds.options = options
+        if shown.recording != self._recording:
+            self._recording = shown.recording
+            self._record.label = "End the video" if shown.recording else "Record a video"
+        if shown.link is not None:
+            self._link = shown.link
+            self._file.label, self._file.visible = f"Download {shown.link.name}", True
+
+
+def open_in_browser(url: str) -> bool:
+    """Open a page where there is a desktop; tells whether one was asked."""
+    desktop = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+    return desktop and webbrowser.open(url)
+
+
+def warning(serve: Serve) -> str:
+    """Return what a page means that others can reach; empty if only this machine can."""
+    if serve.host in LOOPBACK:
+        return ""
+    return (
+        f"Anyone who reaches this machine at {serve.host} can drive, and load and save worlds: "
+        "there is no password."
+    )
+
+
+def _here(host: str) -> str:
+    """Return what this machine calls a host in an address."""
+    if host in ("0.0.0.0", "::"):  # noqa: S104 - it is not served on here
+        return "127.0.0.1"
+    return f"[{host}]" if ":" in host else host
+
+
+def _serve(serve: Serve) -> viser.ViserServer:
+    """Begin to serve, without viser's own message.
+
+    Raises:
+        ConfigError: the host is no address of this machine; viser would wait for it forever.
+    """
+    try:
+        kind, *_, address = socket.getaddrinfo(serve.host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(kind) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise ConfigError(
+            f"--host {serve.host} is no address that this machine can serve on ({error}); take "
+            "127.0.0.1, or 0.0.0.0 to be reached by others."
+        ) from None
+    with contextlib.redirect_stdout(io.StringIO()):
+        return viser.ViserServer(host=serve.host, port=serve.port, verbose=False)

@@ -1,0 +1,201 @@
+"""What is seen before a drive, fitted to the model: a house, a mesh, an episode, a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pewm_jax.config import UserError
+from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.importer import ImportConfig, import_recording
+from pewm_jax.data.navigation import NavGrid, is_free, sample_free
+from pewm_jax.data.recording_folders import read_recording
+from pewm_jax.data.render import render
+from pewm_jax.data.simulator import Simulator, move, open_simulator
+from pewm_jax.geometry.cameras import resize_intrinsics
+from pewm_jax.play.settings import Start
+from pewm_jax.types import Camera, Frames
+
+LOOKS, CANDIDATES, OPEN_M, TURN = 12, 16, 3.0, np.pi / 6
+"""Frames of a look around; places that a drive may begin at; metres around that count as room for
+it; headings that it may begin with are multiples of this, radians."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Place:
+    """Where a drive begins.
+
+    Attributes:
+        name: for people.
+        frames: S ≥ 1 frames of the model's size, rgb uint8; the last one is the present.
+        planar_3: x, y, yaw of the present in a house or mesh, else None.
+        simulator: the house or mesh, which knows the truth and its walls, else None.
+    """
+
+    name: str
+    frames: Frames
+    planar_3: np.ndarray | None = None
+    simulator: Simulator | None = None
+
+
+def open_place(start: Start, height: int, width: int) -> Place:
+    """Open what a drive begins with.
+
+    Args:
+        start: what was asked for.
+        height: of the model's images, pixels.
+        width: of the model's images, pixels.
+
+    Raises:
+        UserError: it does not exist or cannot be used, in one sentence.
+    """
+    if start.episode:
+        return _episode(Path(start.episode), start.number, start.frames, height, width)
+    if start.recording:
+        return _recording(start, height, width)
+    simulator = open_simulator(
+        house_seed=start.house,
+        scene=Path(start.scene) if start.scene else None,
+        up=start.up,
+        height=height,
+        width=width,
+        hfov=start.hfov,
+        camera_height=start.camera_height,
+    )
+    planar = _beginning(simulator.grid, np.random.default_rng(start.seed))
+    around = np.tile(planar, (LOOKS, 1))
+    around[:-1, 2] += 2 * np.pi * np.arange(1, LOOKS) / LOOKS
+    name = Path(start.scene).name if start.scene else f"house {start.house}"
+    return Place(name, simulator.frames(around), planar, simulator)
+
+
+def truth(place: Place, camera: Camera, height: int, width: int) -> Frames | None:
+    """Return what is really seen by (T,) cameras, or None where nobody knows."""
+    if place.simulator is None:
+        return None
+    host = Camera(np.asarray(camera.intrinsics_4), np.asarray(camera.world_from_camera))
+    seen = render(place.simulator.scene, host, height, width)
+    return Frames(seen.rgb_THWC, seen.depth_THW, host)
+
+
+def walk(
+    place: Place, planar_3: np.ndarray, action_3: np.ndarray, *, walls: bool = True
+) -> tuple[np.ndarray, bool]:
+    """Return the next planar pose, and whether a wall was in the way.
+
+    An agent slides along walls. One that stands outside of the free area (its walls were off) may
+    go anywhere.
+
+    Args:
+        place: where.
+        planar_3: x, y, yaw.
+        action_3: dx, dy, dyaw, as ``types`` says.
+        walls: False lets it through walls.
+    """
+    simulator = place.simulator
+    if walls and simulator is not None and bool(is_free(simulator.grid, planar_3[:2])):
+        return move(simulator.grid, planar_3, action_3, sliding=True)
+    x, y, yaw = np.asarray(planar_3, np.float64)
+    dx, dy, dyaw = np.asarray(action_3, np.float64)
+    ahead = np.array([np.cos(yaw) * dx - np.sin(yaw) * dy, np.sin(yaw) * dx + np.cos(yaw) * dy])
+    return np.array([x + ahead[0], y + ahead[1], _wrapped(yaw + dyaw)]), False
+
+
+def action_between(before_3: np.ndarray, after_3: np.ndarray) -> np.ndarray:
+    """Return the (3,) float32 action dx, dy, dyaw from one planar pose to another."""
+    (dx, dy), yaw = after_3[:2] - before_3[:2], before_3[2]
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = _wrapped(after_3[2] - yaw)
+    return np.array([c * dx + s * dy, c * dy - s * dx, turn], np.float32)
+
+
+def way(before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: float) -> np.ndarray:
+    """Return (n, 3) actions of equal parts from one planar pose to another, none above a step.
+
+    Args:
+        before_3: x, y, yaw.
+        after_3: x, y, yaw.
+        step_m: longest step, metres.
+        turn_deg: largest turn, degrees.
+    """
+    far = float(np.linalg.norm(after_3[:2] - before_3[:2]))
+    turn = _wrapped(float(after_3[2] - before_3[2]))
+    parts = int(max(np.ceil(far / step_m - 1e-6), np.ceil(abs(turn) / np.radians(turn_deg) - 1e-6)))
+    share = np.linspace(0, 1, parts + 1)[:, None]
+    poses = before_3 + share * (np.array([*after_3[:2], before_3[2] + turn]) - before_3)
+    actions = [action_between(a, b) for a, b in itertools.pairwise(poses)]
+    return np.stack(actions) if actions else np.zeros((0, 3), np.float32)
+
+
+def fitted(frames: Frames, height: int, width: int) -> Frames:
+    """Crop frames to a shape around their middle, and resize them and their intrinsics.
+
+    Args:
+        frames: NumPy frames, rgb uint8.
+        height: wanted, pixels.
+        width: wanted, pixels.
+    """
+    tall, wide = frames.depth_THW.shape[1:]
+    if (tall, wide) == (height, width):
+        return frames
+    high, broad = min(tall, round(wide * height / width)), min(wide, round(tall * width / height))
+    top, left = (tall - high) // 2, (wide - broad) // 2
+    rgb = frames.rgb_THWC[:, top : top + high, left : left + broad]
+    depth = frames.depth_THW[:, top : top + high, left : left + broad]
+    rows = ((np.arange(height) + 0.5) * high / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * broad / width).astype(int)
+    how = cv2.INTER_AREA if high > height else cv2.INTER_LINEAR
+    small = np.stack([cv2.resize(image, (width, height), interpolation=how) for image in rgb])
+    moved = frames.camera.intrinsics_4 - np.array([0, 0, left, top], np.float32)
+    intrinsics = resize_intrinsics(moved, width / broad, height / high)
+    camera = Camera(intrinsics, frames.camera.world_from_camera)
+    return Frames(small, depth[:, rows][:, :, columns], camera)
+
+
+def _episode(folder: Path, number: int, count: int, height: int, width: int) -> Place:
+    source = EpisodeSource(folder)
+    if number >= len(source):
+        raise UserError(
+            f"--number {number}: {folder} has {len(source)} episodes, 0 to {len(source) - 1}."
+        )
+    episode = source[number]
+    seen = episode.frames(range(min(count, episode.length)))
+    return Place(episode.name, fitted(seen, height, width))
+
+
+def _recording(start: Start, height: int, width: int) -> Place:
+    folder = Path(start.recording)
+    stride = max(1, len(read_recording(folder)) // start.frames)
+    assert start.intrinsics is not None
+    with tempfile.TemporaryDirectory() as made:
+        config = ImportConfig(
+            folder,
+            Path(made),
+            start.intrinsics,
+            depth_scale=start.depth_scale,
+            stride=stride,
+            up=start.recording_up,
+        )
+        import_recording(config, say=lambda _: None)
+        place = _episode(Path(made) / config.split, 0, start.frames, height, width)
+    return dataclasses.replace(place, name=folder.resolve().name)
+
+
+def _beginning(grid: NavGrid, rng: np.random.Generator) -> np.ndarray:
+    """Return x, y, yaw: of some places the one with most room, looking to where it is."""
+    free = grid.centre_of(np.argwhere(grid.free_YX))
+    places = sample_free(grid, rng, CANDIDATES)
+    around = [free[np.linalg.norm(free - place, axis=-1) < OPEN_M] - place for place in places]
+    best = int(np.argmax([len(one) for one in around]))
+    x, y = around[best].mean(0)
+    return np.array([*places[best], round(np.arctan2(y, x) / TURN) * TURN])
+
+
+def _wrapped(angle: float) -> float:
+    """Return an angle in (−π, π]."""
+    return float(np.pi - (np.pi - angle) % (2 * np.pi))

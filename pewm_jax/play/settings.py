@@ -1,0 +1,93 @@
+"""Where a drive begins, and how its page is served; light, so that help comes at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Literal
+
+from pewm_jax.config.errors import require
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+"""Hosts that only this machine reaches."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """What is seen before the drive; a generated house unless another source is named."""
+
+    house: int = 2
+    """Seed of the generated house. The model that comes with the library was trained on 0, 3, 6, …
+    and has never seen 2, 5, 8, …"""
+    seed: int = 0
+    """Where in the house the drive begins, and the noise of what is imagined."""
+    scene: str = ""
+    """A mesh to drive in (GLB, OBJ, PLY, …), in metres, instead of a house."""
+    up: Literal["auto", "y", "z"] = "auto"
+    """Which axis of the mesh points up; `auto`: y for GLB and glTF, z for the others."""
+    episode: str = ""
+    """A split's folder, such as data/small/revisit: begin with one of its episodes."""
+    number: int = 0
+    """Number of the episode."""
+    recording: str = ""
+    """A folder of colour images, depth images and a trajectory, as `pewm-jax data import` reads."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx fy cx cy in pixels of the recorded images; a recording needs them."""
+    depth_scale: float = 1000.0
+    """Value of a recorded depth image that means one metre."""
+    recording_up: Literal["x", "y", "z", "-x", "-y", "-z"] = "-y"
+    """Axis of the recording's world that points up."""
+    frames: int = 24
+    """How many frames of an episode or a recording are seen before the drive, at most."""
+    hfov: float = 90.0
+    """Horizontal field of view in a house or mesh, degrees."""
+    camera_height: float = 1.25
+    """Height of the camera above the floor of a house or mesh, metres."""
+
+    def __post_init__(self):
+        """Validate."""
+        named = [name for name in ("scene", "episode", "recording") if getattr(self, name)]
+        require(
+            len(named) < 2,
+            f"--{' and --'.join(named)} are given: a drive begins in one place, leave out all but "
+            "one.",
+        )
+        for name in ("house", "seed", "number"):
+            value = getattr(self, name)
+            require(
+                isinstance(value, int) and value >= 0,
+                f"--{name} is {value!r}: use a whole number from 0 on.",
+            )
+        require(self.frames >= 1, f"--frames is {self.frames}: use at least 1.")
+        require(
+            not self.recording or self.intrinsics is not None,
+            "--recording needs --intrinsics fx fy cx cy, in pixels of the recorded images.",
+        )
+        require(1 <= self.hfov < 180, f"--hfov is {self.hfov}: use 1 up to below 180 degrees.")
+        require(
+            math.isfinite(self.camera_height) and self.camera_height > 0,
+            f"--camera_height is {self.camera_height}: use metres above 0.",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Serve:
+    """How the page is served."""
+
+    host: str = "127.0.0.1"
+    """Address to serve on. Others than this machine reach the page with 0.0.0.0, without a
+    password."""
+    port: int = 8080
+    """Port of the page; the next free one is taken if it is in use."""
+    worlds: Path | None = None
+    """Folder of saved worlds and videos; by default worlds/ beside the run's reports."""
+    ahead: bool = True
+    """While nobody presses a key, imagine the next steps ahead, so that they are there at once."""
+    open: bool = True
+    """Open the page in the browser, where there is a desktop."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(0 <= self.port < 65536, f"--port is {self.port}: use 0 to 65535.")
+        require(bool(self.host), "--host is empty: name an address, such as 127.0.0.1.")

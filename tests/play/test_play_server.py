@@ -1,0 +1,153 @@
+"""The page without a browser: it is served, tabs come and go, and it ends."""
+
+import contextlib
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+import viser
+import viser.transforms
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from pewm_jax.commands import play
+from pewm_jax.config import ConfigError, UserError
+from pewm_jax.play import page, requests
+from pewm_jax.play.settings import Serve, Start
+from tests.play.tiny_drive import FORWARD, a_place, a_toy
+
+LONG = 120
+
+
+@contextlib.contextmanager
+def a_page(folder, load=a_toy):
+    one = page.Page(load, Start(house=2), Serve(port=0, ahead=False), folder, "toy")
+    try:
+        yield one
+    finally:
+        one.close()
+
+
+def a_tab(one):
+    protocol = f"viser-v{viser.__version__}"
+    return connect(one.url.replace("http", "ws"), subprotocols=[protocol], max_size=None)
+
+
+def heard(tab):
+    """Bytes that a tab was sent until it is quiet for a moment."""
+    count = 0
+    with contextlib.suppress(TimeoutError):
+        while True:
+            count += len(tab.recv(timeout=1.0))
+    return count
+
+
+def test_it_is_served_and_tabs_that_go_take_nothing_with_them(tmp_path):
+    a_place()
+    with a_page(tmp_path) as one:
+        with urllib.request.urlopen(one.url, timeout=30) as answer:
+            assert answer.status == 200
+            assert b"<html" in answer.read().lower()
+        assert one.driver.wait(LONG)
+        first, second = a_tab(one), a_tab(one)
+        assert min(heard(first), heard(second)) > 10_000  # the picture and the map, at once
+        one.driver.put(FORWARD)
+        assert one.driver.wait(LONG)
+        assert min(heard(first), heard(second)) > 5_000
+        first.socket.close()  # lost, without a word
+        one.driver.put(FORWARD)
+        assert one.driver.wait(LONG)
+        assert heard(second) > 5_000
+        second.close()
+        one.driver.put(FORWARD)
+        assert one.driver.wait(LONG)
+        assert one.driver._session.steps == 3
+        third = a_tab(one)
+        assert heard(third) > 10_000
+    with pytest.raises((urllib.error.URLError, ConnectionError)):
+        urllib.request.urlopen(one.url, timeout=5)
+    with contextlib.suppress(ConnectionClosed):
+        heard(third)
+
+
+def test_what_goes_wrong_is_on_the_page(tmp_path):
+    def load():
+        raise UserError("runs/<none> holds no weights.")
+
+    with a_page(tmp_path, load) as one:
+        assert one.driver.wait(LONG)
+        assert "runs/&lt;none&gt; holds no weights." in one._status.content
+        one.driver.put(FORWARD)
+        assert one.driver.wait(LONG)
+        assert "no world yet" in one._status.content
+        one._edit("erase")
+        assert "Choose a box first" in one._status.content
+
+
+def test_a_box_goes_where_it_was_dragged_and_the_agent_too(tmp_path):
+    with a_page(tmp_path) as one:
+        assert one.driver.wait(LONG)
+        view, begun = one._map, one.driver._session
+        low, high = (begun.planar_3[0] - 1, begun.planar_3[1] - 1), (4.0, 4.0)
+        box = np.array([[*low, 0.2], [low[0] + high[0], low[1] + high[1], 1.0]])
+        inside = ((view.points >= box[0]) & (view.points < box[1])).all(-1)
+        assert 0 < inside.sum() < len(view.points)
+        one._choose(box)
+        view.target.position = view.target.position + np.array([0.0, 0.0, -20.0])
+        view.target.wxyz = viser.transforms.SO3.from_z_radians(np.pi / 2).wxyz
+        one._edit("copy")
+        assert one.driver.wait(LONG)
+        assert (view.points[:, 2] < -10).sum() == inside.sum()
+        assert view.box_23 is None
+        x, y, yaw = begun.planar_3
+        view.handle.position = np.array([x, y, 0.0])
+        view.handle.wxyz = viser.transforms.SO3.from_z_radians(yaw + 0.4).wxyz
+        one._put(requests.GoTo(view.dragged()))
+        assert one.driver.wait(LONG)
+        assert np.cos(one.driver._session.planar_3[2] - yaw - 0.4) > 1 - 1e-6
+        view.ceiling = view.tint = True
+        view.redraw()
+        assert len(view.points) == len(one.driver.engine.points(one.driver._session.world)[0])
+
+
+def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so():
+    assert Serve().host == "127.0.0.1"
+    assert page.warning(Serve()) == ""
+    assert "no password" in page.warning(Serve(host="0.0.0.0"))
+    assert [page._here(host) for host in ("0.0.0.0", "::1", "me")] == ["127.0.0.1", "[::1]", "me"]
+    with pytest.raises(ConfigError, match="no address that this machine"):
+        page._serve(Serve(host="203.0.113.7"))  # an address of nobody
+
+
+def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
+    wrong = (
+        ([], "Name a model"),
+        (["runs/none"], "is no run"),
+        (["small", "--port", "a"], "whole number"),
+        (["small", "--scene", "a.glb", "--episode", "b"], "one place"),
+    )
+    for argv, says in wrong:
+        with pytest.raises(UserError, match=says):
+            play.main(argv)
+    code = (
+        "import sys; sys.modules['viser'] = None\n"
+        "from pewm_jax.commands.main import main\n"
+        "sys.exit(main(['play', 'small']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines() == [
+        "error: the live viewer needs viser, which is not installed: pip install 'pewm-jax[play]'."
+    ]
+
+
+def test_settings_of_a_page_are_those_of_its_parts():
+    settings = play.Settings(house=5, port=0)
+    assert play._part(Start, settings).house == 5
+    assert play._part(Serve, settings).port == 0
+    with pytest.raises(ConfigError):
+        play.Settings(port=-1)
+    assert requests.Begin(Start()).start.house == 2
