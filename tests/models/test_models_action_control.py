@@ -1,4 +1,4 @@
-"""Actions by modulation: published normalisation, no action seen early, nothing changed at first."""
+"""Actions by modulation: published normalisation, no action too early, nothing changed at first."""
 
 import dataclasses
 import functools
