@@ -95,7 +95,8 @@ def measure(
             errors = []
             for first in range(0, len(parts), size):
                 here = slice(first, first + size)
-                context, truth = (stack([p[k] for p in parts[here]], size) for k in (0, 1))
+                context = stack([part[0] for part in parts[here]], size)
+                truth = stack([part[1] for part in parts[here]], size)
                 numbers = np.arange(first, first + size)
                 rgb = imagine(config, weights, context, stack(given[here], size), seed, numbers)
                 off = jnp.square(unit_colours(rgb) - unit_colours(truth.rgb_THWC))
