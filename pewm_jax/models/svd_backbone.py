@@ -19,6 +19,7 @@ from jax.sharding import PartitionSpec as P
 from pewm_jax.config import ModelConfig, SVDUNetConfig, UserError
 from pewm_jax.models import backbones, clip_vision, svd_shapes, svd_unet
 from pewm_jax.models.backbones import Conditioning, Observed, Readers
+from pewm_jax.models.blocked_attention import LOGITS
 from pewm_jax.models.costs import FLOAT, Costs, Product, Share
 from pewm_jax.types import Array, Params
 
@@ -141,17 +142,18 @@ def costs(model: ModelConfig, share: Share, *, trained: bool) -> Costs:
         else:
             linear += macs
     attention, largest = 0.0, 0.0
-    for place, level in _attentions(config):
+    for level in _attentions(config):
         pixels = math.prod(sizes[level])
         depth = config.layers[level]
         attention += depth * 2 * config.widths[level] * (frames * pixels**2 + pixels * frames**2)
         logits = config.heads[level] * frames * pixels**2
         largest = max(largest, 0.0 if share.flash else float(logits))
-        del place
     backward, again = 1.0 + trained, float(config.remat)
     blocks = _outputs(config, frames, sizes)
-    kept = share.clips * share.activation_bytes * sum(blocks)
-    inner = share.clips * share.activation_bytes * max(blocks)
+    each = share.clips * share.activation_bytes
+    outputs = each * sum(values for _, values in blocks)
+    inside = each * sum(KEPT[kind] * values for kind, values in blocks)
+    inner = each * max(BLOCK[kind] * values for kind, values in blocks)
     image = config.image
     tokens = image.tokens
     layer = (4 * image.width + 2 * image.hidden) * image.width
@@ -166,15 +168,17 @@ def costs(model: ModelConfig, share: Share, *, trained: bool) -> Costs:
             Product("image", "linear", seen + image.width * image.projection),
             Product("image", "attention", 2 * image.layers * tokens**2 * image.width),
         ),
-        kept=kept * (1 if config.remat else KEPT),
-        block=inner * BLOCK + 2 * FLOAT * share.clips * min(largest, 2**20),
-        streamed=kept * (STREAMS[0] * (1 + again) + STREAMS[1]),
+        kept=outputs if config.remat else inside,
+        block=inner + 2 * FLOAT * share.clips * min(largest, LOGITS),
+        streamed=outputs * (STREAMS[0] * (1 + again) + STREAMS[1]),
     )
 
 
-KEPT, BLOCK = 12, 30
-"""Arrays of a block's size that are kept for the backward pass of it without ``remat``, and that
-its backward pass holds at its peak."""
+KEPT = {"resnet": 14, "attention": 80}
+"""Arrays of the size of a block's output that its backward pass needs; three feed-forward layers,
+with eight times as many channels inside, make up most of an attention's. A rough count."""
+BLOCK = {"resnet": 30, "attention": 160}
+"""The same at the peak of its own backward pass."""
 
 
 def modulated(model: ModelConfig) -> bool:
@@ -222,19 +226,24 @@ def _vectors(
     return frames * math.prod(sizes[_level(config, path)])
 
 
-def _attentions(config: SVDUNetConfig) -> list[tuple[str, int]]:
-    """List the attentions and their levels."""
-    found = [("mid", len(config.widths) - 1)]
+def _attentions(config: SVDUNetConfig) -> list[int]:
+    """List the levels of all attentions."""
+    found = [len(config.widths) - 1]  # at the bottom
     for level, attends in enumerate(config.attends):
-        if attends:
-            found += [("level", level)] * (2 * config.resnets[level] + 1)
+        found += [level] * (attends * (2 * config.resnets[level] + 1))
     return found
 
 
-def _outputs(config: SVDUNetConfig, frames: int, sizes: list[tuple[int, int]]) -> list[float]:
-    """Return the number of values that each residual block and each attention gives."""
-    found = []
-    for level, width in enumerate(config.widths):
-        values = float(frames * math.prod(sizes[level]) * width)
-        found += [values] * ((2 * config.resnets[level] + 1) * (1 + config.attends[level]))
+def _outputs(
+    config: SVDUNetConfig, frames: int, sizes: list[tuple[int, int]]
+) -> list[tuple[str, float]]:
+    """Return the kind and the number of values of what each block gives."""
+
+    def values(level: int) -> float:
+        return float(frames * math.prod(sizes[level]) * config.widths[level])
+
+    found = [("attention", values(level)) for level in _attentions(config)]
+    last = len(config.widths) - 1
+    for level, count in enumerate(config.resnets):
+        found += [("resnet", values(level))] * (2 * count + 1 + 2 * (level == last))
     return found
