@@ -104,7 +104,6 @@ def parts(model, params, state, actions_KN, key) -> dict[str, Clock]:
     latents = jax.block_until_ready(drawing(params, given, sight, keys))
     for name, run in {
         "the sampler (denoiser, 2 steps)": lambda: drawing(params, given, sight, keys),
-        "rendering the memory": lambda: looking(params, state.map, actions_KN),
         "the present frame and the rays": lambda: conditioning(params, state.frame, actions_KN),
         "decoding and the gate, last frame": lambda: decoding(params, latents, sight),
     }.items():
@@ -113,6 +112,28 @@ def parts(model, params, state, actions_KN, key) -> dict[str, Clock]:
         for _ in range(3):
             clocks[name](run)
     return clocks
+
+
+def one_by_one(model, params, state, actions_KN, key, cost) -> tuple[Clock, np.ndarray]:
+    """Imagine candidates alone, as a loop would, and return the time and the costs."""
+    one = jax.jit(functools.partial(worlds.imagine, remember=False), static_argnums=0)
+
+    def judged(actions):
+        frames = one(model, params, state, actions, key)[1]
+        return cost(jax.tree.map(lambda x: x[None], frames))[0]
+
+    jax.block_until_ready(judged(actions_KN[0]))
+    clock = Clock()
+    return clock, np.array([clock(lambda a=actions: judged(a)) for actions in actions_KN])
+
+
+def shares(each: dict[str, float]) -> list[list[str]]:
+    """Return rows: seconds of each part, and their share of all."""
+    spent = sum(each.values())
+    return [
+        [name, f"{seconds * 1e3:.1f} ms", f"{seconds / spent:.0%}"]
+        for name, seconds in each.items()
+    ]
 
 
 def main() -> None:
@@ -128,63 +149,57 @@ def main() -> None:
     state, goal = scene(config, params)
     cost, key = costs.perceptual(), jax.random.key(0)
 
-    rollout, imagining, comparing = (
-        Imagination(config, params, state, key, chosen.batch),
-        Clock(),
-        Clock(),
-    )
+    imagining, rendering = Clock(), Clock()
+
+    def fresh():
+        """A rollout that has rendered nothing yet, and whose rendering is timed."""
+        made = Imagination(config, params, state, key, chosen.batch)
+        views = made._views
+        object.__setattr__(made, "_views", lambda actions: rendering(lambda: views(actions)))
+        return made, views
+
+    rollout, views = fresh()
     asked: list[np.ndarray] = []
 
     def rolled(actions):
         asked.append(np.asarray(actions))
         return imagining(lambda: rollout(actions))
 
-    def compared(frames, goal):
-        return comparing(lambda: cost(frames, goal))
-
     begun = np.random.default_rng(0).integers(0, 3, (settings.candidates, settings.horizon))
     jax.block_until_ready(cost(rollout(begun), goal))  # compiles
-    judged = Judged(rolled, compared, goal)
+    views(np.ones((1, 1), int))  # one camera alone is another program
+    judged = Judged(rolled, cost, goal)
     plan(CEM(), settings, lambda *_: np.zeros(settings.candidates), key, progress=False)  # too
+    rollout, views = fresh()
+    imagining, rendering = Clock(), Clock()
     whole = Clock()
     found = whole(lambda: plan(CEM(), settings, judged, jax.random.key(1)))
+    drawn, drawing = views.rendered, rendering.cpu
 
-    one = jax.jit(functools.partial(worlds.imagine, remember=False), static_argnums=0)
     tried = np.concatenate(asked)
-    each = np.random.default_rng(1).permutation(len(tried))[: chosen.alone]
-    jax.block_until_ready(one(model, params, state, tried[0], key))
-    alone, alone_cost, last = Clock(), Clock(), []
-    for number in each:
-        frames = alone(lambda n=number: one(model, params, state, tried[n], key)[1])
-        frames = jax.tree.map(lambda x: x[None], frames)
-        last.append(alone_cost(lambda f=frames: cost(f, goal))[0])
-    together = np.array([judged(tried[n][None])[0] for n in each])
-    apart = np.abs(together - np.array(last)).max()
+    some = tried[np.random.default_rng(1).permutation(len(tried))[: chosen.alone]]
+    alone, last = one_by_one(model, params, state, some, key, lambda frames: cost(frames, goal))
+    together = np.array([judged(actions[None])[0] for actions in some])
+    apart = np.abs(together - last).max()
 
     clocks = parts(model, params, state, tried[: chosen.batch], key)
     total = settings.rounds * settings.candidates
-    wall = (alone.wall + alone_cost.wall) / len(each) * total
-    cpu = (alone.cpu + alone_cost.cpu) / len(each) * total
-    rest = whole.wall - imagining.wall - comparing.wall
+    wall, cpu = alone.wall / len(some) * total, alone.cpu / len(some) * total
     rows = [
         [f"a plan: {total} candidates, {judged.rolled_out} different", whole.wall, whole.cpu],
         ["— of it imagining", imagining.wall, imagining.cpu],
-        ["— of it LPIPS", comparing.wall, comparing.cpu],
-        ["— of it the planner", rest, whole.cpu - imagining.cpu - comparing.cpu],
-        [f"the {total} one by one, from {len(each)}", wall, cpu],
+        ["— of it LPIPS and the planner", whole.wall - imagining.wall, whole.cpu - imagining.cpu],
+        [f"the {total} one by one, from {len(some)}", wall, cpu],
     ]
+    each = {name: clock.cpu / 3 / chosen.batch for name, clock in clocks.items()}
+    each[f"rendering the memory, {drawn} cameras"] = drawing / judged.rolled_out
     text = [
         table(
             ["what", "seconds", "processor seconds"],
             [[a, f"{b:.1f}", f"{c:.1f}"] for a, b, c in rows],
-        )
+        ),
+        table(["imagining a candidate", "processor time", "share"], shares(each)),
     ]
-    spent = sum(clock.cpu for clock in clocks.values())
-    split = [
-        [name, f"{clock.cpu / 3 / chosen.batch * 1e3:.1f} ms", f"{clock.cpu / spent:.0%}"]
-        for name, clock in clocks.items()
-    ]
-    text.append(table(["imagining a candidate", "processor time", "share"], split))
     per = whole.wall / judged.rolled_out, wall / total
     text.append(
         f"The plan is {wall / whole.wall:.1f} times as fast as one candidate after the other "

@@ -223,6 +223,7 @@ COMMANDS = {
     "protocol": ("pewm-jax protocol", ["-m", "pewm_jax", "protocol"]),
     "compare": ("pewm-jax compare", ["-m", "pewm_jax", "compare"]),
     "table2": ("pewm-jax table2", ["-m", "pewm_jax", "table2"]),
+    "practice": ("pewm-jax practice", ["-m", "pewm_jax", "practice"]),
     "table1": ("pewm-jax table1", ["-m", "pewm_jax", "table1"]),
 }
 """Each subcommand: the words it is called by without ``pewm-jax``, and how to call it so."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import pewm_jax
 from pewm_jax import cli
-from pewm_jax.commands import compare, evaluate, protocol, table1, table2, train
+from pewm_jax.commands import compare, evaluate, practice, protocol, table1, table2, train
 from pewm_jax.convert import __main__ as convert
 from pewm_jax.data import __main__ as data
 from pewm_jax.memory import __main__ as memory
@@ -37,6 +37,7 @@ COMMANDS = {
     "compare": Command(compare.main, "set two scored runs side by side, with paired differences"),
     "table1": Command(table1.main, "train and score every memory: the paper's Table 1, ablations"),
     "table2": Command(table2.main, "decide by policies, rankings and plans: the paper's Table 2"),
+    "practice": Command(practice.main, "let a policy practise in imagination, and measure it"),
     "memory": Command(memory.main, "compute the image encoder's features of a data set once"),
     "convert": Command(convert.main, "bring a CogVideoX or DINOv2 in, take trained weights out"),
     "plan": Command(train.plan, "say what a training would take on hardware that is not here"),

@@ -42,7 +42,8 @@ class Settings:
     horizon: int = 8
     """Actions of a walk and of a plan, a multiple of what the model imagines at once."""
     policy: str = "wander"
-    """`wander` (walks that know nothing) or MODULE:FUNCTION, see `studies.deciders.Policy`."""
+    """`wander` (walks that know nothing), the folder of a trained NoMaD (`runs/nomad`), or
+    MODULE:FUNCTION, see `studies.deciders.Policy`."""
     cost: Literal["lpips", "pixels"] = "lpips"
     """How far the last frame is from the goal's picture."""
     videos: int = 3
@@ -82,8 +83,9 @@ def main(argv: Sequence[str], prog: str = "pewm-jax table2") -> int:
         rounds=settings.rounds,
     )
     shared = ("tasks", "houses", "proposals", "policy", "cost", "videos")
-    errand = table2.Errand(plan=plan, **{name: getattr(settings, name) for name in shared})
-    policy = _policy(settings.policy)
+    chosen = {name: getattr(settings, name) for name in shared}
+    chosen["policy"], policy = _policy(settings.policy)
+    errand = table2.Errand(plan=plan, **chosen)
     cost = costs.perceptual() if settings.cost == "lpips" else costs.Pixels()
     cli.cache_compilation(settings.out)
     page = table2.run(settings.model, settings.out, errand, policy, cost)
@@ -91,19 +93,24 @@ def main(argv: Sequence[str], prog: str = "pewm-jax table2") -> int:
     return 0
 
 
-def _policy(name: str) -> Callable[..., Any]:
-    """Return a policy by its name, or MODULE:FUNCTION."""
-    from pewm_jax.studies.deciders import POLICIES
+def _policy(name: str) -> tuple[str, Callable[..., Any]]:
+    """Return what the decisions of a policy are kept under, and the policy."""
+    from pewm_jax.studies import deciders, policies
 
-    if name in POLICIES:
-        return POLICIES[name]
+    if name in deciders.POLICIES:
+        return name, deciders.POLICIES[name]
+    if policies.is_run(name):
+        opened = policies.open_policy(name)
+        propose = deciders.nomad(opened.config.model.policy, opened.weights, opened.motion)
+        return f"{Path(name).name}-{opened.digest[:8]}", propose
     module, _, function = name.partition(":")
     if not function.isidentifier() or not all(part.isidentifier() for part in module.split(".")):
         raise cli.ConfigError(
-            f"--policy {name} is neither one of {', '.join(POLICIES)} nor MODULE:FUNCTION."
+            f"--policy {name} is neither one of {', '.join(deciders.POLICIES)}, nor the folder of "
+            "a trained NoMaD (pewm-jax train nomad), nor MODULE:FUNCTION."
         )
     imports.look_here()
     found = getattr(kinds.imported(module, "--policy"), function, None)
     if not callable(found):
         raise cli.ConfigError(f"--policy {name}: {module} has no function {function}.")
-    return found
+    return name, found

@@ -10,6 +10,7 @@ from pewm_jax.config.clip_vision import CLIPVisionConfig
 from pewm_jax.config.codec import CodecSettings, PixelConfig
 from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
 from pewm_jax.config.control import CameraConfig, ControlSettings, ModulationConfig
+from pewm_jax.config.cosmos import COSMOS_2B, COSMOS_14B, CosmosConfig
 from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
 from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
@@ -44,6 +45,7 @@ from pewm_jax.config.svd_unet import SVDUNetConfig
 from pewm_jax.config.svd_vae import SVDVAEConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.vae import VAEConfig
+from pewm_jax.config.wan_vae import WanVAEConfig
 
 register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
 register("world", "codec", CodecWorldConfig, "pewm_jax.worlds.codec")
@@ -75,6 +77,8 @@ register("noise", "flow", FlowConfig, "pewm_jax.diffusion.flow")
 
 __all__ = [
     "AXES",
+    "COSMOS_2B",
+    "COSMOS_14B",
     "PUBLISHED",
     "SMALLEST",
     "VERSION",
@@ -91,6 +95,7 @@ __all__ = [
     "Config",
     "ConfigError",
     "ControlSettings",
+    "CosmosConfig",
     "DDPMConfig",
     "DINOv2Config",
     "DINOv2EncoderConfig",
@@ -133,6 +138,7 @@ __all__ = [
     "UserError",
     "VAEConfig",
     "VoxelConfig",
+    "WanVAEConfig",
     "WorldSettings",
     "from_dict",
     "functions",

@@ -112,12 +112,16 @@ class EDMConfig(NoiseSettings):
     """Mean of log σ in training."""
     log_std: float = 1.2
     """Standard deviation of log σ in training."""
-    target: Literal["edm", "v"] = "edm"
+    target: Literal["edm", "v", "flow"] = "edm"
     """What the network predicts. `edm`: F of the paper; `v`: −F, as in Stable Video Diffusion
     (with sigma_data 1 it is v of DDPM). Samples then start with deviation √(σ_max² + sigma_data²),
-    that of noisy latents, instead of σ_max."""
+    that of noisy latents, instead of σ_max. `flow`: the velocity ε − x0 of latents x / (1 + σ), at
+    time σ / (1 + σ), as in Cosmos-Predict2; sigma_data is 1."""
     sample_steps: int = 18
     """Steps of the sampler."""
+    ends: Literal["clean", "sigma_min"] = "clean"
+    """Where the sampler ends: at clean latents, or as in Cosmos-Predict2 at latents with the noise
+    sigma_min, one evaluation of the network less."""
     sampler: Literal["euler", "heun"] = "euler"
     """`euler`: first order, one evaluation of the denoiser per step. `heun`: second order, two."""
     guidance: float = 1.0
@@ -135,6 +139,15 @@ class EDMConfig(NoiseSettings):
         require(
             min(self.sigma_data, self.rho) > 0 and self.log_std >= 0,
             "noise.sigma_data and noise.rho must be above 0, and noise.log_std at least 0.",
+        )
+        require(
+            self.target != "flow" or self.sigma_data == 1,
+            f"noise.sigma_data is {self.sigma_data}: noise.target flow goes with 1.",
+        )
+        require(
+            self.ends != "sigma_min" or self.sample_steps >= 2,
+            "noise.sample_steps is 1: with noise.ends sigma_min use at least 2, or nothing is "
+            "denoised.",
         )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from pewm_jax import config as configuration
 from pewm_jax.config import ConfigError, DDPMConfig, UserError
+from pewm_jax.convert import settings
 
 CLASSES = {"CogVideoXDDIMScheduler": "ddim", "CogVideoXDPMScheduler": "dpm"}
 """Their classes and our samplers."""
@@ -66,12 +67,7 @@ def config_from_diffusers(values: Mapping[str, Any]) -> DDPMConfig:
             f"The scheduler's _class_name is {name!r}; supported are {' and '.join(CLASSES)}."
         )
     known = _DEFAULTS.keys() | _WITHOUT_EFFECT.keys()
-    unknown = sorted(key for key in values if key not in known and not key.startswith("_"))
-    if unknown:
-        raise UserError(
-            f"The scheduler has settings that are not known: {', '.join(unknown)}; known are "
-            f"{', '.join(sorted(known))}."
-        )
+    settings.require_known(values, "The scheduler", known)
     given = {key: values.get(key, default) for key, default in _DEFAULTS.items()}
     _require_supported(given)
     ours = {

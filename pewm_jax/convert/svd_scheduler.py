@@ -12,6 +12,7 @@ from typing import Any
 
 from pewm_jax import config as configuration
 from pewm_jax.config import ConfigError, EDMConfig, UserError
+from pewm_jax.convert import settings
 
 CLASS = "EulerDiscreteScheduler"
 """The reference's class."""
@@ -61,12 +62,7 @@ def config_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
     if name != CLASS:
         raise UserError(f"The scheduler's _class_name is {name!r}; supported is {CLASS}.")
     known = {"sigma_min", "sigma_max", *_ONLY, *_WITHOUT_EFFECT, *_FORMER}
-    unknown = sorted(key for key in values if key not in known and not key.startswith("_"))
-    if unknown:
-        raise UserError(
-            f"The scheduler has settings that are not known: {', '.join(unknown)}; known are "
-            f"{', '.join(sorted(known))}."
-        )
+    settings.require_known(values, "The scheduler", known)
     for key, (only, default) in _ONLY.items():
         if (value := values.get(key, default) or default) != only:
             raise UserError(f"The scheduler's {key} is {value!r}; only {only!r} is supported.")

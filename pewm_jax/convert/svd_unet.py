@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.config import SVDUNetConfig, UserError
+from pewm_jax.convert import settings
 from pewm_jax.convert.mapping import CONV, LINEAR, SAME, Entry, Turn
 from pewm_jax.models import svd_shapes
 
@@ -49,17 +50,7 @@ def config_from_diffusers(values: dict[str, Any]) -> SVDUNetConfig:
     Raises:
         UserError: another class, or a setting that is unknown or not supported.
     """
-    kind = values.get("_class_name", CLASS)
-    if kind != CLASS:
-        raise UserError(f"The U-Net is a {kind}; only {CLASS} can be read.")
-    known = _DEFAULTS.keys() | _WITHOUT_EFFECT.keys()
-    unknown = sorted(key for key in values if not key.startswith("_") and key not in known)
-    if unknown:
-        raise UserError(
-            f"The U-Net has settings that are not known: {', '.join(unknown)}; known are "
-            f"{', '.join(sorted(known))}."
-        )
-    given = {key: values.get(key, default) for key, default in _DEFAULTS.items()}
+    given = settings.of_network(values, "The U-Net", CLASS, _DEFAULTS, _WITHOUT_EFFECT)
     widths = _numbers(given, "block_out_channels", None)
     levels = len(widths)
     attends = tuple(kind == DOWN[True] for kind in given["down_block_types"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from pewm_jax.config import SVDVAEConfig, UserError
+from pewm_jax.convert import settings
 from pewm_jax.convert.mapping import Entry
 from pewm_jax.convert.svd_unet import POINTWISE, RULES, renamed, turn
 from pewm_jax.models import svd_vae
@@ -41,17 +42,7 @@ def config_from_diffusers(values: dict[str, Any]) -> SVDVAEConfig:
     Raises:
         UserError: another class, or a setting that is unknown or not supported.
     """
-    kind = values.get("_class_name", CLASS)
-    if kind != CLASS:
-        raise UserError(f"The VAE is a {kind}; only {CLASS} can be read.")
-    known = _DEFAULTS.keys() | _WITHOUT_EFFECT.keys()
-    unknown = sorted(key for key in values if not key.startswith("_") and key not in known)
-    if unknown:
-        raise UserError(
-            f"The VAE has settings that are not known: {', '.join(unknown)}; known are "
-            f"{', '.join(sorted(known))}."
-        )
-    given = {key: values.get(key, default) for key, default in _DEFAULTS.items()}
+    given = settings.of_network(values, "The VAE", CLASS, _DEFAULTS, _WITHOUT_EFFECT)
     widths = given["block_out_channels"]
     whole = ("in_channels", "out_channels", "latent_channels", "layers_per_block")
     for key, numbers in (*((k, [given[k]]) for k in whole), ("block_out_channels", widths)):

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from pewm_jax.config import DiTConfig, UserError
+from pewm_jax.convert import settings
 from pewm_jax.convert.mapping import LINEAR, SAME, Entry, Turn
 
 CLASS = "CogVideoXTransformer3DModel"
@@ -62,9 +63,7 @@ def config_from_diffusers(values: dict[str, Any]) -> DiTConfig:
     Raises:
         UserError: a key that is unknown, or a value that is not supported, by its name.
     """
-    kind = values.get("_class_name", CLASS)
-    if kind != CLASS:
-        raise UserError(f"The transformer is a {kind}; only {CLASS} can be read.")
+    settings.require_class(values, "The transformer", CLASS)
     for key, value in values.items():
         if key in FIXED and value != FIXED[key]:
             raise UserError(f"The transformer's {key} is {value!r}; only {FIXED[key]!r} is known.")

@@ -2,6 +2,9 @@
 
 The network F gets c_in x and log σ / 4. Clean latents are c_skip x + c_out F (Eq. 7 and Table 1
 there), so input and target have unit variance at every σ. A network may predict v = −F instead.
+
+With the target ``flow`` all of this is flow matching at the time τ = σ / (1 + σ): the network gets
+x / (1 + σ) = (1 − τ) x0 + τ ε and τ, and predicts ε − x0.
 """
 
 from __future__ import annotations
@@ -30,37 +33,40 @@ def corrupt(config: EDMConfig, x0: Array, noise: Array, time_B: Array) -> Array:
 def _scales(config: EDMConfig, sigma: Array) -> tuple[Array, Array, Array]:
     """Return c_skip, c_out and c_in."""
     data = config.sigma_data
+    if config.target == "flow":
+        return 1 / (1 + sigma), sigma / (1 + sigma), 1 / (1 + sigma)
     total = sigma**2 + data**2
     return data**2 / total, sigma * data / jnp.sqrt(total), 1 / jnp.sqrt(total)
 
 
 def shown(config: EDMConfig, x_t: Array, time_B: Array) -> tuple[Array, Array]:
-    """Return c_in x and log σ / 4."""
+    """Return c_in x and log σ / 4, or σ / (1 + σ)."""
     _, _, scale = _scales(config, spread(time_B, x_t.ndim))
-    return scale * x_t, jnp.log(time_B) / 4
+    told = time_B / (1 + time_B) if config.target == "flow" else jnp.log(time_B) / 4
+    return scale * x_t, told
 
 
 def target(config: EDMConfig, x0: Array, noise: Array, time_B: Array) -> Array:
-    """Return F = (x0 − c_skip x_t) / c_out, or v = −F."""
+    """Return F = (x0 − c_skip x_t) / c_out, or −F."""
     skip, out, _ = _scales(config, spread(time_B, x0.ndim))
     return _sign(config) * (x0 - skip * corrupt(config, x0, noise, time_B)) / out
 
 
 def weight(config: EDMConfig, time_B: Array) -> Array:
-    """Return 1: λ(σ) c_out² = 1 in the paper's weighting of the error of x0."""
+    """Return 1: λ(σ) c_out² = 1 in the weighting of the error of x0 that the papers use."""
     del config
     return jnp.ones(time_B.shape)
 
 
 def to_x0(config: EDMConfig, prediction: Array, x_t: Array, time_B: Array) -> Array:
-    """Return c_skip x + c_out F, where F is the prediction or, of v, its negative."""
+    """Return c_skip x + c_out F, where F is the prediction or, of v and flow, its negative."""
     skip, out, _ = _scales(config, spread(time_B, x_t.ndim))
     return skip * x_t + _sign(config) * out * prediction
 
 
 def _sign(config: EDMConfig) -> int:
     """Return the factor between F and what the network predicts."""
-    return {"edm": 1, "v": -1}[config.target]
+    return {"edm": 1, "v": -1, "flow": -1}[config.target]
 
 
 def levels(config: EDMConfig) -> np.ndarray:
@@ -92,4 +98,6 @@ def sample(config: EDMConfig, denoise: Denoiser, noise: Array, key: Array | None
         deviation = np.sqrt(deviation**2 + np.float32(config.sigma_data) ** 2)
     start = (noise * deviation).astype(noise.dtype)
     x, _ = jax.lax.scan(step, start, (jnp.asarray(sigmas[:-1]), jnp.asarray(sigmas[1:])))
+    if config.ends == "sigma_min":
+        return x
     return (x - sigmas[-1] * slope(x, sigmas[-1])).astype(noise.dtype)  # Euler's, to σ = 0

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import VAEConfig
 from pewm_jax.types import Array, Params
 
 POINTS = (0.0, 1.0, -1.0, 0.5, -2.0)
@@ -32,7 +32,16 @@ SAME = ((1, 1), (1, 1))
 """Padding by one row or column of zeros on every side."""
 
 
-def convolve(config: VAEConfig, params: Params, padded_BTHWC: Array) -> Array:
+class Settings(Protocol):
+    """The settings of an autoencoder with 3D convolutions."""
+
+    @property
+    def convolution(self) -> str:
+        """``auto``, ``taps``, ``volume`` or ``winograd``."""
+        ...
+
+
+def convolve(config: Settings, params: Params, padded_BTHWC: Array) -> Array:
     """3×3×3 convolution of a video already padded in time; zeros around the frame.
 
     Args:
@@ -98,7 +107,7 @@ def convolve_doubled(params: Params, x_BTHWC: Array) -> Array:
     return (out + params["bias"]).astype(dtype)
 
 
-def form(config: VAEConfig, dtype: jnp.dtype) -> str:
+def form(config: Settings, dtype: jnp.dtype) -> str:
     """Return the form of the 3D convolutions: ``taps``, ``winograd`` or ``volume``.
 
     ``auto`` looks at JAX's default backend while tracing.

@@ -33,12 +33,15 @@ def _imagined(
     state: WorldState,
     actions_KN: Array,
     keys: Array,
+    views: Any,
     *,
     memory: bool,
     last: bool,
 ) -> Frames:
     """Imagine one batch."""
-    return worlds.imagine_many(model, params, state, actions_KN, keys, memory=memory, last=last)[1]
+    return worlds.imagine_many(
+        model, params, state, actions_KN, keys, memory=memory, last=last, views=views
+    )[1]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,6 +69,7 @@ class Imagination:
     batch: int = 12
     last: bool = True
     memory: bool = True
+    _views: Callable[[Any], Any] | None = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self):
         """Validate."""
@@ -73,6 +77,8 @@ class Imagination:
             self.batch >= 1, f"batch is {self.batch}: imagine at least one candidate at a time."
         )
         object.__setattr__(self, "state", worlds.to_compare(self.config, self.state))
+        views = worlds.views(self.config, self.params, self.state) if self.memory else None
+        object.__setattr__(self, "_views", views)
 
     def __call__(self, actions_KN: Any) -> Frames:
         """Return the frames of K candidates, (K, N) or (K, 1).
@@ -93,9 +99,9 @@ class Imagination:
         for first in range(0, len(order), self.batch):
             part = actions[order[first : first + self.batch]]
             filled = np.concatenate([part, np.repeat(part[-1:], self.batch - len(part), 0)])
-            frames = _imagined(
-                model, self.params, self.state, filled, keys, memory=self.memory, last=self.last
-            )
+            views = None if self._views is None else self._views(filled)
+            options = {"memory": self.memory, "last": self.last}
+            frames = _imagined(model, self.params, self.state, filled, keys, views, **options)
             made.append(frames)
         back = np.argsort(order)  # what was filled in lies behind
         # On the host: the number of candidates changes, and would be compiled for anew.

@@ -15,7 +15,8 @@ import jax
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, UserError
+from pewm_jax.config import ActionConfig, Config, NomadConfig, UserError
+from pewm_jax.planning import nomad_policy
 from pewm_jax.planning.candidates import Imagination, Judged, Rollout
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.plan import plan
@@ -150,5 +151,29 @@ def wanderer(asked: Asked, count: int, *, seed: int = 0) -> np.ndarray:
     return np.stack([wander(rng, asked.actions) for _ in range(count)])
 
 
+def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Policy:
+    """Return NoMaD as a ``Policy``: its waypoints as the actions that come nearest to them.
+
+    Args:
+        config: the policy.
+        params: its parameters.
+        motion: what an action does.
+    """
+
+    def propose(asked: Asked, count: int) -> np.ndarray:
+        if asked.actions > config.waypoints:
+            raise UserError(
+                f"NoMaD proposes {config.waypoints} waypoints, and {asked.actions} actions are "
+                "asked for: use a shorter --horizon."
+            )
+        seen = nomad_policy.history(config, np.asarray(asked.context.rgb_THWC))
+        key = jax.random.key(asked.number)
+        goal = np.asarray(asked.frame.rgb_THWC)[0]
+        ways = nomad_policy.compiled(config, params, seen, goal, key, count)
+        return nomad_policy.discrete(motion, np.asarray(ways)[:, : asked.actions])
+
+    return propose
+
+
 POLICIES: Mapping[str, Policy] = {"wander": functools.partial(wanderer)}
-"""Policies by name; another is named MODULE:FUNCTION."""
+"""Policies by name; another is named MODULE:FUNCTION, or by the folder of a trained NoMaD."""

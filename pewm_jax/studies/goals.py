@@ -14,7 +14,7 @@ import numpy as np
 
 from pewm_jax.config import ActionConfig, UserError
 from pewm_jax.data.make_episode import SPLITS
-from pewm_jax.data.navigation import WaysTo, sample_free
+from pewm_jax.data.navigation import WaysTo, line_is_free, sample_free
 from pewm_jax.data.simulator import Simulator, move, open_simulator
 from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT, discrete_table
 from pewm_jax.types import Frames
@@ -22,6 +22,8 @@ from pewm_jax.types import Frames
 TRIES = 2000
 LEAST_M = 0.5
 """A walk that ends nearer to its start is no task."""
+NEAR_M = 1.5
+"""Tasks near a place start no farther from it."""
 TEST = 2
 """The first house of the split that nobody is trained on; every third one is of it."""
 
@@ -111,9 +113,7 @@ def open_goal(
         planar = np.array([*start, rng.uniform(-np.pi, np.pi)])
         expert = wander(rng, actions)
         walk = walked(simulator, table, planar, expert)
-        moves = np.linalg.norm(np.diff(walk[:, :2], axis=0), axis=-1)
-        blocked = (moves < 1e-6) & (expert == FORWARD)
-        if blocked.any() or np.linalg.norm(walk[-1, :2] - walk[0, :2]) < LEAST_M:
+        if _blocked(walk, expert) or np.linalg.norm(walk[-1, :2] - walk[0, :2]) < LEAST_M:
             continue
         around = _around(walk[actions // 2], context // 2)
         context_frames = simulator.frames(
@@ -126,6 +126,61 @@ def open_goal(
         f"{simulator.scene.name} has no room for a walk of {actions} actions that ends {LEAST_M:g} "
         "m away: take fewer houses."
     )
+
+
+def near(home: Goal, count: int, actions: int) -> list[Goal]:
+    """Make tasks near the places that were seen before a task.
+
+    They start at most ``NEAR_M`` from where it starts or from the middle of its walk, in sight of
+    it, and end at most twice as far from there. The last frame of each one's context is what is
+    seen at its own start.
+
+    Args:
+        home: the task.
+        count: how many.
+        actions: of the walk to each goal.
+
+    Raises:
+        UserError: the house has no room for them.
+    """
+    simulator, made = home.simulator, list[Goal]()
+    places = home.walk_T3[[0, len(home.expert_N) // 2], :2]
+    rng = np.random.default_rng((home.number, count, actions))
+    for start in sample_free(simulator.grid, rng, TRIES):
+        if len(made) == count:
+            break
+        planar = np.array([*start, rng.uniform(-np.pi, np.pi)])
+        expert = wander(rng, actions)
+        walk = walked(simulator, home.table_A3, planar, expert)
+        begins, ends = (np.linalg.norm(places - walk[t, :2], axis=-1) for t in (0, -1))
+        sees = any(line_is_free(simulator.grid, place, walk[0, :2]) for place in places)
+        far = np.linalg.norm(walk[-1, :2] - walk[0, :2])
+        if not sees or begins.min() > NEAR_M or ends.min() > 2 * NEAR_M or far < LEAST_M:
+            continue
+        if _blocked(walk, expert):
+            continue
+        seen = simulator.frames(np.stack([walk[0], walk[-1]]))
+        present = jax.tree.map(lambda *x: np.concatenate(x), home.context, _one(seen, 0))
+        shortest = WaysTo(simulator.grid, walk[-1, :2]).length(walk[0, :2])
+        goal = _one(seen, 1)
+        number = home.number * count + len(made)
+        made.append(Goal(number, simulator, home.table_A3, expert, walk, present, goal, shortest))
+    if len(made) < count:
+        raise UserError(
+            f"{home.house} has room for {len(made)} of {count} walks near where it was seen: take "
+            "fewer tasks."
+        )
+    return made
+
+
+def _one(frames: Frames, number: int) -> Frames:
+    return jax.tree.map(lambda x: x[number : number + 1], frames)
+
+
+def _blocked(walk_T3: np.ndarray, actions_N: np.ndarray) -> bool:
+    """Tell whether a step forward led nowhere."""
+    moves = np.linalg.norm(np.diff(walk_T3[:, :2], axis=0), axis=-1)
+    return bool(((moves < 1e-6) & (actions_N == FORWARD)).any())
 
 
 def wander(rng: np.random.Generator, actions: int) -> np.ndarray:

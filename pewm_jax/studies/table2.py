@@ -23,7 +23,7 @@ from pewm_jax.evaluation.opened import open_run, remembers
 from pewm_jax.planning import scores
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.settings import PlanConfig
-from pewm_jax.studies import deciders, table2_page
+from pewm_jax.studies import deciders, kept, table2_page
 from pewm_jax.studies.deciders import Minds, Policy
 from pewm_jax.studies.goals import Goal, open_goal
 from pewm_jax.types import Params
@@ -95,7 +95,7 @@ def run(
     if config.model.clip.height != config.model.clip.width:
         size = f"{config.model.clip.width}×{config.model.clip.height}"
         raise UserError(f"{model} imagines pictures of {size}, and Table 2 needs square ones.")
-    _require_same(out, about)
+    kept.require_same(out, about, ADDED, "decisions")
     minds = Minds(config, params)
     methods = deciders.names(errand.proposals)
     made: dict[str, list[dict[str, Any]]] = {name: [] for name in methods}
@@ -104,13 +104,13 @@ def run(
             goal: Goal | None = None
             for name in methods:
                 file = out / _folder(name, errand) / f"{number:04d}.json"
-                kept = _kept(file)
+                found = kept.read(file)
                 goal = goal or _goal(errand, config, number)
-                if kept is None:
-                    kept = _decided(name, goal, minds, policy, cost, errand)
-                    file.parent.mkdir(parents=True, exist_ok=True)
-                    atomic.write_text(file, json.dumps(kept) + "\n")
-                made[name].append(kept | {"scores": _scored(goal, np.array(kept["actions"]))})
+                if found is None:
+                    found = _decided(name, goal, minds, policy, cost, errand)
+                    kept.write(file, found)
+                scores_here = _scored(goal, np.array(found["actions"]))
+                made[name].append(found | {"scores": scores_here})
                 meter.advance(1)
     say(meter.summary())
     results = summary(made) | {
@@ -136,22 +136,6 @@ def _folder(name: str, errand: Errand) -> str:
     return f"decisions/{whose}{name}"
 
 
-def _require_same(out: Path, about: Mapping[str, Any]) -> None:
-    """Refuse a folder with decisions of other settings, or weights."""
-    file = out / "settings.json"
-    now = json.dumps({name: value for name, value in about.items() if name not in ADDED}, indent=1)
-    if file.exists():
-        before = json.loads(file.read_text())
-        wrong = [name for name, value in json.loads(now).items() if before.get(name) != value]
-        if wrong:
-            raise UserError(
-                f"{out} holds decisions of other settings ({', '.join(wrong)}): name another "
-                "folder by --out, or put them back."
-            )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    atomic.write_text(file, now + "\n")
-
-
 def _goal(errand: Errand, config: Config, number: int) -> Goal:
     return open_goal(
         number,
@@ -161,13 +145,6 @@ def _goal(errand: Errand, config: Config, number: int) -> Goal:
         motion=config.model.actions,
         size=config.model.clip.height,
     )
-
-
-def _kept(file: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads(file.read_text())
-    except (FileNotFoundError, ValueError):
-        return None
 
 
 def _decided(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,8 @@ def label(name: str) -> str:
     return f"ranking × {what.removeprefix('rank')} · {words[mind]}"
 
 
-def _cell(entry: Mapping[str, Any], decimals: int, *, signed: bool = False) -> str:
+def cell(entry: Mapping[str, Any], decimals: int, *, signed: bool = False) -> str:
+    """Return a mean with half of its interval, where there is one."""
     sign = "+" if signed else ""
     mean = f"{entry['mean']:{sign}.{decimals}f}"
     if entry["low"] is None:
@@ -78,7 +79,8 @@ def _cell(entry: Mapping[str, Any], decimals: int, *, signed: bool = False) -> s
     return f"{mean} ± {(entry['high'] - entry['low']) / 2:.{decimals}f}"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
     return "\n".join(f"| {' | '.join(x)} |" for x in (header, ["---"] * len(header), *rows))
 
 
@@ -88,7 +90,7 @@ def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> s
     rows = [
         [
             label(name),
-            *(_cell(row[m], digits) for m, (_, digits) in COLUMNS.items()),
+            *(cell(row[m], digits) for m, (_, digits) in COLUMNS.items()),
             f"{row['seconds']:.2f}",
         ]
         for name, row in results["rows"].items()
@@ -96,7 +98,7 @@ def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> s
     gains = [
         [
             label(f"{what}-memory").split(" · ", maxsplit=1)[0],
-            *(_cell(by[m], digits, signed=True) for m, (_, digits) in COLUMNS.items()),
+            *(cell(by[m], digits, signed=True) for m, (_, digits) in COLUMNS.items()),
         ]
         for what, by in results["memory_minus_empty"].items()
     ]
@@ -107,12 +109,12 @@ def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> s
     parts = [
         "# Table 2: does a world model help to decide, and does its memory?",
         _how(results),
-        _table(["method", *headings, "seconds"], rows),
+        table(["method", *headings, "seconds"], rows),
         "## What the memory adds\n\nWith memory minus empty, paired by task, 95 % intervals over "
-        "houses; of errors less is better.\n\n" + _table(["method", *headings], gains),
+        "houses; of errors less is better.\n\n" + table(["method", *headings], gains),
         f"## The curve of planning\n\n![SIM against samples]({stem}.png)",
         "## Beside the paper\n\n"
-        + _table(["", "ATE", "RPE", "SIM"], theirs)
+        + table(["", "ATE", "RPE", "SIM"], theirs)
         + f"\n\n{NOT_COMPARABLE}",
     ]
     if videos:
@@ -145,7 +147,7 @@ def latex(results: Mapping[str, Any]) -> str:
         r"\midrule",
     ]
     for name, row in results["rows"].items():
-        cells = [_cell(row[m], digits) for m, (_, digits) in COLUMNS.items()]
+        cells = [cell(row[m], digits) for m, (_, digits) in COLUMNS.items()]
         words = label(name).replace("·", "--").replace("×", r"$\times$")
         lines.append(" & ".join([words, *(c.replace("±", r"$\pm$") for c in cells)]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
@@ -164,11 +166,15 @@ def as_csv(results: Mapping[str, Any]) -> str:
     return file.getvalue()
 
 
+SHARP = 4
+"""Lines are drawn so many times as large, then made smaller, so that they are smooth."""
+APART = 15
+"""Least pixels between the names of two curves."""
+
+
 def plot(results: Mapping[str, Any]) -> np.ndarray:
-    """Draw SIM against samples for each mind; returns a (H, W, 3) uint8 picture."""
+    """Draw SIM against samples for each mind, with 95 % intervals; (H, W, 3) uint8."""
     wide, tall, left, top, bottom = 760, 400, 70, 60, 60
-    canvas = Image.new("RGB", (wide, tall), (255, 255, 255))
-    draw = ImageDraw.Draw(canvas)
     curves = results["curves"]
     most = max(int(count) for curve in curves.values() for count in curve)
     means = [entry["mean"] for curve in curves.values() for entry in curve.values()]
@@ -178,19 +184,44 @@ def plot(results: Mapping[str, Any]) -> np.ndarray:
         x = left + count / most * (wide - left - 190)
         return x, tall - bottom - (value - low) / (high - low) * (tall - top - bottom)
 
+    large = Image.new("RGB", (SHARP * wide, SHARP * tall), (255, 255, 255))
+    lines = ImageDraw.Draw(large, "RGBA")
+
+    def at(points: Iterable[tuple[str, float]]) -> list[tuple[float, float]]:
+        placed = (place(int(count), min(max(value, low), high)) for count, value in points)
+        return [(SHARP * x, SHARP * y) for x, y in placed]
+
+    for tick in range(low, high + 1, 10):
+        lines.line(at([("0", tick), (str(most), tick)]), fill=(228, 228, 228), width=SHARP)
+    for name, curve in curves.items():
+        colour = COLOURS[name.partition("-")[2]]
+        if all(entry["low"] is not None for entry in curve.values()):
+            under = at((count, entry["low"]) for count, entry in curve.items())
+            over = at((count, entry["high"]) for count, entry in curve.items())
+            if len(curve) > 1:
+                lines.polygon([*under, *reversed(over)], fill=(*colour, 34))
+        lines.line(
+            at((count, entry["mean"]) for count, entry in curve.items()),
+            fill=colour,
+            width=3 * SHARP,
+            joint="curve",
+        )
+    canvas = large.resize((wide, tall), Image.Resampling.LANCZOS)
+    draw = ImageDraw.Draw(canvas)
     pictures.write(draw, (16, 22), "SIM of the best plan so far, %", size=17)
     for tick in range(low, high + 1, 10):
-        draw.line([place(0, tick), place(most, tick)], fill=(228, 228, 228))
         pictures.write(draw, (left - 12, place(0, tick)[1]), str(tick), anchor="rm")
     for count in sorted({int(c) for curve in curves.values() for c in curve}):
         x = place(count, low)[0]
         pictures.write(draw, (x, tall - bottom + 14), str(count), size=11, anchor="mm")
     pictures.write(draw, (place(most / 2, low)[0], tall - 18), "samples", anchor="mm")
-    for name, curve in curves.items():
+    ends = {name: place(most, list(curve.values())[-1]["mean"]) for name, curve in curves.items()}
+    lowest = -float(APART)
+    for name, (x, y) in sorted(ends.items(), key=lambda end: end[1][1]):
+        lowest = max(y, lowest + APART)
         mind = name.partition("-")[2]
-        points = [place(int(count), entry["mean"]) for count, entry in curve.items()]
-        draw.line(points, fill=COLOURS[mind], width=3)
-        pictures.write(draw, (points[-1][0] + 10, points[-1][1]), mind, colour=COLOURS[mind])
+        words = label(name).split(" · ", maxsplit=1)[1]
+        pictures.write(draw, (x + 10, lowest), words, size=13, colour=COLOURS[mind])
     return np.asarray(canvas)
 
 

@@ -16,13 +16,15 @@ A world is a ``WorldSettings`` and a module (or object) with these three functio
     split_heads(model, stage) -> {name: n}   numbers that ``train.mesh.tensor`` must divide
     costs(config, stage, share) -> {part: Costs}   see ``models.costs``
 
-and, if it can share work among candidates, an ``imagine_many`` and a ``to_compare`` of its own.
+and, if it can share work among candidates, an ``imagine_many``, a ``to_compare`` and ``views`` of
+its own.
 ``worlds.pewm`` is an example.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -122,6 +124,7 @@ def imagine_many(
     *,
     memory: bool = True,
     last: bool = False,
+    views: Any = None,
 ) -> tuple[WorldState, Frames]:
     """Imagine K candidate controls from one state, without remembering any.
 
@@ -133,6 +136,7 @@ def imagine_many(
         keys: (K,) randomness of each candidate; equal keys give equal noise.
         memory: see ``imagine``.
         last: give only the last frame of each, (K, 1); a world may then leave the others undecoded.
+        views: what ``views(…)(controls)`` gave for these controls, if it was asked.
 
     Returns:
         ``(state, frames)``: K present frames with the shared memory, which is not copied, and
@@ -141,7 +145,8 @@ def imagine_many(
     model = model_of(model)
     own = getattr(functions(model), "imagine_many", None)
     if own is not None:
-        return own(model, params, state, controls, keys, memory=memory, last=last)
+        given = {} if views is None else {"views": views}
+        return own(model, params, state, controls, keys, memory=memory, last=last, **given)
     candidate = functools.partial(imagine, model, remember=False, memory=memory)
     shared = WorldState(0, None)  # type: ignore[arg-type]
     many = jax.vmap(candidate, (None, None, 0, 0), (shared, 0))
@@ -157,6 +162,19 @@ def to_compare(model: Config | WorldSettings, state: WorldState) -> WorldState:
     model = model_of(model)
     own = getattr(functions(model), "to_compare", None)
     return state if own is None else own(model, state)
+
+
+def views(
+    model: Config | WorldSettings, params: Params, state: WorldState
+) -> Callable[[Any], Any] | None:
+    """Return what makes ``views`` for ``imagine_many``, and keeps what candidates have in common.
+
+    On the host, not under jit; None where a world has nothing of the kind. The state is the one
+    that candidates are compared from.
+    """
+    model = model_of(model)
+    own = getattr(functions(model), "views", None)
+    return None if own is None else own(model, params, state)
 
 
 def init(model: Config | WorldSettings, key: Array) -> Params:

@@ -20,7 +20,15 @@ from pewm_jax.memory import memories
 from pewm_jax.models import codecs, encoders, world_model
 from pewm_jax.models.signals import as_signal
 from pewm_jax.types import Array, Control, Frames, Params, Sight, WorldState
-from pewm_jax.worlds import chunks, objective, pewm_costs, pewm_gate, pewm_many, sampling
+from pewm_jax.worlds import (
+    chunks,
+    objective,
+    pewm_costs,
+    pewm_gate,
+    pewm_many,
+    pewm_views,
+    sampling,
+)
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -28,6 +36,7 @@ init = world_model.init
 sample = sampling.sample
 imagine_many = pewm_many.imagine_many
 to_compare = pewm_many.to_compare
+views = pewm_views.views
 costs = pewm_costs.costs
 
 STAGES = (

@@ -33,8 +33,9 @@ def imagine_many(
     *,
     memory: bool = True,
     last: bool = False,
+    views: View | None = None,
 ) -> tuple[WorldState, Frames]:
-    """Imagine K candidates; see ``worlds.imagine_many``."""
+    """Imagine K candidates; see ``worlds.imagine_many``. ``views`` is of ``pewm_views.Views``."""
     asked = jax.vmap(lambda control: control_of(model, state.frame.camera, control))(controls)
     length = model.clip.frames - 1
     count = asked.camera.world_from_camera.shape[1]
@@ -60,6 +61,7 @@ def imagine_many(
             keys_KC[:, number],
             shown=slice(wanted - 1, wanted) if last else slice(0, wanted),
             memory=memory,
+            view=None if views is None else jax.tree.map(lambda x, n=number: x[:, n], views),
         )
         made.append(frames)
         present, shared = jax.tree.map(lambda x: x[:, -1:], frames), False
@@ -89,6 +91,7 @@ def _clip(
     *,
     shown: slice,
     memory: bool,
+    view: View | None = None,
 ) -> Frames:
     """Imagine one clip of every candidate.
 
@@ -101,6 +104,7 @@ def _clip(
         keys: (K,) sampling noise.
         shown: which of the T − 1 frames are returned.
         memory: False ignores the memory.
+        view: (K, T) what the memory looks like, if it is known.
 
     Returns:
         (K, n) frames.
@@ -120,7 +124,7 @@ def _clip(
     conditioning = jax.vmap(condition, (None if shared else 0, 0))(frame, whole)
     sight = None
     if memory and "memory" in params:
-        sight = look(model, remembered, camera, params)
+        sight = look(model, remembered, camera, params, view)
         batched = jax.tree.map(lambda x: x[:, None], sight)
         latents = jax.vmap(functools.partial(sampling.draw, model, params))(
             conditioning, batched, keys
@@ -139,13 +143,15 @@ def _clip(
     rgb, depth = codecs.decode_rgbd(model, params, latents)
     rgb, depth = rgb[:, seen_there], depth[:, seen_there]
     if sight is not None and sight.view is not None and memories.gated(model):
-        view = jax.tree.map(lambda x: x[:, seen], sight.view)
-        rgb, depth = codecs.mix(model, params, rgb, depth, view)
+        remembered_there = jax.tree.map(lambda x: x[:, seen], sight.view)
+        rgb, depth = codecs.mix(model, params, rgb, depth, remembered_there)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     return Frames(rgb, depth, jax.tree.map(lambda x: x[:, shown], control.camera))
 
 
-def look(model: ModelConfig, remembered: Any, camera: Camera, params: Params) -> Sight:
+def look(
+    model: ModelConfig, remembered: Any, camera: Camera, params: Params, view: View | None = None
+) -> Sight:
     """Return what a memory shows K clips, leading axis K; see ``memories.look``.
 
     Args:
@@ -153,6 +159,7 @@ def look(model: ModelConfig, remembered: Any, camera: Camera, params: Params) ->
         remembered: the memory.
         camera: (K, T) cameras.
         params: the world model's parameters.
+        view: (K, T) what it looks like, if that is known.
     """
     pictures = memories.gated(model)
     reader = model.memory.reader
@@ -167,7 +174,8 @@ def look(model: ModelConfig, remembered: Any, camera: Camera, params: Params) ->
     def once(camera: Camera) -> View:
         return each_camera_once(rendered, camera)
 
-    view = jax.lax.platform_dependent(camera, cpu=once, default=jax.vmap(rendered))
+    if view is None:
+        view = jax.lax.platform_dependent(camera, cpu=once, default=jax.vmap(rendered))
     return jax.vmap(lambda camera, view: each(camera, view=view))(camera, view)
 
 

@@ -29,6 +29,7 @@ from pewm_jax.planning.plan import plan
 from pewm_jax.planning.ranking import rank, rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig, RandomShooting
 from pewm_jax.types import Camera, Frames
+from pewm_jax.worlds import pewm_views
 from tests.helpers import init_world, random_frames, randomise
 
 CONFIG = presets.load("tiny")
@@ -85,6 +86,25 @@ def test_batches_are_the_loop_after_several_clips_of_a_rendered_memory():
     assert len(kept.cell_V) < len(all_.cell_V), "free slots are left out"
     np.testing.assert_array_equal(kept.cell_V, all_.cell_V[: len(kept.cell_V)])
     assert int(kept.occupied) == int(all_.occupied) > 0
+
+
+def test_a_camera_is_rendered_once_whatever_came_before(monkeypatch):
+    model, params, state = world("surfels")
+    turns = np.array([[1, 2, 0], [2, 1, 0], [0, 0, 0], [0, 1, 2]])
+    one, other = (Imagination(model, params, state, KEY, batch=4) for _ in range(2))
+    first = one(turns)
+    assert (
+        one._views.rendered == 7
+    )  # here, left, right; one, two, three steps ahead; and left there
+    again = one(turns[::-1])
+    assert one._views.rendered == 7
+    equal(jax.tree.map(lambda x: x[::-1], again), first)
+    monkeypatch.setattr(pewm_views, "MOST", 4)  # no room: all are forgotten between batches
+    other(turns[2:])
+    equal(other(turns), first)
+    keys = jax.numpy.stack([KEY] * 4)
+    many = jax.jit(functools.partial(worlds.imagine_many, last=True), static_argnums=0)
+    equal(many(model, params, one.state, turns, keys)[1], first, atol=2e-4)
 
 
 def test_the_size_of_a_batch_changes_nothing_and_compiles_once():

@@ -1,0 +1,170 @@
+"""The settings and tensor names of Cosmos' transformer, and ours.
+
+Reference: ``CosmosTransformer3DModel`` of diffusers.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pewm_jax.config import CosmosConfig, UserError
+from pewm_jax.convert import settings
+from pewm_jax.convert.mapping import LINEAR, SAME, Entry
+from pewm_jax.models import cosmos
+
+CLASS = "CosmosTransformer3DModel"
+"""The reference's class."""
+WHAT = "The transformer"
+_DEFAULTS: dict[str, Any] = {
+    "in_channels": 16,
+    "out_channels": 16,
+    "num_attention_heads": 32,
+    "attention_head_dim": 128,
+    "num_layers": 28,
+    "mlp_ratio": 4.0,
+    "text_embed_dim": 1024,
+    "adaln_lora_dim": 256,
+    "max_size": (128, 240, 240),
+    "patch_size": (1, 2, 2),
+    "rope_scale": (2.0, 1.0, 1.0),
+    "concat_padding_mask": True,
+}
+"""What diffusers takes for settings that a file leaves out."""
+_CHOICES: dict[str, Any] = {
+    "extra_pos_embed_type": "learnable",
+    "use_crossattn_projection": False,
+    "crossattn_proj_in_channels": 1024,
+    "encoder_hidden_states_channels": 1024,
+}
+"""The same for settings that depend on each other."""
+_ONLY = {"controlnet_block_every_n": None, "img_context_dim_in": None}
+"""Settings of which one value is supported, which is also what diffusers takes."""
+_WITHOUT_EFFECT = {"img_context_num_tokens": 256, "img_context_dim_out": 2048}
+"""Settings that the network does not read, and what is written for them."""
+_RULES = (
+    (r"^patch_embed/", "patch_embed.proj/"),
+    (r"^text_embed/", "crossattn_proj.0/"),
+    (r"^time_embed/linear", "time_embed.t_embedder.linear"),
+    (r"^positions/time$", "learnable_pos_embed.pos_emb_t"),
+    (r"^positions/rows$", "learnable_pos_embed.pos_emb_h"),
+    (r"^positions/columns$", "learnable_pos_embed.pos_emb_w"),
+    (r"modulate_out/", "norm_out."),
+    (r"modulate(\d)/", r"norm\1."),
+    (r"norm(_out|\d)\.down/", r"norm\1.linear_1/"),
+    (r"norm(_out|\d)\.up/", r"norm\1.linear_2/"),
+    (r"to_out/", "to_out.0/"),
+    (r"ff/up/", "ff.net.0.proj/"),
+    (r"ff/down/", "ff.net.2/"),
+    (r"/(kernel|scale)$", "/weight"),
+    (r"/", "."),
+)
+
+
+def config_from_diffusers(values: Mapping[str, Any]) -> CosmosConfig:
+    """Read the settings of ``transformer/config.json``; absent ones have diffusers' defaults.
+
+    Raises:
+        UserError: another class, or a setting that is unknown or not supported.
+    """
+    defaults = {**_DEFAULTS, **_CHOICES, **_ONLY}
+    given = settings.of_network(values, WHAT, CLASS, defaults, _WITHOUT_EFFECT)
+    settings.require_only(given, WHAT, _ONLY)
+    settings.require_like(given, WHAT, _DEFAULTS)
+    patch_t, rows, columns = given["patch_size"]
+    if rows != columns:
+        raise UserError(
+            f"{WHAT}'s patch_size is {given['patch_size']!r}; only square patches are supported."
+        )
+    extra = given["extra_pos_embed_type"]
+    if extra not in (None, "learnable"):
+        raise UserError(
+            f"{WHAT}'s extra_pos_embed_type is {extra!r}; only None and 'learnable' are supported."
+        )
+    return CosmosConfig(
+        in_channels=given["in_channels"],
+        out_channels=given["out_channels"],
+        layers=given["num_layers"],
+        heads=given["num_attention_heads"],
+        head_dim=given["attention_head_dim"],
+        mlp_ratio=float(given["mlp_ratio"]),
+        text_dim=given["text_embed_dim"],
+        raw_text_dim=_raw_text(given),
+        lora_dim=given["adaln_lora_dim"],
+        patch=rows,
+        patch_t=patch_t,
+        max_size=_three(given["max_size"]),
+        rope_scale=_three(map(float, given["rope_scale"])),
+        learned_positions=extra == "learnable",
+        padding_mask=given["concat_padding_mask"],
+    )
+
+
+def _three(values: Iterable[Any]) -> tuple[Any, Any, Any]:
+    time, rows, columns = values
+    return time, rows, columns
+
+
+def _raw_text(given: Mapping[str, Any]) -> int:
+    """Return the channels of given text tokens, or 0 if no layer changes them."""
+    settings.require_like(given, WHAT, {"use_crossattn_projection": False})
+    if not given["use_crossattn_projection"]:
+        return 0
+    sizes = ("crossattn_proj_in_channels", "encoder_hidden_states_channels")
+    settings.require_like(given, WHAT, {key: _CHOICES[key] for key in sizes})
+    inside, outside = (given[key] for key in sizes)
+    if outside != given["text_embed_dim"]:
+        raise UserError(
+            f"{WHAT}'s encoder_hidden_states_channels {outside} is not its text_embed_dim "
+            f"{given['text_embed_dim']}, which the blocks take."
+        )
+    return inside
+
+
+def config_to_diffusers(config: CosmosConfig) -> dict[str, Any]:
+    """Write the settings of ``transformer/config.json``, the inverse of reading them."""
+    return {
+        "_class_name": CLASS,
+        **_ONLY,
+        **_WITHOUT_EFFECT,
+        "in_channels": config.in_channels,
+        "out_channels": config.out_channels,
+        "num_attention_heads": config.heads,
+        "attention_head_dim": config.head_dim,
+        "num_layers": config.layers,
+        "mlp_ratio": config.mlp_ratio,
+        "text_embed_dim": config.text_dim,
+        "adaln_lora_dim": config.lora_dim,
+        "max_size": list(config.max_size),
+        "patch_size": [config.patch_t, config.patch, config.patch],
+        "rope_scale": list(config.rope_scale),
+        "concat_padding_mask": config.padding_mask,
+        "extra_pos_embed_type": "learnable" if config.learned_positions else None,
+        "use_crossattn_projection": config.raw_text_dim > 0,
+        "crossattn_proj_in_channels": config.raw_text_dim or 1024,
+        "encoder_hidden_states_channels": config.text_dim if config.raw_text_dim else 1024,
+    }
+
+
+def entries(config: CosmosConfig) -> list[Entry]:
+    """Return one entry per tensor of the reference."""
+    found = []
+    for path in cosmos.layout(config):
+        turn = LINEAR if path.endswith("/kernel") else SAME
+        if path.startswith("blocks/"):
+            inside = _theirs(path.removeprefix("blocks/"))
+            found += [
+                Entry(f"transformer_blocks.{layer}.{inside}", path, turn, layer)
+                for layer in range(config.layers)
+            ]
+        else:
+            found.append(Entry(_theirs(path), path, turn))
+    return found
+
+
+def _theirs(path: str) -> str:
+    """Turn ``modulate1/down/kernel`` into the reference's name."""
+    for pattern, name in _RULES:
+        path = re.sub(pattern, name, path)
+    return path

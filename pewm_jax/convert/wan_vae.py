@@ -1,0 +1,150 @@
+"""The settings and tensor names of Wan's autoencoder, and ours.
+
+Reference: ``AutoencoderKLWan`` of diffusers, in the form of Wan 2.1 (that of Wan 2.2 has other
+blocks and is refused).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from pewm_jax.config import UserError, WanVAEConfig
+from pewm_jax.config.wan_vae import MEAN_16, STD_16
+from pewm_jax.convert import settings
+from pewm_jax.convert.mapping import CONV, SAME, Entry, Turn
+from pewm_jax.convert.svd_unet import POINTWISE, TIME_CONV
+from pewm_jax.models import wan_vae
+
+CLASS = "AutoencoderKLWan"
+"""The reference's class."""
+WHAT = "The VAE"
+GAMMA_3D = Turn(lambda x: x[:, 0, 0, 0], lambda x: x[:, None, None, None])
+"""torch (C, 1, 1, 1) ↔ ours (C,)."""
+GAMMA_2D = Turn(lambda x: x[:, 0, 0], lambda x: x[:, None, None])
+"""torch (C, 1, 1) ↔ ours (C,)."""
+POINTWISE_3D = Turn(lambda x: x[:, :, 0, 0, 0].T, lambda x: x.T[:, :, None, None, None])
+"""torch (out, in, 1, 1, 1) ↔ ours (in, out)."""
+_DEFAULTS: dict[str, Any] = {
+    "base_dim": 96,
+    "z_dim": 16,
+    "dim_mult": [1, 2, 4, 4],
+    "num_res_blocks": 2,
+    "temperal_downsample": [False, True, True],
+    "latents_mean": list(MEAN_16),
+    "latents_std": list(STD_16),
+    "in_channels": 3,
+    "out_channels": 3,
+}
+"""What diffusers takes for settings that a file leaves out."""
+_BASE = {"decoder_base_dim": None}
+_ONLY: dict[str, Any] = {"attn_scales": [], "is_residual": False, "patch_size": None}
+"""Settings of which one value is supported, which is also what diffusers takes."""
+_WITHOUT_EFFECT = ("dropout", "scale_factor_temporal", "scale_factor_spatial")
+"""Settings that do not change what the network computes, unless in tiles."""
+
+
+def config_from_diffusers(values: Mapping[str, Any]) -> WanVAEConfig:
+    """Read the settings of ``vae/config.json``; absent ones have diffusers' defaults.
+
+    Raises:
+        UserError: another class, or a setting that is unknown or not supported.
+    """
+    defaults = {**_DEFAULTS, **_BASE, **_ONLY}
+    given = settings.of_network(values, WHAT, CLASS, defaults, _WITHOUT_EFFECT)
+    settings.require_only(given, WHAT, _ONLY)
+    settings.require_like(given, WHAT, _DEFAULTS)
+    decoder = given["decoder_base_dim"]
+    if decoder is not None and type(decoder) is not int:
+        raise UserError(f"{WHAT}'s decoder_base_dim is {decoder!r}; it must be a whole number.")
+    return WanVAEConfig(
+        in_channels=given["in_channels"],
+        out_channels=given["out_channels"],
+        latent_channels=given["z_dim"],
+        base_width=given["base_dim"],
+        decoder_base_width=given["base_dim"] if decoder is None else decoder,
+        multiples=tuple(given["dim_mult"]),
+        resnets=given["num_res_blocks"],
+        halves_time=tuple(given["temperal_downsample"]),
+        latents_mean=tuple(map(float, given["latents_mean"])),
+        latents_std=tuple(map(float, given["latents_std"])),
+    )
+
+
+def config_to_diffusers(config: WanVAEConfig) -> dict[str, Any]:
+    """Write the settings of ``vae/config.json``, the inverse of reading them.
+
+    The form of the convolutions is not part of it.
+    """
+    same = config.decoder_base_width == config.base_width
+    return {
+        "_class_name": CLASS,
+        **_ONLY,
+        "base_dim": config.base_width,
+        "decoder_base_dim": None if same else config.decoder_base_width,
+        "z_dim": config.latent_channels,
+        "dim_mult": list(config.multiples),
+        "num_res_blocks": config.resnets,
+        "temperal_downsample": list(config.halves_time),
+        "latents_mean": list(config.latents_mean),
+        "latents_std": list(config.latents_std),
+        "in_channels": config.in_channels,
+        "out_channels": config.out_channels,
+        "dropout": 0.0,
+        "scale_factor_temporal": config.temporal,
+        "scale_factor_spatial": config.spatial,
+    }
+
+
+def entries(config: WanVAEConfig) -> list[Entry]:
+    """Return one entry per tensor of the reference."""
+    return [
+        Entry(_theirs(config, path), path, _turn(path, shape))
+        for path, shape in wan_vae.layout(config).items()
+    ]
+
+
+def _turn(path: str, shape: tuple[int, ...]) -> Turn:
+    """Return the change of layout of a leaf."""
+    attends = "/attend_0/" in path
+    if path.endswith("/scale"):
+        return GAMMA_2D if attends else GAMMA_3D
+    if path.endswith("/bias"):
+        return SAME
+    if len(shape) == 2:
+        return POINTWISE if attends else POINTWISE_3D
+    return TIME_CONV if len(shape) == 3 else CONV
+
+
+def _theirs(config: WanVAEConfig, path: str) -> str:
+    """Turn ``encoder/down_1/resnet_0/conv1/kernel`` into the reference's name.
+
+    On the way down it numbers the blocks of all levels in one row.
+    """
+
+    def flat(found: re.Match) -> str:
+        level, kind, number = int(found[1]), found[2], int(found[3] or config.resnets)
+        rest = "" if kind == "resnet" else "resample/"
+        return f"encoder/down_blocks.{level * (config.resnets + 1) + number}/{rest}"
+
+    rules: tuple[tuple[str, Any], ...] = (
+        (r"^encoder/down_(\d+)/(resnet|resample)(?:_(\d+))?/", flat),
+        (r"^encoder/quant/", "quant_conv/"),
+        (r"^decoder/quant/", "post_quant_conv/"),
+        (r"/up_(\d+)/", r"/up_blocks.\1/"),
+        (r"/mid/", "/mid_block/"),
+        (r"(up_blocks.*)/resample/", r"\1/upsamplers.0/resample/"),
+        (r"resample/space/", "resample.1/"),
+        (r"resample/time/", "time_conv/"),
+        (r"resnet_(\d+)/", r"resnets.\1/"),
+        (r"attend_(\d+)/", r"attentions.\1/"),
+        (r"to_out/", "proj/"),
+        (r"shortcut/", "conv_shortcut/"),
+        (r"/kernel$", "/weight"),
+        (r"/scale$", "/gamma"),
+        (r"/", "."),
+    )
+    for pattern, name in rules:
+        path = re.sub(pattern, name, path)
+    return path

@@ -1,0 +1,255 @@
+"""Practice: a policy walks inside a world, and what it sees there are walks to learn from.
+
+A few posed pictures of a place begin a world. From one of them the policy chooses actions, the
+world imagines what is then seen and remembers it, and so on (paper, Section 3.3). Every later
+picture of such a walk is a goal that the walk reached (hindsight relabelling): NoMaD's loss learns
+from any walk in this way.
+
+A world knows no walls, but it imagines depth: where something stands in the way of a step forward,
+the rest of the block is imagined once more as a turn on the spot.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax import worlds
+from pewm_jax.config import ActionConfig, Config, NomadConfig
+from pewm_jax.config.errors import require
+from pewm_jax.data.simulator import Simulator, move
+from pewm_jax.geometry.actions import (
+    FORWARD,
+    TURN_LEFT,
+    TURN_RIGHT,
+    discrete_table,
+    heading,
+)
+from pewm_jax.models.signals import rgb_from_signal
+from pewm_jax.planning import nomad_policy
+from pewm_jax.types import Frames, Params
+
+Act: TypeAlias = Callable[[np.ndarray, np.ndarray | None, jax.Array], np.ndarray]
+"""``act(rgb_SHWC, goal_HWC, key) -> (N,)`` discrete actions: pictures seen, the present last, and
+the picture of a goal or None."""
+RADIUS_M = 0.2
+"""What is nearer to the agent's way than this, is in it."""
+BODY_M = (-0.3, 0.9)
+"""From this much above the camera to this much below it there must be room."""
+NEAREST = 0.02
+"""This share of the pixels in the way may be nearer: single ones are imagined wrongly."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Practice:
+    """How a policy practises.
+
+    Attributes:
+        walks: how many.
+        blocks: proposals that are carried out in a walk, one after the other.
+        with_goal: share of walks that have the picture of a goal before them, one of those that the
+            world began with; in the others the policy explores.
+    """
+
+    walks: int = 32
+    blocks: int = 4
+    with_goal: float = 0.5
+
+    def __post_init__(self):
+        """Validate."""
+        for name in ("walks", "blocks"):
+            value = getattr(self, name)
+            require(value >= 1, f"practice.{name} is {value}: use 1 or more.")
+        require(
+            0 <= self.with_goal <= 1,
+            f"practice.with_goal is {self.with_goal}: use a share in [0, 1].",
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Walk:
+    """What was seen and done.
+
+    Attributes:
+        frames: (T,) NumPy frames, colours uint8.
+        actions_N: the T − 1 discrete actions.
+    """
+
+    frames: Frames
+    actions_N: np.ndarray
+
+
+class Place(Protocol):
+    """Where a policy practises: a world, or a simulator."""
+
+    def begin(self, number: int) -> tuple[Any, Frames]:
+        """Return the state at the pose of a given picture, and that picture."""
+        ...
+
+    def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames, int]:
+        """Return the state after N actions, what was seen, and the first action not possible.
+
+        The number is N if all were.
+        """
+        ...
+
+
+def walks(place: Place, seen: Frames, act: Act, practice: Practice, seed: int) -> Iterator[Walk]:
+    """Let a policy walk.
+
+    Args:
+        place: where.
+        seen: the pictures that the place was begun with; walks start at one of them.
+        act: the policy.
+        practice: how many and how long.
+        seed: of starts, goals and actions; equal seeds begin equally in every place.
+
+    Returns:
+        The walks, made as they are asked for; each has the same number of frames if the policy
+        proposes as many actions each time.
+    """
+    for number in range(practice.walks):
+        rng, key = np.random.default_rng((seed, number)), jax.random.key(seed)
+        key = jax.random.fold_in(key, number)
+        state, first = place.begin(int(rng.integers(len(seen.depth_THW))))
+        picture = int(rng.integers(len(seen.depth_THW)))
+        goal = seen.rgb_THWC[picture] if rng.random() < practice.with_goal else None
+        frames, done = [first], []
+        for _ in range(practice.blocks):
+            key, one, two = jax.random.split(key, 3)
+            pictures = np.concatenate([each.rgb_THWC for each in frames])
+            actions = np.array(act(pictures, goal, one))
+            turn = rng.choice([TURN_LEFT, TURN_RIGHT])
+            state, after, actions = _carried_out(place, state, actions, int(turn), two)
+            frames.append(after)
+            done.append(actions)
+        together = jax.tree.map(lambda *x: np.concatenate(x), *frames)
+        yield Walk(together, np.concatenate(done))
+
+
+def _carried_out(
+    place: Place, state: Any, actions_N: np.ndarray, turn: int, key: jax.Array
+) -> tuple[Any, Frames, np.ndarray]:
+    """Carry out a block; from the first step that is not possible on, turn instead."""
+    after, frames, possible = place.go(state, actions_N, key)
+    while possible < len(actions_N):
+        actions_N = np.concatenate([actions_N[:possible], np.full(len(actions_N) - possible, turn)])
+        after, frames, now = place.go(state, actions_N, key)
+        if now >= possible:  # turns are always possible
+            break
+        possible = now  # what is imagined anew may stand in the way earlier
+    return after, frames, actions_N
+
+
+class Imagined:
+    """A world as a place to practise in.
+
+    Args:
+        config: the world.
+        params: its weights.
+        seen: posed RGB-D frames that it begins with.
+        memory: False ignores what it remembers.
+    """
+
+    def __init__(self, config: Config, params: Params, seen: Frames, *, memory: bool = True):
+        self.config, self.params, self.seen, self.memory = config, params, seen, memory
+        self.way_m = config.model.actions.step_m
+
+    def begin(self, number: int) -> tuple[Any, Frames]:
+        """Begin with all that was seen; the given picture is the present."""
+        count = len(self.seen.depth_THW)
+        order = np.array([*(n for n in range(count) if n != number), number])
+        seen = jax.tree.map(lambda x: np.asarray(x)[order], self.seen)
+        state = _start(self.config.model, self.params, seen)
+        return state, jax.tree.map(lambda x: x[-1:], seen)
+
+    def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames, int]:
+        """Imagine, and look whether anything stands in the way of a step."""
+        before = np.asarray(state.frame.depth_THW)
+        given = jnp.asarray(actions_N, jnp.int32)
+        state, frames = _imagine(self.config.model, self.params, state, given, key, self.memory)
+        shown = Frames(
+            np.asarray(rgb_from_signal(frames.rgb_THWC)),
+            np.asarray(frames.depth_THW),
+            jax.tree.map(np.asarray, frames.camera),
+        )
+        depths = np.concatenate([before, shown.depth_THW])
+        intrinsics = shown.camera.intrinsics_4[0]
+        for number in np.flatnonzero(actions_N == FORWARD):
+            if not free(depths[number], intrinsics, self.way_m):
+                return state, shown, int(number)
+        return state, shown, len(actions_N)
+
+
+class Real:
+    """A simulator as a place to practise in: the same number of real walks.
+
+    Args:
+        simulator: the house.
+        motion: what an action does.
+        seen: frames whose poses walks start from.
+    """
+
+    def __init__(self, simulator: Simulator, motion: ActionConfig, seen: Frames):
+        self.simulator, self.seen = simulator, seen
+        self.table_A3 = discrete_table(motion).astype(np.float64)
+
+    def begin(self, number: int) -> tuple[Any, Frames]:
+        """Stand where a given picture was taken."""
+        here = jax.tree.map(lambda x: np.asarray(x)[number : number + 1], self.seen)
+        pose = here.camera.world_from_camera[0]
+        return np.array([*pose[:2, 3], float(heading(pose))]), here
+
+    def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames, int]:
+        """Walk until something stands in the way, and on; walls hold."""
+        del key
+        poses, possible = [state], len(actions_N)
+        for number, action in enumerate(actions_N):
+            after, collided = move(self.simulator.grid, poses[-1], self.table_A3[int(action)])
+            if collided:
+                possible = min(possible, number)
+            poses.append(after)
+        return poses[-1], self.simulator.frames(np.stack(poses[1:])), possible
+
+
+def free(depth_HW: np.ndarray, intrinsics_4: np.ndarray, way_m: float) -> bool:
+    """Tell whether there is room for a step forward, by what is seen.
+
+    Args:
+        depth_HW: metres along z, 0 = no measurement.
+        intrinsics_4: fx, fy, cx, cy in pixels, centres at +0.5.
+        way_m: length of the step.
+    """
+    rows, columns = np.indices(depth_HW.shape) + 0.5
+    fx, fy, cx, cy = (float(value) for value in intrinsics_4)
+    right, down = (columns - cx) / fx * depth_HW, (rows - cy) / fy * depth_HW
+    beside = (np.abs(right) <= RADIUS_M) & (down >= BODY_M[0]) & (down <= BODY_M[1])
+    near = beside & (depth_HW > 0) & (depth_HW < way_m + RADIUS_M)
+    return near.sum() <= NEAREST * max(beside.sum(), 1)
+
+
+def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Act:
+    """Return NoMaD as an ``Act``: one proposal, as the discrete actions nearest to it."""
+
+    def act(rgb_SHWC: np.ndarray, goal_HWC: np.ndarray | None, key: jax.Array) -> np.ndarray:
+        seen = nomad_policy.history(config, rgb_SHWC)
+        way = nomad_policy.compiled(config, params, seen, goal_HWC, key, 1)
+        return nomad_policy.discrete(motion, np.asarray(way))[0]
+
+    return act
+
+
+_start = jax.jit(worlds.start, static_argnums=0)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 5))
+def _imagine(
+    model: Any, params: Params, state: Any, actions_N: Any, key: jax.Array, memory: bool
+) -> Any:
+    return worlds.imagine(model, params, state, actions_N, key, memory=memory)

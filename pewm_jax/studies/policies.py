@@ -1,0 +1,57 @@
+"""A trained policy: the run of a NoMaD, opened."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from pewm_jax.config import ActionConfig, Config, NomadWorldConfig, UserError
+from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.rollouts import load_finished
+from pewm_jax.training.runs import WEIGHTS
+from pewm_jax.types import Params
+
+SETTINGS = "config.json"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OpenedPolicy:
+    """A trained NoMaD.
+
+    Attributes:
+        folder: of its run.
+        config: of its training.
+        weights: the policy's parameters.
+        digest: sha256 of the file of weights.
+    """
+
+    folder: Path
+    config: Config
+    weights: Params = dataclasses.field(repr=False)
+    digest: str
+
+    @property
+    def motion(self) -> ActionConfig:
+        """What an action of its walks does."""
+        return self.config.model.actions
+
+
+def is_run(name: str | Path) -> bool:
+    """Tell whether a name is a folder with settings of a training."""
+    return (Path(name) / SETTINGS).is_file()
+
+
+def open_policy(name: str | Path) -> OpenedPolicy:
+    """Open the run of a NoMaD.
+
+    Raises:
+        UserError: there is no such run, it is damaged or not finished, or it trained another kind
+            of model.
+    """
+    folder = Path(name)
+    if not is_run(folder):
+        raise UserError(f"{folder} holds no run: train a policy first (pewm-jax train nomad).")
+    config, params = load_finished(folder)
+    if not isinstance(config.model, NomadWorldConfig):
+        raise UserError(f"{folder} trained no policy: name the run of one (pewm-jax train nomad).")
+    return OpenedPolicy(folder, config, params["policy"], file_hash(folder / WEIGHTS))

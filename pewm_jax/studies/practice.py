@@ -1,0 +1,317 @@
+"""What a policy learns of a new house by practice in imagination (the paper's Figure 6b).
+
+In each held-out house a trained NoMaD practises from the same few pictures: in the world with its
+memory, in the world without, and, as the best there can be, in the house itself. Each time it
+learns from as many walks, in as many steps, and is then sent to the same goals in the real house.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax import atomic
+from pewm_jax.config import ActionConfig, Config, UserError
+from pewm_jax.config.errors import require
+from pewm_jax.data import unfinished
+from pewm_jax.data.dataset import describe_shard, write_shard
+from pewm_jax.data.episodes import EpisodeArrays, write_episode
+from pewm_jax.data.progress import Meter
+from pewm_jax.evaluation import intervals
+from pewm_jax.evaluation.opened import Opened, open_run, remembers
+from pewm_jax.geometry.actions import discrete_table
+from pewm_jax.planning import practice, scores
+from pewm_jax.planning.practice import Act, Imagined, Place, Practice, Real, Walk
+from pewm_jax.studies import goals, kept, practice_page
+from pewm_jax.studies.goals import Goal
+from pewm_jax.studies.policies import OpenedPolicy, open_policy
+from pewm_jax.training import loop
+
+BEFORE, REAL, MEMORY, EMPTY = "before", "real", "memory", "empty"
+LEARNED = (MEMORY, EMPTY, REAL)
+"""Where a policy practises."""
+WITHIN_M, WITHIN_DEG = 0.5, 45.0
+"""A goal is reached this near to it, and with a heading this near to its own."""
+Say = Callable[[str], Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Errand:
+    """The settings of the study.
+
+    Attributes:
+        houses: held-out houses.
+        tasks: goals in each.
+        actions: of the walk to a goal.
+        most: actions that the policy may take for it.
+        replan: actions taken of a proposal before the next.
+        practice: how the policy practises.
+        steps: of training on its walks.
+        learning_rate: of that training.
+        seeds: of practice and training.
+        shown: houses whose first walks are in the picture.
+    """
+
+    houses: int = 12
+    tasks: int = 12
+    actions: int = 8
+    most: int = 24
+    replan: int = 4
+    practice: Practice = dataclasses.field(default_factory=Practice)
+    steps: int = 150
+    learning_rate: float = 2e-4
+    seeds: tuple[int, ...] = (0,)
+    shown: int = 2
+
+    def __post_init__(self):
+        """Validate."""
+        for name in ("houses", "tasks", "actions", "most", "replan", "steps"):
+            value = getattr(self, name)
+            require(value >= 1, f"{name} is {value}: use 1 or more.")
+        require(
+            len(self.seeds) > 0 and len(set(self.seeds)) == len(self.seeds),
+            f"seeds are {self.seeds}: give different ones, such as 0 1 2.",
+        )
+
+
+def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: Say = print) -> Path:
+    """Let a policy practise in every house, and measure it before and after.
+
+    Args:
+        model: a run folder, or the name of weights that come with the library.
+        policy: the run of a NoMaD.
+        out: the folder that everything is kept in; the same call goes on.
+        errand: the settings.
+        say: shows a line.
+
+    Returns:
+        The path of the table in Markdown; beside it .png and ``results.json``.
+
+    Raises:
+        UserError: the weights are absent or do not fit each other, a loss is not finite, or the
+            folder holds pieces of other settings.
+    """
+    world, begun = open_run(model), open_policy(policy)
+    _require_fit(world, begun, model, policy)
+    about = dataclasses.asdict(errand) | {"weights": world.weights_hash, "policy": begun.digest}
+    kept.require_same(out, about, ("houses", "seeds", "shown"), "pieces")
+    pieces = [
+        (house, seed, how)
+        for house in range(errand.houses)
+        for seed in errand.seeds
+        for how in (BEFORE, *LEARNED)
+    ]
+    made: dict[str, list[dict[str, Any]]] = {how: [] for how in (BEFORE, *LEARNED)}
+    with Meter("practising", len(pieces), "pieces") as meter:
+        for house, seed, how in pieces:
+            folder = out / f"house{house:04d}" / f"{how}-seed{seed}"
+            piece = kept.read(folder / "scores.json")
+            if piece is None:
+                home = _home(errand, world.config, house)
+                learned = begun
+                if how != BEFORE:
+                    learned = _learned(world, begun, home, errand, how, seed, folder)
+                piece = {"house": home.house, "tasks": _measured(home, learned, errand, seed)}
+                kept.write(folder / "scores.json", piece)
+            made[how].append(piece)
+            meter.advance(1)
+    say(meter.summary())
+    results = summary(made) | {
+        "about": about
+        | {"model": str(model), "date": dt.datetime.now(dt.UTC).date().isoformat()}
+        | {"within_m": WITHIN_M, "within_deg": WITHIN_DEG, "how": intervals.how()}
+    }
+    atomic.write_text(out / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
+    page = out / "practice.md"
+    shown = [
+        (home.house, {how: _first_walk(place, home, begun, errand) for how, place in there.items()})
+        for home, there in _places_shown(world, errand)
+    ]
+    practice_page.write(results, page, shown)
+    return page
+
+
+def _require_fit(world: Opened, begun: OpenedPolicy, model: str | Path, policy: str | Path) -> None:
+    if not remembers(world):
+        raise UserError(f"{model} has no memory, and what a memory adds is the question.")
+    if begun.motion != world.config.model.actions:
+        raise UserError(
+            f"{policy} takes other steps than {model} imagines ({begun.motion} and "
+            f"{world.config.model.actions}): train one of them with the other's actions."
+        )
+
+
+def _home(errand: Errand, config: Config, house: int) -> Goal:
+    """Return the first task of a house, whose context is what the agent has seen of it."""
+    return goals.open_goal(
+        house,
+        houses=errand.houses,
+        actions=errand.actions,
+        context=config.data.context,
+        motion=config.model.actions,
+        size=config.model.clip.height,
+    )
+
+
+def _place(world: Opened, home: Goal, motion: ActionConfig, how: str) -> Place:
+    if how == REAL:
+        return Real(home.simulator, motion, home.context)
+    return Imagined(world.config, world.params, home.context, memory=how == MEMORY)
+
+
+def _act(policy: OpenedPolicy) -> Act:
+    return practice.nomad(policy.config.model.policy, policy.weights, policy.motion)
+
+
+def _places_shown(world: Opened, errand: Errand) -> Iterator[tuple[Goal, dict[str, Place]]]:
+    for house in range(min(errand.shown, errand.houses)):
+        home = _home(errand, world.config, house)
+        motion = world.config.model.actions
+        yield home, {how: _place(world, home, motion, how) for how in (REAL, MEMORY, EMPTY)}
+
+
+def _first_walk(place: Place, home: Goal, begun: OpenedPolicy, errand: Errand) -> Walk:
+    seed = errand.seeds[0]
+    return next(practice.walks(place, home.context, _act(begun), errand.practice, seed))
+
+
+def _learned(
+    world: Opened,
+    begun: OpenedPolicy,
+    home: Goal,
+    errand: Errand,
+    how: str,
+    seed: int,
+    folder: Path,
+) -> OpenedPolicy:
+    """Let the policy practise, and return what it has become."""
+    place = _place(world, home, begun.motion, how)
+    _collect(folder / "data" / "train", place, home, begun, errand, seed)
+    config = begun.config
+    stage = dataclasses.replace(
+        config.train.policy,  # type: ignore[attr-defined]
+        steps=errand.steps,
+        learning_rate=errand.learning_rate,
+        warmup=min(config.train.policy.warmup, errand.steps // 10),  # type: ignore[attr-defined]
+    )
+    train = dataclasses.replace(
+        config.train, run=str(folder / "run"), start=str(begun.folder), seed=seed, policy=stage
+    )
+    data = dataclasses.replace(config.data, path=str(folder / "data"))
+    loop.train(dataclasses.replace(config, train=train, data=data), say=lambda _: None)
+    shutil.rmtree(folder / "run" / "checkpoints", ignore_errors=True)
+    return open_policy(folder / "run")
+
+
+def _collect(
+    folder: Path, place: Place, home: Goal, begun: OpenedPolicy, errand: Errand, seed: int
+) -> None:
+    """Write the walks of a practice as a dataset, or find them written."""
+    settings = {"made_by": "practice", "seed": seed, **dataclasses.asdict(errand.practice)}
+    state = unfinished.examine(folder, settings)
+    if state == "complete":
+        return
+    path = folder / "shard-00000-of-00001.array_record"
+    done = unfinished.prepare(folder, settings, state, {path: errand.practice.walks})
+    table, frames = discrete_table(begun.motion), 0
+
+    def records() -> Iterator[bytes]:
+        nonlocal frames
+        walks = practice.walks(place, home.context, _act(begun), errand.practice, seed)
+        for number, walk in enumerate(walks):
+            frames += len(walk.frames.depth_THW)
+            yield _record(walk, table, f"{home.house}-{number:04d}", home.house)
+
+    if path.name not in done:
+        write_shard(path, records())
+    shard = done.get(path.name) or describe_shard(path)
+    frames = frames or errand.practice.walks * (1 + errand.practice.blocks * errand.actions)
+    unfinished.publish(folder, settings, [shard], frames)
+
+
+def _record(walk: Walk, table_A3: np.ndarray, name: str, house: str) -> bytes:
+    camera = walk.frames.camera
+    arrays = EpisodeArrays(
+        np.asarray(walk.frames.rgb_THWC),
+        np.asarray(walk.frames.depth_THW, np.float32),
+        np.asarray(camera.intrinsics_4)[0],
+        np.asarray(camera.world_from_camera),
+        table_A3[walk.actions_N].astype(np.float32),
+        walk.actions_N.astype(np.int32),
+    )
+    return write_episode(arrays, name, house, {"policy": "practice"})
+
+
+def _measured(
+    home: Goal, policy: OpenedPolicy, errand: Errand, seed: int
+) -> list[dict[str, float]]:
+    """Send a policy to goals near the places that were seen, in the real house."""
+    act = _act(policy)
+    scored = []
+    for task in goals.near(home, errand.tasks, errand.actions):
+        walked = [task.walk_T3[0]]
+        pictures = [task.context.rgb_THWC[-1:]]
+        key = jax.random.fold_in(jax.random.key(seed), task.number)
+        reached, waiting = False, np.zeros(0, int)
+        for number in range(errand.most):
+            if not len(waiting):
+                seen = np.concatenate(pictures)
+                goal = np.asarray(task.frame.rgb_THWC)[0]
+                waiting = act(seen, goal, jax.random.fold_in(key, number))[: errand.replan]
+            step = goals.walked(task.simulator, task.table_A3, walked[-1], waiting[:1])[-1]
+            waiting = waiting[1:]
+            walked.append(step)
+            pictures.append(task.simulator.frames(step[None]).rgb_THWC)
+            reached = bool(scores.success(step, task.walk_T3[-1], WITHIN_M, WITHIN_DEG))
+            if reached:
+                break
+        way = np.stack(walked)
+        nearest = min(scores.position_error(pose, task.walk_T3[-1]) for pose in way)
+        path = scores.path_length(way)
+        scored.append(
+            {
+                "success": 100.0 * reached,
+                "spl": 100.0 * float(scores.spl(reached, task.shortest_m, path)),
+                "nearest": float(nearest),
+                "sim": float(scores.sim(way[0], way[-1], task.walk_T3[-1])),
+            }
+        )
+    return scored
+
+
+def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """Return means over houses with 95 % intervals, and differences, paired by task and seed."""
+    houses = np.unique(
+        [piece["house"] for piece in made[BEFORE] for _ in piece["tasks"]], return_inverse=True
+    )[1]
+    values = {
+        how: {
+            metric: np.array([task[metric] for piece in pieces for task in piece["tasks"]])
+            for metric in pieces[0]["tasks"][0]
+        }
+        for how, pieces in made.items()
+    }
+    differences = ((MEMORY, BEFORE), (MEMORY, EMPTY), (REAL, MEMORY), (REAL, BEFORE))
+    return {
+        "rows": {
+            how: {metric: intervals.entry(x, houses) for metric, x in by.items()}
+            for how, by in values.items()
+        },
+        "differences": {
+            f"{one} - {other}": {
+                metric: intervals.entry(x - values[other][metric], houses)
+                for metric, x in values[one].items()
+            }
+            for one, other in differences
+        },
+        "houses": len(set(houses.tolist())),
+        "tasks": len(houses),
+    }
