@@ -48,7 +48,7 @@ def experiment(
     return Config(
         model=EgoWMConfig(
             clip=ClipConfig(frames=9, height=height, width=width, depth=False),
-            codec=vae,
+            codec=dataclasses.replace(vae, depth=False),
             backbone=dataclasses.replace(unet, motion_bucket=180.0, remat=True),
             noise=dataclasses.replace(noise, log_mean=0.7, log_std=1.6, guidance=2.0),
             image_noise=0.1,

@@ -30,8 +30,9 @@ class SVDVAEConfig(CodecSettings):
     scaling_factor: float = 0.18215
     """Factor that gives latents unit variance for the diffusion model. The latents of the
     conditioning image stay without it."""
-    depth: bool = False
-    """Whether depth is encoded too, as grey pictures by the same weights, in as many channels."""
+    depth: bool = True
+    """Whether depth is encoded too, as grey pictures by the same weights, in as many channels more;
+    Stable Video Diffusion itself knows colour alone."""
 
     @property
     def spatial(self) -> int:

@@ -49,7 +49,7 @@ UNET = SVDUNetConfig(
 )
 SVD = EgoWMConfig(
     clip=ClipConfig(frames=3, height=16, width=16, depth=False),
-    codec=SVDVAEConfig(widths=(32,)),
+    codec=SVDVAEConfig(widths=(32,), depth=False),
     backbone=UNET,
     noise=EDMConfig(sigma_data=1.0, target="v", log_mean=0.7, log_std=1.6, sample_steps=2),
     image_noise=0.1,
