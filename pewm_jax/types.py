@@ -73,10 +73,13 @@ class Control:
     Attributes:
         camera: cameras of leading shape (..., T): the observed frame's, then those to imagine.
         actions_TA: (..., T − 1, A) actions, or None if only cameras are known.
+        state_A: (..., A) the agent's own state at the observed frame, such as the angles of its
+            joints; None if it is not known.
     """
 
     camera: Camera
     actions_TA: Array | None = None
+    state_A: Array | None = None
 
 
 @_pytree
@@ -97,6 +100,7 @@ class Clip:
         latents_thwC: (..., t, h, w, C) latents of the frames, if they were encoded beforehand
             (``worlds.objective.prepare``), else None.
         sight: what the memory of the context shows, if that was looked at beforehand, else None.
+        state_A: (..., A) the agent's own state at frame 0, None if none was recorded.
     """
 
     frames: Frames
@@ -107,6 +111,7 @@ class Clip:
     voxels_TXYZ: Array | None = None
     latents_thwC: Array | None = None
     sight: Sight | None = None
+    state_A: Array | None = None
 
 
 @_pytree
@@ -203,7 +208,7 @@ class WorldState:
     Attributes:
         frame: the last frame, T = 1, rgb float32 in [−1, 1].
         map: the memory of everything seen or imagined so far: a ``VoxelMap``, or another kind
-            (see ``pewm_jax.memory.memories``).
+            (see ``pewm_jax.memory.memories``); in the world ``egowm`` the frames before the last.
     """
 
     frame: Frames

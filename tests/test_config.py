@@ -30,6 +30,7 @@ from pewm_jax.config import (
     LatentsConfig,
     LearnedCodecConfig,
     ModelConfig,
+    NoMemoryConfig,
     PatchColoursConfig,
     PixelConfig,
     Settings,
@@ -264,8 +265,9 @@ def experiments(draw):
     encoder = draw(some("encoder"))()
     if isinstance(encoder, LatentsConfig):  # fits the learned codec alone
         parts["codec"] = LearnedCodecConfig()
+    reads = parts["backbone"].places is not None
     memory = dataclasses.replace(
-        draw(some("memory"))(),
+        draw(some("memory"))() if reads else NoMemoryConfig(),
         cell_m=draw(st.tuples(*[st.floats(0.1, 2)] * 3)),
         encoder=encoder,
         reader=reader,

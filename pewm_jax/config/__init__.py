@@ -9,10 +9,11 @@ from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
 from pewm_jax.config.clip_vision import CLIPVisionConfig
 from pewm_jax.config.codec import CodecSettings, PixelConfig
 from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
-from pewm_jax.config.control import CameraConfig, ControlSettings
+from pewm_jax.config.control import CameraConfig, ControlSettings, ModulationConfig
 from pewm_jax.config.cosmos import COSMOS_2B, COSMOS_14B, CosmosConfig
 from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
+from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
 from pewm_jax.config.encoder import (
     DINOv2EncoderConfig,
     EncoderSettings,
@@ -48,12 +49,16 @@ from pewm_jax.config.wan_vae import WanVAEConfig
 
 register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
 register("world", "codec", CodecWorldConfig, "pewm_jax.worlds.codec")
+register("world", "egowm", EgoWMConfig, "pewm_jax.worlds.egowm")
 register("world", "nomad", NomadWorldConfig, "pewm_jax.worlds.nomad")
 register("backbone", "dit", DiTConfig, "pewm_jax.models.dit_backbone")
+register("backbone", "svd_unet", SVDUNetConfig, "pewm_jax.models.svd_backbone")
 register("codec", "pixel", PixelConfig, "pewm_jax.models.pixel_codec")
 register("codec", "vae", VAEConfig, "pewm_jax.models.vae_codec")
+register("codec", "svd_vae", SVDVAEConfig, "pewm_jax.models.svd_vae_codec")
 register("codec", "learned", LearnedCodecConfig, "pewm_jax.models.learned_codec")
 register("control", "camera", CameraConfig, "pewm_jax.models.camera_control")
+register("control", "actions", ModulationConfig, "pewm_jax.models.action_control")
 register("encoder", "patch_colours", PatchColoursConfig, "pewm_jax.models.patch_colours")
 register("encoder", "latents", LatentsConfig, "pewm_jax.models.latent_encoder")
 register("encoder", "dinov2", DINOv2EncoderConfig, "pewm_jax.models.dinov2_encoder")
@@ -97,6 +102,8 @@ __all__ = [
     "DataConfig",
     "DiTConfig",
     "EDMConfig",
+    "EgoWMConfig",
+    "EgoWMTrainConfig",
     "EncoderSettings",
     "EvalConfig",
     "FlowConfig",
@@ -109,6 +116,7 @@ __all__ = [
     "MemorySettings",
     "MeshConfig",
     "ModelConfig",
+    "ModulationConfig",
     "NoMemoryConfig",
     "NoiseSettings",
     "NomadConfig",

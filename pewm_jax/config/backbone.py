@@ -32,7 +32,8 @@ class BackboneSettings(Settings):
     """Settings that every backbone has; see ``pewm_jax.models.backbones`` for its functions.
 
     Attributes:
-        places: where a memory reader runs.
+        places: where a memory reader runs; None where none can.
+        time_dim: E, channels of the time embedding, to which a control may add.
         text_shape: (length, channels) of its text tokens; None if it takes none.
         stores_prompt: whether a prompt's embedding is stored with the weights.
         split_heads: a number that ``train.mesh.tensor`` must divide.
@@ -40,14 +41,24 @@ class BackboneSettings(Settings):
     """
 
     SECTION: ClassVar[str] = "backbone"
-    places: Any
+    places: Any = None
     text_shape: Any = None
     stores_prompt: Any = False
     split_heads: Any = 1
     remat: Any = False
 
+    @property
+    def time_dim(self) -> int:
+        """Channels of the time embedding: those that a reader's places are told."""
+        return self.places.time
+
     def check(self, model: Any) -> None:
-        """Refuse latents that do not split into the backbone's patches."""
+        """Refuse latents that do not split into the backbone's patches.
+
+        A backbone that takes other sizes has a check of its own.
+        """
+        if self.places is None:
+            return
         step = model.codec.spatial * self.places.patch
         clip = model.clip
         require(

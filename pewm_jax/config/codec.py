@@ -16,7 +16,8 @@ class CodecSettings(Settings):
         spatial: pixels per latent cell, along height and along width.
         temporal: frames per latent frame after the first: q·k + 1 frames become k + 1.
         rgb_channels: latent channels of colour.
-        depth_channels: latent channels of depth.
+        depth_channels: latent channels of depth; 0 where it encodes colour alone.
+        framewise: whether every latent frame is decoded by itself.
         DEPTH_AS_GREY: whether depth is encoded as a grey image of three channels, not as one.
         PIXELWISE: whether each latent channel of depth is one pixel of one frame.
         CONVERTED: whether the weights are frozen and come from ``train.start``.
@@ -36,6 +37,11 @@ class CodecSettings(Settings):
         """Latent channels of colour and depth together."""
         return self.rgb_channels + self.depth_channels
 
+    @property
+    def framewise(self) -> bool:
+        """Whether every latent frame is one frame, decoded by itself."""
+        return self.temporal == 1
+
     def frames(self, count: int) -> int:
         """Return the number of latent frames for a number of frames."""
         return (count - 1) // self.temporal + 1
@@ -45,7 +51,7 @@ class CodecSettings(Settings):
         return self.frames(clip.frames), clip.height // self.spatial, clip.width // self.spatial
 
     def check(self, model: Any) -> None:
-        """Refuse clips that cannot be folded."""
+        """Refuse clips that cannot be folded, and depth that is not encoded."""
         clip, q, s = model.clip, self.temporal, self.spatial
         require(
             (clip.frames - 1) % q == 0,
@@ -56,6 +62,11 @@ class CodecSettings(Settings):
             clip.height % s == 0 and clip.width % s == 0,
             f"clip {clip.height}×{clip.width}: height and width must be multiples of "
             f"codec.spatial = {s}.",
+        )
+        require(
+            self.depth_channels > 0 or not clip.depth,
+            "clip.depth is true, and this codec encodes colour alone: use clip.depth false, or a "
+            "codec that encodes depth too.",
         )
 
 

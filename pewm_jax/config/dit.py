@@ -39,7 +39,7 @@ class DiTConfig(BackboneSettings):
     """Channels of a text token."""
     prompt: Literal["zeros", "stored"] = "zeros"
     """Which text tokens: `zeros`, or a prompt's embedding that is `stored` with the weights."""
-    time_dim: int = 192
+    time_dim: int = 192  # type: ignore[assignment]
     """Width of the time embedding."""
     ofs_dim: int = 0
     """Width of the second scalar's embedding (1.5-5B-I2V: 512, equal to time_dim); 0 for none."""

@@ -62,6 +62,13 @@ class MemorySettings(Settings):
 
     def check(self, model: Any) -> None:
         """Refuse a model that the encoder or the reader does not fit."""
+        if model.backbone.places is None:
+            require(
+                not self.REMEMBERS,
+                "this backbone has no place where a memory could be read: use memory.kind none, or "
+                "another backbone.",
+            )
+            return
         self.encoder.check(model)
         self.reader.check(model)
 

@@ -13,6 +13,7 @@ commands:
   import cogvideox   a CogVideoX checkpoint in the layout of diffusers → our layout, or with
                      --rgbd --camera [--memory] a world model to train from
   import dinov2      DINOv2 (transformers or the original state dict) → the map's image encoder
+  import svd         a checkpoint of Stable Video Diffusion → a world model steered by actions
   export diffusers   our CogVideoX weights, fine-tuned or not → a folder for from_pretrained
   export inference   a training run → averaged weights in bfloat16, settings and a card
   export stablehlo   a world model → programs that run without this library
@@ -21,6 +22,7 @@ Each has --help. DST is made whole or not at all."""
 COMMANDS = (
     "import cogvideox",
     "import dinov2",
+    "import svd",
     "export diffusers",
     "export inference",
     "export stablehlo",

@@ -29,6 +29,7 @@ from pewm_jax.convert import (
     inference,
     output,
     stablehlo,
+    svd_world,
     text,
     world,
 )
@@ -117,6 +118,26 @@ class ImportDINOv2:
     """Folder to make."""
     dtype: Dtype | None = None
     """Store weights in this precision; by default as they are."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportSVD:
+    """Import a checkpoint of Stable Video Diffusion as a world model steered by actions.
+
+    The result is a folder that `pewm_jax.load` reads and that is trained by its name (`pewm-jax
+    train DST`), with the settings of the preset egowm_svd. Until then actions change nothing.
+    """
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """The pipeline's folder: unet/, vae/, image_encoder/ and scheduler/."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to make."""
+    dtype: Dtype | None = None
+    """Store weights in this precision; by default as they are."""
+    height: int = 512
+    """Height of its images in pixels."""
+    width: int = 512
+    """Width of its images in pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -287,6 +308,13 @@ def import_dinov2(options: ImportDINOv2) -> None:
     dinov2.convert(options.src, options.dst, options.dtype)
 
 
+def import_svd(options: ImportSVD) -> None:
+    """Run ``import svd``."""
+    size = options.height, options.width
+    svd_world.import_world(options.src, options.dst, options.dtype, size)
+    print(f"{options.dst}: a world model; licence of the original: {base.licence(options.src)}")
+
+
 def export_diffusers(options: ExportDiffusers) -> None:
     """Run ``export diffusers``."""
     diffusers_folder.export(options.src, options.dst, options.base, options.dtype, options.original)
@@ -314,6 +342,7 @@ def export_stablehlo(options: ExportStableHLO) -> None:
 COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "import cogvideox": (ImportCogVideoX, import_cogvideox),
     "import dinov2": (ImportDINOv2, import_dinov2),
+    "import svd": (ImportSVD, import_svd),
     "export diffusers": (ExportDiffusers, export_diffusers),
     "export inference": (ExportInference, export_inference),
     "export stablehlo": (ExportStableHLO, export_stablehlo),

@@ -8,6 +8,12 @@ A backbone is a ``BackboneSettings`` and a module (or object) with
     costs(model, share, *, trained) -> Costs    see ``models.costs``
 
 and ``settings.places`` says where a memory reader may run. ``models.dit_backbone`` is an example.
+One that is shown the observed frames in another way than joined to its input has also
+
+    observed(model, params, seen) -> Conditioning
+    init_image(settings, key) -> params         frozen, under ``image/``; {} if it needs none
+
+and ``models.svd_backbone`` is an example of that.
 """
 
 from __future__ import annotations
@@ -19,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import BackboneSettings, functions
+from pewm_jax.config import BackboneSettings, ModelConfig, functions
 from pewm_jax.types import Array, Params
 
 
@@ -32,11 +38,30 @@ class Conditioning:
         joined_BthwC: concatenated to the channels of the noisy latents.
         modulation_BtE: added to the time embedding, per latent frame.
         tokens_BLC: text tokens, or other tokens of the same width.
+        image_BMD: tokens of the observed image, of a width of their own.
+        scalars_BK: numbers that are embedded as the time is, such as frames per second.
     """
 
     joined_BthwC: Array | None = None
     modulation_BtE: Array | None = None
     tokens_BLC: Array | None = None
+    image_BMD: Array | None = None
+    scalars_BK: Array | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Observed:
+    """The observed frames of a batch of clips, with which every clip begins.
+
+    Attributes:
+        latents_BthwC: their latents, encoded as a condition.
+        rgb_BTHWC: their colours in [−1, 1], before any noise was added.
+        noise_B: deviation of the noise that was added to the colours that are encoded.
+    """
+
+    latents_BthwC: Array
+    rgb_BTHWC: Array
+    noise_B: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +114,34 @@ def apply(
         (B, t, h, w, C_out) prediction.
     """
     return functions(config).apply(config, params, x_BthwC, time_B, conditioning, readers)
+
+
+def init_image(config: BackboneSettings, key: Array) -> Params:
+    """Return random parameters of what a backbone sees images with; {} if it has nothing."""
+    own = getattr(functions(config), "init_image", None)
+    return {} if own is None else own(config, key)
+
+
+def observed(model: ModelConfig, params: Params, seen: Observed) -> Conditioning:
+    """Turn the observed frames into inputs of the backbone, by its own ways if it has any.
+
+    By default the latents are joined to the input, zero for the frames to be imagined.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; those under ``image`` are the backbone's to use.
+        seen: the observed frames.
+
+    Returns:
+        Conditioning whose joined channels are as many as the latents have.
+    """
+    own = getattr(functions(model.backbone), "observed", None)
+    if own is not None:
+        return own(model, params, seen)
+    first = seen.latents_BthwC
+    missing = model.latent_shape[0] - first.shape[1]
+    padding = jnp.zeros((len(first), missing, *first.shape[2:]), first.dtype)
+    return Conditioning(joined_BthwC=jnp.concatenate([first, padding], 1))
 
 
 def joined(x_BthwC: Array, conditioning: Conditioning) -> Array:

@@ -10,12 +10,13 @@ A codec is a ``CodecSettings`` and a module (or object) with
 
 and obeys the frame rule: q·k + 1 frames become k + 1 latent frames. Colour and depth are encoded
 separately and their channels concatenated, as in the paper. The VAE sees depth as a grey image
-(``DEPTH_AS_GREY``).
+(``DEPTH_AS_GREY``). A codec whose ``depth_channels`` are 0 encodes colour alone.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -93,10 +94,18 @@ def encode_rgbd(
         depth_BTHW: (B, T, H, W) metres.
         condition: see ``encode``.
     """
+    weights = params.get("codec", {})
+    if not model.codec.depth_channels:
+        return _clip_by_clip(
+            lambda weights, rgb: encode(
+                model.codec, weights, rgb.astype(jnp.dtype(model.dtype)), condition=condition
+            ).astype(jnp.float32),
+            weights,
+            rgb_BTHWC,
+        )
     depth = jnp.asarray(depth_BTHW)
     whole = holes.fill_depth(depth.reshape(-1, *depth.shape[-2:]), model.clip.far_m)
     signal = signal_from_depth(model.clip, whole.reshape(depth.shape))[..., None]
-    weights = params.get("codec", {})
     if not model.codec.DEPTH_AS_GREY:
         parts = [encode(model.codec, weights, x, condition=condition) for x in (rgb_BTHWC, signal)]
         return jnp.concatenate(parts, -1)
@@ -107,19 +116,31 @@ def encode_rgbd(
         latents = encode(model.codec, weights, both, condition=condition)
         return jnp.concatenate(jnp.split(latents.astype(jnp.float32), 2), -1)
 
+    return _clip_by_clip(together, weights, rgb_BTHWC, signal)
+
+
+def _clip_by_clip(encoded: Callable[..., Array], weights: Params, *videos: Array) -> Array:
+    """Encode clip by clip where it is compiled, so that memory does not grow with the batch."""
+
     def one_by_one(weights: Params, *videos: Array) -> Array:
-        """Encode clip by clip, so that memory does not grow with the batch."""
         if len(videos[0]) == 1:
-            return together(weights, *videos)
-        latents = jax.lax.map(lambda clip: together(weights, *(x[None] for x in clip)), videos)
+            return encoded(weights, *videos)
+        latents = jax.lax.map(lambda clip: encoded(weights, *(x[None] for x in clip)), videos)
         return latents[:, 0]
 
-    traced = isinstance(rgb_BTHWC, Tracer)
-    return placement.by_batch(one_by_one if traced else together, weights, rgb_BTHWC, signal)
+    traced = isinstance(videos[0], Tracer)
+    return placement.by_batch(one_by_one if traced else encoded, weights, *videos)
 
 
 def decode_rgbd(model: ModelConfig, params: Params, latents_BthwC: Array) -> tuple[Array, Array]:
-    """Invert ``encode_rgbd``: colour in [−1, 1] (B, T, H, W, 3) and metric depth (B, T, H, W)."""
+    """Invert ``encode_rgbd``: colour in [−1, 1] (B, T, H, W, 3) and metric depth (B, T, H, W).
+
+    Where depth is not encoded it is 0 everywhere: not known.
+    """
+    if not model.codec.depth_channels:
+        latents = latents_BthwC.astype(jnp.dtype(model.dtype))
+        rgb = decode(model.codec, params.get("codec", {}), latents).astype(jnp.float32)
+        return jnp.clip(rgb, -1, 1), jnp.zeros(rgb.shape[:-1])
     parts = jnp.split(latents_BthwC, [model.codec.rgb_channels], -1)
     weights = params.get("codec", {})
     if not model.codec.DEPTH_AS_GREY:

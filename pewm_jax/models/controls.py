@@ -8,7 +8,7 @@ A control is a ``ControlSettings`` and a module (or object) with
     costs(model, share, *, trained) -> Costs         see ``models.costs``
 
 and ``settings.channels(model)``, the number of channels it adds to the denoiser's input.
-``models.camera_control`` is an example.
+``models.camera_control`` is an example, ``models.action_control`` one that modulates.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def condition(
     Args:
         model: the model.
         params: the control's parameters, empty where it has none.
-        observed: (B, 1) the observed first frames, colours in [−1, 1].
-        control: (B, T) cameras, and (B, T − 1) actions if there are any.
+        observed: (B, 1) the observed first frames, colours in [−1, 1]; or more of them.
+        control: (B, T) cameras, (B, T − 1) actions and (B, A) states if there are any.
 
     Returns:
         Input channels, modulation (per latent frame) and tokens.

@@ -97,8 +97,13 @@ class Costs:
 
 
 def video_tokens(model: ModelConfig) -> tuple[int, int]:
-    """Return the video tokens of a clip: (tokens in time, tokens at each time)."""
+    """Return the video tokens of a clip: (tokens in time, tokens at each time).
+
+    Where a backbone names no places, its tokens are the latent cells.
+    """
     (t, h, w), places = model.latent_shape, model.backbone.places
+    if places is None:
+        return t, h * w
     return -(-t // places.patch_t), (h // places.patch) * (w // places.patch)
 
 

@@ -8,11 +8,14 @@ steer it (arXiv 2601.15284, Eq. 5).
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import SVDUNetConfig, UserError
-from pewm_jax.models import layers, svd_layers, svd_shapes
+from pewm_jax.models import layers, placement, svd_layers, svd_shapes
 from pewm_jax.models.vae_convolution import SAME, convolve_2d
 from pewm_jax.models.vae_shapes import draw
 from pewm_jax.types import Array, Params
@@ -58,17 +61,20 @@ def apply(
         UserError: an argument of another shape.
     """
     _check(config, latents_BThwC, timesteps_B, image_BMD, added_BK, modulation_BTE)
-    time = _time(config, params, latents_BThwC.dtype, timesteps_B, added_BK)[:, None]
-    if modulation_BTE is not None:
-        time = time + modulation_BTE.astype(time.dtype)
-    time = jax.nn.silu(time)
+    time = _time(config, params, latents_BThwC.dtype, timesteps_B, added_BK, modulation_BTE)
     levels, last = range(len(config.widths)), len(config.widths) - 1
+    params = jax.tree.map(placement.constrain, params)
+
+    def resnet(place: Params, x: Array, eps: float) -> Array:
+        return _run(config, functools.partial(svd_layers.resnet, eps=eps), place, x, time)
 
     def attend(place: Params, k: int, x: Array, level: int) -> Array:
         if f"attend_{k}" not in place:
             return x
-        heads, depth = config.heads[level], config.layers[level]
-        return svd_layers.attend(place[f"attend_{k}"], x, image_BMD, heads, depth)
+        run = functools.partial(
+            svd_layers.attend, heads=config.heads[level], layers_=config.layers[level]
+        )
+        return _run(config, run, place[f"attend_{k}"], x, image_BMD)
 
     x = convolve_2d(params["conv_in"], latents_BThwC, 1, SAME)
     skips = [x]
@@ -76,7 +82,7 @@ def apply(
         place = params[f"down_{level}"]
         eps = EPS if config.attends[level] else EPS_COARSE
         for k in range(config.resnets[level]):
-            x = svd_layers.resnet(place[f"resnet_{k}"], x, time, eps)
+            x = resnet(place[f"resnet_{k}"], x, eps)
             x = attend(place, k, x, level)
             skips.append(x)
         if level < last:
@@ -84,15 +90,15 @@ def apply(
             skips.append(x)
 
     place = params["mid"]
-    x = svd_layers.resnet(place["resnet_0"], x, time, EPS_COARSE)
+    x = resnet(place["resnet_0"], x, EPS_COARSE)
     x = attend(place, 0, x, last)
-    x = svd_layers.resnet(place["resnet_1"], x, time, EPS_COARSE)
+    x = resnet(place["resnet_1"], x, EPS_COARSE)
 
     for step, level in enumerate(reversed(levels)):
         place = params[f"up_{step}"]
         for k in range(config.resnets[level] + 1):
             x = jnp.concatenate([x, skips.pop()], -1)
-            x = svd_layers.resnet(place[f"resnet_{k}"], x, time, EPS)
+            x = resnet(place[f"resnet_{k}"], x, EPS)
             x = attend(place, k, x, level)
         if level:
             x = svd_layers.upsample(place["resample"], x, *skips[-1].shape[2:4])
@@ -101,15 +107,28 @@ def apply(
     )
 
 
+def _run(config: SVDUNetConfig, layer: Callable[..., Array], *arguments: Array | Params) -> Array:
+    """Run a layer, again in the backward pass if the settings say so; each device its own clips."""
+    layer = jax.checkpoint(layer) if config.remat else layer
+    return placement.constrain(layer(*arguments), "batch")
+
+
 def _time(
-    config: SVDUNetConfig, params: Params, dtype: jnp.dtype, timesteps_B: Array, added_BK: Array
+    config: SVDUNetConfig,
+    params: Params,
+    dtype: jnp.dtype,
+    timesteps_B: Array,
+    added_BK: Array,
+    modulation_BTE: Array | None,
 ) -> Array:
-    """Return the (B, time_dim) embedding of the noise level and the scalars."""
+    """Return SiLU of the (B, T or 1, time_dim) embedding of level, scalars and modulation."""
     wave = layers.sinusoid(timesteps_B, config.widths[0]).astype(dtype)
     waves = layers.sinusoid(added_BK, config.added_dim).astype(dtype)
-    return svd_layers.embed(params["time_embed"], wave) + svd_layers.embed(
+    time = svd_layers.embed(params["time_embed"], wave) + svd_layers.embed(
         params["added_embed"], waves.reshape(len(waves), -1)
     )
+    time = time[:, None]
+    return jax.nn.silu(time if modulation_BTE is None else time + modulation_BTE.astype(dtype))
 
 
 def _check(

@@ -4,7 +4,7 @@ The encoder sees one frame at a time. The decoder mixes neighbouring frames: its
 convolve over time as well. It therefore decodes the frames of a clip together, or some at a time
 with less memory and a slightly different result at the seams.
 
-Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``.
+Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``; ``svd_vae_codec`` does.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
 """The world model's network: the denoiser, conditioned on frame, control, text and memory.
 
-Input channels, in order: noisy colour and depth latents; clean latents of the observed first frame
-(zero for later latent frames); the channels of the control (Plücker rays). At the places that the
-backbone provides, a reader reads the memory.
+Input channels, in order: noisy colour and depth latents; latents of the observed frames, as the
+backbone wants them (by default zero for later latent frames); the channels of the control (Plücker
+rays). At the places that the backbone provides, a reader reads the memory.
 
 Parameters: ``backbone``, ``memory`` (the reader) and, if the settings need them, ``control``, the
-frozen ``codec`` (the VAE), ``encoder`` (DINOv2) and ``text`` (the prompt's embedding). Without the
-``memory`` entry, or without sight of a memory, it is the stage-1 model.
+frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (with which the backbone sees images)
+and ``text`` (the prompt's embedding). Without the ``memory`` entry, or without sight of a memory,
+it is the stage-1 model.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 from pewm_jax.config import ModelConfig
 from pewm_jax.models import backbones, camera_control, codecs, controls, encoders, readers
-from pewm_jax.models.backbones import NO_READERS, Conditioning
+from pewm_jax.models.backbones import NO_READERS, Conditioning, Observed
 from pewm_jax.types import Array, Camera, Control, Frames, Params, Sight
 
 
@@ -40,28 +41,67 @@ class ClipConditioning:
 
 
 def condition(
-    model: ModelConfig, params: Params, observed: Frames, control: Control
+    model: ModelConfig,
+    params: Params,
+    observed: Frames,
+    control: Control,
+    *,
+    noise_B: Array | None = None,
+    clean_BTHWC: Array | None = None,
 ) -> ClipConditioning:
     """Build the conditioning of a batch of clips.
 
     Args:
         model: the model.
-        params: the world model's parameters; codec, control and text are used.
-        observed: (B, 1) the first frames, colours float in [−1, 1], depth in metres.
+        params: the world model's parameters; codec, image, control and text are used.
+        observed: (B, 1) the first frames, colours float in [−1, 1], depth in metres; or more of
+            them, as many as fill latent frames.
         control: (B, T) cameras of all frames, and (B, T − 1) actions if there are any.
+        noise_B: deviation of noise that was added to the observed colours; None for none.
+        clean_BTHWC: these colours before that; None where there is no noise.
     """
-    batch, (frames, h, w) = len(observed.depth_THW), model.latent_shape
-    first = codecs.encode_rgbd(model, params, observed.rgb_THWC, observed.depth_THW, condition=True)
-    padding = jnp.zeros((batch, frames - 1, h, w, first.shape[-1]), first.dtype)
-    first = _seen(model, jnp.concatenate([first, padding], 1))
+    batch, rgb = len(observed.depth_THW), observed.rgb_THWC
+    first = codecs.encode_rgbd(model, params, rgb, observed.depth_THW, condition=True)
+    seen = Observed(
+        _seen(model, first),
+        rgb if clean_BTHWC is None else clean_BTHWC,
+        jnp.zeros((batch,)) if noise_B is None else noise_B,
+    )
+    shown = backbones.observed(model, params, seen)
     steering = controls.condition(model, params.get("control", {}), observed, control)
-    joined = [x for x in (first, steering.joined_BthwC) if x is not None]
-    given = Conditioning(
+    joined = [x for x in (shown.joined_BthwC, steering.joined_BthwC) if x is not None]
+    given = dataclasses.replace(
+        shown,
         joined_BthwC=jnp.concatenate(joined, -1),
         modulation_BtE=steering.modulation_BtE,
         tokens_BLC=_text(model, params, batch, steering.tokens_BLC),
     )
     return ClipConditioning(given, control.camera, camera_control.rays(model, control.camera))
+
+
+def without_image(
+    model: ModelConfig, conditioning: ClipConditioning, hidden_B: Array
+) -> ClipConditioning:
+    """Hide the observed image from clips of a batch; control, text and scalars stay.
+
+    Args:
+        model: the model.
+        conditioning: of a batch of clips.
+        hidden_B: (B,) bool, the clips that are not to see it.
+    """
+    given = conditioning.given
+
+    def hide(x: Array, channels: int) -> Array:
+        there = hidden_B.reshape(-1, *(1,) * (x.ndim - 1))
+        return jnp.where(there & (np.arange(x.shape[-1]) < channels), 0, x)
+
+    joined, image = given.joined_BthwC, given.image_BMD
+    hidden = dataclasses.replace(
+        given,
+        joined_BthwC=None if joined is None else hide(joined, model.codec.channels),
+        image_BMD=None if image is None else hide(image, image.shape[-1]),
+    )
+    return dataclasses.replace(conditioning, given=hidden)
 
 
 def _text(model: ModelConfig, params: Params, batch: int, more: Array | None) -> Array | None:
@@ -76,17 +116,21 @@ def _text(model: ModelConfig, params: Params, batch: int, more: Array | None) ->
 
 
 def init(model: ModelConfig, key: Array, *, memory: bool = True) -> Params:
-    """Return random parameters; with ``memory`` also the reader's, without effect at first."""
+    """Return random parameters; with ``memory`` also the reader's, without effect at first.
+
+    A backbone that names no places has no reader.
+    """
     backbone_key, memory_key = jax.random.split(key)
     frozen_key = jax.random.fold_in(key, 2)
     channels = model.in_channels, model.codec.channels
     params: Params = {"backbone": backbones.init(model.backbone, backbone_key, *channels)}
-    if memory:
+    if memory and model.backbone.places is not None:
         params["memory"] = readers.init(model, memory_key)
     parts = {
         "codec": codecs.init(model.codec, frozen_key),
         "encoder": encoders.init(model.memory.encoder, jax.random.fold_in(frozen_key, 1)),
         "control": controls.init(model, jax.random.fold_in(key, 3)),
+        "image": backbones.init_image(model.backbone, jax.random.fold_in(key, 4)),
     }
     params |= {name: part for name, part in parts.items() if part}
     if model.backbone.stores_prompt:

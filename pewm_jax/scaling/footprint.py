@@ -22,6 +22,9 @@ from pewm_jax.training.stages import Stage
 from pewm_jax.types import Params
 from pewm_jax.worlds import costs
 
+ENCODERS = ("codec", "encoder", "image")
+"""Frozen networks that run before the denoiser, as their parameters are named."""
+
 
 @dataclasses.dataclass(frozen=True)
 class MeshSizes:
@@ -87,7 +90,7 @@ class Counts:
     Attributes:
         trained: trained parameters.
         frozen: frozen parameters, such as the backbone in stage 2, without the encoders.
-        encoders: the frozen VAE and DINOv2.
+        encoders: the frozen VAE, DINOv2 and what a backbone sees the image with.
         layer: parameters of one block and its memory block.
         trained_layer: those of them that are trained.
     """
@@ -104,7 +107,7 @@ def counts(config: Config, stage: Stage) -> Counts:
     """Count the parameters of a stage from shapes alone."""
     params = jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
     trained, frozen = tree.split(params, stage.trained)
-    encoders = {name: frozen.pop(name) for name in ("codec", "encoder") if name in frozen}
+    encoders = {name: frozen.pop(name) for name in ENCODERS if name in frozen}
     count = functools.partial(Weights.of, config.model)
     return Counts(
         trained=count(trained),
@@ -119,7 +122,7 @@ def _one_block(params: Params) -> int:
     """Count the parameters of one block per network, or of a whole network without ``blocks``."""
     total = 0
     for name, part in params.items():
-        if name in ("codec", "encoder", "text"):
+        if name in (*ENCODERS, "text"):
             continue
         stacked = isinstance(part, dict) and "blocks" in part
         blocks = part["blocks"] if stacked else part

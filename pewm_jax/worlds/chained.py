@@ -102,7 +102,7 @@ def _looking_back(
 ) -> tuple[Array, Array]:
     """Run clips backwards, and return what the model makes of the frames where they arrive."""
     back = jax.tree.map(lambda x: x[:, ::-1], frames)
-    if model.codec.temporal == 1:  # latents of one frame each
+    if model.codec.framewise:  # latents of one frame each
         x0 = latents_BthwC[:, ::-1]
     else:
         x0 = codecs.encode_rgbd(model, params, back.rgb_THWC, back.depth_THW)
@@ -118,7 +118,7 @@ def _looking_back(
     inputs, network_time = noises.shown(model.noise, x_t, times)
     out = world_model.apply(model, params, inputs, conditioning, network_time, sight)
     latents = noises.to_x0(model.noise, out, x_t, times)
-    last = latents[:, -1:] if model.codec.temporal == 1 else latents
+    last = latents[:, -1:] if model.codec.framewise else latents
     rgb, depth = (x[:, -1:] for x in codecs.decode_rgbd(model, params, last))
     if view is not None and memories.gated(model):
         arrived: View = jax.tree.map(lambda x: x[:, -1:], view)

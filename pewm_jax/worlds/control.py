@@ -69,7 +69,8 @@ def _in_one_form(model: ModelConfig, present: Camera, control: Any) -> Control:
                 f"imagine() got {count} cameras and actions of shape {actions.shape}; give "
                 f"({count}, A): action k leads to camera k."
             )
-        return Control(_as_arrays(control.camera), actions)
+        state = None if control.state_A is None else jnp.asarray(control.state_A)
+        return Control(_as_arrays(control.camera), actions, state)
     if isinstance(control, Camera):
         _require_cameras(control)
         return Control(_as_arrays(control))

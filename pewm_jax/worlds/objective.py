@@ -91,6 +91,8 @@ def loss(
     key: Array,
     *,
     memory: bool,
+    history: int = 1,
+    blind: float = 0.0,
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of one batch and its parts.
 
@@ -102,6 +104,8 @@ def loss(
         clip: a batch, leading axis B, colours uint8 or float.
         key: randomness of times, noise and image noise.
         memory: whether the memory is read (in stage 2).
+        history: frames of a clip that are observed.
+        blind: share of clips from which these are hidden.
 
     Returns:
         ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of the noise's target,
@@ -120,7 +124,7 @@ def loss(
 
     level = jnp.exp(
         train.image_noise_mean
-        + train.image_noise_std * jax.random.normal(level_key, (batch, 1, 1, 1))
+        + train.image_noise_std * jax.random.normal(level_key, (batch, 1, 1, 1, 1))
     )
     sight = clip.sight if memory else None
     if memory and sight is None:
@@ -128,18 +132,23 @@ def loss(
     if sight is not None and train.hidden:
         kept = jax.random.bernoulli(jax.random.fold_in(key, 4), 1 - train.hidden, (batch,))
         sight = shown(sight, kept)
-    first, depth = frames.rgb_THWC[:, :1], frames.depth_THW[:, :1]
+    first, depth = frames.rgb_THWC[:, :history], frames.depth_THW[:, :history]
     if train.chained:
         again = jax.random.fold_in(key, 5)
         first, depth = chained.first_frames(model, train.chained, params, frames, x0, sight, again)
-    first = first[:, 0]
+    clean = first
     first = first + level * jax.random.normal(image_key, first.shape)
     if train.depth_noise:
         depth = depth * wrong(jax.random.fold_in(image_key, 1), depth.shape, train.depth_noise)
-    observed = Frames(first[:, None], depth, jax.tree.map(lambda x: x[:, :1], frames.camera))
+    observed = Frames(first, depth, jax.tree.map(lambda x: x[:, :history], frames.camera))
     require_actions(model, clip.actions_TA, "the loss")
-    control = Control(frames.camera, clip.actions_TA)
-    conditioning = world_model.condition(model, params, observed, control)
+    control = Control(frames.camera, clip.actions_TA, clip.state_A)
+    conditioning = world_model.condition(
+        model, params, observed, control, noise_B=level.reshape(batch), clean_BTHWC=clean
+    )
+    if blind:
+        hidden = jax.random.bernoulli(jax.random.fold_in(key, 6), blind, (batch,))
+        conditioning = world_model.without_image(model, conditioning, hidden)
     inputs, network_time = noises.shown(model.noise, x_t, times)
     prediction = world_model.apply(model, params, inputs, conditioning, network_time, sight)
 

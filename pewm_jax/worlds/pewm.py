@@ -20,7 +20,15 @@ from pewm_jax.memory import memories
 from pewm_jax.models import codecs, encoders, world_model
 from pewm_jax.models.signals import as_signal
 from pewm_jax.types import Array, Control, Frames, Params, Sight, WorldState
-from pewm_jax.worlds import objective, pewm_costs, pewm_gate, pewm_many, pewm_views, sampling
+from pewm_jax.worlds import (
+    chunks,
+    objective,
+    pewm_costs,
+    pewm_gate,
+    pewm_many,
+    pewm_views,
+    sampling,
+)
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -35,7 +43,7 @@ STAGES = (
     Stage(
         name="stage1",
         number=1,
-        rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|encoder|text)/.*", FREEZE)),
+        rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|encoder|image|text)/.*", FREEZE)),
         init=functools.partial(world_model.init, memory=False),
         loss=objective.without_memory,
         prepare=functools.partial(objective.prepare, memory=False),
@@ -43,7 +51,7 @@ STAGES = (
     Stage(
         name="stage2",
         number=2,
-        rules=((r"memory/.*", TRAIN), (r"(backbone|control|codec|encoder|text)/.*", FREEZE)),
+        rules=((r"memory/.*", TRAIN), (r"(backbone|control|codec|encoder|image|text)/.*", FREEZE)),
         init=world_model.init,
         loss=objective.with_memory,
         memory=True,
@@ -52,7 +60,10 @@ STAGES = (
     Stage(
         name="joint",
         number=3,
-        rules=((r"(backbone|control|memory)/.*", TRAIN), (r"(codec|encoder|text)/.*", FREEZE)),
+        rules=(
+            (r"(backbone|control|memory)/.*", TRAIN),
+            (r"(codec|encoder|image|text)/.*", FREEZE),
+        ),
         init=world_model.init,
         loss=objective.with_memory,
         memory=True,
@@ -64,13 +75,13 @@ STAGES = (
         number=4,
         rules=(
             (r"codec/gate/.*", TRAIN),
-            (r"(backbone|control|memory|codec|encoder|text)/.*", FREEZE),
+            (r"(backbone|control|memory|codec|encoder|image|text)/.*", FREEZE),
         ),
         init=world_model.init,
         loss=pewm_gate.loss,
         memory=True,
         prepare=pewm_gate.prepare,
-        prepares_by=("backbone", "control", "memory", "codec", "encoder", "text"),
+        prepares_by=("backbone", "control", "memory", "codec", "encoder", "image", "text"),
         optional=True,
         given=pewm_gate.perceptual,
         require=pewm_gate.require_gate,
@@ -83,9 +94,14 @@ codec's gate on what the model imagines."""
 
 
 def stages(model: ModelConfig) -> tuple[Stage, ...]:
-    """Return the paper's two stages, and two optional ones."""
-    del model
-    return STAGES
+    """Return the paper's two stages, and two optional ones.
+
+    Where the control asks for another learning rate, its parameters get that.
+    """
+    if model.control.rate == 1:
+        return STAGES
+    rates = ((r"control/.*", model.control.rate),)
+    return tuple(dataclasses.replace(stage, rates=rates) for stage in STAGES)
 
 
 def sharding(model: ModelConfig) -> tuple[tuple[str, Any], ...]:
@@ -106,7 +122,7 @@ def split_heads(model: ModelConfig, stage: Stage) -> dict[str, int]:
 
 def start(model: ModelConfig, params: Params, frames: Frames) -> WorldState:
     """Begin a world; see ``worlds.start``."""
-    count = _require_frames(model, frames, "start")
+    count = require_frames(model, frames, "start")
     frames = jax.tree.map(jnp.asarray, as_signal(frames))
     remembered = memories.from_context(model, params, frames, jnp.ones((count,), bool))
     return WorldState(jax.tree.map(lambda x: x[-1:], frames), remembered)
@@ -114,7 +130,7 @@ def start(model: ModelConfig, params: Params, frames: Frames) -> WorldState:
 
 def observe(model: ModelConfig, params: Params, state: WorldState, frames: Frames) -> WorldState:
     """Take in real frames; see ``worlds.observe``."""
-    _require_frames(model, frames, "observe")
+    require_frames(model, frames, "observe")
     frames = jax.tree.map(jnp.asarray, as_signal(frames))
     remembered = _remember(model, params, state.map, frames)
     return WorldState(jax.tree.map(lambda x: x[-1:], frames), remembered)
@@ -132,21 +148,9 @@ def imagine(
 ) -> tuple[WorldState, Frames]:
     """Imagine clip after clip; see ``worlds.imagine``."""
     asked = control_of(model, state.frame.camera, control)
-    length = model.clip.frames - 1
     count = asked.camera.world_from_camera.shape[0]
-    clips = -(-count // length)
-    missing = clips * length - count
-
-    def cut(x: Array, still: Array) -> Array:
-        """(n, …) → (clips, T − 1, …); where frames are missing the agent stands still."""
-        filled = jnp.concatenate([x, jnp.repeat(still, missing, 0)]) if missing else x
-        return filled.reshape(clips, length, *x.shape[1:])
-
-    chunks = Control(jax.tree.map(lambda x: cut(x, x[-1:]), asked.camera))
-    if asked.actions_TA is not None:
-        chunks = Control(chunks.camera, cut(asked.actions_TA, jnp.zeros_like(asked.actions_TA[:1])))
-
-    wanted = jnp.arange(clips * length).reshape(clips, length) < count if missing else None
+    chunked, wanted = chunks.cut(asked, model.clip.frames - 1)
+    clips = chunked.camera.world_from_camera.shape[0]
 
     def step(state: WorldState, inputs: tuple[Control, Array, Array | None]) -> Any:
         chunk, clip_key, valid = inputs
@@ -154,9 +158,9 @@ def imagine(
             model, params, state, chunk, clip_key, remember=remember, memory=memory, valid_T=valid
         )
 
-    inputs = (chunks, jax.random.split(key, clips), wanted)
+    inputs = (chunked, jax.random.split(key, clips), wanted)
     state, frames = jax.lax.scan(step, state, inputs)
-    return state, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], frames)
+    return state, chunks.joined(frames, count)
 
 
 def imagine_clip(
@@ -188,7 +192,8 @@ def imagine_clip(
     """
     present, future = state.frame, control.camera
     camera = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), present.camera, future)
-    whole = jax.tree.map(lambda x: x[None], Control(camera, control.actions_TA))
+    whole = dataclasses.replace(control, camera=camera)
+    whole = jax.tree.map(lambda x: x[None], whole)
     observed = jax.tree.map(lambda x: x[None], present)
     conditioning = world_model.condition(model, params, observed, whole)
     sight = None
@@ -206,9 +211,8 @@ def imagine_clip(
     if remember:
         new = new_surfaces(model, frames, sight)
         remembered = _remember(model, params, state.map, new, valid_T, observed=False)
-    last = frames.depth_THW.shape[0] - 1 if valid_T is None else valid_T.sum() - 1
-    present = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, last, 1), frames)
-    return WorldState(present, remembered), frames
+    end = None if valid_T is None else valid_T.sum()
+    return WorldState(chunks.last(frames, end), remembered), frames
 
 
 def new_surfaces(model: ModelConfig, frames: Frames, sight: Sight | None) -> Frames:
@@ -235,7 +239,7 @@ def _remember(
     return memories.remember(model, memory, frames, features, valid_T, observed=observed)
 
 
-def _require_frames(model: ModelConfig, frames: Frames, who: str) -> int:
+def require_frames(model: ModelConfig, frames: Frames, who: str) -> int:
     """Return the number of frames, or refuse frames whose shapes do not fit the model."""
     count = frames.depth_THW.shape[0] if frames.depth_THW.ndim else 0
     expected = (count, model.clip.height, model.clip.width)

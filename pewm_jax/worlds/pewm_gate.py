@@ -47,7 +47,7 @@ def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
     sight = objective.clip_sight(model, params, clip, pictures=True)
     frames = as_signal(clip.frames)
     observed = jax.tree.map(lambda x: x[:, :1], frames)
-    control = Control(frames.camera, clip.actions_TA)
+    control = Control(frames.camera, clip.actions_TA, clip.state_A)
     conditioning = world_model.condition(model, params, observed, control)
     key = jax.random.fold_in(jax.random.key(0), clip.frames.rgb_THWC.astype(jnp.uint32).sum())
     shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)

@@ -9,6 +9,7 @@ works frame by frame.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -47,7 +48,10 @@ def imagine_many(
         chunk = Control(jax.tree.map(lambda x, s=here: _filled(x[:, s], length), asked.camera))
         if asked.actions_TA is not None:
             rest = [(0, 0), (0, length - wanted), (0, 0)]
-            chunk = Control(chunk.camera, jnp.pad(asked.actions_TA[:, here], rest))
+            told = asked.state_A
+            if told is not None and number:
+                told = asked.actions_TA[:, here.start - 1]
+            chunk = Control(chunk.camera, jnp.pad(asked.actions_TA[:, here], rest), told)
         frames = _clip(
             model,
             params,
@@ -116,7 +120,7 @@ def _clip(
         one = jax.tree.map(lambda x: x[None], (frame, control))
         return world_model.condition(model, params, *one)
 
-    whole = Control(camera, control.actions_TA)
+    whole = dataclasses.replace(control, camera=camera)
     conditioning = jax.vmap(condition, (None if shared else 0, 0))(frame, whole)
     sight = None
     if memory and "memory" in params:
@@ -131,7 +135,7 @@ def _clip(
         )
     latents = latents[:, 0]
     seen = slice(shown.start + 1, shown.stop + 1)  # frame 0 of a clip is the present one
-    early = model.codec.temporal == 1
+    early = model.codec.framewise
     if early:
         latents, seen_there = latents[:, seen], slice(None)
     else:

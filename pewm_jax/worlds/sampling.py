@@ -16,10 +16,13 @@ def draw(
     conditioning: world_model.ClipConditioning,
     sight: Sight | None,
     key: Array,
+    *,
+    blind: world_model.ClipConditioning | None = None,
 ) -> Array:
-    """Sample the latents of one clip, (1, t, h, w, C), from noise of its own."""
+    """Sample the latents of one clip, (1, t, h, w, C), from noise of its own; see ``sample``."""
     noise = jax.random.normal(key, (1, *model.latent_shape, model.codec.channels))
-    return sample(model, params, conditioning, sight, noise, jax.random.fold_in(key, 1))
+    again = jax.random.fold_in(key, 1)
+    return sample(model, params, conditioning, sight, noise, again, blind=blind)
 
 
 def sample(
@@ -29,11 +32,14 @@ def sample(
     sight: Sight | None,
     noise_BthwC: Array,
     key: Array | None = None,
+    *,
+    blind: world_model.ClipConditioning | None = None,
 ) -> Array:
     """Sample one batch of clips' latents with the configured noise and sampler.
 
     With ``noise.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map)); DDPM
-    lets g vary with the step (``noise.dynamic_guidance``).
+    lets g vary with the step (``noise.dynamic_guidance``). Where ``blind`` is given, it is what the
+    prediction is compared with, in the place of the same without the map.
 
     Args:
         model: the model.
@@ -42,6 +48,7 @@ def sample(
         sight: what the memory shows the clips, or None for no memory.
         noise_BthwC: standard normal start.
         key: randomness of the steps, if the sampler draws noise.
+        blind: the conditioning without what guidance is to strengthen.
 
     Returns:
         (B, t, h, w, C) latents.
@@ -51,16 +58,18 @@ def sample(
     """
     noise = model.noise
 
-    def x0(x: Array, times: Array, sight: Sight | None) -> Array:
+    def x0(
+        x: Array, times: Array, given: world_model.ClipConditioning, sight: Sight | None
+    ) -> Array:
         inputs, network_time = noises.shown(noise, x, times)
-        out = world_model.apply(model, params, inputs, conditioning, network_time, sight)
+        out = world_model.apply(model, params, inputs, given, network_time, sight)
         return noises.to_x0(noise, out, x, times)
 
     def denoise(x: Array, times: Array, weight: Array) -> Array:
-        with_map = x0(x, times, sight)
-        if sight is None or noise.guidance == 1:
-            return with_map
-        without = x0(x, times, None)
-        return without + weight * (with_map - without)
+        with_all = x0(x, times, conditioning, sight)
+        if noise.guidance == 1 or (sight is None and blind is None):
+            return with_all
+        without = x0(x, times, blind or conditioning, None)
+        return without + weight * (with_all - without)
 
     return noises.sample(noise, denoise, noise_BthwC, key)

@@ -1,0 +1,85 @@
+"""Frame by frame against chunks: how long as many frames take, on the same backbone.
+
+Navigation World Models imagine one frame from the ones before, EgoWM a chunk at once. `python
+benchmarks/egowm_latency.py` times both on one network with random weights, whose attention spans
+what each has to see: the present frame and the one to come, or the present frame and a chunk. Runs
+of the two alternate; medians of the wall time, with least and most.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import statistics
+import time
+
+import jax
+import numpy as np
+
+from pewm_jax import presets, worlds
+from pewm_jax.config import EgoWMConfig
+from pewm_jax.types import Camera, Frames
+
+PRESET = "egowm_tiny"
+
+
+def models(chunk: int, steps: int) -> dict[str, EgoWMConfig]:
+    """Return the two ways: the same networks, clips of 2 frames and of ``chunk`` + 1."""
+    base = presets.load(PRESET).model
+    assert isinstance(base, EgoWMConfig)
+    noise = dataclasses.replace(base.noise, sample_steps=steps)
+
+    def of(frames: int) -> EgoWMConfig:
+        return dataclasses.replace(
+            base, clip=dataclasses.replace(base.clip, frames=frames), noise=noise
+        )
+
+    return {"frame by frame": of(2), f"chunks of {chunk}": of(chunk + 1)}
+
+
+def main() -> None:
+    """Time both and print."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--frames", type=int, default=64, help="frames to imagine")
+    parser.add_argument("--chunk", type=int, default=8, help="frames of a chunk")
+    parser.add_argument("--steps", type=int, default=6, help="evaluations of the network")
+    parser.add_argument("--repeats", type=int, default=5, help="timed runs of each")
+    given = parser.parse_args()
+    ways = models(given.chunk, given.steps)
+    runs = {}
+    for name, model in ways.items():
+        params = jax.jit(worlds.init, static_argnums=0)(model, jax.random.key(0))
+        state = worlds.start(model, params, _frame(model))
+        run = jax.jit(functools.partial(worlds.imagine, model))
+        actions = np.tile(np.array([[0.25, 0, 0.1]], np.float32), (given.frames, 1))
+        runs[name] = functools.partial(run, params, state, actions, jax.random.key(1))
+        jax.block_until_ready(runs[name]())
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(given.repeats):
+        for name, run in runs.items():
+            began = time.perf_counter()
+            jax.block_until_ready(run())
+            seconds[name].append(time.perf_counter() - began)
+    print(f"{given.frames} frames, {given.steps} steps, {jax.devices()[0].device_kind}")
+    for name, found in seconds.items():
+        print(
+            f"  {name:<16} {statistics.median(found):.2f} s  [{min(found):.2f}, {max(found):.2f}]"
+        )
+    slow, fast = (statistics.median(found) for found in seconds.values())
+    print(f"  frame by frame takes {slow / fast:.2f} times as long")
+
+
+def _frame(model: EgoWMConfig) -> Frames:
+    """Return one random frame."""
+    rng, size = np.random.default_rng(0), model.clip
+    shape = (1, size.height, size.width)
+    return Frames(
+        rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
+        rng.uniform(1, 4, shape).astype(np.float32),
+        Camera(np.full((1, 4), 32, np.float32), np.eye(4, dtype=np.float32)[None]),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""EgoWM, steered by actions alone, without a map: houses at 64×64 pixels, minutes on two cores."""
+
+from pewm_jax.config import (
+    ClipConfig,
+    Config,
+    DataConfig,
+    DDPMConfig,
+    DiTConfig,
+    EgoWMConfig,
+    EgoWMTrainConfig,
+    EvalConfig,
+    LearnedCodecConfig,
+    ModulationConfig,
+    StageConfig,
+)
+
+
+def config() -> Config:
+    """Return the settings of ``egowm_tiny``.
+
+    The demo's houses, codec and form of backbone, begun at random, so that the layers of the
+    actions learn as fast as the others do; the codec's gate has nothing to mix. Its data are those
+    of ``demo``: ``pewm-jax data collect data/demo --train 144 --frames 80``.
+    """
+    return Config(
+        model=EgoWMConfig(
+            clip=ClipConfig(height=64, width=64, depth=False),
+            codec=LearnedCodecConfig(gate=48),
+            backbone=DiTConfig(layers=4, heads=4, head_dim=32),
+            control=ModulationConfig(units=(0.25, 0.25, 1.0), rate=1.0),
+            noise=DDPMConfig(snr_shift=4.0, max_weight=1.0, sample_steps=6),
+        ),
+        data=DataConfig(path="data/demo", context=20, stride_max=2, prepared=768),
+        train=EgoWMTrainConfig(
+            run="runs/egowm_tiny",
+            start="codec",
+            fresh=(r"(backbone|control)/.*",),
+            optimizer="muon",
+            adapt=StageConfig(steps=600, batch=16, learning_rate=1e-3, warmup=30),
+            ema=0.98,
+            preview_every=0,
+        ),
+        evaluate=EvalConfig(clips=24),
+    )

@@ -1,0 +1,71 @@
+"""EgoWM: a video model that imagines chunk after chunk, steered by actions, without a map."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from pewm_jax.config.control import ControlSettings, ModulationConfig
+from pewm_jax.config.errors import require
+from pewm_jax.config.memory import MemorySettings, NoMemoryConfig
+from pewm_jax.config.model import ModelConfig
+from pewm_jax.config.reader import RenderConfig
+from pewm_jax.config.training import StageConfig, TrainSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class EgoWMTrainConfig(TrainSettings):
+    """How a video model becomes a world model: all of it is trained, with actions."""
+
+    run: str = "runs/egowm"
+    """Folder of this run: checkpoints, logs, images, report."""
+    adapt: StageConfig = StageConfig()
+    """The backbone goes on learning as it did before, now with actions; the control's learning rate
+    is `model.control.rate` times this one's."""
+    blind: float = 0.1
+    """Share of clips whose observed image is hidden; needed for `model.noise.guidance` above 1."""
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
+        require(
+            self.hidden == 0 and self.chained == 0,
+            f"train.hidden is {self.hidden} and train.chained {self.chained}: this world has no "
+            "memory to hide, and its clips cannot be run backwards; use 0 for both.",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class EgoWMConfig(ModelConfig):
+    """A video diffusion model steered by actions (EgoWM, arXiv 2601.15284)."""
+
+    TRAIN: ClassVar[type[TrainSettings]] = EgoWMTrainConfig
+
+    control: ControlSettings = ModulationConfig()
+    """Control: what steers a clip."""
+    memory: MemorySettings = NoMemoryConfig(reader=RenderConfig())
+    """There is none: leave it at `none`."""
+    history: int = 1
+    """Frames that every clip begins with and that are observed, or were imagined before: 1 in
+    Stable Video Diffusion and CogVideoX; more where a backbone learns with more. They fill latent
+    frames: with `codec.temporal` 4, use 4k + 1."""
+    image_noise: float = 0.0
+    """Deviation of the noise on these frames while imagining; the paper's is 0.1, with Stable Video
+    Diffusion. In training it is drawn as `train` says."""
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(
+            not self.memory.REMEMBERS,
+            "model.memory is of a kind that remembers, and the world egowm has no map: use "
+            "memory.kind none, or the world pewm with control.kind actions.",
+        )
+        q = self.codec.temporal
+        require(
+            1 <= self.history < self.clip.frames and (self.history - 1) % q == 0,
+            f"model.history is {self.history}: use {q}k + 1 frames (they fill latent frames), and "
+            f"fewer than clip.frames ({self.clip.frames}).",
+        )
+        require(self.image_noise >= 0, f"model.image_noise is {self.image_noise}: use 0 or more.")

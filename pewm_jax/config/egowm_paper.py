@@ -1,0 +1,68 @@
+"""EgoWM's experiment on Stable Video Diffusion, around networks of any size (arXiv 2601.15284)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+from pewm_jax.config.clip import ClipConfig
+from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
+from pewm_jax.config.experiment import Config
+from pewm_jax.config.mesh import MeshConfig
+from pewm_jax.config.noise import EDMConfig
+from pewm_jax.config.svd_unet import SVDUNetConfig
+from pewm_jax.config.svd_vae import SVDVAEConfig
+from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig
+
+NOISE = EDMConfig(sigma_data=1.0, sigma_max=700.0, target="v", sample_steps=25)
+"""The published scheduler of Stable Video Diffusion."""
+SIDE = 512
+"""Height and width of the paper's frames."""
+
+
+def experiment(
+    unet: SVDUNetConfig,
+    vae: SVDVAEConfig,
+    noise: EDMConfig = NOISE,
+    *,
+    run: str,
+    size: tuple[int, int] = (SIDE, SIDE),
+    dtype: Literal["float32", "bfloat16"] = "bfloat16",
+) -> Config:
+    """Return the settings of the paper.
+
+    The paper's are the size, learning rates, motion bucket, noise on the image, guidance and number
+    of sampling steps; steps, batch, noise levels in training (those of Stable Video Diffusion) and
+    the share of clips without the image are ours.
+
+    Args:
+        unet: the network, with its image encoder.
+        vae: its autoencoder.
+        noise: its scheduler.
+        run: name of the experiment, for the folder of its runs.
+        size: height and width of a frame.
+        dtype: precision of the computation.
+    """
+    height, width = size
+    return Config(
+        model=EgoWMConfig(
+            clip=ClipConfig(frames=9, height=height, width=width, depth=False),
+            codec=dataclasses.replace(vae, depth=False),
+            backbone=dataclasses.replace(unet, motion_bucket=180.0, remat=True),
+            noise=dataclasses.replace(noise, log_mean=0.7, log_std=1.6, guidance=2.0),
+            image_noise=0.1,
+            dtype=dtype,
+        ),
+        data=DataConfig(path="data/egowm", context=1, stride_max=1),
+        train=EgoWMTrainConfig(
+            run=f"runs/{run}",
+            adapt=StageConfig(steps=20000, batch=8, learning_rate=1e-5, warmup=500),
+            mesh=MeshConfig(fsdp=8),
+            image_noise_mean=math.log(0.1),
+            image_noise_std=0.0,
+            ema=0.9999,
+            preview_every=0,
+        ),
+        evaluate=EvalConfig(batch=1),
+    )

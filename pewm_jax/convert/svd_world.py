@@ -1,0 +1,128 @@
+"""A checkpoint of Stable Video Diffusion as a world model, before any training on actions.
+
+The folder has the settings of the preset ``egowm_svd`` around the checkpoint's networks, and fresh
+layers for the actions, which change nothing yet. It is written part by part, so that no more than
+one network is in memory at a time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal
+
+import jax
+import numpy as np
+
+from pewm_jax import config as configuration
+from pewm_jax import tensor_files, tree
+from pewm_jax.config import Config, egowm_paper
+from pewm_jax.convert import assemble, clip_vision, cogvideox, output, sources, svd
+from pewm_jax.convert.cogvideox import CONFIG, WEIGHTS
+from pewm_jax.models import clip_vision as clip_model
+from pewm_jax.models import controls
+from pewm_jax.types import Array, Params
+
+Specs = dict[str, jax.ShapeDtypeStruct]
+"""Shape and dtype of every leaf, by path."""
+
+
+def config_of(src: Path, dst: Path, dtype: str | None, size: tuple[int, int]) -> Config:
+    """Return the settings of the world model around a pipeline's networks.
+
+    Args:
+        src: the pipeline's folder.
+        dst: the folder to be made, whose name the runs have.
+        dtype: of the weights; 16 bits are computed in bfloat16.
+        size: height and width of a frame.
+
+    Raises:
+        UserError: a network of another class, or settings that are not known.
+        ConfigError: the networks do not fit each other or the size.
+    """
+    unet, vae = (
+        network.config(cogvideox.settings(network, src), network.folder)
+        for network in (svd.UNET, svd.VAE)
+    )
+    image = sources.component(src, "image_encoder") / "config.json"
+    encoder = clip_vision.config_from_transformers(sources.read_json(image), str(image))
+    precision: Literal["float32", "bfloat16"] = "float32" if dtype == "float32" else "bfloat16"
+    return egowm_paper.experiment(
+        dataclasses.replace(unet, image=encoder),
+        vae,
+        svd.read_scheduler(src),
+        run=dst.name,
+        size=size,
+        dtype=precision,
+    )
+
+
+def import_world(
+    src: Path, dst: Path, dtype: str | None = None, size: tuple[int, int] = (512, 512)
+) -> None:
+    """Write the folder: ``config.json`` and ``weights.safetensors``.
+
+    Args:
+        src: a pipeline's folder as diffusers writes it: unet/, vae/, image_encoder/, scheduler/.
+        dst: the folder to make.
+        dtype: of the weights; by default the stored one, and float32 for the actions' layers.
+        size: height and width of a frame.
+
+    Raises:
+        UserError: ``dst`` exists, or ``src`` is incomplete, damaged or of another kind.
+        ConfigError: the networks do not fit each other or the size.
+    """
+    output.refuse_existing(dst)
+    stored = dtype or _stored(src)
+    config = config_of(src, dst, stored, size)
+    new = np.dtype(jax.numpy.dtype(dtype or "float32"))
+
+    def actions() -> Params:
+        return jax.jit(controls.init, static_argnums=0)(config.model, jax.random.key(0))
+
+    fresh = tree.flatten(jax.eval_shape(actions))
+    parts: dict[str, tuple[Specs, Callable[[], Params]]] = {
+        "backbone": (
+            cogvideox.stored_specs(svd.UNET, src, dtype),
+            lambda: svd.read_unet(src, dtype)[1],
+        ),
+        "codec": (
+            cogvideox.stored_specs(svd.VAE, src, dtype),
+            lambda: svd.read_vae(src, dtype)[1],
+        ),
+        "image": (_image_specs(src, dtype), lambda: svd.read_image_encoder(src, dtype)[1]),
+        "control": (
+            {path: jax.ShapeDtypeStruct(leaf.shape, new) for path, leaf in fresh.items()},
+            actions,
+        ),
+    }
+    specs = {f"{part}/{p}": spec for part, (like, _) in parts.items() for p, spec in like.items()}
+
+    def tensors() -> Iterator[tuple[str, Array]]:
+        for part, (_, make) in parts.items():
+            for path, leaf in tree.flatten({part: make()}).items():
+                yield path, np.asarray(leaf).astype(specs[path].dtype, copy=False)
+
+    with output.new_folder(dst) as folder:
+        header = tensor_files.header({"stage": "0"})
+        with output.megabytes(f"write {dst.name}", tensor_files.size(specs)) as progress:
+            tensor_files.write(folder / WEIGHTS, specs, tensors(), header, progress)
+        configuration.save(config, folder / CONFIG)
+
+
+def _stored(src: Path) -> str:
+    """Return the dtype that the U-Net's weights have."""
+    return cogvideox.stored_specs(svd.UNET, src, None)["conv_out/kernel"].dtype.name
+
+
+def _image_specs(src: Path, dtype: str | None) -> Specs:
+    """Return what reading the image encoder will give."""
+    inside = sources.component(src, "image_encoder")
+    path = inside / "config.json"
+    config = clip_vision.config_from_transformers(sources.read_json(path), str(path))
+    like = jax.eval_shape(lambda: clip_model.init(config, jax.random.key(0)))
+    entries = clip_vision.entries(config)
+    source = clip_vision.without_positions(sources.open_folder(inside))
+    assemble.require(entries, source, like)
+    return assemble.leaf_specs(entries, source, like, dtype)
