@@ -7,14 +7,12 @@ from the settings and its number. What an environment has to show is said in ``e
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 from pewm_jax.config import UserError
 from pewm_jax.data import env_episode, unfinished
-from pewm_jax.data.dataset import Shard, describe_shard, read_record, write_shard
+from pewm_jax.data.dataset import describe_shard, write_shard
 from pewm_jax.data.env_episode import SPLITS, CollectEnvConfig
-from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.progress import Meter
 
 
@@ -90,10 +88,6 @@ def _split(
         write_shard(path, records(indices))
         done[path.name] = describe_shard(path)
     shards = [done[path.name] for path in jobs]
-    unfinished.publish(folder, settings, shards, sum(_frames(folder, one) for one in shards))
-
-
-def _frames(folder: Path, shard: Shard) -> int:
-    """Return the number of frames of a shard's episodes, which may differ in length."""
-    path = folder / shard.file
-    return sum(read_episode(read_record(path, i)).length for i in range(shard.records))
+    unfinished.publish(
+        folder, settings, shards, sum(unfinished.frames_of(folder, one) for one in shards)
+    )

@@ -20,9 +20,11 @@ from pewm_jax.data.dataset import (
     count_records,
     describe_shard,
     read_manifest,
+    read_record,
     write_json,
     write_manifest,
 )
+from pewm_jax.data.episodes import read_episode
 
 State = Literal["fresh", "resume", "complete"]
 
@@ -103,6 +105,12 @@ def publish(
     """Write ``dataset.json``: the split is finished."""
     write_manifest(folder, Manifest(folder.name, tuple(shards), settings, frames))
     (folder / UNFINISHED).unlink(missing_ok=True)
+
+
+def frames_of(folder: Path, shard: Shard) -> int:
+    """Return the number of frames of a shard's episodes, which may differ in length."""
+    path = folder / shard.file
+    return sum(read_episode(read_record(path, i)).length for i in range(shard.records))
 
 
 def _complete_shard(path: Path, records: int) -> Shard | None:

@@ -12,6 +12,7 @@ time_embed, blocks (stacked over layers), modulate_out, proj_out``, and ``text_e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -128,6 +129,8 @@ def apply(
         "timesteps_Bt": (timesteps_Bt, ((batch,), (batch, grid[0]))),
         "text_BLD": (text_BLD, ((batch, "L", config.raw_text_dim or config.text_dim),)),
         "modulation_BtE": (modulation_BtE, ((batch, grid[0], config.time_dim),)),
+        "added_BND": (added_BND, ((batch, math.prod(grid), config.width),)),
+        "fps": (None if fps is None else jnp.asarray(fps), ((),)),
     }
     for name, (value, forms) in wanted.items():
         _require_shape(name, value, forms)

@@ -5,8 +5,9 @@ world imagines what is then seen and remembers it, and so on (paper, Section 3.3
 picture of such a walk is a goal that the walk reached (hindsight relabelling): NoMaD's loss learns
 from any walk in this way.
 
-A world knows no walls, but it imagines depth: where something stands in the way of a step forward,
-the rest of the block is imagined once more as a turn on the spot.
+A world knows no walls, but the given pictures have depth: where something that they show stands in
+the way of a step forward, the rest of the block is a turn on the spot (``floor_map``). So walls are
+the same whatever the world imagines.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import ActionConfig, Config, NomadConfig
+from pewm_jax.config import ActionConfig, Config, NomadConfig, UserError
 from pewm_jax.config.errors import require
 from pewm_jax.data.simulator import Simulator, move
+from pewm_jax.data.trajectories import advance
 from pewm_jax.geometry.actions import (
     FORWARD,
+    NAMES,
     TURN_LEFT,
     TURN_RIGHT,
     discrete_table,
@@ -33,17 +36,12 @@ from pewm_jax.geometry.actions import (
 )
 from pewm_jax.models.signals import rgb_from_signal
 from pewm_jax.planning import nomad_policy
+from pewm_jax.planning.floor_map import FloorMap
 from pewm_jax.types import Frames, Params
 
 Act: TypeAlias = Callable[[np.ndarray, np.ndarray | None, jax.Array], np.ndarray]
 """``act(rgb_SHWC, goal_HWC, key) -> (N,)`` discrete actions: pictures seen, the present last, and
 the picture of a goal or None."""
-RADIUS_M = 0.2
-"""What is nearer to the agent's way than this, is in it."""
-BODY_M = (-0.3, 0.9)
-"""From this much above the camera to this much below it there must be room."""
-NEAREST = 0.02
-"""This share of the pixels in the way may be nearer: single ones are imagined wrongly."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,11 +90,12 @@ class Place(Protocol):
         """Return the state at the pose of a given picture, and that picture."""
         ...
 
-    def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames, int]:
-        """Return the state after N actions, what was seen, and the first action not possible.
+    def possible(self, state: Any, actions_N: np.ndarray) -> int:
+        """Return the number of actions before the first that leads into something; N if none."""
+        ...
 
-        The number is N if all were.
-        """
+    def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames]:
+        """Return the state after N actions, and what was seen."""
         ...
 
 
@@ -113,6 +112,9 @@ def walks(place: Place, seen: Frames, act: Act, practice: Practice, seed: int) -
     Returns:
         The walks, made as they are asked for; each has the same number of frames if the policy
         proposes as many actions each time.
+
+    Raises:
+        UserError: the policy gives something else than discrete actions.
     """
     for number in range(practice.walks):
         rng, key = np.random.default_rng((seed, number)), jax.random.key(seed)
@@ -124,27 +126,14 @@ def walks(place: Place, seen: Frames, act: Act, practice: Practice, seed: int) -
         for _ in range(practice.blocks):
             key, one, two = jax.random.split(key, 3)
             pictures = np.concatenate([each.rgb_THWC for each in frames])
-            actions = np.array(act(pictures, goal, one))
-            turn = rng.choice([TURN_LEFT, TURN_RIGHT])
-            state, after, actions = _carried_out(place, state, actions, int(turn), two)
+            actions = require_discrete(act(pictures, goal, one), "the policy")
+            turn = int(rng.choice([TURN_LEFT, TURN_RIGHT]))
+            actions[place.possible(state, actions) :] = turn
+            state, after = place.go(state, actions, two)
             frames.append(after)
             done.append(actions)
         together = jax.tree.map(lambda *x: np.concatenate(x), *frames)
         yield Walk(together, np.concatenate(done))
-
-
-def _carried_out(
-    place: Place, state: Any, actions_N: np.ndarray, turn: int, key: jax.Array
-) -> tuple[Any, Frames, np.ndarray]:
-    """Carry out a block; from the first step that is not possible on, turn instead."""
-    after, frames, possible = place.go(state, actions_N, key)
-    while possible < len(actions_N):
-        actions_N = np.concatenate([actions_N[:possible], np.full(len(actions_N) - possible, turn)])
-        after, frames, now = place.go(state, actions_N, key)
-        if now >= possible:  # turns are always possible
-            break
-        possible = now  # what is imagined anew may stand in the way earlier
-    return after, frames, actions_N
 
 
 class Imagined:
@@ -159,7 +148,9 @@ class Imagined:
 
     def __init__(self, config: Config, params: Params, seen: Frames, *, memory: bool = True):
         self.config, self.params, self.seen, self.memory = config, params, seen, memory
-        self.way_m = config.model.actions.step_m
+        self.table_A3 = discrete_table(config.model.actions).astype(np.float64)
+        self.floor = FloorMap()
+        self.floor.add(seen)
 
     def begin(self, number: int) -> tuple[Any, Frames]:
         """Begin with all that was seen; the given picture is the present."""
@@ -169,22 +160,23 @@ class Imagined:
         state = _start(self.config.model, self.params, seen)
         return state, jax.tree.map(lambda x: x[-1:], seen)
 
-    def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames, int]:
-        """Imagine, and look whether anything stands in the way of a step."""
-        before = np.asarray(state.frame.depth_THW)
+    def possible(self, state: Any, actions_N: np.ndarray) -> int:
+        """Look at what the given pictures show to be in the way."""
+        pose = planar(np.asarray(state.frame.camera.world_from_camera)[0])
+        for number, action in enumerate(actions_N):
+            after = advance(pose, self.table_A3[int(action)])
+            if action == FORWARD and not self.floor.free(pose[:2], after[:2]):
+                return number
+            pose = after
+        return len(actions_N)
+
+    def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames]:
+        """Imagine, and remember."""
         given = jnp.asarray(actions_N, jnp.int32)
         state, frames = _imagine(self.config.model, self.params, state, given, key, self.memory)
-        shown = Frames(
-            np.asarray(rgb_from_signal(frames.rgb_THWC)),
-            np.asarray(frames.depth_THW),
-            jax.tree.map(np.asarray, frames.camera),
-        )
-        depths = np.concatenate([before, shown.depth_THW])
-        intrinsics = shown.camera.intrinsics_4[0]
-        for number in np.flatnonzero(actions_N == FORWARD):
-            if not free(depths[number], intrinsics, self.way_m):
-                return state, shown, int(number)
-        return state, shown, len(actions_N)
+        camera = jax.tree.map(np.asarray, frames.camera)
+        rgb = np.asarray(rgb_from_signal(frames.rgb_THWC))
+        return state, Frames(rgb, np.asarray(frames.depth_THW), camera)
 
 
 class Real:
@@ -203,35 +195,44 @@ class Real:
     def begin(self, number: int) -> tuple[Any, Frames]:
         """Stand where a given picture was taken."""
         here = jax.tree.map(lambda x: np.asarray(x)[number : number + 1], self.seen)
-        pose = here.camera.world_from_camera[0]
-        return np.array([*pose[:2, 3], float(heading(pose))]), here
+        return planar(here.camera.world_from_camera[0]), here
 
-    def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames, int]:
-        """Walk until something stands in the way, and on; walls hold."""
-        del key
-        poses, possible = [state], len(actions_N)
+    def possible(self, state: Any, actions_N: np.ndarray) -> int:
+        """Walk until something stands in the way."""
         for number, action in enumerate(actions_N):
-            after, collided = move(self.simulator.grid, poses[-1], self.table_A3[int(action)])
+            state, collided = move(self.simulator.grid, state, self.table_A3[int(action)])
             if collided:
-                possible = min(possible, number)
-            poses.append(after)
-        return poses[-1], self.simulator.frames(np.stack(poses[1:])), possible
+                return number
+        return len(actions_N)
+
+    def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames]:
+        """Walk; walls hold."""
+        del key
+        poses = [state]
+        for action in actions_N:
+            poses.append(move(self.simulator.grid, poses[-1], self.table_A3[int(action)])[0])
+        return poses[-1], self.simulator.frames(np.stack(poses[1:]))
 
 
-def free(depth_HW: np.ndarray, intrinsics_4: np.ndarray, way_m: float) -> bool:
-    """Tell whether there is room for a step forward, by what is seen.
+def planar(world_from_camera: np.ndarray) -> np.ndarray:
+    """Return x, y, yaw of a camera (4, 4)."""
+    return np.array([*world_from_camera[:2, 3], float(heading(world_from_camera))])
 
-    Args:
-        depth_HW: metres along z, 0 = no measurement.
-        intrinsics_4: fx, fy, cx, cy in pixels, centres at +0.5.
-        way_m: length of the step.
+
+def require_discrete(actions_N: Any, who: str) -> np.ndarray:
+    """Return a copy of discrete actions (N,).
+
+    Raises:
+        UserError: they are none.
     """
-    rows, columns = np.indices(depth_HW.shape) + 0.5
-    fx, fy, cx, cy = (float(value) for value in intrinsics_4)
-    right, down = (columns - cx) / fx * depth_HW, (rows - cy) / fy * depth_HW
-    beside = (np.abs(right) <= RADIUS_M) & (down >= BODY_M[0]) & (down <= BODY_M[1])
-    near = beside & (depth_HW > 0) & (depth_HW < way_m + RADIUS_M)
-    return near.sum() <= NEAREST * max(beside.sum(), 1)
+    actions = np.array(actions_N)
+    known = actions.dtype.kind in "iu" and actions.ndim == 1 and actions.size > 0
+    if not known or not ((actions >= 0) & (actions < len(NAMES))).all():
+        raise UserError(
+            f"{who} gave {actions.dtype} of shape {actions.shape}: give whole numbers from 0 to "
+            f"{len(NAMES) - 1}, one for each action."
+        )
+    return actions
 
 
 def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Act:

@@ -22,8 +22,8 @@ from pewm_jax.types import Frames
 TRIES = 2000
 LEAST_M = 0.5
 """A walk that ends nearer to its start is no task."""
-NEAR_M = 1.5
-"""Tasks near a place start no farther from it."""
+NEAR_M, NEAR_LEAST_M = 1.5, 1.0
+"""Tasks near a place start no farther from it, and end at least so far from their start."""
 TEST = 2
 """The first house of the split that nobody is trained on; every third one is of it."""
 
@@ -132,8 +132,8 @@ def near(home: Goal, count: int, actions: int) -> list[Goal]:
     """Make tasks near the places that were seen before a task.
 
     They start at most ``NEAR_M`` from where it starts or from the middle of its walk, in sight of
-    it, and end at most twice as far from there. The last frame of each one's context is what is
-    seen at its own start.
+    that place, and end at most twice as far from there and at least ``NEAR_LEAST_M`` from their
+    start. The last frame of each one's context is what is seen at its own start.
 
     Args:
         home: the task.
@@ -152,12 +152,14 @@ def near(home: Goal, count: int, actions: int) -> list[Goal]:
         planar = np.array([*start, rng.uniform(-np.pi, np.pi)])
         expert = wander(rng, actions)
         walk = walked(simulator, home.table_A3, planar, expert)
-        begins, ends = (np.linalg.norm(places - walk[t, :2], axis=-1) for t in (0, -1))
-        sees = any(line_is_free(simulator.grid, place, walk[0, :2]) for place in places)
         far = np.linalg.norm(walk[-1, :2] - walk[0, :2])
-        if not sees or begins.min() > NEAR_M or ends.min() > 2 * NEAR_M or far < LEAST_M:
-            continue
-        if _blocked(walk, expert):
+        beside = any(
+            np.linalg.norm(place - walk[0, :2]) <= NEAR_M
+            and np.linalg.norm(place - walk[-1, :2]) <= 2 * NEAR_M
+            and line_is_free(simulator.grid, place, walk[0, :2])
+            for place in places
+        )
+        if not beside or far < NEAR_LEAST_M or _blocked(walk, expert):
             continue
         seen = simulator.frames(np.stack([walk[0], walk[-1]]))
         present = jax.tree.map(lambda *x: np.concatenate(x), home.context, _one(seen, 0))

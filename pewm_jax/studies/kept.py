@@ -29,8 +29,12 @@ def require_same(
     """
     file = out / SETTINGS
     now = json.dumps({n: value for n, value in about.items() if n not in may_change}, indent=1)
+    if out.exists() and not out.is_dir():
+        raise UserError(f"{out} is a file: name a folder by --out.")
     if file.exists():
-        before = json.loads(file.read_text("utf-8"))
+        before = read(file)
+        if before is None:
+            raise UserError(f"{file} is damaged: delete it, if its settings are still these.")
         wrong = [name for name, value in json.loads(now).items() if before.get(name) != value]
         if wrong:
             raise UserError(
@@ -42,11 +46,12 @@ def require_same(
 
 
 def read(file: Path) -> dict[str, Any] | None:
-    """Return a finished piece; None where there is none."""
+    """Return a finished piece; None where there is none, or something else."""
     try:
-        return json.loads(file.read_text("utf-8"))
+        found = json.loads(file.read_text("utf-8"))
     except (FileNotFoundError, ValueError):
         return None
+    return found if isinstance(found, dict) else None
 
 
 def write(file: Path, piece: Mapping[str, Any]) -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 from pathlib import Path
 
+from pewm_jax import config as configuration
 from pewm_jax.config import ActionConfig, Config, NomadWorldConfig, UserError
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.rollouts import load_finished
@@ -22,7 +25,7 @@ class OpenedPolicy:
         folder: of its run.
         config: of its training.
         weights: the policy's parameters.
-        digest: sha256 of the file of weights.
+        digest: of weights and settings, see ``digest``.
     """
 
     folder: Path
@@ -34,6 +37,12 @@ class OpenedPolicy:
     def motion(self) -> ActionConfig:
         """What an action of its walks does."""
         return self.config.model.actions
+
+
+def digest(weights_hash: str, config: Config) -> str:
+    """Return a hash of all that what a model does depends on: its weights and its settings."""
+    settings = json.dumps(configuration.to_dict(config.model), sort_keys=True)
+    return hashlib.sha256((weights_hash + settings).encode()).hexdigest()
 
 
 def is_run(name: str | Path) -> bool:
@@ -54,4 +63,6 @@ def open_policy(name: str | Path) -> OpenedPolicy:
     config, params = load_finished(folder)
     if not isinstance(config.model, NomadWorldConfig):
         raise UserError(f"{folder} trained no policy: name the run of one (pewm-jax train nomad).")
-    return OpenedPolicy(folder, config, params["policy"], file_hash(folder / WEIGHTS))
+    return OpenedPolicy(
+        folder, config, params["policy"], digest(file_hash(folder / WEIGHTS), config)
+    )

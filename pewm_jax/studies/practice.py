@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import json
+import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -22,24 +23,26 @@ from pewm_jax import atomic
 from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.config.errors import require
 from pewm_jax.data import unfinished
-from pewm_jax.data.dataset import describe_shard, write_shard
+from pewm_jax.data.dataset import EpisodeSource, describe_shard, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
+from pewm_jax.data.navigation import line_is_free
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation import intervals
 from pewm_jax.evaluation.opened import Opened, open_run, remembers
-from pewm_jax.geometry.actions import discrete_table
+from pewm_jax.geometry.actions import FORWARD, discrete_table
 from pewm_jax.planning import practice, scores
 from pewm_jax.planning.practice import Act, Imagined, Place, Practice, Real, Walk
-from pewm_jax.studies import goals, kept, practice_page
+from pewm_jax.studies import goals, kept, policies, practice_page
 from pewm_jax.studies.goals import Goal
 from pewm_jax.studies.policies import OpenedPolicy, open_policy
 from pewm_jax.training import loop
 
-BEFORE, REAL, MEMORY, EMPTY = "before", "real", "memory", "empty"
+CHANCE, BEFORE, REAL, MEMORY, EMPTY = "chance", "before", "real", "memory", "empty"
 LEARNED = (MEMORY, EMPTY, REAL)
 """Where a policy practises."""
-WITHIN_M, WITHIN_DEG = 0.5, 45.0
-"""A goal is reached this near to it, and with a heading this near to its own."""
+WITHIN_M, WITHIN_DEG = 0.35, 45.0
+"""A goal is reached this near to it, and with a heading this near to its own, as in Table 2."""
+ROWS = (CHANCE, BEFORE, *LEARNED)
 Say = Callable[[str], Any]
 
 
@@ -80,6 +83,12 @@ class Errand:
             len(self.seeds) > 0 and len(set(self.seeds)) == len(self.seeds),
             f"seeds are {self.seeds}: give different ones, such as 0 1 2.",
         )
+        require(min(self.seeds) >= 0, f"seeds are {self.seeds}: use numbers from 0 on.")
+        require(self.shown >= 0, f"shown is {self.shown}: use 0 or more.")
+        require(
+            math.isfinite(self.learning_rate) and self.learning_rate > 0,
+            f"learning_rate is {self.learning_rate}: use a number above 0.",
+        )
 
 
 def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: Say = print) -> Path:
@@ -100,26 +109,26 @@ def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: S
             folder holds pieces of other settings.
     """
     world, begun = open_run(model), open_policy(policy)
-    _require_fit(world, begun, model, policy)
-    about = dataclasses.asdict(errand) | {"weights": world.weights_hash, "policy": begun.digest}
+    _require_fit(world, begun, errand, model, policy)
+    about = dataclasses.asdict(errand) | {
+        "weights": policies.digest(world.weights_hash, world.config),
+        "policy": begun.digest,
+    }
     kept.require_same(out, about, ("houses", "seeds", "shown"), "pieces")
     pieces = [
         (house, seed, how)
         for house in range(errand.houses)
         for seed in errand.seeds
-        for how in (BEFORE, *LEARNED)
+        for how in ROWS
     ]
-    made: dict[str, list[dict[str, Any]]] = {how: [] for how in (BEFORE, *LEARNED)}
+    made: dict[str, list[dict[str, Any]]] = {how: [] for how in ROWS}
     with Meter("practising", len(pieces), "pieces") as meter:
         for house, seed, how in pieces:
             folder = out / f"house{house:04d}" / f"{how}-seed{seed}"
             piece = kept.read(folder / "scores.json")
             if piece is None:
                 home = _home(errand, world.config, house)
-                learned = begun
-                if how != BEFORE:
-                    learned = _learned(world, begun, home, errand, how, seed, folder)
-                piece = {"house": home.house, "tasks": _measured(home, learned, errand, seed)}
+                piece = _piece(world, begun, home, errand, how, seed, folder)
                 kept.write(folder / "scores.json", piece)
             made[how].append(piece)
             meter.advance(1)
@@ -139,14 +148,79 @@ def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: S
     return page
 
 
-def _require_fit(world: Opened, begun: OpenedPolicy, model: str | Path, policy: str | Path) -> None:
+def _require_fit(
+    world: Opened, begun: OpenedPolicy, errand: Errand, model: str | Path, policy: str | Path
+) -> None:
+    """Refuse what would end later, and in words that do not help."""
     if not remembers(world):
         raise UserError(f"{model} has no memory, and what a memory adds is the question.")
+    clip, own = world.config.model.clip, begun.config.model.clip
+    if clip.height != clip.width or not clip.depth:
+        what = f"{clip.width}×{clip.height}" + ("" if clip.depth else " without depth")
+        raise UserError(f"{model} imagines pictures of {what}: give a model of square RGB-D ones.")
+    if (own.height, own.width) != (clip.height, clip.width):
+        raise UserError(
+            f"{policy} learned from pictures of {own.width}×{own.height}, and {model} imagines "
+            f"{clip.width}×{clip.height}: train one of them at the other's size."
+        )
     if begun.motion != world.config.model.actions:
         raise UserError(
             f"{policy} takes other steps than {model} imagines ({begun.motion} and "
             f"{world.config.model.actions}): train one of them with the other's actions."
         )
+    frames = 1 + errand.practice.blocks * begun.config.model.policy.waypoints
+    if frames < own.frames:
+        raise UserError(
+            f"walks of {errand.practice.blocks} blocks have {frames} frames, and {policy} learns "
+            f"from clips of {own.frames}: use more --blocks."
+        )
+
+
+def _piece(
+    world: Opened,
+    begun: OpenedPolicy,
+    home: Goal,
+    errand: Errand,
+    how: str,
+    seed: int,
+    folder: Path,
+) -> dict[str, Any]:
+    """Return what one policy reaches in one house, and what it practised."""
+    piece: dict[str, Any] = {"house": home.house, "walked": {}}
+    act = _act(begun)
+    if how == CHANCE:
+        act = _by_chance(begun.config.model.policy.waypoints)
+    elif how != BEFORE:
+        act = _act(_learned(world, begun, home, errand, how, seed, folder))
+        piece["walked"] = _walked(folder / "data" / "train", home)
+    return piece | {"tasks": _measured(home, act, errand, seed)}
+
+
+def _by_chance(count: int) -> Act:
+    """Return a policy that walks without looking; see ``goals.wander``."""
+
+    def act(rgb_SHWC: np.ndarray, goal_HWC: np.ndarray | None, key: jax.Array) -> np.ndarray:
+        del rgb_SHWC, goal_HWC
+        drawn = jax.random.key_data(key)
+        return goals.wander(np.random.default_rng(np.asarray(drawn)), count)
+
+    return act
+
+
+def _walked(folder: Path, home: Goal) -> dict[str, float]:
+    """Return the per cent of actions that went forward, and of these that went through walls."""
+    forward, through, count = 0, 0, 0
+    for episode in EpisodeSource(folder):
+        ids = np.asarray(episode.action_ids)
+        places = np.asarray(episode.world_from_camera)[:, :2, 3].astype(np.float64)
+        for n in np.flatnonzero(ids == FORWARD):
+            moved = np.linalg.norm(places[n + 1] - places[n]) > 1e-3
+            through += moved and not line_is_free(home.simulator.grid, places[n], places[n + 1])
+        forward, count = forward + int((ids == FORWARD).sum()), count + len(ids)
+    return {
+        "forward": 100.0 * forward / count,
+        "through_walls": 100.0 * float(through) / max(forward, 1),
+    }
 
 
 def _home(errand: Errand, config: Config, house: int) -> Goal:
@@ -202,6 +276,7 @@ def _learned(
         learning_rate=errand.learning_rate,
         warmup=min(config.train.policy.warmup, errand.steps // 10),  # type: ignore[attr-defined]
     )
+    shutil.rmtree(folder / "run", ignore_errors=True)  # half a training is begun anew: it is short
     train = dataclasses.replace(
         config.train, run=str(folder / "run"), start=str(begun.folder), seed=seed, policy=stage
     )
@@ -221,20 +296,17 @@ def _collect(
         return
     path = folder / "shard-00000-of-00001.array_record"
     done = unfinished.prepare(folder, settings, state, {path: errand.practice.walks})
-    table, frames = discrete_table(begun.motion), 0
+    table = discrete_table(begun.motion)
 
     def records() -> Iterator[bytes]:
-        nonlocal frames
         walks = practice.walks(place, home.context, _act(begun), errand.practice, seed)
         for number, walk in enumerate(walks):
-            frames += len(walk.frames.depth_THW)
             yield _record(walk, table, f"{home.house}-{number:04d}", home.house)
 
     if path.name not in done:
         write_shard(path, records())
     shard = done.get(path.name) or describe_shard(path)
-    frames = frames or errand.practice.walks * (1 + errand.practice.blocks * errand.actions)
-    unfinished.publish(folder, settings, [shard], frames)
+    unfinished.publish(folder, settings, [shard], unfinished.frames_of(folder, shard))
 
 
 def _record(walk: Walk, table_A3: np.ndarray, name: str, house: str) -> bytes:
@@ -250,11 +322,11 @@ def _record(walk: Walk, table_A3: np.ndarray, name: str, house: str) -> bytes:
     return write_episode(arrays, name, house, {"policy": "practice"})
 
 
-def _measured(
-    home: Goal, policy: OpenedPolicy, errand: Errand, seed: int
-) -> list[dict[str, float]]:
-    """Send a policy to goals near the places that were seen, in the real house."""
-    act = _act(policy)
+def _measured(home: Goal, act: Act, errand: Errand, seed: int) -> list[dict[str, float]]:
+    """Send a policy to goals near the places that were seen, in the real house.
+
+    It is stopped at the first moment within reach of the goal: it need not know that it is there.
+    """
     scored = []
     for task in goals.near(home, errand.tasks, errand.actions):
         walked = [task.walk_T3[0]]
@@ -299,7 +371,15 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
         }
         for how, pieces in made.items()
     }
-    differences = ((MEMORY, BEFORE), (MEMORY, EMPTY), (REAL, MEMORY), (REAL, BEFORE))
+    differences = ((MEMORY, BEFORE), (MEMORY, EMPTY), (REAL, MEMORY), (BEFORE, CHANCE))
+    walked = {
+        how: {
+            name: float(np.mean([piece["walked"][name] for piece in pieces]))
+            for name in pieces[0]["walked"]
+        }
+        for how, pieces in made.items()
+        if pieces[0]["walked"]
+    }
     return {
         "rows": {
             how: {metric: intervals.entry(x, houses) for metric, x in by.items()}
@@ -312,6 +392,7 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
             }
             for one, other in differences
         },
+        "walked": walked,
         "houses": len(set(houses.tolist())),
         "tasks": len(houses),
     }

@@ -21,6 +21,7 @@ COLUMNS: Mapping[str, tuple[str, int]] = {
 }
 """Score → heading, decimals."""
 LABELS = {
+    "chance": "walking without looking",
     "before": "before practice",
     "memory": "practised in the world, with its memory",
     "empty": "practised in the world, empty memory",
@@ -35,8 +36,9 @@ def write(
     results: Mapping[str, Any], page: Path, shown: Sequence[tuple[str, Mapping[str, Walk]]]
 ) -> None:
     """Write the table as ``page`` (Markdown), and its picture beside it."""
-    atomic.write_text(page, markdown(results, page.stem))
-    pictures.save_png(page.with_suffix(".png"), picture(shown))
+    atomic.write_text(page, markdown(results, page.stem if shown else ""))
+    if shown:
+        pictures.save_png(page.with_suffix(".png"), picture(shown))
 
 
 def markdown(results: Mapping[str, Any], stem: str) -> str:
@@ -55,6 +57,10 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
             (name.split(" - "), by) for name, by in results["differences"].items()
         )
     ]
+    walked = [
+        [LABELS[how], f"{by['forward']:.1f}", f"{by['through_walls']:.1f}"]
+        for how, by in results["walked"].items()
+    ]
     about = results["about"]
     drill = about["practice"]
     how = (
@@ -62,8 +68,9 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
         f"each, {len(about['seeds'])} seed(s). In each house the policy begins with the same few "
         f"pictures, walks {drill['walks']} times ({drill['blocks']} proposals each) and learns "
         f"{about['steps']} steps from these walks alone. Then it is sent to goals "
-        f"{about['actions']} actions away, and may take {about['most']}. Reached: within "
-        f"{about['within_m']:g} m and {about['within_deg']:g}°. Means over houses; ± is half of "
+        f"{about['actions']} actions away, and may take {about['most']}; it is stopped at the "
+        f"first moment within {about['within_m']:g} m and {about['within_deg']:g}° of the goal, "
+        "which is success (it need not know that it is there). Means over houses; ± is half of "
         f"the 95 % interval (bootstrap over houses). {about['date']}."
     )
     return (
@@ -73,7 +80,13 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
                 how,
                 table(["", *headings], rows),
                 "## Differences\n\nPaired by goal and seed.\n\n" + table(["", *headings], gains),
-                f"## What it saw\n\n![Walks in the house and in the world]({stem}.png)",
+                "## What it learned from\n\nOf the actions of its walks in per cent, how many went "
+                "forward, and of these how many through real walls.\n\n"
+                + table(["", "forward", "through walls"], walked),
+                *(
+                    [f"## What it saw\n\n![Walks in the house and in the world]({stem}.png)"]
+                    * bool(stem)
+                ),
             )
         )
         + "\n"

@@ -23,7 +23,7 @@ from pewm_jax.evaluation.opened import open_run, remembers
 from pewm_jax.planning import scores
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.settings import PlanConfig
-from pewm_jax.studies import deciders, kept, table2_page
+from pewm_jax.studies import deciders, kept, policies, table2_page
 from pewm_jax.studies.deciders import Minds, Policy
 from pewm_jax.studies.goals import Goal, open_goal
 from pewm_jax.types import Params
@@ -91,7 +91,7 @@ def run(
             f"plans have {errand.plan.actions} actions, and {model} imagines "
             f"{config.model.clip.frames - 1} frames at once: use a multiple."
         )
-    about = dataclasses.asdict(errand) | {"weights": opened.weights_hash}
+    about = dataclasses.asdict(errand) | {"weights": policies.digest(opened.weights_hash, config)}
     if config.model.clip.height != config.model.clip.width:
         size = f"{config.model.clip.width}×{config.model.clip.height}"
         raise UserError(f"{model} imagines pictures of {size}, and Table 2 needs square ones.")

@@ -47,6 +47,7 @@ FREE = (
     "model.noise.sigma_min",
     "model.noise.sigma_max",
     "model.noise.rho",
+    "model.noise.ends",
     "train.run",
     "train.save_every",
     "train.keep",

@@ -1,10 +1,10 @@
 """Many candidates from one state: what they share is made once, what nobody looks at is not made.
 
 A candidate imagines what ``pewm.imagine`` imagines without remembering. But the present frame is
-encoded once; on a processor the memory is rendered once for each camera that several candidates
-have in common (equal beginnings lead to equal cameras), and not in both sides of a branch, as
-``jax.vmap`` would; and where only the last frame is asked for, only that is decoded, if the codec
-works frame by frame.
+encoded once. What the memory shows may be given (``pewm_views``); if it is not, it is rendered, on
+a processor, once for each camera that several candidates have in common (equal beginnings lead to
+equal cameras), and not in both sides of a branch, as ``jax.vmap`` would. Where only the last frame
+is asked for, only that is decoded, if the codec works frame by frame.
 """
 
 from __future__ import annotations

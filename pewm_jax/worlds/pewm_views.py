@@ -24,8 +24,8 @@ FINE = 2.0**-20
 """Numbers of cameras are rounded to multiples of this, about a millionth of a metre."""
 AT_ONCE = 8
 """Cameras that are rendered by one call while so many are missing."""
-MOST = 4096
-"""Views kept; when there would be more, all are forgotten. One of 64×64 pixels takes 70 kB."""
+MOST = 512 * 2**20
+"""Bytes of views that are kept; when there would be more, all are forgotten."""
 
 
 class Views:
@@ -41,6 +41,7 @@ class Views:
         self.rendered = 0
         self._known: dict[bytes, list[np.ndarray]] = {}
         self._form: Any = None
+        self._bytes = 0
 
     def __call__(self, controls: Any) -> View:
         """Return (K, clips, T) views of K controls, as ``pewm_many.imagine_many`` takes them."""
@@ -48,7 +49,7 @@ class Views:
         rounded = [_rounded(x) for x in _flat(asked)]
         names = [b"".join(x[n].tobytes() for x in rounded) for n in range(len(rounded[0]))]
         wanted = dict.fromkeys(names)
-        if len(wanted.keys() | self._known.keys()) > MOST:
+        if len(wanted.keys() | self._known.keys()) * self._bytes > MOST:
             self._known = {}
         first = {name: number for number, name in reversed(list(enumerate(names)))}
         missing = [first[name] for name in wanted if name not in self._known]
@@ -64,6 +65,7 @@ class Views:
     def _render(self, names: list[bytes], camera: Camera) -> None:
         shown = jax.device_get(_rendered(self.model, self.state.map, camera))
         leaves, self._form = jax.tree.flatten(shown)
+        self._bytes = sum(leaf[0].nbytes for leaf in leaves)
         for number, name in enumerate(names):
             self._known[name] = [leaf[number] for leaf in leaves]
         self.rendered += len(names)

@@ -99,7 +99,7 @@ def test_a_camera_is_rendered_once_whatever_came_before(monkeypatch):
     again = one(turns[::-1])
     assert one._views.rendered == 7
     equal(jax.tree.map(lambda x: x[::-1], again), first)
-    monkeypatch.setattr(pewm_views, "MOST", 4)  # no room: all are forgotten between batches
+    monkeypatch.setattr(pewm_views, "MOST", 1)  # no room: all are forgotten between batches
     other(turns[2:])
     equal(other(turns), first)
     keys = jax.numpy.stack([KEY] * 4)

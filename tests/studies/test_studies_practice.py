@@ -12,13 +12,14 @@ from pewm_jax import presets, weights
 from pewm_jax.commands import table2 as table2_command
 from pewm_jax.config import ActionConfig, ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.data.simulator import open_simulator
-from pewm_jax.geometry.cameras import intrinsics_from_fov
+from pewm_jax.data.simulator import move
+from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.planning import practice
+from pewm_jax.planning.floor_map import FloorMap
 from pewm_jax.planning.practice import Imagined, Practice, Real
 from pewm_jax.studies import deciders, goals, policies
 from pewm_jax.studies import practice as study
-from pewm_jax.types import Frames
+from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import nomad as nomad_world
 from tests.helpers import init_world, randomise
 from tests.planning.planning_page import blocks
@@ -78,16 +79,29 @@ def _clip(frames):
 def test_the_whole_study_is_made_kept_and_goes_on(made):
     folder, page = made
     results = json.loads((folder / "out" / "results.json").read_text())
-    assert set(results["rows"]) == {"before", *study.LEARNED}
+    assert tuple(results["rows"]) == study.ROWS
     assert set(results["differences"]) >= {"memory - before", "memory - empty", "real - memory"}
+    assert set(results["walked"]) == set(study.LEARNED)
+    assert results["walked"]["real"]["through_walls"] == 0
     assert (results["houses"], results["tasks"]) == (1, 2)
     assert "practised in the world, with its memory" in page.read_text()
     assert page.with_suffix(".png").stat().st_size > 0
     pieces = sorted((folder / "out").glob("house*/*/scores.json"))
-    assert len(pieces) == 4
+    assert len(pieces) == len(study.ROWS)
     before = [file.stat().st_mtime_ns for file in pieces]
     study.run(folder / "world", folder / "policy", folder / "out", ERRAND, say=lambda _: None)
     assert [file.stat().st_mtime_ns for file in pieces] == before
+    runs = [
+        (folder / "out" / "house0000" / f"{how}-seed0" / "run" / "weights.safetensors")
+        for how in study.LEARNED
+    ]
+    began = (folder / "policy" / "weights.safetensors").read_bytes()
+    assert len({began, *(run.read_bytes() for run in runs)}) == 4, "each has learned something else"
+    undisturbed = pieces[0].read_bytes(), pieces[-1].read_bytes()
+    pieces[0].unlink()  # as if killed: the walks are there, the training is made anew
+    pieces[-1].unlink()
+    study.run(folder / "world", folder / "policy", folder / "out", ERRAND, say=lambda _: None)
+    assert (pieces[0].read_bytes(), pieces[-1].read_bytes()) == undisturbed
     other = dataclasses.replace(ERRAND, steps=2)
     with pytest.raises(UserError, match=r"holds pieces of other settings \(steps\)"):
         study.run(folder / "world", folder / "policy", folder / "out", other, say=lambda _: None)
@@ -129,6 +143,12 @@ def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
     )
     with pytest.raises(UserError, match="takes other steps than"):
         study.run(folder / "world", tmp_path, tmp_path / "out", ERRAND, say=lambda _: None)
+    short = dataclasses.replace(ERRAND, practice=Practice(walks=1, blocks=1))
+    with pytest.raises(UserError, match="use more --blocks"):
+        study.run(folder / "world", folder / "policy", tmp_path / "o", short, say=lambda _: None)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="is a file: name a folder"):
+        study.run(folder / "world", folder / "policy", tmp_path / "file", ERRAND)
     with pytest.raises(UserError, match="trained no policy"):
         policies.open_policy(folder / "world")
     with pytest.raises(UserError, match="train a policy first"):
@@ -151,11 +171,16 @@ def test_a_trained_nomad_proposes_for_table_2(made, home):
 def test_differences_are_paired_and_over_houses():
     def pieces(values):
         return [
-            {"house": house, "tasks": [{"success": v} for v in tasks]}
+            {"house": house, "walked": {}, "tasks": [{"success": v} for v in tasks]}
             for house, tasks in zip(("a", "b"), values, strict=True)
         ]
 
-    made = {"before": [[0, 0], [0, 100]], "empty": [[0, 0], [0, 100]], "real": [[100, 100]] * 2}
+    made = {
+        "chance": [[0, 0]] * 2,
+        "before": [[0, 0], [0, 100]],
+        "empty": [[0, 0], [0, 100]],
+        "real": [[100, 100]] * 2,
+    }
     made = {how: pieces(values) for how, values in made.items()}
     found = study.summary(made | {"memory": pieces([[0, 100], [100, 100]])})
     assert found["rows"]["memory"]["success"]["mean"] == 75
@@ -191,49 +216,79 @@ def test_equal_seeds_walk_alike_and_other_seeds_do_not(world, home):
     assert any(np.allclose(begun, pose, atol=1e-6) for pose in starts)
 
 
-def test_a_blocked_step_is_imagined_as_a_turn(world, home, monkeypatch):
+def test_where_a_step_is_not_possible_the_block_is_a_turn(world, home, monkeypatch):
     config, params = world
-    asked = []
-
-    def nothing_after_the_second(depth_HW, intrinsics_4, way_m):
-        asked.append(depth_HW)
-        return len(asked) != 3
-
-    monkeypatch.setattr(practice, "free", nothing_after_the_second)
     place = Imagined(config, params, home.context)
+    monkeypatch.setattr(place, "possible", lambda state, actions: 2)
     (walk,) = practice.walks(place, home.context, forward, Practice(walks=1, blocks=1), 0)
     assert walk.actions_N[:2].tolist() == [0, 0]
     assert walk.actions_N[2] == walk.actions_N[3] != 0
     assert len(walk.frames.depth_THW) == 5
 
 
-@pytest.mark.parametrize(("ahead", "room"), [(0.3, False), (0.44, False), (0.46, True)])
-def test_a_wall_ahead_is_seen_and_the_floor_is_none(ahead, room):
-    intrinsics = intrinsics_from_fov(32, 32, 90.0)
-    rows = (np.indices((32, 32))[0] + 0.5 - intrinsics[3]) / intrinsics[1]
-    floor = np.where(rows > 0, 1.25 / np.maximum(rows, 1e-6), 9.0)
-    assert practice.free(floor.astype(np.float32), intrinsics, 0.25)
-    wall = np.minimum(floor, ahead).astype(np.float32)
-    assert practice.free(wall, intrinsics, 0.25) == room
-    wall[:, :4] = wall[:, -4:] = 0  # no measurement
-    assert practice.free(wall, intrinsics, 0.25) == room
+def test_both_worlds_meet_the_walls_that_the_pictures_show(world, home):
+    config, params = world
+    imagined = [Imagined(config, params, home.context, memory=memory) for memory in (True, False)]
+    assert [place.memory for place in imagined] == [True, False]
+    ways = np.zeros((4, 12), int)
+    ways[:, 0] = [0, 1, 2, 1]
+    states = [place.begin(len(home.context.depth_THW) - 1)[0] for place in imagined]
+    found = [
+        [place.possible(state, way) for way in ways]
+        for place, state in zip(imagined, states, strict=True)
+    ]
+    assert found[0] == found[1]
+    assert max(found[0]) < 12, "no room is 3 m wide in every direction of this house's first task"
 
 
-def test_what_is_free_by_depth_is_mostly_free_in_the_house():
-    """The rule is about the agent's body; it agrees with the house's own collisions."""
-    simulator = open_simulator(house_seed=2, height=64, width=64)
-    rng, agree = np.random.default_rng(0), []
-    place = Real(simulator, MOTION, _none())
-    for xy in goals.sample_free(simulator.grid, rng, 120):
-        planar = np.array([*xy, rng.uniform(-np.pi, np.pi)])
-        possible = place.go(planar, np.array([0]), jax.random.key(0))[2] == 1
-        depth = simulator.frames(planar[None]).depth_THW[0]
-        agree.append(practice.free(depth, simulator.intrinsics_4, MOTION.step_m) == possible)
-    assert np.mean(agree) > 0.85
+def test_what_the_pictures_show_to_be_free_is_free_and_what_not_is_not():
+    """The map of the floor agrees with the house's own collisions, both ways."""
+    agree = {True: [], False: []}
+    for number in range(2):
+        goal = goals.open_goal(number, houses=2, actions=8, context=24, motion=MOTION, size=64)
+        floor, rng = FloorMap(), np.random.default_rng(number)
+        floor.add(goal.context)
+        places = goals.sample_free(goal.simulator.grid, rng, 1500)
+        near = np.linalg.norm(places - goal.walk_T3[0, :2], axis=-1) < 1.5
+        for xy in places[near][:150]:
+            planar = np.array([*xy, rng.uniform(-np.pi, np.pi)])
+            _, collided = move(goal.simulator.grid, planar, goal.table_A3[0])
+            ahead = planar[:2] + 0.25 * np.array([np.cos(planar[2]), np.sin(planar[2])])
+            agree[not collided].append(floor.free(planar[:2], ahead) == (not collided))
+    assert len(agree[False]) > 20
+    assert np.mean(agree[True]) > 0.9
+    assert np.mean(agree[False]) > 0.7
 
 
-def _none():
-    return Frames(np.zeros((0, 1, 1, 3), np.uint8), np.zeros((0, 1, 1)), None)
+def test_an_unseen_floor_is_free_and_no_measurement_is_nothing():
+    floor = FloorMap()
+    assert floor.free(np.zeros(2), np.array([0.25, 0.0]))
+    pose = pose_from_yaw(np.array([0.0, 0.0, 1.25]), 0.0)
+    camera = Camera(intrinsics_from_fov(16, 16, 90.0)[None], pose[None])
+    floor.add(Frames(np.zeros((1, 16, 16, 3), np.uint8), np.zeros((1, 16, 16)), camera))
+    assert floor.free(np.zeros(2), np.array([0.25, 0.0]))
+    wall = np.full((1, 16, 16), 0.45)
+    wall[:, :4] = 0
+    floor.add(Frames(np.zeros((1, 16, 16, 3), np.uint8), wall, camera))
+    assert not floor.free(np.zeros(2), np.array([0.25, 0.0]))
+    assert floor.free(np.zeros(2), np.array([-0.25, 0.0]))
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.array([0, 3]), np.array([-1]), np.zeros(2), np.zeros((1, 2), int)]
+)
+def test_a_policy_that_gives_no_actions_is_refused(home, wrong):
+    place = Real(home.simulator, MOTION, home.context)
+    with pytest.raises(UserError, match="the policy gave"):
+        next(practice.walks(place, home.context, lambda *_: wrong, Practice(walks=1), 0))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"seeds": (-1,)}, {"learning_rate": float("nan")}, {"shown": -1}, {"tasks": 0}]
+)
+def test_a_bad_errand_is_refused(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        study.Errand(**wrong)
 
 
 @pytest.mark.parametrize("wrong", [{"walks": 0}, {"blocks": 0}, {"with_goal": 1.5}])
