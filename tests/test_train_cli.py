@@ -222,6 +222,7 @@ COMMANDS = {
     "plan": ("pewm-jax plan", ["-m", "pewm_jax", "plan"]),
     "protocol": ("pewm-jax protocol", ["-m", "pewm_jax", "protocol"]),
     "compare": ("pewm-jax compare", ["-m", "pewm_jax", "compare"]),
+    "play": ("pewm-jax play", ["-m", "pewm_jax", "play"]),
     "table2": ("pewm-jax table2", ["-m", "pewm_jax", "table2"]),
     "practice": ("pewm-jax practice", ["-m", "pewm_jax", "practice"]),
     "table1": ("pewm-jax table1", ["-m", "pewm_jax", "table1"]),
