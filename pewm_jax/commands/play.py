@@ -54,6 +54,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
         )
     # Imported here and not above: help and refusals come at once.
     from pewm_jax.play import page as pages
+    from pewm_jax.play import serving
 
     serve, start = _part(Serve, settings), _part(Start, settings)
     home = shipped.home(argv[0])
@@ -62,7 +63,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
     page = pages.Page(lambda: _load(argv[0], home), start, serve, folder, name, say)
     try:
         if settings.open:
-            pages.open_in_browser(page.url)
+            serving.open_in_browser(page.url)
         threading.Event().wait()
     except KeyboardInterrupt:
         print("\nEnding …", flush=True)

@@ -10,17 +10,16 @@ from __future__ import annotations
 import collections
 import contextlib
 import dataclasses
-import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.evaluation.video import Film
-from pewm_jax.play import board, kept, places, session
+from pewm_jax.play import board, kept, places, session, ticking
+from pewm_jax.play.drive_film import DriveFilm
 from pewm_jax.play.engine import Engine
 from pewm_jax.play.requests import (
     Begin,
@@ -39,14 +38,10 @@ from pewm_jax.types import WorldState
 
 MOST_UNDO, MOST_WAITING = 4, 32
 """Edits that can be undone, and events that may wait."""
-TICK_S = 1.0
-"""Seconds between two messages while something takes long."""
 PAUSE_S = 0.1
 """Seconds for a browser on the same machine to draw before the next step is imagined ahead."""
 PATIENCE_S = 5.0
 """Seconds to wait for the thread at the end."""
-FPS = 6
-"""Steps shown a second in a video."""
 
 
 class Driver:
@@ -76,7 +71,7 @@ class Driver:
         self._session: Session | None = None
         self._made: dict[bytes, WorldState] = {}
         self._before: collections.deque[Session] = collections.deque(maxlen=MOST_UNDO)
-        self._film: tuple[Film, Path, Path] | None = None
+        self._film: DriveFilm | None = None
         self._last: tuple[float, float, float] | None = None
         self._todo: collections.deque[Drive] = collections.deque()
         self._waiting: collections.deque[tuple[Request, float]] = collections.deque()
@@ -267,7 +262,7 @@ class Driver:
             self._session = session.catch_up(self._engine, self._session)
             self._say(self._session.said, picture=self._board())
         if self._film is not None:
-            self._film[0].add(self._board())
+            self._film.add(self._board())
 
     def _set(self, after: Session, asked: float | None = None) -> None:
         """Take a state and show it; ``asked`` is when it was asked for."""
@@ -308,44 +303,19 @@ class Driver:
 
     def _begin_film(self) -> None:
         self._end_film()
-        picture = self._board()
-        self._folder.mkdir(parents=True, exist_ok=True)
-        numbers = [path.stem.removeprefix("drive-") for path in self._folder.glob("drive-*.mp4")]
-        number = 1 + max((int(text) for text in numbers if text.isdigit()), default=0)
-        path = self._folder / f"drive-{number:03d}.mp4"
-        partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-        film = Film(str(partial), picture.shape[:2], FPS)
-        film.add(picture)
-        self._film = (film, partial, path)
+        self._film = DriveFilm(self._folder, self._board())
         self._say("Recording: every step becomes a frame of the video.")
 
     def _end_film(self) -> None:
         if self._film is None:
             return
-        film, partial, path = self._film
-        self._film = None
-        film.close()
-        partial.replace(path)
+        film, self._film = self._film, None
+        path = film.close()
         self._say(f"The video is {path.name}.", link=path)
 
-    @contextlib.contextmanager
-    def _during(self, text: str) -> Iterator[None]:
+    def _during(self, text: str) -> contextlib.AbstractContextManager[None]:
         """Say what takes long, and how long it has taken."""
-        begun, ended = time.monotonic(), threading.Event()
-        self._say(f"{text.capitalize()} …", busy=True)
-
-        def tick() -> None:
-            while not ended.wait(TICK_S):
-                taken = time.monotonic() - begun
-                self._say(f"{text.capitalize()} … {taken:.0f} s", busy=True)
-
-        ticker = threading.Thread(target=tick, name="ticker", daemon=True)
-        ticker.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            ticker.join()
+        return ticking.during(text, lambda said: self._say(said, busy=True))
 
     def _say(self, said: str, **rest) -> None:
         worlds = tuple(kept.names(self._folder))

@@ -8,27 +8,23 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import html
 import io
 import math
-import os
-import socket
-import sys
-import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pewm_jax.config import ActionConfig, ConfigError
+from pewm_jax.config import ActionConfig
 from pewm_jax.evaluation.pictures import as_bytes
-from pewm_jax.play import board, picking, requests, session
+from pewm_jax.play import board, picking, requests, serving, session, status
 from pewm_jax.play.driver import Driver
 from pewm_jax.play.extra import viser
+from pewm_jax.play.files_panel import FilesPanel
 from pewm_jax.play.map_view import MapView, eye_of
 from pewm_jax.play.requests import Request, Shown
-from pewm_jax.play.settings import LOOPBACK, Serve, Start
+from pewm_jax.play.settings import Serve, Start
 
 VIEW_WIDTH, PANEL_WIDTH = 540, 310
 """Widths of the pictures and of the controls, pixels."""
@@ -101,13 +97,13 @@ class Page:
             ConfigError: the address cannot be served on.
         """
         self._start, self._seconds, self._say, self._phase = start, None, say, ""
-        self._server = _serve(serve)
+        self._server = serving.server(serve)
         # Sharing asks a server elsewhere for a public address; this page is local.
         self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
-        self.url = f"http://{_here(serve.host)}:{self._server.get_port()}"
+        self.url = f"http://{serving.here(serve.host)}:{self._server.get_port()}"
         say(f"drive: {self.url}  (Ctrl-C ends)")
-        if warning(serve):
-            say(warning(serve))
+        if serving.warning(serve):
+            say(serving.warning(serve))
         self._map = MapView(self._server)
         gui = self._server.gui
         gui.configure_theme(
@@ -128,7 +124,7 @@ class Page:
         self._add_driving()
         self._add_editing()
         self._add_starting()
-        self._add_keeping()
+        self._files = FilesPanel(self._server, self._put)
 
     def close(self) -> None:
         """End the drive and the server."""
@@ -144,11 +140,11 @@ class Page:
             if shown.picture is not None:
                 self._view.image = shown.picture
             self._busy.visible = shown.busy
-            self._status.content = self._status_of(shown)
+            self._status.content = status.line(shown, self._seconds, len(self._map.points))
         if shown.session is not None and shown.engine is not None:
             seen = as_bytes(np.asarray(shown.session.world.frame.rgb_THWC[0]))
             self._map.show(shown.engine, shown.session, seen)
-        self._show_files(shown)
+        self._show_choices(shown)
 
     def _tell(self, shown: Shown) -> None:
         """Tell the terminal what the page begins to wait for, and what went wrong."""
@@ -158,27 +154,6 @@ class Page:
         if self._phase.startswith("Preparing") and not phase:
             self._say("Ready.")
         self._phase = phase
-
-    def _status_of(self, shown: Shown) -> str:
-        colour = "#ff8a80" if shown.failed else "#60c8ff" if shown.busy else "#7fe0a0"
-        said = html.escape(shown.said)
-        facts = []
-        if shown.engine is not None and shown.engine.sampler_steps:
-            facts.append(f"{shown.engine.sampler_steps} sampler steps")
-        if self._seconds is not None:
-            facts.append(f"last step {self._seconds:.2f} s")
-        count = len(self._map.points)
-        if count:
-            facts.append(f"{count:,} points")
-        if shown.recording:
-            facts.append("<span style='color:#ff8a80'>● recording</span>")
-        return (
-            "<div style='padding:2px 12px 6px;min-height:74px'>"
-            f"<div style='display:flex;gap:8px;line-height:1.35;font-size:14px'>"
-            f"<span style='color:{colour}'>●</span><span>{said or 'Drive on.'}</span></div>"
-            "<div style='opacity:.6;font-size:12px;margin:6px 0 0 17px'>"
-            f"{' · '.join(facts)}</div></div>"
-        )
 
     def _put(self, request: Request) -> None:
         self.driver.put(request)
@@ -314,82 +289,12 @@ class Page:
 
         self._steps = steps
 
-    def _add_keeping(self) -> None:
-        gui = self._server.gui
-        with gui.add_folder("Worlds and videos", expand_by_default=False):
-            name = gui.add_text("Name", "my world")
-            save = gui.add_button("Save this world", icon=viser.Icon.DEVICE_FLOPPY)
-            self._worlds: Any = gui.add_dropdown("Saved", ("none yet",))
-            load = gui.add_button("Go on in it", icon=viser.Icon.FOLDER_OPEN)
-            self._record = gui.add_button("Record a video", icon=viser.Icon.VIDEO, color="red")
-            self._file = gui.add_button("Download", icon=viser.Icon.DOWNLOAD, visible=False)
-        self._link: Path | None = None
-        self._recording = False
-        save.on_click(lambda _: self._put(requests.Save(name.value)))
-        load.on_click(lambda _: self._put(requests.Load(self._worlds.value)))
-        self._record.on_click(lambda _: self._put(requests.Record(not self._recording)))
-
-        @self._file.on_click
-        def _(event: Any) -> None:
-            if self._link is not None and self._link.is_file() and event.client is not None:
-                event.client.send_file_download(self._link.name, self._link.read_bytes())
-
-    def _show_files(self, shown: Shown) -> None:
-        """Show which worlds there are, and what was written."""
-        if not hasattr(self, "_file"):  # the page is still being made
+    def _show_choices(self, shown: Shown) -> None:
+        """Show which steps of the sampler, worlds and files there are."""
+        if not hasattr(self, "_files"):  # the page is still being made
             return
         count = str(shown.engine.sampler_steps) if shown.engine is not None else "0"
         if count not in ("0", self._steps.value):
             self._steps.options = tuple(sorted({*SAMPLER, count}, key=int))
             self._steps.value = count
-        options = shown.worlds or ("none yet",)
-        if options != self._worlds.options:
-            self._worlds.options = options
-        if shown.recording != self._recording:
-            self._recording = shown.recording
-            self._record.label = "End the video" if shown.recording else "Record a video"
-        if shown.link is not None:
-            self._link = shown.link
-            self._file.label, self._file.visible = f"Download {shown.link.name}", True
-
-
-def open_in_browser(url: str) -> bool:
-    """Open a page where there is a desktop; tells whether one was asked."""
-    desktop = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
-    return desktop and webbrowser.open(url)
-
-
-def warning(serve: Serve) -> str:
-    """Return what a page means that others can reach; empty if only this machine can."""
-    if serve.host in LOOPBACK:
-        return ""
-    return (
-        f"Anyone who reaches this machine at {serve.host} can drive, and load and save worlds: "
-        "there is no password."
-    )
-
-
-def _here(host: str) -> str:
-    """Return what this machine calls a host in an address."""
-    if host in ("0.0.0.0", "::"):  # noqa: S104 - it is not served on here
-        return "127.0.0.1"
-    return f"[{host}]" if ":" in host else host
-
-
-def _serve(serve: Serve) -> viser.ViserServer:
-    """Begin to serve, without viser's own message.
-
-    Raises:
-        ConfigError: the host is no address of this machine; viser would wait for it forever.
-    """
-    try:
-        kind, *_, address = socket.getaddrinfo(serve.host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(kind) as probe:
-            probe.bind(address)
-    except OSError as error:
-        raise ConfigError(
-            f"--host {serve.host} is no address that this machine can serve on ({error}); take "
-            "127.0.0.1, or 0.0.0.0 to be reached by others."
-        ) from None
-    with contextlib.redirect_stdout(io.StringIO()):
-        return viser.ViserServer(host=serve.host, port=serve.port, verbose=False)
+        self._files.show(shown)

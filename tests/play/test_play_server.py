@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 from pewm_jax.commands import play
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.play import page, requests
+from pewm_jax.play import page, requests, serving
 from pewm_jax.play.settings import Serve, Start
 from tests.play.tiny_drive import FORWARD, a_place, a_toy
 
@@ -115,11 +115,11 @@ def test_a_box_goes_where_it_was_dragged_and_the_agent_too(tmp_path):
 
 def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so():
     assert Serve().host == "127.0.0.1"
-    assert page.warning(Serve()) == ""
-    assert "no password" in page.warning(Serve(host="0.0.0.0"))
-    assert [page._here(host) for host in ("0.0.0.0", "::1", "me")] == ["127.0.0.1", "[::1]", "me"]
+    assert serving.warning(Serve()) == ""
+    assert "no password" in serving.warning(Serve(host="0.0.0.0"))
+    assert [serving.here(host) for host in ("0.0.0.0", "::1", "me")] == ["127.0.0.1", "[::1]", "me"]
     with pytest.raises(ConfigError, match="no address that this machine"):
-        page._serve(Serve(host="203.0.113.7"))  # an address of nobody
+        serving.server(Serve(host="203.0.113.7"))  # an address of nobody
 
 
 def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():

@@ -1,0 +1,35 @@
+"""The line that says how things are: one sentence, and the facts below it."""
+
+from __future__ import annotations
+
+import html
+
+from pewm_jax.play.requests import Shown
+
+
+def line(shown: Shown, seconds: float | None, points: int) -> str:
+    """Return it as HTML.
+
+    Args:
+        shown: what the driver tells.
+        seconds: what the last step took, if there was one.
+        points: points of the map that are shown.
+    """
+    colour = "#ff8a80" if shown.failed else "#60c8ff" if shown.busy else "#7fe0a0"
+    said = html.escape(shown.said)
+    facts = []
+    if shown.engine is not None and shown.engine.sampler_steps:
+        facts.append(f"{shown.engine.sampler_steps} sampler steps")
+    if seconds is not None:
+        facts.append(f"last step {seconds:.2f} s")
+    if points:
+        facts.append(f"{points:,} points")
+    if shown.recording:
+        facts.append("<span style='color:#ff8a80'>● recording</span>")
+    return (
+        "<div style='padding:2px 12px 6px;min-height:74px'>"
+        f"<div style='display:flex;gap:8px;line-height:1.35;font-size:14px'>"
+        f"<span style='color:{colour}'>●</span><span>{said or 'Drive on.'}</span></div>"
+        "<div style='opacity:.6;font-size:12px;margin:6px 0 0 17px'>"
+        f"{' · '.join(facts)}</div></div>"
+    )
