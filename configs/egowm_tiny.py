@@ -18,25 +18,26 @@ from pewm_jax.config import (
 def config() -> Config:
     """Return the settings of ``egowm_tiny``.
 
-    The demo's houses, codec and form of backbone, begun at random, so that the layers of the
-    actions learn as fast as the others do; the codec's gate has nothing to mix. Its data are those
-    of ``demo``: ``pewm-jax data collect data/demo --train 144 --frames 80``.
+    The demo's houses, codec and form of backbone. It first becomes a video model, without actions,
+    and then learns to follow them. Its data are those of ``demo``: ``pewm-jax data collect
+    data/demo --train 144 --frames 80``.
     """
     return Config(
         model=EgoWMConfig(
             clip=ClipConfig(height=64, width=64, depth=False),
             codec=LearnedCodecConfig(gate=48),
             backbone=DiTConfig(layers=4, heads=4, head_dim=32),
-            control=ModulationConfig(units=(0.25, 0.25, 1.0), rate=1.0),
+            control=ModulationConfig(units=(0.25, 0.25, 1.0)),
             noise=DDPMConfig(snr_shift=4.0, max_weight=1.0, sample_steps=6),
         ),
-        data=DataConfig(path="data/demo", context=20, stride_max=2, prepared=768),
+        data=DataConfig(path="data/demo", context=20, stride_max=1, prepared=768),
         train=EgoWMTrainConfig(
             run="runs/egowm_tiny",
             start="codec",
             fresh=(r"(backbone|control)/.*",),
             optimizer="muon",
-            adapt=StageConfig(steps=600, batch=16, learning_rate=1e-3, warmup=30),
+            video=StageConfig(steps=500, batch=16, learning_rate=1e-3, warmup=30),
+            adapt=StageConfig(steps=1000, batch=16, learning_rate=1e-3, warmup=30),
             ema=0.98,
             preview_every=0,
         ),

@@ -19,6 +19,10 @@ class EgoWMTrainConfig(TrainSettings):
 
     run: str = "runs/egowm"
     """Folder of this run: checkpoints, logs, images, report."""
+    video: StageConfig = StageConfig(steps=0)
+    """Where there is no pre-trained video model, the backbone first becomes one, without actions;
+    by default left out. Begun at once with actions at random weights, it would not learn to follow
+    them: both the control and what it modulates begin with zeros, and neither moves the other."""
     adapt: StageConfig = StageConfig()
     """The backbone goes on learning as it did before, now with actions; the control's learning rate
     is `model.control.rate` times this one's."""

@@ -41,20 +41,29 @@ def loss(
     )
 
 
-ADAPT = Stage(
-    name="adapt",
+VIDEO = Stage(
+    name="video",
     number=1,
-    rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|image|text)/.*", FREEZE)),
+    rules=((r"backbone/.*", TRAIN), (r"(control|codec|image|text)/.*", FREEZE)),
     init=init,
     loss=loss,
     prepare=functools.partial(objective.prepare, memory=False),
+    optional=True,
 )
-"""The only stage: the whole backbone learns on, with actions."""
+"""The backbone learns to be a video model: the control stands still, and it begins with zeros."""
+ADAPT = dataclasses.replace(
+    VIDEO,
+    name="adapt",
+    number=2,
+    rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|image|text)/.*", FREEZE)),
+    optional=False,
+)
+"""The whole backbone learns on, with actions."""
 
 
 def stages(model: EgoWMConfig) -> tuple[Stage, ...]:
-    """Return the one stage, with the control's learning rate."""
-    return (dataclasses.replace(ADAPT, rates=((r"control/.*", model.control.rate),)),)
+    """Return the stages, of which the second has the control's learning rate."""
+    return VIDEO, dataclasses.replace(ADAPT, rates=((r"control/.*", model.control.rate),))
 
 
 def start(model: EgoWMConfig, params: Params, frames: Frames) -> WorldState:

@@ -84,7 +84,7 @@ def svd():
     config = Config(
         model=SVD, data=DataConfig(context=1), train=EgoWMTrainConfig(adapt=STAGE, blind=0.3)
     )
-    (stage,) = worlds.stages(SVD)
+    _, stage = worlds.stages(SVD)
     return config, stage, *trained(config, stage)
 
 
@@ -94,6 +94,20 @@ def test_the_u_net_learns_with_actions_and_the_rest_stands_still(svd):
     assert changed(first, last.params) == {"backbone", "control"}
     assert {"codec", "image"} < first.keys()
     assert first["backbone"]["conv_in"]["kernel"].shape == (3, 3, 8, 32)
+
+
+def test_a_video_model_is_made_first_where_there_is_none_and_the_control_waits(svd):
+    _, _, first, *_ = svd
+    video, adapt = worlds.stages(SVD)
+    assert (video.number, adapt.number, video.optional, adapt.optional) == (1, 2, True, False)
+    assert EgoWMTrainConfig().video.steps == 0
+    waits, learns = (tree.flatten(stage.labels(first)) for stage in (video, adapt))
+    for path, label in learns.items():
+        part = path.split("/")[0]
+        assert label == ("train" if part in ("backbone", "control") else "freeze")
+        assert waits[path] == ("train" if part == "backbone" else "freeze")
+    assert video.rates == ()
+    assert adapt.rates == ((r"control/.*", SVD.control.rate),)
 
 
 def test_its_sums_are_those_of_the_compiled_step(svd):
@@ -106,7 +120,7 @@ def test_its_sums_are_those_of_the_compiled_step(svd):
 def test_every_leaf_has_its_place_on_many_devices():
     config = Config(model=SVD, train=EgoWMTrainConfig(adapt=STAGE))
     mesh = jax.sharding.AbstractMesh((1, 8, 1, 1), ("data", "fsdp", "tensor", "context"))
-    (stage,) = worlds.stages(SVD)
+    _, stage = worlds.stages(SVD)
     shapes = jax.eval_shape(functools.partial(state.create, config, stage), jax.random.key(0))
     placed = tree.flatten(sharding.of_state(SVD, mesh, shapes))
     for path, leaf in tree.flatten(shapes).items():
