@@ -103,6 +103,7 @@ def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         "<h2>Scores</h2>",
         page_tables.scores(metrics),
         page_tables.houses(metrics),
+        page_tables.steering(metrics),
         page_long.videos(metrics),
         _curves(metrics),
         page_tables.drift(metrics),

@@ -8,6 +8,7 @@ from typing import Any
 
 from pewm_jax.evaluation.statistics import ours
 from pewm_jax.evaluation.words import (
+    ACTIONS_NAMES,
     COVERAGE_NAMES,
     MASK_NAMES,
     METHOD_NAMES,
@@ -89,6 +90,30 @@ def houses(metrics: Mapping[str, Any]) -> str:
         f"({found['how']['draws']} draws). Differences are paired. This is one training: how much "
         "another training seed would change is a question of its own (<code>pewm-jax compare "
         "--also_a</code>).</p>"
+    )
+
+
+def steering(metrics: Mapping[str, Any]) -> str:
+    """Return PSNR with the true actions, with others and with none; "" where none was measured."""
+    found = metrics.get("steering")
+    if not found:
+        return ""
+    ends = [0, len(found["per_frame"]["true"]["mean"]) - 1]
+    rows = []
+    for name, label in ACTIONS_NAMES.items():
+        if name not in found["all"]:
+            continue
+        steps, sign = found["per_frame"][name], "-" in name
+        at = [{key: steps[key][t] for key in ("mean", "low", "high")} for t in ends]
+        cells = "".join(f"<td>{spread(e, 2, sign=sign)}</td>" for e in (found["all"][name], *at))
+        rows.append(f"<tr{' class=gain' if sign else ''}><td>{label}</td>{cells}</tr>")
+    heads = "".join(f"<th>frame {t + 1}</th>" for t in ends)
+    return (
+        "<h2>Do the actions steer?</h2>"
+        + table(f"<th>PSNR, dB</th><th>all frames</th>{heads}", rows)
+        + "<p class='quiet'>The same clips with the same noise; another clip's actions are of "
+        "one in another house. Means over houses, in brackets the interval of a bootstrap over "
+        "them. A world that follows its actions is nearest to the truth with the true ones.</p>"
     )
 
 

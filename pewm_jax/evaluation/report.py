@@ -15,7 +15,7 @@ from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import opened as runs
-from pewm_jax.evaluation import protocol_file, samples
+from pewm_jax.evaluation import protocol_file, samples, steering
 from pewm_jax.evaluation.covered import score_coverage
 from pewm_jax.evaluation.fixed import decide
 from pewm_jax.evaluation.gallery import ROWS, Gallery, make_gallery
@@ -28,7 +28,7 @@ from pewm_jax.evaluation.mirror import look_back, way_out
 from pewm_jax.evaluation.page import render
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
-from pewm_jax.evaluation.protocol import file_hash, fingerprint
+from pewm_jax.evaluation.protocol import ClipChoice, file_hash, fingerprint
 from pewm_jax.evaluation.reproject_choice import SPLIT as BASELINE_SPLIT
 from pewm_jax.evaluation.reproject_choice import choose_settings
 from pewm_jax.evaluation.scoring import Scored, score_table
@@ -38,7 +38,7 @@ from pewm_jax.training import processes
 
 TRAINED_ON = "train"
 """The split that training reads."""
-REPORT_VERSION = 7
+REPORT_VERSION = 8
 """Increase it whenever the same scores would give another report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
@@ -159,15 +159,13 @@ def evaluate(
     scored = score_table(config, episodes, methods, partials, say, lpips, clips, measures.i3d)
     long = roll_long(config, episodes, methods, partials, say, lpips, rollouts)
     back = look_back(config, episodes, methods, partials, rollouts, measures.visits, say)
-    covered = None
-    if remembers:
-        covered = score_coverage(config, episodes, methods.model, partials, say, clips)
+    asked = _asked(opened, config, episodes, methods.model, partials, say, clips)
     if not processes.is_primary():
         processes.meet("evaluate: report")  # devices that wait for one another would give up
         return folder / PAGE
     say("drawing the report …")
     metrics = measure(config, scored, long, back, measures.i3d)
-    metrics["coverage"] = covered
+    metrics |= asked
     if cameras:
         metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
     metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {
@@ -189,6 +187,27 @@ def evaluate(
     for line in [*score_lines(metrics), *summary_lines(metrics)]:
         say(line)
     return folder / PAGE
+
+
+def _asked(
+    opened: runs.Opened,
+    config: Config,
+    episodes: EpisodeSource,
+    model: Imagination,
+    partials: Partials,
+    say: Callable[[str], Any],
+    clips: Sequence[ClipChoice],
+) -> dict[str, Any]:
+    """Return what only some models are asked: what the map covers, and whether actions steer."""
+    covered = steered = None
+    if runs.remembers(opened):
+        covered = score_coverage(config, episodes, model, partials, say, clips)
+    if not model.cameras:
+        steered = steering.score(config, opened.params, episodes, clips, partials, say)
+    return {
+        "coverage": covered,
+        "steering": steered and {"all": steered.table(), "per_frame": steered.per_frame()},
+    }
 
 
 def _write(

@@ -46,6 +46,14 @@ COVERAGE_NAMES = {
     "attended": "among those that the frame's own camera would attend to",
 }
 """What becomes of the pixels seen before, each a share of them."""
+ACTIONS_NAMES = {
+    "true": "the true actions",
+    "shuffled": "another clip's actions",
+    "none": "no actions",
+    "true - shuffled": "true minus another clip's",
+    "true - none": "true minus none",
+}
+"""Names of the kinds of actions by which a model was steered, and of their differences."""
 NONE_HOW = (
     "A row for a model trained as long without a memory is missing: train one of the same clip, "
     "codec and number of steps with all steps in stage 1 (--train.stage1.steps N "
@@ -183,6 +191,20 @@ def came_back(metrics: Mapping[str, Any]) -> str:
     )
 
 
+def followed(metrics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on whether the model follows its actions, if that was measured."""
+    found = metrics.get("steering")
+    if not found:
+        return []
+    less = (
+        f"{ACTIONS_NAMES[name.removeprefix('true - ')]}: {spread(entry, 2, sign=True)} dB"
+        for name, entry in found["all"].items()
+        if name.startswith("true - ")
+    )
+    true = spread(found["all"]["true"], 2)
+    return [f"PSNR with the true actions is {true} dB; its lead over {'; over '.join(less)}."]
+
+
 def grew(metrics: Mapping[str, Any]) -> list[str]:
     """Return a sentence on how the map grows, if there is one."""
     found = metrics["long"]["growth"]
@@ -215,7 +237,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     lines += [perceived(metrics), far_apart(metrics)]
     lines += [covered(metrics["coverage"])] if metrics["coverage"] else []
     lines += [drifted(metrics["long"]["drift"][own]), *grew(metrics)]
-    return [*lines, came_back(metrics)]
+    return [*lines, *followed(metrics), came_back(metrics)]
 
 
 def score_lines(metrics: Mapping[str, Any]) -> list[str]:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import Config, EgoWMConfig, EgoWMTrainConfig, UserError
-from pewm_jax.evaluation import steering
+from pewm_jax.evaluation import page_tables, steering
+from pewm_jax.evaluation.partial import Partials
+from pewm_jax.evaluation.words import ACTIONS_NAMES, followed
 from tests.helpers import tiny_config
 
 CONFIG = Config(model=EgoWMConfig(), train=EgoWMTrainConfig())
@@ -60,6 +62,33 @@ def test_true_actions_are_compared_with_those_of_another_house_and_with_none(obe
     assert table["true - shuffled"]["houses"] == 3
     assert table["true - shuffled"]["low"] > 0
     assert len(found.lines()) == 6
+
+
+def test_a_report_keeps_its_pieces_and_says_what_came_out(obeying, monkeypatch, tmp_path):
+    obeying("aabbc")
+    config = dataclasses.replace(CONFIG, evaluate=dataclasses.replace(CONFIG.evaluate, batch=2))
+    choices, partials = steering.choose(), Partials(tmp_path, "weights", "fingerprint")
+    said = []
+    found = steering.score(config, PARAMS, [], choices, partials, said.append)
+    whole = steering.measure(config, PARAMS, [], 5)
+    for name, errors in whole.errors.items():
+        np.testing.assert_array_equal(found.errors[name], errors)
+    monkeypatch.setattr(steering, "load_clip", None)  # nothing is imagined again
+    again = steering.score(config, PARAMS, [], choices, partials, said.append)
+    np.testing.assert_array_equal(again.errors["none"], found.errors["none"])
+    assert len(said) == 1
+    metrics = {"steering": {"all": found.table(), "per_frame": found.per_frame()}}
+    page = page_tables.steering(metrics)
+    assert page.count("<tr") == 1 + len(ACTIONS_NAMES)
+    assert f"{found.psnr['true'].mean():.2f} [" in page
+    (sentence,) = followed(metrics)
+    assert "its lead over another clip's actions: +" in sentence
+    assert followed({"steering": None}) == []
+    assert page_tables.steering({"steering": None}) == ""
+    obeying("aa")
+    assert steering.score(config, PARAMS, [], steering.choose(), partials, said.append) is None
+    obeying("ab")
+    assert steering.score(tiny_config(), {}, [], steering.choose(), partials, said.append) is None
 
 
 def test_what_cannot_be_asked_is_left_out_or_refused(obeying):
