@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import Config, Launch, ModelConfig, UserError, VAEConfig, kinds
+from pewm_jax.config import Config, Launch, ModelConfig, UserError, VAEConfig, WanVAEConfig, kinds
 from pewm_jax.data import abstract
 from pewm_jax.scaling import hlo, plan_text, suggest
 from pewm_jax.scaling.footprint import MeshSizes, footprint
@@ -111,7 +111,7 @@ def compile_stage(config: Config, stage: Stage, devices: Sequence[Any]) -> Compi
 def _as_on_chips(config: Config) -> Config:
     """Choose the form of the VAE's convolutions that accelerators use."""
     codec = getattr(config.model, "codec", None)  # a policy has none
-    if not isinstance(codec, VAEConfig) or codec.convolution != "auto":
+    if not isinstance(codec, VAEConfig | WanVAEConfig) or codec.convolution != "auto":
         return config
     return config.with_model(codec=dataclasses.replace(codec, convolution="volume"))
 
