@@ -8,7 +8,6 @@ from typing import Any
 
 from pewm_jax.config.errors import require
 
-
 COMPILED = ("auto", "on", "off")
 """Whether a plan compiles the step."""
 
@@ -86,7 +85,7 @@ class Launch(Join):
     compiled: str = _flag(
         "auto",
         "with --plan: on compiles the step and says what the program does, off gives the formulas' "
-        "numbers alone, auto leaves compiling out where it would take an hour",
+        "numbers alone, auto leaves compiling out where it takes very long",
     )
     profile: int = _flag(0, "profile this many steps, for TensorBoard and Perfetto")
 

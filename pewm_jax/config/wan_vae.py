@@ -106,8 +106,8 @@ class WanVAEConfig(CodecSettings):
         )
         require(
             all(self.decoder_base_width * m % 2 == 0 for m in self.multiples[1:]),
-            f"codec.decoder_base_width {self.decoder_base_width} times codec.multiples must be even "
-            "numbers: each step up halves the channels.",
+            f"codec.decoder_base_width {self.decoder_base_width} times codec.multiples must be "
+            "even numbers: each step up halves the channels.",
         )
         for name in ("latents_mean", "latents_std"):
             require(

@@ -6,8 +6,8 @@ backbone wants it (by default their latents, zero for later frames); the channel
 
 Parameters: ``backbone``, ``memory`` (the reader) and, if the settings need them, ``control``, the
 frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (with which the backbone sees images)
-and ``text`` (the prompt's embedding, and a negative one's where guidance is on text). Without the ``memory`` entry, or without sight of a memory,
-it is the stage-1 model.
+and ``text`` (the prompt's embedding, and a negative one's where guidance is on text). Without the
+``memory`` entry, or without sight of a memory, it is the stage-1 model.
 """
 
 from __future__ import annotations

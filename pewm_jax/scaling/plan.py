@@ -31,8 +31,8 @@ QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes
 
 MOST_ARRAYS = 1000
 """Trained arrays of parameters above which `--compiled auto` does not compile. Each has operations
-of its own, forward, backward and in the optimizer: with Stable Video Diffusion's 1,432 XLA holds
-216,000 of them, and each of its hundreds of passes takes seconds."""
+of its own, forward, backward and in the optimizer: with Stable Video Diffusion's 1,432, XLA holds
+216,000 of them, and many of its passes take seconds each."""
 
 
 def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> list[Plan]:
@@ -87,7 +87,9 @@ def _why(launch: Launch) -> str:
     """Say why a step is not compiled."""
     if launch.compiled == "off":
         return "--compiled off"
-    return f"it trains more than {MOST_ARRAYS} arrays, which takes an hour; --compiled on does it"
+    return (
+        f"it trains more than {MOST_ARRAYS} arrays, so that takes very long; --compiled on does it"
+    )
 
 
 def virtual(count: int) -> Sequence[Any]:

@@ -2,12 +2,16 @@
 
 import dataclasses
 import functools
+import shutil
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
+from diffusers import Cosmos2VideoToWorldPipeline
+from transformers import AutoTokenizer, T5EncoderModel
 
 import pewm_jax
 from pewm_jax import tree, worlds
@@ -17,6 +21,7 @@ from pewm_jax.models import backbones, codecs, world_model
 from pewm_jax.training import starting
 from pewm_jax.types import Camera, Control, Frames
 from pewm_jax.worlds import sampling
+from tests.convert.convert_pipelines import save_text
 from tests.helpers import random_frames
 from tests.parity.cosmos_references import channels_first, channels_last, small_pipeline
 from tests.parity.svd_references import distance, draw
@@ -46,8 +51,13 @@ def run(src, dst, **options):
 
 
 @pytest.fixture(scope="module")
-def world(folder, tmp_path_factory):
-    return run(folder, tmp_path_factory.mktemp("world") / "world")
+def where(tmp_path_factory):
+    return tmp_path_factory.mktemp("worlds") / "world"
+
+
+@pytest.fixture(scope="module")
+def world(folder, where):
+    return run(folder, where)
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +187,7 @@ def test_attention_over_time_is_not_causal_and_the_given_frame_and_earlier_chunk
     assert np.abs(frames.rgb_THWC[8:] - changed.rgb_THWC[8:]).max() > 1e-5
 
 
-def test_it_loads_with_every_tensor_and_can_be_trained(world, folder, tmp_path):
+def test_it_loads_with_every_tensor_and_can_be_trained(world, folder, where):
     config, params = world
     assert isinstance(config.model, EgoWMConfig)
     clip = config.model.clip
@@ -188,13 +198,38 @@ def test_it_loads_with_every_tensor_and_can_be_trained(world, folder, tmp_path):
         stored = tree.flatten(read(folder)[1])
         for path, leaf in tree.flatten(params[part]).items():
             np.testing.assert_array_equal(leaf, stored[path], err_msg=path)
-    train = dataclasses.replace(config.train, start=str(tmp_path))
     with pytest.raises(UserError, match=r"name its folder by train\.start"):
-        starting.require_weights(dataclasses.replace(config, train=config.train))
-    assert train.start
+        starting.require_weights(config)
+    starting.require_weights(
+        dataclasses.replace(config, train=dataclasses.replace(config.train, start=str(where)))
+    )
 
 
-def test_what_does_not_fit_is_refused_before_anything_is_written(folder, tmp_path, pipeline):
+def test_prompts_are_encoded_as_the_pipeline_does(folder, tmp_path):
+    src = shutil.copytree(folder, tmp_path / "src")
+    save_text(src, width=24)
+    config, params = run(src, tmp_path / "told", prompt="a room", negative="a chair with a room")
+    backbone = config.model.backbone
+    assert (backbone.prompt, backbone.text_shape) == ("stored", (512, 24))
+    assert config.model.noise.guidance == 1
+    reference = SimpleNamespace(
+        tokenizer=AutoTokenizer.from_pretrained(src / "tokenizer"),
+        text_encoder=T5EncoderModel.from_pretrained(src / "text_encoder"),
+        _execution_device="cpu",
+    )
+    with torch.inference_mode():
+        expected = Cosmos2VideoToWorldPipeline._get_t5_prompt_embeds(
+            reference, ["a room", "a chair with a room"], dtype=torch.float32
+        ).numpy()
+    for name, tokens in zip(("prompt_LC", "negative_LC"), expected, strict=True):
+        np.testing.assert_allclose(params["text"][name], tokens, atol=1e-5)
+    assert np.any(params["text"]["negative_LC"][5])
+    assert not np.any(params["text"]["negative_LC"][6:])
+    like = jax.eval_shape(lambda: worlds.init(config.model, jax.random.key(0)))
+    assert tree.mismatches(params, like) == []
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_written(folder, tmp_path):
     with pytest.raises(ConfigError, match=r"codec\.spatial × backbone\.patch"):
         run(folder, tmp_path / "odd", height=20)
     with pytest.raises(ConfigError, match="use 4k"):

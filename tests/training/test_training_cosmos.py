@@ -26,6 +26,7 @@ from pewm_jax.config import (
     WanVAEConfig,
 )
 from pewm_jax.scaling import hlo
+from pewm_jax.scaling.plan import QUICK
 from pewm_jax.training import sharding, state
 from pewm_jax.worlds import costs
 from tests.helpers import TINY, init_world, randomise, with_reader
@@ -106,10 +107,12 @@ def test_actions_and_a_memory_on_cosmos():
     stage = worlds.stages(model)[1]
     fresh = init_world(model)
     read = randomise(fresh, scale=0.1) | {"backbone": fresh["backbone"], "codec": fresh["codec"]}
-    loss = jax.jit(stage.loss, static_argnums=(0, 1))
     batch = jax.tree.map(np.asarray, fakes.clip(config, 1, 0))
+    given = fresh, batch, jax.random.key(0)
+    traced = jax.jit(stage.loss, static_argnums=(0, 1)).lower(model, config.train, *given)
+    loss = traced.compile(compiler_options=QUICK)
     one, other = (
-        float(loss(model, config.train, params, batch, jax.random.key(0))[0])
+        float(loss(params, *given[1:])[0])
         for params in (fresh, {**fresh, "memory": read["memory"]})
     )
     assert np.isfinite(one)
