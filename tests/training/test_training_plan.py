@@ -62,8 +62,8 @@ def test_a_plan_need_not_be_compiled_and_is_not_where_that_takes_very_long(monke
     assert "which no compiled program confirms here" in text
     assert "compiled CPU program" not in text
     with pytest.raises(TypeError):  # what would compile
-        plan.show(configs.load("tiny"), launch(), said.append)
-    off = dataclasses.replace(launch(), compiled="off")
+        plan.show(configs.load("tiny"), launch(1), said.append)
+    off = dataclasses.replace(launch(1), compiled="off")
     (one, *_) = plan.show(configs.load("tiny"), off, said.append)
     assert one.raised == 1
     with pytest.raises(ConfigError, match="use auto, on, off"):

@@ -80,8 +80,9 @@ def frames_in_view(masks_true_KTHW: Array) -> int:
     Args:
         masks_true_KTHW: (K, T, H, W) bool, of things visible in frame 0.
     """
-    seen_T = np.asarray(masks_true_KTHW, bool).any((0, 2, 3))
-    return len(seen_T) if seen_T.all() else int(np.argmin(seen_T))
+    seen_T = np.asarray(masks_true_KTHW, bool).sum((0, 2, 3)) > 0
+    gone = np.flatnonzero(~seen_T)
+    return int(gone[0]) if gone.size else seen_T.size
 
 
 def object_masks(
@@ -144,9 +145,9 @@ def structural_consistency(
 def follow_by_flow(video_THWC: np.ndarray, first_KHW: np.ndarray) -> np.ndarray:
     """Follow masks by dense optical flow from frame to frame; a stand-in, and not SAM 2.
 
-    Every pixel takes what the pixel that it comes from had in the frame before (Farnebäck's flow,
-    SCIA 2003). Pixels whose flow does not lead back belong to nothing. No weights are needed, and
-    nothing is known of things: errors add up over frames.
+    Every pixel takes what the pixel that it comes from had in the frame before (dense inverse
+    search, Kroeger et al. 2016). Pixels whose flow does not lead back belong to nothing. No weights
+    are needed, and nothing is known of things: errors add up over frames.
 
     Args:
         video_THWC: (T, H, W, 3) uint8.
@@ -175,11 +176,10 @@ def follow_by_flow(video_THWC: np.ndarray, first_KHW: np.ndarray) -> np.ndarray:
 
 def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return (H, W, 2) pixels, right and down, by which pixels of one picture move to the other."""
-    start = np.zeros((*one.shape, 2), np.float32)
-    return cv2.calcOpticalFlowFarneback(
-        one, other, start, pyr_scale=0.5, levels=3, winsize=9, iterations=5, poly_n=5,
-        poly_sigma=1.1, flags=0,
-    )  # fmt: skip
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    method.setFinestScale(0)
+    method.setPatchStride(2)
+    return np.asarray(method.calc(one, other, None))  # type: ignore[call-overload]
 
 
 def _masks(pred: Array, true: Array) -> tuple[np.ndarray, np.ndarray]:
