@@ -179,7 +179,7 @@ def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     method.setFinestScale(0)
     method.setPatchStride(2)
-    return np.asarray(method.calc(one, other, None))  # type: ignore[call-overload]
+    return np.asarray(method.calc(one, other, np.zeros((*one.shape, 2), np.float32)))
 
 
 def _masks(pred: Array, true: Array) -> tuple[np.ndarray, np.ndarray]:
