@@ -4,6 +4,7 @@ import dataclasses
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import training_fakes as fakes
@@ -25,11 +26,12 @@ from pewm_jax.config import (
     TrainConfig,
     WanVAEConfig,
 )
+from pewm_jax.models import codecs, controls, world_model
 from pewm_jax.scaling import hlo
 from pewm_jax.scaling.plan import QUICK
 from pewm_jax.training import sharding, state
 from pewm_jax.worlds import costs
-from tests.helpers import TINY, init_world, randomise, with_reader
+from tests.helpers import TINY, init_world, random_frames, randomise, with_reader
 
 COSMOS = CosmosConfig(
     layers=2, heads=2, head_dim=16, mlp_ratio=2.0, text_dim=24, text_length=3, lora_dim=8
@@ -92,16 +94,63 @@ def test_every_leaf_has_its_place_on_many_devices():
         assert split or small or "codec" in path, f"{path} {leaf.shape} is whole"
 
 
+def test_frames_that_are_given_do_not_count_in_the_loss(monkeypatch):
+    def latents(model, _params, rgb, _depth, **_):
+        grid = (model.codec.frames(rgb.shape[1]), *model.latent_shape[1:], model.codec.channels)
+        return jnp.zeros((len(rgb), *grid))
+
+    monkeypatch.setattr(codecs, "encode_rgbd", latents)
+    config = Config(model=MODEL, data=DataConfig(context=1), train=EgoWMTrainConfig(blind=0.5))
+    params = {"control": jax.jit(controls.init, static_argnums=0)(MODEL, jax.random.key(0))}
+    batch = jax.tree.map(np.asarray, fakes.clip(config, 1, 0))
+
+    def loss(wrong_at):
+        def predicted(_model, _params, noisy, *_):
+            return jnp.zeros_like(noisy).at[:, wrong_at].add(3.0)
+
+        monkeypatch.setattr(world_model, "apply", predicted)
+        (stage,) = worlds.stages(MODEL)
+        return float(stage.loss(MODEL, config.train, params, batch, jax.random.key(0))[0])
+
+    right, at_given, at_other = (loss(where) for where in (slice(0, 0), 0, 1))
+    assert at_given == right
+    assert at_other > right + 1
+
+
+PEWM = dataclasses.replace(
+    with_reader(TINY, looks=8),
+    clip=ClipConfig(frames=5, height=16, width=16),
+    codec=dataclasses.replace(VAE, depth=True),
+    backbone=dataclasses.replace(COSMOS, layers=1),
+    control=ModulationConfig(projection="convolution", rays=True),
+    noise=NOISE,
+)
+"""The world ``pewm``: depth beside colour, rays beside actions, memory blocks after its blocks."""
+LATER = dataclasses.replace(
+    MODEL, clip=dataclasses.replace(MODEL.clip, frames=9), history=5, dtype="bfloat16"
+)
+
+
+@pytest.mark.parametrize("model", [PEWM, LATER], ids=["pewm", "egowm"])
+def test_worlds_on_cosmos_imagine_and_compare_candidates(model):
+    clip = model.clip
+    seen = random_frames(np.random.default_rng(0), 2, clip.height, clip.width)
+
+    def shapes(key):
+        params = worlds.init(model, key)
+        state = worlds.start(model, params, seen)
+        plans, keys = jnp.zeros((3, 7, 3)), jax.random.split(key, 3)
+        _, alone = worlds.imagine(model, params, state, plans[0], key)
+        _, many = worlds.imagine_many(model, params, state, plans, keys)
+        return alone.rgb_THWC, many.rgb_THWC
+
+    alone, many = jax.eval_shape(shapes, jax.random.key(0))
+    assert alone.shape == (7, clip.height, clip.width, 3)
+    assert many.shape == (3, *alone.shape)
+
+
 def test_actions_and_a_memory_on_cosmos():
-    """World ``pewm``: depth beside colour, rays beside actions, memory blocks after its blocks."""
-    model = dataclasses.replace(
-        with_reader(TINY, looks=8),
-        clip=ClipConfig(frames=5, height=16, width=12),
-        codec=dataclasses.replace(VAE, depth=True),
-        backbone=dataclasses.replace(COSMOS, layers=1),
-        control=ModulationConfig(projection="convolution", rays=True),
-        noise=NOISE,
-    )
+    model = PEWM
     assert model.in_channels == 8 + 1 + 12
     config = Config(model=model, data=DataConfig(context=1), train=TrainConfig(stage2=STAGE))
     stage = worlds.stages(model)[1]
