@@ -19,6 +19,7 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     ConfigError,
+    CosmosConfig,
     DataConfig,
     DDPMConfig,
     DINOv2EncoderConfig,
@@ -260,6 +261,9 @@ def experiments(draw):
     """An experiment of kinds of every section, with a few settings of each drawn."""
     names = {"backbone", "codec", "control", "noise"}
     parts = {name: draw(some(name))() for name in sorted(names)}
+    if isinstance(parts["backbone"], CosmosConfig):  # is told times in its own units alone
+        flow = EDMConfig(target="flow", sigma_data=1.0)
+        parts["noise"] = draw(st.sampled_from([flow, FlowConfig(scale=1.0)]))
     steps = dataclasses.replace(parts["noise"], sample_steps=draw(st.integers(1, 50)))
     reader = dataclasses.replace(draw(some("reader"))(), mlp_ratio=draw(st.integers(1, 4)))
     encoder = draw(some("encoder"))()

@@ -38,9 +38,12 @@ class BackboneSettings(Settings):
         stores_prompt: whether a prompt's embedding is stored with the weights.
         split_heads: a number that ``train.mesh.tensor`` must divide.
         remat: whether the backward pass recomputes activations.
+        GUIDED_BY_TEXT: whether guidance of a world without a memory is on the text, against
+            another prompt, and not on the observed image.
     """
 
     SECTION: ClassVar[str] = "backbone"
+    GUIDED_BY_TEXT: ClassVar[bool] = False
     places: Any = None
     text_shape: Any = None
     stores_prompt: Any = False
@@ -51,6 +54,10 @@ class BackboneSettings(Settings):
     def time_dim(self) -> int:
         """Channels of the time embedding: those that a reader's places are told."""
         return self.places.time
+
+    def shown_channels(self, model: Any) -> int:
+        """Return the number of input channels that show the observed frames: their latents'."""
+        return model.codec.channels
 
     def check(self, model: Any) -> None:
         """Refuse latents that do not split into the backbone's patches.

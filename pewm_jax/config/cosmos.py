@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
+from pewm_jax.config.backbone import BackboneSettings, Places
 from pewm_jax.config.errors import require, require_positive
+from pewm_jax.config.noise import EDMConfig, FlowConfig
 
 
 @dataclasses.dataclass(frozen=True)
-class CosmosConfig:
+class CosmosConfig(BackboneSettings):
     """A diffusion transformer in Cosmos' form (arXiv 2501.03575); defaults: Predict2-2B for video.
 
-    ``COSMOS_2B`` and ``COSMOS_14B`` are the published video models.
+    ``COSMOS_2B`` and ``COSMOS_14B`` are the published video models. As a backbone it holds observed
+    frames at their latents, and guidance is on its text.
     """
+
+    GUIDED_BY_TEXT: ClassVar[bool] = True
 
     in_channels: int = 17
     """Channels of the input without the padding mask: noisy latents, and 1 for the mask that marks
-    given frames."""
+    given frames. A world model takes its own number."""
     out_channels: int = 16
-    """Channels of the prediction."""
+    """Channels of the prediction. A world model takes its own number."""
     layers: int = 28
     """Transformer blocks."""
     heads: int = 16
@@ -33,6 +38,13 @@ class CosmosConfig:
     raw_text_dim: int = 0
     """Channels of a text token that is given, if a linear layer and GELU turn it into `text_dim`
     channels (Predict2.5); 0 if there is no such layer."""
+    text_length: int = 512
+    """Number of text tokens that a world model gives."""
+    prompt: Literal["zeros", "stored"] = "zeros"
+    """Which text tokens: `zeros`, or the embeddings of a prompt, and of another one for guidance,
+    that are `stored` with the weights."""
+    fps: float = 16.0
+    """Frames per second that a world model tells the network."""
     lora_dim: int = 256
     """Channels of the bottleneck in each block's modulation by the time."""
     patch: int = 2
@@ -54,6 +66,26 @@ class CosmosConfig:
     """Recompute activations in the backward pass: less memory, about a third more time."""
 
     @property
+    def places(self) -> Places:
+        """Where a memory reader runs: after every block."""
+        return Places(self.layers, self.width, self.width, self.patch, self.patch_t)
+
+    @property
+    def text_shape(self) -> tuple[int, int]:
+        """(length, channels) of the text tokens."""
+        return self.text_length, self.raw_text_dim or self.text_dim
+
+    @property
+    def stores_prompt(self) -> bool:
+        """Whether embeddings of prompts are stored with the weights."""
+        return self.prompt == "stored"
+
+    @property
+    def split_heads(self) -> int:
+        """The number that ``train.mesh.tensor`` must divide."""
+        return self.heads
+
+    @property
     def width(self) -> int:
         """Model width D."""
         return self.heads * self.head_dim
@@ -64,43 +96,60 @@ class CosmosConfig:
         return int(self.width * self.mlp_ratio)
 
     @property
-    def time_dim(self) -> int:
-        """Channels of the time embedding, to which a modulation is added."""
-        return self.width
-
-    @property
     def max_grid(self) -> tuple[int, int, int]:
         """Tokens along time, height and width that positions reach."""
         frames, rows, columns = self.max_size
         return frames // self.patch_t, rows // self.patch, columns // self.patch
 
+    def shown_channels(self, model: Any) -> int:
+        """Return 1: a mask marks observed frames, whose latents stand where noisy ones would."""
+        del model
+        return 1
+
+    def check(self, model: Any) -> None:
+        """Refuse noise in other units than the network's, and frames that share a token."""
+        super().check(model)
+        noise = model.noise
+        in_units = isinstance(noise, EDMConfig) and noise.target == "flow"
+        require(
+            in_units or (isinstance(noise, FlowConfig) and noise.scale == 1),
+            "this backbone (cosmos) is told times from 0 to 1 and predicts velocities: use "
+            "noise.kind edm with noise.target flow, or noise.kind flow with noise.scale 1.",
+        )
+        require(
+            self.patch_t == 1,
+            f"backbone.patch_t is {self.patch_t}: in a world model observed frames have a time of "
+            "their own, so a token is of one latent frame; use 1.",
+        )
+
     def __post_init__(self):
         """Validate."""
-        require_positive(self, "cosmos", "in_channels", "out_channels", "layers", "heads")
-        require_positive(self, "cosmos", "text_dim", "lora_dim", "patch", "patch_t")
+        require_positive(self, "backbone", "in_channels", "out_channels", "layers", "heads")
+        require_positive(self, "backbone", "text_dim", "lora_dim", "patch", "patch_t")
+        require_positive(self, "backbone", "text_length", "fps")
         require(
             self.head_dim >= 12 and self.head_dim % 2 == 0,
-            f"cosmos.head_dim is {self.head_dim}: use an even number of at least 12, which the "
+            f"backbone.head_dim is {self.head_dim}: use an even number of at least 12, which the "
             "rotary embedding splits into time, height and width.",
         )
         require(
             self.raw_text_dim >= 0,
-            f"cosmos.raw_text_dim is {self.raw_text_dim}: use 0 for text tokens as they are.",
+            f"backbone.raw_text_dim is {self.raw_text_dim}: use 0 for text tokens as they are.",
         )
         require(
             self.hidden >= 1,
-            f"cosmos.mlp_ratio is {self.mlp_ratio}: use a number that leaves at least a channel.",
+            f"backbone.mlp_ratio is {self.mlp_ratio}: use a number that leaves at least a channel.",
         )
         for name, least in (("max_size", 1), ("rope_scale", 0)):
             values = getattr(self, name)
             require(
                 len(values) == 3 and min(values) >= least and min(values) > 0,
-                f"cosmos.{name} is {values}: name three numbers above 0, for time, height and "
+                f"backbone.{name} is {values}: name three numbers above 0, for time, height and "
                 "width.",
             )
         require(
             min(self.max_grid) >= 1,
-            f"cosmos.max_size {self.max_size} is smaller than one token.",
+            f"backbone.max_size {self.max_size} is smaller than one token.",
         )
 
 

@@ -27,7 +27,8 @@ class EgoWMTrainConfig(TrainSettings):
     """The backbone goes on learning as it did before, now with actions; the control's learning rate
     is `model.control.rate` times this one's."""
     blind: float = 0.1
-    """Share of clips whose observed image is hidden; needed for `model.noise.guidance` above 1."""
+    """Share of clips from which is hidden what guidance is on, the observed image or the text;
+    needed for `model.noise.guidance` above 1."""
 
     def __post_init__(self):
         """Validate."""
@@ -71,5 +72,13 @@ class EgoWMConfig(ModelConfig):
             1 <= self.history < self.clip.frames and (self.history - 1) % q == 0,
             f"model.history is {self.history}: use {q}k + 1 frames (they fill latent frames), and "
             f"fewer than clip.frames ({self.clip.frames}).",
+        )
+        require(
+            self.noise.guidance == 1
+            or not self.backbone.GUIDED_BY_TEXT
+            or self.backbone.stores_prompt,
+            f"noise.guidance is {self.noise.guidance}, which this backbone has on its text, and no "
+            "text is stored: use backbone.prompt stored and weights that were imported with a text "
+            "encoder, or noise.guidance 1.",
         )
         require(self.image_noise >= 0, f"model.image_noise is {self.image_noise}: use 0 or more.")

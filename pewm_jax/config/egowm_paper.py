@@ -1,4 +1,4 @@
-"""EgoWM's experiment on Stable Video Diffusion, around networks of any size (arXiv 2601.15284)."""
+"""EgoWM's experiments, around networks of any size (arXiv 2601.15284)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import math
 from typing import Literal
 
 from pewm_jax.config.clip import ClipConfig
+from pewm_jax.config.control import ModulationConfig
+from pewm_jax.config.cosmos import CosmosConfig
 from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.mesh import MeshConfig
@@ -14,11 +16,16 @@ from pewm_jax.config.noise import EDMConfig
 from pewm_jax.config.svd_unet import SVDUNetConfig
 from pewm_jax.config.svd_vae import SVDVAEConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig
+from pewm_jax.config.wan_vae import WanVAEConfig
 
 NOISE = EDMConfig(sigma_data=1.0, sigma_max=700.0, target="v", sample_steps=25)
 """The published scheduler of Stable Video Diffusion."""
 SIDE = 512
-"""Height and width of the paper's frames."""
+"""Height and width of the paper's frames, with Stable Video Diffusion."""
+COSMOS_NOISE = EDMConfig(sigma_data=1.0, target="flow", ends="sigma_min", sample_steps=35)
+"""The scheduler of Cosmos-Predict2, as its published pipeline uses it."""
+COSMOS_CLIP = (17, 480, 640)
+"""Frames, height and width of the paper's clips with Cosmos: 16 frames after the observed one."""
 
 
 def experiment(
@@ -30,7 +37,7 @@ def experiment(
     size: tuple[int, int] = (SIDE, SIDE),
     dtype: Literal["float32", "bfloat16"] = "bfloat16",
 ) -> Config:
-    """Return the settings of the paper.
+    """Return the settings of the paper on Stable Video Diffusion.
 
     The paper's are the size, learning rates, motion bucket, noise on the image, guidance and number
     of sampling steps; steps, batch, noise levels in training (those of Stable Video Diffusion) and
@@ -60,6 +67,54 @@ def experiment(
             adapt=StageConfig(steps=20000, batch=8, learning_rate=1e-5, warmup=500),
             mesh=MeshConfig(fsdp=8),
             image_noise_mean=math.log(0.1),
+            image_noise_std=0.0,
+            ema=0.9999,
+            preview_every=0,
+        ),
+        evaluate=EvalConfig(batch=1),
+    )
+
+
+def cosmos_experiment(
+    transformer: CosmosConfig,
+    vae: WanVAEConfig,
+    noise: EDMConfig = COSMOS_NOISE,
+    *,
+    run: str,
+    clip: tuple[int, int, int] = COSMOS_CLIP,
+    dtype: Literal["float32", "bfloat16"] = "bfloat16",
+) -> Config:
+    """Return the settings of the paper on Cosmos-Predict2.
+
+    The paper's are the clip, the learning rates, and the form of the actions' layers: two layers
+    and two convolutions over time, which are ten times as fast. Steps, batch and noise levels in
+    training are ours; of guidance it says nothing, so there is none. The observed frame gets no
+    noise.
+
+    Args:
+        transformer: the network.
+        vae: its autoencoder.
+        noise: its scheduler.
+        run: name of the experiment, for the folder of its runs.
+        clip: frames, height and width.
+        dtype: precision of the computation.
+    """
+    frames, height, width = clip
+    return Config(
+        model=EgoWMConfig(
+            clip=ClipConfig(frames=frames, height=height, width=width, depth=False),
+            codec=dataclasses.replace(vae, depth=False),
+            backbone=dataclasses.replace(transformer, remat=True),
+            control=ModulationConfig(projection="convolution"),
+            noise=dataclasses.replace(noise, log_mean=1.0, log_std=1.2),
+            dtype=dtype,
+        ),
+        data=DataConfig(path="data/egowm", context=1, stride_max=1),
+        train=EgoWMTrainConfig(
+            run=f"runs/{run}",
+            adapt=StageConfig(steps=20000, batch=8, learning_rate=1e-6, warmup=500),
+            mesh=MeshConfig(fsdp=8),
+            image_noise_mean=-10.0,
             image_noise_std=0.0,
             ema=0.9999,
             preview_every=0,

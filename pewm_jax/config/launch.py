@@ -8,6 +8,9 @@ from typing import Any
 
 from pewm_jax.config.errors import require
 
+COMPILED = ("auto", "on", "off")
+"""Whether a plan compiles the step."""
+
 
 def _flag(default: Any, text: str) -> Any:
     return dataclasses.field(default=default, metadata={"help": text})
@@ -72,16 +75,26 @@ class Launch(Join):
         plan: do not train, but compile for other hardware and print what training would take.
         devices: devices to plan for.
         chip: kind of device to plan for.
+        compiled: whether a plan compiles the step.
         profile: steps to trace.
     """
 
     plan: bool = _flag(False, "do not train: compile the step and print what training would take")
     devices: int = _flag(8, "with --plan: how many devices")
     chip: str = _flag("h200", "with --plan: h100, h200, b200, v5p or v6e")
+    compiled: str = _flag(
+        "auto",
+        "with --plan: on compiles the step and says what the program does, off gives the formulas' "
+        "numbers alone, auto leaves compiling out where it takes very long",
+    )
     profile: int = _flag(0, "profile this many steps, for TensorBoard and Perfetto")
 
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
+        require(
+            self.compiled in COMPILED,
+            f"--compiled is {self.compiled}: use {', '.join(COMPILED)}.",
+        )
         require(self.devices >= 1, f"--devices is {self.devices}: use at least 1.")
         require(self.profile >= 0, f"--profile is {self.profile}: use 0 or more steps.")

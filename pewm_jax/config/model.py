@@ -63,8 +63,9 @@ class ModelConfig(WorldSettings):
 
     @property
     def in_channels(self) -> int:
-        """Input channels of the denoiser: noisy latents, observed latents, the control's."""
-        return 2 * self.codec.channels + self.control.channels(self)
+        """Input channels of the denoiser: noisy latents, the observed frames', the control's."""
+        shown = self.backbone.shown_channels(self)
+        return self.codec.channels + shown + self.control.channels(self)
 
     def __post_init__(self):
         """Validate what is in each section, and settings that depend on each other."""

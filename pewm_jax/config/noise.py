@@ -14,7 +14,7 @@ class NoiseSettings(Settings):
 
     Attributes:
         guidance: classifier-free guidance on the memory, or in a world without one on the observed
-            image; 1 is off.
+            image, or on the text where the backbone says so; 1 is off.
         per_frame: whether training draws a time for every latent frame.
     """
 
@@ -56,8 +56,8 @@ class DDPMConfig(NoiseSettings):
     set_alpha_to_one: bool = True
     """Whether the last step ends at a clean sample, or at noise level 0, which is almost clean."""
     guidance: float = 1.0
-    """Classifier-free guidance on the memory (in the world egowm: on the observed image): 1 = off,
-    above 1 pushes away from 'no memory'."""
+    """Classifier-free guidance on the memory (in the world egowm: on the observed image, or on the
+    text of Cosmos): 1 = off, above 1 pushes away from 'no memory'."""
     dynamic_guidance: bool = False
     """Vary the guidance with the training level t, as CogVideoX's pipelines do:
     1 + g (1 − cos(π ((N − t) / N)⁵)) / 2 with N = sample_steps."""
@@ -125,8 +125,8 @@ class EDMConfig(NoiseSettings):
     sampler: Literal["euler", "heun"] = "euler"
     """`euler`: first order, one evaluation of the denoiser per step. `heun`: second order, two."""
     guidance: float = 1.0
-    """Classifier-free guidance on the memory (in the world egowm: on the observed image): 1 = off,
-    above 1 pushes away from 'no memory'."""
+    """Classifier-free guidance on the memory (in the world egowm: on the observed image, or on the
+    text of Cosmos): 1 = off, above 1 pushes away from 'no memory'."""
 
     def __post_init__(self):
         """Validate."""
@@ -169,8 +169,8 @@ class FlowConfig(NoiseSettings):
     sample_steps: int = 10
     """Steps of the sampler, by Euler's method."""
     guidance: float = 1.0
-    """Classifier-free guidance on the memory (in the world egowm: on the observed image): 1 = off,
-    above 1 pushes away from 'no memory'."""
+    """Classifier-free guidance on the memory (in the world egowm: on the observed image, or on the
+    text of Cosmos): 1 = off, above 1 pushes away from 'no memory'."""
 
     def __post_init__(self):
         """Validate."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
+from pewm_jax.config.codec import CodecSettings
 from pewm_jax.config.errors import require, require_positive
 
 MEAN_16 = (
@@ -18,8 +19,11 @@ STD_16 = (
 
 
 @dataclasses.dataclass(frozen=True)
-class WanVAEConfig:
+class WanVAEConfig(CodecSettings):
     """Wan 2.1's video autoencoder (arXiv 2503.20314): causal, four frames to a latent."""
+
+    DEPTH_AS_GREY: ClassVar[bool] = True
+    CONVERTED: ClassVar[bool] = True
 
     in_channels: int = 3
     """Channels of an input frame."""
@@ -44,6 +48,9 @@ class WanVAEConfig:
     ``wan_vae.normalise`` and ``wan_vae.restore`` do."""
     convolution: Literal["auto", "taps", "volume", "winograd"] = "auto"
     """The form of 3D convolutions, as in ``VAEConfig``."""
+    depth: bool = True
+    """Whether depth is encoded too, as grey pictures by the same weights, in as many channels more;
+    Cosmos-Predict2 itself knows colour alone."""
 
     @property
     def spatial(self) -> int:
@@ -55,36 +62,60 @@ class WanVAEConfig:
         """Frames per latent after the first."""
         return 2 ** sum(self.halves_time)
 
+    @property
+    def framewise(self) -> bool:
+        """Whether a latent frame is decoded by itself: no, with those before it."""
+        return False
+
+    @property
+    def rgb_channels(self) -> int:
+        """Latent channels of colour."""
+        return self.latent_channels
+
+    @property
+    def depth_channels(self) -> int:
+        """Latent channels of depth."""
+        return self.latent_channels * self.depth
+
+    def check(self, model: Any) -> None:
+        """Refuse clips that are not encoded four frames at a time."""
+        super().check(model)
+        require(
+            model.clip.frames % 4 == 1,
+            f"clip.frames is {model.clip.frames}: this codec encodes four frames at a time after "
+            "the first, so use 4k + 1 frames (5, 9, …).",
+        )
+
     def __post_init__(self):
         """Validate."""
-        require_positive(self, "vae", "in_channels", "out_channels", "latent_channels", "resnets")
-        require_positive(self, "vae", "base_width", "decoder_base_width")
+        require_positive(self, "codec", "in_channels", "out_channels", "latent_channels", "resnets")
+        require_positive(self, "codec", "base_width", "decoder_base_width")
         require(
             len(self.multiples) > 0 and min(self.multiples) >= 1,
-            f"vae.multiples is {self.multiples}: name one number of at least 1 per level.",
+            f"codec.multiples is {self.multiples}: name one number of at least 1 per level.",
         )
         require(
             len(self.halves_time) == len(self.multiples) - 1,
-            f"vae.halves_time names {len(self.halves_time)} levels: name one value for each of "
+            f"codec.halves_time names {len(self.halves_time)} levels: name one value for each of "
             f"the {len(self.multiples)} levels but the last.",
         )
         require(
             self.temporal <= 4,
-            f"vae.halves_time halves time {sum(self.halves_time)} times: at most twice, the "
+            f"codec.halves_time halves time {sum(self.halves_time)} times: at most twice, the "
             "reference reads four frames at a time.",
         )
         require(
             all(self.decoder_base_width * m % 2 == 0 for m in self.multiples[1:]),
-            f"vae.decoder_base_width {self.decoder_base_width} times vae.multiples must be even "
-            "numbers: each step up halves the channels.",
+            f"codec.decoder_base_width {self.decoder_base_width} times codec.multiples must be "
+            "even numbers: each step up halves the channels.",
         )
         for name in ("latents_mean", "latents_std"):
             require(
                 len(getattr(self, name)) == self.latent_channels,
-                f"vae.{name} names {len(getattr(self, name))} channels: name one number for each "
-                f"of the {self.latent_channels} of vae.latent_channels.",
+                f"codec.{name} names {len(getattr(self, name))} channels: name one number for each "
+                f"of the {self.latent_channels} of codec.latent_channels.",
             )
         require(
             min(self.latents_std) > 0,
-            f"vae.latents_std holds {min(self.latents_std)}: use numbers above 0.",
+            f"codec.latents_std holds {min(self.latents_std)}: use numbers above 0.",
         )

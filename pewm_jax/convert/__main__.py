@@ -14,6 +14,7 @@ commands:
                      --rgbd --camera [--memory] a world model to train from
   import dinov2      DINOv2 (transformers or the original state dict) → the map's image encoder
   import svd         a checkpoint of Stable Video Diffusion → a world model steered by actions
+  import cosmos2     a checkpoint of Cosmos-Predict2 for video → a world model steered by actions
   export diffusers   our CogVideoX weights, fine-tuned or not → a folder for from_pretrained
   export inference   a training run → averaged weights in bfloat16, settings and a card
   export stablehlo   a world model → programs that run without this library
@@ -23,6 +24,7 @@ COMMANDS = (
     "import cogvideox",
     "import dinov2",
     "import svd",
+    "import cosmos2",
     "export diffusers",
     "export inference",
     "export stablehlo",

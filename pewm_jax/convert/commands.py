@@ -24,6 +24,7 @@ from pewm_jax.config.dit import Learned
 from pewm_jax.convert import (
     base,
     cogvideox,
+    cosmos_world,
     diffusers_folder,
     dinov2,
     inference,
@@ -137,6 +138,34 @@ class ImportSVD:
     height: int = 512
     """Height of its images in pixels."""
     width: int = 512
+    """Width of its images in pixels."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportCosmos2:
+    """Import a checkpoint of Cosmos-Predict2 for video as a world model steered by actions.
+
+    The result is a folder that `pewm_jax.load` reads and that is trained by its name (`pewm-jax
+    train DST`), with the settings of the preset egowm_cosmos2b. Until then actions change nothing.
+    """
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """The pipeline's folder: transformer/, vae/, scheduler/ and, if a prompt is to be encoded,
+    text_encoder/ and tokenizer/."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to make."""
+    dtype: Dtype | None = None
+    """Store weights in this precision; by default as they are."""
+    prompt: str = ""
+    """Prompt to encode and store; by default the empty one."""
+    negative: str = ""
+    """Prompt that guidance pushes away from, if `noise.guidance` is above 1; the reference's
+    pipeline has a long one, which describes bad videos."""
+    frames: int = 17
+    """Frames of a clip, the observed one among them: 4k + 1."""
+    height: int = 480
+    """Height of its images in pixels."""
+    width: int = 640
     """Width of its images in pixels."""
 
 
@@ -315,6 +344,16 @@ def import_svd(options: ImportSVD) -> None:
     print(f"{options.dst}: a world model; licence of the original: {base.licence(options.src)}")
 
 
+def import_cosmos2(options: ImportCosmos2) -> None:
+    """Run ``import cosmos2``."""
+    size = options.frames, options.height, options.width
+    texts = options.prompt, options.negative
+    encoded = cosmos_world.import_world(options.src, options.dst, options.dtype, size, texts)
+    told = "prompts encoded" if encoded else "no prompt (there is no text_encoder/)"
+    said = base.licence(options.src)
+    print(f"{options.dst}: a world model, {told}; licence of the original: {said}")
+
+
 def export_diffusers(options: ExportDiffusers) -> None:
     """Run ``export diffusers``."""
     diffusers_folder.export(options.src, options.dst, options.base, options.dtype, options.original)
@@ -343,6 +382,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "import cogvideox": (ImportCogVideoX, import_cogvideox),
     "import dinov2": (ImportDINOv2, import_dinov2),
     "import svd": (ImportSVD, import_svd),
+    "import cosmos2": (ImportCosmos2, import_cosmos2),
     "export diffusers": (ExportDiffusers, export_diffusers),
     "export inference": (ExportInference, export_inference),
     "export stablehlo": (ExportStableHLO, export_stablehlo),

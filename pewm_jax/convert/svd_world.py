@@ -8,24 +8,14 @@ one network is in memory at a time.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
 import jax
-import numpy as np
 
-from pewm_jax import config as configuration
-from pewm_jax import tensor_files, tree
 from pewm_jax.config import Config, egowm_paper
-from pewm_jax.convert import assemble, clip_vision, cogvideox, output, sources, svd
-from pewm_jax.convert.cogvideox import CONFIG, WEIGHTS
+from pewm_jax.convert import assemble, clip_vision, cogvideox, output, sources, svd, whole_world
 from pewm_jax.models import clip_vision as clip_model
-from pewm_jax.models import controls
-from pewm_jax.types import Array, Params
-
-Specs = dict[str, jax.ShapeDtypeStruct]
-"""Shape and dtype of every leaf, by path."""
 
 
 def config_of(src: Path, dst: Path, dtype: str | None, size: tuple[int, int]) -> Config:
@@ -76,13 +66,7 @@ def import_world(
     output.refuse_existing(dst)
     stored = dtype or _stored(src)
     config = config_of(src, dst, stored, size)
-    new = np.dtype(jax.numpy.dtype(dtype or "float32"))
-
-    def actions() -> Params:
-        return jax.jit(controls.init, static_argnums=0)(config.model, jax.random.key(0))
-
-    fresh = tree.flatten(jax.eval_shape(actions))
-    parts: dict[str, tuple[Specs, Callable[[], Params]]] = {
+    parts: dict[str, whole_world.Part] = {
         "backbone": (
             cogvideox.stored_specs(svd.UNET, src, dtype),
             lambda: svd.read_unet(src, dtype)[1],
@@ -92,23 +76,9 @@ def import_world(
             lambda: svd.read_vae(src, dtype)[1],
         ),
         "image": (_image_specs(src, dtype), lambda: svd.read_image_encoder(src, dtype)[1]),
-        "control": (
-            {path: jax.ShapeDtypeStruct(leaf.shape, new) for path, leaf in fresh.items()},
-            actions,
-        ),
+        "control": whole_world.actions(config, dtype),
     }
-    specs = {f"{part}/{p}": spec for part, (like, _) in parts.items() for p, spec in like.items()}
-
-    def tensors() -> Iterator[tuple[str, Array]]:
-        for part, (_, make) in parts.items():
-            for path, leaf in tree.flatten({part: make()}).items():
-                yield path, np.asarray(leaf).astype(specs[path].dtype, copy=False)
-
-    with output.new_folder(dst) as folder:
-        header = tensor_files.header({"stage": "0"})
-        with output.megabytes(f"write {dst.name}", tensor_files.size(specs)) as progress:
-            tensor_files.write(folder / WEIGHTS, specs, tensors(), header, progress)
-        configuration.save(config, folder / CONFIG)
+    whole_world.write(dst, config, parts)
 
 
 def _stored(src: Path) -> str:
@@ -116,7 +86,7 @@ def _stored(src: Path) -> str:
     return cogvideox.stored_specs(svd.UNET, src, None)["conv_out/kernel"].dtype.name
 
 
-def _image_specs(src: Path, dtype: str | None) -> Specs:
+def _image_specs(src: Path, dtype: str | None) -> whole_world.Specs:
     """Return what reading the image encoder will give."""
     inside = sources.component(src, "image_encoder")
     path = inside / "config.json"

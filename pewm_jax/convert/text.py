@@ -1,7 +1,7 @@
-"""Prompts through CogVideoX's text encoder, once, at conversion: T5 is not run afterwards.
+"""Prompts through a pipeline's text encoder, once, at conversion: T5 is not run afterwards.
 
-As the reference pipeline does: padded with the pad token to the text length, cut there, and no
-mask given, neither to the encoder nor to the transformer.
+As the reference pipelines do: padded with the pad token to the text length and cut there. For
+CogVideoX no mask is given to the encoder; for Cosmos one is, and the tokens of padding are zeros.
 """
 
 from __future__ import annotations
@@ -16,14 +16,17 @@ from pewm_jax.config import UserError
 from pewm_jax.convert import output, sources
 
 
-def encode(src: Path, prompts: Sequence[str], length: int, width: int) -> dict[str, np.ndarray]:
+def encode(
+    src: Path, prompts: Sequence[str], length: int, width: int, *, masked: bool = False
+) -> dict[str, np.ndarray]:
     """Encode prompts with the ``text_encoder/`` and ``tokenizer/`` of a pipeline's folder.
 
     Args:
         src: the pipeline's folder.
         prompts: the prompts; the empty one is a prompt too.
-        length: text tokens L of the transformer, 226 or 224.
+        length: text tokens L of the transformer: 226 or 224, in Cosmos 512.
         width: channels of a text token.
+        masked: whether padding is masked in the encoder, and its tokens are zeros (Cosmos).
 
     Returns:
         The tokens (L, width) in float32 by prompt; empty where the folder has no text encoder.
@@ -46,11 +49,11 @@ def encode(src: Path, prompts: Sequence[str], length: int, width: int) -> dict[s
             f"text of {width} channels; they are not of the same pipeline."
         )
     sources.open_folder(encoder)  # complete and whole, or a sentence
-    return _encode(encoder, tokenizer, prompts, length)
+    return _encode(encoder, tokenizer, prompts, length, masked=masked)
 
 
 def _encode(
-    encoder: Path, tokenizer: Path, prompts: Sequence[str], length: int
+    encoder: Path, tokenizer: Path, prompts: Sequence[str], length: int, *, masked: bool
 ) -> dict[str, np.ndarray]:
     torch, transformers = output.convert_extra("torch"), output.convert_extra("transformers")
     try:
@@ -72,15 +75,19 @@ def _encode(
     out: dict[str, np.ndarray] = {}
     with torch.inference_mode():
         for prompt in prompts:
-            ids = tokenize(
+            words = tokenize(
                 prompt,
                 padding="max_length",
                 max_length=length,
                 truncation=True,
                 add_special_tokens=True,
                 return_tensors="pt",
-            ).input_ids
-            out[prompt] = model.eval()(ids)[0][0].float().numpy()
+            )
+            mask = words.attention_mask.bool() if masked else None
+            tokens = model.eval()(words.input_ids, attention_mask=mask)[0][0].float()
+            if mask is not None:
+                tokens = tokens.masked_fill(~mask[0, :, None], 0)
+            out[prompt] = tokens.numpy()
             if not np.isfinite(out[prompt]).all():
                 raise UserError(
                     f"{encoder} in {model.dtype} overflows on the prompt {prompt!r}; save it in "

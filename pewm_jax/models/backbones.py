@@ -13,7 +13,8 @@ One that is shown the observed frames in another way than joined to its input ha
     observed(model, params, seen) -> Conditioning
     init_image(settings, key) -> params         frozen, under ``image/``; {} if it needs none
 
-and ``models.svd_backbone`` is an example of that.
+and ``models.svd_backbone`` is an example of that. ``models.cosmos_backbone`` holds observed frames
+in the place of noisy ones.
 """
 
 from __future__ import annotations
@@ -40,6 +41,9 @@ class Conditioning:
         tokens_BLC: text tokens, or other tokens of the same width.
         image_BMD: tokens of the observed image, of a width of their own.
         scalars_BK: numbers that are embedded as the time is, such as frames per second.
+        known_BthwC: latents that are known, at frames that are given; zeros at the others.
+        known_Bt: (B, t) bool, the latent frames that are given; sampling holds them.
+        fps: frames per second, one number, where positions in time depend on it.
     """
 
     joined_BthwC: Array | None = None
@@ -47,6 +51,9 @@ class Conditioning:
     tokens_BLC: Array | None = None
     image_BMD: Array | None = None
     scalars_BK: Array | None = None
+    known_BthwC: Array | None = None
+    known_Bt: Array | None = None
+    fps: Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +140,8 @@ def observed(model: ModelConfig, params: Params, seen: Observed) -> Conditioning
         seen: the observed frames.
 
     Returns:
-        Conditioning whose joined channels are as many as the latents have.
+        Conditioning with ``settings.shown_channels(model)`` joined channels: by default as many as
+        the latents have.
     """
     own = getattr(functions(model.backbone), "observed", None)
     if own is not None:
@@ -149,3 +157,11 @@ def joined(x_BthwC: Array, conditioning: Conditioning) -> Array:
     if conditioning.joined_BthwC is None:
         return x_BthwC
     return jnp.concatenate([x_BthwC, conditioning.joined_BthwC], -1)
+
+
+def held(conditioning: Conditioning, latents_BthwC: Array) -> Array:
+    """Return latents with the known ones in their places, where a backbone says which are known."""
+    if conditioning.known_Bt is None or conditioning.known_BthwC is None:
+        return latents_BthwC
+    there = conditioning.known_Bt[:, :, None, None, None]
+    return jnp.where(there, conditioning.known_BthwC, latents_BthwC)

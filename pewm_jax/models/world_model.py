@@ -1,13 +1,13 @@
 """The world model's network: the denoiser, conditioned on frame, control, text and memory.
 
-Input channels, in order: noisy colour and depth latents; latents of the observed frames, as the
-backbone wants them (by default zero for later latent frames); the channels of the control (Plücker
-rays). At the places that the backbone provides, a reader reads the memory.
+Input channels, in order: noisy colour and depth latents; what shows the observed frames, as the
+backbone wants it (by default their latents, zero for later frames); the channels of the control
+(Plücker rays). At the places that the backbone provides, a reader reads the memory.
 
 Parameters: ``backbone``, ``memory`` (the reader) and, if the settings need them, ``control``, the
 frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (with which the backbone sees images)
-and ``text`` (the prompt's embedding). Without the ``memory`` entry, or without sight of a memory,
-it is the stage-1 model.
+and ``text`` (the prompt's embedding, and a negative one's where guidance is on text). Without the
+``memory`` entry, or without sight of a memory, it is the stage-1 model.
 """
 
 from __future__ import annotations
@@ -79,6 +79,33 @@ def condition(
     return ClipConditioning(given, control.camera, camera_control.rays(model, control.camera))
 
 
+def blind(
+    model: ModelConfig, params: Params, conditioning: ClipConditioning, hidden_B: Array
+) -> ClipConditioning:
+    """Hide from clips of a batch what guidance is on, in a world without a memory.
+
+    That is the observed image, or, of a backbone that is guided by text, the prompt: the negative
+    prompt stands in its place.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; ``text`` is used.
+        conditioning: of a batch of clips.
+        hidden_B: (B,) bool, the clips from which it is hidden.
+    """
+    tokens = conditioning.given.tokens_BLC
+    if not model.backbone.GUIDED_BY_TEXT:
+        return without_image(model, conditioning, hidden_B)
+    stored = params.get("text", {})
+    if tokens is None or "negative_LC" not in stored:
+        return conditioning
+    negative = jnp.asarray(stored["negative_LC"], tokens.dtype)
+    other = tokens.at[:, : len(negative)].set(negative)
+    chosen = jnp.where(hidden_B[:, None, None], other, tokens)
+    given = dataclasses.replace(conditioning.given, tokens_BLC=chosen)
+    return dataclasses.replace(conditioning, given=given)
+
+
 def without_image(
     model: ModelConfig, conditioning: ClipConditioning, hidden_B: Array
 ) -> ClipConditioning:
@@ -95,11 +122,13 @@ def without_image(
         there = hidden_B.reshape(-1, *(1,) * (x.ndim - 1))
         return jnp.where(there & (np.arange(x.shape[-1]) < channels), 0, x)
 
-    joined, image = given.joined_BthwC, given.image_BMD
+    joined, image, known = given.joined_BthwC, given.image_BMD, given.known_Bt
+    shown = model.backbone.shown_channels(model)
     hidden = dataclasses.replace(
         given,
-        joined_BthwC=None if joined is None else hide(joined, model.codec.channels),
+        joined_BthwC=None if joined is None else hide(joined, shown),
         image_BMD=None if image is None else hide(image, image.shape[-1]),
+        known_Bt=None if known is None else known & ~jnp.asarray(hidden_B)[:, None],
     )
     return dataclasses.replace(conditioning, given=hidden)
 
@@ -134,7 +163,8 @@ def init(model: ModelConfig, key: Array, *, memory: bool = True) -> Params:
     }
     params |= {name: part for name, part in parts.items() if part}
     if model.backbone.stores_prompt:
-        params["text"] = {"prompt_LC": jnp.zeros(model.backbone.text_shape)}
+        names = ("prompt_LC", "negative_LC")[: 1 + model.backbone.GUIDED_BY_TEXT]
+        params["text"] = {name: jnp.zeros(model.backbone.text_shape) for name in names}
     return params
 
 

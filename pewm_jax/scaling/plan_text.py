@@ -38,23 +38,29 @@ def lines(plan: Plan) -> Iterator[str]:
     for label, name in MEMORY:
         yield f"    {label:<42}{size(getattr(choice.footprint, name)):>10}"
     yield f"    {'peak, by the formula':<42}{size(choice.footprint.peak):>10}"
-    yield (
-        f"    the compiled CPU program: {size(compiled.arguments)} of state and batch + "
-        f"{size(compiled.temporary)} = {size(compiled.peak)}, where the formula for a CPU, which "
-        f"widens 16 bits to 32, has {size(compiled.expected.peak)}"
-    )
+    if compiled is not None:
+        yield (
+            f"    the compiled CPU program: {size(compiled.arguments)} of state and batch + "
+            f"{size(compiled.temporary)} = {size(compiled.peak)}, where the formula for a CPU, "
+            f"which widens 16 bits to 32, has {size(compiled.expected.peak)}"
+        )
     yield from _verdict(plan)
     yield "  work of a step"
     yield f"    {'the mathematics needs, all devices':<42}{work(time.model_flops):>12}"
-    yield (
-        f"    {'done by a device, with what is recomputed':<42}{work(time.hardware_flops):>12} "
-        f"(compiled program: {work(compiled.program.flops)})"
-    )
-    yield "  sent by a device in a step, by the formula (compiled program, in 32 bits)"
+    done = f"    {'done by a device, with what is recomputed':<42}{work(time.hardware_flops):>12}"
+    sent = "  sent by a device in a step, by the formula"
+    if compiled is None:
+        yield done
+        yield sent
+    else:
+        yield f"{done} (compiled program: {work(compiled.program.flops)})"
+        yield f"{sent} (compiled program, in 32 bits)"
     for kind in hlo.KINDS:
-        formula, counted = time.sent_of(kind), compiled.program.sent(kind)
+        formula = time.sent_of(kind)
+        counted = 0.0 if compiled is None else compiled.program.sent(kind)
         if formula or counted:
-            yield f"    {kind:<42}{size(formula):>10} ({size(counted)})"
+            beside = "" if compiled is None else f" ({size(counted)})"
+            yield f"    {kind:<42}{size(formula):>10}{beside}"
     yield "  predicted"
     yield (
         f"    a step {duration(time.step_s)}: products {duration(time.products_s)}, element-wise "
@@ -80,7 +86,9 @@ def _verdict(plan: Plan) -> Iterator[str]:
         f"    {verdict}: {size(plan.peak)} of {size(plan.chip.memory)}, of which "
         f"{suggest.MARGIN:.0%} may be filled ({size(suggest.MARGIN * plan.chip.memory)})"
     )
-    if raised > 1:
+    if plan.compiled is None:
+        why = "which no compiled program confirms here"
+    elif raised > 1:
         why = f"raised by the {raised - 1:.1%} that the CPU program needs above the formula for it"
     else:
         why = "not lowered, though the CPU program needs less than the formula for it"

@@ -46,7 +46,7 @@ class Plan:
         stage: the stage.
         chip: the kind of device.
         choice: the requested arrangement, with its memory and time by the formulas.
-        compiled: the compiler's report.
+        compiled: the compiler's report; None where the step was not compiled.
         best: the best arrangements.
     """
 
@@ -54,12 +54,14 @@ class Plan:
     stage: Stage
     chip: Chip
     choice: Arrangement
-    compiled: Compiled
+    compiled: Compiled | None
     best: tuple[Arrangement, ...]
 
     @property
     def raised(self) -> float:
-        """The factor, at least 1, by which the compiled program exceeds the formula."""
+        """The factor, at least 1, by which a compiled program exceeds the formula."""
+        if self.compiled is None:
+            return 1.0
         return max(1.0, self.compiled.peak / self.compiled.expected.peak)
 
     @property

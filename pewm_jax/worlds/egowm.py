@@ -2,7 +2,8 @@
 
 There is no map: all that a chunk knows of the past are the last frames, observed or imagined, which
 are shown to the backbone as it learned to be shown them (``backbones.observed``). Guidance is on
-these frames alone: without them, actions steer on (``noise.guidance``; 2 in the paper). A chunk is
+these frames alone, or on the text of a backbone that has one (``world_model.blind``): without them,
+actions steer on (``noise.guidance``; 2 in the paper). A chunk is
 denoised as a whole, so all its frames see all its actions, where the backbone's attention over time
 looks both ways; earlier chunks never see the actions of later ones.
 """
@@ -153,7 +154,7 @@ def imagine_chunk(
     )
     blind = None
     if model.noise.guidance != 1:
-        blind = world_model.without_image(model, given, np.ones((1,), bool))
+        blind = world_model.blind(model, params, given, np.ones((1,), bool))
     latents = sampling.draw(model, params, given, None, key, blind=blind)
     rgb, depth = codecs.decode_rgbd(model, params, latents)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)

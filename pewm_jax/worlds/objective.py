@@ -105,12 +105,13 @@ def loss(
         key: randomness of times, noise and image noise.
         memory: whether the memory is read (in stage 2).
         history: frames of a clip that are observed.
-        blind: share of clips from which these are hidden.
+        blind: share of clips from which is hidden what guidance is on.
 
     Returns:
         ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of the noise's target,
         averaged over colour and over depth where it was measured. If the denoiser works without
-        depth (``clip.depth``), only colour counts.
+        depth (``clip.depth``), only colour counts. Latent frames that the backbone is given
+        (``Conditioning.known_Bt``) do not count.
     """
     frames = as_signal(clip.frames)
     x0 = clip.latents_thwC
@@ -148,7 +149,7 @@ def loss(
     )
     if blind:
         hidden = jax.random.bernoulli(jax.random.fold_in(key, 6), blind, (batch,))
-        conditioning = world_model.without_image(model, conditioning, hidden)
+        conditioning = world_model.blind(model, params, conditioning, hidden)
     inputs, network_time = noises.shown(model.noise, x_t, times)
     prediction = world_model.apply(model, params, inputs, conditioning, network_time, sight)
 
@@ -157,6 +158,10 @@ def loss(
     split = model.codec.rgb_channels
     measured = jnp.broadcast_to(codecs.measured(model, frames.depth_THW), error[..., split:].shape)
     rgb = error[..., :split].mean()
+    if conditioning.given.known_Bt is not None:
+        counted = noises.spread(1.0 - conditioning.given.known_Bt, error.ndim)
+        rgb = (error[..., :split] * counted).mean() / jnp.maximum(counted.mean(), 1e-6)
+        measured = measured * counted
     depth = (error[..., split:] * measured).sum() / jnp.maximum(measured.sum(), 1)
     if not model.clip.depth:
         return rgb, {"loss_rgb": rgb, "loss_depth": depth}

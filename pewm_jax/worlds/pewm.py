@@ -109,7 +109,7 @@ def sharding(model: ModelConfig) -> tuple[tuple[str, Any], ...]:
     memory = model.memory
     parts = (model.backbone, memory.reader, model.codec, memory.encoder, model.control)
     rules = [rule for part in parts for rule in functions(part).SHARDING]
-    return (*rules, (r"text/prompt_LC", P(None, "fsdp")))
+    return (*rules, (r"text/(prompt|negative)_LC", P(None, "fsdp")))
 
 
 def split_heads(model: ModelConfig, stage: Stage) -> dict[str, int]:

@@ -6,7 +6,7 @@ import jax
 
 from pewm_jax.config import ModelConfig
 from pewm_jax.diffusion import noise as noises
-from pewm_jax.models import world_model
+from pewm_jax.models import backbones, world_model
 from pewm_jax.types import Array, Params, Sight
 
 
@@ -39,7 +39,8 @@ def sample(
 
     With ``noise.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map)); DDPM
     lets g vary with the step (``noise.dynamic_guidance``). Where ``blind`` is given, it is what the
-    prediction is compared with, in the place of the same without the map.
+    prediction is compared with, in the place of the same without the map. Latents that the
+    conditioning knows are held: whatever is predicted there, x0 is what is known.
 
     Args:
         model: the model.
@@ -66,10 +67,10 @@ def sample(
         return noises.to_x0(noise, out, x, times)
 
     def denoise(x: Array, times: Array, weight: Array) -> Array:
-        with_all = x0(x, times, conditioning, sight)
-        if noise.guidance == 1 or (sight is None and blind is None):
-            return with_all
-        without = x0(x, times, blind or conditioning, None)
-        return without + weight * (with_all - without)
+        clean = x0(x, times, conditioning, sight)
+        if noise.guidance != 1 and (sight is not None or blind is not None):
+            without = x0(x, times, blind or conditioning, None)
+            clean = without + weight * (clean - without)
+        return backbones.held(conditioning.given, clean)
 
     return noises.sample(noise, denoise, noise_BthwC, key)

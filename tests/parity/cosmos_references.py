@@ -4,7 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from diffusers import CosmosTransformer3DModel
+from diffusers import (
+    AutoencoderKLWan,
+    Cosmos2VideoToWorldPipeline,
+    CosmosTransformer3DModel,
+    FlowMatchEulerDiscreteScheduler,
+)
 from diffusers.models.transformers import transformer_cosmos
 
 from tests.parity.svd_references import randomise
@@ -43,6 +48,43 @@ def transformer(**settings):
         transformer_cosmos.transforms = TRANSFORMS
     network = CosmosTransformer3DModel(**{**SHRUNKEN, **settings})
     return randomise(network)
+
+
+class Harmless:
+    """Stands where the pipeline wants its filter of contents."""
+
+    def to(self, *_, **__):
+        return self
+
+    def check_video_safety(self, video):
+        return video
+
+
+def scheduler():
+    return FlowMatchEulerDiscreteScheduler(use_karras_sigmas=True)
+
+
+def small_pipeline():
+    """Return the pipeline of the reference; making it completes its scheduler's settings."""
+    vae = AutoencoderKLWan(
+        base_dim=4,
+        z_dim=4,
+        dim_mult=[1, 2, 1],
+        num_res_blocks=1,
+        temperal_downsample=[True, True],
+        latents_mean=[0.1, -0.2, 0.3, 0.0],
+        latents_std=[0.5, 1.5, 1.0, 2.0],
+    )
+    made = Cosmos2VideoToWorldPipeline(
+        text_encoder=None,
+        tokenizer=None,
+        transformer=transformer(),
+        vae=randomise(vae),
+        scheduler=scheduler(),
+        safety_checker=Harmless(),
+    )
+    made.set_progress_bar_config(disable=True)
+    return made
 
 
 def channels_first(x):

@@ -8,53 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
-from diffusers import AutoencoderKLWan, Cosmos2VideoToWorldPipeline, FlowMatchEulerDiscreteScheduler
+from diffusers import FlowMatchEulerDiscreteScheduler
 
 from pewm_jax.config import ConfigError, EDMConfig, UserError
 from pewm_jax.convert import cosmos, cosmos_scheduler
 from pewm_jax.diffusion import noise
 from pewm_jax.models import cosmos as model
 from pewm_jax.models import wan_vae
-from tests.parity.cosmos_references import channels_first, channels_last, transformer
-from tests.parity.svd_references import distance, draw, randomise
+from tests.parity.cosmos_references import channels_first, channels_last, scheduler, small_pipeline
+from tests.parity.svd_references import distance, draw
 
 STEPS, GUIDANCE, FPS, GIVEN_SIGMA = 5, 3.0, 16, 1e-4
 FRAMES, SIZE = 9, 16
 
 
-class Harmless:
-    """Stands where the pipeline wants its filter of contents."""
-
-    def to(self, *_, **__):
-        return self
-
-
-def scheduler():
-    return FlowMatchEulerDiscreteScheduler(use_karras_sigmas=True)
-
-
 @pytest.fixture(scope="module")
 def pipeline():
-    """Return the pipeline of the reference; making it completes its scheduler's settings."""
-    vae = AutoencoderKLWan(
-        base_dim=4,
-        z_dim=4,
-        dim_mult=[1, 2, 1],
-        num_res_blocks=1,
-        temperal_downsample=[True, True],
-        latents_mean=[0.1, -0.2, 0.3, 0.0],
-        latents_std=[0.5, 1.5, 1.0, 2.0],
-    )
-    made = Cosmos2VideoToWorldPipeline(
-        text_encoder=None,
-        tokenizer=None,
-        transformer=transformer(),
-        vae=randomise(vae),
-        scheduler=scheduler(),
-        safety_checker=Harmless(),
-    )
-    made.set_progress_bar_config(disable=True)
-    return made
+    return small_pipeline()
 
 
 @pytest.fixture(scope="module")

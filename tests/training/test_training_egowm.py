@@ -30,6 +30,7 @@ from pewm_jax.config import (
 from pewm_jax.models import backbones, svd_backbone
 from pewm_jax.models.backbones import Conditioning
 from pewm_jax.scaling import hlo
+from pewm_jax.scaling.plan import QUICK
 from pewm_jax.training import sharding, state, step
 from pewm_jax.worlds import costs
 from tests.helpers import TINY, randomise, with_reader
@@ -63,7 +64,7 @@ def trained(config, stage, steps=3, start=None):
     batch = jax.device_put(fakes.clip(config, 2, 0), sharding.of_batch(mesh))
     moves = np.random.default_rng(0).normal(0, 0.3, batch.actions_TA.shape).astype(np.float32)
     batch = dataclasses.replace(batch, actions_TA=jax.device_put(moves, sharding.of_batch(mesh)))
-    compiled = step.lower_step(config, stage, mesh, batch).compile()
+    compiled = step.lower_step(config, stage, mesh, batch).compile(compiler_options=QUICK)
     now = step.initial_state(config, stage, mesh, start)
     first = jax.tree.map(np.array, now.params)
     key, losses = step.stage_key(config, stage), []

@@ -52,6 +52,24 @@ def test_the_command_plans_from_settings_alone_and_writes_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_plan_need_not_be_compiled_and_is_not_where_that_takes_very_long(monkeypatch):
+    monkeypatch.setattr(plan, "virtual", lambda count: [None] * count)
+    monkeypatch.setattr(plan, "compile_stage", None)
+    said = []
+    plan.show(configs.load("egowm_svd"), launch(), said.append)
+    text = "\n".join(said)
+    assert "not compiled, all numbers are the formulas' (it trains more than 1000 arrays" in text
+    assert "which no compiled program confirms here" in text
+    assert "compiled CPU program" not in text
+    with pytest.raises(TypeError):  # what would compile
+        plan.show(configs.load("tiny"), launch(1), said.append)
+    off = dataclasses.replace(launch(1), compiled="off")
+    (one, *_) = plan.show(configs.load("tiny"), off, said.append)
+    assert one.raised == 1
+    with pytest.raises(ConfigError, match="use auto, on, off"):
+        Launch(compiled="no")
+
+
 def test_what_cannot_be_planned_is_refused_before_anything_is_compiled(monkeypatch):
     monkeypatch.setattr(plan, "compile_stage", None)
     tiny = configs.load("tiny")
