@@ -10,6 +10,7 @@ import numpy as np
 from pewm_jax.config import UserError
 from pewm_jax.data.consistency import find_disagreement
 from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
+from pewm_jax.data.voxel_checks import disagreement, off_lattice, outside
 from pewm_jax.geometry.actions import PLANAR
 
 MEDIAN_DEPTH_M = (0.05, 40.0)
@@ -61,10 +62,41 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
             episode.ids()
     except UserError as error:
         return [*found, Problem(where, None, "images", str(error))]
+    found += _check_voxels(episode, depth_THW, where)
     found += _check_saturation(depth_THW, where) or check_depth(depth_THW, where)
-    if not found:  # wrong poses or units would only be reported once more
+    if not found and not episode.info.get("moving"):  # wrong poses or units would only be reported once more
         found += _check_geometry(episode, depth_THW, where)
     return found
+
+
+def _check_voxels(episode: Episode, depth_THW: np.ndarray, where: str) -> Iterator[Problem]:
+    """Check that the grids decode, lie around the camera on one lattice, and hold what is seen."""
+    try:
+        grid = episode.voxel_grid
+        if grid is None:
+            return
+        voxels = episode.voxels()
+    except UserError as error:
+        yield Problem(where, None, "voxels", str(error))
+        return
+    for frame, off in off_lattice(voxels.origin_T3, grid.cell_m):
+        what = f"the grid's corner is {off:.3g} cells off the lattice of frame 0."
+        yield Problem(where, frame, "voxels", what)
+        return
+    for frame in outside(voxels, episode.world_from_camera[:, :3, 3]):
+        what = "the camera is not in the grid: origins must be in metres, in the world of the poses."
+        yield Problem(where, frame, "voxels", what)
+        return
+    worst = disagreement(voxels, depth_THW, episode.camera())
+    if worst is not None:
+        yield Problem(
+            where,
+            worst[0],
+            "voxels",
+            f"disagrees with the depth: {worst[1]:.0%} of the points that are seen in the grid "
+            "have only empty cells around them; check the order of the axes, the origins and "
+            "the cell.",
+        )
 
 
 def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:

@@ -154,6 +154,20 @@ def parts_at(moving: MovingHouse, world_from_part_P44: np.ndarray) -> Scene:
     return _placed(moving.parts, world_from_part_P44)
 
 
+def part_at(moving: MovingHouse, number: int, world_from_part_44: np.ndarray) -> Scene:
+    """Return one part alone as a scene, at a pose; its colours are not to be rendered."""
+    assert moving.parts is not None
+    poses = np.broadcast_to(world_from_part_44, (len(moving.moves), 4, 4))
+    whole, mine = _placed(moving.parts, poses), moving.parts.object_F == number
+    return dataclasses.replace(
+        whole,
+        faces_F3=whole.faces_F3[mine],
+        normals_F3=whole.normals_F3[mine],
+        object_F=whole.object_F[mine],
+        albedo_F3=whole.albedo_F3[mine],
+    )
+
+
 def render_moving(
     moving: MovingHouse, poses_TP44: np.ndarray, camera: Camera, height: int, width: int
 ) -> Rendered:

@@ -13,6 +13,7 @@ empty.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -186,6 +187,15 @@ def _heaviest(cell_N3: np.ndarray, class_N: np.ndarray, weight_N: np.ndarray) ->
     chosen = order[last]
     cell = np.stack(np.unravel_index(number[chosen], shape), -1) + first
     return Filled(cell, name[chosen], counted[chosen])
+
+
+def together(parts: Sequence[Filled]) -> Filled:
+    """Return the cells that any of the parts fill, each with the class that counts most."""
+    return _heaviest(
+        np.concatenate([part.cell_N3 for part in parts]),
+        np.concatenate([part.class_N for part in parts]),
+        np.concatenate([part.weight_N for part in parts]),
+    )
 
 
 def _overlay(grid_XYZ: np.ndarray, low_3: np.ndarray, moving: Filled, still: Lattice) -> None:
