@@ -64,7 +64,9 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
         return [*found, Problem(where, None, "images", str(error))]
     found += _check_voxels(episode, depth_THW, where)
     found += _check_saturation(depth_THW, where) or check_depth(depth_THW, where)
-    if not found and not episode.info.get("moving"):  # wrong poses or units would only be reported once more
+    if not found and not episode.info.get(
+        "moving"
+    ):  # wrong poses or units would only be reported once more
         found += _check_geometry(episode, depth_THW, where)
     return found
 
@@ -84,7 +86,9 @@ def _check_voxels(episode: Episode, depth_THW: np.ndarray, where: str) -> Iterat
         yield Problem(where, frame, "voxels", what)
         return
     for frame in outside(voxels, episode.world_from_camera[:, :3, 3]):
-        what = "the camera is not in the grid: origins must be in metres, in the world of the poses."
+        what = (
+            "the camera is not in the grid: origins must be in metres, in the world of the poses."
+        )
         yield Problem(where, frame, "voxels", what)
         return
     worst = disagreement(voxels, depth_THW, episode.camera())

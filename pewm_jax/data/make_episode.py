@@ -31,6 +31,7 @@ SPLITS = ("train", "validation", "revisit")
 HOUSES_PER_SEED = 1_000_000
 _NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
 """Settings that do not change the files."""
+UNRECORDED = VoxelsConfig()
 HEADROOM_M = 0.1
 """Free room above the camera where the agent may stand, metres."""
 
@@ -73,7 +74,7 @@ class CollectConfig:
     """Also write instance ids."""
     moving: bool = False
     """Made houses have doors that open as the agent comes near, and robots on their rounds."""
-    voxels: VoxelsConfig = VoxelsConfig()
+    voxels: VoxelsConfig = UNRECORDED
     episodes_per_house: int = 1
     """Episodes recorded in one house before the next is made."""
     scene: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
@@ -116,15 +117,15 @@ class CollectConfig:
             raise ConfigError(f"--hfov is {self.hfov}: use 1 up to below 180 degrees.")
         if self.frames < 2:
             raise ConfigError("--frames is 1: an episode needs at least 2 frames.")
+        self._check_moving_and_voxels()
+        self._check_address()
+
+    def _check_moving_and_voxels(self) -> None:
         if self.moving and self.scene:
             raise ConfigError(
                 "--moving is for made houses: a mesh of --scene has no parts that move; leave out "
                 "one of the two."
             )
-        self._check_voxels()
-        self._check_address()
-
-    def _check_voxels(self) -> None:
         for field in () if self.voxels.record else dataclasses.fields(self.voxels):
             value = getattr(self.voxels, field.name)
             if value != field.default:

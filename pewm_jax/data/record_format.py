@@ -109,7 +109,11 @@ def pack_record(
             spans.append([offset, len(image)])
             blobs.append(image)
             offset += len(image)
-        header["streams"][stream] = {"codec": "png", **(about or {}).get(stream, {}), "spans": spans}
+        header["streams"][stream] = {
+            "codec": "png",
+            **(about or {}).get(stream, {}),
+            "spans": spans,
+        }
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     return b"".join([MAGIC, struct.pack("<I", len(text)), text, *blobs])
 

@@ -126,9 +126,7 @@ def draw_voxels(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray
         sheet.append(np.vstack(images))
     blank = [np.full_like(sheet[0], BACKGROUND)] * (-count % columns)
     sheet += blank
-    return np.vstack(
-        [np.hstack(sheet[k : k + columns]) for k in range(0, len(sheet), columns)]
-    )
+    return np.vstack([np.hstack(sheet[k : k + columns]) for k in range(0, len(sheet), columns)])
 
 
 def depth_colours(depth_HW: np.ndarray, farthest_m: float) -> np.ndarray:

@@ -108,7 +108,7 @@ def disagreement(
         near = np.asarray(ndimage.binary_dilation(grid > 0, np.ones((3, 3, 3))))
         cell = np.floor((points - voxels.origin_T3[t]) / voxels.cell_m).astype(int)
         cell = cell[((cell >= 0) & (cell < grid.shape)).all(-1)]
-        floating[int(t)] = int((~near[tuple(cell.T)]).sum()), len(cell)
+        floating[int(t)] = int((near[tuple(cell.T)] == 0).sum()), len(cell)
     lost, seen = (sum(counts) for counts in zip(*floating.values(), strict=True))
     if not seen or lost <= MOST_FLOATING * seen:
         return None

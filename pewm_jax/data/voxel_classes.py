@@ -1,7 +1,7 @@
 """What a cell of a voxel grid may be: a kind of thing in one of a few named colours.
 
-The renderer of a voxel world knows of a cell only its class, so a class holds what appearance needs:
-a wall of another colour is another class. Class 0 is empty.
+The renderer of a voxel world knows of a cell only its class, so a class holds what appearance
+needs: a wall of another colour is another class. Class 0 is empty.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class VoxelsConfig:
 
     record: bool = False
     """Record a grid with every frame; `--voxels` alone is short for it."""
-    cell: float = 0.25
-    """Side of a cell, metres. Cells no larger than the walls are thick (0.12) keep the colours of
-    their two sides apart."""
+    cell: float = 0.2
+    """Side of a cell, metres. Up to 0.16 the two sides of a wall are never in one cell, which can
+    have the colour of one of them only."""
     side: int = 48
     """Cells of the grid along each axis; the agent's camera is in the middle."""
     kinds: Literal["all", "groups"] = "all"

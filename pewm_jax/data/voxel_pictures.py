@@ -52,7 +52,9 @@ def ahead(voxels: VoxelFrames, frame: int, camera: Camera, height: int, width: i
     hits = _march(height, width)(
         voxels.classes_TXYZ[frame], voxels.origin_T3[frame], np.float32(voxels.cell_m), one
     )
-    ids, depth, side = (np.asarray(x)[0, ..., 0] for x in (hits.ids_L, hits.distance_L, hits.side_L))
+    ids, depth, side = (
+        np.asarray(x)[0, ..., 0] for x in (hits.ids_L, hits.distance_L, hits.side_L)
+    )
     seen = ids != EMPTY
     colours = table_colours(voxels.names)[ids] * SIDES[side][..., None]
     rgb = np.where(seen[..., None], colours, BACKGROUND).astype(np.uint8)

@@ -12,7 +12,6 @@ from pewm_jax.data.voxel_classes import VoxelsConfig
 from pewm_jax.data.voxel_frames import VoxelFrames
 from pewm_jax.data.voxelise import Filled, Lattice, around, fill, lattice_of, together
 
-
 PART_M = 1.5
 """Parts reach no farther than this from their own origin, metres."""
 

@@ -1,13 +1,14 @@
 """Surfaces to cells: a house as a lattice of class ids, and the grid around an agent.
 
 Cells are aligned with the world: their corners are whole multiples of their side from a point of
-the lattice. Triangles are cut at the borders of cells, so every cell that a surface passes is found,
-however little of it is there. Of several classes a cell has the one with the largest area in it;
-walls and floors count less than what stands before them.
+the lattice. Triangles are cut at the borders of cells, so every cell that a surface passes is
+found, however little of it is there. Of several classes a cell has the one with the largest area in
+it; walls and floors count less than what stands before them.
 
 A surface belongs to the cell just behind it (``BEHIND_M``): a floor at height 0 fills the cells
-below 0, and a rug on it lies in these too. Solid things are hollow: a cell without a surface is
-empty.
+below 0, and a rug on it lies in these too. Only walls belong to the cell just before them, so that
+the two sides of one wall, in two colours, are farther apart. Solid things are hollow: a cell
+without a surface is empty.
 """
 
 from __future__ import annotations
@@ -22,9 +23,13 @@ from pewm_jax.data.voxel_classes import VoxelsConfig, class_ids
 from pewm_jax.houses.kinds import KINDS, SHELL, kind_of
 
 BEHIND_M = 0.02
-"""Surfaces are moved back by this, at most by a quarter of a cell, before they are cut."""
+"""Surfaces are moved back by this, walls forward, at most by a quarter of a cell, before they are
+cut."""
 SHELL_WEIGHT = 1.0 / 3
 """What an area of a wall or a floor counts beside the same area of a thing in front of it."""
+EQUAL = 1e-3
+"""Areas that differ by less than this part of a cell's face are equal: then the class with the
+smaller id has the cell, and not rounding."""
 NEAR = 1e-9
 """Cells: a corner this near to a border does not reach over it."""
 
@@ -36,7 +41,7 @@ class Filled:
     Attributes:
         cell_N3: (N, 3) int64 numbers of the cells in the lattice, any sign.
         class_N: (N,) class ids.
-        weight_N: (N,) what the class counts there, square metres.
+        weight_N: (N,) what the class counts there: its area, in faces of a cell.
     """
 
     cell_N3: np.ndarray
@@ -71,13 +76,13 @@ def fill(config: VoxelsConfig, scene: Scene, point_3: np.ndarray) -> Filled:
         scene: the world, or what moves in it at one moment.
         point_3: the lowest corner of the lattice's cell (0, 0, 0), metres.
     """
-    back = min(BEHIND_M, config.cell / 4) * scene.normals_F3[:, None]
-    corners = (scene.vertices_V3[scene.faces_F3] - back - point_3) / config.cell
-    piece_N33, face_N = cut(corners)
-    sides = piece_N33[:, 1:] - piece_N33[:, :1]
-    area_N = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2 * config.cell**2
     kind_O = np.array([KINDS.index(kind_of(name)) for name in scene.objects])
     kind_F = kind_O[scene.object_F]
+    back_F = np.where(kind_F == KINDS.index("wall"), -1, 1) * min(BEHIND_M, config.cell / 4)
+    back = back_F[:, None, None] * scene.normals_F3[:, None]
+    piece_N33, face_N = cut((scene.vertices_V3[scene.faces_F3] - back - point_3) / config.cell)
+    sides = piece_N33[:, 1:] - piece_N33[:, :1]
+    area_N = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
     class_F = class_ids(config, kind_F, scene.albedo_F3)
     shell_F = np.isin(kind_F, [KINDS.index(kind) for kind in SHELL])
     weight_N = area_N * np.where(shell_F, SHELL_WEIGHT, 1.0)[face_N]
@@ -147,7 +152,9 @@ def cut(corners_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pieces, faces
 
 
-def _halve(corners_F33: np.ndarray, axis: int, plane_F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _halve(
+    corners_F33: np.ndarray, axis: int, plane_F: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Cut triangles at a plane between their corners, into three each; and say of which each is."""
     order = corners_F33[:, :, axis].argsort(1)
     low, mid, high = np.take_along_axis(corners_F33, order[:, :, None], 1).swapaxes(0, 1)
@@ -180,11 +187,10 @@ def _heaviest(cell_N3: np.ndarray, class_N: np.ndarray, weight_N: np.ndarray) ->
     classes = 1 + int(class_N.max())
     number_N = np.ravel_multi_index(tuple((cell_N3 - first).T), shape)
     key, inverse = np.unique(number_N * classes + class_N, return_inverse=True)
-    counted = np.bincount(inverse, weight_N)
+    counted = np.round(np.bincount(inverse, weight_N) / EQUAL) * EQUAL
     number, name = np.divmod(key, classes)
     order = np.lexsort((-name, counted, number))  # the heaviest last; of equal ones the smaller id
-    last = np.append(np.diff(number[order]) > 0, True)
-    chosen = order[last]
+    chosen = order[np.append(np.flatnonzero(np.diff(number[order])), len(order) - 1)]
     cell = np.stack(np.unravel_index(number[chosen], shape), -1) + first
     return Filled(cell, name[chosen], counted[chosen])
 
