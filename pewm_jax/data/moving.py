@@ -5,8 +5,8 @@ a pure function of the house and of where the agent has been up to t, so picture
 frame show the same moment, and frame t never depends on what the agent does after t.
 
 * A **door** opens as the agent comes near: from closed at ``doors.FAR_M`` to open at
-  ``doors.NEAR_M`` from the middle of the doorway. Some doors close again behind it, the others stay as far open as they ever
-  were.
+  ``doors.NEAR_M`` from the middle of the doorway. Some doors close again behind it, the others stay
+  as far open as they ever were.
 * A **robot** goes its round in one room at a steady speed, whoever is there.
 """
 

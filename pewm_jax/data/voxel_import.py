@@ -99,7 +99,7 @@ def turned(
     exact = np.rint(rotation_33).astype(int)
     order = np.abs(exact).argmax(1)  # new axis k is old axis order[k]
     sign = exact[np.arange(3), order]
-    backward = [axis for axis in range(3) if sign[axis] < 0]
+    backward = tuple(axis for axis in range(3) if sign[axis] < 0)
     cells = np.flip(classes_XYZ.transpose(order), backward)
     ends = np.stack([origin_3, origin_3 + cell_m * len(classes_XYZ)])[:, order] * sign
     return cells, ends.min(0)

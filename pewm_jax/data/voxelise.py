@@ -209,7 +209,7 @@ def _overlay(grid_XYZ: np.ndarray, low_3: np.ndarray, moving: Filled, still: Lat
     here_N3 = moving.cell_N3 - low_3
     inside = ((here_N3 >= 0) & (here_N3 < grid_XYZ.shape)).all(-1)
     there_N3 = moving.cell_N3 - still.first_3
-    known = ((there_N3 >= 0) & (there_N3 < still.weight_XYZ.shape)).all(-1)
+    known = np.all((there_N3 >= 0) & (there_N3 < still.weight_XYZ.shape), axis=-1)
     where = np.where(known[:, None], there_N3, 0)
     before = np.where(known, still.weight_XYZ[tuple(where.T)], 0)
     won = inside & (moving.weight_N > before)
