@@ -23,6 +23,7 @@ from pewm_jax.data.dataset import (
 )
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.progress import Meter
+from pewm_jax.data.record_format import DamagedError
 from pewm_jax.data.voxel_frames import VoxelGrid, require_alike
 
 SHOWN = 20
@@ -137,10 +138,12 @@ def _check_record(
     except UserError as error:
         return 0, [Problem(where, None, "record", str(error).removeprefix(where).lstrip(":, "))]
     found = check_episode(episode, where)
-    if any(problem.field == "voxels" for problem in found) or episode.voxel_grid is None:
-        return episode.length, found
     try:
-        require_alike(grids.setdefault(file.parent, episode.voxel_grid), episode.voxel_grid, "it")
+        grid = episode.voxel_grid
+        if grid is not None:
+            require_alike(grids.setdefault(file.parent, grid), grid, "it")
+    except DamagedError:
+        pass  # found already
     except UserError as error:
         found.append(Problem(where, None, "voxels", str(error)))
     return episode.length, found

@@ -127,7 +127,7 @@ def _table(path: Path) -> tuple[str, ...]:
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the classes, the origin and the cell of one file."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             classes, origin, cell = (np.asarray(file[field]) for field in FIELDS)
     except _UNREADABLE as error:
         raise UserError(
