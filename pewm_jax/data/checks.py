@@ -10,7 +10,7 @@ import numpy as np
 from pewm_jax.config import UserError
 from pewm_jax.data.consistency import find_disagreement
 from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
-from pewm_jax.data.voxel_checks import disagreement, off_lattice, outside
+from pewm_jax.data.voxel_checks import LOOKS, disagreement, off_lattice, outside
 from pewm_jax.geometry.actions import PLANAR
 
 MEDIAN_DEPTH_M = (0.05, 40.0)
@@ -74,28 +74,30 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
 def _check_voxels(episode: Episode, depth_THW: np.ndarray, where: str) -> Iterator[Problem]:
     """Check that the grids decode, lie around the camera on one lattice, and hold what is seen."""
     try:
-        grid = episode.voxel_grid
-        if grid is None:
+        grid, origin_T3 = episode.voxel_grid, episode.voxel_origin_T3
+        if grid is None or origin_T3 is None:
             return
-        voxels = episode.voxels()
+        for frame in range(episode.length):  # one at a time: grids may be large
+            episode.voxels([frame])
     except UserError as error:
         yield Problem(where, None, "voxels", str(error))
         return
-    for frame, off in off_lattice(voxels.origin_T3, grid.cell_m):
+    for frame, off in off_lattice(origin_T3, grid.cell_m):
         what = f"the grid's corner is {off:.3g} cells off the lattice of frame 0."
         yield Problem(where, frame, "voxels", what)
         return
-    for frame in outside(voxels, episode.world_from_camera[:, :3, 3]):
+    for frame in outside(origin_T3, grid, episode.world_from_camera[:, :3, 3]):
         what = (
             "the camera is not in the grid: origins must be in metres, in the world of the poses."
         )
         yield Problem(where, frame, "voxels", what)
         return
-    worst = disagreement(voxels, depth_THW, episode.camera())
+    looks = np.unique(np.linspace(0, episode.length - 1, LOOKS).round().astype(int))
+    worst = disagreement(episode.voxels(looks), depth_THW[looks], episode.camera(looks))
     if worst is not None:
         yield Problem(
             where,
-            worst[0],
+            int(looks[worst[0]]),
             "voxels",
             f"disagrees with the depth: {worst[1]:.0%} of the points that are seen in the grid "
             "have only empty cells around them; check the order of the axes, the origins and "

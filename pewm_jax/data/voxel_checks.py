@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from pewm_jax.config import UserError
 from pewm_jax.data.voxel_classes import SIDE_LIMIT
-from pewm_jax.data.voxel_frames import DTYPES, VoxelFrames
+from pewm_jax.data.voxel_frames import DTYPES, VoxelFrames, VoxelGrid
 from pewm_jax.types import Camera
 
 OFF_CELLS = 1e-3
@@ -78,27 +78,31 @@ def off_lattice(origin_T3: np.ndarray, cell_m: float) -> Iterator[tuple[int, flo
         yield int(frame), float(off[frame])
 
 
-def outside(voxels: VoxelFrames, place_T3: np.ndarray) -> list[int]:
+def outside(origin_T3: np.ndarray, grid: VoxelGrid, place_T3: np.ndarray) -> list[int]:
     """Return the frames in which a place (T, 3) does not lie in the grid."""
-    side_m = voxels.cell_m * voxels.classes_TXYZ.shape[-1]
-    at = (np.asarray(place_T3, np.float64) - voxels.origin_T3) / side_m
+    at = (np.asarray(place_T3, np.float64) - origin_T3) / (grid.cell_m * grid.side)
     return np.flatnonzero(((at < 0) | (at > 1)).any(-1)).tolist()
 
 
 def disagreement(
     voxels: VoxelFrames, depth_THW: np.ndarray, camera: Camera
 ) -> tuple[int, float] | None:
-    """Return the frame that fits its grid worst, and the share of points that float in the frames.
+    """Return the frame that fits its grid worst, and the share of points that float in all frames.
 
     A point that the camera sees in the grid floats if its cell and those around it are empty.
+
+    Args:
+        voxels: the grids of T frames.
+        depth_THW: their depths, metres.
+        camera: (T,) their cameras.
 
     Returns:
         None where at most ``MOST_FLOATING`` float.
     """
     frames, height, width = depth_THW.shape
     rows, columns = np.mgrid[0:height:STEP, 0:width:STEP]
-    floating: dict[int, tuple[int, int]] = {}
-    for t in np.unique(np.linspace(0, frames - 1, min(frames, LOOKS)).round().astype(int)):
+    lost, seen = np.zeros(frames), np.zeros(frames)
+    for t in range(frames):
         depth = np.asarray(depth_THW[t, rows, columns], np.float64)
         fx, fy, cx, cy = np.asarray(camera.intrinsics_4[t], np.float64)
         ray = np.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones_like(depth)], -1)
@@ -108,9 +112,8 @@ def disagreement(
         near = np.asarray(ndimage.binary_dilation(grid > 0, np.ones((3, 3, 3))))
         cell = np.floor((points - voxels.origin_T3[t]) / voxels.cell_m).astype(int)
         cell = cell[((cell >= 0) & (cell < grid.shape)).all(-1)]
-        floating[int(t)] = int((near[tuple(cell.T)] == 0).sum()), len(cell)
-    lost, seen = (sum(counts) for counts in zip(*floating.values(), strict=True))
-    if not seen or lost <= MOST_FLOATING * seen:
+        lost[t], seen[t] = (near[tuple(cell.T)] == 0).sum(), len(cell)
+    share = float(lost.sum() / max(1, seen.sum()))
+    if share <= MOST_FLOATING:
         return None
-    worst = max(floating, key=lambda t: floating[t][0] / max(1, floating[t][1]))
-    return worst, lost / seen
+    return int((lost / np.maximum(seen, 1)).argmax()), share

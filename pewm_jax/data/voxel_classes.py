@@ -58,7 +58,7 @@ class VoxelsConfig:
     """Cells of the grid along each axis; the agent's camera is in the middle."""
     kinds: Literal["all", "groups"] = "all"
     """Kinds of things: `all` (every kind of furniture its own), or `groups` (all furniture one)."""
-    colours: int = 12
+    colours: int = 16
     """Colours of each kind, 1 (colours make no difference) to 24."""
 
     def __post_init__(self):

@@ -84,7 +84,7 @@ def test_every_part_of_a_house_has_a_kind():
 
 
 def test_classes_are_kinds_in_colours():
-    assert len(VoxelsConfig().names) == 1 + 12 * len(KINDS)
+    assert len(VoxelsConfig().names) == 1 + 16 * len(KINDS)
     named = dict(zip(GRID.names, table_colours(GRID.names), strict=True))
     assert (named["sofa/red"] == PALETTE["red"]).all()
     kind = np.full(24, KINDS.index("sofa"))
@@ -171,7 +171,7 @@ def test_what_is_recorded_besides_stays_the_same():
     assert not {"voxels", "moving"} & settings_of(PLAIN, "train").keys()
     made = settings_of(dataclasses.replace(PLAIN, voxels=GRID, moving=True), "train")
     assert made["moving"] is True
-    assert made["voxels"] == {"cell": 0.2, "side": 40, "kinds": "all", "colours": 12}
+    assert made["voxels"] == {"cell": 0.2, "side": 40, "kinds": "all", "colours": 16}
 
 
 # How grids are recorded and read.
