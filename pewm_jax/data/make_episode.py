@@ -24,6 +24,7 @@ from pewm_jax.data.trajectories import Policy, make_trajectory
 from pewm_jax.data.voxel_classes import VoxelsConfig
 from pewm_jax.data.voxel_recording import record_voxels
 from pewm_jax.geometry.cameras import intrinsics_from_fov
+from pewm_jax.houses.moving_pieces import ROBOT_HEIGHT_M
 from pewm_jax.types import Camera
 
 SPLITS = ("train", "validation", "revisit")
@@ -125,6 +126,11 @@ class CollectConfig:
             raise ConfigError(
                 "--moving is for made houses: a mesh of --scene has no parts that move; leave out "
                 "one of the two."
+            )
+        if self.moving and self.camera_height < ROBOT_HEIGHT_M + HEADROOM_M:
+            raise ConfigError(
+                f"--camera-height is {self.camera_height}: with --moving use "
+                f"{ROBOT_HEIGHT_M + HEADROOM_M:g} m or more, as robots go below the camera."
             )
         for field in () if self.voxels.record else dataclasses.fields(self.voxels):
             value = getattr(self.voxels, field.name)

@@ -15,7 +15,7 @@ from pewm_jax.houses.textures import hsv, shade
 
 LEAF_M = 0.05
 """Thickness of a leaf."""
-ROBOT_RADIUS_M = 0.2
+ROBOT_RADIUS_M, ROBOT_HEIGHT_M = 0.2, 0.6
 
 
 def door_leaf(rng: np.random.Generator, width: float) -> Piece:
@@ -35,7 +35,7 @@ def door_leaf(rng: np.random.Generator, width: float) -> Piece:
 
 def robot(rng: np.random.Generator) -> Piece:
     """A robot: a drum with a dark belt and a lamp on its head."""
-    piece = Piece("robot", (2 * ROBOT_RADIUS_M, 2 * ROBOT_RADIUS_M, 0.6))
+    piece = Piece("robot", (2 * ROBOT_RADIUS_M, 2 * ROBOT_RADIUS_M, ROBOT_HEIGHT_M))
     colour = bright(rng)
     piece.prism((0, 0), (0.02, 0.2), (ROBOT_RADIUS_M, ROBOT_RADIUS_M), hsv(0, 0, 0.2), 12)
     piece.prism((0, 0), (0.2, 0.5), (ROBOT_RADIUS_M, 0.8 * ROBOT_RADIUS_M), colour, 12)

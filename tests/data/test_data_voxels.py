@@ -434,3 +434,5 @@ def test_grids_that_cannot_work_are_refused(wrong, says):
         VoxelsConfig(**wrong)
     with pytest.raises(ConfigError, match="made houses"):
         CollectConfig(Path("x"), scene=(Path("a.glb"),), moving=True)
+    with pytest.raises(ConfigError, match=r"with --moving use 0\.7 m or more"):
+        CollectConfig(Path("x"), camera_height=0.5, moving=True)
