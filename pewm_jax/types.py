@@ -95,8 +95,10 @@ class Clip:
             they are cached (``pewm_jax.memory.feature_cache``), else None.
         actions_TA: (..., T − 1, A) float32, action k leads from frame k to frame k + 1 of the clip;
             None if none were recorded (hand-held cameras). A = 3 is a planar action.
-        voxels_TXYZ: (..., T, X, Y, Z) integer class ids of the cells around the agent at each
-            frame, None if none were recorded.
+        classes_TXYZ: (..., T, n, n, n) integer class ids of the cells around the agent at each
+            frame, 0 where nothing is; None if none were recorded.
+        origin_T3: (..., T, 3) float32 world position of each grid's lowest corner, metres; None
+            where ``classes_TXYZ`` is.
         latents_thwC: (..., t, h, w, C) latents of the frames, if they were encoded beforehand
             (``worlds.objective.prepare``), else None.
         sight: what the memory of the context shows, if that was looked at beforehand, else None.
@@ -108,7 +110,8 @@ class Clip:
     context_valid_S: Array
     context_features_ShwF: Array | None = None
     actions_TA: Array | None = None
-    voxels_TXYZ: Array | None = None
+    classes_TXYZ: Array | None = None
+    origin_T3: Array | None = None
     latents_thwC: Array | None = None
     sight: Sight | None = None
     state_A: Array | None = None

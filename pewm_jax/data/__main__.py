@@ -60,6 +60,7 @@ def _run(command: str, flags: Sequence[str], prog: str) -> int:
         from pewm_jax.data.collect import collect
         from pewm_jax.data.make_episode import CollectConfig
 
+        flags = ["--voxels.record" if flag == "--voxels" else flag for flag in flags]
         collect(cli.parse_command(CollectConfig, flags, prog))
     elif command == "import":
         from pewm_jax.data.importer import ImportConfig, import_recording

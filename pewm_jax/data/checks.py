@@ -10,6 +10,7 @@ import numpy as np
 from pewm_jax.config import UserError
 from pewm_jax.data.consistency import find_disagreement
 from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
+from pewm_jax.data.voxel_checks import LOOKS, disagreement, off_lattice, outside
 from pewm_jax.geometry.actions import PLANAR
 
 MEDIAN_DEPTH_M = (0.05, 40.0)
@@ -61,10 +62,47 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
             episode.ids()
     except UserError as error:
         return [*found, Problem(where, None, "images", str(error))]
+    found += _check_voxels(episode, depth_THW, where)
     found += _check_saturation(depth_THW, where) or check_depth(depth_THW, where)
-    if not found:  # wrong poses or units would only be reported once more
+    if not found and not episode.info.get(
+        "moving"
+    ):  # wrong poses or units would only be reported once more
         found += _check_geometry(episode, depth_THW, where)
     return found
+
+
+def _check_voxels(episode: Episode, depth_THW: np.ndarray, where: str) -> Iterator[Problem]:
+    """Check that the grids decode, lie around the camera on one lattice, and hold what is seen."""
+    try:
+        grid, origin_T3 = episode.voxel_grid, episode.voxel_origin_T3
+        if grid is None or origin_T3 is None:
+            return
+        for frame in range(episode.length):  # one at a time: grids may be large
+            episode.voxels([frame])
+    except UserError as error:
+        yield Problem(where, None, "voxels", str(error))
+        return
+    for frame, off in off_lattice(origin_T3, grid.cell_m):
+        what = f"the grid's corner is {off:.3g} cells off the lattice of frame 0."
+        yield Problem(where, frame, "voxels", what)
+        return
+    for frame in outside(origin_T3, grid, episode.world_from_camera[:, :3, 3]):
+        what = (
+            "the camera is not in the grid: origins must be in metres, in the world of the poses."
+        )
+        yield Problem(where, frame, "voxels", what)
+        return
+    looks = np.unique(np.linspace(0, episode.length - 1, LOOKS).round().astype(int))
+    worst = disagreement(episode.voxels(looks), depth_THW[looks], episode.camera(looks))
+    if worst is not None:
+        yield Problem(
+            where,
+            int(looks[worst[0]]),
+            "voxels",
+            f"disagrees with the depth: {worst[1]:.0%} of the points that are seen in the grid "
+            "have only empty cells around them; check the order of the axes, the origins and "
+            "the cell.",
+        )
 
 
 def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:

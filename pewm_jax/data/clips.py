@@ -99,8 +99,8 @@ def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | N
             features of the clip's first frame.
 
     Returns:
-        A NumPy clip without batch axis: rgb uint8, depth float32 metres, and the actions and voxels
-        that the episode has.
+        A NumPy clip without batch axis: rgb uint8, depth float32 metres, and the actions and the
+        grids around the agent that the episode has.
     """
     wanted, place = np.unique(
         np.concatenate([choice.frames_T, choice.context_S]), return_inverse=True
@@ -114,13 +114,15 @@ def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | N
     context.rgb_THWC[~valid] = 0
     context.depth_THW[~valid] = 0
     found = None if features is None else features(episode, wanted[fill])
+    voxels = None if episode.voxel_grid is None else episode.voxels(choice.frames_T)
     return Clip(
         _take(frames, place[:count]),
         context,
         valid,
         found,
         None if episode.actions is None else join_actions(episode.actions, choice.frames_T),
-        None if episode.voxels_TXYZ is None else episode.voxels_TXYZ[choice.frames_T],
+        None if voxels is None else voxels.classes_TXYZ,
+        None if voxels is None else voxels.origin_T3,
     )
 
 
@@ -204,7 +206,8 @@ def stack(clips: Sequence[Clip]) -> Clip:
         np.stack([clip.context_valid_S for clip in clips]),
         optional("context_features_ShwF"),
         optional("actions_TA"),
-        optional("voxels_TXYZ"),
+        optional("classes_TXYZ"),
+        optional("origin_T3"),
     )
 
 

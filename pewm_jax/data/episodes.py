@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from pewm_jax.config import UserError
+from pewm_jax.data import voxel_frames
 from pewm_jax.data.record_format import (
     CONVENTIONS,
     UNITS,
@@ -27,6 +28,8 @@ from pewm_jax.data.record_format import (
     shape_fits,
     shape_text,
 )
+from pewm_jax.data.voxel_checks import refuse_misfits
+from pewm_jax.data.voxel_frames import VoxelFrames, VoxelGrid
 from pewm_jax.types import Camera, Frames
 
 MILLIMETRES = 1000.0
@@ -50,7 +53,7 @@ class EpisodeArrays:
             the camera does not move like the agent.
         action_ids: (T − 1,) discrete actions, or None.
         ids_THW: (T, H, W) instance ids from −1 (nothing) to 65534, or None.
-        voxels_TXYZ: (T, X, Y, Z) integer class ids of the cells around the agent, or None.
+        voxels: the grids of class ids around the agent at each frame, or None.
     """
 
     rgb_THWC: np.ndarray
@@ -60,7 +63,7 @@ class EpisodeArrays:
     actions: np.ndarray | None = None
     action_ids: np.ndarray | None = None
     ids_THW: np.ndarray | None = None
-    voxels_TXYZ: np.ndarray | None = None
+    voxels: VoxelFrames | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,7 +80,7 @@ class Episode:
         world_from_camera: (T, 4, 4) float32.
         actions: (T − 1, A) float32 or None; A = 3 is (dx, dy, dyaw).
         action_ids: (T − 1,) int32 or None.
-        voxels_TXYZ: (T, X, Y, Z) integers or None; a read-only view of the record.
+        voxel_origin_T3: (T, 3) float32 lowest corners of the grids around the agent, or None.
         info: free-form facts about the episode, e.g. ``return_frame`` of a revisit episode.
         header: the whole JSON header.
         record: the bytes.
@@ -92,7 +95,7 @@ class Episode:
     world_from_camera: np.ndarray
     actions: np.ndarray | None
     action_ids: np.ndarray | None
-    voxels_TXYZ: np.ndarray | None
+    voxel_origin_T3: np.ndarray | None
     info: Mapping[str, Any]
     header: Mapping[str, Any] = dataclasses.field(repr=False)
     record: bytes = dataclasses.field(repr=False)
@@ -136,6 +139,37 @@ class Episode:
         chosen = range(self.length) if indices is None else indices
         return np.stack([self._image("ids", int(i)).astype(np.int32) - 1 for i in chosen])
 
+    @property
+    def voxel_grid(self) -> VoxelGrid | None:
+        """The cell, side and classes of the grids around the agent, None if none were recorded.
+
+        Raises:
+            DamagedError: the header makes no sense.
+        """
+        stream = self.header["streams"].get("voxels")
+        return None if stream is None else voxel_frames.grid_in(stream, f"episode {self.name}")
+
+    def voxels(self, indices: Sequence[int] | np.ndarray | None = None) -> VoxelFrames:
+        """Decode the grids around the agent of some frames (all by default), in that order.
+
+        Raises:
+            UserError: the episode has none.
+            DamagedError: a grid does not decode, naming the frame.
+        """
+        grid, origin = self.voxel_grid, self.voxel_origin_T3
+        if grid is None or origin is None:
+            raise UserError(f"episode {self.name} has no voxels; collect it with --voxels.")
+        chosen = np.arange(self.length) if indices is None else np.asarray(indices, np.int64)
+        found = np.empty((len(chosen), *(grid.side,) * 3), grid.dtype)
+        record, spans = memoryview(self.record), self.header["streams"]["voxels"]["spans"]
+        for row, index in enumerate(chosen):
+            if not 0 <= index < self.length:
+                raise IndexError(f"frame {index} of {self.name}, which has {self.length} frames")
+            offset, size = spans[index]
+            where = f"episode {self.name}, frame {index}"
+            found[row] = voxel_frames.decode(record[offset : offset + size], grid, where)
+        return VoxelFrames(found, origin[chosen], grid.cell_m, grid.names)
+
     def _image(self, stream: str, index: int) -> np.ndarray:
         if not 0 <= index < self.length:
             raise IndexError(f"frame {index} of {self.name}, which has {self.length} frames")
@@ -173,12 +207,16 @@ def write_episode(
     }
     if arrays.ids_THW is not None:
         streams["ids"] = [_png((image + 1).astype(np.uint16)) for image in arrays.ids_THW]
+    about, voxels = {}, arrays.voxels
+    if voxels is not None:
+        streams["voxels"] = [voxel_frames.encode(grid) for grid in voxels.classes_TXYZ]
+        about["voxels"] = voxel_frames.header_of(voxels)
     small = {
         "intrinsics": np.asarray(arrays.intrinsics_4, "<f4"),
         "world_from_camera": np.asarray(arrays.world_from_camera, "<f4"),
         "actions": None if arrays.actions is None else np.asarray(arrays.actions, "<f4"),
         "action_ids": None if arrays.action_ids is None else np.asarray(arrays.action_ids, "<i4"),
-        "voxels": arrays.voxels_TXYZ,
+        "voxel_origins": None if voxels is None else np.asarray(voxels.origin_T3, "<f4"),
     }
     header: dict[str, Any] = {
         "format": "pewm-episode",
@@ -194,7 +232,7 @@ def write_episode(
         "arrays": {},
         "streams": {},
     }
-    return pack_record(header, {k: v for k, v in small.items() if v is not None}, streams)
+    return pack_record(header, {k: v for k, v in small.items() if v is not None}, streams, about)
 
 
 def to_millimetres(depth: np.ndarray) -> np.ndarray:
@@ -228,8 +266,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
             )
         dtype, count = np.dtype(place["dtype"]), int(np.prod(shape))
         check_span(record, place["offset"], count * dtype.itemsize, where, field)
-        found = np.frombuffer(record, dtype, count, place["offset"]).reshape(shape)
-        arrays[field] = found if field == "voxels" else found.copy()
+        arrays[field] = np.frombuffer(record, dtype, count, place["offset"]).reshape(shape).copy()
     for stream in ("rgb", "depth", *header["streams"]):
         spans = header["streams"].get(stream, {"spans": []})["spans"]
         if len(spans) != frames:
@@ -241,6 +278,8 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
             check_span(record, spans[-1][0], spans[-1][1], where, stream)
     if not {"intrinsics", "world_from_camera"} <= arrays.keys():
         raise DamagedError(f"{where} lacks intrinsics or world_from_camera; write it again.")
+    if ("voxels" in header["streams"]) != ("voxel_origins" in arrays):
+        raise DamagedError(f"{where} lacks voxels or voxel_origins; write it again.")
     return Episode(
         name=header["name"],
         scene=header["scene"],
@@ -251,7 +290,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
         world_from_camera=arrays["world_from_camera"],
         actions=arrays.get("actions"),
         action_ids=arrays.get("action_ids"),
-        voxels_TXYZ=arrays.get("voxels"),
+        voxel_origin_T3=arrays.get("voxel_origins"),
         info=header["info"],
         header=header,
         record=record,
@@ -290,7 +329,6 @@ def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
         "world_from_camera": arrays.world_from_camera,
         "actions": arrays.actions,
         "action_ids": arrays.action_ids,
-        "voxels": arrays.voxels_TXYZ,
     }
     for field, array in given.items():
         if array is not None and not shape_fits(np.shape(array), expected[field]):
@@ -298,10 +336,7 @@ def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
                 f"episode {name}, field {field}: shape {np.shape(array)} for {frames} frames of "
                 f"depth, expected {shape_text(expected[field])}; the counts do not match."
             )
-    voxels = arrays.voxels_TXYZ
-    if voxels is not None and not np.issubdtype(voxels.dtype, np.integer):
-        raise UserError(
-            f"episode {name}, field voxels: dtype {voxels.dtype}, expected integer class ids."
-        )
+    if arrays.voxels is not None:
+        refuse_misfits(arrays.voxels, frames, f"episode {name}")
     if rgb.dtype != np.uint8:
         raise UserError(f"episode {name}, field rgb: dtype {rgb.dtype}, expected uint8 in 0…255.")

@@ -41,6 +41,8 @@ from pewm_jax.data.episodes import (
 )
 from pewm_jax.data.progress import Meter
 from pewm_jax.data.recording_folders import RecordedFrame, read_recording
+from pewm_jax.data.voxel_frames import VoxelFrames, VoxelGrid, require_alike
+from pewm_jax.data.voxel_import import read_voxels
 from pewm_jax.geometry.actions import actions_between
 from pewm_jax.geometry.cameras import resize_intrinsics
 
@@ -55,11 +57,13 @@ class _Imported:
         shard: the file.
         frames: frames of the episode.
         actions: whether it has actions.
+        voxels: whether it has voxels.
     """
 
     shard: Shard
     frames: int
     actions: bool
+    voxels: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +71,8 @@ class ImportConfig:
     """Import a recording: a folder of colour images, depth images and a trajectory.
 
     The camera has OpenCV axes (x right, y down, z forward) and the trajectory is camera-to-world,
-    as Open3D and TUM write them.
+    as Open3D and TUM write them. Grids of class ids around the agent are imported with them from
+    voxels/, if there is such a folder: a .npz for each colour image, and classes.json.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -148,26 +153,40 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
     # The units are judged before anything is left out, which could hide that they are wrong.
     _refuse(check_depth(depth, str(config.src)), config, frames)
     depth[depth > config.max_depth] = 0
+    voxels = read_voxels(
+        config.src, [frame.colour for frame in frames], world_from_recording(config.up)
+    )
+    if voxels is not None:
+        _require_like_others(folder, imported, voxels, config)
     arrays = EpisodeArrays(
-        rgb, depth, resize_intrinsics(intrinsics, *scale), pose, planar_actions(pose)
+        rgb,
+        depth,
+        resize_intrinsics(intrinsics, *scale),
+        pose,
+        planar_actions(pose),
+        voxels=voxels,
     )
     info = {"policy": "recorded", "stride": config.stride, "source": config.src.resolve().name}
     record = write_episode(arrays, name, name, info)
     _refuse(check_episode(read_episode(record), str(config.src)), config, frames)
     path = folder / f"recording-{name}.array_record"
     write_shard(path, [record])
-    imported.append(_Imported(describe_shard(path), len(frames), arrays.actions is not None))
+    acts = arrays.actions is not None
+    imported.append(_Imported(describe_shard(path), len(frames), acts, voxels is not None))
     settings = {
         "made_by": "import",
         "frames": {one.shard.file: one.frames for one in imported},
         "actions": {one.shard.file: one.actions for one in imported},
     }
+    if any(one.voxels for one in imported):
+        settings["voxels"] = {one.shard.file: one.voxels for one in imported}
     total = sum(one.frames for one in imported)
     write_manifest(
         folder, Manifest(config.split, tuple(one.shard for one in imported), settings, total)
     )
-    moves = "planar actions" if arrays.actions is not None else "poses only (moves in 6 degrees)"
-    say(f"{folder}: added {name}, {len(frames)} frames of {width}×{height} pixels, {moves}.")
+    moves = "planar actions" if acts else "poses only (moves in 6 degrees)"
+    grids = "" if voxels is None else f", voxels of {voxels.grid.side}³ cells"
+    say(f"{folder}: added {name}, {len(frames)} frames of {width}×{height} pixels, {moves}{grids}.")
 
 
 def world_from_recording(up: str) -> np.ndarray:
@@ -217,8 +236,9 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
     for shard in kept:
         check_size(folder / shard.file, shard)
     frames, actions = manifest.settings["frames"], manifest.settings.get("actions", {})
+    voxels = manifest.settings.get("voxels", {})  # not listed where no recording has any
     return [
-        _Imported(shard, frames[shard.file], actions[shard.file])
+        _Imported(shard, frames[shard.file], actions[shard.file], voxels.get(shard.file, False))
         if shard.file in actions
         else _look(folder / shard.file, shard)  # imported before actions were listed
         for shard in kept
@@ -228,7 +248,21 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
 def _look(path: Path, shard: Shard) -> _Imported:
     """Open a shard to see what it holds."""
     episode = read_episode(read_record(path, 0), str(path))
-    return _Imported(shard, episode.length, episode.actions is not None)
+    acts, grid = episode.actions is not None, episode.voxel_grid
+    return _Imported(shard, episode.length, acts, grid is not None)
+
+
+def _require_like_others(
+    folder: Path, imported: list[_Imported], voxels: VoxelFrames, config: ImportConfig
+) -> None:
+    """Refuse voxels that do not go together with those of the split."""
+    for one in imported:
+        if one.voxels:
+            path = folder / one.shard.file
+            there = read_episode(read_record(path, 0), str(path)).voxel_grid
+            assert isinstance(there, VoxelGrid)
+            require_alike(there, voxels.grid, str(config.src / "voxels"))
+            return
 
 
 def _read_images(

@@ -21,6 +21,7 @@ from pewm_jax.data.clips import Choice, ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.record_format import DamagedError
+from pewm_jax.data.voxel_frames import VoxelGrid, require_alike
 from pewm_jax.geometry.actions import PLANAR
 from pewm_jax.types import Clip
 
@@ -49,6 +50,7 @@ class _DrawClip(grain.transforms.RandomMap):
         features: as for ``clips``.
         bad: as for ``clips``.
         left_out: optional fields of a clip that are not read, see ``_not_in_all``.
+        grid: what the voxels of all episodes must be like, if they are read.
     """
 
     def __init__(
@@ -58,9 +60,10 @@ class _DrawClip(grain.transforms.RandomMap):
         features: ReadFeatures | None,
         bad: BadRecords,
         left_out: tuple[str, ...] = (),
+        grid: VoxelGrid | None = None,
     ):
         self.config, self.source, self.features, self.bad = config, source, features, bad
-        self.left_out = left_out
+        self.left_out, self.grid = left_out, grid
 
     def random_map(self, element: int, rng: np.random.Generator) -> Clip:
         return self.draw(element, rng).clip
@@ -77,6 +80,8 @@ class _DrawClip(grain.transforms.RandomMap):
             try:
                 episode = self.source[record]
                 _check_size(self.config, episode)
+                if self.grid is not None and episode.voxel_grid is not None:
+                    require_alike(self.grid, episode.voxel_grid, f"episode {episode.name}")
                 choice = choose(self.config, episode.length, rng, f"episode {episode.name}")
                 clip = cut(episode, choice, self.config.data.context, self.features)
                 clip = dataclasses.replace(clip, **dict.fromkeys(self.left_out))
@@ -116,7 +121,7 @@ def dataset(
     """Return the endless dataset whose element k is batch k, or some rows of it.
 
     All batches have the same fields: actions and voxels where all episodes have them (``import``
-    lists which have actions; a split of another maker is judged by its first episode).
+    lists which have them; a split of another maker is judged by its first episode).
 
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit the
@@ -125,8 +130,11 @@ def dataset(
     """
     source = EpisodeSource(Path(config.data.path) / split)
     bad = BadRecords(config.data.bad_records) if bad is None else bad
-    left_out = _not_in_all(source, _check_first(config, source, bad))
-    drawn = _order(source, seed).random_map(_DrawClip(config, source, features, bad, left_out))
+    first = _check_first(config, source, bad)
+    left_out = _not_in_all(source, first)
+    grid = None if "classes_TXYZ" in left_out else first.voxel_grid
+    draw = _DrawClip(config, source, features, bad, left_out, grid)
+    drawn = _order(source, seed).random_map(draw)
     wanted = range(batch)[rows or slice(None)]
 
     def read(number: int) -> Clip:
@@ -230,14 +238,15 @@ def _not_in_all(source: EpisodeSource, first: Episode) -> tuple[str, ...]:
         source: the split.
         first: its first episode.
     """
-    actions = first.actions is not None
+    actions, voxels = first.actions is not None, first.voxel_grid is not None
     settings = source.manifest.settings
     if settings.get("made_by") == "import":  # hand-held cameras among others
         listed = settings.get("actions")
         if listed is None:  # imported before actions were listed: a few recordings, looked at
             listed = {k: source[k].actions is not None for k in range(len(source))}
         actions = all(listed.values())
-    has = {"actions_TA": actions, "voxels_TXYZ": first.voxels_TXYZ is not None}
+        voxels = voxels and all(settings.get("voxels", {None: False}).values())
+    has = {"actions_TA": actions, "classes_TXYZ": voxels, "origin_T3": voxels}
     return tuple(field for field, there in has.items() if not there)
 
 

@@ -16,11 +16,15 @@ import tyro
 from pewm_jax.config import ActionConfig, ConfigError
 from pewm_jax.config.launch import is_address
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
+from pewm_jax.data.moving import MovingHouse, moving_house, render_moving
 from pewm_jax.data.navigation import NavGrid, navigable
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import Scene, house, load_scene
 from pewm_jax.data.trajectories import Policy, make_trajectory
+from pewm_jax.data.voxel_classes import VoxelsConfig
+from pewm_jax.data.voxel_recording import record_voxels
 from pewm_jax.geometry.cameras import intrinsics_from_fov
+from pewm_jax.houses.moving_pieces import ROBOT_HEIGHT_M
 from pewm_jax.types import Camera
 
 SPLITS = ("train", "validation", "revisit")
@@ -28,6 +32,7 @@ SPLITS = ("train", "validation", "revisit")
 HOUSES_PER_SEED = 1_000_000
 _NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
 """Settings that do not change the files."""
+UNRECORDED = VoxelsConfig()
 HEADROOM_M = 0.1
 """Free room above the camera where the agent may stand, metres."""
 
@@ -68,6 +73,9 @@ class CollectConfig:
     """Small continuous (dx, dy, dyaw) actions instead of forward / turn left / turn right."""
     ids: bool = False
     """Also write instance ids."""
+    moving: bool = False
+    """Made houses have doors that open as the agent comes near, and robots on their rounds."""
+    voxels: VoxelsConfig = UNRECORDED
     episodes_per_house: int = 1
     """Episodes recorded in one house before the next is made."""
     scene: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
@@ -110,7 +118,24 @@ class CollectConfig:
             raise ConfigError(f"--hfov is {self.hfov}: use 1 up to below 180 degrees.")
         if self.frames < 2:
             raise ConfigError("--frames is 1: an episode needs at least 2 frames.")
+        self._check_moving_and_voxels()
         self._check_address()
+
+    def _check_moving_and_voxels(self) -> None:
+        if self.moving and self.scene:
+            raise ConfigError(
+                "--moving is for made houses: a mesh of --scene has no parts that move; leave out "
+                "one of the two."
+            )
+        if self.moving and self.camera_height < ROBOT_HEIGHT_M + HEADROOM_M:
+            raise ConfigError(
+                f"--camera-height is {self.camera_height}: with --moving use "
+                f"{ROBOT_HEIGHT_M + HEADROOM_M:g} m or more, as robots go below the camera."
+            )
+        for field in () if self.voxels.record else dataclasses.fields(self.voxels):
+            value = getattr(self.voxels, field.name)
+            if value != field.default:
+                raise ConfigError(f"--voxels.{field.name} {value} needs --voxels, which records.")
 
     def _check_address(self) -> None:
         if self.address and self.engine != "ray":
@@ -135,6 +160,10 @@ def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
     settings = dataclasses.asdict(config)
     for name in (*_NOT_IN_FILES, "train", "validation", "test"):
         del settings[name]
+    if not config.moving:  # datasets of before there was a choice stay what they are
+        del settings["moving"]
+    if not settings["voxels"].pop("record"):
+        del settings["voxels"]
     settings["scene"] = [f"{p.name} ({p.stat().st_size} bytes)" for p in config.scene]
     return {"made_by": "collect", "episodes": config.episodes(split), **settings}
 
@@ -164,9 +193,13 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     Raises:
         UserError: a mesh that does not load or has no floor to stand on.
     """
+    moving: MovingHouse | None = None
     if config.scene:
         scenes = scenes_of(config, split)
         scene, grid = _mesh(scenes[index % len(scenes)], config.up, config.camera_height)
+    elif config.moving:
+        moving = _moving(house_seed(config, split, index), config.camera_height)
+        scene, grid = moving.scene, moving.grid
     else:
         scene, grid = _house(house_seed(config, split, index), config.camera_height)
     policy: Policy = "revisit" if split == "revisit" else config.policy
@@ -181,7 +214,16 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     )
     intrinsics = intrinsics_from_fov(config.size, config.size, config.hfov)
     pose = walk.world_from_camera(grid.floor_z + config.camera_height)
-    seen = render(scene, Camera(intrinsics, pose), config.size, config.size)
+    camera = Camera(intrinsics, pose)
+    if moving is None:
+        parts, seen = None, render(scene, camera, config.size, config.size)
+    else:
+        parts = moving.poses(walk.planar_T3[:, :2])
+        seen = render_moving(moving, parts, camera, config.size, config.size)
+    voxels = None
+    if config.voxels.record:
+        floor_z = float(grid.floor_z) if config.scene else 0.0
+        voxels = record_voxels(config.voxels, scene, floor_z, pose[:, :3, 3], moving, parts)
     arrays = EpisodeArrays(
         rgb_THWC=seen.rgb_THWC,
         depth_THW=seen.depth_THW,
@@ -190,6 +232,7 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         actions=walk.actions,
         action_ids=walk.action_ids,
         ids_THW=seen.ids_THW if config.ids else None,
+        voxels=voxels,
     )
     info: dict[str, Any] = {
         "policy": policy,
@@ -198,6 +241,8 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         "step_m": config.step_m,
         "turn_deg": config.turn_deg,
     }
+    if config.moving:
+        info["moving"] = True
     if walk.return_frame is not None:
         info["return_frame"] = walk.return_frame
     return write_episode(arrays, f"{split}-{index:06d}", scene.name, info)
@@ -207,6 +252,11 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
 def _house(seed: int, camera_height: float) -> tuple[Scene, NavGrid]:
     scene = house(seed)
     return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
+
+
+@functools.lru_cache(maxsize=1)
+def _moving(seed: int, camera_height: float) -> MovingHouse:
+    return moving_house(seed, agent_height_m=camera_height + HEADROOM_M)
 
 
 @functools.lru_cache(maxsize=2)

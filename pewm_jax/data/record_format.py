@@ -62,7 +62,7 @@ def array_shapes(frames: int) -> dict[str, tuple[int | str, ...]]:
         "world_from_camera": (frames, 4, 4),
         "actions": (frames - 1, "A"),
         "action_ids": (frames - 1,),
-        "voxels": (frames, "X", "Y", "Z"),
+        "voxel_origins": (frames, 3),
     }
 
 
@@ -80,9 +80,19 @@ def shape_text(expected: tuple[int | str, ...] | None) -> str:
 
 
 def pack_record(
-    header: dict[str, Any], arrays: Mapping[str, np.ndarray], streams: Mapping[str, list[bytes]]
+    header: dict[str, Any],
+    arrays: Mapping[str, np.ndarray],
+    streams: Mapping[str, list[bytes]],
+    about: Mapping[str, dict[str, Any]] | None = None,
 ) -> bytes:
-    """Concatenate header, arrays and images; offsets count from the end of the header."""
+    """Concatenate header, arrays and images; offsets count from the end of the header.
+
+    Args:
+        header: without ``arrays`` and ``streams``, which are filled in.
+        arrays: the arrays by field.
+        streams: the encoded images, or grids, of each frame, by stream.
+        about: what the header says of a stream that is not of PNG images.
+    """
     blobs: list[bytes] = []
     offset = 0
     for field, array in arrays.items():
@@ -99,7 +109,11 @@ def pack_record(
             spans.append([offset, len(image)])
             blobs.append(image)
             offset += len(image)
-        header["streams"][stream] = {"codec": "png", "spans": spans}
+        header["streams"][stream] = {
+            "codec": "png",
+            **(about or {}).get(stream, {}),
+            "spans": spans,
+        }
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     return b"".join([MAGIC, struct.pack("<I", len(text)), text, *blobs])
 

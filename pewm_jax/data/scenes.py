@@ -57,6 +57,7 @@ class Scene:
             s, t) stored as q₀, q₁ − q₀, q₂ − q₀ over the corners; last, texels per metre.
         texture_F: (F,) int32 first row of the face's image in the level table.
         textures: the images.
+        albedo_F3: (F, 3) float32 mean RGB in [0, 1] of each face's own colour, without light.
         metadata: plain values that came with the scene (rooms, seed).
     """
 
@@ -69,6 +70,7 @@ class Scene:
     shading_16F: np.ndarray
     texture_F: np.ndarray
     textures: Textures
+    albedo_F3: np.ndarray
     metadata: dict[str, Any]
 
     @functools.cached_property
@@ -226,6 +228,7 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
         shading_16F=np.zeros((16, len(faces)), np.float32),
         texture_F=texture,
         textures=textures,
+        albedo_F3=_albedo(parts),
         metadata=metadata,
     )
     bare = np.repeat(np.array([part.surface.bare for part in parts]), counts)
@@ -243,6 +246,16 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
     scene.shading_16F[10:15] = (values[:, 2] - values[:, 0]).T
     scene.shading_16F[15] = density
     return scene
+
+
+def _albedo(parts: list[_Part]) -> np.ndarray:
+    """Return (F, 3) float32 mean colours of faces; of an image, the mean of all of it."""
+    found = []
+    for part in parts:
+        image = part.surface.image
+        whole = 1.0 if image is None else image.mean((0, 1)) / 255
+        found.append(part.surface.colour_F33.mean(1) * whole)
+    return np.concatenate(found).astype(np.float32)
 
 
 def _one_line(error: BaseException) -> str:

@@ -15,6 +15,7 @@ from pewm_jax import atomic
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
+from pewm_jax.data.voxel_pictures import above, ahead
 
 THUMB = 128
 """Height of a thumbnail, pixels."""
@@ -38,6 +39,9 @@ class ShowConfig:
     """Thumbnails side by side."""
     rows: int = 2
     """Rows of thumbnails, each of colour over depth."""
+    voxels: bool = False
+    """Draw the grids around the agent instead: what the camera sees, over what it would see of the
+    grid alone, over the grid from above."""
 
     def __post_init__(self):
         """Validate."""
@@ -60,7 +64,10 @@ def show(config: ShowConfig, say: Callable[[str], None] = print) -> None:
             f"0 to {len(source) - 1}."
         )
     episode = source[config.episode]
-    picture = draw(episode, config.columns, config.rows)
+    if config.voxels:
+        picture = draw_voxels(episode, config.columns, config.rows)
+    else:
+        picture = draw(episode, config.columns, config.rows)
     config.out.parent.mkdir(parents=True, exist_ok=True)
     done, code = cv2.imencode(".png", picture[..., ::-1])
     assert done
@@ -89,6 +96,37 @@ def draw(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray:
         plan, MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_CONSTANT, value=(BACKGROUND,) * 3
     )
     return np.vstack([sheet, framed])
+
+
+def draw_voxels(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray:
+    """Return an RGB picture of grids; each row of frames has five images of each.
+
+    They are: colour; the grid as the camera sees it; the depth of either, to one scale; and the
+    grid from above without what is over the camera, x to the right, with the camera's view.
+
+    Raises:
+        UserError: the episode has no voxels.
+    """
+    count = min(columns * rows, episode.length)
+    chosen = np.round(np.linspace(0, episode.length - 1, count)).astype(int)
+    frames, voxels = episode.frames(chosen), episode.voxels(chosen)
+    width = max(1, round(THUMB * episode.width / episode.height))
+    farthest = max(float(frames.depth_THW.max()), 1e-3)
+    sheet = []
+    for k, number in enumerate(chosen):
+        seen = ahead(voxels, k, frames.camera, episode.height, episode.width)
+        plan = above(voxels, k, frames.camera)
+        images = [
+            _thumb(frames.rgb_THWC[k], width, str(number)),
+            _thumb(seen.rgb_HWC, width),
+            _thumb(depth_colours(frames.depth_THW[k], farthest), width),
+            _thumb(depth_colours(seen.depth_HW, farthest), width),
+            _thumb(plan, width),
+        ]
+        sheet.append(np.vstack(images))
+    blank = [np.full_like(sheet[0], BACKGROUND)] * (-count % columns)
+    sheet += blank
+    return np.vstack([np.hstack(sheet[k : k + columns]) for k in range(0, len(sheet), columns)])
 
 
 def depth_colours(depth_HW: np.ndarray, farthest_m: float) -> np.ndarray:

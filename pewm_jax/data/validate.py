@@ -23,6 +23,8 @@ from pewm_jax.data.dataset import (
 )
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.progress import Meter
+from pewm_jax.data.record_format import DamagedError
+from pewm_jax.data.voxel_frames import VoxelGrid, require_alike
 
 SHOWN = 20
 """Most problems printed."""
@@ -68,10 +70,11 @@ def validate(config: ValidateConfig, say: Callable[[str], None] = print) -> Verd
         files, problems = _files(path)
     total = sum(count_records(file) for file in files)
     episodes = frames = 0
+    grids: dict[Path, VoxelGrid] = {}
     with Meter(f"validating {path}", total, "episodes") as meter:
         for file in files:
             for index in range(count_records(file)):
-                length, found = _check_record(file, index)
+                length, found = _check_record(file, index, grids)
                 episodes, frames, problems = episodes + 1, frames + length, problems + found
                 meter.advance(1)
     for problem in problems[:SHOWN]:
@@ -119,11 +122,28 @@ def _check_hashes(folder: Path, manifest: Manifest) -> list[Problem]:
     return problems
 
 
-def _check_record(file: Path, index: int) -> tuple[int, list[Problem]]:
-    """Return the number of frames of a record and its problems."""
+def _check_record(
+    file: Path, index: int, grids: dict[Path, VoxelGrid]
+) -> tuple[int, list[Problem]]:
+    """Return the number of frames of a record and its problems.
+
+    Args:
+        file: the shard.
+        index: the record's number in it.
+        grids: what the voxels of a folder's first record are like, by folder; filled in here.
+    """
     where = f"{file}, record {index}"
     try:
         episode = read_episode(read_record(file, index), where)
     except UserError as error:
         return 0, [Problem(where, None, "record", str(error).removeprefix(where).lstrip(":, "))]
-    return episode.length, check_episode(episode, where)
+    found = check_episode(episode, where)
+    try:
+        grid = episode.voxel_grid
+        if grid is not None:
+            require_alike(grids.setdefault(file.parent, grid), grid, "it")
+    except DamagedError:
+        pass  # found already
+    except UserError as error:
+        found.append(Problem(where, None, "voxels", str(error)))
+    return episode.length, found

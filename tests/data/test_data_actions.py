@@ -19,8 +19,8 @@ T = 5
 
 
 def episode(**options):
-    """A walk through the box; ``actions`` and ``voxels_TXYZ`` replace what was recorded."""
-    other = {name: options.pop(name) for name in ("actions", "voxels_TXYZ") if name in options}
+    """A walk through the box; ``actions`` replace what was recorded."""
+    other = {name: options.pop(name) for name in ("actions",) if name in options}
     made = dataclasses.replace(arrays(frames=30, policy="walk", **options), **other)
     return read_episode(write_episode(made, "a", "b"))
 
@@ -88,24 +88,11 @@ def test_one_frame_has_no_action():
 def test_what_was_not_recorded_leaves_no_trace():
     walk = dataclasses.replace(episode(), actions=None)
     clip = clips.clip_at(config(), walk, 3)
-    assert (clip.actions_TA, clip.voxels_TXYZ) == (None, None)
+    assert (clip.actions_TA, clip.classes_TXYZ, clip.origin_T3) == (None, None, None)
     batch = clips.stack([clip, clip])
     assert len(jax.tree.leaves(batch)) == 9
     with pytest.raises(UserError, match=r"one batch have actions_TA .*\(4, 3\) and none"):
         clips.stack([clip, clips.clip_at(config(), episode(), 3)])
-
-
-def test_voxels_around_the_agent_are_those_of_the_frames():
-    voxels = np.random.default_rng(0).integers(0, 200, (30, 4, 3, 2), np.uint8)
-    walk = episode(voxels_TXYZ=voxels)
-    np.testing.assert_array_equal(walk.voxels_TXYZ, voxels)
-    clip = clips.clip_at(config(), walk, 3, stride=2)
-    np.testing.assert_array_equal(clip.voxels_TXYZ, voxels[3:12:2])
-    assert clip.voxels_TXYZ.dtype == np.uint8
-    assert clips.stack([clip, clip]).voxels_TXYZ.shape == (2, T, 4, 3, 2)
-    for wrong, says in ((voxels[1:], "expected .30, X, Y, Z."), (voxels / 2, "integer class ids")):
-        with pytest.raises(UserError, match=says):
-            episode(voxels_TXYZ=wrong)
 
 
 def test_the_loader_keeps_what_is_recorded(tmp_path):

@@ -1,0 +1,245 @@
+"""Houses in which something moves: doors that open for the agent, robots on their rounds.
+
+A moving house is a made house with parts that have poses of their own. Where they are at frame t is
+a pure function of the house and of where the agent has been up to t, so pictures and voxels of a
+frame show the same moment, and frame t never depends on what the agent does after t.
+
+* A **door** opens as the agent comes near: from closed at ``doors.FAR_M`` to open at
+  ``doors.NEAR_M`` from the middle of the doorway. Some doors close again behind it, the others stay
+  as far open as they ever were.
+* A **robot** goes its round in one room at a steady speed, whoever is there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import trimesh
+
+from pewm_jax.data.doors import Leaf, hang, planar_poses
+from pewm_jax.data.navigation import NavGrid, navigable, shortest_path
+from pewm_jax.data.render import Rendered, render
+from pewm_jax.data.scenes import Scene, from_trimesh, house
+from pewm_jax.houses.moving_pieces import ROBOT_RADIUS_M, door_leaf, robot
+from pewm_jax.houses.shapes import Piece
+from pewm_jax.types import Camera
+
+_STREAM = 0x0D00E5
+"""Keeps the random numbers of what moves apart from those of the house, which stays as it is."""
+ROBOT_PROBABILITY = 0.6
+"""Probability that a room has a robot, where there is room for its round."""
+ROBOT_STEP_M = 0.12
+"""Metres that a robot goes from frame to frame."""
+ROBOT_DISTANCE_M = 1.4
+"""Robots keep this far from doorways, where leaves swing."""
+_APART_M = 20.0
+"""Parts are lit this far from each other, so that none shades another."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Round:
+    """A robot's round.
+
+    Attributes:
+        way_N2: (N, 2) corners of a closed way, the first one again at its end, metres.
+        start_m: how far along it the robot is at frame 0.
+    """
+
+    way_N2: np.ndarray
+    start_m: float
+
+    def poses(self, xy_T2: np.ndarray) -> np.ndarray:
+        """Return (T, 4, 4) world_from_part; of the agent only the number of frames counts."""
+        sides = np.diff(self.way_N2, axis=0)
+        ends = np.append(0, np.cumsum(np.linalg.norm(sides, axis=-1)))
+        along = (self.start_m + ROBOT_STEP_M * np.arange(len(xy_T2))) % ends[-1]
+        place = np.stack([np.interp(along, ends, self.way_N2[:, axis]) for axis in (0, 1)], -1)
+        side = sides[np.searchsorted(ends, along, "right").clip(1, len(sides)) - 1]
+        return planar_poses(place, np.arctan2(side[:, 1], side[:, 0]))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MovingHouse:
+    """A house with parts that move.
+
+    Attributes:
+        scene: all that stands still.
+        grid: where the agent can stand whatever the doors do.
+        moves: the leaves and rounds, one per part.
+        parts: the parts, each in its own frame; ``object_F`` is the number of the part.
+    """
+
+    scene: Scene
+    grid: NavGrid
+    moves: tuple[Leaf | Round, ...]
+    parts: Scene | None
+
+    def poses(self, xy_T2: np.ndarray) -> np.ndarray:
+        """Return (T, P, 4, 4) world_from_part of all parts.
+
+        Args:
+            xy_T2: (T, 2) where the agent is at each frame, metres; frame t depends on those up
+                to t.
+        """
+        if not self.moves:
+            return np.zeros((len(xy_T2), 0, 4, 4))
+        return np.stack([move.poses(np.asarray(xy_T2, np.float64)) for move in self.moves], 1)
+
+
+def moving_house(seed: int, agent_height_m: float) -> MovingHouse:
+    """Return the made house of a seed with doors and robots; the house itself is that of ``house``.
+
+    Args:
+        seed: of the house.
+        agent_height_m: obstacles above this height are passed under.
+    """
+    scene = house(seed)
+    rng = np.random.default_rng([_STREAM, seed])
+    moves: list[Leaf | Round] = []
+    pieces: list[Piece] = []
+    free = navigable(scene, agent_height_m=agent_height_m)
+    for *_, x0, y0, x1, y1 in scene.metadata["doorways"]:
+        draw = np.random.default_rng(rng.integers(1 << 30))
+        leaves, width, free = hang(scene, free, draw, (x0, y0, x1, y1))
+        moves += leaves
+        pieces += [door_leaf(draw, width)] * len(leaves)
+    opened = _placed(_parts(pieces), _opened(moves)) if moves else None
+    grid = navigable(_together(scene, opened), agent_height_m=agent_height_m)
+    for room in scene.metadata["rooms"]:
+        way = _round(grid, rng, room, scene.metadata["doorways"])
+        if way is not None:
+            moves.append(way)
+            pieces.append(robot(rng))
+    return MovingHouse(scene, grid, tuple(moves), _parts(pieces) if pieces else None)
+
+
+def parts_at(moving: MovingHouse, world_from_part_P44: np.ndarray) -> Scene:
+    """Return the parts alone as a scene, at their poses of one frame."""
+    assert moving.parts is not None
+    return _placed(moving.parts, world_from_part_P44)
+
+
+def part_at(moving: MovingHouse, number: int, world_from_part_44: np.ndarray) -> Scene:
+    """Return one part alone as a scene, at a pose; its colours are not to be rendered."""
+    assert moving.parts is not None
+    poses = np.broadcast_to(world_from_part_44, (len(moving.moves), 4, 4))
+    whole, mine = _placed(moving.parts, poses), moving.parts.object_F == number
+    return dataclasses.replace(
+        whole,
+        faces_F3=whole.faces_F3[mine],
+        normals_F3=whole.normals_F3[mine],
+        object_F=whole.object_F[mine],
+        albedo_F3=whole.albedo_F3[mine],
+    )
+
+
+def render_moving(
+    moving: MovingHouse, poses_TP44: np.ndarray, camera: Camera, height: int, width: int
+) -> Rendered:
+    """Render T frames of a moving house: at each pixel the nearer of what stands and what moves.
+
+    Args:
+        moving: the house.
+        poses_TP44: (T, P, 4, 4) poses of its parts, from ``MovingHouse.poses``.
+        camera: (T,) cameras, as for ``render``.
+        height: image height in pixels.
+        width: image width in pixels.
+
+    Returns:
+        As ``render``; ids of parts follow on those of the scene's objects.
+    """
+    seen = render(moving.scene, camera, height, width)
+    if moving.parts is None:
+        return seen
+    pose = np.asarray(camera.world_from_camera)
+    intrinsics = np.broadcast_to(np.asarray(camera.intrinsics_4), (len(pose), 4))
+    for t in range(len(pose)):
+        one = Camera(intrinsics[t : t + 1], pose[t : t + 1])
+        over = render(parts_at(moving, poses_TP44[t]), one, height, width)
+        depth, behind = over.depth_THW[0], seen.depth_THW[t]
+        nearer = (over.ids_THW[0] >= 0) & ((behind <= 0) | (depth < behind))
+        seen.rgb_THWC[t][nearer] = over.rgb_THWC[0][nearer]
+        seen.depth_THW[t][nearer] = depth[nearer]
+        seen.ids_THW[t][nearer] = over.ids_THW[0][nearer] + len(moving.scene.objects)
+    return seen
+
+
+def _opened(moves: list[Leaf | Round]) -> np.ndarray:
+    """Return (P, 4, 4) poses of doors that are open."""
+    leaves = [move for move in moves if isinstance(move, Leaf)]
+    return np.concatenate([leaf.poses(leaf.middle_2[None]) for leaf in leaves])
+
+
+def _together(scene: Scene, other: Scene | None) -> Scene:
+    """Return two scenes as one to cast rays in; its colours are not to be used."""
+    if other is None:
+        return scene
+    return dataclasses.replace(
+        scene,
+        vertices_V3=np.concatenate([scene.vertices_V3, other.vertices_V3]),
+        faces_F3=np.concatenate([scene.faces_F3, other.faces_F3 + len(scene.vertices_V3)]),
+        normals_F3=np.concatenate([scene.normals_F3, other.normals_F3]),
+    )
+
+
+def _round(
+    grid: NavGrid, rng: np.random.Generator, room: list[float], doorways: list[list[float]]
+) -> Round | None:
+    """Return a robot's round in a room: through three places and back; None without one."""
+    draw = np.random.default_rng(rng.integers(1 << 30))
+    if draw.uniform() > ROBOT_PROBABILITY:
+        return None
+    rows, columns = np.indices(grid.free_YX.shape)
+    centres = grid.centre_of(np.stack([rows, columns], -1))
+    inside = ((centres > room[:2]) & (centres < room[2:])).all(-1)
+    for *_, x0, y0, x1, y1 in doorways:
+        middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
+        inside &= np.linalg.norm(centres - middle, axis=-1) > ROBOT_DISTANCE_M
+    own = dataclasses.replace(grid, free_YX=grid.free_YX & inside)
+    cells = np.argwhere(own.free_YX)
+    for _ in range(6):
+        if len(cells) < 3:
+            return None
+        corners = own.centre_of(cells[draw.choice(len(cells), 3, replace=False)])
+        ways = [shortest_path(own, corners[k], corners[(k + 1) % 3]) for k in range(3)]
+        found = [way for way in ways if way is not None]
+        if len(found) == 3:
+            closed = np.concatenate([found[0], *(way[1:] for way in found[1:])])
+            length = float(np.linalg.norm(np.diff(closed, axis=0), axis=-1).sum())
+            if length > 6 * ROBOT_RADIUS_M:
+                return Round(closed, float(draw.uniform(0, length)))
+    return None
+
+
+def _parts(pieces: list[Piece]) -> Scene:
+    """Return pieces as one scene, each lit by itself and in its own frame."""
+    scene = trimesh.Scene(metadata={"shading": "soft"})
+    for number, piece in enumerate(pieces):
+        apart = np.eye(4)
+        apart[0, 3] = _APART_M * number
+        solid = piece.solid()
+        assert solid is not None
+        scene.add_geometry(solid, node_name=f"{piece.kind}{number}", transform=apart)
+    made = from_trimesh(scene, "parts")
+    assert list(made.objects) == [f"{piece.kind}{k}" for k, piece in enumerate(pieces)]
+    part_V = _part_of_vertex(made)
+    vertices = made.vertices_V3.copy()
+    vertices[:, 0] -= _APART_M * part_V
+    return dataclasses.replace(made, vertices_V3=vertices)
+
+
+def _placed(parts: Scene, world_from_part_P44: np.ndarray) -> Scene:
+    """Move every part of a scene to its pose."""
+    pose = world_from_part_P44[_part_of_vertex(parts)]
+    vertices = np.einsum("vij,vj->vi", pose[:, :3, :3], parts.vertices_V3) + pose[:, :3, 3]
+    turn = world_from_part_P44[parts.object_F, :3, :3]
+    normals = np.einsum("fij,fj->fi", turn, parts.normals_F3)
+    return dataclasses.replace(parts, vertices_V3=vertices, normals_F3=normals)
+
+
+def _part_of_vertex(parts: Scene) -> np.ndarray:
+    """Return (V,) the part that each vertex belongs to."""
+    part_V = np.zeros(len(parts.vertices_V3), np.int64)
+    part_V[parts.faces_F3.ravel()] = np.repeat(parts.object_F, 3)
+    return part_V

@@ -1,0 +1,94 @@
+"""Pictures of a grid of class ids: as a camera sees it, and from above."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import cv2
+import jax
+import numpy as np
+
+from pewm_jax.data.voxel_classes import table_colours
+from pewm_jax.data.voxel_frames import VoxelFrames
+from pewm_jax.geometry.march import EMPTY, through_pixels
+from pewm_jax.types import Camera
+
+SIDES = np.array([0.85, 0.7, 1.0, 0.5])
+"""How bright a face is that a ray meets across x, y, z, and the cell in which it begins."""
+ABOVE_M = 0.5
+"""Cells this far above the camera are left out of the view from above, as ceilings are."""
+BACKGROUND = 24
+PIXELS = 8
+"""Pixels along the side of a cell in the view from above."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Ahead:
+    """What a camera sees of a grid.
+
+    Attributes:
+        rgb_HWC: (H, W, 3) uint8 colours of the classes, shaded by the side of the cell.
+        depth_HW: (H, W) float32 metres along z, 0 where the ray meets nothing.
+        classes_HW: (H, W) class ids, 0 where it meets nothing.
+    """
+
+    rgb_HWC: np.ndarray
+    depth_HW: np.ndarray
+    classes_HW: np.ndarray
+
+
+def ahead(voxels: VoxelFrames, frame: int, camera: Camera, height: int, width: int) -> Ahead:
+    """March through the grid of one frame from its camera.
+
+    Args:
+        voxels: the grids of T frames.
+        frame: which of them.
+        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
+        height: of the image, pixels.
+        width: of the image, pixels.
+    """
+    one = Camera(camera.intrinsics_4[frame : frame + 1], camera.world_from_camera[frame][None])
+    hits = _march(height, width)(
+        voxels.classes_TXYZ[frame], voxels.origin_T3[frame], np.float32(voxels.cell_m), one
+    )
+    ids, depth, side = (
+        np.asarray(x)[0, ..., 0] for x in (hits.ids_L, hits.distance_L, hits.side_L)
+    )
+    seen = ids != EMPTY
+    colours = table_colours(voxels.names)[ids] * SIDES[side][..., None]
+    rgb = np.where(seen[..., None], colours, BACKGROUND).astype(np.uint8)
+    return Ahead(rgb, np.where(seen, depth, 0).astype(np.float32), ids)
+
+
+@functools.lru_cache(maxsize=4)
+def _march(height: int, width: int):
+    """Return the march for a size of images, compiled."""
+    march = functools.partial(through_pixels, height=height, width=width, layers=1)
+    return jax.jit(march)
+
+
+def above(voxels: VoxelFrames, frame: int, camera: Camera) -> np.ndarray:
+    """Return the grid of one frame from above (RGB, x to the right, y up), with the camera's view.
+
+    Of each column the highest cell is drawn that is no higher than the camera and a little more;
+    higher cells are lighter.
+    """
+    grid, origin, cell = voxels.classes_TXYZ[frame], voxels.origin_T3[frame], voxels.cell_m
+    pose = np.asarray(camera.world_from_camera[frame], np.float64)
+    top = int(np.clip((pose[2, 3] + ABOVE_M - origin[2]) / cell, 1, grid.shape[2]))
+    full = grid[:, :, :top] != EMPTY
+    height = np.where(full.any(2), top - 1 - full[:, :, ::-1].argmax(2), 0)
+    ids = np.take_along_axis(grid[:, :, :top], height[..., None], 2)[..., 0]
+    light = 0.55 + 0.45 * height / max(1, top - 1)
+    colours = table_colours(voxels.names)[ids] * light[..., None]
+    colours = np.where(full.any(2)[..., None], colours, BACKGROUND)
+    image = np.repeat(np.repeat(colours.swapaxes(0, 1), PIXELS, 0), PIXELS, 1)
+    image = np.ascontiguousarray(image[::-1], np.uint8)
+    at = (pose[:2, 3] - origin[:2]) / cell * PIXELS
+    fx, width = float(camera.intrinsics_4[frame][0]), 2 * float(camera.intrinsics_4[frame][2])
+    for sign in (-1, 0, 1):
+        way = (pose[:2, :3] @ [sign * width / 2 / fx, 0.0, 1.0]) * 2.0 / cell * PIXELS
+        ends = [(round(x), round(len(image) - 1 - y)) for x, y in (at, at + way)]
+        cv2.line(image, ends[0], ends[1], (255, 60, 60), 2, cv2.LINE_AA)
+    return image

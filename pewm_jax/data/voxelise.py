@@ -1,0 +1,228 @@
+"""Surfaces to cells: a house as a lattice of class ids, and the grid around an agent.
+
+Cells are aligned with the world: their corners are whole multiples of their side from a point of
+the lattice. Triangles are cut at the borders of cells, so every cell that a surface passes is
+found, however little of it is there. Of several classes a cell has the one with the largest area in
+it; walls and floors count less than what stands before them.
+
+A surface belongs to the cell just behind it (``BEHIND_M``): a floor at height 0 fills the cells
+below 0, and a rug on it lies in these too. Only walls belong to the cell just before them, so that
+the two sides of one wall, in two colours, are farther apart. Solid things are hollow: a cell
+without a surface is empty.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pewm_jax.data.scenes import Scene
+from pewm_jax.data.voxel_classes import VoxelsConfig, class_ids
+from pewm_jax.houses.kinds import KINDS, SHELL, kind_of
+
+BEHIND_M = 0.02
+"""Surfaces are moved back by this, walls forward, at most by a quarter of a cell, before they are
+cut."""
+SHELL_WEIGHT = 1.0 / 3
+"""What an area of a wall or a floor counts beside the same area of a thing in front of it."""
+EQUAL = 1e-3
+"""Areas that differ by less than this part of a cell's face are equal: then the class with the
+smaller id has the cell, and not rounding."""
+NEAR = 1e-9
+"""Cells: a corner this near to a border does not reach over it."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Filled:
+    """The cells that surfaces pass, each once.
+
+    Attributes:
+        cell_N3: (N, 3) int64 numbers of the cells in the lattice, any sign.
+        class_N: (N,) class ids.
+        weight_N: (N,) what the class counts there: its area, in faces of a cell.
+    """
+
+    cell_N3: np.ndarray
+    class_N: np.ndarray
+    weight_N: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lattice:
+    """What fills the cells of a box of the world.
+
+    Attributes:
+        classes_XYZ: (X, Y, Z) class ids, 0 where nothing is.
+        weight_XYZ: (X, Y, Z) float32, what the class counts there.
+        first_3: (3,) number of the lowest cell along each axis.
+        cell_m: side of a cell, metres.
+        point_3: (3,) the lowest corner of cell (0, 0, 0), metres.
+    """
+
+    classes_XYZ: np.ndarray
+    weight_XYZ: np.ndarray
+    first_3: np.ndarray
+    cell_m: float
+    point_3: np.ndarray
+
+
+def fill(config: VoxelsConfig, scene: Scene, point_3: np.ndarray) -> Filled:
+    """Find the cells that the surfaces of a scene pass.
+
+    Args:
+        config: the cell and the classes.
+        scene: the world, or what moves in it at one moment.
+        point_3: the lowest corner of the lattice's cell (0, 0, 0), metres.
+    """
+    kind_O = np.array([KINDS.index(kind_of(name)) for name in scene.objects])
+    kind_F = kind_O[scene.object_F]
+    back_F = np.where(kind_F == KINDS.index("wall"), -1, 1) * min(BEHIND_M, config.cell / 4)
+    back = back_F[:, None, None] * scene.normals_F3[:, None]
+    piece_N33, face_N = cut((scene.vertices_V3[scene.faces_F3] - back - point_3) / config.cell)
+    sides = piece_N33[:, 1:] - piece_N33[:, :1]
+    area_N = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
+    class_F = class_ids(config, kind_F, scene.albedo_F3)
+    shell_F = np.isin(kind_F, [KINDS.index(kind) for kind in SHELL])
+    weight_N = area_N * np.where(shell_F, SHELL_WEIGHT, 1.0)[face_N]
+    return _heaviest(np.floor(piece_N33.mean(1)).astype(np.int64), class_F[face_N], weight_N)
+
+
+def lattice_of(config: VoxelsConfig, filled: Filled, point_3: np.ndarray) -> Lattice:
+    """Return cells as a box that holds them all."""
+    first = filled.cell_N3.min(0)
+    shape = tuple(filled.cell_N3.max(0) - first + 1)
+    classes, weight = np.zeros(shape, config.dtype), np.zeros(shape, np.float32)
+    where = tuple((filled.cell_N3 - first).T)
+    classes[where], weight[where] = filled.class_N, filled.weight_N
+    return Lattice(classes, weight, first, config.cell, np.asarray(point_3, np.float64))
+
+
+def around(
+    lattice: Lattice, side: int, centre_T3: np.ndarray, moving: list[Filled] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cut the grids around places out of a lattice.
+
+    Args:
+        lattice: all that stands still.
+        side: n, cells along each axis.
+        centre_T3: (T, 3) places, metres: in the middle cell of its grid where n is odd, within half
+            a cell of its middle where n is even.
+        moving: T times the cells of what moves; a cell is theirs where they count more than what
+            stands there.
+
+    Returns:
+        ``(classes_TXYZ, origin_T3)``: (T, n, n, n) class ids, and (T, 3) float64 lowest corners,
+        metres.
+    """
+    at = (np.asarray(centre_T3, np.float64) - lattice.point_3) / lattice.cell_m
+    low_T3 = np.floor(at - (side - 1) / 2).astype(np.int64)
+    grids = np.zeros((len(low_T3), side, side, side), lattice.classes_XYZ.dtype)
+    for t, low in enumerate(low_T3):
+        _copy(lattice.classes_XYZ, lattice.first_3 - low, grids[t])
+        if moving is not None:
+            _overlay(grids[t], low, moving[t], lattice)
+    return grids, lattice.point_3 + low_T3 * lattice.cell_m
+
+
+def cut(corners_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cut triangles at whole numbers along each axis.
+
+    Args:
+        corners_F33: (F, 3, 3) the corners of triangles, in cells.
+
+    Returns:
+        ``(piece_N33, face_N)``: triangles that each lie within one cell, and which one they were
+        part of.
+    """
+    pieces, faces = np.asarray(corners_F33, np.float64), np.arange(len(corners_F33))
+    for axis in range(3):
+        done, done_faces = [], []
+        while len(pieces):
+            low = np.floor(pieces[:, :, axis].min(1) + NEAR)
+            high = np.ceil(pieces[:, :, axis].max(1) - NEAR)
+            over = high - low > 1
+            done.append(pieces[~over])
+            done_faces.append(faces[~over])
+            plane = np.floor((low + high)[over] / 2)
+            pieces, which = _halve(pieces[over], axis, plane)
+            faces = faces[over][which]
+        pieces, faces = np.concatenate(done), np.concatenate(done_faces)
+    return pieces, faces
+
+
+def _halve(
+    corners_F33: np.ndarray, axis: int, plane_F: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cut triangles at a plane between their corners, into three each; and say of which each is."""
+    order = corners_F33[:, :, axis].argsort(1)
+    low, mid, high = np.take_along_axis(corners_F33, order[:, :, None], 1).swapaxes(0, 1)
+
+    def meet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return where the side from a to b meets the plane."""
+        length = b[:, axis] - a[:, axis]
+        share = (plane_F - a[:, axis]) / np.where(length == 0, 1, length)
+        point = a + np.clip(share, 0, 1)[:, None] * (b - a)
+        point[:, axis] = plane_F
+        return point
+
+    across = meet(low, high)
+    below = (mid[:, axis] <= plane_F)[:, None]  # the middle corner: its side to the one beyond
+    alone, pair = np.where(below, high, low), np.where(below, low, high)
+    other = np.where(below, meet(mid, high), meet(low, mid))
+    pieces = [(alone, other, across), (pair, mid, across), (mid, other, across)]
+    found = np.concatenate([np.stack(piece, 1) for piece in pieces])
+    return found, np.tile(np.arange(len(corners_F33)), 3)
+
+
+def _heaviest(cell_N3: np.ndarray, class_N: np.ndarray, weight_N: np.ndarray) -> Filled:
+    """Add up what counts in each cell, and keep the class that counts most."""
+    kept = weight_N > 0
+    cell_N3, class_N, weight_N = cell_N3[kept], class_N[kept], weight_N[kept]
+    if not len(cell_N3):
+        return Filled(cell_N3, class_N, weight_N)
+    first = cell_N3.min(0)
+    shape = tuple(cell_N3.max(0) - first + 1)
+    classes = 1 + int(class_N.max())
+    number_N = np.ravel_multi_index(tuple((cell_N3 - first).T), shape)
+    key, inverse = np.unique(number_N * classes + class_N, return_inverse=True)
+    counted = np.round(np.bincount(inverse, weight_N) / EQUAL) * EQUAL
+    number, name = np.divmod(key, classes)
+    order = np.lexsort((-name, counted, number))  # the heaviest last; of equal ones the smaller id
+    chosen = order[np.append(np.flatnonzero(np.diff(number[order])), len(order) - 1)]
+    cell = np.stack(np.unravel_index(number[chosen], shape), -1) + first
+    return Filled(cell, name[chosen], counted[chosen])
+
+
+def together(parts: Sequence[Filled]) -> Filled:
+    """Return the cells that any of the parts fill, each with the class that counts most."""
+    return _heaviest(
+        np.concatenate([part.cell_N3 for part in parts]),
+        np.concatenate([part.class_N for part in parts]),
+        np.concatenate([part.weight_N for part in parts]),
+    )
+
+
+def _overlay(grid_XYZ: np.ndarray, low_3: np.ndarray, moving: Filled, still: Lattice) -> None:
+    """Fill the cells of a grid in which what moves counts more than what stands there."""
+    here_N3 = moving.cell_N3 - low_3
+    inside = ((here_N3 >= 0) & (here_N3 < grid_XYZ.shape)).all(-1)
+    there_N3 = moving.cell_N3 - still.first_3
+    known = np.all((there_N3 >= 0) & (there_N3 < still.weight_XYZ.shape), axis=-1)
+    where = np.where(known[:, None], there_N3, 0)
+    before = np.where(known, still.weight_XYZ[tuple(where.T)], 0)
+    won = inside & (moving.weight_N > before)
+    grid_XYZ[tuple(here_N3[won].T)] = moving.class_N[won]
+
+
+def _copy(source_XYZ: np.ndarray, at_3: np.ndarray, target_XYZ: np.ndarray) -> None:
+    """Copy a box into another, its lowest cell to a place that may lie outside."""
+    take, put = [], []
+    for start, size, room in zip(at_3, source_XYZ.shape, target_XYZ.shape, strict=True):
+        low, high = max(0, int(start)), min(room, int(start) + size)
+        if low >= high:
+            return
+        put.append(slice(low, high))
+        take.append(slice(low - int(start), high - int(start)))
+    target_XYZ[tuple(put)] = source_XYZ[tuple(take)]

@@ -1,0 +1,63 @@
+"""Kinds of things in a house, read from the names that the generator gives to its parts."""
+
+from __future__ import annotations
+
+import re
+
+OTHER = "other"
+"""What no name tells, such as the parts of a mesh that was not made here."""
+SHELL = ("wall", "floor", "ceiling", "trim", "doorway", "window")
+MOVING = ("door", "robot")
+FURNITURE = (
+    "armchair",
+    "bathtub",
+    "bed",
+    "bookshelf",
+    "ceiling_lamp",
+    "chair",
+    "clock",
+    "coat_rack",
+    "coffee_table",
+    "desk",
+    "dining_table",
+    "dresser",
+    "fireplace",
+    "floor_lamp",
+    "fridge",
+    "kitchen_counter",
+    "nightstand",
+    "office_chair",
+    "piano",
+    "picture",
+    "plant",
+    "rug",
+    "sofa",
+    "stove",
+    "toilet",
+    "toy_chest",
+    "tv_stand",
+    "wall_shelf",
+    "wardrobe",
+    "washbasin",
+    "washing_machine",
+)
+KINDS = (OTHER, *SHELL, *MOVING, *FURNITURE)
+"""All kinds; the order is part of the data format, new ones go last."""
+GROUPS = {
+    **dict.fromkeys(("wall", "trim", "doorway"), "wall"),
+    **{kind: kind for kind in (OTHER, "floor", "ceiling", "window", *MOVING)},
+    **dict.fromkeys(FURNITURE, "furniture"),
+    **dict.fromkeys(("rug", "picture", "clock", "ceiling_lamp", "wall_shelf"), "decoration"),
+}
+"""A coarser division, for small models."""
+_NODE = re.compile(
+    r"room\d+-(?:[a-z]+-(?P<shell>wall|floor|ceiling|trim|window)|(?P<piece>[a-z_]+)-\d)"
+    r"|(?P<part>doorway|door|robot)\d"
+)
+
+
+def kind_of(node: str) -> str:
+    """Return the kind of a part of a house by its name, e.g. ``sofa`` for ``room0-sofa-3``."""
+    found = _NODE.match(node)
+    kind = next((group for group in found.groups() if group), OTHER) if found else OTHER
+    return kind if kind in GROUPS else OTHER
