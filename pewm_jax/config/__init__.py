@@ -22,6 +22,7 @@ from pewm_jax.config.encoder import (
 )
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import VERSION, Config
+from pewm_jax.config.frame_blocks import BlocksConfig
 from pewm_jax.config.kinds import Settings, functions, register
 from pewm_jax.config.launch import Join, Launch
 from pewm_jax.config.learned_codec import LearnedCodecConfig
@@ -45,6 +46,8 @@ from pewm_jax.config.svd_unet import SVDUNetConfig
 from pewm_jax.config.svd_vae import SVDVAEConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.vae import VAEConfig
+from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
+from pewm_jax.config.voxel_vae import VoxelVAEConfig
 from pewm_jax.config.wan_vae import WanVAEConfig
 
 register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
@@ -85,9 +88,11 @@ __all__ = [
     "ActionConfig",
     "AttentionConfig",
     "BackboneSettings",
+    "BlocksConfig",
     "BothConfig",
     "CLIPVisionConfig",
     "CameraConfig",
+    "CameraModelConfig",
     "ClipConfig",
     "CodecSettings",
     "CodecTrainConfig",
@@ -138,6 +143,9 @@ __all__ = [
     "UserError",
     "VAEConfig",
     "VoxelConfig",
+    "VoxelDiTConfig",
+    "VoxelRendererConfig",
+    "VoxelVAEConfig",
     "WanVAEConfig",
     "WorldSettings",
     "from_dict",
