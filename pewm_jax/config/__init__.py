@@ -23,6 +23,7 @@ from pewm_jax.config.encoder import (
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.frame_blocks import BlocksConfig
+from pewm_jax.config.frame_flow import FrameFlowConfig
 from pewm_jax.config.kinds import Settings, functions, register
 from pewm_jax.config.launch import Join, Launch
 from pewm_jax.config.learned_codec import LearnedCodecConfig
@@ -77,6 +78,7 @@ register("memory", "none", NoMemoryConfig, "pewm_jax.memory.nothing")
 register("noise", "ddpm", DDPMConfig, "pewm_jax.diffusion.ddpm")
 register("noise", "edm", EDMConfig, "pewm_jax.diffusion.edm")
 register("noise", "flow", FlowConfig, "pewm_jax.diffusion.flow")
+register("noise", "frame_flow", FrameFlowConfig, "pewm_jax.diffusion.frame_flow")
 
 __all__ = [
     "AXES",
@@ -112,6 +114,7 @@ __all__ = [
     "EncoderSettings",
     "EvalConfig",
     "FlowConfig",
+    "FrameFlowConfig",
     "ImagesConfig",
     "Join",
     "LatentsConfig",

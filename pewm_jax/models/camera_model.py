@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import CameraModelConfig, UserError
 from pewm_jax.geometry.camera_steps import NUMBERS, STEPS
-from pewm_jax.models import frame_blocks
+from pewm_jax.models import frame_blocks, frame_costs
 from pewm_jax.models.costs import Costs, Share
 from pewm_jax.models.frame_blocks import FrameCache
 from pewm_jax.types import Array, Params
@@ -118,7 +118,7 @@ def costs(config: CameraModelConfig, share: Share, frames: int, *, trained: bool
     """Return the costs of T frames."""
     inward = config.inner**3 * config.embed + NUMBERS + config.actions + 3 * config.blocks.width
     ends_in = (inward + STEPS) * config.blocks.width
-    return frame_blocks.costs(
+    return frame_costs.costs(
         config.blocks,
         PARTS,
         share,

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import UserError, VoxelDiTConfig
-from pewm_jax.models import frame_blocks
+from pewm_jax.models import frame_blocks, frame_costs
 from pewm_jax.models.costs import Costs, Share
 from pewm_jax.models.frame_blocks import FrameCache
 from pewm_jax.models.patches import patchify, unpatchify
@@ -133,7 +133,7 @@ def costs(
     given = pixels // config.pixel_patch**2
     ends_in = config.tokens * 2 * config.latent_channels * config.patch**3
     ends_in += given * config.pixel_channels * config.pixel_patch**2
-    return frame_blocks.costs(
+    return frame_costs.costs(
         config.blocks,
         PARTS,
         share,

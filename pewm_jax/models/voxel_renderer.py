@@ -22,7 +22,7 @@ from pewm_jax.config import UserError, VoxelRendererConfig
 from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import resize_intrinsics
 from pewm_jax.geometry.march import Layers
-from pewm_jax.models import frame_blocks
+from pewm_jax.models import frame_blocks, frame_costs
 from pewm_jax.models.costs import Costs, Share
 from pewm_jax.models.frame_blocks import FrameCache
 from pewm_jax.models.patches import patchify, unpatchify
@@ -191,7 +191,7 @@ def costs(config: VoxelRendererConfig, share: Share, frames: int, *, trained: bo
     cells = config.patch**2 * (2 * config.latent_channels + config.features)
     rays = config.height * config.width * config.places
     folding = rays * config.kernel * config.embed * config.fold
-    return frame_blocks.costs(
+    return frame_costs.costs(
         config.blocks,
         PARTS,
         share,

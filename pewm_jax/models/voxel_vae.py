@@ -152,9 +152,10 @@ def loss(
         dtype: of the computation.
 
     Returns:
-        ``(loss, measured)``: ``cross_entropy`` per compared cell (occupied ones by ``occupied_weight``),
-        ``divergence`` summed over a grid's latents and divided by its cells, ``occupied_right`` and
-        ``empty_right``, the shares of such cells whose class is the likeliest one.
+        ``(loss, measured)``: ``cross_entropy`` per compared cell (occupied ones weigh
+        ``occupied_weight``), ``divergence`` summed over a grid's latents and divided by its cells,
+        ``occupied_right`` and ``empty_right``, the shares of such cells whose class is the
+        likeliest one.
     """
     mean, log_variance = moments(config, params, classes_BXYZ, dtype)
     noise_key, cells_key = jax.random.split(key)
