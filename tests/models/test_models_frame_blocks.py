@@ -42,20 +42,20 @@ def ids(seed, *shape):
     return jnp.asarray(np.random.default_rng(seed).integers(0, 6, shape))
 
 
-def run_dit(params, inputs, cache=None):
+def run_dit(params, inputs, cache=None, config=DIT):
     latents, times, actions, pixels, camera, shown = inputs
     return voxel_dit.apply(
-        DIT, params, latents, times, actions, pixels,
+        config, params, latents, times, actions, pixels,
         camera_BTN=camera, shown_BT=shown, cache=cache,
     )  # fmt: skip
 
 
-def run_camera(params, inputs, cache=None):
-    return camera_model.apply(CAMERA, params, *inputs, cache=cache)
+def run_camera(params, inputs, cache=None, config=CAMERA):
+    return camera_model.apply(config, params, *inputs, cache=cache)
 
 
-def run_renderer(params, inputs, cache=None):
-    return voxel_renderer.apply(RENDERER, params, *inputs, cache=cache)
+def run_renderer(params, inputs, cache=None, config=RENDERER):
+    return voxel_renderer.apply(config, params, *inputs, cache=cache)
 
 
 NETS = {
@@ -186,35 +186,21 @@ def test_published_sizes_and_sharding(name):
     assert whole < 0.001 * count
 
 
-def flops(function, *arguments):
-    return jax.jit(function).lower(*arguments).cost_analysis()["flops"]
-
-
-def test_costs_are_the_programs():
-    share = Share()
-    pixels = 2 * 4
-    for name, found in (
-        ("voxel_dit", voxel_dit.costs(DIT, share, FRAMES, pixels, trained=False)),
-        ("camera_model", camera_model.costs(CAMERA, share, FRAMES, trained=False)),
-        ("renderer", voxel_renderer.costs(RENDERER, share, FRAMES, trained=False)),
-    ):
-        module, config, run, inputs = NETS[name]
-        wide = dataclasses.replace(BLOCKS, layers=1, heads=16, head_dim=32, context=FRAMES)
-        config = dataclasses.replace(config, blocks=wide)
-        found = module.costs(
-            config, share, FRAMES, *([pixels] if name == "voxel_dit" else []), trained=False
-        )
-        params = jax.eval_shape(lambda m=module, c=config: m.init(c, jax.random.key(0)))
-        one = jax.tree.map(lambda x: x[:1], inputs)
-        names = ("DIT", "CAMERA", "RENDERER")
-        before = {key: globals()[key] for key in names}
-        globals()[names[list(NETS).index(name)]] = config
-        try:
-            counted = flops(run, params, one)
-        finally:
-            globals().update(before)
-        stated = sum(2 * product.macs for product in found.products)
-        assert 0.8 < counted / stated < 1.3
+@pytest.mark.parametrize("name", NETS)
+def test_costs_are_the_programs(name):
+    module, config, run, inputs = NETS[name]
+    wide = dataclasses.replace(BLOCKS, layers=1, heads=16, head_dim=32, context=FRAMES)
+    config = dataclasses.replace(config, blocks=wide)
+    pixels = [2 * 4] if name == "voxel_dit" else []
+    found = module.costs(config, Share(), FRAMES, *pixels, trained=False)
+    params = jax.eval_shape(lambda: module.init(config, jax.random.key(0)))
+    one = jax.tree.map(lambda x: x[:1], inputs)
+    program = jax.jit(lambda p, x: run(p, x, config=config)).lower(params, one)
+    stated = sum(2 * product.macs for product in found.products)
+    assert 0.8 < program.cost_analysis()["flops"] / stated < 1.3
+    learning = module.costs(config, Share(), FRAMES, *pixels, trained=True)
+    assert sum(x.model for x in learning.products) == 3 * stated
+    assert learning.kept > found.kept == 0
 
 
 @pytest.mark.parametrize(
