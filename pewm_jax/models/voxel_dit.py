@@ -17,7 +17,6 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import UserError, VoxelDiTConfig
 from pewm_jax.models import frame_blocks, frame_costs
@@ -28,7 +27,7 @@ from pewm_jax.models.plain_layers import linear
 from pewm_jax.types import Array, Params
 
 PARTS = ("space", "time", "cross")
-SHARDING = (*frame_blocks.rules("voxel_dit"), (r"voxel_dit/no_pixels/bias", P()))
+SHARDING = frame_blocks.rules("voxel_dit")
 """Rules over the paths of its parameters under ``voxel_dit``."""
 
 
