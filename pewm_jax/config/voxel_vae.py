@@ -43,7 +43,7 @@ class VoxelVAEConfig:
     compared: int = 0
     """Cells of each grid, drawn at random at every step, at which training compares the class with
     the true one; 0 for all. With many classes and few processors the scores are most of the work.
-    """
+    Occupied cells are drawn more often, by their weight, and then weigh as much as others."""
     slab: int = 0
     """Layers of cells at a time whose scores are held when class ids are compared or decoded; 0
     for all at once. At published sizes the scores of one grid take almost a gigabyte."""

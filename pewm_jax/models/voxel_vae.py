@@ -170,17 +170,17 @@ def loss(
         chosen = jnp.take_along_axis(scores, wanted[..., None], -1)[..., 0]
         return jax.nn.logsumexp(scores, -1) - chosen, chosen >= scores.max(-1)
 
-    if config.compared:
-        batch, count = len(ids), config.side**3
-        cells = jax.random.randint(cells_key, (batch, config.compared), 0, count)
-        ids = jnp.take_along_axis(ids.reshape(batch, count), cells, 1)
-        seen = jnp.take_along_axis(seen.reshape(batch, count, -1), cells[..., None], 1)
-        missed, right = compare(seen, ids)
-    else:
-        missed, right = _by_slab(config, jax.checkpoint(compare), seen, ids)
     full = (ids != 0).astype(jnp.float32)
     weight = 1 + (config.occupied_weight - 1) * full
-    entropy = (missed * weight).sum() / weight.sum()
+    if config.compared:
+        cells = _drawn(weight.reshape(len(ids), -1), config.compared, cells_key)
+        ids, full = (jnp.take_along_axis(x.reshape(len(x), -1), cells, 1) for x in (ids, full))
+        flat = seen.reshape(len(seen), -1, config.embed)
+        missed, right = compare(jnp.take_along_axis(flat, cells[..., None], 1), ids)
+        entropy = missed.mean()
+    else:
+        missed, right = _by_slab(config, jax.checkpoint(compare), seen, ids)
+        entropy = (missed * weight).sum() / weight.sum()
     divergence = (jnp.square(mean) + jnp.exp(log_variance) - 1 - log_variance) / 2
     divergence = divergence.sum() / jnp.size(classes_BXYZ)
     measured = {
@@ -243,6 +243,14 @@ def _convolved(config: VoxelVAEConfig, part: Params, x: Array) -> Array:
     return convolve(x, part["kernel"].astype(x.dtype), config.convolution) + part["bias"].astype(
         x.dtype
     )
+
+
+def _drawn(weight_BN: Array, count: int, key: Array) -> Array:
+    """Draw (B, count) places with a probability in proportion to their weight."""
+    share_BN = jnp.cumsum(weight_BN, 1)
+    drawn = jax.random.uniform(key, (len(share_BN), count)) * share_BN[:, -1:]
+    places = jax.vmap(lambda share, at: jnp.searchsorted(share, at, side="right"))(share_BN, drawn)
+    return jnp.minimum(places, share_BN.shape[1] - 1)
 
 
 def _by_slab(config: VoxelVAEConfig, function: Callable[..., Any], *grids_BXYZ: Array) -> Any:

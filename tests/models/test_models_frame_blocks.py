@@ -19,7 +19,7 @@ from pewm_jax.config import (
 )
 from pewm_jax.models import camera_model, frame_blocks, voxel_dit, voxel_renderer
 from pewm_jax.models.costs import Share
-from tests.helpers import randomise
+from tests.persist_nets import normal, weights
 
 BLOCKS = BlocksConfig(layers=2, heads=2, head_dim=8, mlp_ratio=2, context=3)
 DIT = VoxelDiTConfig(
@@ -32,10 +32,6 @@ RENDERER = VoxelRendererConfig(
 )  # fmt: skip
 FRAMES = 6
 """Twice as many as a frame sees."""
-
-
-def normal(seed, *shape):
-    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
 
 
 def ids(seed, *shape):
@@ -91,12 +87,14 @@ NETS = {
 }
 
 
+JITTED = {name: jax.jit(run) for name, (_, _, run, _) in NETS.items()}
+
+
 @pytest.fixture(scope="module", params=NETS)
 def net(request):
-    module, config, run, inputs = NETS[request.param]
-    params = randomise(jax.jit(module.init, static_argnums=0)(config, jax.random.key(0)))
-    jitted = jax.jit(run)
-    return module, config, jitted, params, inputs, jitted(params, inputs)[0]
+    module, config, _, inputs = NETS[request.param]
+    params, run = weights(module, config), JITTED[request.param]
+    return module, config, run, params, inputs, run(params, inputs)[0]
 
 
 def test_frame_by_frame_with_a_cache_is_all_at_once(net):
@@ -122,8 +120,7 @@ def test_a_frame_depends_on_all_it_may_see_and_on_nothing_later(net):
 
 
 def test_gradients_of_a_frame_reach_no_later_action():
-    params = randomise(jax.jit(voxel_dit.init, static_argnums=0)(DIT, jax.random.key(0)))
-    inputs = NETS["voxel_dit"][3]
+    params, inputs = weights(voxel_dit, DIT), NETS["voxel_dit"][3]
 
     @jax.jit
     def slope(actions, latents):
@@ -140,9 +137,8 @@ def test_gradients_of_a_frame_reach_no_later_action():
 
 
 def test_a_hidden_picture_does_not_matter_and_a_shown_one_does():
-    _, _, run, inputs = NETS["voxel_dit"]
-    params = randomise(jax.jit(voxel_dit.init, static_argnums=0)(DIT, jax.random.key(0)))
-    run = jax.jit(run)
+    inputs, run = NETS["voxel_dit"][3], JITTED["voxel_dit"]
+    params = weights(voxel_dit, DIT)
     for shown in (True, False):
         kept = jnp.full((2, FRAMES), shown)
         one = run(params, (*inputs[:5], kept))[0]
@@ -151,18 +147,24 @@ def test_a_hidden_picture_does_not_matter_and_a_shown_one_does():
 
 
 def test_networks_begin_at_zero_and_blocks_as_the_identity():
-    params = jax.jit(voxel_dit.init, static_argnums=0)(DIT, jax.random.key(0))
-    x, condition, given = normal(0, 1, 2, 3, 16), normal(1, 1, 2, 16), normal(2, 1, 2, 4, 16)
-    run = jax.jit(
-        lambda blocks: frame_blocks.run(
-            BLOCKS, voxel_dit.PARTS, blocks, x, condition, given_BTMD=given
-        )[0]
-    )
-    np.testing.assert_array_equal(run(params["blocks"]), x)
-    assert not frame_blocks.project(params, x, condition).any()
-    opened = dataclasses.replace(DIT, blocks=dataclasses.replace(BLOCKS, gates="open"))
-    params = jax.jit(voxel_dit.init, static_argnums=0)(opened, jax.random.key(0))
-    assert bool((run(params["blocks"]) != x).any())
+    x, condition = normal(0, 1, 2, 3, 16), normal(1, 1, 2, 16)
+    ends = frame_blocks.end_shapes(16, 5)
+
+    @jax.jit
+    def both(key):
+        made = []
+        for gates in ("zero", "open"):
+            config = dataclasses.replace(BLOCKS, gates=gates)
+            params = frame_blocks.init(config, ("time",), ends, key)
+            moved, _ = frame_blocks.run(config, ("time",), params["blocks"], x, condition)
+            made.append((moved, frame_blocks.project(params, moved, condition)))
+        return made
+
+    (same, nothing), (moved, still) = both(jax.random.key(0))
+    np.testing.assert_array_equal(same, x)
+    assert not nothing.any()
+    assert not still.any()
+    assert bool((moved != x).any())
 
 
 PUBLISHED = {

@@ -14,7 +14,7 @@ from pewm_jax import tree
 from pewm_jax.config import ConfigError, UserError, VoxelVAEConfig
 from pewm_jax.models import voxel_vae, voxel_vae_shapes
 from pewm_jax.models.costs import Share
-from tests.helpers import randomise
+from tests.persist_nets import weights
 
 LIKE_PUBLISHED = VoxelVAEConfig(
     side=4,
@@ -38,7 +38,7 @@ init = jax.jit(lambda config: voxel_vae.init(config, jax.random.key(0)), static_
 @pytest.fixture(scope="module", params=[LIKE_PUBLISHED, FOLDED], ids=["published", "folded"])
 def net(request):
     config = request.param
-    params = randomise(init(config))
+    params = weights(voxel_vae, config)
     params["latent_scale_C"] = jnp.abs(params["latent_scale_C"]) + 0.5
     return config, params
 
@@ -135,7 +135,7 @@ def test_it_equals_torch_and_its_other_form(net):
 
 def test_slabs_change_nothing_and_drawn_cells_are_a_sample():
     config, key = FOLDED, jax.random.key(1)
-    params, ids = randomise(init(config)), grids(config)
+    params, ids = weights(voxel_vae, config), grids(config)
 
     def both(c):
         def run(p):
@@ -163,7 +163,7 @@ def test_slabs_change_nothing_and_drawn_cells_are_a_sample():
 
 def test_fitted_latents_have_mean_0_and_variance_1_and_decode_the_same():
     config, axes = FOLDED, (0, 1, 2, 3)
-    params, ids = randomise(init(config)), grids(config, 4)
+    params, ids = weights(voxel_vae, config), grids(config, 4)
 
     @jax.jit
     def both(p):
