@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import (
+    PERSIST_VOXELS,
     BlocksConfig,
     CameraModelConfig,
-    FrameFlowConfig,
     VoxelDiTConfig,
     VoxelRendererConfig,
     VoxelVAEConfig,
@@ -21,7 +21,7 @@ from pewm_jax.worlds import persist_losses
 from tests.persist_nets import normal, weights
 
 BLOCKS = BlocksConfig(layers=1, heads=2, head_dim=8, mlp_ratio=2, context=3)
-NOISE = FrameFlowConfig()
+NOISE = PERSIST_VOXELS
 
 
 def walk(seed, frames=4):

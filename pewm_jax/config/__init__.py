@@ -23,7 +23,7 @@ from pewm_jax.config.encoder import (
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.frame_blocks import BlocksConfig
-from pewm_jax.config.frame_flow import FrameFlowConfig
+from pewm_jax.config.frame_flow import PERSIST_PIXELS, PERSIST_VOXELS, FrameFlowConfig
 from pewm_jax.config.kinds import Settings, functions, register
 from pewm_jax.config.launch import Join, Launch
 from pewm_jax.config.learned_codec import LearnedCodecConfig
@@ -84,6 +84,8 @@ __all__ = [
     "AXES",
     "COSMOS_2B",
     "COSMOS_14B",
+    "PERSIST_PIXELS",
+    "PERSIST_VOXELS",
     "PUBLISHED",
     "SMALLEST",
     "VERSION",

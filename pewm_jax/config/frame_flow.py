@@ -11,10 +11,11 @@ from pewm_jax.config.noise import FlowConfig
 
 @dataclasses.dataclass(frozen=True)
 class FrameFlowConfig(FlowConfig):
-    """x_t = (1 − t) x0 + (s + (1 − s) t) ε, velocity (1 − s) ε − x0; defaults: as published.
+    """x_t = (1 − t) x0 + (s + (1 − s) t) ε, velocity (1 − s) ε − x0.
 
-    A little noise, s, is left at t = 0 (arXiv 2210.02747). Each frame has a time of its own
-    (diffusion forcing, arXiv 2407.01392); frames that are given have a little noise, too.
+    A little noise, s, is left at t = 0 (arXiv 2210.02747). With ``per_frame`` each frame has a time
+    of its own (diffusion forcing, arXiv 2407.01392); frames that are given have a little noise, too.
+    ``PERSIST_VOXELS`` and ``PERSIST_PIXELS`` are the published settings.
     """
 
     shift: float = 3.0
@@ -23,8 +24,6 @@ class FrameFlowConfig(FlowConfig):
     """Distribution of times in training."""
     shifted_times: bool = False
     """Whether the times of training are shifted, too."""
-    per_frame: bool = True
-    """Whether training draws one time per latent frame instead of one per clip."""
     sample_steps: int = 20
     """Steps of the sampler, by Euler's method."""
     smallest: float = 1e-5
@@ -38,3 +37,9 @@ class FrameFlowConfig(FlowConfig):
         for name in ("smallest", "context_noise"):
             value = getattr(self, name)
             require(0 <= value < 1, f"noise.{name} is {value}: use 0 or more, below 1.")
+
+
+PERSIST_VOXELS = FrameFlowConfig(per_frame=True)
+"""The noise of PERSIST's voxel frames."""
+PERSIST_PIXELS = FrameFlowConfig(per_frame=True, context_noise=0.1)
+"""The noise of PERSIST's pictures."""

@@ -7,7 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import ConfigError, FlowConfig, FrameFlowConfig
+from pewm_jax.config import (
+    PERSIST_PIXELS,
+    PERSIST_VOXELS,
+    ConfigError,
+    FlowConfig,
+    FrameFlowConfig,
+)
 from pewm_jax.diffusion import flow, frame_flow, noise
 
 PLAIN = FrameFlowConfig(shift=1.0, smallest=0.0)
@@ -47,7 +53,7 @@ def test_the_target_is_the_slope_of_the_path_whatever_is_left_at_0():
 
 
 def test_times_are_drawn_per_frame_and_only_the_sampler_shifts_them():
-    config = FrameFlowConfig()
+    config = PERSIST_VOXELS
     times = np.asarray(frame_flow.draw(config, jax.random.key(0), 400, 5))
     assert times.shape == (400, 5)
     assert np.unique(times).size > 1990
@@ -64,7 +70,7 @@ def test_times_are_drawn_per_frame_and_only_the_sampler_shifts_them():
 
 
 def test_given_frames_have_a_little_noise_and_say_so():
-    config = FrameFlowConfig(context_noise=0.1)
+    config = PERSIST_PIXELS
     x0 = np.zeros((2, 3, 50, 40), np.float32)
     x_t, times = frame_flow.given(config, x0, jax.random.key(0))
     np.testing.assert_allclose(times, np.full((2, 3), 0.1), rtol=1e-6)

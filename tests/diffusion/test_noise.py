@@ -32,7 +32,7 @@ KINDS = {
     "edm_heun": EDMConfig(sampler="heun"),
     "flow": FlowConfig(),
     "flow_shifted": FlowConfig(shift=3.0, times="logit_normal"),
-    "frame_flow": FrameFlowConfig(per_frame=False),
+    "frame_flow": FrameFlowConfig(),
 }
 every = pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
 
