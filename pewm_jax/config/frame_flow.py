@@ -14,7 +14,7 @@ class FrameFlowConfig(FlowConfig):
     """x_t = (1 − t) x0 + (s + (1 − s) t) ε, velocity (1 − s) ε − x0.
 
     A little noise, s, is left at t = 0 (arXiv 2210.02747). With ``per_frame`` each frame has a time
-    of its own (diffusion forcing, arXiv 2407.01392); frames that are given have a little noise, too.
+    of its own (diffusion forcing, arXiv 2407.01392); frames that are given have some noise, too.
     ``PERSIST_VOXELS`` and ``PERSIST_PIXELS`` are the published settings.
     """
 

@@ -189,6 +189,32 @@ def test_published_sizes_and_sharding(name):
 
 
 @pytest.mark.parametrize("name", NETS)
+def test_published_sizes_run_in_bfloat16_with_a_cache(name):
+    module, config, *_ = PUBLISHED[name]
+    params = jax.eval_shape(lambda: module.init(config, jax.random.key(0)))
+    front, half = (1, 2), jnp.bfloat16
+
+    def array(*shape, dtype=half):
+        return jax.ShapeDtypeStruct((*front, *shape), dtype)
+
+    inputs = {
+        "voxel_dit": lambda: (array(12, 12, 12, 48), array(), array(23), array(36, 64, 16)),
+        "camera_model": lambda: (array(48, 48, 48, dtype=jnp.int32), array(10), array(23)),
+        "renderer": lambda: (array(36, 64, 16), array(), array(36, 64, 752)),
+    }[name]()
+    options = {"dtype": half} if name == "camera_model" else {}
+    cache = jax.eval_shape(lambda: module.no_frames(config, 1, half))
+    made, after = jax.eval_shape(
+        lambda p, x, c: module.apply(config, p, *x, cache=c, **options), params, inputs, cache
+    )
+    wanted = (*front, 6) if name == "camera_model" else inputs[0].shape
+    assert made.shape == wanted
+    assert made.dtype == (jnp.float32 if name == "camera_model" else half)
+    same = jax.tree.map(lambda a, b: (a.shape, a.dtype) == (b.shape, b.dtype), after, cache)
+    assert all(jax.tree.leaves(same))
+
+
+@pytest.mark.parametrize("name", NETS)
 def test_costs_are_the_programs(name):
     module, config, run, inputs = NETS[name]
     wide = dataclasses.replace(BLOCKS, layers=1, heads=16, head_dim=32, context=FRAMES)

@@ -216,6 +216,13 @@ def test_published_size_sharding_and_costs():
     count = sum(x.size for x in jax.tree.leaves(params))
     assert abs(count / 138e6 - 1) < 0.005
     assert (config.latent_side, config.latent_channels) == (12, 48)
+    grids = jax.ShapeDtypeStruct((1, 48, 48, 48), jnp.uint16)
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    slabs = dataclasses.replace(config, slab=4)
+    loss, _ = jax.eval_shape(
+        lambda p, x, k: voxel_vae.loss(slabs, p, x, k, jnp.bfloat16), params, grids, key
+    )
+    assert (loss.shape, loss.dtype) == ((), jnp.float32)
     specs = tree.assign(voxel_vae_shapes.SHARDING, {"voxel_vae": params})
     assert any(spec != P() for spec in jax.tree.leaves(specs, is_leaf=lambda x: isinstance(x, P)))
     for small in (LIKE_PUBLISHED, dataclasses.replace(FOLDED, convolution="xla")):
