@@ -61,14 +61,13 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=4, help="grids of a step")
     parser.add_argument("--runs", type=int, default=3)
     asked = parser.parse_args()
-    rows = []
+    print(f"{asked.batch} grids of {SMALL.side}³ cells, {SMALL.classes} classes, processor seconds")
+    print(table(["network", "convolutions", "compile", "step"], []))
     for name, config in FORMS.items():
         for form in ("xla", "products"):
             chosen = dataclasses.replace(config, convolution=form)
             compiling, step = measure(chosen, asked.batch, asked.runs)
-            rows.append([name, form, f"{compiling:.1f}", f"{step:.2f}"])
-    print(f"{asked.batch} grids of {SMALL.side}³ cells, {SMALL.classes} classes, processor seconds")
-    print(table(["network", "convolutions", "compile", "step"], rows))
+            print(f"| {name} | {form} | {compiling:.1f} | {step:.2f} |", flush=True)
 
 
 if __name__ == "__main__":

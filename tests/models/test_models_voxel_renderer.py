@@ -28,7 +28,8 @@ def test_layers_are_folded_as_by_torch():
     params = weights(voxel_renderer, CONFIG)
     depth = rng.uniform(0, 12, (2, 3, 14)).astype(np.float32)
     seen = Layers(rng.integers(0, 9, (2, 3, 14)), depth, rng.integers(-1, 3, (2, 3, 14)))
-    made = voxel_renderer.features(CONFIG, params, seen)
+    run = jax.jit(voxel_renderer.features, static_argnums=0)
+    made = run(CONFIG, params, seen)
 
     waves = np.geomspace(CONFIG.shortest_m, CONFIG.longest_m, 3)
     angle = 2 * np.pi * depth[..., None] / waves
@@ -45,9 +46,9 @@ def test_layers_are_folded_as_by_torch():
 
     faced = dataclasses.replace(CONFIG, sides=True)
     faces = {"faces": {"kernel": jnp.asarray(rng.normal(size=(4, 6)), jnp.float32)}}
-    plain = voxel_renderer.features(faced, {**params, **faces}, seen)
+    plain = run(faced, {**params, **faces}, seen)
     inside = dataclasses.replace(seen, side_L=np.full_like(seen.side_L, -1))
-    assert not np.allclose(plain, voxel_renderer.features(faced, {**params, **faces}, inside))
+    assert not np.allclose(plain, run(faced, {**params, **faces}, inside))
 
 
 def test_each_frame_looks_into_its_own_grid_through_the_middle_of_latents():
