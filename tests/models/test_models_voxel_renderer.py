@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from pewm_jax.config import VoxelRendererConfig
+from pewm_jax.config import BlocksConfig, VoxelRendererConfig
 from pewm_jax.geometry import cameras
 from pewm_jax.geometry.march import Layers
 from pewm_jax.models import voxel_renderer
@@ -15,8 +15,9 @@ from pewm_jax.types import Camera
 from tests.persist_nets import weights
 
 CONFIG = VoxelRendererConfig(
-    classes=9, height=6, width=8, latent_channels=3, layers=14, embed=6, fold=5, longest_m=30.0
-)
+    classes=9, height=6, width=8, latent_channels=3, layers=14, embed=6, fold=5, longest_m=30.0,
+    blocks=BlocksConfig(layers=1, heads=1, head_dim=8),
+)  # fmt: skip
 
 
 def test_published_layers_become_752_channels():
