@@ -22,6 +22,8 @@ from pewm_jax.config.encoder import (
 )
 from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import VERSION, Config
+from pewm_jax.config.frame_blocks import BlocksConfig
+from pewm_jax.config.frame_flow import PERSIST_PIXELS, PERSIST_VOXELS, FrameFlowConfig
 from pewm_jax.config.kinds import Settings, functions, register
 from pewm_jax.config.launch import Join, Launch
 from pewm_jax.config.learned_codec import LearnedCodecConfig
@@ -45,6 +47,8 @@ from pewm_jax.config.svd_unet import SVDUNetConfig
 from pewm_jax.config.svd_vae import SVDVAEConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.vae import VAEConfig
+from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
+from pewm_jax.config.voxel_vae import VoxelVAEConfig
 from pewm_jax.config.wan_vae import WanVAEConfig
 
 register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
@@ -76,20 +80,25 @@ register("memory", "none", NoMemoryConfig, "pewm_jax.memory.nothing")
 register("noise", "ddpm", DDPMConfig, "pewm_jax.diffusion.ddpm")
 register("noise", "edm", EDMConfig, "pewm_jax.diffusion.edm")
 register("noise", "flow", FlowConfig, "pewm_jax.diffusion.flow")
+register("noise", "frame_flow", FrameFlowConfig, "pewm_jax.diffusion.frame_flow")
 
 __all__ = [
     "AXES",
     "COSMOS_2B",
     "COSMOS_14B",
+    "PERSIST_PIXELS",
+    "PERSIST_VOXELS",
     "PUBLISHED",
     "SMALLEST",
     "VERSION",
     "ActionConfig",
     "AttentionConfig",
     "BackboneSettings",
+    "BlocksConfig",
     "BothConfig",
     "CLIPVisionConfig",
     "CameraConfig",
+    "CameraModelConfig",
     "ClipConfig",
     "CodecSettings",
     "CodecTrainConfig",
@@ -109,6 +118,7 @@ __all__ = [
     "EncoderSettings",
     "EvalConfig",
     "FlowConfig",
+    "FrameFlowConfig",
     "ImagesConfig",
     "Join",
     "LatentsConfig",
@@ -140,6 +150,9 @@ __all__ = [
     "UserError",
     "VAEConfig",
     "VoxelConfig",
+    "VoxelDiTConfig",
+    "VoxelRendererConfig",
+    "VoxelVAEConfig",
     "WanVAEConfig",
     "WorldSettings",
     "from_dict",

@@ -4,13 +4,14 @@ A noise is a ``NoiseSettings`` and a module (or object) with the functions below
 latents at a given time, prepare the network's inputs, define its target and the weight of its
 error, turn its prediction into x0, and sample.
 
-======= ==================== ==================================== ==========================
-kind    time                 x_t                                  target
-======= ==================== ==================================== ==========================
-ddpm    level, 0 … N − 1     √ᾱ x0 + √(1 − ᾱ) ε                   x0, v or ε
-edm     σ                    x0 + σ ε                             ±(x0 − c_skip x_t) / c_out
-flow    t in [0, 1]          (1 − t) x0 + t ε                     ε − x0
-======= ==================== ==================================== ==========================
+========== ==================== ==================================== ==========================
+kind       time                 x_t                                  target
+========== ==================== ==================================== ==========================
+ddpm       level, 0 … N − 1     √ᾱ x0 + √(1 − ᾱ) ε                   x0, v or ε
+edm        σ                    x0 + σ ε                             ±(x0 − c_skip x_t) / c_out
+flow       t in [0, 1]          (1 − t) x0 + t ε                     ε − x0
+frame_flow t in [0, 1]          (1 − t) x0 + (s + (1 − s) t) ε       (1 − s) ε − x0
+========== ==================== ==================================== ==========================
 
 A time is one number per clip, (B,), or one per latent frame, (B, t), if the kind allows it.
 """

@@ -10,7 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import DDPMConfig, EDMConfig, FlowConfig, TrainConfig, kinds
+from pewm_jax.config import (
+    DDPMConfig,
+    EDMConfig,
+    FlowConfig,
+    FrameFlowConfig,
+    TrainConfig,
+    kinds,
+)
 from pewm_jax.diffusion import flow, noise
 from pewm_jax.worlds import objective
 from tests.diffusion.test_diffusion import make_clip
@@ -25,6 +32,7 @@ KINDS = {
     "edm_heun": EDMConfig(sampler="heun"),
     "flow": FlowConfig(),
     "flow_shifted": FlowConfig(shift=3.0, times="logit_normal"),
+    "frame_flow": FrameFlowConfig(),
 }
 every = pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
 
@@ -61,7 +69,7 @@ def test_levels_fall_and_begin_at_the_most_noise(config):
     levels = np.asarray(noise.levels(dataclasses.replace(config, sample_steps=7)))
     assert levels.shape == (7,)
     assert (np.diff(levels) < 0).all()
-    most = {"ddpm": 999, "edm": 80.0, "flow": 1.0}[kinds.of(config).name]
+    most = {"ddpm": 999, "edm": 80.0, "flow": 1.0, "frame_flow": 1.0}[kinds.of(config).name]
     np.testing.assert_allclose(levels[0], most, rtol=1e-6)
 
 

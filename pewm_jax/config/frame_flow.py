@@ -1,0 +1,45 @@
+"""Flow matching with a time for every frame, as in PERSIST."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from pewm_jax.config.errors import require
+from pewm_jax.config.noise import FlowConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameFlowConfig(FlowConfig):
+    """x_t = (1 − t) x0 + (s + (1 − s) t) ε, velocity (1 − s) ε − x0.
+
+    A little noise, s, is left at t = 0 (arXiv 2210.02747). With ``per_frame`` each frame has a time
+    of its own (diffusion forcing, arXiv 2407.01392); frames that are given have some noise, too.
+    ``PERSIST_VOXELS`` and ``PERSIST_PIXELS`` are the published settings.
+    """
+
+    shift: float = 3.0
+    """Time shift of the sampler: t → s t / (1 + (s − 1) t)."""
+    times: Literal["uniform", "logit_normal"] = "logit_normal"
+    """Distribution of times in training."""
+    shifted_times: bool = False
+    """Whether the times of training are shifted, too."""
+    sample_steps: int = 20
+    """Steps of the sampler, by Euler's method."""
+    smallest: float = 1e-5
+    """The noise s that is left at t = 0."""
+    context_noise: float = 0.02
+    """Time of the frames that are given; published: 0.02 for voxels, 0.1 for pixels."""
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        for name in ("smallest", "context_noise"):
+            value = getattr(self, name)
+            require(0 <= value < 1, f"noise.{name} is {value}: use 0 or more, below 1.")
+
+
+PERSIST_VOXELS = FrameFlowConfig(per_frame=True)
+"""The noise of PERSIST's voxel frames."""
+PERSIST_PIXELS = FrameFlowConfig(per_frame=True, context_noise=0.1)
+"""The noise of PERSIST's pictures."""

@@ -1,0 +1,83 @@
+"""Flow matching with a time per frame: its formulas, its times, what it shares with flow."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax.config import (
+    PERSIST_PIXELS,
+    PERSIST_VOXELS,
+    ConfigError,
+    FlowConfig,
+    FrameFlowConfig,
+)
+from pewm_jax.diffusion import flow, frame_flow, noise
+
+PLAIN = FrameFlowConfig(shift=1.0, smallest=0.0)
+
+
+def draw(seed, *shape):
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def test_without_noise_left_at_0_it_is_flow():
+    x0, eps = draw(0, 2, 3, 4), draw(1, 2, 3, 4)
+    times = np.random.default_rng(2).uniform(0.1, 1, (2, 3)).astype(np.float32)
+    config = FlowConfig(per_frame=True)
+    x_t = noise.corrupt(config, x0, eps, times)
+    np.testing.assert_allclose(noise.corrupt(PLAIN, x0, eps, times), x_t, atol=1e-6)
+    wanted = noise.target(config, x0, eps, times)
+    np.testing.assert_allclose(noise.target(PLAIN, x0, eps, times), wanted, atol=1e-6)
+    for made in (noise.to_x0(PLAIN, wanted, x_t, times), noise.to_x0(config, wanted, x_t, times)):
+        np.testing.assert_allclose(made, x0, atol=1e-6)
+
+
+def test_the_target_is_the_slope_of_the_path_whatever_is_left_at_0():
+    config = FrameFlowConfig(smallest=0.3)
+    x0, eps = draw(0, 2, 3, 4), draw(1, 2, 3, 4)
+
+    def at(time):
+        return frame_flow.corrupt(config, x0, eps, jnp.full((2, 3), time))
+
+    x_t, slope = jax.jvp(at, (0.4,), (1.0,))
+    wanted = frame_flow.target(config, x0, eps, None)
+    np.testing.assert_allclose(slope, wanted, atol=1e-6)
+    np.testing.assert_allclose(x_t, 0.6 * x0 + (0.3 + 0.7 * 0.4) * eps, atol=1e-6)
+    times = jnp.full((2, 3), 0.4)
+    np.testing.assert_allclose(frame_flow.to_x0(config, wanted, x_t, times), x0, atol=1e-6)
+    np.testing.assert_allclose(frame_flow.velocity(config, x0, x_t, times), wanted, atol=1e-5)
+    np.testing.assert_allclose(at(0.0) - x0, 0.3 * eps, atol=1e-6)
+
+
+def test_times_are_drawn_per_frame_and_only_the_sampler_shifts_them():
+    config = PERSIST_VOXELS
+    times = np.asarray(frame_flow.draw(config, jax.random.key(0), 400, 5))
+    assert times.shape == (400, 5)
+    assert np.unique(times).size > 1990
+    logit = np.log(times / (1 - times))
+    assert abs(logit.mean()) < 0.1
+    assert abs(logit.std() - 1) < 0.1
+    shifted = frame_flow.draw(
+        dataclasses.replace(config, shifted_times=True), jax.random.key(0), 400, 5
+    )
+    np.testing.assert_allclose(shifted, 3 * times / (1 + 2 * times), rtol=1e-5)
+    even = np.linspace(1, 0, 21)[:-1]
+    np.testing.assert_allclose(frame_flow.levels(config), 3 * even / (1 + 2 * even), rtol=1e-6)
+    assert frame_flow.levels is flow.levels
+
+
+def test_given_frames_have_a_little_noise_and_say_so():
+    config = PERSIST_PIXELS
+    x0 = np.zeros((2, 3, 50, 40), np.float32)
+    x_t, times = frame_flow.given(config, x0, jax.random.key(0))
+    np.testing.assert_allclose(times, np.full((2, 3), 0.1), rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(x_t).std(), 0.1, rtol=0.05)
+
+
+@pytest.mark.parametrize("wrong", [{"smallest": 1.0}, {"context_noise": -0.1}, {"shift": 0.0}])
+def test_settings_that_cannot_work_are_refused(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        FrameFlowConfig(**wrong)

@@ -1,0 +1,37 @@
+"""3D convolutions as products are XLA's, forward and backward."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax.models import convolution3d
+
+FORMS = {"whole": convolution3d.convolve, "halved": convolution3d.halved}
+
+
+def draw(seed, *shape):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_both_forms_and_both_gradients_agree(name):
+    x, kernel = draw(0, 2, 4, 6, 2, 3), draw(1, 3, 3, 3, 3, 5)
+    out = draw(2, *FORMS[name](x, kernel, "xla").shape)
+    assert out.shape[1:4] == ((4, 6, 2) if name == "whole" else (2, 3, 1))
+
+    def gradients(form):
+        return jax.value_and_grad(
+            lambda x, kernel: (FORMS[name](x, kernel, form) * out).sum(), (0, 1)
+        )
+
+    wanted = jax.jit(gradients("xla"))(x, kernel)
+    for form in ("products", "auto"):
+        made = jax.jit(gradients(form))(x, kernel)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-4), made, wanted)
+
+
+def test_a_kernel_of_one_place_is_a_linear_layer():
+    x, kernel = draw(0, 2, 3, 3, 3, 4), draw(1, 1, 1, 1, 4, 5)
+    made = convolution3d.convolve(x, kernel)
+    np.testing.assert_allclose(made, convolution3d.by_xla(x, kernel), atol=1e-5)
