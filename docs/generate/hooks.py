@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,17 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from docs.generate import code, links, pages
 
-OUTSIDE = {page: origin for origin, page in links.HOMES.items() if origin not in ("README.md",)}
+OUTSIDE = {page: origin for origin, page in links.HOMES.items() if origin != "README.md"}
+
+
+def on_config(config: Any) -> Any:
+    """Add to the menu the chapters of the reference, and pages that it does not name."""
+    menu = {title: entries for part in config.nav for title, entries in part.items()}
+    named = set(re.findall(r"[\w/]+\.md", str(menu)))
+    pages_here = sorted(path.name for path in (code.ROOT / "docs").glob("*.md"))
+    menu["How to"] += [name for name in pages_here if name not in named]
+    menu["Reference"] += [{name: f"reference/{name}.md"} for name, _ in links.chapters()]
+    return config
 
 
 def on_files(files: Files, *, config: Any) -> Files:
@@ -24,9 +35,7 @@ def on_files(files: Files, *, config: Any) -> Files:
     made["glossary.md"] = pages.glossary()
     for path in sorted((code.ROOT / "notebooks").glob("*.ipynb")):
         text, pictures = pages.notebook(path)
-        made[f"notebooks/{path.stem}.md"] = text.replace(
-            f"../../notebooks/{path.name}", path.name
-        )
+        made[f"notebooks/{path.stem}.md"] = text.replace(f"../../notebooks/{path.name}", path.name)
         made |= {f"notebooks/{name}": data for name, data in pictures.items()}
         made[f"notebooks/{path.name}"] = path.read_bytes()
     for name, content in made.items():

@@ -73,7 +73,7 @@ def broken(origin: str, text: str, root: Path = code.ROOT) -> list[str]:
         if there.startswith("docs/") and there.removeprefix("docs/") in MADE:
             continue
         target = root / there
-        if not target.exists() or there.startswith(".."):
+        if path and (there.startswith("..") or not target.exists()):
             wrong.append(f"{origin}: {link} does not exist")
         elif anchor and anchor not in anchors(text if not path else target.read_text("utf-8")):
             wrong.append(f"{origin}: {link} has no such heading")

@@ -13,8 +13,8 @@ from docs.generate import code, links
 
 NUMBERS = """# Numbers
 
-Every number here was written by a command of the repository into a file of it, and this page is made
-from those files.
+Every number here was written by a command of the repository into a file of it, and this page is
+made from those files.
 """
 GLOSSARY = """# Letters
 
@@ -32,6 +32,8 @@ Some files need further letters; their docstrings say what they stand for.
 | letter | where |
 |---|---|
 """
+SCORES = ("sim", "success", "position_error", "yaw_error")
+"""Of `results.json`, in the order of the table's columns."""
 SUFFIX = re.compile(r"\b[a-z][a-z0-9_]*_([A-Ztwhnqk]*[A-Z][A-Ztwhnqk]*)[0-9]*\b")
 """The letters at the end of an array's name."""
 
@@ -41,7 +43,7 @@ def reference(root: Path = code.ROOT) -> dict[str, str]:
     pages, rows = {}, []
     for chapter, question in links.chapters(root):
         modules = list(modules_of(chapter, root))
-        body = "".join(f"\n## {name}\n\n::: {name}\n" for name in modules)
+        body = "".join(f"\n::: {name}\n" for name in modules)
         pages[f"reference/{chapter}.md"] = f"# {chapter}\n\n{question}\n{body}"
         rows.append(f"| [{chapter}]({chapter}.md) | {question} | {len(modules)} |")
     head = "# Reference\n\nIn the reading order: a chapter imports only chapters above it.\n\n"
@@ -120,14 +122,14 @@ def numbers(root: Path = code.ROOT) -> str:
 def table2(found: dict[str, Any]) -> str:
     """Return the scores of `results.json` as a table, means and 95 % intervals over houses."""
     lines = [
-        "From `docs/table2/results.json`, which `pewm-jax table2` writes; 95 % intervals over houses."
-        " [What the rows are](planning.md#does-it-help-table-2).",
+        "From `docs/table2/results.json`, which `pewm-jax table2` writes; 95 % intervals over",
+        "houses. [What the rows are](planning.md#does-it-help-table-2).",
         "",
         "| row | SIM, % | success, % | final position, m | final heading, ° |",
         "|---|---|---|---|---|",
     ]
     for name, row in found["rows"].items():
-        cells = [interval(row[score]) for score in ("sim", "success", "position_error", "yaw_error")]
+        cells = [interval(row[score]) for score in SCORES]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -142,16 +144,14 @@ def interval(score: dict[str, float]) -> str:
 
 def section(text: str, title: str) -> str:
     """Return the text below a heading of the second level."""
-    (body,) = re.findall(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", text, re.S | re.M)
+    (body,) = re.findall(
+        rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", text, re.DOTALL | re.MULTILINE
+    )
     return body.strip()
 
 
 def notebook(path: Path) -> tuple[str, dict[str, bytes]]:
-    """Return a notebook as Markdown, and its pictures by name.
-
-    Raises:
-        ValueError: a cell of code that was never run.
-    """
+    """Return a notebook as Markdown, and its pictures by name."""
     parts, pictures = [], {}
     for number, cell in enumerate(json.loads(path.read_text("utf-8"))["cells"]):
         source = "".join(cell["source"])
@@ -165,7 +165,8 @@ def notebook(path: Path) -> tuple[str, dict[str, bytes]]:
                     name = f"{path.stem}-{number}-{place}.{kind.removeprefix('image/')}"
                     pictures[name] = base64.b64decode(data)
                     parts.append(f"![What the cell above shows.]({name})")
-            if output["output_type"] == "stream":
-                parts.append(f"```text\n{''.join(output['text']).rstrip()}\n```")
+        said = [o["text"] for o in cell["outputs"] if o["output_type"] == "stream"]
+        if said:
+            parts.append(f"```text\n{''.join(map(''.join, said)).rstrip()}\n```")
     head = f"*[The notebook itself](../../notebooks/{path.name}) can be run.*"
     return "\n\n".join([parts[0], head, *parts[1:]]) + "\n", pictures
