@@ -22,7 +22,8 @@ def on_config(config: Any) -> Any:
     named = set(re.findall(r"[\w/]+\.md", str(menu)))
     pages_here = sorted(path.name for path in (code.ROOT / "docs").glob("*.md"))
     menu["How to"] += [name for name in pages_here if name not in named]
-    menu["Reference"] += [{name: f"reference/{name}.md"} for name, _ in links.chapters()]
+    chapters = [{name: f"reference/{name}.md"} for name, _ in links.chapters()]
+    config.nav.append({"Chapters": ["reference/index.md", *chapters]})
     return config
 
 

@@ -44,7 +44,9 @@ def reference(root: Path = code.ROOT) -> dict[str, str]:
     for chapter, question in links.chapters(root):
         modules = list(modules_of(chapter, root))
         body = "".join(f"\n::: {name}\n" for name in modules)
-        pages[f"reference/{chapter}.md"] = f"# {chapter}\n\n{question}\n{body}"
+        pages[f"reference/{chapter}.md"] = (
+            f"# {chapter}\n\n{question[:1].upper()}{question[1:]}\n{body}"
+        )
         rows.append(f"| [{chapter}]({chapter}.md) | {question} | {len(modules)} |")
     head = "# Reference\n\nIn the reading order: a chapter imports only chapters above it.\n\n"
     table = "| chapter | question | files |\n|---|---|---|\n"

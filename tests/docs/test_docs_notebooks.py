@@ -39,6 +39,13 @@ def run(name, **replaced):
     return names
 
 
+@pytest.fixture(autouse=True)
+def elsewhere(monkeypatch, tmp_path):
+    """Files of the notebooks go to a folder of the test, and the process comes back from it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tempfile.mkdtemp", lambda: str(tmp_path))
+
+
 @pytest.fixture
 def tiny(monkeypatch):
     model = tiny_drive.an_engine()
@@ -100,6 +107,7 @@ def test_it_holds_its_outputs_and_is_small(path):
     outputs = [output for cell in cells(path, "code") for output in cell["outputs"]]
     assert any(kind.startswith("image/") for o in outputs for kind in o.get("data", {}))
     assert not [output for output in outputs if output["output_type"] == "error"]
+    assert "/tmp" not in json.dumps(outputs), "outputs name no folder of a machine"
     printing = [c for c in cells(path, "code") if "print(" in "".join(c["source"])]
     shown = [c for c in printing if c["outputs"]]
     assert len(shown) >= len(printing) - 1, "run it again: python notebooks/run.py"
