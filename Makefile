@@ -12,7 +12,7 @@ NEWEST = tests/parity tests/diffusion tests/training/test_training_sharding.py \
   tests/training/test_training_loop.py tests/training/test_training_two_stages.py \
   tests/test_train_cli.py
 
-.PHONY: help demo table1 table2 test test-newest lint format bench clean
+.PHONY: help demo table1 table2 test test-newest docs lint format bench clean
 
 help:
 	@echo "make demo         collect, train, imagine and score; ends with the path of a report page"
@@ -20,6 +20,7 @@ help:
 	@echo "make table2       does a world model help to decide? policies, rankings, plans, in hours"
 	@echo "make test         the whole test suite"
 	@echo "make test-newest  a quick part of it on the newest Python that is there, with the newest JAX"
+	@echo "make docs         the documentation as a site, in site/"
 	@echo "make lint         ruff (format and rules) and pyright"
 	@echo "make format       let ruff rewrite the files"
 	@echo "make bench        speed, each beside a named peer"
@@ -62,6 +63,11 @@ test: .venv/installed-dev
 
 test-newest:
 	@PYTHON="$(PYTHON)" .ci/newest $(NEWEST) $(ARGS)
+
+docs: .venv/installed
+	@$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@$(PY) -m mkdocs build --strict --quiet
+	@echo "documentation: $(CURDIR)/site/index.html"
 
 lint: .venv/installed-dev
 	@.venv/bin/ruff format --check .

@@ -103,6 +103,9 @@ class TrainSettings:
     """Steps between log lines."""
     preview_every: int = 250
     """Steps between sample images; 0 for none."""
+    wandb: str = ""
+    """Project of Weights & Biases that gets what TensorBoard gets (`pip install 'pewm-jax[wandb]'`;
+    WANDB_MODE=offline keeps it in the run's folder); empty: none."""
     mesh: MeshConfig = MeshConfig()
     """How devices are arranged; may differ each time a run is resumed."""
     fresh: tuple[str, ...] = (r"memory/.*",)

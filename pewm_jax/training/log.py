@@ -1,5 +1,7 @@
 """The log of a training: a line of JSON and a TensorBoard event per logged step, and a live view.
 
+Where ``train.wandb`` names a project, Weights & Biases gets the same scalars (``wandb_log``).
+
 On a terminal the live view is a progress bar, elsewhere a line every ten seconds.
 """
 
@@ -19,8 +21,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from pewm_jax import atomic
+from pewm_jax.config import Config
 from pewm_jax.training import processes
 from pewm_jax.training.stages import Stage
+from pewm_jax.training.wandb_log import WandbLog
 
 FLUSH_S = 10
 """Seconds between writes of TensorBoard's events; lines of JSON are written at once."""
@@ -38,9 +42,13 @@ class MetricsLog:
         run: the run's folder.
         stage: the stage about to be trained.
         step: steps of it that are done.
+        config: the experiment, which may ask for Weights & Biases; without it there is none.
+
+    Raises:
+        UserError: Weights & Biases is asked for and cannot begin.
     """
 
-    def __init__(self, run: Path, stage: Stage, step: int):
+    def __init__(self, run: Path, stage: Stage, step: int, config: Config | None = None):
         self._stage = stage.number
         self._writes = processes.is_primary()
         if not self._writes:
@@ -48,6 +56,9 @@ class MetricsLog:
         # Imported here and not above: it takes a second, and loads torch where that is installed.
         import tensorboardX  # noqa: PLC0415
 
+        self._wandb = None
+        if config is not None and config.train.wandb:
+            self._wandb = WandbLog(config, run, stage)
         path = run / "metrics.jsonl"
         drop_after(path, stage.number, step)
         self._file = path.open("a")
@@ -74,6 +85,8 @@ class MetricsLog:
                 self._file.close()
             finally:
                 self._events.close()
+                if self._wandb is not None:
+                    self._wandb.close(failed=error is not None)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Log the scalars of one step; NaN and infinity, which JSON lacks, are written as null."""
@@ -86,6 +99,8 @@ class MetricsLog:
         self._file.flush()
         for name, value in finite.items():
             self._events.add_scalar(name, value, step)
+        if self._wandb is not None:
+            self._wandb.write(step, finite)
 
 
 def drop_after(path: Path, stage: int, step: int) -> None:

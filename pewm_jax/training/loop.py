@@ -22,7 +22,7 @@ from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.memory import feature_cache
-from pewm_jax.training import prepared, processes, runs, sharding, stages, starting
+from pewm_jax.training import prepared, processes, runs, sharding, stages, starting, wandb_log
 from pewm_jax.training.checkpoint import Checkpoints
 from pewm_jax.training.feed import Feed, rows_of
 from pewm_jax.training.log import LiveView, MetricsLog, Pace, duration
@@ -72,6 +72,8 @@ def train(
     """
     planned = stages.planned(config)
     starting.require_weights(config)
+    if config.train.wandb:
+        wandb_log.load()  # refused now, and not after the data are prepared
     mesh = sharding.make_mesh(arranged=config.train.mesh)
     for stage in planned:
         sharding.require_divisible(config, stage, mesh)
@@ -152,7 +154,7 @@ class _Worker:
                 return params
             with (
                 LiveView(stage.title, steps, done) as self.view,
-                MetricsLog(run, stage, done) as log,
+                MetricsLog(run, stage, done, config) as log,
             ):
                 self.bad.say = self.view.say if processes.is_primary() else _print_error
                 self.watch = Watch(

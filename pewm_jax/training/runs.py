@@ -5,6 +5,7 @@
     runs/demo/config.json           written first: what this run is
               metrics.jsonl         one line per logged step
               tensorboard/          the same for TensorBoard
+              wandb/, wandb.id      the same for Weights & Biases, where `train.wandb` asks for it
               checkpoints/stage1/   by Orbax, see ``checkpoint``
               previews/             sample pictures
               weights.safetensors   inference weights, written when a stage is finished
@@ -58,6 +59,7 @@ FREE = (
     "train.grace_s",
     "train.log_every",
     "train.preview_every",
+    "train.wandb",
 )
 """Settings that may change between one start of a run and the next: none alters what is learnt.
 
