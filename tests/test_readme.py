@@ -196,7 +196,7 @@ def test_make_test_runs_the_suite():
 
 def test_every_file_the_readme_names_exists():
     for name in re.findall(r"\]\((?!http)([^)]+)\)", README):
-        assert (ROOT / name).is_file(), name
+        assert (ROOT / name).exists(), name
     for name in re.findall(r"`([a-z_]+/|[a-z_]+\.py)`", README):
         assert (ROOT / name).exists() or (ROOT / "pewm_jax" / name).exists(), name
 

@@ -64,7 +64,7 @@ ONE = {"data": 1, "fsdp": 1, "tensor": 1, "context": 1}
 def stepped():
     train = EgoWMTrainConfig(adapt=STAGE, mesh=MeshConfig())
     config = Config(model=MODEL, data=DataConfig(context=1), train=train)
-    (stage,) = worlds.stages(MODEL)
+    *_, stage = worlds.stages(MODEL)
     return config, stage, *trained(config, stage)
 
 
@@ -85,7 +85,7 @@ def test_its_sums_are_those_of_the_compiled_step(stepped):
 def test_every_leaf_has_its_place_on_many_devices():
     config = Config(model=MODEL, train=EgoWMTrainConfig(adapt=STAGE))
     mesh = jax.sharding.AbstractMesh((1, 4, 2, 1), ("data", "fsdp", "tensor", "context"))
-    (stage,) = worlds.stages(MODEL)
+    *_, stage = worlds.stages(MODEL)
     shapes = jax.eval_shape(functools.partial(state.create, config, stage), jax.random.key(0))
     placed = tree.flatten(sharding.of_state(MODEL, mesh, shapes))
     for path, leaf in tree.flatten(shapes).items():
@@ -109,7 +109,7 @@ def test_frames_that_are_given_do_not_count_in_the_loss(monkeypatch):
             return jnp.zeros_like(noisy).at[:, wrong_at].add(3.0)
 
         monkeypatch.setattr(world_model, "apply", predicted)
-        (stage,) = worlds.stages(MODEL)
+        *_, stage = worlds.stages(MODEL)
         return float(stage.loss(MODEL, config.train, params, batch, jax.random.key(0))[0])
 
     right, at_given, at_other = (loss(where) for where in (slice(0, 0), 0, 1))
