@@ -103,6 +103,7 @@ class Clip:
             (``worlds.objective.prepare``), else None.
         sight: what the memory of the context shows, if that was looked at beforehand, else None.
         state_A: (..., A) the agent's own state at frame 0, None if none was recorded.
+        prepared: what else a stage's preparation made of the clip, in a form of its world's own.
     """
 
     frames: Frames
@@ -115,6 +116,7 @@ class Clip:
     latents_thwC: Array | None = None
     sight: Sight | None = None
     state_A: Array | None = None
+    prepared: Any = None
 
 
 @_pytree
@@ -211,7 +213,8 @@ class WorldState:
     Attributes:
         frame: the last frame, T = 1, rgb float32 in [−1, 1].
         map: the memory of everything seen or imagined so far: a ``VoxelMap``, or another kind
-            (see ``pewm_jax.memory.memories``); in the world ``egowm`` the frames before the last.
+            (see ``pewm_jax.memory.memories``); in the world ``egowm`` the frames before the last,
+            in ``persist`` the voxels.
     """
 
     frame: Frames

@@ -7,7 +7,17 @@ from collections.abc import Callable, Sequence
 
 import pewm_jax
 from pewm_jax import cli
-from pewm_jax.commands import compare, evaluate, play, practice, protocol, table1, table2, train
+from pewm_jax.commands import (
+    compare,
+    evaluate,
+    horizon,
+    play,
+    practice,
+    protocol,
+    table1,
+    table2,
+    train,
+)
 from pewm_jax.convert import __main__ as convert
 from pewm_jax.data import __main__ as data
 from pewm_jax.memory import __main__ as memory
@@ -36,6 +46,7 @@ COMMANDS = {
     "protocol": Command(protocol.main, "choose what runs are scored by, before training them"),
     "evaluate": Command(evaluate.main, "score a trained run on held-out scenes and write a report"),
     "compare": Command(compare.main, "set two scored runs side by side, with paired differences"),
+    "horizon": Command(horizon.main, "imagine hundreds of frames, and measure what comes of it"),
     "table1": Command(table1.main, "train and score every memory: the paper's Table 1, ablations"),
     "table2": Command(table2.main, "decide by policies, rankings and plans: the paper's Table 2"),
     "practice": Command(practice.main, "let a policy practise in imagination, and measure it"),

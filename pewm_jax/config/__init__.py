@@ -41,6 +41,13 @@ from pewm_jax.config.migrations import upgrade
 from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettings
 from pewm_jax.config.nomad import NomadConfig, NomadTrainConfig, NomadWorldConfig
+from pewm_jax.config.persist import (
+    POINT_WAVES,
+    GridConfig,
+    PersistConfig,
+    PersistNetsConfig,
+    PersistTrainConfig,
+)
 from pewm_jax.config.reader import AttentionConfig, BothConfig, ReaderSettings, RenderConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
 from pewm_jax.config.svd_unet import SVDUNetConfig
@@ -54,10 +61,12 @@ from pewm_jax.config.wan_vae import WanVAEConfig
 register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
 register("world", "codec", CodecWorldConfig, "pewm_jax.worlds.codec")
 register("world", "egowm", EgoWMConfig, "pewm_jax.worlds.egowm")
+register("world", "persist", PersistConfig, "pewm_jax.worlds.persist")
 register("world", "nomad", NomadWorldConfig, "pewm_jax.worlds.nomad")
 register("backbone", "dit", DiTConfig, "pewm_jax.models.dit_backbone")
 register("backbone", "svd_unet", SVDUNetConfig, "pewm_jax.models.svd_backbone")
 register("backbone", "cosmos", CosmosConfig, "pewm_jax.models.cosmos_backbone")
+register("backbone", "persist", PersistNetsConfig, "pewm_jax.models.persist_nets")
 register("codec", "pixel", PixelConfig, "pewm_jax.models.pixel_codec")
 register("codec", "vae", VAEConfig, "pewm_jax.models.vae_codec")
 register("codec", "svd_vae", SVDVAEConfig, "pewm_jax.models.svd_vae_codec")
@@ -75,6 +84,7 @@ register("memory", "voxel", VoxelConfig, "pewm_jax.memory.voxel_memory")
 register("memory", "map2d", Map2DConfig, "pewm_jax.memory.map2d")
 register("memory", "points", PointsConfig, "pewm_jax.memory.points")
 register("memory", "surfels", SurfelConfig, "pewm_jax.memory.surfels")
+register("memory", "grid", GridConfig, "pewm_jax.memory.class_grid")
 register("memory", "images", ImagesConfig, "pewm_jax.memory.images")
 register("memory", "none", NoMemoryConfig, "pewm_jax.memory.nothing")
 register("noise", "ddpm", DDPMConfig, "pewm_jax.diffusion.ddpm")
@@ -88,6 +98,7 @@ __all__ = [
     "COSMOS_14B",
     "PERSIST_PIXELS",
     "PERSIST_VOXELS",
+    "POINT_WAVES",
     "PUBLISHED",
     "SMALLEST",
     "VERSION",
@@ -119,6 +130,7 @@ __all__ = [
     "EvalConfig",
     "FlowConfig",
     "FrameFlowConfig",
+    "GridConfig",
     "ImagesConfig",
     "Join",
     "LatentsConfig",
@@ -135,6 +147,9 @@ __all__ = [
     "NomadTrainConfig",
     "NomadWorldConfig",
     "PatchColoursConfig",
+    "PersistConfig",
+    "PersistNetsConfig",
+    "PersistTrainConfig",
     "PixelConfig",
     "Places",
     "PointsConfig",

@@ -18,6 +18,8 @@ class MemorySettings(Settings):
 
     Attributes:
         KEEPS_FEATURES: whether it keeps features of the image encoder.
+        READ_BY_BLOCKS: whether memory blocks read it, which are trained for that; else it is the
+            state of its world.
     """
 
     SECTION: ClassVar[str] = "memory"
@@ -25,6 +27,7 @@ class MemorySettings(Settings):
     """Whether it keeps the encoder's features; else the first three of a point are its colour."""
     REMEMBERS: ClassVar[bool] = True
     """Whether it ever holds anything."""
+    READ_BY_BLOCKS: ClassVar[bool] = True
     TELLS_IMAGINED: ClassVar[bool] = False
     """Whether its ``remember`` asks, by ``observed``, if frames were observed or imagined."""
 

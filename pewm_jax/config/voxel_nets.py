@@ -99,6 +99,9 @@ class VoxelRendererConfig:
     """Columns of the picture's latents."""
     latent_channels: int = 16
     """Channels of the picture's latents."""
+    rays: int = 1
+    """Rays through each latent, along its rows and along its columns; 1 as published, more where a
+    latent stands for many pixels."""
     layers: int = 192
     """Occupied voxels along a ray that are seen, nearest first."""
     embed: int = 32
@@ -124,7 +127,7 @@ class VoxelRendererConfig:
 
     def __post_init__(self):
         """Validate."""
-        names = ("height", "width", "latent_channels", "layers", "kernel", "stride", "fold")
+        names = ("height", "width", "latent_channels", "rays", "layers", "kernel", "stride", "fold")
         require_positive(self, "renderer", *names, "patch")
         require(
             self.classes >= 2,
@@ -157,8 +160,8 @@ class VoxelRendererConfig:
 
     @property
     def features(self) -> int:
-        """Channels that the layers of a ray become."""
-        return self.places * self.fold
+        """Channels that the layers of the rays of a latent become."""
+        return self.places * self.fold * self.rays**2
 
     @property
     def tokens(self) -> int:

@@ -43,12 +43,16 @@ def clip(config: Config, batch: int, *, features: bool = False, actions: bool = 
     control = getattr(config.model, "control", None)  # a world that is not steered has none
     width = getattr(control, "actions", 0) or ACTION
     pixels = {"height": size.height, "width": size.width}
+    side = getattr(getattr(config.model, "memory", None), "recorded", 0)  # cells of grids, if any
+    cells = (batch, size.frames, side, side, side)
     return Clip(
         frames(batch, size.frames, **pixels),
         frames(batch, context, **pixels),
         array(batch, context, dtype=np.bool_),
         kept,
         array(batch, size.frames - 1, width) if actions else None,
+        array(*cells, dtype=np.uint16) if side else None,
+        array(batch, size.frames, 3) if side else None,
     )
 
 

@@ -91,6 +91,9 @@ def remembers(opened: Opened) -> bool:
     """
     known = stages.all_stages(opened.config)
     asked = [stage for stage in known if stage.memory and stage.settings(opened.config).steps > 0]
+    if not opened.config.model.memory.READ_BY_BLOCKS:
+        _require_all_steps(opened)
+        return opened.config.model.memory.REMEMBERS
     if "memory" not in opened.params:
         if asked:
             raise UserError(

@@ -78,6 +78,8 @@ def look(
 ) -> Layers:
     """Return what the rays of T cameras meet in T grids, (T, h, w, L); distances are depths.
 
+    With ``rays`` r above 1 the shape is (T, h·r, w·r, L).
+
     Args:
         config: the network.
         classes_TXYZ: class ids of each frame's grid.
@@ -86,14 +88,13 @@ def look(
         camera: (T,) cameras.
         size: height and width of the images that their intrinsics are for, pixels.
     """
-    shrink = config.width / size[1], config.height / size[0]
+    height, width = config.height * config.rays, config.width * config.rays
+    shrink = width / size[1], height / size[0]
     intrinsics = resize_intrinsics(camera.intrinsics_4, shrink[0], shrink[1])
 
     def one(ids: Array, low: Array, intrinsics_4: Array, pose: Array) -> Layers:
         seen = Camera(intrinsics_4[None], pose[None])
-        found = march.through_pixels(
-            ids, low, cell_m, seen, config.height, config.width, config.layers
-        )
+        found = march.through_pixels(ids, low, cell_m, seen, height, width, config.layers)
         return jax.tree.map(lambda x: x[0], found)
 
     return jax.vmap(one)(classes_TXYZ, low_T3, intrinsics, camera.world_from_camera)
@@ -102,7 +103,9 @@ def look(
 def features(
     config: VoxelRendererConfig, params: Params, layers: Layers, dtype: Any = jnp.float32
 ) -> Array:
-    """Fold layers (..., L) into channels (..., F): first all of the nearest place.
+    """Fold layers (..., h, w, L) into channels (..., h, w, F): first all of the nearest place.
+
+    Of several rays of one latent, first all of the first ray.
 
     Args:
         config: the network.
@@ -117,7 +120,13 @@ def features(
     last = config.stride * (config.places - 1) + 1
     taps = [x[..., tap : tap + last : config.stride, :] for tap in range(config.kernel)]
     folded = linear(params["fold"], jnp.concatenate(taps, -1))
-    return folded.reshape(*folded.shape[:-2], config.features)
+    if config.rays == 1:
+        return folded.reshape(*folded.shape[:-2], config.features)
+    *front, rows, columns, places, channels = folded.shape
+    rays = config.rays
+    cut = folded.reshape(*front, rows // rays, rays, columns // rays, rays, places * channels)
+    cut = jnp.moveaxis(cut, -4, -3)
+    return cut.reshape(*cut.shape[:-3], config.features)
 
 
 def depth_waves(config: VoxelRendererConfig, depth: Array) -> Array:
@@ -189,7 +198,7 @@ def apply(
 def costs(config: VoxelRendererConfig, share: Share, frames: int, *, trained: bool) -> Costs:
     """Return the costs of T frames, without the march of the rays."""
     cells = config.patch**2 * (2 * config.latent_channels + config.features)
-    rays = config.height * config.width * config.places
+    rays = config.height * config.width * config.rays**2 * config.places
     folding = rays * config.kernel * config.embed * config.fold
     return frame_costs.costs(
         config.blocks,

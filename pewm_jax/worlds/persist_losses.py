@@ -68,9 +68,13 @@ def world_frames(
     *,
     camera_BTN: Array | None = None,
     blind: float = 0.0,
+    known_BTxyz: Array | None = None,
+    counted_BTxyz: Array | None = None,
     dtype: Any = jnp.float32,
 ) -> tuple[Array, Measured]:
     """Return the squared error of the velocity of voxel frames.
+
+    What is not known of a frame is noise alone, whatever the frame's time.
 
     Args:
         config: the network.
@@ -82,6 +86,8 @@ def world_frames(
         key: randomness of times, noise and of what is hidden.
         camera_BTN: numbers of the camera at each frame.
         blind: share of frames after the first that are not shown a picture.
+        known_BTxyz: bool, which latents a world would know at that frame; None for all.
+        counted_BTxyz: bool, at which latents the error counts; None for all.
         dtype: of the computation.
     """
     velocity_key, shown_key = jax.random.split(key)
@@ -96,7 +102,15 @@ def world_frames(
         camera_BTN=None if camera_BTN is None else previous(camera_BTN),
         shown_BT=shown | (jnp.arange(front[1]) == 0) if blind else None,
     )
-    return _velocity(noise, lambda x, t: predict(x, t)[0], latents_BTxyzC, velocity_key, dtype)
+    return _velocity(
+        noise,
+        lambda x, t: predict(x, t)[0],
+        latents_BTxyzC,
+        velocity_key,
+        dtype,
+        known=known_BTxyz,
+        counted=counted_BTxyz,
+    )
 
 
 def camera(
@@ -108,6 +122,7 @@ def camera(
     actions_BTA: Array,
     width: int,
     *,
+    reckoned_BT6: Array | None = None,
     dtype: Any = jnp.float32,
 ) -> tuple[Array, Measured]:
     """Return the mean squared error of the steps between cameras, in ``config.units``.
@@ -123,6 +138,8 @@ def camera(
         cameras: (B, T) cameras.
         actions_BTA: the action that leads to each frame.
         width: of the images that the cameras' intrinsics are for, pixels.
+        reckoned_BT6: steps to which the network adds what it says, each to its frame; None for
+            none.
         dtype: of the computation.
 
     Returns:
@@ -135,6 +152,8 @@ def camera(
     made, _ = camera_model.apply(
         config, params, classes_BTXYZ[:, 1:], seen, actions_BTA[:, 1:], dtype=dtype
     )
+    if reckoned_BT6 is not None:
+        made = made + reckoned_BT6[:, 1:]
     off = made - camera_steps.between(before, after, width)
     measured = {
         "metres_off": jnp.linalg.norm(off[..., :3], axis=-1).mean(),
@@ -179,6 +198,9 @@ def _velocity(
     x0: Array,
     key: Array,
     dtype: Any,
+    *,
+    known: Array | None = None,
+    counted: Array | None = None,
 ) -> tuple[Array, Measured]:
     """Return the squared error at times drawn for each frame, and that of x0.
 
@@ -188,15 +210,23 @@ def _velocity(
         x0: (B, T, …) clean latents.
         key: randomness.
         dtype: of the computation.
+        known: bool, in the shape of x0 without its channels: elsewhere x_t is noise alone.
+        counted: bool, in that shape: where the error counts.
     """
     time_key, noise_key = jax.random.split(key)
     times = noises.draw(noise, time_key, *x0.shape[:2])
     times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], x0.shape[:2])
     drawn = jax.random.normal(noise_key, x0.shape)
     x_t = noises.corrupt(noise, x0, drawn, times)
+    if known is not None:
+        x_t = jnp.where(known[..., None], x_t, drawn)
     inputs, network_times = noises.shown(noise, x_t, times)
     made = predict(inputs.astype(dtype), network_times).astype(jnp.float32)
     error = jnp.square(made - noises.target(noise, x0, drawn, times))
     weight = noises.spread(noises.weight(noise, times), error.ndim)
     x0_error = jnp.square(noises.to_x0(noise, made, x_t, times) - x0)
-    return (error * weight).mean(), {"x0_error": x0_error.mean()}
+    if counted is None:
+        return (error * weight).mean(), {"x0_error": x0_error.mean()}
+    share = counted[..., None].astype(jnp.float32)
+    share = share / jnp.maximum(share.mean(), 1e-6)
+    return (error * weight * share).mean(), {"x0_error": (x0_error * share).mean()}

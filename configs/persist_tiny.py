@@ -1,0 +1,119 @@
+"""PERSIST, small: houses that move at 64×64 pixels, half an hour on two cores with its data."""
+
+from pewm_jax.config import (
+    BlocksConfig,
+    CameraModelConfig,
+    ClipConfig,
+    Config,
+    DataConfig,
+    EvalConfig,
+    FrameFlowConfig,
+    GridConfig,
+    LearnedCodecConfig,
+    ModulationConfig,
+    PersistConfig,
+    PersistNetsConfig,
+    PersistTrainConfig,
+    StageConfig,
+    VoxelDiTConfig,
+    VoxelRendererConfig,
+    VoxelVAEConfig,
+)
+
+CLASSES = 73
+"""Nine groups of kinds in eight colours, and nothing."""
+
+
+def config() -> Config:
+    """Return the settings of ``persist_tiny``.
+
+    Its data: ``pewm-jax data collect data/persist --moving --voxels --voxels.kinds groups
+    --voxels.colours 8 --voxels.cell 0.25 --voxels.side 40 --train 112 --validation 8 --test 16
+    --frames 40``. The codec of pictures is the one that comes with the library.
+    """
+    codec = LearnedCodecConfig(gate=48)
+    width = {"heads": 4, "head_dim": 40, "gates": "open"}
+    pixels = FrameFlowConfig(
+        per_frame=True, context_noise=0.1, times="uniform", sample_steps=4, shift=1.0
+    )
+    voxels = FrameFlowConfig(per_frame=True, times="uniform", sample_steps=4, shift=1.0)
+    return Config(
+        model=PersistConfig(
+            clip=ClipConfig(frames=5, height=64, width=64),
+            codec=codec,
+            backbone=PersistNetsConfig(
+                voxel_vae=VoxelVAEConfig(
+                    side=32,
+                    classes=CLASSES,
+                    patch=4,
+                    embed=16,
+                    widths=(192,),
+                    blocks=1,
+                    middle=0,
+                    kernel=1,
+                    latent_channels=24,
+                    compared=4096,
+                    occupied_weight=9.0,
+                ),
+                world_frames=VoxelDiTConfig(
+                    latent_side=8,
+                    latent_channels=24,
+                    patch=2,
+                    actions=3,
+                    pixel_channels=codec.channels + 24,
+                    pixel_patch=1,
+                    blocks=BlocksConfig(layers=4, context=4, **width),
+                ),
+                camera_model=CameraModelConfig(
+                    classes=CLASSES,
+                    inner=6,
+                    embed=8,
+                    actions=3,
+                    units=(0.05, 0.05, 0.05, 0.05, 0.05, 0.05),
+                    blocks=BlocksConfig(layers=2, heads=2, head_dim=32, context=4),
+                ),
+                renderer=VoxelRendererConfig(
+                    classes=CLASSES,
+                    height=8,
+                    width=8,
+                    latent_channels=codec.channels,
+                    rays=4,
+                    layers=6,
+                    embed=16,
+                    sides=True,
+                    kernel=2,
+                    stride=2,
+                    fold=8,
+                    patch=1,
+                    longest_m=12.0,
+                    blocks=BlocksConfig(layers=4, context=3, **width),
+                ),
+            ),
+            control=ModulationConfig(units=(0.25, 0.25, 1.0)),
+            memory=GridConfig(
+                cell_m=(0.25, 0.25, 0.25),
+                cells=(128, 128, 32),
+                recorded=40,
+                kinds="groups",
+                colours=8,
+            ),
+            noise=pixels,
+            voxel_noise=voxels,
+            hold=3.0,
+            points=True,
+            dead_reckoning=True,
+        ),
+        data=DataConfig(path="data/persist", context=8, stride_max=1, prepared=1024),
+        train=PersistTrainConfig(
+            run="runs/persist_tiny",
+            start="codec",
+            optimizer="muon",
+            voxel_vae=StageConfig(steps=700, batch=4, learning_rate=3e-3, warmup=20),
+            voxel_statistics=StageConfig(steps=60, batch=16, learning_rate=0.03, warmup=0),
+            world_frames=StageConfig(steps=700, batch=6, learning_rate=1.5e-3, warmup=30),
+            camera=StageConfig(steps=60, batch=16, learning_rate=1e-3, warmup=10),
+            renderer=StageConfig(steps=700, batch=6, learning_rate=1.5e-3, warmup=30),
+            ema=0.98,
+        ),
+        evaluate=EvalConfig(clips=24, seeds=(0,), videos=4, video_clips=8, batch=8),
+    )

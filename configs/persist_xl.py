@@ -1,0 +1,65 @@
+"""PERSIST at its published sizes: 288×512 pixels, grids of 48³ cells with 2,138 classes."""
+
+from pewm_jax.config import (
+    BlocksConfig,
+    ClipConfig,
+    Config,
+    DataConfig,
+    EvalConfig,
+    GridConfig,
+    LearnedCodecConfig,
+    ModulationConfig,
+    PersistConfig,
+    PersistNetsConfig,
+    PersistTrainConfig,
+    StageConfig,
+    VoxelDiTConfig,
+    VoxelRendererConfig,
+    VoxelVAEConfig,
+)
+
+ACTIONS = 23
+"""Numbers of an action, as published."""
+
+
+def config() -> Config:
+    """Return the published sizes with this library's codec of pictures.
+
+    The published pictures have 360×640 pixels in patches of 10; this codec's cells have 8, so that
+    288×512 pixels are the same 36×64 latents of 16 channels. ``--plan`` needs nothing.
+    """
+    blocks = BlocksConfig(remat=True)
+    return Config(
+        model=PersistConfig(
+            clip=ClipConfig(frames=16, height=288, width=512, depth=False),
+            codec=LearnedCodecConfig(),
+            backbone=PersistNetsConfig(
+                voxel_vae=VoxelVAEConfig(slab=8),
+                world_frames=VoxelDiTConfig(blocks=blocks),
+                renderer=VoxelRendererConfig(blocks=BlocksConfig(context=16, remat=True)),
+            ),
+            control=ModulationConfig(
+                actions=ACTIONS,
+                units=(1.0,) * ACTIONS,
+                low=(-1.0,) * ACTIONS,
+                high=(1.0,) * ACTIONS,
+                angles=(),
+            ),
+            memory=GridConfig(recorded=56),
+            dtype="bfloat16",
+        ),
+        data=DataConfig(path="data/persist_xl", context=8, stride_max=1),
+        train=PersistTrainConfig(
+            run="runs/persist_xl",
+            weight_decay=2e-3,
+            clip_norm=1.0,
+            ema=0.9999,
+            save_every=1000,
+            voxel_vae=StageConfig(steps=200_000, batch=64, learning_rate=1e-4, warmup=1000),
+            voxel_statistics=StageConfig(steps=200, batch=64, learning_rate=0.03, warmup=0),
+            world_frames=StageConfig(steps=400_000, batch=64, learning_rate=1e-4, warmup=1000),
+            camera=StageConfig(steps=100_000, batch=64, learning_rate=1e-4, warmup=1000),
+            renderer=StageConfig(steps=400_000, batch=64, learning_rate=1e-4, warmup=1000),
+        ),
+        evaluate=EvalConfig(),
+    )

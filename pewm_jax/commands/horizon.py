@@ -1,0 +1,130 @@
+"""``pewm-jax horizon``: hundreds of imagined frames, by one world or several beside each other."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pewm_jax import cli
+from pewm_jax.commands import imports
+
+ABOUT = (
+    "Imagine long walks through held-out houses with the recorded actions, compare them with the "
+    "truth by stretches (PSNR) and as sets of windows of 16 frames (FVD, KVD), and, of a world of "
+    "voxels, see what its renderer makes of the true ones and whether what is placed in it stays."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What is imagined and measured."""
+
+    data: Path = Path("data/persist_long")
+    """Folder of the data set; its episodes must be longer than the horizon."""
+    split: str = "revisit"
+    """Folder inside it."""
+    beside: tuple[str, ...] = ()
+    """Other worlds, runs' folders or names of models that come with the library, which go the same
+    ways."""
+    ends: tuple[int, ...] = (200, 400, 600)
+    """Frames at which windows end, and between which PSNR is averaged."""
+    walks: int = 8
+    """Walks, one of each episode."""
+    context: int = 8
+    """Observed frames before each."""
+    fvd: Literal["on", "off"] = "off"
+    """Whether FVD and KVD are measured (`pip install 'pewm-jax[metrics]'`); on processors that
+    takes longer than imagining."""
+    windows: int = 4
+    """Windows of each walk before each end."""
+    trials: int = 0
+    """Blocks that are placed in a world of voxels; 40 as published here."""
+    trial_frames: int = 64
+    """Frames that are imagined after a block was placed."""
+    out: Path | None = None
+    """Folder of the report; by default RUN/horizon."""
+
+
+def main(argv: Sequence[str], prog: str = "pewm-jax horizon") -> int:
+    """Measure, write RUN/horizon/horizon.html and print the numbers.
+
+    Args:
+        argv: the arguments: a run's folder and settings.
+        prog: the words that the command was called by, for help and refusals.
+
+    Returns:
+        The exit code.
+    """
+    argv = imports.take(argv)
+    asks = bool(argv) and argv[0] in ("-h", "--help")
+    if not asks and (not argv or argv[0].startswith("-")):
+        raise cli.ConfigError(f"Name a run folder first: {prog} runs/persist_tiny.")
+    settings = cli.parse(
+        Settings,
+        ["--help"] if asks else argv[1:],
+        default=Settings(),
+        prog=f"{prog} RUN",
+        description=f"{ABOUT} Beside these settings:\n{imports.HELP}",
+    )
+    ends = settings.ends
+    if not ends or sorted(set(ends)) != list(ends) or ends[0] < 16:
+        raise cli.ConfigError(
+            f"--ends is {ends}: name rising numbers of frames from 16 on, such as 200 400 600."
+        )
+    if min(settings.walks, settings.context, settings.windows, settings.trial_frames) < 1:
+        raise cli.ConfigError("--walks, --context, --windows and --trial-frames must be above 0.")
+    # Imported here and not above: help and refusals come at once.
+    from pewm_jax.config import PersistConfig
+    from pewm_jax.data.dataset import EpisodeSource
+    from pewm_jax.evaluation import edit_trials, horizon, horizon_page
+    from pewm_jax.evaluation.metrics.videos import read
+    from pewm_jax.evaluation.opened import open_run
+    from pewm_jax.models import i3d_weights
+
+    i3d = read(i3d_weights.find(None), "fvd") if settings.fvd == "on" else None
+    opened = open_run(argv[0])
+    others = [(name, open_run(name)) for name in settings.beside]
+    cli.cache_compilation(opened.home.parent)
+    episodes = EpisodeSource(settings.data / settings.split)
+    first = settings.context - 1
+    chosen = [episodes[k] for k in range(min(settings.walks, len(episodes)))]
+    walks = [horizon.walk_of(one, first, ends[-1], settings.context) for one in chosen]
+    import numpy as np
+
+    truth = np.stack([walk.truth_THWC for walk in walks])
+    config, params = opened.config, opened.params
+    made: dict[str, Any] = {"world": horizon.roll(config, params, walks)}
+    facts: dict[str, Any] = {}
+    if isinstance(config.model, PersistConfig):
+        made["without"] = horizon.roll(config, params, walks, memory=False, say="without voxels")
+        if all(walk.first is not None for walk in walks):
+            made["bound"] = horizon.bound(config, params, walks)
+    for name, other in others:
+        made[name] = horizon.roll(other.config, other.params, walks, say=name)
+    facts["psnr"] = {name: horizon.stretches(video, truth, ends) for name, video in made.items()}
+    if i3d is not None:
+        facts["distances"] = horizon.distances(made, truth, ends, settings.windows, i3d)
+    if settings.trials and isinstance(config.model, PersistConfig):
+        starts = range(first, chosen[0].length - settings.trial_frames - 1)
+        each = -(-settings.trials // len(chosen))
+        places = [starts[len(starts) * k // each] for k in range(each)]
+        tried = [
+            horizon.walk_of(one, at, settings.trial_frames, 1) for one in chosen for at in places
+        ][: settings.trials]
+        facts["edits"] = edit_trials.run(config, params, tried).facts()
+    facts["protocol"] = {
+        "run": argv[0],
+        "weights_sha256": opened.weights_hash,
+        "data": f"{settings.data}/{settings.split}",
+        "walks": len(walks),
+        "observed frames": settings.context,
+        "windows of each walk before each end": settings.windows,
+    }
+    page = horizon_page.write(
+        settings.out or opened.home / "horizon", facts, {"truth": truth, **made}, ends
+    )
+    print("\n".join(horizon_page.lines(facts, ends)))
+    print(f"report: {page}")
+    return 0

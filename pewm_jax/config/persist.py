@@ -1,0 +1,253 @@
+"""PERSIST: a world whose state is a grid of class ids, which a diffusion model carries on."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar, Literal
+
+from pewm_jax.config.backbone import BackboneSettings
+from pewm_jax.config.codec import CodecSettings
+from pewm_jax.config.control import ControlSettings, ModulationConfig
+from pewm_jax.config.errors import require
+from pewm_jax.config.frame_flow import PERSIST_PIXELS, PERSIST_VOXELS
+from pewm_jax.config.learned_codec import LearnedCodecConfig
+from pewm_jax.config.memory import MemorySettings
+from pewm_jax.config.model import ModelConfig
+from pewm_jax.config.noise import NoiseSettings
+from pewm_jax.config.reader import ReaderSettings, RenderConfig
+from pewm_jax.config.training import StageConfig, TrainSettings
+from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
+from pewm_jax.config.voxel_vae import VoxelVAEConfig
+
+POINT_WAVES = 4
+"""Wavelengths of the sinusoids of a place, with ``model.points``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PersistNetsConfig(BackboneSettings):
+    """The four networks of PERSIST; by default as published."""
+
+    voxel_vae: VoxelVAEConfig = VoxelVAEConfig()
+    """The autoencoder of voxels."""
+    world_frames: VoxelDiTConfig = VoxelDiTConfig()
+    """The transformer that makes the next voxel frame."""
+    camera_model: CameraModelConfig = CameraModelConfig()
+    """The transformer that says where the camera goes."""
+    renderer: VoxelRendererConfig = VoxelRendererConfig()
+    """The transformer that makes pictures of voxels."""
+
+    @property
+    def places(self) -> None:  # type: ignore[override]
+        """No memory reader runs in them: the voxels are the memory."""
+        return None
+
+    @property
+    def time_dim(self) -> int:
+        """Width of the world frames' condition."""
+        return self.world_frames.blocks.width
+
+    @property
+    def split_heads(self) -> int:  # type: ignore[override]
+        """Heads of the world frames' transformer."""
+        return self.world_frames.blocks.heads
+
+    @property
+    def remat(self) -> bool:  # type: ignore[override]
+        """Whether the backward pass recomputes activations."""
+        return self.world_frames.blocks.remat
+
+    @property
+    def token_cells(self) -> int:
+        """Cells along an axis of the grid for one token of a world frame."""
+        return self.voxel_vae.factor * self.world_frames.patch
+
+    def check(self, model: Any) -> None:
+        """Refuse networks that do not fit together."""
+        require(
+            isinstance(model, PersistConfig),
+            "backbone.kind persist is of the world persist alone: use model.kind persist.",
+        )
+        vae, frames, view = self.voxel_vae, self.world_frames, self.renderer
+        for name, found, wanted in (
+            ("world_frames.latent_side", frames.latent_side, vae.latent_side),
+            ("world_frames.latent_channels", frames.latent_channels, vae.latent_channels),
+            ("world_frames.pixel_channels", frames.pixel_channels, model.shown_channels),
+            ("world_frames.actions", frames.actions, model.control.actions),
+            ("camera_model.actions", self.camera_model.actions, model.control.actions),
+            ("camera_model.classes", self.camera_model.classes, vae.classes),
+            ("renderer.classes", view.classes, vae.classes),
+            ("renderer.latent_channels", view.latent_channels, model.picture_channels),
+            ("renderer.height", view.height, model.clip.height // model.codec.spatial),
+            ("renderer.width", view.width, model.clip.width // model.codec.spatial),
+        ):
+            require(
+                found == wanted,
+                f"backbone.{name} is {found}, and the other parts of the model ask for {wanted}: "
+                "use that.",
+            )
+        require(
+            view.actions in (0, model.control.actions),
+            f"backbone.renderer.actions is {view.actions}: use 0, or control.actions "
+            f"({model.control.actions}).",
+        )
+        require(
+            model.codec.temporal == 1,
+            f"codec.temporal is {model.codec.temporal}: this world makes frame after frame; use a "
+            "codec that encodes frames one by one, such as codec.kind learned.",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class GridConfig(MemorySettings):
+    """The state of the world: class ids of all cells that were ever near the agent.
+
+    A frame's voxels are a window of it around the agent; what leaves the window is kept.
+    """
+
+    KEEPS_FEATURES: ClassVar[bool] = False
+    READ_BY_BLOCKS: ClassVar[bool] = False
+
+    cell_m: tuple[float, float, float] = (0.2, 0.2, 0.2)
+    """Side of a cell, three times the same, metres."""
+    cells: tuple[int, int, int] = (192, 192, 48)
+    """Cells that are kept along x, y, z; along z as many as a window has."""
+    recorded: int = 64
+    """Cells along each side of the grids in the data: those of a window, and as many more as the
+    window may lie off the agent."""
+    kinds: Literal["all", "groups"] = "all"
+    """Which classes there are, as the data were collected (`--voxels.kinds`)."""
+    colours: int = 16
+    """Colours of each kind, as the data were collected (`--voxels.colours`)."""
+    eye_m: float = 1.25
+    """Height of the camera above the floor, metres: where a world begins without a known grid, the
+    floor is a border between cells."""
+    reader: ReaderSettings = RenderConfig()
+    """Nothing reads it but the networks of the world."""
+
+    def check(self, model: Any) -> None:
+        """Refuse a grid that the networks do not fit."""
+        require(
+            isinstance(model, PersistConfig),
+            "memory.kind grid is the state of the world persist: use model.kind persist.",
+        )
+        side, token = model.backbone.voxel_vae.side, model.backbone.token_cells
+        require(
+            len(set(self.cell_m)) == 1,
+            f"memory.cell_m is {self.cell_m}: cells are cubes, name the same side three times.",
+        )
+        x, y, z = self.cells
+        require(
+            min(x, y) >= side and z == side and x % token == 0 and y % token == 0,
+            f"memory.cells is {self.cells}: use multiples of {token} from {side} on along x and "
+            f"y, and {side} along z, as a window has (backbone.voxel_vae.side).",
+        )
+        require(
+            self.recorded >= side + token and (self.recorded - side) % 2 == 0,
+            f"memory.recorded is {self.recorded}: use {side + token} or more, a window and what it "
+            "may lie off the agent, by an even number more than the window.",
+        )
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(self.eye_m > 0, f"memory.eye_m is {self.eye_m}: use a height above 0 metres.")
+
+
+@dataclasses.dataclass(frozen=True)
+class PersistTrainConfig(TrainSettings):
+    """How the world learns: its networks one after the other, the codec of pictures given."""
+
+    run: str = "runs/persist"
+    """Folder of this run: checkpoints, logs, images, report."""
+    fresh: tuple[str, ...] = (r"(voxel_vae|voxel_dit|camera_model|renderer)/.*",)
+    """Parameter paths (regular expressions) that may be missing from the weights a stage starts
+    from; these parameters start at random."""
+    preview_every: int = 0
+    """Steps between sample pictures; 0 for none: a picture needs all the networks."""
+    voxel_vae: StageConfig = StageConfig()
+    """The autoencoder of voxels."""
+    voxel_statistics: StageConfig = StageConfig(steps=60, learning_rate=0.03, warmup=0)
+    """Mean and scale of the voxels' latents are fitted."""
+    world_frames: StageConfig = StageConfig()
+    """The transformer that makes the next voxel frame."""
+    camera: StageConfig = StageConfig()
+    """The transformer that says where the camera goes."""
+    renderer: StageConfig = StageConfig()
+    """The transformer that makes pictures of voxels."""
+    blind: float = 0.3
+    """Share of frames after the first that are shown no picture."""
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
+        require(
+            self.hidden == 0 and self.chained == 0,
+            f"train.hidden is {self.hidden} and train.chained {self.chained}: they are of worlds "
+            "with memory blocks; use 0 for both.",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class PersistConfig(ModelConfig):
+    """A world that is three-dimensional itself (PERSIST, arXiv 2603.03482)."""
+
+    TRAIN: ClassVar[type[TrainSettings]] = PersistTrainConfig
+
+    codec: CodecSettings = LearnedCodecConfig()
+    """Codec: pictures to latents and back."""
+    backbone: BackboneSettings = PersistNetsConfig()
+    """The four networks."""
+    control: ControlSettings = ModulationConfig()
+    """The numbers of an action; nothing else of it is used."""
+    memory: MemorySettings = GridConfig()
+    """The state of the world."""
+    noise: NoiseSettings = PERSIST_PIXELS
+    """Noise of pictures, sampler."""
+    voxel_noise: NoiseSettings = PERSIST_VOXELS
+    """Noise of voxel frames, sampler."""
+    hold: float = 0.0
+    """By how many nats another class must be likelier than the one that a cell has had, for it to
+    change; 0 as published. Small networks forget without it."""
+    points: bool = False
+    """Whether the picture that a voxel frame is shown comes with the place of its surfaces, from
+    its depth; not as published."""
+    dead_reckoning: bool = False
+    """Whether the camera model says by what a step differs from the planar action, and not the step
+    itself; not as published."""
+
+    @property
+    def picture_channels(self) -> int:
+        """Channels of a picture's latents: with those of depth, if that is imagined."""
+        return self.codec.channels if self.clip.depth else self.codec.rgb_channels
+
+    @property
+    def shown_channels(self) -> int:
+        """Channels of what a voxel frame is shown of a picture."""
+        return self.picture_channels + (6 * POINT_WAVES if self.points else 0)
+
+    def __post_init__(self):
+        """Validate."""
+        for name, kind in (("backbone", PersistNetsConfig), ("memory", GridConfig)):
+            found = getattr(self, name)
+            require(
+                isinstance(found, kind),
+                f"model.{name} is a {type(found).__name__}, and the world persist is made of a "
+                f"{kind.__name__}: use that.",
+            )
+        super().__post_init__()
+        for name in ("noise", "voxel_noise"):
+            require(
+                getattr(self, name).per_frame,
+                f"model.{name}.per_frame is false, and every frame of this world has a time of its "
+                "own: use true.",
+            )
+        require(self.hold >= 0, f"model.hold is {self.hold}: use 0 or more nats.")
+        require(
+            not (self.points and not self.clip.depth),
+            "model.points needs depth: use clip.depth true, or points false.",
+        )
+        require(
+            not self.dead_reckoning or self.control.actions == 3,
+            "model.dead_reckoning is of planar actions (dx, dy, dyaw): use control.actions 3.",
+        )

@@ -1,0 +1,357 @@
+"""The world of PERSIST: voxels that evolve, edits that stay, frames that know nothing of later."""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax import config as configuration
+from pewm_jax import presets, worlds
+from pewm_jax.config import (
+    BlocksConfig,
+    CameraModelConfig,
+    ClipConfig,
+    Config,
+    ConfigError,
+    FrameFlowConfig,
+    GridConfig,
+    ModulationConfig,
+    PersistConfig,
+    PersistNetsConfig,
+    PersistTrainConfig,
+    PixelConfig,
+    UserError,
+    VoxelDiTConfig,
+    VoxelRendererConfig,
+    VoxelVAEConfig,
+)
+from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.memory import class_edit, class_grid, memories
+from pewm_jax.models import frame_blocks
+from pewm_jax.planning import imagined_env
+from pewm_jax.types import Camera, Clip, Control, Frames
+from pewm_jax.worlds import persist, persist_stages
+from pewm_jax.worlds import persist_windows as windows
+from tests.helpers import random_frames
+
+BLOCKS = BlocksConfig(layers=1, heads=1, head_dim=8, mlp_ratio=2, context=3)
+NOISE = FrameFlowConfig(per_frame=True, sample_steps=1)
+MODEL = PersistConfig(
+    clip=ClipConfig(frames=3, height=16, width=16),
+    codec=PixelConfig(spatial=4, temporal=1),
+    backbone=PersistNetsConfig(
+        voxel_vae=VoxelVAEConfig(
+            side=8, classes=13, patch=2, embed=4, widths=(8,), blocks=1, middle=0, kernel=1,
+            latent_channels=3,
+        ),
+        world_frames=VoxelDiTConfig(
+            latent_side=4, latent_channels=3, patch=1, actions=3, pixel_channels=88,
+            pixel_patch=4, blocks=BLOCKS,
+        ),
+        camera_model=CameraModelConfig(classes=13, inner=2, embed=2, actions=3, blocks=BLOCKS),
+        renderer=VoxelRendererConfig(
+            classes=13, height=4, width=4, latent_channels=64, rays=2, layers=2, embed=4,
+            kernel=2, stride=2, fold=2, actions=3, blocks=BLOCKS,
+        ),
+    ),
+    control=ModulationConfig(),
+    memory=GridConfig(
+        cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8), recorded=12, kinds="groups", colours=1,
+        eye_m=1.25,
+    ),
+    noise=NOISE,
+    voxel_noise=NOISE,
+    hold=1.0,
+    points=True,
+    dead_reckoning=True,
+)  # fmt: skip
+CONFIG = Config(model=MODEL, train=PersistTrainConfig())
+KEY = jax.random.key(1)
+MOVES = np.array([[0.4, 0, 0], [0.4, 0, 0.3], [0.2, 0.1, -0.3]], np.float32)
+imagine = jax.jit(worlds.imagine, static_argnums=0, static_argnames=("remember", "memory"))
+begin = jax.jit(worlds.start, static_argnums=0)
+
+
+def equal(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def seen(count=1, seed=0):
+    frames = random_frames(np.random.default_rng(seed), count, 16, 16)
+    return jax.tree.map(jnp.asarray, frames)
+
+
+@pytest.fixture(scope="module")
+def params():
+    shapes = jax.eval_shape(lambda: worlds.init(MODEL, KEY))
+    rng = np.random.default_rng(0)
+
+    def draw(path, leaf):
+        low = 1.0 if jax.tree_util.keystr(path).endswith(("['scale']", "scale_C']")) else 0.0
+        return jnp.asarray(low + 0.2 * rng.normal(size=leaf.shape), jnp.float32)
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+@pytest.fixture(scope="module")
+def state(params):
+    return begin(MODEL, params, seen())
+
+
+@pytest.fixture(scope="module")
+def walked(params, state):
+    return imagine(MODEL, params, state, MOVES, KEY)
+
+
+def test_one_image_begins_a_world_whose_window_is_known(state):
+    start = state.map.history.start_3
+    inside = windows.window(MODEL, state.map.classes_XYZ, start)
+    assert (inside >= 0).all()
+    assert (state.map.classes_XYZ >= 0).sum() == inside.size
+    camera = state.frame.camera.world_from_camera[0, :3, 3]
+    off = windows.middle(MODEL, state.map.low_3, start) - camera
+    assert np.abs(off[:2]).max() <= 0.5 * MODEL.backbone.token_cells + 0.5
+    floor = (camera[2] - MODEL.memory.eye_m - state.map.low_3[2]) / 0.5
+    np.testing.assert_allclose(floor, np.round(floor), atol=1e-4)
+
+
+def test_imagined_twice_is_the_same_and_goes_on_as_in_one_go(params, state, walked):
+    equal(imagine(MODEL, params, state, MOVES, KEY), walked)
+    after, frames = walked
+    assert frames.rgb_THWC.shape == (3, 16, 16, 3)
+    assert np.isfinite(frames.depth_THW).all()
+    equal(after.frame, jax.tree.map(lambda x: x[-1:], frames))
+    assert int(after.map.history.voxels.count) == 3
+    assert int(after.map.history.pictures.count) == 4
+
+
+def test_no_frame_depends_on_later_actions(params, state):
+    @jax.jit
+    def slopes(moves):
+        def total(moves):
+            frames = worlds.imagine(MODEL, params, state, moves, KEY)[1]
+            return frames.rgb_THWC.sum((1, 2, 3)), frames.camera.world_from_camera.sum((1, 2))
+
+        return jax.jacrev(total)(moves)
+
+    for slope in slopes(jnp.asarray(MOVES)):
+        found = np.abs(slope).sum(-1)  # (frame, action)
+        assert not np.triu(found, 1).any()
+        assert (np.diag(found) > 0).all()
+    other = MOVES.copy()
+    other[2] = [0.1, -0.2, 0.5]
+    one, two = (imagine(MODEL, params, state, m, KEY)[1] for m in (MOVES, other))
+    equal(one.rgb_THWC[:2], two.rgb_THWC[:2])
+    assert np.any(one.rgb_THWC[2] != two.rgb_THWC[2])
+
+
+def test_the_camera_model_steers_and_given_cameras_are_kept(params, state, walked):
+    poses = action_geometry.integrate(state.frame.camera.world_from_camera[0], MOVES)[1:]
+    made = walked[1].camera.world_from_camera
+    assert not np.allclose(made, poses, atol=1e-3)
+    intrinsics = np.repeat(state.frame.camera.intrinsics_4, 3, 0)
+    _, frames = imagine(MODEL, params, state, Camera(intrinsics, poses), KEY)
+    np.testing.assert_array_equal(frames.camera.world_from_camera, poses)
+    silent = {**params, "camera_model": jax.tree.map(jnp.zeros_like, params["camera_model"])}
+    _, straight = imagine(MODEL, silent, state, MOVES, KEY)
+    np.testing.assert_allclose(straight.camera.world_from_camera, poses, atol=1e-5)
+
+
+def test_an_edit_is_the_world_that_goes_on(params, state):
+    still = dataclasses.replace(MODEL, hold=1e6)
+    here = np.asarray(state.frame.camera.world_from_camera[0, :3, 3])
+    reach = np.array([1, 1, 0.6], np.float32)
+    box = np.stack([here - reach, here + reach])
+    edited = persist.edit(state, class_edit.place, MODEL.memory, box, 5)
+    inside = np.asarray(edited.map.classes_XYZ) == 5
+    assert inside.sum() >= 16
+    after, frames = imagine(still, params, edited, MOVES, KEY)
+    np.testing.assert_array_equal((np.asarray(after.map.classes_XYZ) == 5)[inside], True)
+    _, without = imagine(still, params, state, MOVES, KEY)
+    assert np.abs(frames.rgb_THWC - without.rgb_THWC).max() > 1e-4
+    gone = persist.edit(after, class_edit.erase, MODEL.memory, box)
+    assert not (np.asarray(gone.map.classes_XYZ)[inside]).any()
+
+
+def test_boxes_are_moved_and_copied_by_the_calls_of_the_voxel_map(state):
+    here = np.round(np.asarray(state.map.low_3), 4)
+    box = np.stack([here + 2.0, here + 3.0]).astype(np.float32)
+    blank = dataclasses.replace(state.map, classes_XYZ=jnp.zeros((24, 24, 8), jnp.int16))
+    placed = class_edit.place(MODEL.memory, blank, box, 7)
+    assert (placed.classes_XYZ == 7).sum() == 8
+    shift = np.eye(4, dtype=np.float32)
+    shift[:3, 3] = 0.5, 1.0, -0.5
+    moved = memories.move(MODEL, placed, box, shift)
+    copied = memories.move(MODEL, placed, box, shift, leave=True)
+    assert [(x.classes_XYZ == 7).sum() for x in (moved, copied)] == [8, 16]
+    np.testing.assert_array_equal(moved.classes_XYZ[5:7, 6:8, 3:5], 7)
+    assert moved.history is not None
+    points, colours, there = memories.to_points(MODEL, memories.erase(MODEL, placed, box))
+    assert not there.any()
+    assert points.shape == colours.shape == (24 * 24 * 8, 3)
+    with pytest.raises(UserError, match="no class 'sofa'"):
+        class_grid.number_of(MODEL.memory, "sofa")
+    assert class_grid.names(MODEL.memory)[class_grid.number_of(MODEL.memory, "door")] == "door"
+    with pytest.raises(UserError, match="takes in no pictures"):
+        class_grid.remember(MODEL, blank, None, None)
+
+
+def test_windows_move_by_tokens_and_what_leaves_is_kept(params, walked, state):
+    far = np.repeat(np.array([[1.0, 0, 0]], np.float32), 3, 0)
+    before = state.map
+    after, _ = imagine(dataclasses.replace(MODEL, hold=1e6), params, state, far, KEY)
+    moved = after.map.history.start_3 - before.history.start_3
+    assert np.any(moved)
+    assert not np.any(moved % MODEL.backbone.token_cells)
+    known = np.asarray(before.classes_XYZ) >= 0
+    np.testing.assert_array_equal(after.map.classes_XYZ[known], before.classes_XYZ[known])
+    assert (after.map.classes_XYZ >= 0).sum() > known.sum()
+    shape = (1, 1, 2, 64, 1, 1)
+    tokens = jnp.arange(128.0).reshape(shape) + 1
+    cache = frame_blocks.FrameCache(tokens, tokens, jnp.int32(2))
+    turned = windows.moved(MODEL, cache, jnp.array([2, 0, 0]), jnp.array([4, 0, 0]))
+    grid, new = (x.reshape(2, 4, 4, 4) for x in (tokens, turned.keys_LBSNKd))
+    np.testing.assert_array_equal(new[:, :3], grid[:, 1:])
+    assert not new[:, 3].any()
+
+
+def test_known_grids_are_begun_in_and_rendered(params):
+    frames = seen()
+    rng = np.random.default_rng(5)
+    place = np.asarray(frames.camera.world_from_camera[0, :3, 3])
+    origin = (place - [3, 3, 3.25]).astype(np.float32)
+    classes = rng.integers(0, 13, (12, 12, 12)).astype(np.uint8)
+    begun = persist.start_in(MODEL, params, frames, classes, origin)
+    inside = windows.window(MODEL, begun.map.classes_XYZ, begun.map.history.start_3)
+    off = np.round((begun.map.low_3 - origin) / 0.5).astype(int) + begun.map.history.start_3
+    x, y, z = off
+    np.testing.assert_array_equal(inside, classes[x : x + 8, y : y + 8, z : z + 8])
+    poses = action_geometry.integrate(frames.camera.world_from_camera[0], MOVES[:1])[1:]
+    camera = Camera(frames.camera.intrinsics_4, poses)
+    other = rng.integers(0, 13, (1, 12, 12, 12))
+    pictures = [
+        persist.render_true(MODEL, params, begun, camera, grid, origin[None], KEY)[1].rgb_THWC
+        for grid in (other, classes[None])
+    ]
+    assert np.abs(pictures[0] - pictures[1]).max() > 1e-4
+    with pytest.raises(UserError, match="class ids and the"):
+        persist.start_in(MODEL, params, frames, classes[0], origin)
+
+
+def test_without_its_memory_it_begins_anew_and_the_state_is_left(params, walked):
+    after, _ = walked
+    kept, frames = imagine(MODEL, params, after, MOVES, KEY, memory=False)
+    equal(kept.map, after.map)
+    anew = begin(MODEL, params, after.frame)
+    _, same = imagine(MODEL, params, anew, MOVES, KEY)
+    np.testing.assert_allclose(frames.rgb_THWC, same.rgb_THWC, atol=1e-4)
+
+
+def test_real_frames_carry_it_on_and_it_is_an_environment(params):
+    frames = seen(3, 2)
+    whole = begin(MODEL, params, frames)
+    equal(whole.frame, jax.tree.map(lambda x: x[-1:], worlds.pewm.as_signal(frames)))
+    assert int(whole.map.history.pictures.count) == 3
+    env = imagined_env.WorldModelEnv(CONFIG, params, render_mode="rgb_array")
+    first, _ = env.reset(seed=0, options={"frames": frames, "goal": seen(1, 3)})
+    after, *_ = env.step(1)
+    assert after in env.observation_space
+    assert not np.array_equal(after["rgb"], first["rgb"])
+
+
+def recorded(count=2):
+    """Return a batch of clips with voxels, as the loader gives it."""
+    rng = np.random.default_rng(0)
+    moves = np.tile(MOVES[:2], (count, 1, 1))
+    frames = jax.tree.map(lambda x: np.stack([x] * count), random_frames(rng, 3, 16, 16))
+    poses = np.stack([action_geometry.integrate(p[0], m) for p, m in
+                      zip(frames.camera.world_from_camera, moves, strict=True)])  # fmt: skip
+    frames = Frames(
+        frames.rgb_THWC, frames.depth_THW, Camera(frames.camera.intrinsics_4, np.asarray(poses))
+    )
+    place = poses[..., :3, 3]
+    origin = (np.floor(place / 0.5) - 6) * 0.5
+    classes = rng.integers(0, 13, (count, 3, 12, 12, 12)).astype(np.uint8)
+    context = jax.tree.map(lambda x: x[:, :1], frames)
+    return Clip(
+        frames, context, np.ones((count, 1), bool), None, moves, classes, origin.astype(np.float32)
+    )
+
+
+@pytest.mark.parametrize("stage", worlds.stages(MODEL), ids=lambda stage: stage.name)
+def test_a_stage_learns_what_it_names_and_prepared_is_the_same(params, stage):
+    shapes = jax.eval_shape(lambda: stage.init(MODEL, KEY))
+    own = {name: params[name] for name in shapes}
+    assert jax.tree.map(jnp.shape, own) == jax.tree.map(lambda x: x.shape, shapes)
+    clip = recorded()
+
+    @jax.jit
+    def slopes(params, clip):
+        return jax.value_and_grad(
+            lambda p: stage.loss(MODEL, CONFIG.train, p, clip, KEY), has_aux=True
+        )(params)
+
+    (loss, _), found = slopes(own, clip)
+    assert np.isfinite(loss)
+    labels = stage.labels(own)
+    moves = jax.tree.map(lambda g, label: bool(np.any(g)) and label == "train", found, labels)
+    assert any(jax.tree.leaves(moves))
+    prepared = jax.jit(stage.prepare, static_argnums=0)(MODEL, own, clip)
+    (again, _), _ = slopes(own, prepared)
+    np.testing.assert_allclose(again, loss, rtol=2e-3)
+
+
+def test_windows_of_recorded_grids_are_those_of_a_rollout():
+    clip = recorded(1)
+    places = np.arange(12**3).reshape(12, 12, 12)
+    clip = dataclasses.replace(clip, classes_TXYZ=np.broadcast_to(places, (1, 3, 12, 12, 12)))
+    found, start = persist_stages.lattice(MODEL, clip)
+    grids = persist_stages.cut(MODEL, clip, start, found)
+    for frame in range(3):
+        x, y, z = np.asarray(start - found)[0, frame]
+        np.testing.assert_array_equal(
+            grids[0, frame], places[x : x + 8, y : y + 8, z : z + 8].astype(np.int16)
+        )
+    agent = np.floor((clip.frames.camera.world_from_camera[0, :, :3, 3] - clip.origin_T3[0]) / 0.5)
+    off = agent + np.asarray(found)[0] - np.asarray(start)[0]
+    assert np.abs(off[:, :2] - 4).max() <= MODEL.backbone.token_cells
+    with pytest.raises(UserError, match=re.escape("--voxels.side 12")):
+        persist_stages.lattice(MODEL, dataclasses.replace(clip, classes_TXYZ=None))
+
+
+def test_its_settings_travel_and_what_cannot_work_is_refused():
+    assert configuration.from_dict(Config, configuration.to_dict(CONFIG)) == CONFIG
+    tiny = presets.load("persist_tiny")
+    assert configuration.from_dict(Config, configuration.to_dict(tiny)) == tiny
+    for changes, says in (
+        ({"hold": -1.0}, "use 0 or more nats"),
+        ({"memory": configuration.VoxelConfig()}, "made of a GridConfig"),
+        ({"codec": PixelConfig(spatial=2, temporal=1)}, "pixel_channels is 88"),
+        ({"noise": dataclasses.replace(NOISE, per_frame=False)}, "per_frame is false"),
+        ({"memory": dataclasses.replace(MODEL.memory, recorded=8)}, "memory.recorded is 8"),
+        ({"memory": dataclasses.replace(MODEL.memory, cells=(24, 24, 10))}, "along z"),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(says)):
+            dataclasses.replace(MODEL, **changes)
+    with pytest.raises(UserError, match="colours"):
+        worlds.start(MODEL, {}, random_frames(np.random.default_rng(0), 2))
+
+
+def test_the_published_sizes_are_those_of_the_preset():
+    model = presets.load("persist_xl").model
+    shapes = jax.eval_shape(lambda: worlds.init(model, KEY))
+    wanted = {"voxel_vae": 138e6, "voxel_dit": 686e6, "camera_model": 234e6, "renderer": 460e6}
+    for name, count in wanted.items():
+        found = sum(int(np.prod(x.shape)) for x in jax.tree.leaves(shapes[name]))
+        assert abs(found / count - 1) < 0.005, name
+
+
+def test_a_control_of_nothing_known_is_refused(params, state):
+    with pytest.raises(UserError, match="no actions"):
+        worlds.imagine(MODEL, params, state, np.zeros((0, 3), np.float32), KEY)
+    control = Control(state.frame.camera, np.zeros((1, 5), np.float32))
+    with pytest.raises(UserError, match="takes 3"):
+        worlds.imagine(MODEL, params, state, control, KEY)
