@@ -6,6 +6,8 @@ They are a backbone in that a model names their settings there; each runs by fun
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 from jax.sharding import PartitionSpec as P
 
@@ -28,7 +30,7 @@ NETWORKS = ("voxel_vae", "voxel_dit", "camera_model", "renderer")
 
 def init(config: PersistNetsConfig, key: Array, networks: tuple[str, ...] = NETWORKS) -> Params:
     """Return random parameters of some of the networks, under their names."""
-    makers = {
+    makers: dict[str, Any] = {
         "voxel_vae": (voxel_vae, config.voxel_vae),
         "voxel_dit": (voxel_dit, config.world_frames),
         "camera_model": (camera_model, config.camera_model),
