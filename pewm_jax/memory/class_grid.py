@@ -15,8 +15,9 @@ import numpy as np
 
 from pewm_jax.config import GridConfig, ModelConfig, UserError
 from pewm_jax.data.voxel_classes import VoxelsConfig, table_colours
+from pewm_jax.geometry import march
 from pewm_jax.memory import class_edit
-from pewm_jax.types import Array, Camera, Frames
+from pewm_jax.types import Array, Camera, Frames, View
 
 UNKNOWN = class_edit.UNKNOWN
 
@@ -79,6 +80,26 @@ def to_points(model: ModelConfig, grid: ClassGrid) -> tuple[Array, Array, Array]
     ids = grid.classes_XYZ.reshape(-1).astype(jnp.int32)
     table = table_colours(names(model.memory)).astype(np.float32) / 127.5 - 1
     return points, jnp.asarray(table)[jnp.maximum(ids, 0)], ids > 0
+
+
+def render(model: ModelConfig, grid: ClassGrid, camera: Camera, height: int, width: int) -> View:
+    """Return what cameras see of the cells in the colours of their classes, by rays.
+
+    Args:
+        model: the model.
+        grid: the grid.
+        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
+        height: of the images, pixels.
+        width: of the images, pixels.
+    """
+    assert isinstance(model.memory, GridConfig)
+    ids = jnp.maximum(grid.classes_XYZ, 0).astype(jnp.int32)
+    cell = model.memory.cell_m[0]
+    seen = march.through_pixels(ids, grid.low_3, cell, camera, height, width, 1)
+    table = table_colours(names(model.memory)).astype(np.float32) / 127.5 - 1
+    there = seen.ids_L[..., 0] > 0
+    colours = jnp.where(there[..., None], jnp.asarray(table)[seen.ids_L[..., 0]], 0)
+    return View(colours, seen.distance_L[..., 0], there)
 
 
 def erase(model: ModelConfig, grid: ClassGrid, box_23: Array) -> ClassGrid:
