@@ -34,7 +34,7 @@ def config() -> Config:
             clip=ClipConfig(frames=16, height=288, width=512, depth=False),
             codec=LearnedCodecConfig(),
             backbone=PersistNetsConfig(
-                voxel_vae=VoxelVAEConfig(slab=8),
+                voxel_vae=VoxelVAEConfig(slab=8, convolution="xla"),
                 world_frames=VoxelDiTConfig(blocks=blocks),
                 renderer=VoxelRendererConfig(blocks=BlocksConfig(context=16, remat=True)),
             ),

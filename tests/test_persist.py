@@ -31,10 +31,9 @@ from pewm_jax.config import (
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import class_edit, class_grid, memories
 from pewm_jax.models import frame_blocks
-from pewm_jax.models.signals import as_signal
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Clip, Control, Frames
-from pewm_jax.worlds import persist, persist_stages
+from pewm_jax.worlds import persist, persist_stages, persist_step
 from pewm_jax.worlds import persist_windows as windows
 from tests.helpers import random_frames
 
@@ -65,7 +64,7 @@ MODEL = PersistConfig(
     ),
     noise=NOISE,
     voxel_noise=NOISE,
-    hold=1.0,
+    hold=1e6,
     points=True,
     dead_reckoning=True,
 )  # fmt: skip
@@ -131,17 +130,18 @@ def test_imagined_twice_is_the_same_and_goes_on_as_in_one_go(params, state, walk
 
 def test_no_frame_depends_on_later_actions(params, state):
     @jax.jit
-    def slopes(moves):
+    def slope(moves):
         def total(moves):
             frames = worlds.imagine(MODEL, params, state, moves, KEY)[1]
-            return frames.rgb_THWC.sum((1, 2, 3)), frames.camera.world_from_camera.sum((1, 2))
+            return (frames.rgb_THWC[:2] ** 2).sum() + (
+                frames.camera.world_from_camera[:2] ** 2
+            ).sum()
 
-        return jax.jacrev(total)(moves)
+        return jax.grad(total)(moves)
 
-    for slope in slopes(jnp.asarray(MOVES)):
-        found = np.abs(slope).sum(-1)  # (frame, action)
-        assert not np.triu(found, 1).any()
-        assert (np.diag(found) > 0).all()
+    found = np.abs(slope(jnp.asarray(MOVES))).sum(-1)
+    assert (found[:2] > 0).all()
+    assert found[2] == 0
     other = MOVES.copy()
     other[2] = [0.1, -0.2, 0.5]
     one, two = (imagine(MODEL, params, state, m, KEY)[1] for m in (MOVES, other))
@@ -149,29 +149,39 @@ def test_no_frame_depends_on_later_actions(params, state):
     assert np.any(one.rgb_THWC[2] != two.rgb_THWC[2])
 
 
-def test_the_camera_model_steers_and_given_cameras_are_kept(params, state, walked):
+def test_the_camera_model_steers(params, state, walked):
     poses = action_geometry.integrate(state.frame.camera.world_from_camera[0], MOVES)[1:]
     made = walked[1].camera.world_from_camera
     assert not np.allclose(made, poses, atol=1e-3)
-    intrinsics = np.repeat(state.frame.camera.intrinsics_4, 3, 0)
-    _, frames = imagine(MODEL, params, state, Camera(intrinsics, poses), KEY)
-    np.testing.assert_array_equal(frames.camera.world_from_camera, poses)
     silent = {**params, "camera_model": jax.tree.map(jnp.zeros_like, params["camera_model"])}
     _, straight = imagine(MODEL, silent, state, MOVES, KEY)
     np.testing.assert_allclose(straight.camera.world_from_camera, poses, atol=1e-5)
 
 
+def test_a_cell_changes_only_where_another_class_is_likelier_by_what_is_held(params):
+    latents = jnp.asarray(np.random.default_rng(3).normal(size=(1, 4, 4, 4, 3)), jnp.float32)
+    nothing = jnp.full((8, 8, 8), -1, jnp.int16)
+    free, firm = (dataclasses.replace(MODEL, hold=hold) for hold in (0.0, 0.5))
+    held = jax.jit(persist_step.held, static_argnums=0)
+    made = held(free, params, latents, nothing)
+    np.testing.assert_array_equal(held(firm, params, latents, nothing), made)
+    before = jnp.full((8, 8, 8), 3, jnp.int16)
+    kept = held(firm, params, latents, before)
+    assert ((kept == made) | (kept == 3)).all()
+    assert (kept == 3).sum() > (made == 3).sum()
+    np.testing.assert_array_equal(held(MODEL, params, latents, before), before)
+
+
 def test_an_edit_is_the_world_that_goes_on(params, state):
-    still = dataclasses.replace(MODEL, hold=1e6)
     here = np.asarray(state.frame.camera.world_from_camera[0, :3, 3])
     reach = np.array([1, 1, 0.6], np.float32)
     box = np.stack([here - reach, here + reach])
     edited = persist.edit(state, class_edit.place, MODEL.memory, box, 5)
     inside = np.asarray(edited.map.classes_XYZ) == 5
     assert inside.sum() >= 16
-    after, frames = imagine(still, params, edited, MOVES, KEY)
+    after, frames = imagine(MODEL, params, edited, MOVES, KEY)
     np.testing.assert_array_equal((np.asarray(after.map.classes_XYZ) == 5)[inside], True)
-    _, without = imagine(still, params, state, MOVES, KEY)
+    _, without = imagine(MODEL, params, state, MOVES, KEY)
     assert np.abs(frames.rgb_THWC - without.rgb_THWC).max() > 1e-4
     gone = persist.edit(after, class_edit.erase, MODEL.memory, box)
     assert not (np.asarray(gone.map.classes_XYZ)[inside]).any()
@@ -192,7 +202,8 @@ def test_boxes_are_moved_and_copied_by_the_calls_of_the_voxel_map(state):
     assert moved.history is not None
     frames = seen()
     above = np.array(frames.camera.world_from_camera)
-    above[0, :3, 3], above[0, :3, :3] = here + [2.5, 2.5, 3.9], np.diag([1, -1, -1])  # looks down
+    above[0, :3, 3] = here + np.array([2.5, 2.5, 3.9])
+    above[0, :3, :3] = np.diag([1, -1, -1])  # looks down
     view = memories.render(MODEL, placed, Camera(frames.camera.intrinsics_4, above), 16, 16)
     assert view.seen_THW[0, 8, 8]
     assert not view.seen_THW[0, 0, 0]
@@ -210,7 +221,7 @@ def test_boxes_are_moved_and_copied_by_the_calls_of_the_voxel_map(state):
 def test_windows_move_by_tokens_and_what_leaves_is_kept(params, walked, state):
     far = np.repeat(np.array([[1.0, 0, 0]], np.float32), 3, 0)
     before = state.map
-    after, _ = imagine(dataclasses.replace(MODEL, hold=1e6), params, state, far, KEY)
+    after, _ = imagine(MODEL, params, state, far, KEY)
     moved = after.map.history.start_3 - before.history.start_3
     assert np.any(moved)
     assert not np.any(moved % MODEL.backbone.token_cells)
@@ -241,11 +252,12 @@ def test_known_grids_are_begun_in_and_rendered(params):
     camera = Camera(frames.camera.intrinsics_4, poses)
     other = rng.integers(0, 13, (1, 12, 12, 12))
     render = jax.jit(persist.render_true, static_argnums=0)
-    pictures = [
-        render(MODEL, params, begun, camera, grid, origin[None], KEY)[1].rgb_THWC
+    one, two = (
+        render(MODEL, params, begun, camera, grid, origin[None], KEY)[1]
         for grid in (other, classes[None].astype(int))
-    ]
-    assert np.abs(pictures[0] - pictures[1]).max() > 1e-4
+    )
+    assert np.abs(one.rgb_THWC - two.rgb_THWC).max() > 1e-4
+    np.testing.assert_array_equal(one.camera.world_from_camera, poses)
     with pytest.raises(UserError, match="class ids and the"):
         persist.start_in(MODEL, params, frames, classes[0], origin)
 
@@ -259,17 +271,9 @@ def test_without_its_memory_it_begins_anew_and_the_state_is_left(params, walked)
     np.testing.assert_allclose(frames.rgb_THWC, same.rgb_THWC, atol=1e-4)
 
 
-def test_real_frames_carry_it_on(params):
-    frames = seen(3, 2)
-    whole = begin(MODEL, params, frames)
-    equal(whole.frame, jax.tree.map(lambda x: x[-1:], as_signal(frames)))
-    assert int(whole.map.history.pictures.count) == 3
-    assert int(whole.map.history.voxels.count) == 2
-
-
 def test_it_is_an_environment(params):
     env = imagined_env.WorldModelEnv(CONFIG, params, render_mode="rgb_array")
-    first, _ = env.reset(seed=0, options={"frames": seen(1, 2), "goal": seen(1, 3)})
+    first, _ = env.reset(seed=0, options={"frames": seen(3, 2), "goal": seen(1, 3)})
     after, *_ = env.step(1)
     assert after in env.observation_space
     assert not np.array_equal(after["rgb"], first["rgb"])

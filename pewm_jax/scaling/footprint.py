@@ -226,9 +226,14 @@ def share_of(
 
 
 def clip_bytes(config: Config, stage: Stage) -> float:
-    """Return the bytes of one clip of a batch: 8-bit colours, 32-bit depth, cached features."""
+    """Return the bytes of one clip of a batch.
+
+    That is 8-bit colours, 32-bit depth, cached features, 16-bit class ids of recorded grids.
+    """
     clip, context = config.model.clip, config.data.context
     pixels = (clip.frames + context) * clip.height * clip.width * (3 + FLOAT)
+    cells = getattr(getattr(config.model, "memory", None), "recorded", 0) ** 3
+    pixels += 2 * clip.frames * cells
     if not (config.data.features and stage.memory):
         return pixels
     encoder = config.model.memory.encoder

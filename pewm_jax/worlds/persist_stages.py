@@ -41,8 +41,6 @@ GRIDS = 2
 STATISTICS = r"voxel_vae/latent_(mean|scale)_C"
 SMALL = 1e-4
 """The least scale of a latent."""
-QUIET = -6.0
-"""Log variance with which the autoencoder's latents begin; from 0 on, it learns slowly at first."""
 
 
 def init(model: PersistConfig, key: Array, networks: int = len(persist_nets.NETWORKS)) -> Params:
@@ -50,10 +48,7 @@ def init(model: PersistConfig, key: Array, networks: int = len(persist_nets.NETW
     codec_key, key = jax.random.split(key)
     names = persist_nets.NETWORKS[:networks]
     made = {"codec": functions_of(model.codec).init(model.codec, codec_key)}
-    made |= persist_nets.init(model.backbone, key, names)  # type: ignore[arg-type]
-    out = made["voxel_vae"]["encoder"]["out"]
-    out["bias"] = out["bias"].at[len(out["bias"]) // 2 :].set(QUIET)
-    return made
+    return made | persist_nets.init(model.backbone, key, names)  # type: ignore[arg-type]
 
 
 def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
