@@ -71,7 +71,9 @@ def main(settings: Settings) -> None:
     ahead = np.array([STEP_M, 0, 0], np.float32)
     grown = jax.jit(worlds.start, static_argnums=0)(model, params, frames)
     true = jax.jit(persist.start_in, static_argnums=0)(model, params, frames, *known)
-    after, made = imagine(model, params, grown, np.tile(turn, (12, 1)), jax.random.key(0))
+    still = np.zeros(3, np.float32)
+    around = np.stack([*[turn] * 12, *[still] * 5])  # as long as the way below: compiled once
+    after, made = imagine(model, params, grown, around, jax.random.key(0))
     shown = [0, *range(1, 12, 2)]
     cameras = [frames.camera if t == 0 else _at(made.camera, t - 1) for t in shown]
     first = frames.rgb_THWC[0]
@@ -91,7 +93,6 @@ def main(settings: Settings) -> None:
         return
     number = class_grid.number_of(model.memory, "furniture/red")
     edited = persist.edit(true, class_edit.place, model.memory, box, number)
-    still = np.zeros(3, np.float32)
     way = np.stack([still, *[turn] * 6, ahead, ahead, *[turn] * 6, ahead, ahead])
     after, made = imagine(model, params, edited, way, jax.random.key(1))
     _, plain = imagine(model, params, true, way, jax.random.key(1))

@@ -225,6 +225,7 @@ COMMANDS = {
     "play": ("pewm-jax play", ["-m", "pewm_jax", "play"]),
     "table2": ("pewm-jax table2", ["-m", "pewm_jax", "table2"]),
     "practice": ("pewm-jax practice", ["-m", "pewm_jax", "practice"]),
+    "horizon": ("pewm-jax horizon", ["-m", "pewm_jax", "horizon"]),
     "table1": ("pewm-jax table1", ["-m", "pewm_jax", "table1"]),
 }
 """Each subcommand: the words it is called by without ``pewm-jax``, and how to call it so."""

@@ -67,7 +67,7 @@ def start(model: PersistConfig, params: Params, frames: Frames) -> WorldState:
     on, seen as it really was.
     """
     pewm.require_frames(model, frames, "start")
-    frames = jax.tree.map(jnp.asarray, as_signal(frames))
+    params, frames = _arrays(params, as_signal(frames))
     grid = class_grid.empty(model, frames.camera.world_from_camera[0, :3, 3])
     return _started(model, params, grid, frames)
 
@@ -94,7 +94,7 @@ def start_in(
             f"start_in() got cells of shape {jnp.shape(classes_XYZ)} from {jnp.shape(origin_3)}: "
             "give (n, n, n) class ids and the (3,) lowest corner in metres."
         )
-    frames = jax.tree.map(jnp.asarray, as_signal(frames))
+    params, frames = _arrays(params, as_signal(frames))
     empty = class_grid.empty(model, frames.camera.world_from_camera[0, :3, 3])
     size, origin = windows.cell_m(model), jnp.asarray(origin_3, jnp.float32)
     # The world's cells are laid where the given ones are, and their heights where those are.
@@ -108,7 +108,7 @@ def start_in(
 def observe(model: PersistConfig, params: Params, state: WorldState, frames: Frames) -> WorldState:
     """Take in real frames; see ``worlds.observe``."""
     pewm.require_frames(model, frames, "observe")
-    frames = jax.tree.map(jnp.asarray, as_signal(frames))
+    params, frames = _arrays(params, as_signal(frames))
     return _observed(model, params, past_of(model, params, state), frames)
 
 
@@ -127,6 +127,7 @@ def imagine(
     Without ``memory`` the voxels are generated anew from the present picture, and what is in the
     state is left as it is.
     """
+    params = _arrays(params)[0]
     asked, steered = _asked(model, state.frame.camera, control)
     begun = state if memory else start(model, params, state.frame)
     past = past_of(model, params, begun)
@@ -184,6 +185,7 @@ def render_true(
         origin_T3: (n, 3) their lowest corners, metres.
         key: randomness.
     """
+    params = _arrays(params)[0]
     asked, _ = _asked(model, state.frame.camera, control)
     past = past_of(model, params, state)
     size, low = windows.cell_m(model), state.map.low_3
@@ -209,6 +211,11 @@ def past_of(model: PersistConfig, params: Params, state: WorldState) -> Past:
     latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
     camera = jax.tree.map(lambda x: x[0], frame.camera)
     return Past(state.map, windows.shown_of(latents, frame.depth_THW[0], camera))
+
+
+def _arrays(*trees: Any) -> Any:
+    """Return trees of JAX arrays: weights as they are loaded are NumPy's, which are no tables."""
+    return jax.tree.map(jnp.asarray, trees)
 
 
 def _started(model: PersistConfig, params: Params, grid: ClassGrid, frames: Frames) -> WorldState:
