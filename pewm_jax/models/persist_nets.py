@@ -36,5 +36,5 @@ def init(config: PersistNetsConfig, key: Array, networks: tuple[str, ...] = NETW
         "camera_model": (camera_model, config.camera_model),
         "renderer": (voxel_renderer, config.renderer),
     }
-    keys = dict(zip(NETWORKS, jax.random.split(key, len(NETWORKS)), strict=True))
+    keys: dict[str, Array] = dict(zip(NETWORKS, jax.random.split(key, len(NETWORKS)), strict=True))
     return {name: makers[name][0].init(makers[name][1], keys[name]) for name in networks}
