@@ -93,7 +93,10 @@ def test_it_follows_as_the_reference_does(folder):
         network(inference_session=session, frame_idx=0)
         wanted = [
             torch.nn.functional.interpolate(
-                each.pred_masks, size=(SIDE, SIDE), mode="bilinear", align_corners=False
+                torch.as_tensor(each.pred_masks),
+                size=(SIDE, SIDE),
+                mode="bilinear",
+                align_corners=False,
             )[:, 0].numpy()
             for each in network.propagate_in_video_iterator(session)
         ]
