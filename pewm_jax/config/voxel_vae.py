@@ -30,6 +30,10 @@ class VoxelVAEConfig:
     kernel: int = 3
     """Places along an axis under a kernel of the levels' residual blocks: 3, or 1 for blocks that
     see one place each."""
+    middle_kernel: int = 3
+    """Places along an axis under a kernel next to the latents: of the blocks in the middle, of the
+    encoder's last convolution and of the decoder's first. With 1 here and in ``kernel``, and one
+    level, a latent tells of its own patch alone."""
     latent_channels: int = 48
     """Channels of a latent."""
     kl: float = 1e-6
@@ -84,7 +88,9 @@ class VoxelVAEConfig:
             f"voxel_vae.embed is {self.embed}: with voxel_vae.patch 1 use the first of voxel_vae."
             f"widths ({widths[0]}).",
         )
-        require(self.kernel in (1, 3), f"voxel_vae.kernel is {self.kernel}: use 1 or 3.")
+        for name in ("kernel", "middle_kernel"):
+            value = getattr(self, name)
+            require(value in (1, 3), f"voxel_vae.{name} is {value}: use 1 or 3.")
         require(
             self.kl >= 0 and self.occupied_weight > 0,
             "voxel_vae.kl must be 0 or more, and voxel_vae.occupied_weight above 0.",

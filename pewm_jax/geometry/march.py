@@ -13,12 +13,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pewm_jax.config import UserError
 from pewm_jax.types import Array, Camera
 
 SIDES, SHIFT, INSIDE = 4, 2, 3
 """Ways into a cell, and their bits: by one of three axes, or by beginning there."""
 EMPTY = 0
 """The class id of a cell with nothing in it."""
+CHUNK = 4096
+"""Rays at a time: what is known of them stays in a processor's cache."""
+ROUND = 32
+"""Cells of a ray that are looked up at a time: the bits of a word."""
 
 
 @jax.tree_util.register_dataclass
@@ -59,54 +64,188 @@ def march(
     Returns:
         (R, L).
     """
-    shape, rays = ids_XYZ.shape, len(origins_R3)
-    flat = ids_XYZ.astype(jnp.int32).reshape(-1)
+    _require_bits(ids_XYZ.shape)
+    rays = len(origins_R3)
     start, way = (origins_R3 - low_3).T / cell_m, directions_R3.T / cell_m  # (3, R) each
+    flat = jnp.asarray(ids_XYZ).reshape(-1)
+    if rays <= CHUNK:
+        return _chunk(flat, ids_XYZ.shape, start, way, layers)
+    more = -rays % CHUNK
+    parts = [
+        jnp.pad(x, ((0, 0), (0, more)), "edge").reshape(3, -1, CHUNK).swapaxes(0, 1)
+        for x in (start, way)
+    ]
+    made = jax.lax.map(
+        lambda part: _chunk(flat, ids_XYZ.shape, part[0], part[1], layers), tuple(parts)
+    )
+    return jax.tree.map(lambda x: x.reshape(-1, layers)[:rays], made)
+
+
+def _require_bits(shape: tuple[int, ...]) -> None:
+    """Refuse grids whose cells have no number of 32 bits."""
+    if SHIFT + sum((count + 1).bit_length() for count in shape) > 32:
+        raise UserError(
+            f"The grid has {shape} cells: rays go through at most 1022 along each axis."
+        )
+
+
+def _chunk(
+    flat: Array, shape: tuple[int, int, int], start: Array, way: Array, layers: int
+) -> Layers:
+    """Return ``march`` of some rays: all cells on their ways first, then the occupied ones.
+
+    The loop over cells is run more often than anything else: it goes to the next one and writes
+    down its number, no more. What is there is looked up for many cells at once. Each round of cells
+    leaves a word per ray with a bit for each occupied one; layer by layer, the lowest bits of all
+    rays are then taken out. Nothing is written to scattered places.
+
+    Args:
+        flat: (X·Y·Z,) class ids.
+        shape: X, Y, Z.
+        start: (3, R) where rays begin, in cells.
+        way: (3, R) where they go.
+        layers: L.
+    """
+    rays, words = start.shape[1], -(-(sum(shape) + 1) // ROUND)
+    code = _Code(shape)
     forward, still = way > 0, way == 0
-    inverse, ahead = 1 / jnp.where(still, 1, way), jnp.where(forward, 1, -1)
-    cells_3R, side_R, first_R, met_R = _enter(start, way, jnp.array(shape)[:, None])
+    inverse = 1 / jnp.where(still, 1, way)
+    turns = code.turns(jnp.where(forward, 1, -1))
+    cells_3R, side_R, met_R = _enter(start, way, jnp.array(shape)[:, None])
 
-    def number(cells_3R: tuple[Array, ...]) -> tuple[Array, Array]:
-        """Return the cells' places in ``flat``, and whether they are in the grid."""
-        inside = met_R
-        for cell, count in zip(cells_3R, shape, strict=True):
-            inside = inside & (cell >= 0) & (cell < count)
-        x, y, z = cells_3R
-        return jnp.where(inside, (x * shape[1] + y) * shape[2] + z, 0), inside
-
-    rows, slots = jnp.arange(rays) * layers, rays * layers
-
-    def step(at: tuple[Any, ...]) -> tuple[Any, ...]:
-        cells_3R, side_R, distance_R, count_R, ids, distances = at
-        place, inside = number(cells_3R)
-        found = flat[place]
-        full = inside & (found != EMPTY)
-        slot = jnp.where(full & (count_R < layers), rows + count_R, slots)
-        ids = ids.at[slot].set(found << SHIFT | side_R, mode="drop")
-        distances = distances.at[slot].set(distance_R, mode="drop")
+    def step(at_R: Array) -> Array:
+        """Return the next cells; rays that have left the grid stay where they are."""
         away = [
             jnp.where(still[axis], jnp.inf, (cell + forward[axis] - start[axis]) * inverse[axis])
-            for axis, cell in enumerate(cells_3R)
+            for axis, cell in enumerate(code.cells(at_R))
         ]
         by_x, by_y = (away[0] <= away[1]) & (away[0] <= away[2]), away[1] <= away[2]
-        side_R = jnp.where(by_x, 0, jnp.where(by_y, 1, 2))
-        distance_R = jnp.minimum(away[0], jnp.minimum(away[1], away[2]))
-        moved = (cell + jnp.where(side_R == a, ahead[a], 0) for a, cell in enumerate(cells_3R))
-        return tuple(moved), side_R, distance_R, count_R + full, ids, distances
+        turn = jnp.where(by_x, turns[0], jnp.where(by_y, turns[1], turns[2]))
+        return jnp.where(code.inside(at_R), code.without_side(at_R) + turn, at_R)
 
-    def goes_on(at: tuple[Any, ...]) -> Array:
-        return number(at[0])[1].any()
+    def walk(held: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Go on by a round of cells, and look what is in them."""
+        number, at_R, way_WNR, full_WR = held
 
-    begun = (tuple(cells_3R), side_R, first_R, jnp.zeros(rays, jnp.int32))
-    nothing = jnp.full(slots, EMPTY << SHIFT | INSIDE), jnp.zeros(slots, start.dtype)
-    *_, ids, distances = jax.lax.while_loop(goes_on, step, (*begun, *nothing))
-    ids, distances = (x.reshape(rays, layers) for x in (ids, distances))
-    side = ids & SIDES - 1
-    return Layers(ids >> SHIFT, distances, jnp.where(side == INSIDE, -1, side))
+        def one(k: Array, held: tuple[Array, Array]) -> tuple[Array, Array]:
+            at_R, way_NR = held
+            return step(at_R), jax.lax.dynamic_update_index_in_dim(way_NR, at_R, k, 0)
+
+        way_NR = jnp.zeros((ROUND, rays), jnp.uint32)
+        at_R, way_NR = jax.lax.fori_loop(0, ROUND, one, (at_R, way_NR))
+        inside = code.inside(way_NR)
+        full = inside & (flat[jnp.where(inside, code.place(way_NR), 0)] != EMPTY)
+        bits = jnp.left_shift(full.astype(jnp.uint32), jnp.arange(ROUND, dtype=jnp.uint32)[:, None])
+        return (
+            number + 1,
+            at_R,
+            jax.lax.dynamic_update_index_in_dim(way_WNR, way_NR, number, 0),
+            jax.lax.dynamic_update_index_in_dim(full_WR, bits.sum(0, dtype=jnp.uint32), number, 0),
+        )
+
+    def take(held: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Take the nearest occupied cell that is left out of all rays, as one layer."""
+        layer, full_WR, made = held
+        word_R, number_R = full_WR[0], jnp.zeros(rays, jnp.int32)
+        for number in range(1, words):
+            number_R = jnp.where(word_R == 0, number, number_R)
+            word_R = jnp.where(word_R == 0, full_WR[number], word_R)
+        lowest_R, found = word_R & -word_R, word_R != 0
+        rest_R, numbers = word_R ^ lowest_R, jnp.arange(words)[:, None]
+        full_WR = jnp.where(numbers == number_R, rest_R, full_WR)
+        place_R = number_R * ROUND + jax.lax.population_count(lowest_R - 1).astype(jnp.int32)
+        at_R = ways[jnp.where(found, place_R * rays + jnp.arange(rays), 0)]
+        side_R, cells = code.side(at_R), code.cells(at_R)
+        border = [
+            (cell + ~forward[axis] - start[axis]) * inverse[axis] for axis, cell in enumerate(cells)
+        ]
+        distance_R = jnp.where(side_R == 0, border[0], jnp.where(side_R == 1, border[1], border[2]))
+        outside = found & (side_R != INSIDE)
+        id_R = flat[jnp.where(found, code.place(at_R), 0)].astype(jnp.int32)
+        layer_R = (
+            jnp.where(found, id_R, EMPTY),
+            jnp.where(outside, distance_R, 0),
+            jnp.where(outside, side_R, -1),
+        )
+        put, pairs = jax.lax.dynamic_update_index_in_dim, zip(made, layer_R, strict=True)
+        return layer + 1, full_WR, [put(x, x_R, layer, 1) for x, x_R in pairs]
+
+    begun = jnp.where(met_R, code.pack(cells_3R, side_R), jnp.uint32(0))
+    nothing = jnp.zeros((words, ROUND, rays), jnp.uint32), jnp.zeros((words, rays), jnp.uint32)
+    *_, way_WNR, full_WR = jax.lax.while_loop(
+        lambda held: code.inside(held[1]).any(), walk, (0, begun, *nothing)
+    )
+    ways = way_WNR.reshape(-1)
+    empty = [
+        jnp.full((rays, layers), EMPTY, jnp.int32),
+        jnp.zeros((rays, layers), start.dtype),
+        jnp.full((rays, layers), -1, jnp.int32),
+    ]
+    *_, made = jax.lax.while_loop(
+        lambda held: (held[0] < layers) & (held[1] != 0).any(), take, (0, full_WR, empty)
+    )
+    return Layers(*made)
 
 
-def _enter(start: Array, way: Array, shape_31: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the first cells (3, R), the side and distance by which rays come in, and if they do.
+class _Code:
+    """A cell and the way into it in one number: x, y and z, each from 1, and the side.
+
+    A cell beside the grid has 0 or the count of cells plus 1 along an axis.
+    """
+
+    def __init__(self, shape: tuple[int, int, int]):
+        """Count bits.
+
+        Args:
+            shape: cells of the grid along each axis.
+        """
+        self.shape = shape
+        self.bits = [(count + 1).bit_length() for count in shape]
+        self.shifts = [SHIFT + sum(self.bits[:axis]) for axis in range(3)]
+
+    def fields(self, at: Array) -> list[Array]:
+        """Return x, y and z, each from 1, as unsigned numbers."""
+        pairs = zip(self.shifts, self.bits, strict=True)
+        return [at >> shift & (1 << bits) - 1 for shift, bits in pairs]
+
+    def cells(self, at: Array) -> list[Array]:
+        """Return x, y and z, int32."""
+        return [field.astype(jnp.int32) - 1 for field in self.fields(at)]
+
+    def inside(self, at: Array) -> Array:
+        """Return whether cells are in the grid."""
+        x, y, z = (f - 1 < count for f, count in zip(self.fields(at), self.shape, strict=True))
+        return x & y & z
+
+    def place(self, at: Array) -> Array:
+        """Return the place of cells in the grid's flat array, int32."""
+        x, y, z = self.cells(at)
+        return (x * self.shape[1] + y) * self.shape[2] + z
+
+    def side(self, at: Array) -> Array:
+        """Return by which side cells are entered, int32."""
+        return (at & SIDES - 1).astype(jnp.int32)
+
+    def without_side(self, at: Array) -> Array:
+        """Return cells alone."""
+        return at & ~jnp.uint32(SIDES - 1)
+
+    def pack(self, cells: Array, side: Array) -> Array:
+        """Return the numbers of cells (3, ...) that are entered by sides."""
+        pairs = zip(cells, self.shifts, strict=True)
+        x, y, z = (cell.astype(jnp.uint32) + 1 << shift for cell, shift in pairs)
+        return x | y | z | side.astype(jnp.uint32)
+
+    def turns(self, ahead: Array) -> list[Array]:
+        """Return what a step of −1 or 1 along each axis adds to a cell without a side."""
+        return [
+            (step << shift).astype(jnp.uint32) + jnp.uint32(axis)
+            for axis, (step, shift) in enumerate(zip(ahead, self.shifts, strict=True))
+        ]
+
+
+def _enter(start: Array, way: Array, shape_31: Array) -> tuple[Array, Array, Array]:
+    """Return the first cells (3, R), the side by which rays come in, and if they do.
 
     Args:
         start: (3, R) where rays begin, in cells.
@@ -125,7 +264,7 @@ def _enter(start: Array, way: Array, shape_31: Array) -> tuple[Array, Array, Arr
     cell = jnp.floor(start + jnp.where(jnp.isfinite(first), first, 0) * way).astype(jnp.int32)
     edge = jnp.where(forward, 0, shape_31 - 1)  # of the axis by which a ray comes in, exactly
     cell = jnp.where(jnp.arange(3)[:, None] == side, edge, jnp.clip(cell, 0, shape_31 - 1))
-    return cell, side, first, first < leave.min(0)
+    return cell, side, first < leave.min(0)
 
 
 def through_pixels(

@@ -89,14 +89,17 @@ def look(
     shrink = config.width / size[1], config.height / size[0]
     intrinsics = resize_intrinsics(camera.intrinsics_4, shrink[0], shrink[1])
 
-    def one(ids: Array, low: Array, intrinsics_4: Array, pose: Array) -> Layers:
+    def one(frame: tuple[Array, ...]) -> Layers:
+        ids, low, intrinsics_4, pose = frame
         seen = Camera(intrinsics_4[None], pose[None])
         found = march.through_pixels(
             ids, low, cell_m, seen, config.height, config.width, config.layers
         )
         return jax.tree.map(lambda x: x[0], found)
 
-    return jax.vmap(one)(classes_TXYZ, low_T3, intrinsics, camera.world_from_camera)
+    # One after the other: the march ends when its rays have left the grid, and not each frame's do.
+    frames = classes_TXYZ, low_T3, intrinsics, camera.world_from_camera
+    return jax.lax.map(one, tuple(jnp.asarray(x) for x in frames))
 
 
 def features(

@@ -14,6 +14,7 @@ the decoder's are the mirror image, and end in ``scores``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -28,9 +29,16 @@ from pewm_jax.models.plain_layers import draw, layer_norm, linear
 from pewm_jax.models.voxel_vae_shapes import follows, shapes
 from pewm_jax.types import Array, Params
 
+FIRST_DEVIATION = 0.05
+"""Standard deviation of the latents around their means before anything is learned."""
+
 
 def init(config: VoxelVAEConfig, key: Array) -> Params:
-    """Return random parameters, float32; residual blocks change nothing at first."""
+    """Return random parameters, float32.
+
+    Residual blocks change nothing at first, and latents vary by no more than ``FIRST_DEVIATION``:
+    as long as they were mostly noise, the decoder would learn nothing from them.
+    """
     params = draw(shapes(config), key)
     for part in ("encoder", "decoder"):
         for where in (params[part], *params[part].values()):
@@ -39,6 +47,8 @@ def init(config: VoxelVAEConfig, key: Array) -> Params:
                     leaf["two"]["kernel"] = jnp.zeros_like(leaf["two"]["kernel"])
     embed = params["encoder"]["embed"]
     embed["kernel"] = embed["kernel"] * jnp.sqrt(float(config.classes))  # one row, not all of them
+    out = params["encoder"]["out"]
+    out["bias"] = out["bias"].at[config.latent_channels :].set(2 * math.log(FIRST_DEVIATION))
     params["latent_mean_C"] = jnp.zeros((config.latent_channels,))
     params["latent_scale_C"] = jnp.ones((config.latent_channels,))
     return params

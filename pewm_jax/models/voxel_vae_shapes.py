@@ -26,7 +26,7 @@ def kernels(config: VoxelVAEConfig) -> Kernels:
 
 
 def _encoder(config: VoxelVAEConfig) -> Kernels:
-    inside, last = config.widths[0], config.widths[-1]
+    inside, last, around = config.widths[0], config.widths[-1], config.middle_kernel
     made: Kernels = {"encoder/embed": (config.classes, config.embed)}
     if config.patch > 1:
         made["encoder/into"] = (config.embed * config.patch**3, inside)
@@ -37,16 +37,16 @@ def _encoder(config: VoxelVAEConfig) -> Kernels:
         if follows(config, level):
             made[f"encoder/level_{level}/down"] = (3, 3, 3, width, width)
     for number in range(config.middle):
-        made |= _block(f"encoder/middle_{number}", last, last, 3)
-    made["encoder/out"] = (3, 3, 3, last, 2 * config.latent_channels)
+        made |= _block(f"encoder/middle_{number}", last, last, around)
+    made["encoder/out"] = (around, around, around, last, 2 * config.latent_channels)
     return made
 
 
 def _decoder(config: VoxelVAEConfig) -> Kernels:
-    inside = config.widths[-1]
-    made: Kernels = {"decoder/into": (3, 3, 3, config.latent_channels, inside)}
+    inside, around = config.widths[-1], config.middle_kernel
+    made: Kernels = {"decoder/into": (around, around, around, config.latent_channels, inside)}
     for number in range(config.middle):
-        made |= _block(f"decoder/middle_{number}", inside, inside, 3)
+        made |= _block(f"decoder/middle_{number}", inside, inside, around)
     for level, width in reversed(list(enumerate(config.widths))):
         for number in range(config.blocks + 1):
             made |= _block(f"decoder/level_{level}/block_{number}", inside, width, config.kernel)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pewm_jax.config import UserError
 from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera
@@ -36,10 +37,21 @@ def brute_force(ids, origin, direction):
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.booleans())
 def test_the_march_is_brute_force(seed, share, axes):
+    compare(seed, share, axes, SHAPE)
+
+
+def test_ways_of_more_cells_than_a_word_has_bits_and_more_rays_than_a_chunk(monkeypatch):
+    monkeypatch.setattr(march, "CHUNK", 12)
+    fresh = jax.jit(lambda *given: march.march(*given, LAYERS))
+    compare(0, 0.02, False, (33, 20, 27), lambda *given: fresh(*given[:-1]))
+
+
+def compare(seed, share, axes, shape, marched=marched):
+    """Compare what random rays through a random grid meet with a look at every cell."""
     rng = np.random.default_rng(seed)
-    ids = rng.integers(1, 9, SHAPE) * (rng.random(SHAPE) < share)
-    middle = LOW + CELL * np.array(SHAPE) / 2
-    origins = middle + rng.normal(0, 1.5, (RAYS, 3))
+    ids = rng.integers(1, 9, shape) * (rng.random(shape) < share)
+    middle = LOW + CELL * np.array(shape) / 2
+    origins = middle + rng.normal(0, 0.3 * CELL * max(shape), (RAYS, 3))
     directions = rng.normal(0, 1, (RAYS, 3)) * rng.uniform(0.2, 3, (RAYS, 1))
     if axes:  # along one or two axes, where the others never change
         directions *= rng.random((RAYS, 3)) < 0.5
@@ -90,6 +102,11 @@ def test_a_wall_is_seen_at_its_depth():
     on_wall = np.asarray(seen.ids_L[0, :, :, 0]) == 7
     assert on_wall.mean() > 0.5
     np.testing.assert_allclose(np.asarray(seen.distance_L)[0][on_wall], 1.95, atol=1e-4)
+
+
+def test_a_grid_whose_cells_have_no_number_is_refused():
+    with pytest.raises(UserError, match="1022"):
+        march.march(np.zeros((2000, 2000, 2000), bool), LOW, CELL, *np.ones((2, 1, 3)), 1)
 
 
 @pytest.mark.parametrize("axis", range(3))

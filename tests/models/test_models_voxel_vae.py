@@ -28,7 +28,7 @@ LIKE_PUBLISHED = VoxelVAEConfig(
 )
 FOLDED = VoxelVAEConfig(
     side=8, classes=7, patch=4, embed=3, widths=(12,), blocks=1, middle=1, kernel=1,
-    latent_channels=4, occupied_weight=3.0,
+    middle_kernel=1, latent_channels=4, occupied_weight=3.0,
 )  # fmt: skip
 
 
@@ -179,11 +179,35 @@ def test_fitted_latents_have_mean_0_and_variance_1_and_decode_the_same():
     np.testing.assert_allclose(same, scores, atol=1e-3)
 
 
+def test_with_kernels_of_one_place_a_latent_tells_of_its_own_patch_alone():
+    config, params = FOLDED, weights(voxel_vae, FOLDED)
+    ids = grids(config, 1)
+    other = ids.copy()
+    other[0, 5, 1, 2] = (ids[0, 5, 1, 2] + 1) % config.classes
+
+    @jax.jit
+    def run(ids):
+        latents = voxel_vae.encode(config, params, ids)
+        return latents, voxel_vae.logits(config, params, latents)
+
+    (before, scores), (after, others) = run(ids), run(other)
+    places = np.argwhere((np.asarray(before) != np.asarray(after)).any(-1))
+    np.testing.assert_array_equal(places, [[0, 1, 0, 0]])
+    cells = np.argwhere((np.asarray(scores) != np.asarray(others)).any(-1))
+    assert len(cells) > 32
+    np.testing.assert_array_equal(cells // [1, 4, 4, 4], np.tile(places, (len(cells), 1)))
+
+
 def test_residual_blocks_change_nothing_at_first_and_it_learns():
     import optax
 
     config = dataclasses.replace(FOLDED, widths=(24,), classes=4)
     params = init(config)
+    _, log_variance = jax.jit(lambda p, ids: voxel_vae.moments(config, p, ids))(
+        params, grids(config)
+    )
+    deviation = np.exp(np.asarray(log_variance).mean() / 2)
+    np.testing.assert_allclose(deviation, voxel_vae.FIRST_DEVIATION, rtol=0.3)
     assert not params["encoder"]["middle_0"]["two"]["kernel"].any()
     assert not params["decoder"]["level_0"]["block_1"]["two"]["kernel"].any()
     ids = np.zeros((2, 8, 8, 8), np.uint8)
@@ -239,8 +263,8 @@ def test_published_size_sharding_and_costs():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"side": 46}, {"embed": 16}, {"kernel": 2}, {"widths": ()}, {"slab": 5}, {"classes": 1},
-     {"compared": -1}],
+    [{"side": 46}, {"embed": 16}, {"kernel": 2}, {"middle_kernel": 5}, {"widths": ()}, {"slab": 5},
+     {"classes": 1}, {"compared": -1}],
 )  # fmt: skip
 def test_settings_that_cannot_work_are_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
