@@ -46,9 +46,10 @@ def held_mb() -> float:
 def listen(page: Page) -> None:
     """Be a tab until the page ends: take all that is sent and keep nothing."""
     url, protocol = page.url.replace("http", "ws"), f"viser-v{viser.__version__}"
-    with contextlib.suppress(ConnectionClosed), connect(
-        url, subprotocols=[protocol], max_size=None
-    ) as tab:
+    with (
+        contextlib.suppress(ConnectionClosed),
+        connect(url, subprotocols=[protocol], max_size=None) as tab,
+    ):
         for _ in tab:
             pass
 
@@ -58,7 +59,7 @@ class Wheel:
 
     def __init__(self, page: Page):
         self._page, self._told = page, threading.Event()
-        shown = page.driver._show  # noqa: SLF001 - a listener beside the page
+        shown = page.driver._show
 
         def show(told) -> None:
             shown(told)
@@ -66,7 +67,7 @@ class Wheel:
                 self.seconds = told.seconds
                 self._told.set()
 
-        page.driver._show = show  # noqa: SLF001
+        page.driver._show = show
         self.seconds = 0.0
 
     def step(self, request) -> float:
@@ -103,7 +104,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1800)
     parser.add_argument("--every", type=int, default=200, help="steps between two measurements")
     parser.add_argument("--house", type=int, default=2)
-    parser.add_argument("--idle", type=float, default=20.0, help="seconds of rest that are measured")
+    parser.add_argument(
+        "--idle", type=float, default=20.0, help="seconds of rest that are measured"
+    )
     parser.add_argument("--record", action="store_true")
     given = parser.parse_args()
     cli.cache_compilation(Path("runs"))
@@ -120,6 +123,11 @@ def main() -> None:
         finally:
             page.close()
     first, last = rows[0][1], rows[-1][1]
+    sentence = (
+        f"{given.steps} steps with a tab open: {100 * (last / first - 1):+.1f} % of memory. "
+        f"A step took {statistics.median(took):.2f} s (median; 95 of 100 below "
+        f"{np.percentile(took, 95):.2f} s). At rest the page takes {share:.1f} % of one core."
+    )
     text = "\n\n".join(
         [
             "## Half an hour of driving",
@@ -131,9 +139,7 @@ def main() -> None:
                     for steps, held, points in rows
                 ],
             ),
-            f"{given.steps} steps with a tab open: {100 * (last / first - 1):+.1f} % of memory. "
-            f"A step took {statistics.median(took):.2f} s (median; 95 of 100 below "
-            f"{np.percentile(took, 95):.2f} s). At rest the page takes {share:.1f} % of one core.",
+            sentence,
         ]
     )
     print(text)
@@ -148,10 +154,10 @@ def drive(page: Page, given) -> tuple[list[tuple[int, float, int]], list[float],
     actions, took, rows = page.driver.engine.model.actions, [], []
     for number in range(1, given.steps + 1):
         took.append(wheel.step(walk(rng, actions)))
-        if number % RESTS == 0:
+        if number == 1 or number % min(RESTS, given.every) == 0:
             wheel.rest()
         if number == 1 or number % given.every == 0:
-            rows.append((number, held_mb(), len(page._map.points)))  # noqa: SLF001
+            rows.append((number, held_mb(), len(page._map.points)))
             print(f"step {number}: {rows[-1][1]:.0f} MB, {rows[-1][2]} points", flush=True)
     wheel.rest()
     return rows, took, idle_share(given.idle)

@@ -88,7 +88,7 @@ class Page:
         Args:
             load: gives the model, an ``Engine``.
             start: where the drive begins.
-            serve: address and port.
+            serve: address, port and names.
             folder: of saved worlds and videos.
             name: of the model, for the title.
             say: told where the page is, what it waits for, and what goes wrong, once each.
@@ -97,7 +97,7 @@ class Page:
             ConfigError: the address cannot be served on.
         """
         self._start, self._seconds, self._say, self._phase = start, None, say, ""
-        self._server = serving.server(serve)
+        self._server = serving.server(serve, say)
         # Sharing asks a server elsewhere for a public address; this page is local.
         self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
         self.url = f"http://{serving.here(serve.host)}:{self._server.get_port()}"
