@@ -100,8 +100,8 @@ def main() -> None:
         process.end()
     first, last = rows[0][1], rows[-1][1]
     sentence = (
-        f"{given.steps} steps with a tab open: {100 * (last / first - 1):+.1f} % of memory from the "
-        f"first step on. A step took {statistics.median(took):.2f} s (median; 95 of 100 below "
+        f"{given.steps} steps with a tab open: {100 * (last / first - 1):+.1f} % of memory since "
+        f"the first step. A step took {statistics.median(took):.2f} s (median; 95 of 100 below "
         f"{np.percentile(took, 95):.2f} s), the next one asked for at once. At rest the page takes "
         f"{share:.1f} % of one core."
     )
