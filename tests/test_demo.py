@@ -48,6 +48,12 @@ def test_it_does_what_make_demo_does(called, capsys):
     assert "runs/demo/report/index.html" in lines[-1]
 
 
+def test_walks_are_collected_as_large_as_the_preset_wants_them():
+    parts = {preset: demo.steps(demo.Settings(preset)) for preset in ("demo", "tiny")}
+    assert "--size" not in parts["demo"][0][2]
+    assert parts["tiny"][0][2][-2:] == ["--size", "16"]
+
+
 def test_a_part_that_fails_ends_it(called, monkeypatch, capsys):
     monkeypatch.setattr(demo.data, "main", lambda argv, prog: 2)
     assert demo.main(["--run", "elsewhere"]) == 2
@@ -65,6 +71,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made(called):
     wrong = (
         (["--preset", "dmo"], "There is no preset 'dmo'"),
         (["--houses", "0"], "at least 1"),
+        (["--preset", "codec"], "square pictures"),
         (["--house", "3"], "did you mean --houses"),
     )
     for argv, says in wrong:

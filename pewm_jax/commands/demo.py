@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pewm_jax import cli, presets
 from pewm_jax.commands import evaluate, train
+from pewm_jax.config import ModelConfig
 from pewm_jax.data import __main__ as data
 
 ABOUT = (
@@ -17,6 +18,8 @@ ABOUT = (
     "through houses it has never seen, and score it. Interrupted and started again, it goes on "
     "where it was."
 )
+SIZE = 64
+"""Width and height of a walk's pictures, pixels, where collecting is not told another."""
 VIEWER = "viser"
 """The library of the viewer, which may be missing."""
 
@@ -42,6 +45,22 @@ class Settings:
         for name in ("houses", "frames"):
             if getattr(self, name) < 1:
                 raise cli.ConfigError(f"--{name} is {getattr(self, name)}: give at least 1.")
+        _ = self.size
+
+    @property
+    def size(self) -> int:
+        """Width and height of the preset's pictures, pixels.
+
+        Raises:
+            ConfigError: they are not square, or the preset is not of a world with a map.
+        """
+        model = presets.load(self.preset).model
+        if not isinstance(model, ModelConfig) or model.clip.width != model.clip.height:
+            raise cli.ConfigError(
+                f"--preset {self.preset} does not fit the demo, which trains a world with a map on "
+                "square pictures: take demo, or the steps one by one."
+            )
+        return model.clip.width
 
 
 def main(argv: Sequence[str], prog: str = "pewm-jax demo") -> int:
@@ -70,6 +89,8 @@ def steps(settings: Settings) -> list[tuple[str, Callable[[Sequence[str], str], 
     """Return the parts: what each does, its function, and the same as a command of its own."""
     walks, run = str(settings.data), str(settings.run)
     collect = ["collect", walks, "--train", str(settings.houses), "--frames", str(settings.frames)]
+    if settings.size != SIZE:
+        collect += ["--size", str(settings.size)]
     learn = [settings.preset, "--data.path", walks, "--train.run", run]
     return [
         ("Walking through generated houses", data.main, ["pewm-jax", "data", *collect]),

@@ -55,6 +55,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
         )
     # Imported here and not above: help and refusals come at once, and memory is set up before.
     heap.few_arenas()
+    print("Starting …", flush=True)
     from pewm_jax.play import page as pages
     from pewm_jax.play import serving
 
