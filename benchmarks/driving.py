@@ -57,8 +57,8 @@ class Process:
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def end(self) -> None:
-        """Press Ctrl-C and wait."""
-        self._running.send_signal(2)
+        """End it and wait."""
+        self._running.terminate()
         self._running.wait(30)
 
 

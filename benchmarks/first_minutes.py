@@ -73,7 +73,7 @@ def first_minutes(folder: Path, source: str, python: str) -> Clock:
         step = run(".venv/bin/python", "benchmarks/tab.py", url)
         clock.part(f"a tab opens and drives a step (the step itself: {float(step):.2f} s)")
     finally:
-        page.send_signal(2)
+        page.terminate()
         page.wait(60)
     return clock
 

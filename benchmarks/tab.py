@@ -17,6 +17,19 @@ import viser
 import zstandard
 from websockets.sync.client import ClientConnection, connect
 
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (0.0, 0.0, 3.0),
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 100.0,
+    "image_height": 600,
+    "image_width": 800,
+    "look_at": (0.0, 0.0, 0.0),
+    "up_direction": (0.0, 1.0, 0.0),
+}
+"""What a tab says first; the server listens to none that has not said it."""
 AGENT = "/agent"
 """What moves in the map at each step."""
 
@@ -38,6 +51,13 @@ class Tab:
     def press(self, name: str) -> None:
         """Ask for what a key does, such as ``forward (W)``."""
         message = {"type": "CommandTriggerMessage", "uuid": self.keys[name]}
+        self._say(message)
+
+    def begin(self) -> None:
+        """Say where this tab's camera is, as a browser does first."""
+        self._say(CAMERA)
+
+    def _say(self, message: dict) -> None:
         self._connection.send(msgspec.msgpack.encode(message))
 
     def hear(self, seconds: float) -> list[dict]:
@@ -88,7 +108,9 @@ def opened(url: str) -> Iterator[Tab]:
     protocol = f"viser-v{viser.__version__}"
     there = re.sub(r"^http", "ws", url)
     with connect(there, origin=url, subprotocols=[protocol], max_size=None) as connection:
-        yield Tab(connection)
+        tab = Tab(connection)
+        tab.begin()
+        yield tab
 
 
 if __name__ == "__main__":
