@@ -119,7 +119,8 @@ def drive(process: Process, tab: Tab, given) -> tuple[list[tuple[int, float]], l
     rng = np.random.default_rng(0)
     rows, took = [], []
     for number in range(1, given.steps + 1):
-        took.append(tab.step(str(rng.choice(KEYS, p=CHANCES))))
+        key = KEYS[1] if tab.at_wall else str(rng.choice(KEYS, p=CHANCES))
+        took.append(tab.step(key))
         measured = number == 1 or number % given.every == 0
         if measured or number % RESTS == 0:
             rest(process, tab)

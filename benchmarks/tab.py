@@ -53,6 +53,11 @@ class Tab:
         message = {"type": "CommandTriggerMessage", "uuid": self.keys[name]}
         self._say(message)
 
+    @property
+    def at_wall(self) -> bool:
+        """Whether the last step was stopped by a wall."""
+        return "There is a wall" in self.status
+
     def begin(self) -> None:
         """Say where this tab's camera is, as a browser does first."""
         self._say(CAMERA)
@@ -80,10 +85,11 @@ class Tab:
         """Make a step; returns the seconds until the agent stands elsewhere, or at a wall."""
         begun = time.monotonic()
         self.press(name)
-        while (past := time.monotonic() - begun) < patience_s:
-            if any(message.get("name") == AGENT for message in self.hear(patience_s - past)):
+        while time.monotonic() - begun < patience_s:
+            told = self.hear(1.0)
+            if any(message.get("name") == AGENT for message in told):
                 return time.monotonic() - begun
-            if "There is a wall" in self.status:
+            if not told and self.at_wall:  # a wall that it stood at before is not told again
                 return time.monotonic() - begun
         raise TimeoutError(f"{name} was not answered in {patience_s} s: {self.status}")
 

@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from pewm_jax.commands import play
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.play import page, requests, serving, visitors
+from pewm_jax.play import page, requests, serving, status, visitors
 from pewm_jax.play.settings import Serve, Start
 from tests.play.tiny_drive import FORWARD, a_place, a_toy
 
@@ -86,6 +86,24 @@ def test_what_goes_wrong_is_on_the_page(tmp_path):
         assert "no world yet" in one._status.content
         one._edit("erase")
         assert "Choose a box first" in one._status.content
+
+
+def test_the_terminal_is_told_now_and_then_what_is_waited_for(tmp_path, monkeypatch):
+    told = []
+
+    def load():
+        raise UserError("nothing to load here")
+
+    with a_page(tmp_path, load, told.append) as one:
+        assert one.driver.wait(LONG)
+        assert told[1:] == ["Loading the model …", "error: nothing to load here"]
+        told.clear()
+        for seconds in range(1, 4):
+            one._tell(requests.Shown(f"Preparing … {seconds} s", busy=True))
+        monkeypatch.setattr(status, "SAY_AGAIN_S", 0.0)
+        one._tell(requests.Shown("Preparing … 4 s", busy=True))
+        one._tell(requests.Shown("Drive."))
+        assert told == ["Preparing … 1 s", "Preparing … 4 s", "Ready."]
 
 
 def test_a_box_goes_where_it_was_dragged_and_the_agent_too(tmp_path):
