@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
+import importlib.metadata
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,8 +20,6 @@ ABOUT = (
 )
 SIZE = 64
 """Width and height of a walk's pictures, pixels, where collecting is not told another."""
-VIEWER = "viser"
-"""The library of the viewer, which may be missing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +79,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax demo") -> int:
         code = run(flags[2:], " ".join(flags[:2]))
         if code:
             return code
-    print(ending(settings.run, importlib.util.find_spec(VIEWER) is not None), flush=True)
+    print(ending(settings.run, _viewer()), flush=True)
     return 0
 
 
@@ -112,3 +110,12 @@ def ending(run: Path, viewer: bool) -> str:
         f"what was imagined. {run / 'config.json'} holds the settings. Drive in it: "
         f"{install}pewm-jax play {shlex.quote(str(run))}"
     )
+
+
+def _viewer() -> bool:
+    """Tell whether what the viewer needs is installed."""
+    try:
+        importlib.metadata.version("viser")
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
