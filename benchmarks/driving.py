@@ -107,7 +107,7 @@ def main() -> None:
     )
     shown = [(str(n), f"{mb:.0f}", f"{100 * (mb / first - 1):+.1f} %") for n, mb in rows]
     head = ("steps", "memory, MB", "more than after the first step")
-    parts = ["## Half an hour of driving", machine("jax", "viser"), table(head, shown), sentence]
+    parts = ["## What driving takes", machine("jax", "viser"), table(head, shown), sentence]
     text = "\n\n".join(parts)
     print(text)
     if given.record:
