@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import http
 import ipaddress
+import re
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -22,6 +23,8 @@ from websockets.http11 import Request, Response
 
 PORTS = {"http": 80, "https": 443}
 """Ports that an address leaves out."""
+PLAIN = re.compile(r"[a-z0-9._:-]{1,253}")
+"""Hosts that are shown as they are: what a stranger sends must not reach the terminal otherwise."""
 MOST_TOLD = 20
 """Reasons that are told; a page that tries many names must not fill the terminal."""
 
@@ -37,20 +40,24 @@ def objection(origin: str | None, host: str | None, here: str, names: Sequence[s
         names: what the page may be called beside, and that pages which a proxy shows have for host.
     """
     called = _parts(f"//{host or ''}")
+    if called is None:
+        return f"{host!r} is no name of this page."
     known = {"localhost", *(name.lower() for name in (here, *names, *_own_names()))}
-    if called is None or not (called.hostname in known or _in_digits(called.hostname)):
-        name = called.hostname if called else host
-        return f"{name!r} is not known as a name of this page: --names {name or 'NAME'} lets it in."
-    if origin is None:
-        return ""
+    name = called.hostname
+    if not (name in known or _in_digits(name)):
+        return f"{name!r} is not known as a name of this page: --names {name} lets it in."
+    return "" if origin is None else _objection_to_page(origin, called, names)
+
+
+def _objection_to_page(origin: str, called: SplitResult, names: Sequence[str]) -> str:
+    """Return why a page may not drive a server that is rightly called so; empty if it may."""
     asking = _parts(origin)
     if asking is None or asking.scheme not in PORTS:
         return f"A page without an address of its own ({origin!r}) may not drive here."
-    there = (asking.hostname, asking.port or PORTS[asking.scheme])
-    if there == (called.hostname, called.port or PORTS[asking.scheme]):
-        return ""
-    if asking.hostname in {name.lower() for name in names}:
-        return ""  # a proxy that passes its own name for the server on
+    usual = PORTS[asking.scheme]
+    same = (asking.hostname, asking.port or usual) == (called.hostname, called.port or usual)
+    if same or asking.hostname in {name.lower() for name in names}:
+        return ""  # the latter is a proxy that calls the server by another name than its own
     return (
         f"A page of {asking.hostname!r} may not drive here: it is another site. If a proxy shows "
         f"this page there, --names {asking.hostname} lets it in."
@@ -109,13 +116,13 @@ def _forbidden(reason: str) -> Response:
 
 
 def _parts(address: str) -> SplitResult | None:
-    """Split an address; None if it has no host or a port that is none."""
+    """Split an address; None if it has no host, an odd one, or a port that is none."""
     try:
         parts = urlsplit(address)
         _ = parts.port  # read now, as a port that is none is found only then
     except ValueError:
         return None
-    return parts if parts.hostname else None
+    return parts if PLAIN.fullmatch(parts.hostname or "") else None
 
 
 def _in_digits(host: str | None) -> bool:

@@ -179,6 +179,11 @@ def test_which_visitors_are_welcome():
     ):
         assert visitors.objection(origin, host, here, names), (origin, host)
     assert visitors.objection("http://box:80", "box", "box") == ""
+    for odd in ("a;b", "a\udc9b", "a b", "<b>", "a" * 300):
+        for origin, host in ((None, odd), (f"http://{odd}", "localhost")):
+            said = visitors.objection(origin, host, here)
+            assert said.isascii()
+            assert "--names" not in said
 
 
 def test_a_server_that_cannot_be_asked_about_is_not_served(monkeypatch):
