@@ -4,7 +4,7 @@
 clones this repository, makes a virtual environment, installs with an empty cache of pip, starts
 `pewm-jax play small`, waits for the page to answer and for the first imagined step. It needs git, a
 network and nothing but Python's own library. What is in the clone is what was committed. With
-``--record`` the section of ``RESULTS.md`` is rewritten.
+``--record``, by a Python in which the library is installed, the section of ``RESULTS.md`` is rewritten.
 """
 
 from __future__ import annotations
@@ -94,6 +94,7 @@ def main() -> None:
     parser.add_argument("--python", default=sys.executable)
     parser.add_argument("--record", action="store_true")
     given = parser.parse_args()
+    waiting = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
         clock = first_minutes(Path(folder), given.source, given.python)
     total = f"{clock.total:.0f} s in all, {clock.total / 60:.1f} minutes."
@@ -102,14 +103,12 @@ def main() -> None:
         from record import machine, record, table
 
         rows = [(name, f"{seconds:.1f}") for name, seconds in clock.parts]
-        text = [
-            "## The first minutes",
-            machine("jax", "viser"),
-            "No cache of pip, none of compiled programs; the clone from the same disk.",
-            table(("part", "seconds"), rows),
-            total,
-        ]
-        record("first_minutes", "\n\n".join(text))
+        how = (
+            "No cache of pip, none of compiled programs; the clone from the same disk. "
+            f"{waiting:.0f} other processes wanted the processor when it began."
+        )
+        parts = ("## The first minutes", machine("jax", "viser"), how)
+        record("first_minutes", "\n\n".join([*parts, table(("part", "seconds"), rows), total]))
 
 
 if __name__ == "__main__":
