@@ -4,7 +4,8 @@
 clones this repository, makes a virtual environment, installs with an empty cache of pip, starts
 `pewm-jax play small`, waits for the page to answer and for the first imagined step. It needs git, a
 network and nothing but Python's own library. What is in the clone is what was committed. With
-``--record``, by a Python in which the library is installed, the section of ``RESULTS.md`` is rewritten.
+``--record``, by a Python in which the library is installed, its section of ``RESULTS.md`` is
+rewritten.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
             f"{', '.join(shipped.names())}."
         )
     # Imported here and not above: help and refusals come at once, and memory is set up before.
-    heap.few_arenas()
+    heap.keep_small()
     print("Starting …", flush=True)
     from pewm_jax.play import page as pages
     from pewm_jax.play import serving

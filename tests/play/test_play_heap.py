@@ -13,7 +13,7 @@ COUNT = f"""
 import ctypes, sys, threading
 from pewm_jax.play import heap
 if sys.argv[1] == "few":
-    assert heap.few_arenas()
+    assert heap.keep_small()
 libc = ctypes.CDLL(None)
 together = threading.Barrier({THREADS})
 
@@ -37,10 +37,10 @@ def arenas(how):
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="this C library is not glibc")
-def test_threads_share_few_arenas_only_when_asked_to():
+def test_threads_share_keep_small_only_when_asked_to():
     assert arenas("few") <= heap.ARENAS < arenas("many")
 
 
 def test_where_there_is_nothing_to_set_it_says_so(monkeypatch):
     monkeypatch.setattr(heap.ctypes, "CDLL", lambda _: object())
-    assert not heap.few_arenas()
+    assert not heap.keep_small()
