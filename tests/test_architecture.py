@@ -66,6 +66,7 @@ HOMES = {
     "tyro": {"cli", "config", "convert/commands", "data", "memory/feature_command"},
     "viser": {"play/extra"},
     "wandb": {"training/wandb_log"},
+    "websockets": {"play/visitors"},
 }
 """Libraries and the only places that import them."""
 BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}

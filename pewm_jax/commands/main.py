@@ -7,7 +7,17 @@ from collections.abc import Callable, Sequence
 
 import pewm_jax
 from pewm_jax import cli
-from pewm_jax.commands import compare, evaluate, play, practice, protocol, table1, table2, train
+from pewm_jax.commands import (
+    compare,
+    demo,
+    evaluate,
+    play,
+    practice,
+    protocol,
+    table1,
+    table2,
+    train,
+)
 from pewm_jax.convert import __main__ as convert
 from pewm_jax.data import __main__ as data
 from pewm_jax.memory import __main__ as memory
@@ -31,6 +41,7 @@ class Command:
 
 COMMANDS = {
     "play": Command(play.main, "drive through a world that a model imagines, in the browser"),
+    "demo": Command(demo.main, "collect, train, imagine and score, small and by one command"),
     "data": Command(data.main, "collect, import, validate and show episodes"),
     "train": Command(train.main, "train a world model, or go on where a training stopped"),
     "protocol": Command(protocol.main, "choose what runs are scored by, before training them"),
