@@ -3,7 +3,8 @@
 Navigation World Models imagine one frame from the ones before, EgoWM a chunk at once. `python
 benchmarks/egowm_latency.py` times both on one network with random weights, whose attention spans
 what each has to see: the present frame and the one to come, or the present frame and a chunk. Runs
-of the two alternate; medians of the wall time, with least and most.
+of the two alternate; medians of the wall time, with least and most. ``--record`` rewrites the
+section of ``RESULTS.md``, ``--preset`` takes another network.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import time
 
 import jax
 import numpy as np
+from record import machine, record, table
 
 from pewm_jax import presets, worlds
 from pewm_jax.config import EgoWMConfig
@@ -24,9 +26,9 @@ from pewm_jax.types import Camera, Frames
 PRESET = "egowm_tiny"
 
 
-def models(chunk: int, steps: int) -> dict[str, EgoWMConfig]:
+def models(preset: str, chunk: int, steps: int) -> dict[str, EgoWMConfig]:
     """Return the two ways: the same networks, clips of 2 frames and of ``chunk`` + 1."""
-    base = presets.load(PRESET).model
+    base = presets.load(preset).model
     assert isinstance(base, EgoWMConfig)
     noise = dataclasses.replace(base.noise, sample_steps=steps)
 
@@ -45,8 +47,10 @@ def main() -> None:
     parser.add_argument("--chunk", type=int, default=8, help="frames of a chunk")
     parser.add_argument("--steps", type=int, default=6, help="evaluations of the network")
     parser.add_argument("--repeats", type=int, default=5, help="timed runs of each")
+    parser.add_argument("--preset", default=PRESET, help="whose network it is")
+    parser.add_argument("--record", action="store_true", help="rewrite this section of RESULTS.md")
     given = parser.parse_args()
-    ways = models(given.chunk, given.steps)
+    ways = models(given.preset, given.chunk, given.steps)
     runs = {}
     for name, model in ways.items():
         params = jax.jit(worlds.init, static_argnums=0)(model, jax.random.key(0))
@@ -61,13 +65,20 @@ def main() -> None:
             began = time.perf_counter()
             jax.block_until_ready(run())
             seconds[name].append(time.perf_counter() - began)
-    print(f"{given.frames} frames, {given.steps} steps, {jax.devices()[0].device_kind}")
-    for name, found in seconds.items():
-        print(
-            f"  {name:<16} {statistics.median(found):.2f} s  [{min(found):.2f}, {max(found):.2f}]"
+    slow = [statistics.median(found) for found in seconds.values()]
+    rows = [
+        [name, f"{m:.2f}", f"{min(found):.2f} … {max(found):.2f}", f"{m / slow[-1]:.2f}"]
+        for (name, found), m in zip(seconds.items(), slow, strict=True)
+    ]
+    text = table(["", "seconds, median", "least … most", "of the chunks' time"], rows)
+    print(text)
+    if given.record:
+        how = (
+            f"`python benchmarks/egowm_latency.py --record`: {given.frames} frames, the network of "
+            f"`{given.preset}` with random weights, {given.steps} evaluations of it, "
+            f"{given.repeats} turns, on {jax.devices()[0].device_kind}. {machine('jax')}."
         )
-    slow, fast = (statistics.median(found) for found in seconds.values())
-    print(f"  frame by frame takes {slow / fast:.2f} times as long")
+        record("egowm_latency", "\n\n".join(["## Frame by frame against chunks", how, text]))
 
 
 def _frame(model: EgoWMConfig) -> Frames:

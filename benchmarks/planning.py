@@ -139,7 +139,7 @@ def shares(each: dict[str, float]) -> list[list[str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--rounds", type=int, default=12)
-    parser.add_argument("--batch", type=int, default=12)
+    parser.add_argument("--batch", type=int, default=6)
     parser.add_argument("--alone", type=int, default=48, help="candidates imagined one by one")
     parser.add_argument("--record", action="store_true", help="rewrite this section of RESULTS.md")
     chosen = parser.parse_args()
@@ -149,16 +149,13 @@ def main() -> None:
     state, goal = scene(config, params)
     cost, key = costs.perceptual(), jax.random.key(0)
 
-    imagining, rendering = Clock(), Clock()
+    imagining, rendering, whole = Clock(), Clock(), Clock()
 
     def fresh():
-        """A rollout that has rendered nothing yet, and whose rendering is timed."""
-        made = Imagination(config, params, state, key, chosen.batch)
-        views = made._views
-        object.__setattr__(made, "_views", lambda actions: rendering(lambda: views(actions)))
-        return made, views
+        """A rollout that has rendered nothing yet."""
+        return Imagination(config, params, state, key, chosen.batch)
 
-    rollout, views = fresh()
+    rollout = fresh()
     asked: list[np.ndarray] = []
 
     def rolled(actions):
@@ -167,13 +164,18 @@ def main() -> None:
 
     begun = np.random.default_rng(0).integers(0, 3, (settings.candidates, settings.horizon))
     jax.block_until_ready(cost(rollout(begun), goal))  # compiles
-    views(np.ones((1, 1), int))  # one camera alone is another program
+    rollout._views(np.ones((1, 1), int))  # one camera alone is another program
     judged = Judged(rolled, cost, goal)
     plan(CEM(), settings, lambda *_: np.zeros(settings.candidates), key, progress=False)  # too
-    rollout, views = fresh()
-    imagining, rendering = Clock(), Clock()
-    whole = Clock()
+    rollout, imagining = fresh(), Clock()
+    asked.clear()
     found = whole(lambda: plan(CEM(), settings, judged, jax.random.key(1)))
+    views = fresh()._views
+    for actions in asked:  # again, and alone: in a plan it goes on while others are imagined
+        order = np.lexsort(actions.T[::-1])
+        for first in range(0, len(order), chosen.batch):
+            part = actions[np.resize(order[first : first + chosen.batch], chosen.batch)]
+            rendering(functools.partial(views, part))
     drawn, drawing = views.rendered, rendering.cpu
 
     tried = np.concatenate(asked)

@@ -107,10 +107,16 @@ def parts(clips: int) -> tuple[dict[str, Callable[[], object]], Any, Any]:
     frames = batch.imagine(methods, "memory", 0)[2]
     lpips = metrics.load("lpips_alex")
     assert isinstance(lpips, Perceptual)
+
+    def read() -> Any:
+        """Read a batch, and wait for what has been seen before."""
+        made = load_batch(config, episodes, choices, 0, cameras=False)
+        return made.seen, made.unseen
+
     runs: dict[str, Callable[[], object]] = {
         SAMPLER: lambda: batch.imagine(methods, "memory", 0),
         EMPTY: lambda: batch.imagine(methods, "empty", 0),
-        READING: lambda: load_batch(config, episodes, choices, 0, cameras=False),
+        READING: read,
         PLAIN: lambda: batch.sums(frames, None),
         LPIPS: lambda: lpips.frames(frames.rgb_THWC, batch.targets.rgb_THWC),
     }

@@ -60,12 +60,13 @@ HOMES = {
     "safetensors": {"tensor_files", "weights", "convert"},
     "scipy": {"data", "houses"},
     "tensorboardX": {"training/log"},
-    "torch": {"convert"},
-    "transformers": {"convert"},
+    "torch": {"convert", "evaluation/metrics/sam2"},
+    "transformers": {"convert", "evaluation/metrics/sam2"},
     "trimesh": {"data", "houses"},
     "tyro": {"cli", "config", "convert/commands", "data", "memory/feature_command"},
     "viser": {"play/extra"},
     "wandb": {"training/wandb_log"},
+    "websockets": {"play/visitors"},
 }
 """Libraries and the only places that import them."""
 BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}

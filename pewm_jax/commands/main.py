@@ -9,6 +9,7 @@ import pewm_jax
 from pewm_jax import cli
 from pewm_jax.commands import (
     compare,
+    demo,
     evaluate,
     horizon,
     play,
@@ -41,6 +42,7 @@ class Command:
 
 COMMANDS = {
     "play": Command(play.main, "drive through a world that a model imagines, in the browser"),
+    "demo": Command(demo.main, "collect, train, imagine and score, small and by one command"),
     "data": Command(data.main, "collect, import, validate and show episodes"),
     "train": Command(train.main, "train a world model, or go on where a training stopped"),
     "protocol": Command(protocol.main, "choose what runs are scored by, before training them"),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pewm_jax import cli, shipped
 from pewm_jax.commands import imports
+from pewm_jax.play import heap
 from pewm_jax.play.settings import Serve, Start
 
 ABOUT = (
@@ -52,7 +53,9 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
             f"{argv[0]} is no run: name its folder, such as runs/demo, or one of "
             f"{', '.join(shipped.names())}."
         )
-    # Imported here and not above: help and refusals come at once.
+    # Imported here and not above: help and refusals come at once, and memory is set up before.
+    heap.keep_small()
+    print("Starting …", flush=True)
     from pewm_jax.play import page as pages
     from pewm_jax.play import serving
 

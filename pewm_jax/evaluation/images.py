@@ -69,17 +69,18 @@ def ssim_map(a_HWC: Array, b_HWC: Array) -> Array:
     rows, columns = jnp.asarray(_band(height)), jnp.asarray(_band(width))
 
     def blur(x):
-        along_width = jnp.einsum("vw,...hwc->...hvc", columns, x, precision="highest")
-        return jnp.einsum("uh,...hvc->...uvc", rows, along_width, precision="highest")
+        """Slide the window, as two products of large matrices: (..., 3, H, W) to (..., 3, v, u)."""
+        along_width = jnp.matmul(x, columns.T, precision="highest")
+        return jnp.matmul(jnp.swapaxes(along_width, -1, -2), rows.T, precision="highest")
 
+    a, b = (jnp.moveaxis(x, -1, -3) for x in (a_HWC, b_HWC))
+    mean_a, mean_b, square_a, square_b, product = blur(jnp.stack([a, b, a * a, b * b, a * b]))
     c1, c2 = 0.01**2, 0.03**2
-    mean_a, mean_b = blur(a_HWC), blur(b_HWC)
-    variance_a = blur(a_HWC * a_HWC) - mean_a**2
-    variance_b = blur(b_HWC * b_HWC) - mean_b**2
-    covariance = blur(a_HWC * b_HWC) - mean_a * mean_b
+    variance_a, variance_b = square_a - mean_a**2, square_b - mean_b**2
+    covariance = product - mean_a * mean_b
     luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
     structure = (2 * covariance + c2) / (variance_a + variance_b + c2)
-    return (luminance * structure).mean(-1)
+    return jnp.swapaxes((luminance * structure).mean(-3), -1, -2)
 
 
 def error_sums(predicted: Frames, true: Frames, seen_THW: Array, unseen_THW: Array) -> Array:

@@ -42,15 +42,16 @@ def visible_in(points_world_P3: Array, depth_HW: Array, camera: Camera) -> Array
     u, v = uv[:, 0], uv[:, 1]
     inside = (z > 1e-3) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
 
-    def at(row, column):
-        row = jnp.clip(row, 0, height - 1).astype(jnp.int32)
-        column = jnp.clip(column, 0, width - 1).astype(jnp.int32)
-        return depth_HW[row, column]
-
-    nearest = at(jnp.floor(v), jnp.floor(u))
+    # Once to the memory for all four pixels around a point, of which the nearest is one.
+    padded = jnp.pad(depth_HW, 1, mode="edge")
+    four = [padded[i : i + height + 1, j : j + width + 1] for i in (0, 1) for j in (0, 1)]
     left, top = jnp.floor(u - 0.5), jnp.floor(v - 0.5)
     across, down = u - 0.5 - left, v - 0.5 - top
-    corners = jnp.stack([at(top + i, left + j) for i in (0, 1) for j in (0, 1)])
+    row = jnp.clip(top + 1, 0, height).astype(jnp.int32)
+    column = jnp.clip(left + 1, 0, width).astype(jnp.int32)
+    corners = jnp.moveaxis(jnp.stack(four, -1)[row, column], -1, 0)
+    upper, lower = (jnp.where(across < 0.5, corners[i], corners[i + 1]) for i in (0, 2))
+    nearest = jnp.where(down < 0.5, upper, lower)
     weights = jnp.stack(
         [(1 - down) * (1 - across), (1 - down) * across, down * (1 - across), down * across]
     )

@@ -21,8 +21,17 @@ def plucker(camera: Camera, height: int, width: int) -> Array:
         height: image height in pixels.
         width: image width in pixels.
     """
+    return _moved(_unit_directions(camera, height, width), camera)
+
+
+def _unit_directions(camera: Camera, height: int, width: int) -> Array:
+    """Return (..., H, W, 3) directions of length 1 in the cameras' own frames."""
     direction = ray_directions(camera.intrinsics_4, height, width)
-    direction = direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
+    return direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def _moved(direction: Array, camera: Camera) -> Array:
+    """Return (o × R d, R d) of directions d in the cameras' own frames; linear in them."""
     rotation = camera.world_from_camera[..., None, :3, :3]
     direction = direction @ jnp.swapaxes(rotation, -1, -2)
     origin = jnp.broadcast_to(camera.world_from_camera[..., None, None, :3, 3], direction.shape)
@@ -53,8 +62,11 @@ def camera_latents(camera: Camera, height: int, width: int, spatial: int, tempor
     Returns:
         (t, h, w, 6·temporal) camera channels; 24 for CogVideoX's factor 4.
     """
-    rays = plucker(relative_to_first(camera), height, width)
-    frames, h, w = rays.shape[0], height // spatial, width // spatial
-    pooled = rays.reshape(frames, h, spatial, w, spatial, 6).mean((2, 4))
+    camera = relative_to_first(camera)
+    direction = _unit_directions(camera, height, width)
+    frames, h, w = direction.shape[0], height // spatial, width // spatial
+    # The mean of rays is the ray of the mean: both parts are linear in the direction.
+    direction = direction.reshape(frames, h, spatial, w, spatial, 3).mean((2, 4))
+    pooled = _moved(direction, camera)
     folded = jnp.moveaxis(fold_frames(pooled, temporal), 1, -2)
     return folded.reshape(*folded.shape[:-2], temporal * 6)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeAlias
 
 import jax
@@ -24,6 +25,10 @@ from pewm_jax.types import Array, Frames, Params, WorldState
 
 Rollout: TypeAlias = Callable[[Any], Frames]
 """``rollout(actions_KN) -> Frames``, leading shape (K, N) or, of the last ones, (K, 1)."""
+
+
+WORKERS = 2
+"""Batches under way at once: what XLA does on one core (convolutions) would leave others idle."""
 
 
 @functools.partial(jax.jit, static_argnums=0, static_argnames=("memory", "last"))
@@ -56,8 +61,8 @@ class Imagination:
         params: its parameters.
         state: the world so far.
         key: the noise.
-        batch: candidates that are imagined at once. It bounds memory and changes no result, but
-            for rounding.
+        batch: candidates that are imagined together, two batches at a time. It bounds memory and
+            changes no result, but for rounding.
         last: give only the last frame of each, which spares decoding the others.
         memory: False ignores what is remembered.
     """
@@ -66,7 +71,7 @@ class Imagination:
     params: Params = dataclasses.field(repr=False)
     state: WorldState = dataclasses.field(repr=False)
     key: Array
-    batch: int = 12
+    batch: int = 6
     last: bool = True
     memory: bool = True
     _views: Callable[[Any], Any] | None = dataclasses.field(init=False, repr=False)
@@ -95,17 +100,23 @@ class Imagination:
         # Neighbours with equal beginnings come into one batch, where they share their views.
         order = np.lexsort(actions.reshape(len(actions), -1).T[::-1])
         model, keys = worlds.model_of(self.config), jnp.stack([self.key] * self.batch)
-        made = []
-        for first in range(0, len(order), self.batch):
-            part = actions[order[first : first + self.batch]]
-            filled = np.concatenate([part, np.repeat(part[-1:], self.batch - len(part), 0)])
-            views = None if self._views is None else self._views(filled)
-            options = {"memory": self.memory, "last": self.last}
-            frames = _imagined(model, self.params, self.state, filled, keys, views, **options)
-            made.append(frames)
-        back = np.argsort(order)  # what was filled in lies behind
+        batches = [order[first : first + self.batch] for first in range(0, len(order), self.batch)]
+        options = {"memory": self.memory, "last": self.last}
+
+        def imagined(part: np.ndarray, views: Any) -> Frames:
+            filled = actions[np.resize(part, self.batch)]
+            run = _imagined(model, self.params, self.state, filled, keys, views, **options)
+            return jax.tree.map(lambda x: x[: len(part)], jax.device_get(run))
+
+        with ThreadPoolExecutor(WORKERS) as pool:
+            waiting = []
+            for part in batches:
+                views = self._views and self._views(actions[np.resize(part, self.batch)])
+                waiting.append(pool.submit(imagined, part, views))
+            parts = [each.result() for each in waiting]
+        back = np.argsort(order)
         # On the host: the number of candidates changes, and would be compiled for anew.
-        return jax.tree.map(lambda *x: np.concatenate(x)[back], *jax.device_get(made))
+        return jax.tree.map(lambda *x: np.concatenate(x)[back], *parts)
 
 
 @dataclasses.dataclass(eq=False)

@@ -52,7 +52,7 @@ def imagining(
     config: Config | WorldSettings,
     params: Params,
     *,
-    batch: int = 12,
+    batch: int = 6,
     last: bool = True,
     memory: bool = True,
 ) -> Mind:

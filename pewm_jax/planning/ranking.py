@@ -42,7 +42,7 @@ def rank(
     goal: Frames,
     key: Array,
     *,
-    batch: int = 12,
+    batch: int = 6,
     last: bool = True,
 ) -> Ranking:
     """Imagine proposals and put them in order.

@@ -88,7 +88,7 @@ class Page:
         Args:
             load: gives the model, an ``Engine``.
             start: where the drive begins.
-            serve: address and port.
+            serve: address, port and names.
             folder: of saved worlds and videos.
             name: of the model, for the title.
             say: told where the page is, what it waits for, and what goes wrong, once each.
@@ -96,8 +96,8 @@ class Page:
         Raises:
             ConfigError: the address cannot be served on.
         """
-        self._start, self._seconds, self._say, self._phase = start, None, say, ""
-        self._server = serving.server(serve)
+        self._start, self._seconds, self._tell = start, None, status.Terminal(say)
+        self._server = serving.server(serve, say)
         # Sharing asks a server elsewhere for a public address; this page is local.
         self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
         self.url = f"http://{serving.here(serve.host)}:{self._server.get_port()}"
@@ -145,15 +145,6 @@ class Page:
             seen = as_bytes(np.asarray(shown.session.world.frame.rgb_THWC[0]))
             self._map.show(shown.engine, shown.session, seen)
         self._show_choices(shown)
-
-    def _tell(self, shown: Shown) -> None:
-        """Tell the terminal what the page begins to wait for, and what went wrong."""
-        phase = shown.said.partition(" …")[0] if shown.busy or shown.failed else ""
-        if phase and phase != self._phase:
-            self._say(f"{phase} …" if shown.busy else f"error: {phase}")
-        if self._phase.startswith("Preparing") and not phase:
-            self._say("Ready.")
-        self._phase = phase
 
     def _put(self, request: Request) -> None:
         self.driver.put(request)

@@ -8,8 +8,10 @@ import os
 import socket
 import sys
 import webbrowser
+from collections.abc import Callable
 
-from pewm_jax.config import ConfigError
+from pewm_jax.config import ConfigError, UserError
+from pewm_jax.play import visitors
 from pewm_jax.play.extra import viser
 from pewm_jax.play.settings import LOOPBACK, Serve
 
@@ -37,11 +39,16 @@ def here(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def server(serve: Serve) -> viser.ViserServer:
-    """Begin to serve, without viser's own message.
+def server(serve: Serve, say: Callable[[str], None] = lambda _: None) -> viser.ViserServer:
+    """Begin to serve, without viser's own message, and to no page of another site.
+
+    Args:
+        serve: address, port and names.
+        say: told who was refused, and why.
 
     Raises:
         ConfigError: the host is no address of this machine; viser would wait for it forever.
+        UserError: a viser whose visitors cannot be asked where they come from.
     """
     try:
         kind, *_, address = socket.getaddrinfo(serve.host, 0, type=socket.SOCK_STREAM)[0]
@@ -52,5 +59,13 @@ def server(serve: Serve) -> viser.ViserServer:
             f"--host {serve.host} is no address that this machine can serve on ({error}); take "
             "127.0.0.1, or 0.0.0.0 to be reached by others."
         ) from None
-    with contextlib.redirect_stdout(io.StringIO()):
-        return viser.ViserServer(host=serve.host, port=serve.port, verbose=False)
+    asked = visitors.asked(serve.host, serve.names, say)
+    with contextlib.redirect_stdout(io.StringIO()), asked as asking:
+        begun = viser.ViserServer(host=serve.host, port=serve.port, verbose=False)
+        if not asking:
+            begun.stop()
+            raise UserError(
+                f"viser {viser.__version__} serves in a way in which pages of other sites could "
+                "drive here: pip install 'viser==1.1.1'."
+            )
+    return begun

@@ -80,6 +80,9 @@ class Serve:
     password."""
     port: int = 8080
     """Port of the page; the next free one is taken if it is in use."""
+    names: tuple[str, ...] = ()
+    """Names that stand in the browser's address bar beside this machine's own, such as that of a
+    proxy in front of it. Pages of other sites are refused."""
     worlds: Path | None = None
     """Folder of saved worlds and videos; by default worlds/ beside the run's reports."""
     ahead: bool = True

@@ -1,10 +1,33 @@
-"""The line that says how things are: one sentence, and the facts below it."""
+"""Saying how things are: on the page a sentence and the facts below it, in the terminal a line."""
 
 from __future__ import annotations
 
 import html
+import time
+from collections.abc import Callable
 
 from pewm_jax.play.requests import Shown
+
+SAY_AGAIN_S = 10.0
+"""Seconds after which the terminal is told again what is waited for."""
+
+
+class Terminal:
+    """Tells the terminal what the page waits for, now and then again, and what went wrong."""
+
+    def __init__(self, say: Callable[[str], None]):
+        self._say, self._phase, self._told = say, "", 0.0
+
+    def __call__(self, shown: Shown) -> None:
+        """Tell it what the driver tells the page, as far as it is new."""
+        phase = shown.said.partition(" …")[0] if shown.busy or shown.failed else ""
+        late = shown.busy and time.monotonic() - self._told >= SAY_AGAIN_S
+        if phase and (phase != self._phase or late):
+            self._say(shown.said if shown.busy else f"error: {phase}")
+            self._told = time.monotonic()
+        if self._phase.startswith("Preparing") and not phase:
+            self._say("Ready.")
+        self._phase = phase
 
 
 def line(shown: Shown, seconds: float | None, points: int) -> str:

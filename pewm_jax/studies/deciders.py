@@ -59,7 +59,7 @@ class Minds:
 
     config: Config
     params: Params = dataclasses.field(repr=False)
-    batch: int = 12
+    batch: int = 6
 
     def rollout(self, mind: str, goal: Goal) -> Rollout:
         """Return what a mind rolls candidates out with."""

@@ -222,7 +222,7 @@ def test_other_programs_of_pages_exist():
             assert set(named) <= targets, command
         elif words[0] == "python" and words[1].endswith(".py"):
             assert (ROOT / words[1]).is_file(), command
-        for extra in re.findall(r"(?:pewm-jax|\.)\[([a-z,]+)\]", command):
+        for extra in re.findall(r"(?:pewm-jax|\.)\[([a-z0-9,]+)\]", command):
             assert set(extra.split(",")) <= extras["optional-dependencies"].keys(), command
 
 

@@ -1,6 +1,7 @@
 """The page without a browser: it is served, tabs come and go, and it ends."""
 
 import contextlib
+import socket
 import subprocess
 import sys
 import urllib.error
@@ -10,12 +11,12 @@ import numpy as np
 import pytest
 import viser
 import viser.transforms
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from pewm_jax.commands import play
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.play import page, requests, serving
+from pewm_jax.play import page, requests, serving, status, visitors
 from pewm_jax.play.settings import Serve, Start
 from tests.play.tiny_drive import FORWARD, a_place, a_toy
 
@@ -23,17 +24,17 @@ LONG = 120
 
 
 @contextlib.contextmanager
-def a_page(folder, load=a_toy):
-    one = page.Page(load, Start(house=2), Serve(port=0, ahead=False), folder, "toy")
+def a_page(folder, load=a_toy, say=lambda _: None):
+    one = page.Page(load, Start(house=2), Serve(port=0, ahead=False), folder, "toy", say)
     try:
         yield one
     finally:
         one.close()
 
 
-def a_tab(one):
+def a_tab(one, **rest):
     protocol = f"viser-v{viser.__version__}"
-    return connect(one.url.replace("http", "ws"), subprotocols=[protocol], max_size=None)
+    return connect(one.url.replace("http", "ws"), subprotocols=[protocol], max_size=None, **rest)
 
 
 def heard(tab):
@@ -87,6 +88,24 @@ def test_what_goes_wrong_is_on_the_page(tmp_path):
         assert "Choose a box first" in one._status.content
 
 
+def test_the_terminal_is_told_now_and_then_what_is_waited_for(tmp_path, monkeypatch):
+    told = []
+
+    def load():
+        raise UserError("nothing to load here")
+
+    with a_page(tmp_path, load, told.append) as one:
+        assert one.driver.wait(LONG)
+        assert told[1:] == ["Loading the model …", "error: nothing to load here"]
+        told.clear()
+        for seconds in range(1, 4):
+            one._tell(requests.Shown(f"Preparing … {seconds} s", busy=True))
+        monkeypatch.setattr(status, "SAY_AGAIN_S", 0.0)
+        one._tell(requests.Shown("Preparing … 4 s", busy=True))
+        one._tell(requests.Shown("Drive."))
+        assert told == ["Preparing … 1 s", "Preparing … 4 s", "Ready."]
+
+
 def test_a_box_goes_where_it_was_dragged_and_the_agent_too(tmp_path):
     with a_page(tmp_path) as one:
         assert one.driver.wait(LONG)
@@ -111,6 +130,70 @@ def test_a_box_goes_where_it_was_dragged_and_the_agent_too(tmp_path):
         view.ceiling = view.tint = True
         view.redraw()
         assert len(view.points) == len(one.driver.engine.points(one.driver._session.world)[0])
+
+
+def test_a_page_of_another_site_cannot_drive(tmp_path):
+    told = []
+
+    def load():
+        raise UserError("nothing to load here")
+
+    with a_page(tmp_path, load, told.append) as one:
+        a_tab(one, origin=one.url).close()
+        for origin in ("https://evil.example", "http://127.0.0.1:1", "null"):
+            with pytest.raises(InvalidStatus, match="403"):
+                a_tab(one, origin=origin)
+        port = int(one.url.rpartition(":")[2])
+        rebound = f"evil.example:{port}"  # a name that was made to point at this machine
+        way = socket.create_connection(("127.0.0.1", port))
+        with way, pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://{rebound}", sock=way, origin=f"http://{rebound}")
+        page_of_a_stranger = urllib.request.Request(one.url, headers={"Host": rebound})
+        with pytest.raises(urllib.error.HTTPError, match="403") as refused:
+            urllib.request.urlopen(page_of_a_stranger, timeout=30)
+        assert b"--names evil.example" in refused.value.read()
+    said = [line for line in told if line.startswith("refused: ")]
+    assert len(said) == len(set(said)) == 4
+    assert any("another site" in line for line in said)
+
+
+def test_which_visitors_are_welcome():
+    here = "127.0.0.1"
+    for origin, host, names in (
+        (None, "localhost:8080", ()),
+        ("http://localhost:8080", "localhost:8080", ()),
+        ("http://[::1]:8080", "[::1]:8080", ()),
+        ("http://192.168.0.7:8080", "192.168.0.7:8080", ()),
+        ("https://Box.example", "box.example:443", ("box.example",)),
+        ("https://box.example", "127.0.0.1:8080", ("box.example",)),  # a proxy that renames
+    ):
+        assert visitors.objection(origin, host, here, names) == "", (origin, host)
+    for origin, host, names in (
+        ("http://localhost:8080", "localhost:8081", ()),
+        ("https://localhost", "localhost:80", ()),
+        ("http://box.example:8080", "box.example:8080", ()),
+        ("http://localhost.evil.example", "localhost", ()),
+        ("file://", "localhost:8080", ("",)),
+        (None, None, ("",)),
+        (None, "localhost:port", ()),
+    ):
+        assert visitors.objection(origin, host, here, names), (origin, host)
+    assert visitors.objection("http://box:80", "box", "box") == ""
+    for odd in ("a;b", "a\udc9b", "a b", "<b>", "a" * 300):
+        for origin, host in ((None, odd), (f"http://{odd}", "localhost")):
+            said = visitors.objection(origin, host, here)
+            assert said.isascii()
+            assert "--names" not in said
+
+
+def test_a_server_that_cannot_be_asked_about_is_not_served(monkeypatch):
+    class Other:
+        def __init__(self, **_):
+            self.stop = lambda: None
+
+    monkeypatch.setattr(serving.viser, "ViserServer", Other)
+    with pytest.raises(UserError, match="pages of other sites"):
+        serving.server(Serve(port=0))
 
 
 def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so():

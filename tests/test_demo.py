@@ -1,0 +1,99 @@
+"""``pewm-jax demo``: the same parts as ``make demo`` in order, and what to open then."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pewm_jax.commands import demo
+from pewm_jax.config import UserError
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def called(monkeypatch):
+    """What the parts are called with, in place of doing it."""
+    seen = []
+
+    def part(name, code=0):
+        def run(argv, prog):
+            seen.append((prog, list(argv)))
+            return code
+
+        return run
+
+    for name in ("data", "train", "evaluate"):
+        monkeypatch.setattr(getattr(demo, name), "main", part(name))
+    return seen
+
+
+def test_it_does_what_make_demo_does(called, capsys):
+    assert demo.main([]) == 0
+    makefile = (ROOT / "Makefile").read_text()
+    settings = dict(re.findall(r"^(\w+) \?= (.+)$", makefile, re.MULTILINE))
+    (recipe,) = re.findall(r"^demo: .*\n((?:\t.*\n)+)", makefile, re.MULTILINE)
+    asked = [
+        re.sub(r"\$\((\w+)\)", lambda m: settings.get(m[1], m[0]), x) for x in recipe.split("\n")
+    ]
+    plain = [re.sub(r"^\t@\$\(PY\) (-m pewm_jax\.)?", "", x).replace(".py", "") for x in asked if x]
+    assert [shlex.split(line) for line in plain] == [
+        [prog.removeprefix("pewm-jax "), *argv] for prog, argv in called
+    ]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:5] for line in lines[:3]] == ["[1/3]", "[2/3]", "[3/3]"]
+    assert "runs/demo/report/index.html" in lines[-1]
+
+
+def test_walks_are_collected_as_large_as_the_preset_wants_them():
+    parts = {preset: demo.steps(demo.Settings(preset)) for preset in ("demo", "tiny")}
+    assert "--size" not in parts["demo"][0][2]
+    assert parts["tiny"][0][2][-2:] == ["--size", "16"]
+
+
+def test_a_part_that_fails_ends_it(called, monkeypatch, capsys):
+    monkeypatch.setattr(demo.data, "main", lambda argv, prog: 2)
+    assert demo.main(["--run", "elsewhere"]) == 2
+    assert called == []
+    assert "Done" not in capsys.readouterr().out
+
+
+def test_its_end_names_the_command_that_installs_the_viewer():
+    run = Path("my runs/a")
+    assert demo.ending(run, viewer=True).endswith("Drive in it: pewm-jax play 'my runs/a'")
+    assert "pip install 'pewm-jax[play]' && pewm-jax play" in demo.ending(run, viewer=False)
+
+
+def test_what_cannot_be_is_refused_before_anything_is_made(called):
+    wrong = (
+        (["--preset", "dmo"], "There is no preset 'dmo'"),
+        (["--houses", "0"], "at least 1"),
+        (["--preset", "codec"], "square pictures"),
+        (["--house", "3"], "did you mean --houses"),
+    )
+    for argv, says in wrong:
+        with pytest.raises(UserError, match=says):
+            demo.main(argv)
+    assert called == []
+
+
+def test_without_the_renderer_it_names_the_command_that_installs_it(tmp_path):
+    code = (
+        "import sys; sys.modules['embreex'] = None\n"
+        "from pewm_jax.commands.main import main; sys.exit(main(['demo']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "pip install embreex" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
