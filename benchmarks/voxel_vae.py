@@ -40,18 +40,18 @@ LEARNS = VoxelVAEConfig(
     side=24,
     patch=2,
     embed=16,
-    widths=(96,),
+    widths=(256,),
     blocks=1,
     middle=0,
     kernel=1,
     middle_kernel=1,
-    latent_channels=8,
+    latent_channels=16,
     kl=1e-5,
     compared=3072,
     occupied_weight=6.0,
 )
 """What ``--learn`` trains; classes are the dataset's. Of larger grids the middle is taken."""
-RATE, WARMUP, BATCH = 6e-3, 50, 4
+RATE, WARMUP, BATCH = 4e-3, 50, 4
 FORMS = {
     "patches of 4, 27 places": SMALL,
     "patches of 4, 27 places in the middle": dataclasses.replace(SMALL, kernel=1),
@@ -131,7 +131,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=4, help="grids of a step")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--learn", type=Path, help="a dataset to train a small network on")
-    parser.add_argument("--steps", type=int, default=3000, help="of --learn")
+    parser.add_argument("--steps", type=int, default=2000, help="of --learn")
     asked = parser.parse_args()
     if asked.learn:
         learn(asked.learn, asked.steps)

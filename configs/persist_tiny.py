@@ -32,7 +32,7 @@ def config() -> Config:
     --frames 40``. The codec of pictures is the one that comes with the library.
     """
     codec = LearnedCodecConfig(gate=48)
-    width = {"heads": 4, "head_dim": 40, "gates": "open"}
+    width = {"head_dim": 40, "gates": "open"}
     pixels = FrameFlowConfig(
         per_frame=True, context_noise=0.1, times="uniform", sample_steps=4, shift=1.0
     )
@@ -47,24 +47,24 @@ def config() -> Config:
                     classes=CLASSES,
                     patch=2,
                     embed=16,
-                    widths=(96,),
+                    widths=(256,),
                     blocks=1,
                     middle=0,
                     kernel=1,
                     middle_kernel=1,
-                    latent_channels=8,
+                    latent_channels=16,
                     kl=1e-5,
                     compared=3072,
                     occupied_weight=6.0,
                 ),
                 world_frames=VoxelDiTConfig(
                     latent_side=16,
-                    latent_channels=8,
+                    latent_channels=16,
                     patch=4,
                     actions=3,
                     pixel_channels=codec.channels + 24,
                     pixel_patch=1,
-                    blocks=BlocksConfig(layers=4, context=4, **width),
+                    blocks=BlocksConfig(layers=4, heads=8, context=4, **width),
                 ),
                 camera_model=CameraModelConfig(
                     classes=CLASSES,
@@ -88,7 +88,7 @@ def config() -> Config:
                     fold=8,
                     patch=1,
                     longest_m=12.0,
-                    blocks=BlocksConfig(layers=4, context=3, **width),
+                    blocks=BlocksConfig(layers=4, heads=4, context=3, **width),
                 ),
             ),
             control=ModulationConfig(units=(0.25, 0.25, 1.0)),
@@ -110,7 +110,7 @@ def config() -> Config:
             run="runs/persist_tiny",
             start="codec",
             optimizer="muon",
-            voxel_vae=StageConfig(steps=800, batch=2, learning_rate=6e-3, warmup=30),
+            voxel_vae=StageConfig(steps=600, batch=2, learning_rate=4e-3, warmup=30),
             voxel_statistics=StageConfig(steps=40, batch=8, learning_rate=0.05, warmup=0),
             world_frames=StageConfig(steps=500, batch=6, learning_rate=1.5e-3, warmup=30),
             camera=StageConfig(steps=40, batch=16, learning_rate=1e-3, warmup=10),

@@ -223,6 +223,7 @@ COMMANDS = {
     "protocol": ("pewm-jax protocol", ["-m", "pewm_jax", "protocol"]),
     "compare": ("pewm-jax compare", ["-m", "pewm_jax", "compare"]),
     "play": ("pewm-jax play", ["-m", "pewm_jax", "play"]),
+    "demo": ("pewm-jax demo", ["-m", "pewm_jax", "demo"]),
     "table2": ("pewm-jax table2", ["-m", "pewm_jax", "table2"]),
     "practice": ("pewm-jax practice", ["-m", "pewm_jax", "practice"]),
     "horizon": ("pewm-jax horizon", ["-m", "pewm_jax", "horizon"]),
