@@ -78,7 +78,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax horizon") -> int:
     # Imported here and not above: help and refusals come at once.
     from pewm_jax.config import PersistConfig
     from pewm_jax.data.dataset import EpisodeSource
-    from pewm_jax.evaluation import edit_trials, horizon, horizon_page
+    from pewm_jax.evaluation import edit_trials, horizon, horizon_page, voxel_score
     from pewm_jax.evaluation.metrics.videos import read
     from pewm_jax.evaluation.opened import open_run
     from pewm_jax.models import i3d_weights
@@ -101,6 +101,8 @@ def main(argv: Sequence[str], prog: str = "pewm-jax horizon") -> int:
         made["without"] = horizon.roll(config, params, walks, memory=False, say="without voxels")
         if all(walk.first is not None for walk in walks):
             made["bound"] = horizon.bound(config, params, walks)
+            grids = [walk.classes_TXYZ for walk in walks if walk.classes_TXYZ is not None]
+            facts["autoencoder"] = voxel_score.given_back(config.model, params, grids)
     for name, other in others:
         made[name] = horizon.roll(other.config, other.params, walks, say=name)
     facts["psnr"] = {name: horizon.stretches(video, truth, ends) for name, video in made.items()}

@@ -67,6 +67,19 @@ def lines(facts: Mapping[str, Any], ends: Sequence[int]) -> list[str]:
             for end, one in found.items()
         )
         said.append(f"  {_name(name)}: {scores}")
+    return [*said, *sentences(facts)]
+
+
+def sentences(facts: Mapping[str, Any]) -> list[str]:
+    """Return what is said of a world of voxels: its autoencoder, and blocks placed in it."""
+    said = []
+    if "autoencoder" in facts:
+        back = facts["autoencoder"]
+        said.append(
+            f"The 3D VAE gives back {100 * back['occupied']:.1f} % of the occupied cells with "
+            f"their class ({100 * back['filled']:.1f} % as occupied) and {100 * back['empty']:.1f} "
+            f"% of the empty ones, of {back['grids']} recorded grids."
+        )
     if "edits" in facts:
         edits = facts["edits"]
         said.append(
@@ -116,7 +129,7 @@ def _html(facts: Mapping[str, Any], ends: Sequence[int]) -> str:
             "<h2>Windows of 16 frames, as sets</h2><table><thead><tr><th></th><th>frames before"
             f"</th><th>FVD</th><th>KVD</th><th>clips</th></tr></thead><tbody>{rows}</tbody></table>"
         )
-    said = "".join(f"<p>{escape(line)}</p>" for line in lines(facts, ends)[-1:] if "edits" in facts)
+    said = "".join(f"<p>{escape(line)}</p>" for line in sentences(facts))
     parts.append(f"{said}<figure><img src='horizon.png' alt='Frames of a walk.'></figure>")
     parts.append("<video src='horizon.mp4' controls muted loop></video>")
     protocol = "".join(

@@ -1,12 +1,15 @@
 """Long horizons: which frames count, what is written, what is refused."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from pewm_jax.cli import ConfigError
 from pewm_jax.commands import horizon as command
-from pewm_jax.config import UserError
-from pewm_jax.evaluation import edit_trials, horizon, horizon_page
+from pewm_jax.config import UserError, VoxelVAEConfig
+from pewm_jax.evaluation import edit_trials, horizon, horizon_page, voxel_score
+from pewm_jax.models import voxel_vae
 
 
 def test_stretches_are_of_their_frames_alone():
@@ -56,19 +59,40 @@ def test_the_report_says_what_was_measured(tmp_path):
     facts = {
         "psnr": {"world": [12.0, 11.5], "bound": [20.0, 19.0]},
         "distances": {"world": {"10": score, "20": score}},
+        "autoencoder": {"grids": 3, "occupied": 0.984, "filled": 0.99, "empty": 0.997},
         "edits": trials.facts(),
         "protocol": {"run": "runs/<tiny>"},
     }
     page = horizon_page.write(tmp_path, facts, videos, (10, 20))
     text = page.read_text()
-    for wanted in ("11–20", "19.00", "runs/&lt;tiny&gt;", "1 of 2", "5 of 7"):
+    for wanted in ("11–20", "19.00", "runs/&lt;tiny&gt;", "1 of 2", "5 of 7", "98.4 %"):
         assert wanted in text, wanted
     assert {path.name for path in tmp_path.iterdir()} == {
         "horizon.html", "horizon.json", "horizon.mp4", "horizon.png",
     }  # fmt: skip
     said = horizon_page.lines(facts, (10, 20))
     assert said[0] == "PSNR in dB of frames 1–10, 11–20:"
-    assert "20: FVD 12, KVD 0.50" in said[-2]
+    assert "20: FVD 12, KVD 0.50" in said[-3]
+
+
+def test_cells_are_given_back_with_their_class_or_count_as_wrong(monkeypatch):
+    model = SimpleNamespace(backbone=SimpleNamespace(voxel_vae=VoxelVAEConfig(side=4, classes=5)))
+    grids = np.zeros((voxel_score.EVERY + 1, 6, 6, 6), np.int16)
+    grids[:, 1:3, 1:5, 1:5] = 3  # within the middle: 32 of 64 cells
+    grids[:, 0] = 4  # outside of it
+    grids[1:-1] = 1  # frames that are not looked at
+    monkeypatch.setattr(voxel_vae, "encode", lambda _config, _params, grid: grid)
+
+    def share(decode):
+        monkeypatch.setattr(voxel_vae, "decode", lambda _config, _params, grid: decode(grid))
+        return voxel_score.given_back(model, {"voxel_vae": {}}, [grids])  # type: ignore[arg-type]
+
+    whole = {"grids": 2, "occupied": 1.0, "filled": 1.0, "empty": 1.0}
+    assert share(lambda grid: grid) == whole
+    other = share(lambda grid: grid.at[:, 0].set(2))  # half of the occupied: another class
+    assert other == whole | {"occupied": 0.5}
+    gone = share(lambda grid: grid.at[:, 0].set(0).at[:, 3, 0].set(1))
+    assert gone == whole | {"occupied": 0.5, "filled": 0.5, "empty": 1 - 4 / 32}
 
 
 def test_ends_that_make_no_windows_are_refused():
