@@ -11,22 +11,11 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets, worlds
 from pewm_jax.config import (
-    BlocksConfig,
-    CameraModelConfig,
-    ClipConfig,
     Config,
     ConfigError,
-    FrameFlowConfig,
-    GridConfig,
-    ModulationConfig,
-    PersistConfig,
-    PersistNetsConfig,
     PersistTrainConfig,
     PixelConfig,
     UserError,
-    VoxelDiTConfig,
-    VoxelRendererConfig,
-    VoxelVAEConfig,
 )
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import class_edit, class_grid, memories
@@ -36,38 +25,8 @@ from pewm_jax.types import Camera, Clip, Control, Frames
 from pewm_jax.worlds import persist, persist_stages, persist_step
 from pewm_jax.worlds import persist_windows as windows
 from tests.helpers import random_frames
+from tests.persist_world import MODEL, NOISE
 
-BLOCKS = BlocksConfig(layers=1, heads=1, head_dim=8, mlp_ratio=2, context=3)
-NOISE = FrameFlowConfig(per_frame=True, sample_steps=1)
-MODEL = PersistConfig(
-    clip=ClipConfig(frames=3, height=16, width=16),
-    codec=PixelConfig(spatial=4, temporal=1),
-    backbone=PersistNetsConfig(
-        voxel_vae=VoxelVAEConfig(
-            side=8, classes=13, patch=2, embed=4, widths=(8,), blocks=1, middle=0, kernel=1,
-            latent_channels=3,
-        ),
-        world_frames=VoxelDiTConfig(
-            latent_side=4, latent_channels=3, patch=1, actions=3, pixel_channels=88,
-            pixel_patch=4, blocks=BLOCKS,
-        ),
-        camera_model=CameraModelConfig(classes=13, inner=2, embed=2, actions=3, blocks=BLOCKS),
-        renderer=VoxelRendererConfig(
-            classes=13, height=4, width=4, latent_channels=64, rays=2, layers=2, embed=4,
-            kernel=2, stride=2, fold=2, actions=3, blocks=BLOCKS,
-        ),
-    ),
-    control=ModulationConfig(),
-    memory=GridConfig(
-        cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8), recorded=12, kinds="groups", colours=1,
-        eye_m=1.25,
-    ),
-    noise=NOISE,
-    voxel_noise=NOISE,
-    hold=1e6,
-    points=True,
-    dead_reckoning=True,
-)  # fmt: skip
 CONFIG = Config(model=MODEL, train=PersistTrainConfig())
 KEY = jax.random.key(1)
 MOVES = np.array([[0.4, 0, 0], [0.4, 0, 0.3], [0.2, 0.1, -0.3]], np.float32)
@@ -118,7 +77,7 @@ def test_one_image_begins_a_world_whose_window_is_known(state):
     np.testing.assert_allclose(floor, np.round(floor), atol=1e-4)
 
 
-def test_imagined_twice_is_the_same_and_goes_on_as_in_one_go(params, state, walked):
+def test_imagined_twice_is_the_same_and_its_caches_have_grown(params, state, walked):
     equal(imagine(MODEL, params, state, MOVES, KEY), walked)
     after, frames = walked
     assert frames.rgb_THWC.shape == (3, 16, 16, 3)

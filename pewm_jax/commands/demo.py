@@ -53,7 +53,8 @@ class Settings:
             ConfigError: they are not square, or the preset is not of a world with a map.
         """
         model = presets.load(self.preset).model
-        if not isinstance(model, ModelConfig) or model.clip.width != model.clip.height:
+        maps = type(model) is ModelConfig  # of other worlds, which need other data
+        if not maps or model.clip.width != model.clip.height:
             raise cli.ConfigError(
                 f"--preset {self.preset} does not fit the demo, which trains a world with a map on "
                 "square pictures: take demo, or the steps one by one."

@@ -30,8 +30,8 @@ class Settings:
     ways."""
     ends: tuple[int, ...] = (200, 400, 600)
     """Frames at which windows end, and between which PSNR is averaged."""
-    walks: int = 8
-    """Walks, one of each episode."""
+    walks: int = 4
+    """Walks, one of each episode; those of one episode's trials may overlap."""
     context: int = 8
     """Observed frames before each."""
     fvd: Literal["on", "off"] = "off"
@@ -40,7 +40,7 @@ class Settings:
     windows: int = 4
     """Windows of each walk before each end."""
     trials: int = 0
-    """Blocks that are placed in a world of voxels; 40 as published here."""
+    """Walks in whose beginning a block is placed in a world of voxels, such as 40."""
     trial_frames: int = 64
     """Frames that are imagined after a block was placed."""
     out: Path | None = None
@@ -76,57 +76,96 @@ def main(argv: Sequence[str], prog: str = "pewm-jax horizon") -> int:
     if min(settings.walks, settings.context, settings.windows, settings.trial_frames) < 1:
         raise cli.ConfigError("--walks, --context, --windows and --trial-frames must be above 0.")
     # Imported here and not above: help and refusals come at once.
-    from pewm_jax.config import PersistConfig
-    from pewm_jax.data.dataset import EpisodeSource
-    from pewm_jax.evaluation import edit_trials, horizon, horizon_page, voxel_score
-    from pewm_jax.evaluation.metrics.videos import read
+    from pewm_jax.evaluation import horizon_page
     from pewm_jax.evaluation.opened import open_run
-    from pewm_jax.models import i3d_weights
 
-    i3d = read(i3d_weights.find(None), "fvd") if settings.fvd == "on" else None
     opened = open_run(argv[0])
     others = [(name, open_run(name)) for name in settings.beside]
     cli.cache_compilation(opened.home.parent)
-    episodes = EpisodeSource(settings.data / settings.split)
-    first = settings.context - 1
-    chosen = [episodes[k] for k in range(min(settings.walks, len(episodes)))]
-    walks = [horizon.walk_of(one, first, ends[-1], settings.context) for one in chosen]
+    facts, videos = _measured(settings, opened, others)
+    facts["protocol"] = {
+        "run": argv[0],
+        "weights_sha256": opened.weights_hash,
+        "data": f"{settings.data}/{settings.split}",
+        "walks": settings.walks,
+        "observed frames": settings.context,
+        "windows of each walk before each end": settings.windows,
+        **{f"weights_sha256 of {name}": other.weights_hash for name, other in others},
+    }
+    page = horizon_page.write(settings.out or opened.home / "horizon", facts, videos, ends)
+    print("\n".join(horizon_page.lines(facts, ends)))
+    print(f"report: {page}")
+    return 0
+
+
+def _measured(
+    settings: Settings, opened: Any, others: Sequence[tuple[str, Any]]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what is measured, and (B, T, H, W, 3) pictures by method, the truth first.
+
+    Raises:
+        ConfigError: the episodes are too few or too short, or trials are asked of another world.
+    """
     import numpy as np
 
+    from pewm_jax.config import PersistConfig
+    from pewm_jax.data.dataset import EpisodeSource
+    from pewm_jax.evaluation import edit_trials, horizon, voxel_score
+    from pewm_jax.evaluation.metrics.videos import read
+    from pewm_jax.models import i3d_weights
+
+    i3d = read(i3d_weights.find(None), "fvd") if settings.fvd == "on" else None
+    episodes = EpisodeSource(settings.data / settings.split)
+    if len(episodes) < settings.walks:
+        raise cli.ConfigError(
+            f"--walks is {settings.walks}, and {settings.data}/{settings.split} has "
+            f"{len(episodes)} episodes: ask for as many, or collect more."
+        )
+    config, params, ends = opened.config, opened.params, settings.ends
+    first = settings.context - 1
+    chosen = [episodes[k] for k in range(settings.walks)]
+    walks = [horizon.walk_of(one, first, ends[-1], settings.context) for one in chosen]
+    tried = _tried(settings, chosen, first)
+    of_voxels = isinstance(config.model, PersistConfig)
+    if tried:  # before hours of imagining
+        if not of_voxels:
+            raise cli.ConfigError("--trials places blocks in a world of voxels; this has none.")
+        edit_trials.class_of(config, tried)
     truth = np.stack([walk.truth_THWC for walk in walks])
-    config, params = opened.config, opened.params
     made: dict[str, Any] = {"world": horizon.roll(config, params, walks)}
     facts: dict[str, Any] = {}
-    if isinstance(config.model, PersistConfig):
+    if of_voxels:
         made["without"] = horizon.roll(config, params, walks, memory=False, say="without voxels")
-        if all(walk.first is not None for walk in walks):
+        grids = [walk.classes_TXYZ for walk in walks if walk.classes_TXYZ is not None]
+        if len(grids) == len(walks):
             made["bound"] = horizon.bound(config, params, walks)
-            grids = [walk.classes_TXYZ for walk in walks if walk.classes_TXYZ is not None]
             facts["autoencoder"] = voxel_score.given_back(config.model, params, grids)
     for name, other in others:
         made[name] = horizon.roll(other.config, other.params, walks, say=name)
     facts["psnr"] = {name: horizon.stretches(video, truth, ends) for name, video in made.items()}
     if i3d is not None:
         facts["distances"] = horizon.distances(made, truth, ends, settings.windows, i3d)
-    if settings.trials and isinstance(config.model, PersistConfig):
-        starts = range(first, chosen[0].length - settings.trial_frames - 1)
-        each = -(-settings.trials // len(chosen))
-        places = [starts[len(starts) * k // each] for k in range(each)]
-        tried = [
-            horizon.walk_of(one, at, settings.trial_frames, 1) for one in chosen for at in places
-        ][: settings.trials]
+    if tried:
         facts["edits"] = edit_trials.run(config, params, tried).facts()
-    facts["protocol"] = {
-        "run": argv[0],
-        "weights_sha256": opened.weights_hash,
-        "data": f"{settings.data}/{settings.split}",
-        "walks": len(walks),
-        "observed frames": settings.context,
-        "windows of each walk before each end": settings.windows,
-    }
-    page = horizon_page.write(
-        settings.out or opened.home / "horizon", facts, {"truth": truth, **made}, ends
-    )
-    print("\n".join(horizon_page.lines(facts, ends)))
-    print(f"report: {page}")
-    return 0
+    return facts, {"truth": truth, **made}
+
+
+def _tried(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
+    """Return the walks of the trials, spread over the episodes."""
+    if not settings.trials:
+        return []
+    from pewm_jax.evaluation import horizon
+
+    shortest = min(episode.length for episode in chosen)
+    starts = range(first, shortest - settings.trial_frames)
+    if not starts:
+        raise cli.ConfigError(
+            f"--trial-frames is {settings.trial_frames}, and the shortest episode has {shortest} "
+            "frames: take fewer, or collect longer episodes."
+        )
+    each = -(-settings.trials // len(chosen))
+    places = [starts[len(starts) * k // each] for k in range(each)]
+    walks = ((one, at) for at in places for one in chosen)
+    return [horizon.walk_of(one, at, settings.trial_frames, 1) for one, at in walks][
+        : settings.trials
+    ]

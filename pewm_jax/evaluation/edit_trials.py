@@ -2,6 +2,8 @@
 
 In each trial a world begins in a recorded grid. A block of one class is put on the floor in front
 of the agent, which then walks as recorded. Beside it the same walk without the block is imagined.
+What is outside of the window around the agent cannot change, and inside ``model.hold`` keeps it:
+how many frames had a part of the block in their window stands beside what stayed.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,7 @@ from pewm_jax.geometry.actions import heading
 from pewm_jax.memory import class_edit, class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models import voxel_renderer
-from pewm_jax.types import Params, WorldState
+from pewm_jax.types import Array, Params, WorldState
 from pewm_jax.worlds import persist
 from pewm_jax.worlds import persist_windows as windows
 
@@ -42,29 +44,36 @@ class Trials:
 
     Attributes:
         kept_N: share of each block's cells that have its class in the end.
-        shown: in how many frames a block was in sight of its camera.
+        shown: in how many frames a block was in sight of its camera, and not all that was.
         visible: in how many of these the picture is changed more there than elsewhere.
-        placed: how many walks had room for a block.
-        asked: how many walks there were.
+        within: in how many frames a block was in the window that may change.
+        frames: how many frames there were, of all walks with a block.
+        asked: how many walks there were, with room for a block or without.
+        hold: ``model.hold``, nats.
     """
 
     kept_N: np.ndarray
     shown: int
     visible: int
-    placed: int
+    within: int
+    frames: int
     asked: int
+    hold: float
 
     def facts(self) -> dict[str, Any]:
         """Return plain values, for a report."""
         kept = self.kept_N
         return {
-            "trials": int(self.placed),
-            "without_room": int(self.asked - self.placed),
+            "trials": len(kept),
+            "without_room": self.asked - len(kept),
             "stayed": int((kept >= STAYS).sum()),
             "share_of_trials": float((kept >= STAYS).mean()) if len(kept) else 0.0,
             "share_of_cells": float(kept.mean()) if len(kept) else 0.0,
             "frames_in_sight": int(self.shown),
             "changed_in_sight": int(self.visible),
+            "frames": int(self.frames),
+            "frames_in_window": int(self.within),
+            "hold": float(self.hold),
         }
 
 
@@ -87,11 +96,29 @@ def room(model: PersistConfig, state: WorldState, floor_z: float) -> np.ndarray 
     return None
 
 
+def class_of(config: Config, walks: Sequence[Walk], name: str = "") -> int:
+    """Return the id of the class that blocks are made of.
+
+    Args:
+        config: an experiment of a ``persist`` world.
+        walks: one for each trial.
+        name: of the class; by default the first kind of furniture.
+
+    Raises:
+        UserError: the walks have no voxels, or there is no such class.
+    """
+    if any(walk.first is None for walk in walks):
+        raise UserError("the walks have no voxels: collect them with --voxels.")
+    table = class_grid.names(config.model.memory)
+    furniture = (each for each in table if each.startswith("furniture"))
+    return class_grid.number_of(config.model.memory, name or next(furniture, table[-1]))
+
+
 def run(
     config: Config,
     params: Params,
     walks: Sequence[Walk],
-    name: str = "furniture/red",
+    name: str = "",
     batch: int = 8,
     chunk: int = 16,
 ) -> Trials:
@@ -101,22 +128,20 @@ def run(
         config: an experiment of a ``persist`` world.
         params: its weights.
         walks: one for each trial, of one length, with voxels.
-        name: class of the blocks.
+        name: class of the blocks; see ``class_of``.
         batch: walks imagined at once.
         chunk: frames imagined by one call.
 
     Raises:
-        UserError: the walks have no voxels, or there is no such class.
+        UserError: see ``class_of``.
     """
     model: PersistConfig = config.model
-    number = class_grid.number_of(model.memory, name)  # type: ignore[arg-type]
-    if any(walk.first is None for walk in walks):
-        raise UserError("the walks have no voxels: collect them with --voxels.")
+    number = class_of(config, walks, name)
     start = jax.jit(functools.partial(persist.start_in, model))
     imagine = functools.partial(persist.imagine, model)
     imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
-    sight = jax.jit(functools.partial(_sight, model))
-    ready: list[tuple[WorldState, WorldState, np.ndarray, np.ndarray]] = []
+    look = jax.jit(functools.partial(_sight, model))
+    ready: list[_Trial] = []
     for walk in walks:
         assert walk.first is not None
         frames = jax.tree.map(lambda x: x[-1:], walk.context)
@@ -125,42 +150,76 @@ def run(
         box = room(model, state, floor)
         if box is not None:
             edited = persist.edit(state, class_edit.place, model.memory, box, number)
-            ready.append((state, edited, box, walk.actions_T3))
-    kept, shown, visible = [], 0, 0
+            cells = _cells(model, edited.map, box, number)
+            ready.append(_Trial(state, edited, box, walk.actions_T3, cells))
+    kept, seen = [], np.zeros(3, int)
     steps = len(walks[0].actions_T3)
     with Meter("trials", len(ready), "trials") as meter:
         for at in range(0, len(ready), batch):
             some = ready[at : at + batch]
             filled = some + some[:1] * (batch - len(some))
-            plain, edited = (_stacked([one[k] for one in filled]) for k in (0, 1))
-            actions = np.stack([one[3] for one in filled])
+            plain, edited = (_stacked([x[k] for x in filled]) for k in (0, 1))
+            actions = np.stack([trial.actions_T3 for trial in filled])
             for first in range(0, steps, chunk):
                 keys = jax.random.split(jax.random.key(at * 1000 + first), batch)
                 part = actions[:, first : first + chunk]
                 plain, without = imagine(params, plain, part, keys)
                 edited, made = imagine(params, edited, part, keys)
-            for k, (_, _, box, _) in enumerate(some):
+                change = np.abs(np.asarray(made.rgb_THWC) - np.asarray(without.rgb_THWC)).mean(-1)
+                for k, trial in enumerate(some):
+                    grid = jax.tree.map(lambda x, k=k: x[k], edited.map)
+                    for t in range(change.shape[1]):
+                        camera = jax.tree.map(lambda x, k=k, t=t: x[k, t][None], made.camera)
+                        there, within = look(grid, camera, jnp.asarray(trial.box_23))
+                        seen += [*judged(np.asarray(there), change[k, t]), bool(within)]
+            for k, trial in enumerate(some):
                 grid = jax.tree.map(lambda x, k=k: x[k], edited.map)
-                held = np.asarray(class_edit.copy(model.memory, grid, box).classes_XYZ)
-                count = round(float(np.prod(np.array(BLOCK_M) / windows.cell_m(model))))
-                kept.append(float((held == number).sum()) / count)
-                now = np.asarray(made.rgb_THWC[k]) - np.asarray(without.rgb_THWC[k])
-                change = np.abs(now).mean(-1)
-                for t in range(change.shape[0]):
-                    camera = jax.tree.map(lambda x, k=k, t=t: x[k, t][None], made.camera)
-                    there = np.asarray(sight(grid, camera, jnp.asarray(box)))
-                    if there.sum() >= SEEN:
-                        shown += 1
-                        large = np.kron(there, np.ones(np.array(change[t].shape) // there.shape))
-                        inside = change[t][large > 0].mean()
-                        outside = change[t][large == 0].mean()
-                        visible += int(inside > 2 * outside)
+                kept.append(_cells(model, grid, trial.box_23, number) / trial.cells)
             meter.advance(len(some))
-    return Trials(np.array(kept), shown, visible, len(ready), len(walks))
+    shown, visible, within = (int(x) for x in seen)
+    frames = steps * len(ready)
+    return Trials(np.array(kept), shown, visible, within, frames, len(walks), model.hold)
 
 
-def _sight(model: PersistConfig, grid: ClassGrid, camera: Any, box_23: Any) -> Any:
-    """Return (rows, columns) bool: which rays of a camera first meet a cell of a box."""
+def judged(there_hw: np.ndarray, change_HW: np.ndarray) -> tuple[bool, bool]:
+    """Return whether a block is in sight, and whether the picture is changed more there.
+
+    Args:
+        there_hw: bool, rays that meet the block first.
+        change_HW: by how much pixels differ from those of the same walk without it.
+    """
+    rows, columns = (
+        np.arange(size) * rays // size
+        for size, rays in zip(change_HW.shape, there_hw.shape, strict=True)
+    )
+    large = there_hw[rows][:, columns]
+    if there_hw.sum() < SEEN or large.all():
+        return False, False
+    return True, bool(change_HW[large].mean() > 2 * change_HW[~large].mean())
+
+
+class _Trial(NamedTuple):
+    """A walk with room for a block: its world without it and with it."""
+
+    plain: WorldState
+    edited: WorldState
+    box_23: np.ndarray
+    actions_T3: np.ndarray
+    cells: int
+
+
+def _cells(model: PersistConfig, grid: ClassGrid, box_23: np.ndarray, number: int) -> int:
+    """Return how many cells of a box have a class."""
+    held = class_edit.copy(model.memory, grid, jnp.asarray(box_23))
+    return int((held.classes_XYZ == number).sum())
+
+
+def _sight(model: PersistConfig, grid: ClassGrid, camera: Any, box_23: Any) -> tuple[Array, Array]:
+    """Return which rays of a camera first meet a cell of a box, and whether its window has some.
+
+    Returns:
+        (rows, columns) bool, and () bool: a part of the box is in the window around the camera.
+    """
     place = camera.world_from_camera[0, :3, 3]
     first = windows.first_cell(model, grid.low_3, place)
     marked = class_edit.place(model.memory, grid, box_23, 1)
@@ -178,7 +237,10 @@ def _sight(model: PersistConfig, grid: ClassGrid, camera: Any, box_23: Any) -> A
     ]
     apart = [(one.ids_L[0, ..., 0], one.distance_L[0, ..., 0]) for one in both]
     (ids, depth), (other, beyond) = apart
-    return (ids != other) | (jnp.abs(depth - beyond) > 1e-3)
+    low = grid.low_3 + first * windows.cell_m(model)
+    high = low + windows.side(model) * windows.cell_m(model)
+    within = jnp.all((box_23[1] > low) & (box_23[0] < high))
+    return (ids != other) | (jnp.abs(depth - beyond) > 1e-3), within
 
 
 def _stacked(trees: Sequence[Any]) -> Any:

@@ -63,7 +63,8 @@ def lines(facts: Mapping[str, Any], ends: Sequence[int]) -> list[str]:
         said.append(f"  {_name(name):<26}" + "  ".join(f"{value:6.2f}" for value in values))
     for name, found in facts.get("distances", {}).items():
         scores = ", ".join(
-            f"{end}: FVD {one['fvd']['value']:.0f}, KVD {one['kvd']['value']:.2f}"
+            f"{end}: FVD {one['fvd']['value']:.0f}, KVD {one['kvd']['value']:.2f} "
+            f"({one['fvd']['clips']} clips)"
             for end, one in found.items()
         )
         said.append(f"  {_name(name)}: {scores}")
@@ -84,7 +85,10 @@ def sentences(facts: Mapping[str, Any]) -> list[str]:
         edits = facts["edits"]
         said.append(
             f"Blocks that were placed and stayed: {edits['stayed']} of {edits['trials']} "
-            f"({100 * edits['share_of_cells']:.0f} % of their cells); seen as changed in "
+            f"({100 * edits['share_of_cells']:.0f} % of their cells; {edits['without_room']} more "
+            f"walks had no room); in {edits['frames_in_window']} of {edits['frames']} frames a "
+            "part was in the window that may change, where a known cell changes if another class "
+            f"is likelier by {edits['hold']:g} nats. Seen as changed in "
             f"{edits['changed_in_sight']} of {edits['frames_in_sight']} frames in sight."
         )
     return said
@@ -116,6 +120,8 @@ def _html(facts: Mapping[str, Any], ends: Sequence[int]) -> str:
         (
             "<p class=quiet>The renderer that is given the true voxels and cameras bounds the "
             "world.</p>"
+            if "bound" in facts["psnr"]
+            else ""
         ),
     ]
     if facts.get("distances"):

@@ -16,6 +16,7 @@ import numpy as np
 from jax.core import Tracer
 
 from pewm_jax.config import MemorySettings, UserError
+from pewm_jax.data.voxel_classes import VoxelsConfig
 from pewm_jax.geometry.cameras import invert_rigid, transform_points
 from pewm_jax.memory import boxes
 from pewm_jax.types import Array
@@ -39,10 +40,16 @@ def place(config: MemorySettings, grid: ClassGrid, box_23: Array, number: int | 
         number: the class's id; see ``class_grid.number_of``.
 
     Raises:
-        UserError: the box is not a box, or the id is negative.
+        UserError: the box is not a box, or the id is not of the table.
     """
-    if not isinstance(number, Tracer) and np.any(np.asarray(number) < EMPTY):
-        raise UserError(f"place() got the class {number}: use an id of the table, 0 for nothing.")
+    if not isinstance(number, Tracer):
+        given, table = np.asarray(number), VoxelsConfig(kinds=config.kinds, colours=config.colours)  # type: ignore[attr-defined]
+        count = len(table.names)
+        if np.any((given < EMPTY) | (given >= count)):
+            raise UserError(
+                f"place() got the class {number}: use an id of the table, 1 to {count - 1}, or 0 "
+                "for nothing."
+            )
     inside = _within(config, grid, box_23)
     return _with(grid, jnp.where(inside, jnp.asarray(number, jnp.int16), grid.classes_XYZ))
 

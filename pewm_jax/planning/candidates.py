@@ -108,12 +108,18 @@ class Imagination:
             run = _imagined(model, self.params, self.state, filled, keys, views, **options)
             return jax.tree.map(lambda x: x[: len(part)], jax.device_get(run))
 
+        waiting = []
         with ThreadPoolExecutor(WORKERS) as pool:
-            waiting = []
-            for part in batches:
-                views = self._views and self._views(actions[np.resize(part, self.batch)])
-                waiting.append(pool.submit(imagined, part, views))
-            parts = [each.result() for each in waiting]
+            try:
+                for number, part in enumerate(batches):
+                    if number > WORKERS:  # views of few batches are held at once
+                        waiting[number - WORKERS - 1].result()
+                    views = self._views and self._views(actions[np.resize(part, self.batch)])
+                    waiting.append(pool.submit(imagined, part, views))
+                parts = [each.result() for each in waiting]
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
         back = np.argsort(order)
         # On the host: the number of candidates changes, and would be compiled for anew.
         return jax.tree.map(lambda *x: np.concatenate(x)[back], *parts)

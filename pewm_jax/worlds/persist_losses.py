@@ -225,8 +225,14 @@ def _velocity(
     error = jnp.square(made - noises.target(noise, x0, drawn, times))
     weight = noises.spread(noises.weight(noise, times), error.ndim)
     x0_error = jnp.square(noises.to_x0(noise, made, x_t, times) - x0)
-    if counted is None:
-        return (error * weight).mean(), {"x0_error": x0_error.mean()}
-    share = counted[..., None].astype(jnp.float32)
-    share = share / jnp.maximum(share.mean(), 1e-6)
-    return (error * weight * share).mean(), {"x0_error": (x0_error * share).mean()}
+
+    def mean(x: Array, where: Array | None) -> Array:
+        if where is None:
+            return x.mean()
+        share = where[..., None].astype(jnp.float32)
+        return (x * (share / jnp.maximum(share.mean(), 1e-6))).mean()
+
+    # Where x_t is noise alone it is not on the path, and x0 is not found from it.
+    on_path = known if counted is None or known is None else known & counted
+    on_path = counted if known is None else on_path
+    return mean(error * weight, counted), {"x0_error": mean(x0_error, on_path)}

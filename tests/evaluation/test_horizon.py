@@ -54,7 +54,7 @@ def test_the_report_says_what_was_measured(tmp_path):
         name: rng.integers(0, 255, (1, 20, 16, 16, 3)).astype(np.uint8)
         for name in ("truth", "world", "bound")
     }
-    trials = edit_trials.Trials(np.array([1.0, 0.4]), 7, 5, 2, 3)
+    trials = edit_trials.Trials(np.array([1.0, 0.4]), 7, 5, 30, 40, 3, 2.0)
     score = {"fvd": {"value": 12.0, "clips": 4}, "kvd": {"value": 0.5, "clips": 4}}
     facts = {
         "psnr": {"world": [12.0, 11.5], "bound": [20.0, 19.0]},
@@ -65,7 +65,16 @@ def test_the_report_says_what_was_measured(tmp_path):
     }
     page = horizon_page.write(tmp_path, facts, videos, (10, 20))
     text = page.read_text()
-    for wanted in ("11–20", "19.00", "runs/&lt;tiny&gt;", "1 of 2", "5 of 7", "98.4 %"):
+    for wanted in (
+        "11–20",
+        "19.00",
+        "runs/&lt;tiny&gt;",
+        "1 of 2",
+        "5 of 7",
+        "30 of 40",
+        "1 more walks",
+        "98.4 %",
+    ):
         assert wanted in text, wanted
     assert {path.name for path in tmp_path.iterdir()} == {
         "horizon.html", "horizon.json", "horizon.mp4", "horizon.png",

@@ -1,0 +1,48 @@
+"""The smallest world of PERSIST."""
+
+from pewm_jax.config import (
+    BlocksConfig,
+    CameraModelConfig,
+    ClipConfig,
+    FrameFlowConfig,
+    GridConfig,
+    ModulationConfig,
+    PersistConfig,
+    PersistNetsConfig,
+    PixelConfig,
+    VoxelDiTConfig,
+    VoxelRendererConfig,
+    VoxelVAEConfig,
+)
+
+BLOCKS = BlocksConfig(layers=1, heads=1, head_dim=8, mlp_ratio=2, context=3)
+NOISE = FrameFlowConfig(per_frame=True, sample_steps=1)
+MODEL = PersistConfig(
+    clip=ClipConfig(frames=3, height=16, width=16),
+    codec=PixelConfig(spatial=4, temporal=1),
+    backbone=PersistNetsConfig(
+        voxel_vae=VoxelVAEConfig(
+            side=8, classes=13, patch=2, embed=4, widths=(8,), blocks=1, middle=0, kernel=1,
+            latent_channels=3,
+        ),
+        world_frames=VoxelDiTConfig(
+            latent_side=4, latent_channels=3, patch=1, actions=3, pixel_channels=88,
+            pixel_patch=4, blocks=BLOCKS,
+        ),
+        camera_model=CameraModelConfig(classes=13, inner=2, embed=2, actions=3, blocks=BLOCKS),
+        renderer=VoxelRendererConfig(
+            classes=13, height=4, width=4, latent_channels=64, rays=2, layers=2, embed=4,
+            kernel=2, stride=2, fold=2, actions=3, blocks=BLOCKS,
+        ),
+    ),
+    control=ModulationConfig(),
+    memory=GridConfig(
+        cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8), recorded=12, kinds="groups", colours=1,
+        eye_m=1.25,
+    ),
+    noise=NOISE,
+    voxel_noise=NOISE,
+    hold=1e6,
+    points=True,
+    dead_reckoning=True,
+)  # fmt: skip
