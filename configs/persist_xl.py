@@ -2,13 +2,10 @@
 
 from pewm_jax.config import (
     BlocksConfig,
-    ClipConfig,
     Config,
     DataConfig,
     EvalConfig,
     GridConfig,
-    LearnedCodecConfig,
-    ModulationConfig,
     PersistConfig,
     PersistNetsConfig,
     PersistTrainConfig,
@@ -17,9 +14,6 @@ from pewm_jax.config import (
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
-
-ACTIONS = 23
-"""Numbers of an action, as published."""
 
 
 def config() -> Config:
@@ -31,19 +25,10 @@ def config() -> Config:
     blocks = BlocksConfig(remat=True)
     return Config(
         model=PersistConfig(
-            clip=ClipConfig(frames=16, height=288, width=512, depth=False),
-            codec=LearnedCodecConfig(),
             backbone=PersistNetsConfig(
                 voxel_vae=VoxelVAEConfig(slab=8, convolution="xla"),
                 world_frames=VoxelDiTConfig(blocks=blocks),
                 renderer=VoxelRendererConfig(blocks=BlocksConfig(context=16, remat=True)),
-            ),
-            control=ModulationConfig(
-                actions=ACTIONS,
-                units=(1.0,) * ACTIONS,
-                low=(-1.0,) * ACTIONS,
-                high=(1.0,) * ACTIONS,
-                angles=(),
             ),
             memory=GridConfig(recorded=56),
             dtype="bfloat16",

@@ -105,7 +105,10 @@ def test_every_kind_can_be_put_into_its_section(section):
     fitting = {"latents": ("--codec.kind", "learned")}
     for name in kinds.names(part):
         others = fitting.get(name, ())
-        found = parse(f"--{section}.kind", name, *others, default=Config()).model
+        default = (
+            presets.load("persist_tiny") if name == "grid" else Config()
+        )  # of that world alone
+        found = parse(f"--{section}.kind", name, *others, default=default).model
         for step in section.split("."):
             found = getattr(found, step)
         assert kinds.of(found).name == name
@@ -131,8 +134,11 @@ def test_another_kind_keeps_what_both_have_and_takes_settings_of_its_own():
 @pytest.mark.parametrize(
     ("argv", "sentence"),
     [
-        (["--memory.kind", "image"], "no memory of kind 'image'; there is images, map2d, .*none"),
-        (["--memory.kind"], "--model.memory.kind needs a value: images, map2d"),
+        (
+            ["--memory.kind", "image"],
+            "no memory of kind 'image'; there is grid, images, map2d, .*none",
+        ),
+        (["--memory.kind"], "--model.memory.kind needs a value: grid, images, map2d"),
         (["--memory.snapshots", 3], "--model.memory.snapshots is not a setting"),
         (["--memory.reader.kind", "?"], "no reader of kind"),
         (["--clip.kind", "x"], "--model.clip.kind is not a setting"),

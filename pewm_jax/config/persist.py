@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.backbone import BackboneSettings
+from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.codec import CodecSettings
 from pewm_jax.config.control import ControlSettings, ModulationConfig
 from pewm_jax.config.errors import require
@@ -188,17 +189,32 @@ class PersistTrainConfig(TrainSettings):
         )
 
 
+ACTIONS = 23
+"""Numbers of an action, as published."""
+PUBLISHED_ACTIONS = ModulationConfig(
+    actions=ACTIONS,
+    units=(1.0,) * ACTIONS,
+    low=(-1.0,) * ACTIONS,
+    high=(1.0,) * ACTIONS,
+    angles=(),
+)
+PUBLISHED_CLIP = ClipConfig(frames=16, height=288, width=512, depth=False)
+"""36×64 latents, as published, with a codec whose cells have 8 pixels."""
+
+
 @dataclasses.dataclass(frozen=True)
 class PersistConfig(ModelConfig):
     """A world that is three-dimensional itself (PERSIST, arXiv 2603.03482)."""
 
     TRAIN: ClassVar[type[TrainSettings]] = PersistTrainConfig
 
+    clip: ClipConfig = PUBLISHED_CLIP
+    """What one clip is."""
     codec: CodecSettings = LearnedCodecConfig()
     """Codec: pictures to latents and back."""
     backbone: BackboneSettings = PersistNetsConfig()
     """The four networks."""
-    control: ControlSettings = ModulationConfig()
+    control: ControlSettings = PUBLISHED_ACTIONS
     """The numbers of an action; nothing else of it is used."""
     memory: MemorySettings = GridConfig()
     """The state of the world."""
