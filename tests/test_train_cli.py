@@ -174,7 +174,10 @@ def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, pa
         (["tiny", "--train.seed"], "Missing value for argument '--train.seed'"),
         (["tiny", "--noise.target", "x1"], "Expected one of ('x0', 'v', 'eps')"),
         (["tiny", "--memory.cell_m", "1", "2"], "'--model.memory.cell_m'. Expected 3 values"),
-        (["tiny", "--memory.kind", "image"], "There is no memory of kind 'image'; there is grid, images"),
+        (
+            ["tiny", "--memory.kind", "image"],
+            "There is no memory of kind 'image'; there is grid, images",
+        ),
         (["tiny", "--clip.frames", "8"], "clip.frames is 8: the codec folds every 4 frames"),
         (
             ["tiny", "--clip.height", "20"],
