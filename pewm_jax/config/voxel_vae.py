@@ -44,10 +44,16 @@ class VoxelVAEConfig:
     convolution: Literal["auto", "xla", "products"] = "auto"
     """How 3D convolutions are computed. `xla`: by XLA. `products`: as matrix products of shifted
     copies. `auto`: products on a CPU, else XLA."""
+    cube: int = 0
+    """Cells along an axis of the cubes, cut out around occupied cells, from which training learns;
+    0 for whole grids, most of which is air."""
+    cubes: int = 16
+    """Cubes cut out of each grid at every step, where ``cube`` is not 0."""
     compared: int = 0
-    """Cells of each grid, drawn at random at every step, at which training compares the class with
-    the true one; 0 for all. With many classes and few processors the scores are most of the work.
-    Occupied cells are drawn more often, by their weight, and then weigh as much as others."""
+    """Cells of each grid or cube, drawn at random at every step, at which training compares the
+    class with the true one; 0 for all. With many classes and few processors the scores are most of
+    the work. Occupied cells are drawn more often, by their weight, and then weigh as much as
+    others."""
     slab: int = 0
     """Layers of cells at a time whose scores are held when class ids are compared or decoded; 0
     for all at once. At published sizes the scores of one grid take almost a gigabyte."""
@@ -70,7 +76,7 @@ class VoxelVAEConfig:
             self.classes >= 2,
             f"voxel_vae.classes is {self.classes}: use at least 2, of which one is empty.",
         )
-        for name in ("middle", "compared"):
+        for name in ("middle", "compared", "cube"):
             value = getattr(self, name)
             require(value >= 0, f"voxel_vae.{name} is {value}: use 0 or more.")
         widths = list(self.widths)
@@ -87,6 +93,16 @@ class VoxelVAEConfig:
             self.patch > 1 or self.embed == widths[0],
             f"voxel_vae.embed is {self.embed}: with voxel_vae.patch 1 use the first of voxel_vae."
             f"widths ({widths[0]}).",
+        )
+        require(
+            self.cube <= self.side and self.cube % self.factor == 0 and self.cubes >= 1,
+            f"voxel_vae.cube is {self.cube} and voxel_vae.cubes {self.cubes}: use a multiple of "
+            f"{self.factor} up to voxel_vae.side ({self.side}), and 1 cube or more.",
+        )
+        require(
+            not (self.cube and self.slab),
+            f"voxel_vae.slab is {self.slab}: it is of whole grids, and with voxel_vae.cube cubes "
+            "are compared; use 0 for one of them.",
         )
         for name in ("kernel", "middle_kernel"):
             value = getattr(self, name)

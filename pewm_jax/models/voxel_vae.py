@@ -14,6 +14,7 @@ the decoder's are the mirror image, and end in ``scores``.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -167,6 +168,11 @@ def loss(
         ``occupied_right`` and ``empty_right``, the shares of such cells whose class is the
         likeliest one.
     """
+    if config.cube:
+        require_grids(config, classes_BXYZ)
+        cubes_key, key = jax.random.split(key)
+        classes_BXYZ = cubes(config, classes_BXYZ, cubes_key)
+        config = dataclasses.replace(config, side=config.cube, cube=0)
     mean, log_variance = moments(config, params, classes_BXYZ, dtype)
     noise_key, cells_key = jax.random.split(key)
     noise = jax.random.normal(noise_key, mean.shape)
@@ -200,6 +206,28 @@ def loss(
         "empty_right": (right * (1 - full)).sum() / jnp.maximum((1 - full).sum(), 1),
     }
     return entropy + config.kl * divergence, measured
+
+
+def cubes(config: VoxelVAEConfig, classes_BXYZ: Array, key: Array) -> Array:
+    """Return ``config.cubes`` cubes of each grid, (B · cubes, cube, cube, cube).
+
+    Each holds an occupied cell, drawn at random, if its grid has any, and begins at a whole latent.
+    """
+    ids = jnp.asarray(classes_BXYZ)
+    full = (ids != 0).astype(jnp.float32).reshape(len(ids), -1)
+    cells_key, off_key = jax.random.split(key)
+    cells = _drawn(full, config.cubes, cells_key)
+    place = jnp.stack(jnp.unravel_index(cells, ids.shape[1:]), -1)
+    low = place - jax.random.randint(off_key, place.shape, 0, config.cube)
+    low = jnp.clip(low // config.factor * config.factor, 0, config.side - config.cube)
+    # Rounded down, a cube could end before its cell.
+    low = jnp.where(low + config.cube <= place, low + config.factor, low)
+
+    def cut(grid: Array, low_3: Array) -> Array:
+        return jax.lax.dynamic_slice(grid, tuple(low_3), (config.cube,) * 3)
+
+    made = jax.vmap(lambda grid, lows: jax.vmap(lambda low: cut(grid, low))(lows))(ids, low)
+    return made.reshape(-1, *made.shape[2:])
 
 
 def require_grids(config: VoxelVAEConfig, classes_BXYZ: Array) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 from jax.sharding import PartitionSpec as P
@@ -97,6 +98,9 @@ def costs(config: VoxelVAEConfig, share: Share, grids: int, *, trained: bool) ->
         grids: of a clip.
         trained: whether it learns; else it is frozen, and only encodes.
     """
+    if trained and config.cube:
+        grids *= config.cubes
+        config = dataclasses.replace(config, side=config.cube, cube=0)
     macs, kept, largest = 0.0, 0.0, 0.0
     for path, shape in kernels(config).items():
         if not trained and path.startswith("decoder"):

@@ -162,6 +162,29 @@ def test_slabs_change_nothing_and_drawn_cells_are_a_sample():
     np.testing.assert_allclose(some["cross_entropy"], parts["cross_entropy"], rtol=0.05)
 
 
+def test_cubes_are_pieces_of_the_grid_with_something_in_them():
+    config = dataclasses.replace(FOLDED, side=16, cube=8, cubes=64)
+    side = config.side
+    places = np.arange(side**3).reshape(1, side, side, side)  # every cell but one is occupied
+    made = np.asarray(jax.jit(voxel_vae.cubes, static_argnums=0)(config, places, jax.random.key(0)))
+    assert made.shape == (64, *(config.cube,) * 3)
+    low = np.stack(np.unravel_index(made[:, 0, 0, 0], places.shape[1:]), -1)
+    assert not (low % config.factor).any()
+    assert len(np.unique(low, axis=0)) > 1
+    for cube, (x, y, z) in zip(made, low, strict=True):
+        size = config.cube
+        np.testing.assert_array_equal(cube, places[0, x : x + size, y : y + size, z : z + size])
+    rare = np.zeros_like(places).reshape(1, -1)
+    rare[0, [0, -1, 77]] = 1  # two corners and a cell
+    made = voxel_vae.cubes(config, rare.reshape(places.shape), jax.random.key(1))
+    assert (made > 0).any((1, 2, 3)).all()
+    assert not voxel_vae.cubes(config, jnp.zeros_like(places), jax.random.key(2)).any()
+    _, parts = voxel_vae.loss(config, weights(voxel_vae, config), grids(config), jax.random.key(3))
+    assert all(np.isfinite(x) for x in parts.values())
+    with pytest.raises(ConfigError, match=r"voxel_vae\.cube is 3"):
+        dataclasses.replace(config, cube=3)
+
+
 def test_fitted_latents_have_mean_0_and_variance_1_and_decode_the_same():
     config, axes = FOLDED, (0, 1, 2, 3)
     params, ids = weights(voxel_vae, config), grids(config, 4)
