@@ -17,12 +17,14 @@ from pewm_jax.config import (
     PixelConfig,
     UserError,
 )
+from pewm_jax.diffusion import noise as noises
 from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.geometry import camera_steps
 from pewm_jax.memory import class_edit, class_grid, memories
-from pewm_jax.models import frame_blocks
+from pewm_jax.models import frame_blocks, voxel_dit, voxel_vae
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Clip, Control, Frames
-from pewm_jax.worlds import persist, persist_stages, persist_step
+from pewm_jax.worlds import persist, persist_prepare, persist_voxels
 from pewm_jax.worlds import persist_windows as windows
 from tests.helpers import random_frames
 from tests.persist_world import MODEL, NOISE
@@ -121,7 +123,7 @@ def test_a_cell_changes_only_where_another_class_is_likelier_by_what_is_held(par
     latents = jnp.asarray(np.random.default_rng(3).normal(size=(1, 4, 4, 4, 3)), jnp.float32)
     nothing = jnp.full((8, 8, 8), -1, jnp.int16)
     free, firm = (dataclasses.replace(MODEL, hold=hold) for hold in (0.0, 0.5))
-    held = jax.jit(persist_step.held, static_argnums=0)
+    held = jax.jit(persist_voxels.held, static_argnums=0)
     made = held(free, params, latents, nothing)
     np.testing.assert_array_equal(held(firm, params, latents, nothing), made)
     before = jnp.full((8, 8, 8), 3, jnp.int16)
@@ -144,6 +146,48 @@ def test_an_edit_is_the_world_that_goes_on(params, state):
     assert np.abs(frames.rgb_THWC - without.rgb_THWC).max() > 1e-4
     gone = persist.edit(after, class_edit.erase, MODEL.memory, box)
     assert not (np.asarray(gone.map.classes_XYZ)[inside]).any()
+
+
+def test_the_next_voxels_depend_on_what_was_edited_elsewhere(params, state):
+    free = dataclasses.replace(MODEL, hold=0.0)
+    low = np.asarray(state.map.low_3) + 0.5 * np.asarray(state.map.history.start_3)
+    box = np.stack([low, low + np.array([2.0, 4.0, 4.0])]).astype(np.float32)  # half of the window
+    edited = persist.edit(state, class_edit.place, MODEL.memory, box, 5)
+    loud = {**params, "voxel_dit": jax.tree.map(lambda x: 3 * x, params["voxel_dit"])}
+    still = np.zeros((1, 3), np.float32)
+    one, two = (
+        np.asarray(imagine(free, loud, begun, still, KEY)[0].map.classes_XYZ)
+        for begun in (state, edited)
+    )
+    beyond = int(state.map.history.start_3[0]) + 4
+    assert (one != two)[beyond:].any()
+
+
+def test_the_cache_of_a_rollout_is_that_of_its_frames_at_once(params, state):
+    clean = dataclasses.replace(NOISE, context_noise=0.0, smallest=0.0)
+    model = dataclasses.replace(MODEL, voxel_noise=clean)
+    config, coder = MODEL.backbone.world_frames, MODEL.backbone.voxel_vae
+    middle = windows.middle(MODEL, state.map.low_3, state.map.history.start_3)
+    frames, present, shown = [], state, persist.past_of(MODEL, params, state).shown
+    for move in (MOVES[0] * 0.01, MOVES[1] * 0.01):  # small steps, that leave the window
+        grid = windows.window(MODEL, present.map.classes_XYZ, present.map.history.start_3)
+        told = windows.told(MODEL, shown, middle)
+        camera = camera_steps.numbers(shown.camera, MODEL.clip.width, middle)
+        latents = voxel_vae.encode(coder, params["voxel_vae"], grid[None].astype(int))[0]
+        frames.append((latents, present.map.history.action_A, told, camera))
+        shown = persist.past_of(MODEL, params, present).shown
+        present, _ = imagine(model, params, present, move[None], KEY)
+    np.testing.assert_array_equal(present.map.history.start_3, state.map.history.start_3)
+    latents, actions, told, camera = (jnp.stack(x)[None] for x in zip(*frames, strict=True))
+    times = jnp.zeros((1, 2))
+    inputs, times = noises.shown(clean, latents, times)
+    _, cache = voxel_dit.apply(
+        config, params["voxel_dit"], inputs, times, actions, told,
+        camera_BTN=camera if config.camera_numbers else None, cache=voxel_dit.no_frames(config, 1),
+    )  # fmt: skip
+    found = present.map.history.voxels
+    np.testing.assert_allclose(found.keys_LBSNKd, cache.keys_LBSNKd, atol=1e-4)
+    np.testing.assert_allclose(found.values_LBSNKd, cache.values_LBSNKd, atol=1e-4)
 
 
 def test_boxes_are_moved_and_copied_by_the_calls_of_the_voxel_map(state):
@@ -189,11 +233,13 @@ def test_windows_move_by_tokens_and_what_leaves_is_kept(params, walked, state):
     assert (after.map.classes_XYZ >= 0).sum() > known.sum()
     shape = (1, 1, 2, 64, 1, 1)
     tokens = jnp.arange(128.0).reshape(shape) + 1
-    cache = frame_blocks.FrameCache(tokens, tokens, jnp.int32(2))
+    cache = frame_blocks.FrameCache(tokens, tokens, jnp.ones((1, 2, 64), bool), jnp.int32(2))
     turned = windows.moved(MODEL, cache, jnp.array([2, 0, 0]), jnp.array([4, 0, 0]))
     grid, new = (x.reshape(2, 4, 4, 4) for x in (tokens, turned.keys_LBSNKd))
     np.testing.assert_array_equal(new[:, :3], grid[:, 1:])
-    assert not new[:, 3].any()
+    known = np.asarray(turned.known_BSN).reshape(2, 4, 4, 4)
+    assert known[:, :3].all()
+    assert not known[:, 3].any()
 
 
 def test_known_grids_are_begun_in_and_rendered(params):
@@ -304,8 +350,8 @@ def test_windows_of_recorded_grids_are_those_of_a_rollout():
     clip = recorded(1)
     places = np.arange(12**3).reshape(12, 12, 12)
     clip = dataclasses.replace(clip, classes_TXYZ=np.broadcast_to(places, (1, 3, 12, 12, 12)))
-    found, start = persist_stages.lattice(MODEL, clip)
-    grids = persist_stages.cut(MODEL, clip, start, found)
+    found, start = persist_prepare.lattice(MODEL, clip)
+    grids = persist_prepare.cut(MODEL, clip, start, found)
     for frame in range(3):
         x, y, z = np.asarray(start - found)[0, frame]
         np.testing.assert_array_equal(
@@ -315,7 +361,7 @@ def test_windows_of_recorded_grids_are_those_of_a_rollout():
     off = agent + np.asarray(found)[0] - np.asarray(start)[0]
     assert np.abs(off[:, :2] - 4).max() <= MODEL.backbone.token_cells
     with pytest.raises(UserError, match=re.escape("--voxels.side 12")):
-        persist_stages.lattice(MODEL, dataclasses.replace(clip, classes_TXYZ=None))
+        persist_prepare.lattice(MODEL, dataclasses.replace(clip, classes_TXYZ=None))
 
 
 def test_its_settings_travel_and_what_cannot_work_is_refused():

@@ -56,11 +56,13 @@ class FrameCache:
     Attributes:
         keys_LBSNKd: (layers, B, context − 1, N, heads, head_dim) rotated keys, the last one last.
         values_LBSNKd: the values.
+        known_BSN: bool, which of those tokens may be read.
         count: () int32, frames that have passed so far; slots before the first frame are not read.
     """
 
     keys_LBSNKd: Array
     values_LBSNKd: Array
+    known_BSN: Array
     count: Array
 
 
@@ -69,7 +71,8 @@ def no_frames(
 ) -> FrameCache:
     """Return the cache before the first frame, for ``tokens`` tokens in a frame."""
     slots = (config.layers, batch, config.context - 1, tokens, config.heads, config.head_dim)
-    return FrameCache(jnp.zeros(slots, dtype), jnp.zeros(slots, dtype), jnp.zeros((), jnp.int32))
+    nothing = jnp.zeros(slots, dtype)
+    return FrameCache(nothing, nothing, jnp.ones(slots[1:4], bool), jnp.zeros((), jnp.int32))
 
 
 def rules(where: str) -> tuple[tuple[str, Any], ...]:
@@ -157,6 +160,7 @@ def run(
     condition_BTD: Array,
     *,
     given_BTMD: Array | None = None,
+    known_BTN: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
     """Run all blocks.
@@ -169,6 +173,7 @@ def run(
             of the computation.
         condition_BTD: each frame's condition, from which its modulation is made.
         given_BTMD: (B, T, M, D) the tokens that ``cross`` attends to, each frame to its own.
+        known_BTN: bool, which tokens later frames may read; None for all.
         cache: the frames before; None if there are none and none are to be kept.
 
     Returns:
@@ -177,7 +182,14 @@ def run(
     frames = x_BTND.shape[1]
     past = 0 if cache is None else config.context - 1
     first = jnp.int32(0) if cache is None else cache.count
-    angles_TR, allowed_TS = times_of(config, first, frames, past)
+    angles_TR, allowed = times_of(config, first, frames, past)
+    if cache is not None:
+        here = jnp.ones(x_BTND.shape[:3], bool) if known_BTN is None else known_BTN
+        known_BTN = jnp.concatenate([cache.known_BSN, here], 1)
+    if known_BTN is not None:
+        itself = jnp.arange(past, past + frames)[:, None] == jnp.arange(past + frames)
+        known_BN1S = jnp.moveaxis(known_BTN, 1, 2)[:, :, None]
+        allowed = (allowed & (known_BN1S | itself))[:, :, None]  # (B, N, 1, T, S)
     condition = jax.nn.silu(condition_BTD)[:, :, None]
 
     def body(x: Array, layer: Any) -> tuple[Array, Any]:
@@ -187,7 +199,7 @@ def run(
             shift, scale, gate, *after = jnp.split(linear(inside["modulate"], condition), 6, -1)
             normed = norm(x) * (1 + scale) + shift
             if part == "time":
-                mixed, kept = _over_time(config, inside, normed, angles_TR, allowed_TS, kept)
+                mixed, kept = _over_time(config, inside, normed, angles_TR, allowed, kept)
             else:
                 context = normed if part == "space" else given_BTMD
                 mixed = _in_frame(config, inside, normed, context)
@@ -205,7 +217,8 @@ def run(
     if cache is None:
         return x, None
     keys, values = after
-    return x, FrameCache(keys, values, cache.count + frames)
+    assert known_BTN is not None
+    return x, FrameCache(keys, values, known_BTN[:, frames:], cache.count + frames)
 
 
 def project(params: Params, x_BTND: Array, condition_BTD: Array) -> Array:
@@ -275,7 +288,7 @@ def _over_time(
     part: Params,
     x_BTND: Array,
     angles_TR: Array,
-    allowed_TS: Array,
+    allowed: Array,
     kept: tuple[Array, Array] | None,
 ) -> tuple[Array, tuple[Array, Array] | None]:
     """Attend to the same place in earlier frames; returns also the keys and values to keep."""
@@ -293,7 +306,7 @@ def _over_time(
         )
         kept = (k[:, here:].astype(kept[0].dtype), v[:, here:].astype(kept[1].dtype))
     logits = jnp.einsum("btnkd,bsnkd->bnkts", q, k, preferred_element_type=jnp.float32)
-    logits = jnp.where(allowed_TS, logits / math.sqrt(config.head_dim), -jnp.inf)
+    logits = jnp.where(allowed, logits / math.sqrt(config.head_dim), -jnp.inf)
     weights = jax.nn.softmax(logits, -1).astype(v.dtype)
     mixed = jnp.einsum("bnkts,bsnkd->btnkd", weights, v)
     return linear(part["to_out"], mixed.reshape(x_BTND.shape)), kept

@@ -69,6 +69,7 @@ def apply(
     *,
     camera_BTN: Array | None = None,
     shown_BT: Array | None = None,
+    known_BTxyz: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
     """Predict from noisy frames what the noise asks for.
@@ -84,6 +85,8 @@ def apply(
             the first frame of a walk its own. Channels may hold more, such as rays.
         camera_BTN: numbers of that picture's camera; see ``geometry.camera_steps.numbers``.
         shown_BT: bool, whether a frame is shown its picture; None means all are.
+        known_BTxyz: bool, which latents are known; tokens of others are not read by later frames.
+            None means all are.
         cache: the frames before these; see ``frame_blocks``.
 
     Returns:
@@ -117,8 +120,18 @@ def apply(
         if shown_BT is not None:
             seen = jnp.where(jnp.asarray(shown_BT)[..., None], seen, 0)
         condition = condition + seen
+    if known_BTxyz is not None:
+        cube = known_BTxyz.reshape(batch * frames, *known_BTxyz.shape[2:], 1)
+        known_BTxyz = patchify(cube, config.patch, config.patch).all(-1).reshape(x.shape[:3])
     x, cache = frame_blocks.run(
-        config.blocks, PARTS, params["blocks"], x, condition, given_BTMD=given, cache=cache
+        config.blocks,
+        PARTS,
+        params["blocks"],
+        x,
+        condition,
+        given_BTMD=given,
+        known_BTN=known_BTxyz,
+        cache=cache,
     )
     out = frame_blocks.project(params, x, condition).reshape(batch * frames, config.tokens, -1)
     out = _cube(config, out)

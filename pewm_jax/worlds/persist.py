@@ -29,7 +29,8 @@ from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds import persist_stages, pewm
 from pewm_jax.worlds import persist_windows as windows
 from pewm_jax.worlds.control import control_of
-from pewm_jax.worlds.persist_step import Given, Past, begin, encoded, step
+from pewm_jax.worlds.persist_past import Given, Past, encoded
+from pewm_jax.worlds.persist_step import begin, step
 from pewm_jax.worlds.stages import Stage
 
 init = persist_stages.init

@@ -69,12 +69,12 @@ def world_frames(
     camera_BTN: Array | None = None,
     blind: float = 0.0,
     known_BTxyz: Array | None = None,
-    counted_BTxyz: Array | None = None,
     dtype: Any = jnp.float32,
 ) -> tuple[Array, Measured]:
     """Return the squared error of the velocity of voxel frames.
 
-    What is not known of a frame is noise alone, whatever the frame's time.
+    What is not known of a frame is noise alone, whatever the frame's time; later frames do not
+    read it, and its error does not count.
 
     Args:
         config: the network.
@@ -87,7 +87,6 @@ def world_frames(
         camera_BTN: numbers of the camera at each frame.
         blind: share of frames after the first that are not shown a picture.
         known_BTxyz: bool, which latents a world would know at that frame; None for all.
-        counted_BTxyz: bool, at which latents the error counts; None for all.
         dtype: of the computation.
     """
     velocity_key, shown_key = jax.random.split(key)
@@ -101,6 +100,7 @@ def world_frames(
         pixels_BThwC=previous(pixels_BThwC),
         camera_BTN=None if camera_BTN is None else previous(camera_BTN),
         shown_BT=shown | (jnp.arange(front[1]) == 0) if blind else None,
+        known_BTxyz=known_BTxyz,
     )
     return _velocity(
         noise,
@@ -109,7 +109,6 @@ def world_frames(
         velocity_key,
         dtype,
         known=known_BTxyz,
-        counted=counted_BTxyz,
     )
 
 
@@ -200,7 +199,6 @@ def _velocity(
     dtype: Any,
     *,
     known: Array | None = None,
-    counted: Array | None = None,
 ) -> tuple[Array, Measured]:
     """Return the squared error at times drawn for each frame, and that of x0.
 
@@ -210,8 +208,8 @@ def _velocity(
         x0: (B, T, …) clean latents.
         key: randomness.
         dtype: of the computation.
-        known: bool, in the shape of x0 without its channels: elsewhere x_t is noise alone.
-        counted: bool, in that shape: where the error counts.
+        known: bool, in the shape of x0 without its channels: elsewhere x_t is noise alone, and
+            the error does not count.
     """
     time_key, noise_key = jax.random.split(key)
     times = noises.draw(noise, time_key, *x0.shape[:2])
@@ -226,13 +224,10 @@ def _velocity(
     weight = noises.spread(noises.weight(noise, times), error.ndim)
     x0_error = jnp.square(noises.to_x0(noise, made, x_t, times) - x0)
 
-    def mean(x: Array, where: Array | None) -> Array:
-        if where is None:
+    def mean(x: Array) -> Array:
+        if known is None:
             return x.mean()
-        share = where[..., None].astype(jnp.float32)
+        share = known[..., None].astype(jnp.float32)
         return (x * (share / jnp.maximum(share.mean(), 1e-6))).mean()
 
-    # Where x_t is noise alone it is not on the path, and x0 is not found from it.
-    on_path = known if counted is None or known is None else known & counted
-    on_path = counted if known is None else on_path
-    return mean(error * weight, counted), {"x0_error": mean(x0_error, on_path)}
+    return mean(error * weight), {"x0_error": mean(x0_error)}

@@ -108,7 +108,7 @@ def spread(known_xyz: Array, patch: int) -> Array:
 
 
 def moved(model: PersistConfig, cache: FrameCache, before_3: Array, after_3: Array) -> FrameCache:
-    """Return keys and values of voxel frames for a window that has moved; what is new is 0."""
+    """Return what is kept of voxel frames for a window that has moved; nothing of new cells."""
     token = model.backbone.token_cells  # type: ignore[attr-defined]
     count = side(model) // token
     tokens = (after_3 - before_3) // token
@@ -118,10 +118,12 @@ def moved(model: PersistConfig, cache: FrameCache, before_3: Array, after_3: Arr
     at = jnp.clip(source, 0, count - 1)
     row = (at[:, 0] * count + at[:, 1]) * count + at[:, 2]
 
-    def take(x: Array) -> Array:
-        return jnp.where(inside[:, None, None], jnp.take(x, row, 3), 0)
-
-    return FrameCache(take(cache.keys_LBSNKd), take(cache.values_LBSNKd), cache.count)
+    return FrameCache(
+        jnp.take(cache.keys_LBSNKd, row, 3),
+        jnp.take(cache.values_LBSNKd, row, 3),
+        jnp.take(cache.known_BSN, row, 2) & inside,
+        cache.count,
+    )
 
 
 def shown_of(latents_hwC: Array, depth_HW: Array, camera: Camera) -> Shown:

@@ -136,6 +136,30 @@ def test_gradients_of_a_frame_reach_no_later_action():
         assert (by_frame[1:4] > 0).all()
 
 
+def test_later_frames_do_not_read_unknown_tokens():
+    x, condition = normal(2, 2, FRAMES, 5, BLOCKS.width), normal(3, 2, 1, BLOCKS.width)
+    params = {"time": weights(voxel_dit, DIT)["blocks"]["time"]}
+    known = jnp.ones((2, FRAMES, 5), bool).at[:, 1, 2].set(False)
+
+    @jax.jit
+    def run(x, known, cache=None):
+        return frame_blocks.run(
+            BLOCKS, ("time",), params, x, condition, known_BTN=known, cache=cache
+        )
+
+    whole = run(x, known)[0]
+    other = run(x.at[:, 1, 2].add(1.0), known)[0]
+    assert bool((whole[:, 1, 2] != other[:, 1, 2]).any())  # a token always reads itself
+    np.testing.assert_array_equal(whole.at[:, 1, 2].set(0), other.at[:, 1, 2].set(0))
+    assert bool((run(x, jnp.ones_like(known))[0][:, 2, 2] != whole[:, 2, 2]).any())
+    cache = frame_blocks.no_frames(BLOCKS, 2, 5)
+    half = FRAMES // 2
+    first, cache = run(x[:, :half], known[:, :half], cache)
+    np.testing.assert_allclose(first, whole[:, :half], atol=1e-5)
+    later, _ = run(x[:, half:], known[:, half:], cache)
+    np.testing.assert_allclose(later, whole[:, half:], atol=1e-5)
+
+
 def test_a_hidden_picture_does_not_matter_and_a_shown_one_does():
     inputs, run = NETS["voxel_dit"][3], JITTED["voxel_dit"]
     params = weights(voxel_dit, DIT)
