@@ -1,5 +1,7 @@
 """PERSIST, small: houses that move at 64×64 pixels, half an hour on two cores with its data."""
 
+import dataclasses
+
 from pewm_jax.config import (
     BlocksConfig,
     CameraModelConfig,
@@ -33,10 +35,10 @@ def config() -> Config:
     """
     codec = LearnedCodecConfig(gate=48)
     width = {"head_dim": 40, "gates": "open"}
-    pixels = FrameFlowConfig(
-        per_frame=True, context_noise=0.1, times="uniform", sample_steps=4, shift=1.0
+    voxels = FrameFlowConfig(
+        per_frame=True, times="uniform", sample_steps=4, shift=1.0, predicts="x0"
     )
-    voxels = FrameFlowConfig(per_frame=True, times="uniform", sample_steps=4, shift=1.0)
+    pixels = dataclasses.replace(voxels, context_noise=0.1)
     return Config(
         model=PersistConfig(
             clip=ClipConfig(frames=5, height=64, width=64),
@@ -112,11 +114,13 @@ def config() -> Config:
             run="runs/persist_tiny",
             start="codec",
             optimizer="muon",
-            voxel_vae=StageConfig(steps=1500, batch=2, learning_rate=4e-3, warmup=30),
+            voxel_vae=StageConfig(
+                steps=1500, batch=2, learning_rate=4e-3, warmup=30, optimizer="adam"
+            ),
             voxel_statistics=StageConfig(steps=40, batch=8, learning_rate=0.05, warmup=0),
             world_frames=StageConfig(steps=500, batch=6, learning_rate=1.5e-3, warmup=30),
             camera=StageConfig(steps=40, batch=16, learning_rate=1e-3, warmup=10),
-            renderer=StageConfig(steps=500, batch=6, learning_rate=1.5e-3, warmup=30),
+            renderer=StageConfig(steps=900, batch=6, learning_rate=1.5e-3, warmup=30),
             ema=0.98,
         ),
         evaluate=EvalConfig(clips=24, seeds=(0,), videos=4, video_clips=8, batch=8),

@@ -15,8 +15,9 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture
-def called(monkeypatch):
+def called(monkeypatch, tmp_path):
     """What the parts are called with, in place of doing it."""
+    monkeypatch.chdir(tmp_path)
     seen = []
 
     def part(name, code=0):
@@ -59,6 +60,13 @@ def test_a_part_that_fails_ends_it(called, monkeypatch, capsys):
     assert demo.main(["--run", "elsewhere"]) == 2
     assert called == []
     assert "Done" not in capsys.readouterr().out
+
+
+def test_a_folder_that_training_refuses_is_refused_before_the_walks(called):
+    Path("taken").write_text("a file")
+    with pytest.raises(UserError, match="taken cannot be made"):
+        demo.main(["--run", "taken"])
+    assert called == []
 
 
 def test_its_end_names_the_command_that_installs_the_viewer():

@@ -364,6 +364,18 @@ def test_windows_of_recorded_grids_are_those_of_a_rollout():
         persist_prepare.lattice(MODEL, dataclasses.replace(clip, classes_TXYZ=None))
 
 
+def test_clips_that_begin_elsewhere_lie_on_other_lattices():
+    cells = np.stack(np.meshgrid(*[np.arange(-16, 16)] * 2, [3], indexing="ij"), -1).reshape(-1, 3)
+    mixed = np.asarray(persist_prepare._mixed(jnp.asarray(cells)))
+    assert not mixed[:, 2].any()
+    for axis in (0, 1):
+        shares = np.bincount(mixed[:, axis] % 8, minlength=8) / len(cells)
+        assert np.abs(shares - 1 / 8).max() < 0.05
+        for other in (cells[:, 0] % 8, cells[:, 1] % 8, mixed[:, 1 - axis] % 8):
+            together = np.histogram2d(mixed[:, axis] % 8, other, 8)[0] / len(cells)
+            assert np.abs(together - 1 / 64).max() < 0.02
+
+
 def test_its_settings_travel_and_what_cannot_work_is_refused():
     assert configuration.from_dict(Config, configuration.to_dict(CONFIG)) == CONFIG
     tiny = presets.load("persist_tiny")

@@ -73,6 +73,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax demo") -> int:
         The exit code.
     """
     settings = cli.parse(Settings, argv, default=Settings(), prog=prog, description=ABOUT)
+    _require_folder(settings)
     parts = steps(settings)
     for number, (what, run, flags) in enumerate(parts, 1):
         words = shlex.join(flags)
@@ -111,6 +112,19 @@ def ending(run: Path, viewer: bool) -> str:
         f"what was imagined. {run / 'config.json'} holds the settings. Drive in it: "
         f"{install}pewm-jax play {shlex.quote(str(run))}"
     )
+
+
+def _require_folder(settings: Settings) -> None:
+    """Refuse a folder that training would refuse, before minutes of walks; makes none."""
+    there = next(path for path in (settings.run, *settings.run.parents) if path.exists())
+    if there != settings.run and there.is_dir():
+        return
+    from pewm_jax.training import runs  # here: help and refusals of words come at once
+
+    config = presets.load(settings.preset)
+    where = dataclasses.replace(config.data, path=str(settings.data))
+    train = dataclasses.replace(config.train, run=str(settings.run))
+    runs.check(dataclasses.replace(config, data=where, train=train))
 
 
 def _viewer() -> bool:

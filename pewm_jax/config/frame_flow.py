@@ -26,6 +26,10 @@ class FrameFlowConfig(FlowConfig):
     """Whether the times of training are shifted, too."""
     sample_steps: int = 20
     """Steps of the sampler, by Euler's method."""
+    predicts: Literal["velocity", "x0"] = "velocity"
+    """What the network predicts. `velocity` as published. `x0`, the clean latents, where tokens
+    hold more numbers than the network is wide: noise has as many dimensions as a token, and what
+    does not pass through the network stays in the sample (arXiv 2511.13720)."""
     smallest: float = 1e-5
     """The noise s that is left at t = 0."""
     context_noise: float = 0.02

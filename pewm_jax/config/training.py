@@ -64,6 +64,8 @@ class StageConfig:
     """Steps of linear warm-up."""
     decay: Literal["constant", "cosine"] = "cosine"
     """What the learning rate does after the warm-up."""
+    optimizer: Literal["", "adam", "muon"] = ""
+    """Optimizer of this stage; empty for that of all stages, ``train.optimizer``."""
 
     def __post_init__(self):
         """Validate."""

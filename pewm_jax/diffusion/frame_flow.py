@@ -1,7 +1,8 @@
 """Flow matching with a time for every frame (PERSIST, arXiv 2603.03482).
 
 x_t = (1 − t) x0 + (s + (1 − s) t) ε with the velocity (1 − s) ε − x0, which is dx_t/dt. With s = 0
-this is ``flow``, from which it takes times, levels and what the network is shown.
+this is ``flow``, from which it takes times, levels and what the network is shown. The network may
+predict x0 in the place of the velocity (``noise.predicts``).
 """
 
 from __future__ import annotations
@@ -36,13 +37,17 @@ def corrupt(config: FrameFlowConfig, x0: Array, noise: Array, time_B: Array) -> 
 
 
 def target(config: FrameFlowConfig, x0: Array, noise: Array, time_B: Array) -> Array:
-    """Return the velocity (1 − s) ε − x0."""
+    """Return the velocity (1 − s) ε − x0, or x0 where that is predicted."""
     del time_B
+    if config.predicts == "x0":
+        return x0
     return (1 - config.smallest) * noise - x0
 
 
 def to_x0(config: FrameFlowConfig, prediction: Array, x_t: Array, time_B: Array) -> Array:
-    """Return (1 − s) (x_t − t v) − s v."""
+    """Return (1 − s) (x_t − t v) − s v, or the prediction where it is x0."""
+    if config.predicts == "x0":
+        return prediction
     least = config.smallest
     at_zero = x_t - spread(time_B, x_t.ndim) * prediction
     return (1 - least) * at_zero - least * prediction

@@ -62,11 +62,13 @@ def make(config: Config, stage: Stage) -> optax.GradientTransformation:
     def decayed(trained: Params) -> Params:
         return tree.assign(DECAYED, trained, "weight-decay mask")
 
+    settings = stage.settings(config)
+    chosen = settings.optimizer or config.train.optimizer
     trains = optax.chain(
         optax.clip_by_global_norm(config.train.clip_norm),
-        muon() if config.train.optimizer == "muon" else optax.scale_by_adam(),
+        muon() if chosen == "muon" else optax.scale_by_adam(),
         optax.add_decayed_weights(config.train.weight_decay, mask=decayed),
-        optax.scale_by_learning_rate(schedule(stage.settings(config))),
+        optax.scale_by_learning_rate(schedule(settings)),
         *([_rates(stage)] if stage.rates else []),
     )
     return optax.partition({TRAIN: trains, FREEZE: optax.set_to_zero()}, stage.labels)

@@ -26,6 +26,9 @@ from pewm_jax.worlds import persist_windows as windows
 def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
     """Return where the recorded grids begin, and the windows of their frames, in whole cells.
 
+    Windows begin at whole tokens of a lattice. A rollout's lies where its first frame was, so each
+    clip has another, by the cell where it begins.
+
     Returns:
         ``(recorded_BT3, start_BT3)``: int32 cells, counted from a corner that a clip's frames have
         in common.
@@ -41,9 +44,20 @@ def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
     place = jnp.asarray(clip.frames.camera.world_from_camera)[..., :3, 3]
     agent = recorded + jnp.floor((place - origin) / size).astype(jnp.int32)
     wide, token = windows.side(model), model.backbone.token_cells  # type: ignore[attr-defined]
+    shift = _mixed(agent[:, :1]) % token
+    recorded, agent = recorded + shift, agent + shift
     start = windows.snapped(agent - wide // 2, token)
     beside = (model.memory.recorded - wide) // 2  # type: ignore[attr-defined]
     return recorded, start.at[..., 2].set(recorded[..., 2] + beside)
+
+
+def _mixed(cell_BT3: Array) -> Array:
+    """Return two numbers and 0 of a cell that tell nothing of it: a clip's own, without a key."""
+    x, y, _ = jnp.moveaxis(cell_BT3.astype(jnp.uint32), -1, 0)
+    mixed = (x * jnp.uint32(0x9E3779B1)) ^ (y * jnp.uint32(0x85EBCA6B))
+    mixed = (mixed ^ (mixed >> 15)) * jnp.uint32(0xC2B2AE35)
+    both = jnp.stack([mixed >> 8, mixed >> 20, jnp.zeros_like(mixed)], -1) & 0xFF
+    return both.astype(jnp.int32)
 
 
 def cut(model: PersistConfig, clip: Clip, start_BT3: Array, recorded_BT3: Array) -> Array:

@@ -52,6 +52,27 @@ def test_the_target_is_the_slope_of_the_path_whatever_is_left_at_0():
     np.testing.assert_allclose(at(0.0) - x0, 0.3 * eps, atol=1e-6)
 
 
+def test_where_x0_is_predicted_samples_follow_the_same_path():
+    config = FrameFlowConfig(predicts="x0", sample_steps=3)
+    x0, eps, times = draw(0, 2, 3, 4), draw(1, 2, 3, 4), np.full((2, 3), 0.4, np.float32)
+    np.testing.assert_array_equal(noise.target(config, x0, eps, times), x0)
+    np.testing.assert_array_equal(noise.to_x0(config, x0, eps, times), x0)
+    velocity = dataclasses.replace(config, predicts="velocity")
+
+    def sample(config):
+        def network(x, time):  # some x0, and the velocity that leads to it
+            made = 0.5 * x + x0
+            if config.predicts == "x0":
+                return made
+            return frame_flow.velocity(config, made, x, time)
+
+        return frame_flow.sample(
+            config, lambda x, t, w: frame_flow.to_x0(config, network(x, t), x, t), eps
+        )
+
+    np.testing.assert_allclose(sample(config), sample(velocity), atol=1e-5)
+
+
 def test_times_are_drawn_per_frame_and_only_the_sampler_shifts_them():
     config = PERSIST_VOXELS
     times = np.asarray(frame_flow.draw(config, jax.random.key(0), 400, 5))
