@@ -63,7 +63,7 @@ HOMES = {
     "torch": {"convert", "evaluation/metrics/sam2"},
     "transformers": {"convert", "evaluation/metrics/sam2"},
     "trimesh": {"data", "houses"},
-    "tyro": {"cli", "config", "convert/commands", "data", "memory/feature_command"},
+    "tyro": {"cli", "config", "convert/options", "data", "memory/feature_command"},
     "viser": {"play/extra"},
     "wandb": {"training/wandb_log"},
     "websockets": {"play/visitors"},

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pewm_jax import cli, shipped
 from pewm_jax import config as configuration
-from pewm_jax.commands import imports
+from pewm_jax.commands import imports, named
 from pewm_jax.config import Join
 
 
@@ -70,25 +70,22 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
         The exit code.
     """
     argv = imports.take(argv)
+    run, argv = named.take(argv, "RUN", f"Name a run folder first: {prog} runs/demo.")
     about = (
         "Score a trained run on held-out scenes and write RUN/report/index.html. Beside these "
         "settings, several processes can share the work; all must see the same folders:\n"
         f"{cli.list_flags(Join)}\n{imports.HELP}"
     )
-    asks = bool(argv) and argv[0] in ("-h", "--help")
-    if not asks and (not argv or argv[0].startswith("-")):
-        raise cli.ConfigError(f"Name a run folder first: {prog} runs/demo.")
-    join, argv = cli.take(Join, argv)
-    prog = f"{prog} {'RUN' if asks else argv[0]}"
-    flags = ["--help"] if asks else argv[1:]
+    join, flags = cli.take(Join, argv)
+    prog = f"{prog} {run}"
     settings = cli.parse(Settings, flags, default=Settings(), prog=prog, description=about)
-    if _is_codec(Path(argv[0])):
+    if _is_codec(Path(run)):
         if join.distributed:
             raise cli.ConfigError(
-                f"{argv[0]} holds a codec: one process scores it; leave out --distributed."
+                f"{run} holds a codec: one process scores it; leave out --distributed."
             )
-        cli.cache_compilation(Path(argv[0]).parent)
-        return _codec(argv[0], settings)
+        cli.cache_compilation(Path(run).parent)
+        return _codec(run, settings)
     # Imported here and not above: help and refusals come at once, and Ctrl-C is clean meanwhile.
     from pewm_jax.training import processes
 
@@ -96,10 +93,10 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
         # After joining: these imports take seconds, and JAX must not be used before it.
         from pewm_jax.evaluation import report
 
-        cli.cache_compilation(Path(argv[0]).parent)
+        cli.cache_compilation(Path(run).parent)
         try:
             changes = {name: value for name, value in vars(settings).items() if name != "out"}
-            page = report.evaluate(argv[0], out=settings.out, **changes)
+            page = report.evaluate(run, out=settings.out, **changes)
         except KeyboardInterrupt:
             again = "Interrupted; what is scored is kept, run the same command again to go on."
             raise KeyboardInterrupt(again) from None

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pewm_jax import cli
-from pewm_jax.commands import imports
+from pewm_jax.commands import imports, named
 
 ABOUT = (
     "Imagine long walks through held-out houses with the recorded actions, compare them with the "
@@ -57,13 +57,11 @@ def main(argv: Sequence[str], prog: str = "pewm-jax horizon") -> int:
     Returns:
         The exit code.
     """
-    argv = imports.take(argv)
-    asks = bool(argv) and argv[0] in ("-h", "--help")
-    if not asks and (not argv or argv[0].startswith("-")):
-        raise cli.ConfigError(f"Name a run folder first: {prog} runs/persist_tiny.")
+    missing = f"Name a run folder first: {prog} runs/persist_tiny."
+    run, flags = named.take(imports.take(argv), "RUN", missing)
     settings = cli.parse(
         Settings,
-        ["--help"] if asks else argv[1:],
+        flags,
         default=Settings(),
         prog=f"{prog} RUN",
         description=f"{ABOUT} Beside these settings:\n{imports.HELP}",
@@ -79,12 +77,12 @@ def main(argv: Sequence[str], prog: str = "pewm-jax horizon") -> int:
     from pewm_jax.evaluation import horizon_page
     from pewm_jax.evaluation.opened import open_run
 
-    opened = open_run(argv[0])
+    opened = open_run(run)
     others = [(name, open_run(name)) for name in settings.beside]
     cli.cache_compilation(opened.home.parent)
     facts, videos = _measured(settings, opened, others)
     facts["protocol"] = {
-        "run": argv[0],
+        "run": run,
         "weights_sha256": opened.weights_hash,
         "data": f"{settings.data}/{settings.split}",
         "walks": settings.walks,

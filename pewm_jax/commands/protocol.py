@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pewm_jax import cli, presets, shipped
 from pewm_jax import config as configuration
-from pewm_jax.commands import imports
+from pewm_jax.commands import imports, named
 from pewm_jax.config import Config, ModelConfig
 
 ABOUT = (
@@ -53,15 +53,12 @@ def main(argv: Sequence[str], prog: str = "pewm-jax protocol") -> int:
     Returns:
         The exit code.
     """
-    argv = imports.take(argv)
-    asks = bool(argv) and argv[0] in ("-h", "--help")
-    if not asks and (not argv or argv[0].startswith("-")):
-        raise cli.ConfigError(f"Name a preset or a run first: {prog} demo --out protocol.json.")
-    flags = ["--help"] if asks else argv[1:]
-    named = f"{prog} {'PRESET_OR_RUN' if asks else argv[0]}"
+    missing = f"Name a preset or a run first: {prog} demo --out protocol.json."
+    name, flags = named.take(imports.take(argv), "PRESET_OR_RUN", missing)
+    prog = f"{prog} {name}"
     about = f"{ABOUT} Beside these settings:\n{imports.HELP}"
-    settings = cli.parse(Settings, flags, default=Settings(), prog=named, description=about)
-    config = _laid(_settings_of(argv[0]), settings)
+    settings = cli.parse(Settings, flags, default=Settings(), prog=prog, description=about)
+    config = _laid(_settings_of(name), settings)
     # Imported here and not above: help and refusals come at once.
     from pewm_jax.evaluation import protocol_file
 

@@ -1,19 +1,16 @@
-"""The flags of ``pewm-jax convert`` and what each command does with them."""
+"""What each command of ``pewm-jax convert`` does with its flags, which are in ``options``."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import tyro
 
 from pewm_jax import cli
 from pewm_jax.config import (
     Config,
-    ConfigError,
     DDPMConfig,
     DINOv2EncoderConfig,
     DiTConfig,
@@ -35,199 +32,17 @@ from pewm_jax.convert import (
     world,
 )
 from pewm_jax.convert.cogvideox import TRANSFORMER, VAE
+from pewm_jax.convert.options import (
+    ExportDiffusers,
+    ExportInference,
+    ExportStableHLO,
+    ImportCogVideoX,
+    ImportCosmos2,
+    ImportDINOv2,
+    ImportSVD,
+)
 from pewm_jax.models import dinov2 as dinov2_model
 from pewm_jax.types import Params
-
-Dtype = Literal["float32", "bfloat16", "float16"]
-
-
-@dataclasses.dataclass(frozen=True)
-class ImportCogVideoX:
-    """Import a CogVideoX checkpoint in the layout of diffusers.
-
-    With --rgbd --camera the patch embedding and the output layer are widened for a world model:
-    depth, the observed frame and the camera come in, depth comes out; --memory adds the blocks
-    that read the map. The result is a folder that `pewm_jax.load` reads and that is trained by its
-    name (`pewm-jax train DST`), with the settings of the presets pewm_2b and pewm_5b. Until then
-    the colours it makes are those of the original. Without these flags the networks are only
-    brought into our layout.
-    """
-
-    src: Annotated[Path, tyro.conf.Positional]
-    """The pipeline's folder: transformer/, vae/, scheduler/ and, if prompts are to be encoded,
-    text_encoder/ and tokenizer/."""
-    dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
-    dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
-    prompt: tuple[str, ...] = ("",)
-    """Prompts to encode and store, by default the empty one; a world model takes one."""
-    rgbd: bool = False
-    """Widen for depth; goes with --camera."""
-    camera: bool = False
-    """Widen for the camera; goes with --rgbd."""
-    memory: bool = False
-    """Add memory blocks, which change nothing until they are trained."""
-    frames: int | None = None
-    """Frames of the world model's clips: 8k + 1; by default 9, or the size of learned positions."""
-    positions: Learned | None = None
-    """What learned positions (5b-I2V) do for clips of other sizes than 49 × 480 × 720:
-    `interpolate` resizes their table, `drop` leaves it out, `reference` puts a fixed sinusoid in
-    its place for other numbers of frames, `exact` refuses. By default `exact`."""
-    height: int | None = None
-    """Height of its images in pixels; by default 512, or the size of learned positions."""
-    width: int | None = None
-    """Width of its images in pixels; by default 512, or the size of learned positions."""
-    encoder: Path | None = None
-    """Folder of `import dinov2`: the image encoder behind the map; by default patches' colours."""
-    config: Path | None = None
-    """JSON file of other settings of the world model, such as {"memory": {"tokens": 1024}}."""
-    seed: int = 0
-    """Seed of the memory blocks' random weights."""
-
-    def __post_init__(self):
-        """Validate."""
-        if self.rgbd != self.camera:
-            given, lacking = ("rgbd", "camera") if self.rgbd else ("camera", "rgbd")
-            raise ConfigError(
-                f"--{given} was given without --{lacking}: a world model takes both depth and "
-                f"camera; add --{lacking}."
-            )
-        if not self.prompt:
-            raise ConfigError('--prompt was given no prompt; the empty one is --prompt "".')
-        if self.rgbd:
-            if len(set(self.prompt)) > 1:
-                raise ConfigError(
-                    f"--prompt names {len(self.prompt)} prompts: a world model takes one."
-                )
-            return
-        if self.memory:
-            raise ConfigError("--memory was given without --rgbd --camera; add them.")
-        for name in ("frames", "height", "width", "positions", "encoder", "config"):
-            if getattr(self, name) is not None:
-                raise ConfigError(f"--{name} is of a world model; add --rgbd --camera.")
-
-
-@dataclasses.dataclass(frozen=True)
-class ImportDINOv2:
-    """Import DINOv2, the image encoder behind the map."""
-
-    src: Annotated[Path, tyro.conf.Positional]
-    """A folder of transformers (config.json, model.safetensors), or the original repository's
-    state dict (.pth or .safetensors)."""
-    dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
-    dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ImportSVD:
-    """Import a checkpoint of Stable Video Diffusion as a world model steered by actions.
-
-    The result is a folder that `pewm_jax.load` reads and that is trained by its name (`pewm-jax
-    train DST`), with the settings of the preset egowm_svd. Until then actions change nothing.
-    """
-
-    src: Annotated[Path, tyro.conf.Positional]
-    """The pipeline's folder: unet/, vae/, image_encoder/ and scheduler/."""
-    dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
-    dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
-    height: int = 512
-    """Height of its images in pixels."""
-    width: int = 512
-    """Width of its images in pixels."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ImportCosmos2:
-    """Import a checkpoint of Cosmos-Predict2 for video as a world model steered by actions.
-
-    The result is a folder that `pewm_jax.load` reads and that is trained by its name (`pewm-jax
-    train DST`), with the settings of the preset egowm_cosmos2b. Until then actions change nothing.
-    """
-
-    src: Annotated[Path, tyro.conf.Positional]
-    """The pipeline's folder: transformer/, vae/, scheduler/ and, if a prompt is to be encoded,
-    text_encoder/ and tokenizer/."""
-    dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
-    dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
-    prompt: str = ""
-    """Prompt to encode and store; by default the empty one."""
-    negative: str = ""
-    """Prompt that guidance pushes away from, if `noise.guidance` is above 1; the reference's
-    pipeline has a long one, which describes bad videos."""
-    frames: int = 17
-    """Frames of a clip, the observed one among them: 4k + 1."""
-    height: int = 480
-    """Height of its images in pixels."""
-    width: int = 640
-    """Width of its images in pixels."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ExportDiffusers:
-    """Write a folder that the from_pretrained of diffusers loads.
-
-    Of a world model the video model inside is written: memory blocks and the channels of depth
-    and camera stay behind. Text encoder and tokenizer are copied from the original pipeline, or
-    left out.
-    """
-
-    src: Annotated[Path, tyro.conf.Positional]
-    """An imported folder, a widened one, or a training run that started from one."""
-    dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
-    dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
-    base: Path | None = None
-    """Folder with base.json; by default SRC, or the folder that the training started from."""
-    original: Path | None = None
-    """The original pipeline's folder: its text_encoder/ and tokenizer/ are copied, so that the
-    whole pipeline loads. Without them it loads with text_encoder=None, tokenizer=None."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ExportInference:
-    """Write what inference needs of a training run: averaged weights in 16 bits, settings, a card.
-
-    The folder is read by `pewm_jax.load`; the card says what it is, what it was trained on and how
-    long, and the licence of the weights that the training started from.
-    """
-
-    src: Annotated[Path, tyro.conf.Positional]
-    """A run's folder, made by train.py."""
-    dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
-    dtype: Literal["bfloat16", "float16"] = "bfloat16"
-    """Precision of the weights: float16 rounds less, bfloat16 reaches farther."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ExportStableHLO:
-    """Write the world model as programs that need jax and NumPy, and none of this library's code.
-
-    They are checked by running them in a fresh process.
-    """
-
-    src: Annotated[Path, tyro.conf.Positional]
-    """A run's folder with `weights.safetensors`, or that of `export inference`."""
-    dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
-    what: Literal["rollout", "denoise"] = "rollout"
-    """`rollout`: begin a world and imagine clips; `denoise`: one step of the denoiser."""
-    clips: int = 1
-    """Clips that one call of the rollout imagines."""
-    frames: int | None = None
-    """Observed frames that a world begins with; by default data.context."""
-    platforms: tuple[str, ...] = stablehlo.PLATFORMS
-    """Where the programs shall run."""
-    check: bool = True
-    """Run the programs on the CPU afterwards and compare; for a large model this takes long."""
 
 
 def import_cogvideox(options: ImportCogVideoX) -> None:

@@ -57,8 +57,7 @@ def write(
 
 def lines(facts: Mapping[str, Any], ends: Sequence[int]) -> list[str]:
     """Return what is printed: a line for each method."""
-    spans = [f"{low + 1}–{high}" for low, high in zip((0, *ends[:-1]), ends, strict=True)]
-    said = [f"PSNR in dB of frames {', '.join(spans)}:"]
+    said = [f"PSNR in dB of frames {', '.join(_spans(ends))}:"]
     for name, values in facts["psnr"].items():
         said.append(f"  {_name(name):<26}" + "  ".join(f"{value:6.2f}" for value in values))
     for name, found in facts.get("distances", {}).items():
@@ -94,13 +93,17 @@ def sentences(facts: Mapping[str, Any]) -> list[str]:
     return said
 
 
+def _spans(ends: Sequence[int]) -> list[str]:
+    """Return what the stretches between ends are called, such as 1–200 and 201–400."""
+    return [f"{low + 1}–{high}" for low, high in zip((0, *ends[:-1]), ends, strict=True)]
+
+
 def _name(name: str) -> str:
     return NAMES.get(name, name)
 
 
 def _html(facts: Mapping[str, Any], ends: Sequence[int]) -> str:
-    spans = [f"{low + 1}–{high}" for low, high in zip((0, *ends[:-1]), ends, strict=True)]
-    head = "".join(f"<th>{span}</th>" for span in spans)
+    head = "".join(f"<th>{span}</th>" for span in _spans(ends))
     body = "".join(
         f"<tr><td>{escape(_name(name))}</td>"
         + "".join(f"<td>{value:.2f}</td>" for value in values)

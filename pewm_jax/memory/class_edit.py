@@ -113,7 +113,14 @@ def paste(
     return _with(grid, jnp.where(found > EMPTY, found, grid.classes_XYZ))
 
 
-def move(config: MemorySettings, grid: ClassGrid, box_23: Array, transform: Array) -> ClassGrid:
+def move(
+    config: MemorySettings,
+    grid: ClassGrid,
+    box_23: Array,
+    transform: Array,
+    *,
+    leave: bool = False,
+) -> ClassGrid:
     """Move what is in a box: copy it, erase it, paste it elsewhere.
 
     Args:
@@ -121,12 +128,14 @@ def move(config: MemorySettings, grid: ClassGrid, box_23: Array, transform: Arra
         grid: the grid.
         box_23: (2, 3) lower and upper corner in the world, metres.
         transform: (4, 4) rigid, from old to new positions, metres.
+        leave: erase nothing: a copy.
 
     Raises:
         UserError: the box is not a box, or the transform not a rigid 4×4.
     """
     piece = copy(config, grid, box_23)
-    return paste(config, erase(config, grid, box_23), piece, transform)
+    rest = grid if leave else erase(config, grid, box_23)
+    return paste(config, rest, piece, transform)
 
 
 def centres(config: MemorySettings, grid: ClassGrid) -> Array:

@@ -78,8 +78,7 @@ def to_points(model: ModelConfig, grid: ClassGrid) -> tuple[Array, Array, Array]
     assert isinstance(model.memory, GridConfig)
     points = class_edit.centres(model.memory, grid).reshape(-1, 3)
     ids = grid.classes_XYZ.reshape(-1).astype(jnp.int32)
-    table = table_colours(names(model.memory)).astype(np.float32) / 127.5 - 1
-    return points, jnp.asarray(table)[jnp.maximum(ids, 0)], ids > 0
+    return points, _colours(model.memory)[jnp.maximum(ids, 0)], ids > 0
 
 
 def render(model: ModelConfig, grid: ClassGrid, camera: Camera, height: int, width: int) -> View:
@@ -96,10 +95,14 @@ def render(model: ModelConfig, grid: ClassGrid, camera: Camera, height: int, wid
     ids = jnp.maximum(grid.classes_XYZ, 0).astype(jnp.int32)
     cell = model.memory.cell_m[0]
     seen = march.through_pixels(ids, grid.low_3, cell, camera, height, width, 1)
-    table = table_colours(names(model.memory)).astype(np.float32) / 127.5 - 1
     there = seen.ids_L[..., 0] > 0
-    colours = jnp.where(there[..., None], jnp.asarray(table)[seen.ids_L[..., 0]], 0)
+    colours = jnp.where(there[..., None], _colours(model.memory)[seen.ids_L[..., 0]], 0)
     return View(colours, seen.distance_L[..., 0], there)
+
+
+def _colours(config: GridConfig) -> Array:
+    """Return the colours (classes, 3) of the table, in [−1, 1]."""
+    return jnp.asarray(table_colours(names(config)).astype(np.float32) / 127.5 - 1)
 
 
 def erase(model: ModelConfig, grid: ClassGrid, box_23: Array) -> ClassGrid:
@@ -110,10 +113,8 @@ def erase(model: ModelConfig, grid: ClassGrid, box_23: Array) -> ClassGrid:
 def move(
     model: ModelConfig, grid: ClassGrid, box_23: Array, transform: Array, *, leave: bool = False
 ) -> ClassGrid:
-    """Move or copy what is in a box; see ``memories.move``."""
-    piece = class_edit.copy(model.memory, grid, box_23)
-    rest = grid if leave else class_edit.erase(model.memory, grid, box_23)
-    return class_edit.paste(model.memory, rest, piece, transform)
+    """Move or copy what is in a box; see ``class_edit.move``."""
+    return class_edit.move(model.memory, grid, box_23, transform, leave=leave)
 
 
 def remember(

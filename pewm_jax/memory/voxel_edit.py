@@ -105,7 +105,14 @@ def paste(
     return voxel_core.renewed(config, voxels, cell_V, jnp.maximum(old, new), dropped, outside)
 
 
-def move(config: MemorySettings, voxels: VoxelMap, box_23: Array, transform: Array) -> VoxelMap:
+def move(
+    config: MemorySettings,
+    voxels: VoxelMap,
+    box_23: Array,
+    transform: Array,
+    *,
+    leave: bool = False,
+) -> VoxelMap:
     """Move what is in a box: copy it, erase it, paste it elsewhere.
 
     Args:
@@ -113,12 +120,14 @@ def move(config: MemorySettings, voxels: VoxelMap, box_23: Array, transform: Arr
         voxels: the map.
         box_23: (2, 3) lower and upper corner in the world, metres.
         transform: (4, 4) rigid, from old to new positions, metres.
+        leave: erase nothing: a copy.
 
     Raises:
         UserError: the box is not a box, or the transform not a rigid 4×4.
     """
     piece = copy(config, voxels, box_23)
-    return paste(config, erase(config, voxels, box_23), piece, transform)
+    rest = voxels if leave else erase(config, voxels, box_23)
+    return paste(config, rest, piece, transform)
 
 
 def _within(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> Array:

@@ -41,7 +41,5 @@ def erase(model: ModelConfig, voxels: VoxelMap, box_23: Array) -> VoxelMap:
 def move(
     model: ModelConfig, voxels: VoxelMap, box_23: Array, transform: Array, *, leave: bool = False
 ) -> VoxelMap:
-    """Move or copy what is in a box; see ``memories.move``."""
-    piece = voxel_map.copy(model.memory, voxels, box_23)
-    rest = voxels if leave else voxel_map.erase(model.memory, voxels, box_23)
-    return voxel_map.paste(model.memory, rest, piece, transform)
+    """Move or copy what is in a box; see ``voxel_map.move``."""
+    return voxel_map.move(model.memory, voxels, box_23, transform, leave=leave)

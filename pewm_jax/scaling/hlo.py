@@ -13,31 +13,18 @@ import math
 import re
 from collections.abc import Callable, Iterator
 
-import numpy as np
+from pewm_jax.scaling import hlo_text
+from pewm_jax.scaling.hlo_text import Line
 
 KINDS = ("all-gather", "reduce-scatter", "all-reduce", "all-to-all", "collective-permute")
 """The kinds of collective communication."""
 THROUGH = ("bitcast", "copy", "convert", "transpose", "reshape")
 """Operations that pass an array on without using its values."""
-BITS = {"pred": 8, "s4": 4, "u4": 4, "bf16": 16, "c64": 64, "c128": 128}
-"""Bits of the types whose name does not tell."""
 
-_COMPUTATION = re.compile(r"^(?:ENTRY )?%?([\w.$-]+) .*\{$")
-_NAME = re.compile(r"^\s+(?:ROOT )?%?([\w.$-]+) = ")
-_OPCODE = re.compile(r"\s*([\w-]+)\(")
-_ARRAY = re.compile(r"([a-z]+\d*(?:e\dm\d\w*)?)\[([\d,<=]*)\]")
 _CALLED = re.compile(r"\b(?:calls|to_apply|body)=%?([\w.$-]+)")
 _BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
 _EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
 _TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
-_LISTED = re.compile(r"replica_groups=\{(\{[\d,{} ]*\})\}")
-_COUNTED = re.compile(r"replica_groups=\[([\d,]+)\]<=\[([\d,]+)\](?:T\(([\d,]+)\))?")
-_MESH = re.compile(
-    r"replica_groups=mesh\[([^\]]*)\](?:, device_ids=\(([^()]*(?:\([\d,]+\))?)\))? ?\{([^}]*)\}"
-)
-_ORDER = re.compile(r"\[([\d,]+)\](?:T\(([\d,]+)\))?")
-_PAIRS = re.compile(r"source_target_pairs=\{\{(\d+),(\d+)\}")
-_LABEL = re.compile(r'op_name="([^"]*)"')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,29 +82,14 @@ class Program:
         return sum(item.sent for item in self.collectives if item.kind == kind)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Line:
-    """An instruction: its type, opcode, operands and the rest of its text."""
-
-    shape: str
-    opcode: str
-    operands: tuple[str, ...]
-    rest: str
-
-    @property
-    def label(self) -> str:
-        found = _LABEL.search(self.rest)
-        return found[1] if found else ""
-
-
 def read(text: str) -> Program:
     """Count what a compiled program does.
 
     Args:
         text: ``compiled.as_text()``.
     """
-    computations, entry = _split(text)
-    users = {name: _users(lines) for name, lines in computations.items()}
+    computations, entry = hlo_text.split(text)
+    users = {name: hlo_text.users(lines) for name, lines in computations.items()}
     unknown: list[str] = []
 
     def only_sliced(
@@ -165,7 +137,7 @@ def read(text: str) -> Program:
     return Program(*walk(entry), tuple(unknown))
 
 
-def _inside(line: _Line, walk) -> Iterator[tuple]:
+def _inside(line: Line, walk) -> Iterator[tuple]:
     """Yield what an instruction calls, and how often: 0 if the text does not tell."""
     if line.opcode == "while":
         trips = _TRIPS.search(line.rest)
@@ -184,71 +156,16 @@ def _inside(line: _Line, walk) -> Iterator[tuple]:
             yield walk(called[1]), 1
 
 
-def _split(text: str) -> tuple[dict[str, dict[str, _Line]], str]:
-    """Split a program into its computations; also return the name of the entry computation."""
-    computations: dict[str, dict[str, _Line]] = {}
-    entry, lines = "", {}
-    for row in text.splitlines():
-        if row.endswith("{") and (found := _COMPUTATION.match(row)):
-            lines = computations.setdefault(found[1], {})
-            entry = found[1] if row.startswith("ENTRY") else entry
-        elif found := _NAME.match(row):
-            lines[found[1]] = _parse(row[found.end() :])
-    return computations, entry
-
-
-def _parse(text: str) -> _Line:
-    """Parse an instruction: ``TYPE opcode(operands), attributes``."""
-    end = _close(text, 0) if text.startswith("(") else text.find(" ")
-    shape, text = text[:end], text[end:]
-    found = _OPCODE.match(text)
-    if found is None:
-        return _Line(shape, "", (), text)
-    close = _close(text, found.end() - 1)
-    inside = re.sub(r"/\*.*?\*/", "", text[found.end() : close - 1])
-    operands = tuple(part.strip().split(" ")[-1].lstrip("%") for part in inside.split(", "))
-    return _Line(shape, found[1], operands, text[close:])
-
-
-def _close(text: str, start: int) -> int:
-    """Return the index after the parenthesis that closes the one at ``start``."""
-    depth = 0
-    for place in range(start, len(text)):
-        depth += (text[place] == "(") - (text[place] == ")")
-        if depth == 0:
-            return place + 1
-    return len(text)
-
-
-def _dims(shape: str) -> tuple[int, ...]:
-    found = _ARRAY.search(shape)
-    return tuple(int(n) for n in found[2].split(",") if n) if found else ()
-
-
-def size(shape: str) -> float:
-    """Return the bytes of an array or tuple type such as ``(f32[2,3]{1,0}, s32[])``."""
-    total = 0.0
-    for kind, dims in _ARRAY.findall(shape):
-        digits = re.search(r"\d+", kind)
-        bits = BITS.get(kind, int(digits[0]) if digits else 0)
-        total += bits / 8 * math.prod(int(n) for n in dims.split(",") if n)
-    return total
-
-
-def _numbers(line: _Line, name: str) -> list[int]:
-    found = re.search(name + r"=\{([\d,]*)\}", line.rest)
-    return [int(n) for n in found[1].split(",") if n] if found else []
-
-
-def _flops(line: _Line, lines: dict[str, _Line]) -> float:
+def _flops(line: Line, lines: dict[str, Line]) -> float:
     """Return the FLOPs of one instruction, without what it calls."""
     matmul = line.opcode == "custom-call" and "matmul" in line.rest
     if line.opcode not in ("dot", "convolution") and not matmul:
         return 0.0
-    shapes = [_dims(lines[name].shape) for name in line.operands[:2]]
-    out = math.prod(_dims(line.shape))
+    shapes = [hlo_text.dims(lines[name].shape) for name in line.operands[:2]]
+    out = math.prod(hlo_text.dims(line.shape))
     if line.opcode == "dot":
-        summed = math.prod(shapes[0][axis] for axis in _numbers(line, "lhs_contracting_dims"))
+        axes = hlo_text.numbers(line, "lhs_contracting_dims")
+        summed = math.prod(shapes[0][axis] for axis in axes)
     elif matmul:
         summed = shapes[0][-1]
     else:
@@ -259,17 +176,17 @@ def _flops(line: _Line, lines: dict[str, _Line]) -> float:
 
 
 def _collectives(
-    line: _Line, lines: dict[str, _Line], only_sliced: Callable[[str], bool]
+    line: Line, lines: dict[str, Line], only_sliced: Callable[[str], bool]
 ) -> Iterator[Collective]:
     """Yield a ``Collective`` for each operand of a communication instruction.
 
     An all-reduce whose result is only sliced counts as a reduce-scatter.
     """
-    kind, group = line.opcode.removesuffix("-start"), _group(line)
+    kind, group = line.opcode.removesuffix("-start"), hlo_text.group(line)
     ring = (len(group) - 1) / max(len(group), 1)
     own = next((name for name, other in lines.items() if other is line), "")
     for index, operand in enumerate(line.operands):
-        taken = size(lines[operand].shape) if operand in lines else 0.0
+        taken = hlo_text.size(lines[operand].shape) if operand in lines else 0.0
         effective = kind
         if kind == "all-reduce" and only_sliced(_element(own, index, lines)):
             effective = "reduce-scatter"
@@ -283,7 +200,7 @@ def _collectives(
         yield Collective(effective, line.label, group, sent)
 
 
-def _element(name: str, index: int, lines: dict[str, _Line]) -> str:
+def _element(name: str, index: int, lines: dict[str, Line]) -> str:
     """Return the name of one of an instruction's results, by its index in the tuple."""
     for other, line in lines.items():
         taken = line.opcode == "get-tuple-element" and line.operands == (name,)
@@ -292,21 +209,12 @@ def _element(name: str, index: int, lines: dict[str, _Line]) -> str:
     return name
 
 
-def _users(lines: dict[str, _Line]) -> dict[str, list[tuple[str, _Line]]]:
-    """Return, for each name, the instructions that use it as an operand."""
-    found: dict[str, list[tuple[str, _Line]]] = {}
-    for name, line in lines.items():
-        for operand in set(line.operands):
-            found.setdefault(operand, []).append((name, line))
-    return found
-
-
-def _is_slice(line: _Line, name: str) -> bool:
+def _is_slice(line: Line, name: str) -> bool:
     return line.opcode == "dynamic-slice" and line.operands[0] == name
 
 
 def _parameters(
-    line: _Line, name: str, computations: dict[str, dict[str, _Line]]
+    line: Line, name: str, computations: dict[str, dict[str, Line]]
 ) -> Iterator[tuple[str, str]]:
     """Yield the parameter of a fusion or call that an operand becomes: (computation, name)."""
     called = _CALLED.search(line.rest) if line.opcode in ("fusion", "call") else None
@@ -316,49 +224,3 @@ def _parameters(
     for inner, other in computations.get(called[1], {}).items():
         if other.opcode == "parameter" and other.operands[0] in places:
             yield called[1], inner
-
-
-def _group(line: _Line) -> tuple[int, ...]:
-    """Return the first group of devices that communicate."""
-    if counted := _COUNTED.search(line.rest):
-        shape, dims = ([int(n) for n in counted[k].split(",")] for k in (1, 2))
-        devices = np.arange(math.prod(dims)).reshape(dims)
-        if counted[3]:
-            devices = devices.transpose([int(n) for n in counted[3].split(",")])
-        return tuple(int(n) for n in devices.reshape(shape)[0])
-    if mesh := _MESH.search(line.rest):
-        return _along(mesh[1], mesh[3], mesh[2] or "")
-    if listed := _LISTED.search(line.rest):
-        first = listed[1].split("}")[0].strip("{ ")
-        return tuple(int(n) for n in first.split(",") if n.strip())
-    if pairs := _PAIRS.search(line.rest):
-        return int(pairs[1]), int(pairs[2])
-    return ()
-
-
-def _along(mesh: str, axes: str, order: str) -> tuple[int, ...]:
-    """Return the first group along mesh axes, or along parts of them.
-
-    Args:
-        mesh: sizes, such as ``'a'=4,'b'=2``.
-        axes: such as ``'a'``, or ``'a':(2)2`` for a sub-axis of size 2 after one of size 2.
-        order: device order if it is not 0, 1, 2 …: ``[4,2]T(1,0)`` or ``0,2,4,6``.
-    """
-    sizes = {name: int(count) for name, count in re.findall(r"'([^']*)'=(\d+)", mesh)}
-    strides, stride = {}, 1
-    for name in reversed(sizes):
-        strides[name], stride = stride, stride * sizes[name]
-    group = np.zeros(1, int)
-    for name, before, count in re.findall(r"'([^']*)'(?::\((\d+)\)(\d+))?", axes):
-        steps = int(count) if count else sizes[name]
-        inner = sizes[name] // (int(before) * steps) if count else 1
-        places = np.arange(steps) * inner * strides[name]
-        group = (group[:, None] + places).ravel()
-    devices = np.arange(stride)
-    if turned := _ORDER.fullmatch(order):
-        devices = devices.reshape([int(n) for n in turned[1].split(",")])
-        if turned[2]:
-            devices = devices.transpose([int(n) for n in turned[2].split(",")])
-    elif order:
-        devices = np.array([int(n) for n in order.split(",")])
-    return tuple(int(n) for n in devices.ravel()[group])

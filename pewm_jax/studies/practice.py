@@ -10,85 +10,38 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import json
-import math
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from pewm_jax import atomic
-from pewm_jax.config import ActionConfig, Config, UserError
-from pewm_jax.config.errors import require
-from pewm_jax.data import unfinished
-from pewm_jax.data.dataset import EpisodeSource, describe_shard, write_shard
-from pewm_jax.data.episodes import EpisodeArrays, write_episode
-from pewm_jax.data.navigation import line_is_free
+from pewm_jax.config import UserError
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation import intervals
 from pewm_jax.evaluation.opened import Opened, open_run, remembers
-from pewm_jax.geometry.actions import FORWARD, discrete_table
-from pewm_jax.planning import practice, scores
-from pewm_jax.planning.practice import Act, Imagined, Place, Practice, Real, Walk
-from pewm_jax.studies import goals, kept, policies, practice_page
+from pewm_jax.planning import practice
+from pewm_jax.planning.practice import Place, Walk
+from pewm_jax.studies import kept, policies, practice_page, practice_piece
 from pewm_jax.studies.goals import Goal
 from pewm_jax.studies.policies import OpenedPolicy, open_policy
-from pewm_jax.training import loop
+from pewm_jax.studies.practice_piece import (
+    BEFORE,
+    CHANCE,
+    EMPTY,
+    MEMORY,
+    REAL,
+    ROWS,
+    WITHIN_DEG,
+    WITHIN_M,
+    Errand,
+    act_of,
+    open_home,
+    place_of,
+)
 
-CHANCE, BEFORE, REAL, MEMORY, EMPTY = "chance", "before", "real", "memory", "empty"
-LEARNED = (MEMORY, EMPTY, REAL)
-"""Where a policy practises."""
-WITHIN_M, WITHIN_DEG = 0.35, 45.0
-"""A goal is reached this near to it, and with a heading this near to its own, as in Table 2."""
-ROWS = (CHANCE, BEFORE, *LEARNED)
 Say = Callable[[str], Any]
-
-
-@dataclasses.dataclass(frozen=True)
-class Errand:
-    """The settings of the study.
-
-    Attributes:
-        houses: held-out houses.
-        tasks: goals in each.
-        actions: of the walk to a goal.
-        most: actions that the policy may take for it.
-        replan: actions taken of a proposal before the next.
-        practice: how the policy practises.
-        steps: of training on its walks.
-        learning_rate: of that training.
-        seeds: of practice and training.
-        shown: houses whose first walks are in the picture.
-    """
-
-    houses: int = 12
-    tasks: int = 12
-    actions: int = 8
-    most: int = 24
-    replan: int = 4
-    practice: Practice = dataclasses.field(default_factory=Practice)
-    steps: int = 150
-    learning_rate: float = 2e-4
-    seeds: tuple[int, ...] = (0,)
-    shown: int = 2
-
-    def __post_init__(self):
-        """Validate."""
-        for name in ("houses", "tasks", "actions", "most", "replan", "steps"):
-            value = getattr(self, name)
-            require(value >= 1, f"{name} is {value}: use 1 or more.")
-        require(
-            len(self.seeds) > 0 and len(set(self.seeds)) == len(self.seeds),
-            f"seeds are {self.seeds}: give different ones, such as 0 1 2.",
-        )
-        require(min(self.seeds) >= 0, f"seeds are {self.seeds}: use numbers from 0 on.")
-        require(self.shown >= 0, f"shown is {self.shown}: use 0 or more.")
-        require(
-            math.isfinite(self.learning_rate) and self.learning_rate > 0,
-            f"learning_rate is {self.learning_rate}: use a number above 0.",
-        )
 
 
 def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: Say = print) -> Path:
@@ -127,8 +80,8 @@ def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: S
             folder = out / f"house{house:04d}" / f"{how}-seed{seed}"
             piece = kept.read(folder / "scores.json")
             if piece is None:
-                home = _home(errand, world.config, house)
-                piece = _piece(world, begun, home, errand, how, seed, folder)
+                home = open_home(errand, world.config, house)
+                piece = practice_piece.make(world, begun, home, errand, how, seed, folder)
                 kept.write(folder / "scores.json", piece)
             made[how].append(piece)
             meter.advance(1)
@@ -176,187 +129,16 @@ def _require_fit(
         )
 
 
-def _piece(
-    world: Opened,
-    begun: OpenedPolicy,
-    home: Goal,
-    errand: Errand,
-    how: str,
-    seed: int,
-    folder: Path,
-) -> dict[str, Any]:
-    """Return what one policy reaches in one house, and what it practised."""
-    piece: dict[str, Any] = {"house": home.house, "walked": {}}
-    act = _act(begun)
-    if how == CHANCE:
-        act = _by_chance(begun.config.model.policy.waypoints)
-    elif how != BEFORE:
-        act = _act(_learned(world, begun, home, errand, how, seed, folder))
-        piece["walked"] = _walked(folder / "data" / "train", home)
-    return piece | {"tasks": _measured(home, act, errand, seed)}
-
-
-def _by_chance(count: int) -> Act:
-    """Return a policy that walks without looking; see ``goals.wander``."""
-
-    def act(rgb_SHWC: np.ndarray, goal_HWC: np.ndarray | None, key: jax.Array) -> np.ndarray:
-        del rgb_SHWC, goal_HWC
-        drawn = jax.random.key_data(key)
-        return goals.wander(np.random.default_rng(np.asarray(drawn)), count)
-
-    return act
-
-
-def _walked(folder: Path, home: Goal) -> dict[str, float]:
-    """Return the per cent of actions that went forward, and of these that went through walls."""
-    forward, through, count = 0, 0, 0
-    for episode in EpisodeSource(folder):
-        ids = np.asarray(episode.action_ids)
-        places = np.asarray(episode.world_from_camera)[:, :2, 3].astype(np.float64)
-        for n in np.flatnonzero(ids == FORWARD):
-            moved = np.linalg.norm(places[n + 1] - places[n]) > 1e-3
-            through += moved and not line_is_free(home.simulator.grid, places[n], places[n + 1])
-        forward, count = forward + int((ids == FORWARD).sum()), count + len(ids)
-    return {
-        "forward": 100.0 * forward / count,
-        "through_walls": 100.0 * float(through) / max(forward, 1),
-    }
-
-
-def _home(errand: Errand, config: Config, house: int) -> Goal:
-    """Return the first task of a house, whose context is what the agent has seen of it."""
-    return goals.open_goal(
-        house,
-        houses=errand.houses,
-        actions=errand.actions,
-        context=config.data.context,
-        motion=config.model.actions,
-        size=config.model.clip.height,
-    )
-
-
-def _place(world: Opened, home: Goal, motion: ActionConfig, how: str) -> Place:
-    if how == REAL:
-        return Real(home.simulator, motion, home.context)
-    return Imagined(world.config, world.params, home.context, memory=how == MEMORY)
-
-
-def _act(policy: OpenedPolicy) -> Act:
-    return practice.nomad(policy.config.model.policy, policy.weights, policy.motion)
-
-
 def _places_shown(world: Opened, errand: Errand) -> Iterator[tuple[Goal, dict[str, Place]]]:
     for house in range(min(errand.shown, errand.houses)):
-        home = _home(errand, world.config, house)
+        home = open_home(errand, world.config, house)
         motion = world.config.model.actions
-        yield home, {how: _place(world, home, motion, how) for how in (REAL, MEMORY, EMPTY)}
+        yield home, {how: place_of(world, home, motion, how) for how in (REAL, MEMORY, EMPTY)}
 
 
 def _first_walk(place: Place, home: Goal, begun: OpenedPolicy, errand: Errand) -> Walk:
     seed = errand.seeds[0]
-    return next(practice.walks(place, home.context, _act(begun), errand.practice, seed))
-
-
-def _learned(
-    world: Opened,
-    begun: OpenedPolicy,
-    home: Goal,
-    errand: Errand,
-    how: str,
-    seed: int,
-    folder: Path,
-) -> OpenedPolicy:
-    """Let the policy practise, and return what it has become."""
-    place = _place(world, home, begun.motion, how)
-    _collect(folder / "data" / "train", place, home, begun, errand, seed)
-    config = begun.config
-    stage = dataclasses.replace(
-        config.train.policy,  # type: ignore[attr-defined]
-        steps=errand.steps,
-        learning_rate=errand.learning_rate,
-        warmup=min(config.train.policy.warmup, errand.steps // 10),  # type: ignore[attr-defined]
-    )
-    shutil.rmtree(folder / "run", ignore_errors=True)  # half a training is begun anew: it is short
-    train = dataclasses.replace(
-        config.train, run=str(folder / "run"), start=str(begun.folder), seed=seed, policy=stage
-    )
-    data = dataclasses.replace(config.data, path=str(folder / "data"))
-    loop.train(dataclasses.replace(config, train=train, data=data), say=lambda _: None)
-    shutil.rmtree(folder / "run" / "checkpoints", ignore_errors=True)
-    return open_policy(folder / "run")
-
-
-def _collect(
-    folder: Path, place: Place, home: Goal, begun: OpenedPolicy, errand: Errand, seed: int
-) -> None:
-    """Write the walks of a practice as a dataset, or find them written."""
-    settings = {"made_by": "practice", "seed": seed, **dataclasses.asdict(errand.practice)}
-    state = unfinished.examine(folder, settings)
-    if state == "complete":
-        return
-    path = folder / "shard-00000-of-00001.array_record"
-    done = unfinished.prepare(folder, settings, state, {path: errand.practice.walks})
-    table = discrete_table(begun.motion)
-
-    def records() -> Iterator[bytes]:
-        walks = practice.walks(place, home.context, _act(begun), errand.practice, seed)
-        for number, walk in enumerate(walks):
-            yield _record(walk, table, f"{home.house}-{number:04d}", home.house)
-
-    if path.name not in done:
-        write_shard(path, records())
-    shard = done.get(path.name) or describe_shard(path)
-    unfinished.publish(folder, settings, [shard], unfinished.frames_of(folder, shard))
-
-
-def _record(walk: Walk, table_A3: np.ndarray, name: str, house: str) -> bytes:
-    camera = walk.frames.camera
-    arrays = EpisodeArrays(
-        np.asarray(walk.frames.rgb_THWC),
-        np.asarray(walk.frames.depth_THW, np.float32),
-        np.asarray(camera.intrinsics_4)[0],
-        np.asarray(camera.world_from_camera),
-        table_A3[walk.actions_N].astype(np.float32),
-        walk.actions_N.astype(np.int32),
-    )
-    return write_episode(arrays, name, house, {"policy": "practice"})
-
-
-def _measured(home: Goal, act: Act, errand: Errand, seed: int) -> list[dict[str, float]]:
-    """Send a policy to goals near the places that were seen, in the real house.
-
-    It is stopped at the first moment within reach of the goal: it need not know that it is there.
-    """
-    scored = []
-    for task in goals.near(home, errand.tasks, errand.actions):
-        walked = [task.walk_T3[0]]
-        pictures = [task.context.rgb_THWC[-1:]]
-        key = jax.random.fold_in(jax.random.key(seed), task.number)
-        reached, waiting = False, np.zeros(0, int)
-        for number in range(errand.most):
-            if not len(waiting):
-                seen = np.concatenate(pictures)
-                goal = np.asarray(task.frame.rgb_THWC)[0]
-                waiting = act(seen, goal, jax.random.fold_in(key, number))[: errand.replan]
-            step = goals.walked(task.simulator, task.table_A3, walked[-1], waiting[:1])[-1]
-            waiting = waiting[1:]
-            walked.append(step)
-            pictures.append(task.simulator.frames(step[None]).rgb_THWC)
-            reached = bool(scores.success(step, task.walk_T3[-1], WITHIN_M, WITHIN_DEG))
-            if reached:
-                break
-        way = np.stack(walked)
-        nearest = min(scores.position_error(pose, task.walk_T3[-1]) for pose in way)
-        path = scores.path_length(way)
-        scored.append(
-            {
-                "success": 100.0 * reached,
-                "spl": 100.0 * float(scores.spl(reached, task.shortest_m, path)),
-                "nearest": float(nearest),
-                "sim": float(scores.sim(way[0], way[-1], task.walk_T3[-1])),
-            }
-        )
-    return scored
+    return next(practice.walks(place, home.context, act_of(begun), errand.practice, seed))
 
 
 def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:

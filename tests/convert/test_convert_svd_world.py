@@ -16,6 +16,7 @@ import pewm_jax
 from pewm_jax import tree, worlds
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.convert import commands, svd, svd_unet, svd_vae
+from pewm_jax.convert.options import ImportSVD
 from pewm_jax.training import starting
 from tests.helpers import random_frames
 
@@ -65,7 +66,7 @@ def folder(tmp_path_factory):
 
 
 def run(src, dst, **options):
-    commands.import_svd(commands.ImportSVD(src, dst, **options))
+    commands.import_svd(ImportSVD(src, dst, **options))
 
 
 def test_it_loads_with_every_tensor_and_can_be_imagined_and_trained(folder, tmp_path):

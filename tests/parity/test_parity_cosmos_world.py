@@ -17,6 +17,7 @@ import pewm_jax
 from pewm_jax import tree, worlds
 from pewm_jax.config import ConfigError, EgoWMConfig, UserError
 from pewm_jax.convert import commands, cosmos
+from pewm_jax.convert.options import ImportCosmos2
 from pewm_jax.models import backbones, codecs, world_model
 from pewm_jax.training import starting
 from pewm_jax.types import Camera, Control, Frames
@@ -46,7 +47,7 @@ def folder(pipeline, tmp_path_factory):
 
 def run(src, dst, **options):
     sizes = {"frames": FRAMES, "height": SIZE, "width": SIZE}
-    commands.import_cosmos2(commands.ImportCosmos2(src, dst, **(sizes | options)))
+    commands.import_cosmos2(ImportCosmos2(src, dst, **(sizes | options)))
     return pewm_jax.load(dst)
 
 

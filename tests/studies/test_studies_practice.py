@@ -19,6 +19,7 @@ from pewm_jax.planning.floor_map import FloorMap
 from pewm_jax.planning.practice import Imagined, Practice, Real
 from pewm_jax.studies import deciders, goals, policies
 from pewm_jax.studies import practice as study
+from pewm_jax.studies.practice_piece import LEARNED, ROWS, Errand
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import nomad as nomad_world
 from tests.helpers import init_world, randomise
@@ -26,7 +27,7 @@ from tests.planning.planning_page import blocks
 from tests.training.test_training_nomad import experiment
 
 MOTION = ActionConfig()
-ERRAND = study.Errand(
+ERRAND = Errand(
     houses=1,
     tasks=2,
     actions=4,
@@ -79,21 +80,21 @@ def _clip(frames):
 def test_the_whole_study_is_made_kept_and_goes_on(made):
     folder, page = made
     results = json.loads((folder / "out" / "results.json").read_text())
-    assert tuple(results["rows"]) == study.ROWS
+    assert tuple(results["rows"]) == ROWS
     assert set(results["differences"]) >= {"memory - before", "memory - empty", "real - memory"}
-    assert set(results["walked"]) == set(study.LEARNED)
+    assert set(results["walked"]) == set(LEARNED)
     assert results["walked"]["real"]["through_walls"] == 0
     assert (results["houses"], results["tasks"]) == (1, 2)
     assert "practised in the world, with its memory" in page.read_text()
     assert page.with_suffix(".png").stat().st_size > 0
     pieces = sorted((folder / "out").glob("house*/*/scores.json"))
-    assert len(pieces) == len(study.ROWS)
+    assert len(pieces) == len(ROWS)
     before = [file.stat().st_mtime_ns for file in pieces]
     study.run(folder / "world", folder / "policy", folder / "out", ERRAND, say=lambda _: None)
     assert [file.stat().st_mtime_ns for file in pieces] == before
     runs = [
         (folder / "out" / "house0000" / f"{how}-seed0" / "run" / "weights.safetensors")
-        for how in study.LEARNED
+        for how in LEARNED
     ]
     began = (folder / "policy" / "weights.safetensors").read_bytes()
     assert len({began, *(run.read_bytes() for run in runs)}) == 4, "each has learned something else"
@@ -109,7 +110,7 @@ def test_the_whole_study_is_made_kept_and_goes_on(made):
 
 def test_what_it_learns_from_are_whole_walks_of_its_own_actions(made):
     folder, _ = made
-    for how in study.LEARNED:
+    for how in LEARNED:
         source = EpisodeSource(folder / "out" / "house0000" / f"{how}-seed0" / "data" / "train")
         assert len(source) == 2
         episode = source[0]
@@ -288,7 +289,7 @@ def test_a_policy_that_gives_no_actions_is_refused(home, wrong):
 )
 def test_a_bad_errand_is_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        study.Errand(**wrong)
+        Errand(**wrong)
 
 
 @pytest.mark.parametrize("wrong", [{"walks": 0}, {"blocks": 0}, {"with_goal": 1.5}])
