@@ -1,4 +1,4 @@
-"""PERSIST, small: houses that move at 64×64 pixels, half an hour on two cores with its data."""
+"""PERSIST, small: a world of blocks at 64×64 pixels, half an hour on two cores with its data."""
 
 import dataclasses
 
@@ -22,16 +22,17 @@ from pewm_jax.config import (
     VoxelVAEConfig,
 )
 
-CLASSES = 73
-"""Nine groups of kinds in eight colours, and nothing."""
+CLASSES = 145
+"""Nine groups of kinds in sixteen colours, and nothing."""
 
 
 def config() -> Config:
     """Return the settings of ``persist_tiny``.
 
     Its data: ``pewm-jax data collect data/persist --moving --voxels --voxels.kinds groups
-    --voxels.colours 8 --voxels.cell 0.25 --voxels.side 40 --train 112 --validation 8 --test 16
-    --frames 40``. The codec of pictures is the one that comes with the library.
+    --voxels.colours 16 --voxels.pictures cells --voxels.cell 0.25 --voxels.side 40 --train 128
+    --validation 8 --test 16 --frames 40``. The codec of pictures is the one that comes with the
+    library.
     """
     codec = LearnedCodecConfig(gate=48)
     width = {"head_dim": 40, "gates": "open"}
@@ -90,6 +91,7 @@ def config() -> Config:
                     kernel=2,
                     stride=2,
                     fold=8,
+                    drawn=codec.channels,
                     patch=1,
                     longest_m=12.0,
                     blocks=BlocksConfig(layers=4, heads=4, context=3, **width),
@@ -101,11 +103,13 @@ def config() -> Config:
                 cells=(128, 128, 32),
                 recorded=40,
                 kinds="groups",
-                colours=8,
+                colours=16,
+                pictures="cells",
             ),
             noise=pixels,
             voxel_noise=voxels,
             hold=3.0,
+            sight=12.0,
             points=True,
             dead_reckoning=True,
         ),
@@ -121,6 +125,7 @@ def config() -> Config:
             world_frames=StageConfig(steps=500, batch=6, learning_rate=1.5e-3, warmup=30),
             camera=StageConfig(steps=40, batch=16, learning_rate=1e-3, warmup=10),
             renderer=StageConfig(steps=900, batch=6, learning_rate=1.5e-3, warmup=30),
+            occupied=4.0,
             ema=0.98,
         ),
         evaluate=EvalConfig(clips=24, seeds=(0,), videos=4, video_clips=8, batch=8),

@@ -32,7 +32,7 @@ MODEL = PersistConfig(
         camera_model=CameraModelConfig(classes=13, inner=2, embed=2, actions=3, blocks=BLOCKS),
         renderer=VoxelRendererConfig(
             classes=13, height=4, width=4, latent_channels=64, rays=2, layers=2, embed=4,
-            kernel=2, stride=2, fold=2, actions=3, blocks=BLOCKS,
+            kernel=2, stride=2, fold=2, drawn=64, actions=3, blocks=BLOCKS,
         ),
     ),
     control=ModulationConfig(),
@@ -43,6 +43,7 @@ MODEL = PersistConfig(
     noise=NOISE,
     voxel_noise=NOISE,
     hold=1e6,
+    sight=1e3,
     points=True,
     dead_reckoning=True,
 )  # fmt: skip

@@ -153,7 +153,7 @@ def test_the_next_voxels_depend_on_what_was_edited_elsewhere(params, state):
     low = np.asarray(state.map.low_3) + 0.5 * np.asarray(state.map.history.start_3)
     box = np.stack([low, low + np.array([2.0, 4.0, 4.0])]).astype(np.float32)  # half of the window
     edited = persist.edit(state, class_edit.place, MODEL.memory, box, 5)
-    loud = {**params, "voxel_dit": jax.tree.map(lambda x: 3 * x, params["voxel_dit"])}
+    loud = {**params, "voxel_dit": jax.tree.map(lambda x: 8 * x, params["voxel_dit"])}
     still = np.zeros((1, 3), np.float32)
     one, two = (
         np.asarray(imagine(free, loud, begun, still, KEY)[0].map.classes_XYZ)
@@ -382,6 +382,7 @@ def test_its_settings_travel_and_what_cannot_work_is_refused():
     assert configuration.from_dict(Config, configuration.to_dict(tiny)) == tiny
     for changes, says in (
         ({"hold": -1.0}, "use 0 or more nats"),
+        ({"sight": -1.0}, "model.sight is -1.0: use 0 or more nats"),
         ({"memory": configuration.VoxelConfig()}, "made of a GridConfig"),
         ({"codec": PixelConfig(spatial=2, temporal=1)}, "pixel_channels is 88"),
         ({"noise": dataclasses.replace(NOISE, per_frame=False)}, "per_frame is false"),

@@ -83,6 +83,35 @@ def test_world_frames_are_shown_the_picture_before_and_learn_from_everything():
     assert by_frame[0] > 0 == by_frame[-1]  # the last picture is of no frame's past
 
 
+def test_the_error_counts_where_it_is_told_to():
+    config = VoxelDiTConfig(
+        latent_side=2, latent_channels=3, patch=1, actions=4, pixel_channels=5, blocks=BLOCKS
+    )
+    params = weights(voxel_dit, config)
+    params = {**params, "proj_out": jax.tree.map(jnp.zeros_like, params["proj_out"])}
+    actions, pixels, shape = normal(1, 2, 4, 4), normal(2, 2, 4, 2, 4, 5), (2, 4, 2, 2, 2)
+    large = np.zeros(shape, bool)
+    large[..., 0] = True
+    x0 = 10.0 * large[..., None] * np.ones(3, np.float32)
+
+    @jax.jit
+    def error(counts, known):
+        return persist_losses.world_frames(
+            config, NOISE, params, x0, actions, pixels, jax.random.key(3), weight_BTxyz=counts,
+            known_BTxyz=known,
+        )[0]  # fmt: skip
+
+    ones = np.ones(shape, bool)
+    alike, here, there, more = (
+        float(error(counts, ones)) for counts in (1 + 0 * large, large, ~large, 1 + 3 * large)
+    )
+    assert 90 < here < 110
+    assert there < 3
+    np.testing.assert_allclose(alike, (here + there) / 2, rtol=1e-5)
+    np.testing.assert_allclose(more, (4 * here + there) / 5, rtol=1e-5)
+    np.testing.assert_allclose(float(error(1 + 3 * large, ~large)), there, rtol=1e-5)
+
+
 def test_the_camera_learns_steps_and_does_not_see_where_the_next_grid_lies():
     units = (0.25, 0.25, 0.25, 0.3, 0.3, 0.3)
     config = CameraModelConfig(classes=5, inner=2, embed=4, actions=4, units=units, blocks=BLOCKS)

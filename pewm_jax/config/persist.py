@@ -92,6 +92,11 @@ class PersistNetsConfig(BackboneSettings):
             f"({model.control.actions}).",
         )
         require(
+            view.drawn in (0, model.picture_channels),
+            f"backbone.renderer.drawn is {view.drawn}: use 0, or the {model.picture_channels} "
+            "channels of a picture's latents.",
+        )
+        require(
             model.codec.temporal == 1,
             f"codec.temporal is {model.codec.temporal}: this world makes frame after frame; use a "
             "codec that encodes frames one by one, such as codec.kind learned.",
@@ -119,6 +124,8 @@ class GridConfig(MemorySettings):
     """Which classes there are, as the data were collected (`--voxels.kinds`)."""
     colours: int = 16
     """Colours of each kind, as the data were collected (`--voxels.colours`)."""
+    pictures: Literal["surfaces", "cells"] = "surfaces"
+    """What the data's images show, as they were collected (`--voxels.pictures`)."""
     eye_m: float = 1.25
     """Height of the camera above the floor, metres: where a world begins without a known grid, the
     floor is a border between cells."""
@@ -178,9 +185,14 @@ class PersistTrainConfig(TrainSettings):
     blind: float = 0.3
     """Share of frames after the first that are shown no picture."""
 
+    occupied: float = 1.0
+    """What the error of a world frame's latent counts where anything is in its cells, beside those
+    of air, which are most; 1 as published."""
+
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
+        require(self.occupied > 0, f"train.occupied is {self.occupied}: use a number above 0.")
         require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
         require(
             self.hidden == 0 and self.chained == 0,
@@ -225,6 +237,9 @@ class PersistConfig(ModelConfig):
     hold: float = 0.0
     """By how many nats another class must be likelier than the one that a cell has had, for it to
     change; 0 as published. Small networks forget without it."""
+    sight: float = 0.0
+    """By how many nats a class is likelier that a real picture shows in a cell: air before what
+    its depth says, a surface there; 0 for not at all, as published."""
     points: bool = False
     """Whether the picture that a voxel frame is shown comes with the place of its surfaces, from
     its depth; not as published."""
@@ -258,7 +273,9 @@ class PersistConfig(ModelConfig):
                 f"model.{name}.per_frame is false, and every frame of this world has a time of its "
                 "own: use true.",
             )
-        require(self.hold >= 0, f"model.hold is {self.hold}: use 0 or more nats.")
+        for name in ("hold", "sight"):
+            value = getattr(self, name)
+            require(value >= 0, f"model.{name} is {value}: use 0 or more nats.")
         require(
             not (self.points and not self.clip.depth),
             "model.points needs depth: use clip.depth true, or points false.",

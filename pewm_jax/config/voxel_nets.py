@@ -118,6 +118,9 @@ class VoxelRendererConfig:
     """Layers from one place of that convolution to the next."""
     fold: int = 16
     """Channels of that convolution; published networks have 47 places of 16, which are 752."""
+    drawn: int = 0
+    """Channels of the latents of the voxels drawn in the colours of their classes, which join what
+    rays meet; 0 for none, as published. Small networks learn colours slowly without."""
     patch: int = 2
     """Latents along each axis for one token."""
     actions: int = 0
@@ -152,6 +155,7 @@ class VoxelRendererConfig:
             f"({self.patch}).",
         )
         require(self.actions >= 0, f"renderer.actions is {self.actions}: use 0 for none, or more.")
+        require(self.drawn >= 0, f"renderer.drawn is {self.drawn}: use 0 for none, or more.")
 
     @property
     def places(self) -> int:
@@ -159,9 +163,14 @@ class VoxelRendererConfig:
         return (self.layers - self.kernel) // self.stride + 1
 
     @property
-    def features(self) -> int:
+    def folded(self) -> int:
         """Channels that the layers of the rays of a latent become."""
         return self.places * self.fold * self.rays**2
+
+    @property
+    def features(self) -> int:
+        """Channels that the renderer is told of the voxels."""
+        return self.folded + self.drawn
 
     @property
     def tokens(self) -> int:

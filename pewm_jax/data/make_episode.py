@@ -15,6 +15,7 @@ import tyro
 
 from pewm_jax.config import ActionConfig, ConfigError
 from pewm_jax.config.launch import is_address
+from pewm_jax.data import block_pictures
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.moving import MovingHouse, moving_house, render_moving
 from pewm_jax.data.navigation import NavGrid, navigable
@@ -136,6 +137,11 @@ class CollectConfig:
             value = getattr(self.voxels, field.name)
             if value != field.default:
                 raise ConfigError(f"--voxels.{field.name} {value} needs --voxels, which records.")
+        if self.ids and self.voxels.pictures == "cells":
+            raise ConfigError(
+                "--ids are of the house's own things, which --voxels.pictures cells does not show: "
+                "leave out one of the two."
+            )
 
     def _check_address(self) -> None:
         if self.address and self.engine != "ray":
@@ -162,6 +168,8 @@ def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
         del settings[name]
     if not config.moving:  # datasets of before there was a choice stay what they are
         del settings["moving"]
+    if settings["voxels"]["pictures"] == UNRECORDED.pictures:
+        del settings["voxels"]["pictures"]
     if not settings["voxels"].pop("record"):
         del settings["voxels"]
     settings["scene"] = [f"{p.name} ({p.stat().st_size} bytes)" for p in config.scene]
@@ -224,6 +232,8 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     if config.voxels.record:
         floor_z = float(grid.floor_z) if config.scene else 0.0
         voxels = record_voxels(config.voxels, scene, floor_z, pose[:, :3, 3], moving, parts)
+        if config.voxels.pictures == "cells":
+            seen = block_pictures.pictures(voxels, camera, config.size, config.size)
     arrays = EpisodeArrays(
         rgb_THWC=seen.rgb_THWC,
         depth_THW=seen.depth_THW,

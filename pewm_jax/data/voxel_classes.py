@@ -60,6 +60,9 @@ class VoxelsConfig:
     """Kinds of things: `all` (every kind of furniture its own), or `groups` (all furniture one)."""
     colours: int = 16
     """Colours of each kind, 1 (colours make no difference) to 24."""
+    pictures: Literal["surfaces", "cells"] = "surfaces"
+    """What the images show: the house's own surfaces, or the recorded `cells` as blocks in the
+    colours of their classes, as in a game of blocks."""
 
     def __post_init__(self):
         """Validate."""

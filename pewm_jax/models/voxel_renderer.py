@@ -104,7 +104,12 @@ def look(
 
 
 def features(
-    config: VoxelRendererConfig, params: Params, layers: Layers, dtype: Any = jnp.float32
+    config: VoxelRendererConfig,
+    params: Params,
+    layers: Layers,
+    dtype: Any = jnp.float32,
+    *,
+    drawn_hwC: Array | None = None,
 ) -> Array:
     """Fold layers (..., h, w, L) into channels (..., h, w, F): first all of the nearest place.
 
@@ -115,7 +120,25 @@ def features(
         params: its parameters.
         layers: what rays meet, from ``look``.
         dtype: of the computation.
+        drawn_hwC: (..., h, w, C) latents of the voxels drawn in the colours of their classes,
+            where the network takes them (``config.drawn``); they are the last channels.
+
+    Raises:
+        UserError: drawn voxels where the network takes none, or none where it does.
     """
+    given = 0 if drawn_hwC is None else drawn_hwC.shape[-1]
+    if given != config.drawn:
+        raise UserError(
+            f"The drawn voxels have {given} channels: the renderer takes {config.drawn} "
+            "(renderer.drawn)."
+        )
+    folded = _folded(config, params, layers, dtype)
+    if drawn_hwC is None:
+        return folded
+    return jnp.concatenate([folded, drawn_hwC.astype(dtype)], -1)
+
+
+def _folded(config: VoxelRendererConfig, params: Params, layers: Layers, dtype: Any) -> Array:
     x = params["classes"]["kernel"].astype(dtype)[layers.ids_L]
     if config.sides:
         x = x + params["faces"]["kernel"].astype(dtype)[layers.side_L]  # −1 is the last row
@@ -124,12 +147,12 @@ def features(
     taps = [x[..., tap : tap + last : config.stride, :] for tap in range(config.kernel)]
     folded = linear(params["fold"], jnp.concatenate(taps, -1))
     if config.rays == 1:
-        return folded.reshape(*folded.shape[:-2], config.features)
+        return folded.reshape(*folded.shape[:-2], config.folded)
     *front, rows, columns, places, channels = folded.shape
     rays = config.rays
     cut = folded.reshape(*front, rows // rays, rays, columns // rays, rays, places * channels)
     cut = jnp.moveaxis(cut, -4, -3)
-    return cut.reshape(*cut.shape[:-3], config.features)
+    return cut.reshape(*cut.shape[:-3], config.folded)
 
 
 def depth_waves(config: VoxelRendererConfig, depth: Array) -> Array:

@@ -69,6 +69,7 @@ def world_frames(
     camera_BTN: Array | None = None,
     blind: float = 0.0,
     known_BTxyz: Array | None = None,
+    weight_BTxyz: Array | None = None,
     dtype: Any = jnp.float32,
 ) -> tuple[Array, Measured]:
     """Return the squared error of the velocity of voxel frames.
@@ -87,6 +88,7 @@ def world_frames(
         camera_BTN: numbers of the camera at each frame.
         blind: share of frames after the first that are not shown a picture.
         known_BTxyz: bool, which latents a world would know at that frame; None for all.
+        weight_BTxyz: what the error of each latent counts; None for 1.
         dtype: of the computation.
     """
     velocity_key, shown_key = jax.random.split(key)
@@ -109,6 +111,7 @@ def world_frames(
         velocity_key,
         dtype,
         known=known_BTxyz,
+        counts=weight_BTxyz,
     )
 
 
@@ -170,6 +173,7 @@ def renderer(
     key: Array,
     *,
     actions_BTA: Array | None = None,
+    drawn_BThwC: Array | None = None,
     dtype: Any = jnp.float32,
 ) -> tuple[Array, Measured]:
     """Return the squared error of the velocity of pictures' latents.
@@ -182,9 +186,10 @@ def renderer(
         layers: (B, T, h, w, L) what their rays meet, from ``voxel_renderer.look``.
         key: randomness of times and noise.
         actions_BTA: the action that leads to each frame, where the network takes one.
+        drawn_BThwC: latents of the drawn voxels, where the network takes them.
         dtype: of the computation.
     """
-    seen = voxel_renderer.features(config, params, layers, dtype)
+    seen = voxel_renderer.features(config, params, layers, dtype, drawn_hwC=drawn_BThwC)
     predict = functools.partial(
         voxel_renderer.apply, config, params, features_BThwF=seen, actions_BTA=actions_BTA
     )
@@ -199,6 +204,7 @@ def _velocity(
     dtype: Any,
     *,
     known: Array | None = None,
+    counts: Array | None = None,
 ) -> tuple[Array, Measured]:
     """Return the squared error at times drawn for each frame, and that of x0.
 
@@ -210,6 +216,7 @@ def _velocity(
         dtype: of the computation.
         known: bool, in the shape of x0 without its channels: elsewhere x_t is noise alone, and
             the error does not count.
+        counts: in the same shape, what the error counts there; None for 1.
     """
     time_key, noise_key = jax.random.split(key)
     times = noises.draw(noise, time_key, *x0.shape[:2])
@@ -225,9 +232,9 @@ def _velocity(
     x0_error = jnp.square(noises.to_x0(noise, made, x_t, times) - x0)
 
     def mean(x: Array) -> Array:
-        if known is None:
-            return x.mean()
-        share = known[..., None].astype(jnp.float32)
-        return (x * (share / jnp.maximum(share.mean(), 1e-6))).mean()
+        share = jnp.ones(x0.shape[:-1]) if counts is None else counts.astype(jnp.float32)
+        if known is not None:
+            share = share * known
+        return (x * (share / jnp.maximum(share.mean(), 1e-6))[..., None]).mean()
 
     return mean(error * weight), {"x0_error": mean(x0_error)}

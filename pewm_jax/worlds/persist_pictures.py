@@ -9,11 +9,13 @@ from pewm_jax.config import PersistConfig
 from pewm_jax.diffusion import noise as noises
 from pewm_jax.geometry import camera_steps
 from pewm_jax.geometry.actions import step_pose
+from pewm_jax.memory import class_grid
+from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models import camera_model, voxel_renderer
 from pewm_jax.models.frame_blocks import FrameCache
 from pewm_jax.types import Array, Camera, Params
 from pewm_jax.worlds import persist_windows as windows
-from pewm_jax.worlds.persist_past import context
+from pewm_jax.worlds.persist_past import context, encoded
 
 
 def reckoned(model: PersistConfig, here: Camera, action_A: Array) -> Camera:
@@ -80,7 +82,29 @@ def features(
         jax.tree.map(lambda x: x[None], camera),
         (model.clip.height, model.clip.width),
     )
-    return voxel_renderer.features(config, params["renderer"], layers, jnp.dtype(model.dtype))[None]
+    told = None
+    if config.drawn:
+        told = drawn(model, params, classes_XYZ, corner, camera)[None]
+    dtype = jnp.dtype(model.dtype)
+    return voxel_renderer.features(config, params["renderer"], layers, dtype, drawn_hwC=told)[None]
+
+
+def drawn(
+    model: PersistConfig, params: Params, classes_XYZ: Array, corner_3: Array, camera: Camera
+) -> Array:
+    """Return latents (h, w, C) of a window drawn in the colours of its classes, without light.
+
+    Args:
+        model: the model.
+        params: gives the codec.
+        classes_XYZ: the window's cells.
+        corner_3: its lowest corner, metres.
+        camera: one camera.
+    """
+    cells = ClassGrid(classes_XYZ, corner_3)
+    one = jax.tree.map(lambda x: x[None], camera)
+    view = class_grid.render(model, cells, one, model.clip.height, model.clip.width)
+    return encoded(model, params, view.features_THWF[0], view.depth_THW[0])
 
 
 def sample(

@@ -21,6 +21,7 @@ from pewm_jax.models.signals import as_signal
 from pewm_jax.types import Array, Camera, Clip, Params
 from pewm_jax.worlds import persist_losses as losses
 from pewm_jax.worlds import persist_windows as windows
+from pewm_jax.worlds.persist_pictures import drawn
 
 
 def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
@@ -120,8 +121,18 @@ def frames(model: PersistConfig, params: Params, clip: Clip) -> Clip:
         "camera": camera,
         "actions": losses.led_to(clip.actions_TA),
         "known": known,
+        "occupied": occupied(model, classes),
     }
     return _prepared(clip, made)
+
+
+def occupied(model: PersistConfig, classes_BTXYZ: Array) -> Array:
+    """Return (B, T, x, y, z) bool: whether anything is known to be in the cells of a latent."""
+    *front, wide, _, _ = classes_BTXYZ.shape
+    factor = model.backbone.voxel_vae.factor  # type: ignore[attr-defined]
+    count = wide // factor
+    cells = (classes_BTXYZ > 0).reshape(*front, count, factor, count, factor, count, factor)
+    return cells.any((-5, -3, -1))
 
 
 def cameras(model: PersistConfig, params: Params, clip: Clip) -> Clip:
@@ -166,6 +177,12 @@ def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
         "side": layers.side_L.astype(jnp.int8),
         "actions": losses.led_to(clip.actions_TA),
     }
+    if model.backbone.renderer.drawn:  # type: ignore[attr-defined]
+
+        def draw(one: tuple[Array, Array, Camera]) -> Array:
+            return jax.lax.map(lambda frame: drawn(model, params, *frame), one)
+
+        made["drawn"] = jax.lax.map(draw, (classes, corner, camera)).astype(jnp.float16)
     return _prepared(clip, made)
 
 
@@ -179,7 +196,7 @@ def require_recorded(model: PersistConfig, clip: Clip) -> None:
     groups = f"--voxels.kinds {memory.kinds} --voxels.colours {memory.colours}"  # type: ignore[attr-defined]
     command = (
         f"pewm-jax data collect DATA --moving --voxels --voxels.cell {windows.cell_m(model):g} "
-        f"--voxels.side {memory.recorded} {groups}"  # type: ignore[attr-defined]
+        f"--voxels.side {memory.recorded} {groups} --voxels.pictures {memory.pictures}"  # type: ignore[attr-defined]
     )
     if classes is None or clip.actions_TA is None:
         raise UserError(

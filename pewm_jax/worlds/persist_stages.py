@@ -104,6 +104,7 @@ def world_frames(
         camera_BTN=made["camera"] if config.camera_numbers else None,
         blind=train.blind,
         known_BTxyz=made["known"],
+        weight_BTxyz=1 + (train.occupied - 1) * made["occupied"],
         dtype=jnp.dtype(model.dtype),
     )
 
@@ -147,6 +148,7 @@ def renderer(
         layers,
         key,
         actions_BTA=made["actions"] if config.actions else None,
+        drawn_BThwC=made["drawn"].astype(jnp.float32) if config.drawn else None,
         dtype=jnp.dtype(model.dtype),
     )
 

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from pewm_jax.config import PersistConfig
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models import camera_model, voxel_dit, voxel_renderer
-from pewm_jax.types import Array, Frames, Params
-from pewm_jax.worlds import persist_pictures, persist_voxels
+from pewm_jax.types import Array, Camera, Frames, Params
+from pewm_jax.worlds import persist_pictures, persist_sight, persist_voxels
 from pewm_jax.worlds import persist_windows as windows
 from pewm_jax.worlds.persist_past import Given, History, Past, decoded, encoded
+from pewm_jax.worlds.persist_sight import Sight
 
 
 def begin(model: PersistConfig, params: Params, grid: ClassGrid, frame: Frames, key: Array) -> Past:
@@ -46,7 +47,10 @@ def begin(model: PersistConfig, params: Params, grid: ClassGrid, frame: Frames, 
     voxel_key, picture_key = jax.random.split(key)
     before = windows.window(model, grid.classes_XYZ, start)
     middle = windows.middle(model, grid.low_3, start)
-    made = persist_voxels.sample(model, params, history, history.voxels, middle, before, voxel_key)
+    sight = _sight(model, grid, start, frame.rgb_THWC[0], frame.depth_THW[0], camera)
+    made = persist_voxels.sample(
+        model, params, history, history.voxels, middle, before, voxel_key, sight
+    )
     classes = jnp.where(before >= 0, before, made)  # a known grid is not changed by its picture
     everything = windows.written(grid.classes_XYZ, classes, start)
     seen = persist_pictures.features(model, params, classes, grid.low_3, start, camera)
@@ -94,7 +98,10 @@ def step(
     now = dataclasses.replace(history, action_A=action_A, shown=past.shown)
     classes = given.classes_XYZ
     if classes is None:
-        classes = persist_voxels.sample(model, params, now, cache, middle, before, keys[1])
+        sight = None
+        if given.rgb_HWC is not None and given.depth_HW is not None:
+            sight = _sight(model, grid, start, given.rgb_HWC, given.depth_HW, camera)
+        classes = persist_voxels.sample(model, params, now, cache, middle, before, keys[1], sight)
     everything = windows.written(grid.classes_XYZ, classes, start)
     made, cameras = persist_pictures.next_camera(
         model, params, everything, grid.low_3, here, action_A, history.cameras
@@ -119,3 +126,18 @@ def step(
     )
     one = jax.tree.map(lambda x: x[None], (rgb, depth, camera))
     return after, Frames(*one)
+
+
+def _sight(
+    model: PersistConfig,
+    grid: ClassGrid,
+    start_3: Array,
+    rgb_HWC: Array,
+    depth_HW: Array,
+    camera: Camera,
+) -> Sight | None:
+    """Return what a real picture shows of the window's cells, where the model looks."""
+    if not model.sight or not model.clip.depth:
+        return None
+    corner = grid.low_3 + start_3 * windows.cell_m(model)
+    return persist_sight.seen(model, corner, rgb_HWC, depth_HW, camera)

@@ -18,8 +18,10 @@ from pewm_jax.models import voxel_dit, voxel_vae
 from pewm_jax.models.frame_blocks import FrameCache
 from pewm_jax.models.plain_layers import linear
 from pewm_jax.types import Array, Params
+from pewm_jax.worlds import persist_sight
 from pewm_jax.worlds import persist_windows as windows
 from pewm_jax.worlds.persist_past import History, context
+from pewm_jax.worlds.persist_sight import Sight
 
 
 def sample(
@@ -30,6 +32,7 @@ def sample(
     middle_3: Array,
     before_XYZ: Array,
     key: Array,
+    sight: Sight | None = None,
 ) -> Array:
     """Sample a voxel frame: (X, Y, Z) class ids.
 
@@ -41,6 +44,7 @@ def sample(
         middle_3: the middle of its window, metres.
         before_XYZ: the window's cells before; where they are known, ``model.hold`` counts.
         key: randomness.
+        sight: what a real picture of this frame shows of the window's cells.
     """
     config, noise = model.backbone.world_frames, model.voxel_noise  # type: ignore[attr-defined]
     asked = _asked(model, history, middle_3)
@@ -57,29 +61,41 @@ def sample(
         return noises.to_x0(noise, made.astype(jnp.float32), x, times)
 
     latents = noises.sample(noise, denoise, jax.random.normal(key, shape))[:, 0]
-    return held(model, params, latents, before_XYZ)
+    return held(model, params, latents, before_XYZ, sight)
 
 
-def held(model: PersistConfig, params: Params, latents_BxyzC: Array, before_XYZ: Array) -> Array:
+def held(
+    model: PersistConfig,
+    params: Params,
+    latents_BxyzC: Array,
+    before_XYZ: Array,
+    sight: Sight | None = None,
+) -> Array:
     """Return the class ids (X, Y, Z) that latents (1, …) decode to.
 
-    A cell whose class was known has another one only if that is likelier by ``model.hold``.
+    A cell whose class was known has another one only if that is likelier by ``model.hold``; what a
+    real picture shows of it is likelier by ``model.sight``.
     """
     config = model.backbone.voxel_vae  # type: ignore[attr-defined]
     weights, dtype = params["voxel_vae"], jnp.dtype(model.dtype)
-    if not model.hold:
+    looked = sight is not None and model.sight > 0
+    if not model.hold and not looked:
         return voxel_vae.decode(config, weights, latents_BxyzC, dtype)[0]
-    seen = voxel_vae.features(config, weights, latents_BxyzC, dtype)[0]
+    features = voxel_vae.features(config, weights, latents_BxyzC, dtype)[0]
 
-    def likeliest(slab: tuple[Array, Array]) -> Array:
-        features, before = slab
+    def likeliest(slab: tuple[Array, Array, Sight | None]) -> Array:
+        features, before, sight = slab
         scores = linear(weights["decoder"]["scores"], features).astype(jnp.float32)
         same = jnp.arange(config.classes) == before[..., None]
-        return (scores + model.hold * same).argmax(-1).astype(jnp.int32)
+        scores = scores + model.hold * same
+        if sight is not None:
+            scores = scores + persist_sight.advantage(model, sight, config.classes)
+        return scores.argmax(-1).astype(jnp.int32)
 
     slab = config.slab or config.side
-    cut = (x.reshape(-1, slab, *x.shape[1:]) for x in (seen, before_XYZ.astype(jnp.int32)))
-    return jax.lax.map(likeliest, tuple(cut)).reshape(before_XYZ.shape)
+    whole = features, before_XYZ.astype(jnp.int32), sight if looked else None
+    cut = jax.tree.map(lambda x: x.reshape(-1, slab, *x.shape[1:]), whole)
+    return jax.lax.map(likeliest, cut).reshape(before_XYZ.shape)
 
 
 def taken_in(

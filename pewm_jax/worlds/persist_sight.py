@@ -1,0 +1,116 @@
+"""What a real picture says of the cells that it shows, with no network: air, surfaces, colours.
+
+A real frame has depth. A cell in front of what was measured is air; one that a measured surface
+lies in is occupied, and pictured in its colour. ``model.sight`` is the advantage, in nats, that
+this gives a class over others when voxels are made of a real frame (``persist_voxels.held``).
+Imagined frames are made of the voxels, so they say nothing of them. Not as published.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import PersistConfig
+from pewm_jax.data import block_pictures
+from pewm_jax.data.voxel_classes import PALETTE
+from pewm_jax.geometry.cameras import invert_rigid, transform_points, unproject
+from pewm_jax.types import Array, Camera
+from pewm_jax.worlds import persist_windows as windows
+
+INTO_M = 0.03
+"""A measured point belongs to the cell this far behind it, metres."""
+NEAREST_M = 0.05
+"""Cells nearer to the camera than this are not judged, metres."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Sight:
+    """What is seen of the cells of a window.
+
+    Attributes:
+        air_XYZ: bool, that nothing is there.
+        colour_XYZ: int32 number of the palette's colour of the surface in it, −1 where none is.
+    """
+
+    air_XYZ: Array
+    colour_XYZ: Array
+
+
+def advantage(model: PersistConfig, sight: Sight, classes: int) -> Array:
+    """Return the nats (X, Y, Z, classes) that sight adds to the scores of classes."""
+    number = jnp.arange(classes)
+    colours = model.memory.colours  # type: ignore[attr-defined]
+    air = sight.air_XYZ[..., None] & (number == 0)
+    surface = (number > 0) & ((number - 1) % colours == sight.colour_XYZ[..., None])
+    return model.sight * (air | surface)
+
+
+def seen(
+    model: PersistConfig, corner_3: Array, rgb_HWC: Array, depth_HW: Array, camera: Camera
+) -> Sight:
+    """Return what a picture shows of a window's cells.
+
+    Args:
+        model: the model.
+        corner_3: the window's lowest corner, metres.
+        rgb_HWC: colours in [−1, 1].
+        depth_HW: depth, metres; 0 where nothing was measured.
+        camera: its camera.
+    """
+    size, side = windows.cell_m(model), windows.side(model)
+    point_HW3 = unproject(depth_HW, camera)
+    way_HW3 = point_HW3 - camera.world_from_camera[:3, 3]
+    metres_HW1 = jnp.linalg.norm(way_HW3, axis=-1, keepdims=True)
+    behind_HW3 = point_HW3 + INTO_M * way_HW3 / jnp.maximum(metres_HW1, INTO_M)
+    at = jnp.floor((behind_HW3 - corner_3) / size).astype(jnp.int32)
+    met = (depth_HW > 0) & ((at >= 0) & (at < side)).all(-1)
+    cell = jnp.where(met, (at[..., 0] * side + at[..., 1]) * side + at[..., 2], side**3)
+    colour_HW = _nearest(model, (rgb_HWC + 1) / 2 / _light(model, corner_3, point_HW3, way_HW3))
+    colours = model.memory.colours  # type: ignore[attr-defined]
+    votes = jnp.zeros((side**3 + 1, colours), jnp.int32)
+    votes = votes.at[cell.reshape(-1), colour_HW.reshape(-1)].add(1)[:-1]
+    surface = (votes.sum(-1) > 0).reshape((side,) * 3)
+    colour = votes.argmax(-1).reshape((side,) * 3).astype(jnp.int32)
+    air = _before(model, corner_3, depth_HW, camera) & ~surface
+    return Sight(air, jnp.where(surface, colour, -1))
+
+
+def _before(model: PersistConfig, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:
+    """Return which cells (X, Y, Z) lie before what was measured in their direction."""
+    size, side = windows.cell_m(model), windows.side(model)
+    steps = (np.arange(side) + 0.5) * size
+    middle = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).astype(np.float32)
+    place = transform_points(invert_rigid(camera.world_from_camera), middle + corner_3)
+    far = jnp.maximum(place[..., 2], NEAREST_M)
+    fx, fy, cx, cy = camera.intrinsics_4
+    column = jnp.floor(place[..., 0] / far * fx + cx).astype(jnp.int32)
+    row = jnp.floor(place[..., 1] / far * fy + cy).astype(jnp.int32)
+    height, width = depth_HW.shape
+    within = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    measured = depth_HW[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
+    return within & (place[..., 2] > NEAREST_M) & (place[..., 2] + size / 2 < measured)
+
+
+def _light(model: PersistConfig, corner_3: Array, point_HW3: Array, way_HW3: Array) -> Array:
+    """Return the light (H, W, 1) on what was measured, where pictures of cells say it; else 1."""
+    if model.memory.pictures != "cells":  # type: ignore[attr-defined]
+        return jnp.ones((*point_HW3.shape[:-1], 1))
+    metres_HW = jnp.linalg.norm(way_HW3, axis=-1)
+    at = (point_HW3 - corner_3) / windows.cell_m(model)
+    side = jnp.abs(at - jnp.round(at)).argmin(-1)
+    facing = jnp.asarray(block_pictures.SIDES)[side]
+    above = (side == 2) & (way_HW3[..., 2] > 0)
+    facing = jnp.where(above, block_pictures.BELOW, facing)
+    return (facing / (1 + jnp.square(metres_HW / block_pictures.HALF_M)))[..., None]
+
+
+def _nearest(model: PersistConfig, rgb_HW3: Array) -> Array:
+    """Return the number of the nearest colour of the palette, (H, W)."""
+    count = model.memory.colours  # type: ignore[attr-defined]
+    palette = np.array(list(PALETTE.values())[:count], np.float32) / 255
+    return jnp.square(rgb_HW3[..., None, :] - palette).sum(-1).argmin(-1)
