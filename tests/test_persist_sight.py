@@ -48,9 +48,9 @@ def test_a_picture_tells_air_from_surfaces_and_their_colours():
     right = (grid[surface].astype(int) - 1) % COLOURS == colour[surface]
     assert right.mean() > 0.8
     assert not (air & surface).any()
-    # The cell of a block's face that is looked at, its colour, and the air before it.
+    # The cell of a block's face that is looked at, its colour, and the air beside it.
     assert colour[5, 2, 2] == 6 % COLOURS
-    assert air[3, 2, 3]
+    assert air[4, 3, 3]
 
 
 def test_where_nothing_was_measured_nothing_is_said():
