@@ -41,5 +41,5 @@ def config() -> Config:
             ema=0.99,
             log_every=10,
         ),
-        evaluate=EvalConfig(clips=192, seeds=(0,), batch=16),
+        evaluate=EvalConfig(clips=96, seeds=(0,), batch=16),
     )

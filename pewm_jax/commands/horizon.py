@@ -136,6 +136,7 @@ def _measured(
         made["without"] = horizon.roll(config, params, walks, memory=False, say="without voxels")
         grids = [walk.classes_TXYZ for walk in walks if walk.classes_TXYZ is not None]
         if len(grids) == len(walks):
+            made["known"] = horizon.roll(config, params, walks, known=True, say="from known grids")
             made["bound"] = horizon.bound(config, params, walks)
             facts["autoencoder"] = voxel_score.given_back(config.model, params, grids)
     for name, other in others:

@@ -98,6 +98,7 @@ def roll(
     walks: Sequence[Walk],
     *,
     memory: bool = True,
+    known: bool = False,
     say: str = "imagining",
 ) -> np.ndarray:
     """Imagine all walks at once; returns (B, T, H, W, 3) uint8 colours.
@@ -107,15 +108,18 @@ def roll(
         params: its weights.
         walks: of one length.
         memory: False goes on from the last picture alone, clip after clip.
+        known: begins in the recorded grid of the present frame, of a ``persist`` world.
         say: what the progress is called.
     """
     model = config.model
     each = CHUNK if memory else model.clip.frames - 1
-    context = _stacked([walk.context for walk in walks])
-    start = jax.jit(jax.vmap(functools.partial(worlds.start, model), (None, 0)))
     imagine = functools.partial(worlds.imagine, model, memory=memory)
     imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
-    state = start(params, context)
+    if known:
+        state = _begun(config, params, walks)
+    else:
+        start = jax.jit(jax.vmap(functools.partial(worlds.start, model), (None, 0)))
+        state = start(params, _stacked([walk.context for walk in walks]))
     actions = np.stack([walk.actions_T3 for walk in walks])
     keys = jax.random.split(jax.random.key(0), len(walks))
     return _in_chunks(
@@ -130,13 +134,9 @@ def roll(
 def bound(config: Config, params: Params, walks: Sequence[Walk]) -> np.ndarray:
     """Return what the renderer of a ``persist`` world makes of the true voxels and cameras."""
     model: PersistConfig = config.model
-    context = _stacked([jax.tree.map(lambda x: x[-1:], walk.context) for walk in walks])
-    firsts = [walk.first for walk in walks if walk.first is not None]
-    cells, corners = (np.stack(part) for part in zip(*firsts, strict=True))
-    start = jax.jit(jax.vmap(functools.partial(persist.start_in, model), (None, 0, 0, 0)))
     render = functools.partial(persist.render_true, model)
     render = jax.jit(jax.vmap(render, (None, 0, 0, 0, 0, 0)))
-    state = start(params, context, cells, corners)
+    state = _begun(config, params, walks)
     whole: Any = _stacked(
         [
             (Control(walk.camera, walk.actions_T3), walk.classes_TXYZ, walk.origin_T3)
@@ -151,6 +151,15 @@ def bound(config: Config, params: Params, walks: Sequence[Walk]) -> np.ndarray:
 
     count = walks[0].actions_T3.shape[0]
     return _in_chunks(count, CHUNK, "rendering true voxels", state, made)
+
+
+def _begun(config: Config, params: Params, walks: Sequence[Walk]) -> Any:
+    """Return the worlds that begin in the recorded grids of the present frames."""
+    context = _stacked([jax.tree.map(lambda x: x[-1:], walk.context) for walk in walks])
+    firsts = [walk.first for walk in walks if walk.first is not None]
+    cells, corners = (np.stack(part) for part in zip(*firsts, strict=True))
+    start = functools.partial(persist.start_in, config.model)
+    return jax.jit(jax.vmap(start, (None, 0, 0, 0)))(params, context, cells, corners)
 
 
 def stretches(made: np.ndarray, truth: np.ndarray, ends: Sequence[int]) -> list[float]:

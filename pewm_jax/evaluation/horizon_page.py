@@ -21,6 +21,7 @@ FRAMES_PER_SECOND = 12
 NAMES = {
     "truth": "truth",
     "bound": "its renderer, true voxels",
+    "known": "begun in a known grid",
     "world": "the world itself",
     "without": "without its voxels",
 }
