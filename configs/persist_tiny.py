@@ -22,15 +22,15 @@ from pewm_jax.config import (
     VoxelVAEConfig,
 )
 
-CLASSES = 145
-"""Nine groups of kinds in sixteen colours, and nothing."""
+CLASSES = 73
+"""Nine groups of kinds in eight colours, and nothing."""
 
 
 def config() -> Config:
     """Return the settings of ``persist_tiny``.
 
     Its data: ``pewm-jax data collect data/persist --moving --voxels --voxels.kinds groups
-    --voxels.colours 16 --voxels.pictures cells --voxels.cell 0.25 --voxels.side 40 --train 128
+    --voxels.colours 8 --voxels.pictures cells --voxels.cell 0.25 --voxels.side 40 --train 128
     --validation 8 --test 16 --frames 40``. The codec of pictures is the one that comes with the
     library.
     """
@@ -69,7 +69,7 @@ def config() -> Config:
                     actions=3,
                     pixel_channels=codec.channels + 24,
                     pixel_patch=1,
-                    blocks=BlocksConfig(layers=4, heads=8, context=4, **width),
+                    blocks=BlocksConfig(layers=4, heads=8, mlp_ratio=2, context=4, **width),
                 ),
                 camera_model=CameraModelConfig(
                     classes=CLASSES,
@@ -103,7 +103,7 @@ def config() -> Config:
                 cells=(128, 128, 32),
                 recorded=40,
                 kinds="groups",
-                colours=16,
+                colours=8,
                 pictures="cells",
             ),
             noise=pixels,

@@ -12,6 +12,7 @@ import pewm_jax
 ROOT = Path(__file__).parents[1]
 CHAPTERS = [
     "atomic",
+    "heap",
     "config",
     "types",
     "tree",

@@ -8,9 +8,8 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from pewm_jax import cli, shipped
+from pewm_jax import cli, heap, shipped
 from pewm_jax.commands import imports
-from pewm_jax.play import heap
 from pewm_jax.play.settings import Serve, Start
 
 ABOUT = (

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from pewm_jax import cli, presets
+from pewm_jax import cli, heap, presets
 from pewm_jax.commands import imports
 
 ABOUT = (
@@ -68,6 +68,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax table1") -> int:
     if settings.clips is not None:
         evaluate = dataclasses.replace(config.evaluate, clips=settings.clips)
         config = dataclasses.replace(config, evaluate=evaluate)
+    heap.keep_large()
     # Imported here and not above: help and refusals come at once.
     from pewm_jax.studies import table1
 

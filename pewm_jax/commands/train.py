@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from pewm_jax import cli, presets
+from pewm_jax import cli, heap, presets
 from pewm_jax import config as configuration
 from pewm_jax.commands import imports
 from pewm_jax.config import Config, Launch, ModelConfig
@@ -54,6 +54,7 @@ def main(argv: Sequence[str], prog: str = "python train.py") -> int:
         print(_usage(prog, TRAIN_EXAMPLES, cli.list_flags(Launch), more))
         return 0
     config, launch = _read(argv, prog)
+    heap.keep_large()
     # Imported here and not above: help and refusals come at once, and Ctrl-C is clean meanwhile.
     if launch.plan:
         from pewm_jax.scaling import plan as planning

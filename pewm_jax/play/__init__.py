@@ -14,7 +14,6 @@ driver    a thread that takes requests, the newest step first; errors become a s
 picking   a box chosen on the screen
 map_view  the map in 3D
 visitors  who may talk to the page: no page of another site
-heap      memory that the process keeps
 serving   its address, who reaches it, the browser
 page      the page, by viser
 ========  ===========================================================================
