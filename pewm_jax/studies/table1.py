@@ -18,8 +18,8 @@ from typing import Any
 from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.evaluation import intervals
+from pewm_jax.studies import recorded, table, table_page, timing
 from pewm_jax.studies import rows as table_rows
-from pewm_jax.studies import table, table_page, timing
 from pewm_jax.studies.rows import Row
 from pewm_jax.studies.scorer import BASELINES, Arrays, Scorer, open_scorer
 from pewm_jax.studies.timing import planned
@@ -115,12 +115,23 @@ def _rows(
 def _one(
     study: Study, scorer: Scorer, row: Row, seed: int, plan: dict[str, Any], say: Callable
 ) -> dict[str, Arrays]:
-    """Train and score a row; also its backbone, where that is a row of the table."""
-    config = train(study, row, seed, {name: entry["steps"] for name, entry in plan.items()}, say)
+    """Train and score a row; also its backbone, where that is a row of the table.
+
+    What was recorded of it on another machine is taken, where nothing of it is here.
+    """
+    steps = {name: entry["steps"] for name, entry in plan.items()}
+    file = recorded.path(study, row, seed, steps, scorer.name)
+    before = recorded.read(file)
+    if before is not None and not study.folder(row.name, seed).exists():
+        say(f"{row.name}, training seed {seed}: its scores are recorded in {file.parent}")
+        return before
+    config = train(study, row, seed, steps, say)
     found = {row.name: scorer.row(config, memory=row.remembers)}
     if row.depth:
-        before = settings(study, backbone_of(study.base, row), seed, plan[EMPTY]["steps"], start="")
-        found[EMPTY] = scorer.row(before, memory=False)
+        first = settings(study, backbone_of(study.base, row), seed, plan[EMPTY]["steps"], start="")
+        found[EMPTY] = scorer.row(first, memory=False)
+    if before is None:
+        recorded.write(file, found)
     return found
 
 

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from pewm_jax.data.__main__ import main as data_command
 from pewm_jax.evaluation.images import MASKS, SUMS
 from pewm_jax.geometry.actions import integrate, there_and_back
 from pewm_jax.geometry.cameras import pose_from_yaw
-from pewm_jax.studies import rows, scorer, table, table1, table_page, timing, trainings
+from pewm_jax.studies import recorded, rows, scorer, table, table1, table_page, timing, trainings
 
 SIZE = ["--size", "16", "--frames", "30"]
 
@@ -68,9 +69,9 @@ def test_the_whole_table_is_made(made):
     assert results["about"]["hours"]["clock"] > 0
 
 
-def whole(folder, say):
+def whole(folder, say, out=None):
     """Make the table."""
-    base, out = small(folder / "data"), folder / "out"
+    base, out = small(folder / "data"), out or folder / "out"
     return table1.run(base, out, minutes=(1, 1), steps=(2, 2), seeds=[0], only=ROWS, say=say)
 
 
@@ -84,6 +85,31 @@ def test_what_is_done_is_not_done_again(made):
     assert [file.stat().st_mtime_ns for file in files] == before
     assert len(files) >= 2 * len(ROWS)
     assert not any("compil" in line for line in said)
+
+
+def test_scores_outlive_the_weights(made):
+    folder, page, _ = made
+    out, before = folder / "elsewhere", page.read_text()
+    for name in ("protocol.json", "hours.json"):
+        (out / name).parent.mkdir(exist_ok=True)
+        shutil.copy(folder / "out" / name, out / name)
+    shutil.copytree(folder / "out" / "recorded", out / "recorded")
+    said = []
+    again = whole(folder, said.append, out)
+    assert sum("its scores are recorded" in line for line in said) == len(ROWS)
+    assert not (out / "seed0").exists()
+    numbers = [line for line in before.splitlines() if line.startswith("| ")]
+    assert [line for line in again.read_text().splitlines() if line.startswith("| ")] == numbers
+    file = sorted((out / "recorded").iterdir())[0]
+    file.write_bytes(file.read_bytes()[:100])
+    assert recorded.read(file) is None
+    base, row = small(folder / "data"), rows.main_rows(small(folder / "data"))[0]
+    study = trainings.Study(base, out, (1, 1), (2, 2))
+    steps = {"none": 2, "backbone": 2}
+    path = recorded.path(study, row, 0, steps, "x")
+    assert path != recorded.path(study, row, 0, steps | {"backbone": 3}, "x")
+    assert path != recorded.path(study, row, 0, steps, "y")
+    assert path != recorded.path(study, row, 1, steps, "x")
 
 
 def test_all_rows_start_from_one_backbone_and_keep_it(made):

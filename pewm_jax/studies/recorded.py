@@ -1,0 +1,72 @@
+"""Scores of Table 1 that outlive the weights: small files, which a repository can hold.
+
+A row that was trained and scored on one machine need not be trained again on another. Its file is
+named by a hash of the settings of its training and of its backbone's, of the data, and of what was
+scored how. Where a row's own folder is there, that is what counts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pewm_jax import atomic
+from pewm_jax import config as configuration
+from pewm_jax.data.dataset import MANIFEST
+from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.studies.rows import Row
+from pewm_jax.studies.trainings import Study, backbone_of, settings
+
+FOLDER = "recorded"
+Arrays = dict[str, np.ndarray]
+
+
+def path(study: Study, row: Row, seed: int, steps: Mapping[str, int], scored: str) -> Path:
+    """Return the file of a row's scores.
+
+    Args:
+        study: what all rows share.
+        row: the row.
+        seed: of its training.
+        steps: name of a row or backbone → steps.
+        scored: hash of what is scored and how (``Scorer.name``).
+    """
+    facts: list[Any] = [scored, file_hash(Path(study.base.data.path) / "train" / MANIFEST)]
+    for which in (backbone_of(study.base, row), row):
+        config = configuration.to_dict(settings(study, which, seed, steps[which.name], start="x"))
+        for name in ("run", "start"):  # folders, which may lie anywhere
+            del config["train"][name]
+        del config["data"]["path"]
+        facts.append(config)
+    name = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+    return study.out / FOLDER / f"seed{seed}-{row.name}-{name[:12]}.npz"
+
+
+def read(file: Path) -> dict[str, Arrays] | None:
+    """Return the scores in a file by name, or None where there is no whole one."""
+    try:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+            found: dict[str, Arrays] = {}
+            for key in arrays.files:
+                name, _, measure = key.rpartition(":")
+                found.setdefault(name, {})[measure] = arrays[key]
+            return found
+    except (OSError, ValueError, EOFError, KeyError):
+        return None
+
+
+def write(file: Path, found: Mapping[str, Arrays]) -> None:
+    """Write scores: name of a row → measure → numbers."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    flat = {
+        f"{name}:{measure}": values
+        for name, arrays in found.items()
+        for measure, values in arrays.items()
+    }
+    with atomic.replacing(file) as partial, partial.open("wb") as opened:
+        np.savez_compressed(opened, **flat)  # pyright: ignore[reportArgumentType]
