@@ -100,7 +100,7 @@ def test_scores_outlive_the_weights(made):
     assert not (out / "seed0").exists()
     numbers = [line for line in before.splitlines() if line.startswith("| ")]
     assert [line for line in again.read_text().splitlines() if line.startswith("| ")] == numbers
-    file = sorted((out / "recorded").iterdir())[0]
+    file = min((out / "recorded").iterdir())
     file.write_bytes(file.read_bytes()[:100])
     assert recorded.read(file) is None
     base, row = small(folder / "data"), rows.main_rows(small(folder / "data"))[0]
