@@ -122,7 +122,7 @@ def config() -> Config:
                 steps=1500, batch=2, learning_rate=4e-3, warmup=30, optimizer="adam"
             ),
             voxel_statistics=StageConfig(steps=40, batch=8, learning_rate=0.05, warmup=0),
-            world_frames=StageConfig(steps=500, batch=6, learning_rate=1.5e-3, warmup=30),
+            world_frames=StageConfig(steps=340, batch=6, learning_rate=1.5e-3, warmup=30),
             camera=StageConfig(steps=40, batch=16, learning_rate=1e-3, warmup=10),
             renderer=StageConfig(steps=900, batch=6, learning_rate=1.5e-3, warmup=30),
             occupied=4.0,

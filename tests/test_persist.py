@@ -24,8 +24,9 @@ from pewm_jax.memory import class_edit, class_grid, memories
 from pewm_jax.models import frame_blocks, voxel_dit, voxel_vae
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Clip, Control, Frames
-from pewm_jax.worlds import persist, persist_prepare, persist_voxels
+from pewm_jax.worlds import persist, persist_pictures, persist_prepare, persist_voxels
 from pewm_jax.worlds import persist_windows as windows
+from pewm_jax.worlds.persist_past import encoded
 from tests.helpers import random_frames
 from tests.persist_world import MODEL, NOISE
 
@@ -364,6 +365,29 @@ def test_windows_of_recorded_grids_are_those_of_a_rollout():
         persist_prepare.lattice(MODEL, dataclasses.replace(clip, classes_TXYZ=None))
 
 
+def test_a_latent_is_occupied_where_anything_is_known_in_its_cells():
+    classes = np.zeros((1, 1, 8, 8, 8), np.int16)
+    classes[0, 0, 3, 5, 6], classes[0, 0, 0, 0, 0] = 7, -1
+    found = np.asarray(persist_prepare.occupied(MODEL, classes))
+    assert found.shape == (1, 1, 4, 4, 4)
+    assert np.argwhere(found[0, 0]).tolist() == [[1, 2, 3]]
+
+
+def test_the_renderer_is_given_the_voxels_drawn_in_their_colours(params):
+    cells = np.zeros((8, 8, 8), np.int32)
+    cells[6] = class_grid.number_of(MODEL.memory, "furniture")
+    camera = jax.tree.map(lambda x: jnp.asarray(x[0]), seen().camera)
+    corner = np.asarray(camera.world_from_camera[:3, 3]) - 2.0
+    made = persist_pictures.drawn(MODEL, params, cells, corner, camera)
+    view = class_grid.render(MODEL, class_grid.ClassGrid(cells, corner), seen().camera, 16, 16)
+    wanted = encoded(MODEL, params, view.features_THWF[0], view.depth_THW[0])
+    np.testing.assert_allclose(made, wanted, atol=1e-6)
+    empty = persist_pictures.drawn(MODEL, params, 0 * cells, corner, camera)
+    assert np.abs(made - empty).max() > 1e-3
+    told = persist_pictures.features(MODEL, params, cells, corner, jnp.zeros(3, jnp.int32), camera)
+    np.testing.assert_allclose(told[0, 0, ..., -64:], made, atol=1e-6)
+
+
 def test_clips_that_begin_elsewhere_lie_on_other_lattices():
     cells = np.stack(np.meshgrid(*[np.arange(-16, 16)] * 2, [3], indexing="ij"), -1).reshape(-1, 3)
     mixed = np.asarray(persist_prepare._mixed(jnp.asarray(cells)))
@@ -383,6 +407,15 @@ def test_its_settings_travel_and_what_cannot_work_is_refused():
     for changes, says in (
         ({"hold": -1.0}, "use 0 or more nats"),
         ({"sight": -1.0}, "model.sight is -1.0: use 0 or more nats"),
+        (
+            {
+                "backbone": dataclasses.replace(
+                    MODEL.backbone,
+                    renderer=dataclasses.replace(MODEL.backbone.renderer, drawn=5),
+                )
+            },
+            "backbone.renderer.drawn is 5: use 0, or the 64",
+        ),
         ({"memory": configuration.VoxelConfig()}, "made of a GridConfig"),
         ({"codec": PixelConfig(spatial=2, temporal=1)}, "pixel_channels is 88"),
         ({"noise": dataclasses.replace(NOISE, per_frame=False)}, "per_frame is false"),

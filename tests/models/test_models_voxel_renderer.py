@@ -5,9 +5,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import torch
 
-from pewm_jax.config import BlocksConfig, VoxelRendererConfig
+from pewm_jax.config import BlocksConfig, UserError, VoxelRendererConfig
 from pewm_jax.geometry import cameras
 from pewm_jax.geometry.march import Layers
 from pewm_jax.models import voxel_renderer
@@ -50,6 +51,29 @@ def test_layers_are_folded_as_by_torch():
     plain = run(faced, {**params, **faces}, seen)
     inside = dataclasses.replace(seen, side_L=np.full_like(seen.side_L, -1))
     assert not np.allclose(plain, run(faced, {**params, **faces}, inside))
+
+
+def test_drawn_voxels_join_what_rays_meet_and_reach_the_picture():
+    config = dataclasses.replace(CONFIG, drawn=3)
+    params = weights(voxel_renderer, config)
+    rng = np.random.default_rng(1)
+    shape = (1, 1, 6, 8, 14)
+    layers = Layers(rng.integers(0, 9, shape), rng.uniform(0, 5, shape), np.zeros(shape, int))
+    drawn = rng.normal(size=(1, 1, 6, 8, 3)).astype(np.float32)
+    told = voxel_renderer.features(config, params, layers, drawn_hwC=drawn)
+    assert told.shape[-1] == config.features == config.folded + 3
+    np.testing.assert_array_equal(told[..., -3:], drawn)
+    plain = voxel_renderer.features(CONFIG, params, layers)
+    np.testing.assert_array_equal(told[..., :-3], plain)
+    noisy = jnp.zeros((1, 1, 6, 8, 3))
+    made, other = (
+        voxel_renderer.apply(config, params, noisy, jnp.zeros((1, 1)), x)[0]
+        for x in (told, told.at[..., -3:].multiply(-1))
+    )
+    assert np.abs(made - other).max() > 1e-3
+    for settings, given in ((config, None), (CONFIG, drawn), (config, drawn[..., :2])):
+        with pytest.raises(UserError, match=r"renderer\.drawn"):
+            voxel_renderer.features(settings, params, layers, drawn_hwC=given)
 
 
 def test_each_frame_looks_into_its_own_grid_through_the_middle_of_latents():
