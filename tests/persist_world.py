@@ -38,7 +38,7 @@ MODEL = PersistConfig(
     control=ModulationConfig(),
     memory=GridConfig(
         cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8), recorded=12, kinds="groups", colours=1,
-        eye_m=1.25,
+        pictures="cells", eye_m=1.25,
     ),
     noise=NOISE,
     voxel_noise=NOISE,

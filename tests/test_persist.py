@@ -408,6 +408,14 @@ def test_its_settings_travel_and_what_cannot_work_is_refused():
         ({"hold": -1.0}, "use 0 or more nats"),
         ({"sight": -1.0}, "model.sight is -1.0: use 0 or more nats"),
         (
+            {"memory": dataclasses.replace(MODEL.memory, pictures="surfaces")},
+            "it reads colours of blocks",
+        ),
+        (
+            {"clip": dataclasses.replace(MODEL.clip, depth=False), "points": False},
+            "model.sight needs depth",
+        ),
+        (
             {
                 "backbone": dataclasses.replace(
                     MODEL.backbone,

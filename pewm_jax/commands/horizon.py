@@ -108,6 +108,7 @@ def _measured(
 
     from pewm_jax.config import PersistConfig
     from pewm_jax.data.dataset import EpisodeSource
+    from pewm_jax.data.voxel_checks import require_same_cells
     from pewm_jax.evaluation import edit_trials, horizon, voxel_score
     from pewm_jax.evaluation.metrics.videos import read
     from pewm_jax.models import i3d_weights
@@ -122,6 +123,8 @@ def _measured(
     config, params, ends = opened.config, opened.params, settings.ends
     first = settings.context - 1
     chosen = [episodes[k] for k in range(settings.walks)]
+    for one in chosen[:1]:
+        require_same_cells(config.model.memory, one)
     walks = [horizon.walk_of(one, first, ends[-1], settings.context) for one in chosen]
     tried = _tried(settings, chosen, first)
     of_voxels = isinstance(config.model, PersistConfig)

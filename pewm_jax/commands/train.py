@@ -54,7 +54,8 @@ def main(argv: Sequence[str], prog: str = "python train.py") -> int:
         print(_usage(prog, TRAIN_EXAMPLES, cli.list_flags(Launch), more))
         return 0
     config, launch = _read(argv, prog)
-    heap.keep_large()
+    if not launch.plan:
+        heap.keep_large()
     # Imported here and not above: help and refusals come at once, and Ctrl-C is clean meanwhile.
     if launch.plan:
         from pewm_jax.scaling import plan as planning

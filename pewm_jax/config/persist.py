@@ -238,8 +238,9 @@ class PersistConfig(ModelConfig):
     """By how many nats another class must be likelier than the one that a cell has had, for it to
     change; 0 as published. Small networks forget without it."""
     sight: float = 0.0
-    """By how many nats a class is likelier that a real picture shows in a cell: air before what
-    its depth says, a surface there; 0 for not at all, as published."""
+    """By how many nats a class is likelier that a real picture of blocks (`memory.pictures cells`)
+    shows in a cell: air before what its depth says, a surface there; 0 for not at all, as
+    published."""
     points: bool = False
     """Whether the picture that a voxel frame is shown comes with the place of its surfaces, from
     its depth; not as published."""
@@ -276,9 +277,15 @@ class PersistConfig(ModelConfig):
         for name in ("hold", "sight"):
             value = getattr(self, name)
             require(value >= 0, f"model.{name} is {value}: use 0 or more nats.")
+        for name in ("points", "sight"):
+            require(
+                self.clip.depth or not getattr(self, name),
+                f"model.{name} needs depth: use clip.depth true, or leave {name} out.",
+            )
         require(
-            not (self.points and not self.clip.depth),
-            "model.points needs depth: use clip.depth true, or points false.",
+            not self.sight or self.memory.pictures == "cells",  # type: ignore[attr-defined]
+            f"model.sight is {self.sight} and memory.pictures is not cells: it reads colours of "
+            "blocks; use 0, or data of --voxels.pictures cells.",
         )
         require(
             not self.dead_reckoning or self.control.actions == 3,

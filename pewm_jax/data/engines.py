@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import jax
 
 from pewm_jax import atomic
 from pewm_jax.config import UserError
@@ -49,7 +50,16 @@ QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "
 """Environment variables for Ray: no usage reports, no warning about unused GPUs."""
 CHAPTERS = ("config", "geometry", "houses", "data")
 """Folders of this library whose code can change the bytes of a shard."""
-LIBRARIES = ("numpy", "scipy", "trimesh", "embreex", "opencv-python-headless", "array_record")
+LIBRARIES = (
+    "numpy",
+    "scipy",
+    "trimesh",
+    "embreex",
+    "opencv-python-headless",
+    "array_record",
+    "jax",
+    "jaxlib",
+)
 """Libraries whose versions can change the bytes of a shard."""
 
 
@@ -125,6 +135,7 @@ def _start_worker() -> None:
     """Set up a worker: one thread, ignores Ctrl-C (its parent ends it), ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
+    jax.config.update("jax_platforms", "cpu")  # no worker takes an accelerator's memory
     parent = multiprocessing.parent_process()
     if parent is not None:
 

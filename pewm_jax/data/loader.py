@@ -21,6 +21,7 @@ from pewm_jax.data.clips import Choice, ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.record_format import DamagedError
+from pewm_jax.data.voxel_checks import require_same_cells
 from pewm_jax.data.voxel_frames import VoxelGrid, require_alike
 from pewm_jax.geometry.actions import PLANAR
 from pewm_jax.types import Clip
@@ -226,6 +227,7 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Epis
             continue
         _check_size(config, first)
         _check_actions(config, first)
+        require_same_cells(config.model.memory, first)
         choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
         return first
     raise UserError(f"{source.path}: none of its records can be read; make the split again.")

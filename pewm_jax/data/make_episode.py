@@ -223,17 +223,17 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     intrinsics = intrinsics_from_fov(config.size, config.size, config.hfov)
     pose = walk.world_from_camera(grid.floor_z + config.camera_height)
     camera = Camera(intrinsics, pose)
-    if moving is None:
-        parts, seen = None, render(scene, camera, config.size, config.size)
-    else:
-        parts = moving.poses(walk.planar_T3[:, :2])
-        seen = render_moving(moving, parts, camera, config.size, config.size)
+    parts = None if moving is None else moving.poses(walk.planar_T3[:, :2])
     voxels = None
     if config.voxels.record:
         floor_z = float(grid.floor_z) if config.scene else 0.0
         voxels = record_voxels(config.voxels, scene, floor_z, pose[:, :3, 3], moving, parts)
-        if config.voxels.pictures == "cells":
-            seen = block_pictures.pictures(voxels, camera, config.size, config.size)
+    if voxels is not None and config.voxels.pictures == "cells":
+        seen = block_pictures.pictures(voxels, camera, config.size, config.size)
+    elif moving is not None and parts is not None:
+        seen = render_moving(moving, parts, camera, config.size, config.size)
+    else:
+        seen = render(scene, camera, config.size, config.size)
     arrays = EpisodeArrays(
         rgb_THWC=seen.rgb_THWC,
         depth_THW=seen.depth_THW,
@@ -253,6 +253,8 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     }
     if config.moving:
         info["moving"] = True
+    if config.voxels.pictures != UNRECORDED.pictures:
+        info["pictures"] = config.voxels.pictures
     if walk.return_frame is not None:
         info["return_frame"] = walk.return_frame
     return write_episode(arrays, f"{split}-{index:06d}", scene.name, info)

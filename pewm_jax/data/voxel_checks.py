@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
 
-from pewm_jax.config import UserError
-from pewm_jax.data.voxel_classes import SIDE_LIMIT
+from pewm_jax.config import ConfigError, GridConfig, UserError
+from pewm_jax.config.memory import MemorySettings
+from pewm_jax.data.voxel_classes import PALETTE, SIDE_LIMIT, VoxelsConfig
 from pewm_jax.data.voxel_frames import DTYPES, VoxelFrames, VoxelGrid
 from pewm_jax.types import Camera
+
+if TYPE_CHECKING:
+    from pewm_jax.data.episodes import Episode
 
 OFF_CELLS = 1e-3
 """Largest distance of a grid's corner from the lattice of the first frame's, cells."""
@@ -19,6 +24,37 @@ MOST_FLOATING = 0.1
 frames; right data has next to none."""
 LOOKS, STEP = 8, 3
 """Frames looked at, and of these every n-th row and column."""
+
+
+def require_same_cells(memory: MemorySettings, episode: Episode) -> None:
+    """Refuse collected grids of other classes, or pictures of something else, than a world expects.
+
+    Args:
+        memory: of the world; kinds other than ``grid`` ask for nothing.
+        episode: of the data. Tables of other makers are not compared.
+
+    Raises:
+        ConfigError: another table of classes, or pictures of surfaces where cells are expected.
+    """
+    if not isinstance(memory, GridConfig) or episode.voxel_grid is None:
+        return
+    for kinds in ("all", "groups"):
+        for colours in range(1, len(PALETTE) + 1):
+            same = (kinds, colours) == (memory.kinds, memory.colours)
+            if not same and VoxelsConfig(kinds=kinds, colours=colours).names == (
+                episode.voxel_grid.names
+            ):
+                raise ConfigError(
+                    f"episode {episode.name} was collected with --voxels.kinds {kinds} "
+                    f"--voxels.colours {colours}, and memory.kinds is {memory.kinds}, memory."
+                    f"colours {memory.colours}: use the same."
+                )
+    shown = episode.info.get("pictures", "surfaces")
+    if shown != memory.pictures:
+        raise ConfigError(
+            f"episode {episode.name} has pictures of {shown}, and memory.pictures is "
+            f"{memory.pictures}: use that, or collect with --voxels.pictures {memory.pictures}."
+        )
 
 
 def refuse_misfits(voxels: VoxelFrames, frames: int, where: str) -> None:

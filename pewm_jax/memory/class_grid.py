@@ -61,14 +61,15 @@ def empty(model: ModelConfig, centre_3: Array) -> ClassGrid:
     Args:
         model: the model.
         centre_3: (3,) camera around which it lies, metres; the floor, ``memory.eye_m`` below it,
-            is a border between cells.
+            is a border between cells, and across the ground whole multiples of a cell are.
     """
     config = model.memory
     assert isinstance(config, GridConfig)
     cell, centre = config.cell_m[0], jnp.asarray(centre_3, jnp.float32)
     below = np.floor(config.eye_m / cell - (config.cells[2] - 1) / 2 + 1e-4)
     low_z = centre[2] - config.eye_m + below * cell
-    low_xy = centre[:2] - np.asarray(config.cells[:2]) / 2 * cell
+    middle = jnp.round(centre[:2] / cell) * cell  # on the lattice of recorded grids
+    low_xy = middle - np.asarray(config.cells[:2]) // 2 * cell
     cells = jnp.full(config.cells, UNKNOWN, jnp.int16)
     return ClassGrid(cells, jnp.concatenate([low_xy, low_z[None]]))
 

@@ -1,26 +1,29 @@
 """Scores of Table 1 that outlive the weights: small files, which a repository can hold.
 
 A row that was trained and scored on one machine need not be trained again on another. Its file is
-named by a hash of the settings of its training and of its backbone's, of the data, and of what was
-scored how. Where a row's own folder is there, that is what counts.
+named by a hash of the settings of its training and of its backbone's, of the data and the weights
+that these start from, and of what was scored how. Where a row's own folder is there, that counts.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pewm_jax import atomic
+from pewm_jax import atomic, shipped
 from pewm_jax import config as configuration
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.studies.rows import Row
 from pewm_jax.studies.trainings import Study, backbone_of, settings
+from pewm_jax.training.runs import WEIGHTS
 
 FOLDER = "recorded"
 Arrays = dict[str, np.ndarray]
@@ -36,7 +39,12 @@ def path(study: Study, row: Row, seed: int, steps: Mapping[str, int], scored: st
         steps: name of a row or backbone → steps.
         scored: hash of what is scored and how (``Scorer.name``).
     """
-    facts: list[Any] = [scored, file_hash(Path(study.base.data.path) / "train" / MANIFEST)]
+    start = study.base.train.start
+    facts: list[Any] = [
+        scored,
+        file_hash(Path(study.base.data.path) / "train" / MANIFEST),
+        file_hash(shipped.find(start) / WEIGHTS) if start else "",
+    ]
     for which in (backbone_of(study.base, row), row):
         config = configuration.to_dict(settings(study, which, seed, steps[which.name], start="x"))
         for name in ("run", "start"):  # folders, which may lie anywhere
@@ -56,7 +64,7 @@ def read(file: Path) -> dict[str, Arrays] | None:
                 name, _, measure = key.rpartition(":")
                 found.setdefault(name, {})[measure] = arrays[key]
             return found
-    except (OSError, ValueError, EOFError, KeyError):
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error):
         return None
 
 

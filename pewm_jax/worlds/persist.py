@@ -68,9 +68,7 @@ def start(model: PersistConfig, params: Params, frames: Frames) -> WorldState:
     on, seen as it really was.
     """
     pewm.require_frames(model, frames, "start")
-    params, frames = _arrays(params, as_signal(frames))
-    grid = class_grid.empty(model, frames.camera.world_from_camera[0, :3, 3])
-    return _started(model, params, grid, frames)
+    return _from_nothing(model, params, frames)
 
 
 def start_in(
@@ -130,7 +128,7 @@ def imagine(
     """
     params = _arrays(params)[0]
     asked, steered = _asked(model, state.frame.camera, control)
-    begun = state if memory else start(model, params, state.frame)
+    begun = state if memory else _from_nothing(model, params, state.frame, real=False)
     past = past_of(model, params, begun)
 
     def one(past: Past, inputs: tuple[Array, Camera, Array]) -> tuple[Past, Frames]:
@@ -219,10 +217,21 @@ def _arrays(*trees: Any) -> Any:
     return jax.tree.map(jnp.asarray, trees)
 
 
-def _started(model: PersistConfig, params: Params, grid: ClassGrid, frames: Frames) -> WorldState:
+def _from_nothing(
+    model: PersistConfig, params: Params, frames: Frames, *, real: bool = True
+) -> WorldState:
+    """Return a world of which nothing but frames is known."""
+    params, frames = _arrays(params, as_signal(frames))
+    grid = class_grid.empty(model, frames.camera.world_from_camera[0, :3, 3])
+    return _started(model, params, grid, frames, real=real)
+
+
+def _started(
+    model: PersistConfig, params: Params, grid: ClassGrid, frames: Frames, *, real: bool = True
+) -> WorldState:
     first, later = (jax.tree.map(lambda x, c=c: x[c], frames) for c in (slice(1), slice(1, None)))
     key = jax.random.key(START)
-    past = begin(model, params, grid, first, key)
+    past = begin(model, params, grid, first, key, real=real)
     if not later.depth_THW.shape[0]:
         return WorldState(first, past.grid)
     return _observed(model, params, past, later)

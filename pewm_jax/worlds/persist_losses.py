@@ -231,10 +231,10 @@ def _velocity(
     weight = noises.spread(noises.weight(noise, times), error.ndim)
     x0_error = jnp.square(noises.to_x0(noise, made, x_t, times) - x0)
 
-    def mean(x: Array) -> Array:
-        share = jnp.ones(x0.shape[:-1]) if counts is None else counts.astype(jnp.float32)
-        if known is not None:
-            share = share * known
+    share = jnp.ones(x0.shape[:-1]) if known is None else known.astype(jnp.float32)
+
+    def mean(x: Array, share: Array) -> Array:
         return (x * (share / jnp.maximum(share.mean(), 1e-6))[..., None]).mean()
 
-    return mean(error * weight), {"x0_error": mean(x0_error)}
+    counted = share if counts is None else share * counts
+    return mean(error * weight, counted), {"x0_error": mean(x0_error, share)}

@@ -1,9 +1,10 @@
 """What a real picture says of the cells that it shows, with no network: air, surfaces, colours.
 
-A real frame has depth. A cell in front of what was measured is air; one that a measured surface
-lies in is occupied, and pictured in its colour. ``model.sight`` is the advantage, in nats, that
-this gives a class over others when voxels are made of a real frame (``persist_voxels.held``).
-Imagined frames are made of the voxels, so they say nothing of them. Not as published.
+Of a world of blocks (``memory.pictures cells``). A real frame has depth: a cell in front of what
+was measured is air; one that a measured surface lies in is occupied, in the colour that it has
+without the light on it. ``model.sight`` is the advantage, in nats, that this gives a class over
+others when voxels are made of a real frame (``persist_voxels.held``). Imagined frames are made of
+the voxels, so nothing is concluded from them. Not as published.
 """
 
 from __future__ import annotations
@@ -15,14 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import PersistConfig
-from pewm_jax.data import block_pictures
 from pewm_jax.data.voxel_classes import PALETTE
+from pewm_jax.geometry import block_light
 from pewm_jax.geometry.cameras import invert_rigid, transform_points, unproject
 from pewm_jax.types import Array, Camera
 from pewm_jax.worlds import persist_windows as windows
 
-INTO_M = 0.03
-"""A measured point belongs to the cell this far behind it, metres."""
+INTO_M = 0.005
+"""A measured point belongs to the cell this far behind it, metres; depth is kept in millimetres."""
+VOTES = 2
+"""Pixels that must show a surface in a cell: a single one may be a ray that clips an edge."""
 NEAREST_M = 0.05
 """Cells nearer to the camera than this are not judged, metres."""
 
@@ -63,18 +66,25 @@ def seen(
         camera: its camera.
     """
     size, side = windows.cell_m(model), windows.side(model)
-    point_HW3 = unproject(depth_HW, camera)
-    way_HW3 = point_HW3 - camera.world_from_camera[:3, 3]
+    eye = camera.world_from_camera[:3, 3]
+    way_HW3 = unproject(depth_HW, camera) - eye
     metres_HW1 = jnp.linalg.norm(way_HW3, axis=-1, keepdims=True)
-    behind_HW3 = point_HW3 + INTO_M * way_HW3 / jnp.maximum(metres_HW1, INTO_M)
-    at = jnp.floor((behind_HW3 - corner_3) / size).astype(jnp.int32)
+    behind_HW3 = way_HW3 * (1 + INTO_M / jnp.maximum(metres_HW1, INTO_M)) + (eye - corner_3)
+    at = jnp.floor(behind_HW3 / size).astype(jnp.int32)
     met = (depth_HW > 0) & ((at >= 0) & (at < side)).all(-1)
     cell = jnp.where(met, (at[..., 0] * side + at[..., 1]) * side + at[..., 2], side**3)
-    colour_HW = _nearest(model, (rgb_HWC + 1) / 2 / _light(model, corner_3, point_HW3, way_HW3))
+    cell = cell.reshape(-1)
+    hits = jnp.zeros(side**3 + 1, jnp.int32).at[cell].add(1)[:-1]
+    surface = (hits >= VOTES).reshape((side,) * 3)
+
+    # What lights the cells that are seen is known, so their own colours are.
+    borders = block_light.side_of((way_HW3 + (eye - corner_3)) / size)
+    ones = jnp.ones(depth_HW.shape)
+    lit = block_light.light(surface, corner_3, size, eye, way_HW3, ones, borders)
+    colour_HW = _nearest(model, (rgb_HWC + 1) / 2 / lit[..., None])
     colours = model.memory.colours  # type: ignore[attr-defined]
     votes = jnp.zeros((side**3 + 1, colours), jnp.int32)
-    votes = votes.at[cell.reshape(-1), colour_HW.reshape(-1)].add(1)[:-1]
-    surface = (votes.sum(-1) > 0).reshape((side,) * 3)
+    votes = votes.at[cell, colour_HW.reshape(-1)].add(1)[:-1]
     colour = votes.argmax(-1).reshape((side,) * 3).astype(jnp.int32)
     air = _before(model, corner_3, depth_HW, camera) & ~surface
     return Sight(air, jnp.where(surface, colour, -1))
@@ -94,19 +104,6 @@ def _before(model: PersistConfig, corner_3: Array, depth_HW: Array, camera: Came
     within = (row >= 0) & (row < height) & (column >= 0) & (column < width)
     measured = depth_HW[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
     return within & (place[..., 2] > NEAREST_M) & (place[..., 2] + size / 2 < measured)
-
-
-def _light(model: PersistConfig, corner_3: Array, point_HW3: Array, way_HW3: Array) -> Array:
-    """Return the light (H, W, 1) on what was measured, where pictures of cells say it; else 1."""
-    if model.memory.pictures != "cells":  # type: ignore[attr-defined]
-        return jnp.ones((*point_HW3.shape[:-1], 1))
-    metres_HW = jnp.linalg.norm(way_HW3, axis=-1)
-    at = (point_HW3 - corner_3) / windows.cell_m(model)
-    side = jnp.abs(at - jnp.round(at)).argmin(-1)
-    facing = jnp.asarray(block_pictures.SIDES)[side]
-    above = (side == 2) & (way_HW3[..., 2] > 0)
-    facing = jnp.where(above, block_pictures.BELOW, facing)
-    return (facing / (1 + jnp.square(metres_HW / block_pictures.HALF_M)))[..., None]
 
 
 def _nearest(model: PersistConfig, rgb_HW3: Array) -> Array:

@@ -17,6 +17,7 @@ from pewm_jax.config import functions as functions_of
 from pewm_jax.geometry.march import Layers
 from pewm_jax.models import (
     camera_model,
+    codecs,
     persist_nets,
     voxel_dit,
     voxel_renderer,
@@ -193,6 +194,8 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     found = {"codec": functions_of(model.codec).costs(model, share)}
     if stage.name == "renderer":
         made = voxel_renderer.costs(nets.renderer, share, frames, trained=True)
+        if nets.renderer.drawn:  # the drawn voxels are encoded, too
+            found["drawn"] = codecs.costs_of_images(model, share, 2 * frames, "codec")
         return found | {"renderer": made}
     pixels = nets.renderer.height * nets.renderer.width
     return found | {

@@ -20,7 +20,15 @@ from pewm_jax.worlds.persist_past import Given, History, Past, decoded, encoded
 from pewm_jax.worlds.persist_sight import Sight
 
 
-def begin(model: PersistConfig, params: Params, grid: ClassGrid, frame: Frames, key: Array) -> Past:
+def begin(
+    model: PersistConfig,
+    params: Params,
+    grid: ClassGrid,
+    frame: Frames,
+    key: Array,
+    *,
+    real: bool = True,
+) -> Past:
     """Return the world at its first frame; where nothing is known of its window, w₀ is generated.
 
     Args:
@@ -29,6 +37,7 @@ def begin(model: PersistConfig, params: Params, grid: ClassGrid, frame: Frames, 
         grid: what is known of the world.
         frame: (1,) the first frame, colours in [−1, 1].
         key: randomness of w₀.
+        real: whether the frame is real, and shows what is there (``model.sight``).
     """
     camera = jax.tree.map(lambda x: x[0], frame.camera)
     latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
@@ -47,7 +56,9 @@ def begin(model: PersistConfig, params: Params, grid: ClassGrid, frame: Frames, 
     voxel_key, picture_key = jax.random.split(key)
     before = windows.window(model, grid.classes_XYZ, start)
     middle = windows.middle(model, grid.low_3, start)
-    sight = _sight(model, grid, start, frame.rgb_THWC[0], frame.depth_THW[0], camera)
+    sight = None
+    if real:
+        sight = _sight(model, grid, start, frame.rgb_THWC[0], frame.depth_THW[0], camera)
     made = persist_voxels.sample(
         model, params, history, history.voxels, middle, before, voxel_key, sight
     )
@@ -137,7 +148,7 @@ def _sight(
     camera: Camera,
 ) -> Sight | None:
     """Return what a real picture shows of the window's cells, where the model looks."""
-    if not model.sight or not model.clip.depth:
+    if not model.sight:
         return None
     corner = grid.low_3 + start_3 * windows.cell_m(model)
     return persist_sight.seen(model, corner, rgb_HWC, depth_HW, camera)

@@ -6,13 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pewm_jax.config import ConfigError
+from pewm_jax.config import ConfigError, GridConfig
 from pewm_jax.data import block_pictures
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
+from pewm_jax.data.voxel_checks import require_same_cells
 from pewm_jax.data.voxel_classes import PALETTE, VoxelsConfig
 from pewm_jax.data.voxel_frames import VoxelFrames
 from pewm_jax.data.voxel_pictures import ahead
+from pewm_jax.geometry import block_light
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera
 
@@ -39,7 +41,7 @@ def test_a_room_of_blocks_is_lit_by_side_distance_and_corner():
     np.testing.assert_allclose(seen.depth_THW[0, middle, middle], 3 * CELL - 0.01, atol=1e-4)
     assert seen.ids_THW[0, middle, middle] == BROWN
     # Light as the formula says: met across x, at 1.49 m; far from corners.
-    wanted = np.array(PALETTE["brown"]) * 0.88 / (1 + (1.49 / block_pictures.HALF_M) ** 2)
+    wanted = np.array(PALETTE["brown"]) * 0.88 / (1 + (1.49 / block_light.HALF_M) ** 2)
     np.testing.assert_allclose(rgb[middle, middle], wanted, atol=1.0)
     floor, ceiling = rgb[-1, middle].mean(), rgb[0, middle].mean()
     assert floor > 1.3 * ceiling
@@ -75,6 +77,15 @@ def test_an_episode_of_cells_shows_the_cells_it_records():
         "pictures" not in settings_of(others, "train")["voxels"]
     )  # old datasets stay what they are
     assert settings_of(config, "train")["voxels"]["pictures"] == "cells"
+    # A world says which pictures and which classes it expects.
+    cell = (0.25, 0.25, 0.25)
+    expects = GridConfig(cell_m=cell, kinds="groups", colours=16, pictures="cells")
+    require_same_cells(expects, episode)
+    require_same_cells(dataclasses.replace(expects, pictures="surfaces"), house)
+    with pytest.raises(ConfigError, match="has pictures of surfaces"):
+        require_same_cells(expects, house)
+    with pytest.raises(ConfigError, match=r"--voxels\.kinds groups --voxels\.colours 16, and"):
+        require_same_cells(dataclasses.replace(expects, colours=8), episode)
 
 
 def test_instances_are_not_in_pictures_of_cells():

@@ -110,6 +110,10 @@ def test_scores_outlive_the_weights(made):
     assert path != recorded.path(study, row, 0, steps | {"backbone": 3}, "x")
     assert path != recorded.path(study, row, 0, steps, "y")
     assert path != recorded.path(study, row, 1, steps, "x")
+    from_codec = dataclasses.replace(
+        study, base=dataclasses.replace(base, train=dataclasses.replace(base.train, start="codec"))
+    )
+    assert path != recorded.path(from_codec, row, 0, steps, "x")
 
 
 def test_all_rows_start_from_one_backbone_and_keep_it(made):

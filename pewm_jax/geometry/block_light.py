@@ -1,0 +1,79 @@
+"""How a world of blocks is lit: by the direction of a side, by distance, and darker in corners.
+
+One law for whoever draws such pictures (``data.block_pictures``) and for whoever reads colours out
+of them (``worlds.persist_sight``).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.types import Array
+
+SIDES = (0.88, 0.74, 1.0, 0.5)
+"""Light on a side that is met across x, y, z, and on the cell in which a ray begins."""
+BELOW = 0.62
+"""Light on a side that is seen from below, such as a ceiling."""
+HALF_M = 7.0
+"""At this distance light has fallen to a half, metres."""
+CORNER, CORNER_M = 0.35, 0.2
+"""How much darker a corner is than what lies this far from it, metres."""
+
+
+def light(
+    occupied_XYZ: Array,
+    low_3: Array,
+    cell_m: float | Array,
+    eye_3: Array,
+    way_HW3: Array,
+    far_HW: Array,
+    side_HW: Array,
+) -> Array:
+    """Return by what the colours of what rays meet are multiplied, (H, W).
+
+    Args:
+        occupied_XYZ: bool, the cells with something in them.
+        low_3: lowest corner of the grid, metres.
+        cell_m: side of a cell, metres.
+        eye_3: where the rays begin, metres.
+        way_HW3: where they go.
+        far_HW: how far each goes until it meets a cell, in lengths of its direction.
+        side_HW: across which axis (0, 1, 2) it enters; −1 where it begins in the cell.
+    """
+    facing = jnp.asarray(SIDES, jnp.float32)[side_HW]
+    facing = jnp.where((side_HW == 2) & (way_HW3[..., 2] > 0), BELOW, facing)
+    metres = far_HW * jnp.linalg.norm(way_HW3, axis=-1)
+    at = (eye_3 - low_3 + far_HW[..., None] * way_HW3) / cell_m
+    dark = _dark(occupied_XYZ, cell_m, at, way_HW3, side_HW)
+    return facing / (1 + jnp.square(metres / HALF_M)) * (1 - CORNER * dark)
+
+
+def side_of(at_HW3: Array) -> Array:
+    """Return across which axis a point on a cell's side is entered, (H, W): the nearest border.
+
+    Args:
+        at_HW3: points, in cells from the grid's lowest corner.
+    """
+    return jnp.abs(at_HW3 - jnp.round(at_HW3)).argmin(-1)
+
+
+def _dark(
+    occupied_XYZ: Array, cell_m: float | Array, at_HW3: Array, way_HW3: Array, side_HW: Array
+) -> Array:
+    """Return how deep in a corner points are, (H, W): 1 in it, 0 from ``CORNER_M`` on."""
+    met = side_HW >= 0
+    across = np.arange(3) == jnp.where(met, side_HW, 0)[..., None]
+    # The open cell before the side: the side's plane is a border, the ray comes from before it.
+    before = jnp.where(across, jnp.round(at_HW3) - (way_HW3 > 0), jnp.floor(at_HW3))
+    before, inside = before.astype(jnp.int32), at_HW3 - jnp.floor(at_HW3)
+    shape, dark = np.array(occupied_XYZ.shape), jnp.zeros(side_HW.shape)
+    for axis in range(3):
+        for sign in (-1, 1):
+            beside = before + sign * (np.arange(3) == axis)
+            within = ((beside >= 0) & (beside < shape)).all(-1)
+            x, y, z = jnp.moveaxis(jnp.clip(beside, 0, shape - 1), -1, 0)
+            wall = met & within & occupied_XYZ[x, y, z] & ~across[..., axis]
+            gap = inside[..., axis] if sign < 0 else 1 - inside[..., axis]
+            dark = jnp.maximum(dark, jnp.where(wall, 1 - gap * cell_m / CORNER_M, 0))
+    return dark
