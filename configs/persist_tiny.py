@@ -37,9 +37,9 @@ def config() -> Config:
     codec = LearnedCodecConfig(gate=48)
     width = {"head_dim": 40, "gates": "open"}
     voxels = FrameFlowConfig(
-        per_frame=True, times="uniform", sample_steps=4, shift=1.0, predicts="x0"
+        per_frame=True, times="uniform", sample_steps=1, shift=1.0, predicts="x0"
     )
-    pixels = dataclasses.replace(voxels, context_noise=0.1)
+    pixels = dataclasses.replace(voxels, sample_steps=2, context_noise=0.1)
     return Config(
         model=PersistConfig(
             clip=ClipConfig(frames=5, height=64, width=64),
@@ -108,8 +108,9 @@ def config() -> Config:
             ),
             noise=pixels,
             voxel_noise=voxels,
-            hold=3.0,
-            sight=12.0,
+            hold=30.0,
+            doubt=8.0,
+            sight=60.0,
             points=True,
             dead_reckoning=True,
         ),

@@ -134,6 +134,19 @@ def test_a_cell_changes_only_where_another_class_is_likelier_by_what_is_held(par
     np.testing.assert_array_equal(held(MODEL, params, latents, before), before)
 
 
+def test_a_cell_of_which_nothing_was_known_has_air_unless_a_class_is_likelier_by_the_doubt(params):
+    latents = jax.random.normal(KEY, (1, 4, 4, 4, 3))
+    unknown = jnp.full((8, 8, 8), class_edit.UNKNOWN).at[:4].set(3)
+    models = [dataclasses.replace(MODEL, hold=0.0, doubt=nats) for nats in (0.0, 0.5, 1e6)]
+    free, doubtful, sure = (
+        np.asarray(persist_voxels.held(model, params, latents, unknown)) for model in models
+    )
+    np.testing.assert_array_equal(doubtful[:4], free[:4])  # what was known is not doubted
+    assert ((doubtful == free) | (doubtful == 0)).all()
+    assert (sure[4:] == 0).all()
+    assert (free[4:] == 0).sum() < (doubtful[4:] == 0).sum() < sure[4:].size
+
+
 def test_an_edit_is_the_world_that_goes_on(params, state):
     here = np.asarray(state.frame.camera.world_from_camera[0, :3, 3])
     reach = np.array([1, 1, 0.6], np.float32)

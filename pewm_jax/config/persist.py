@@ -237,6 +237,9 @@ class PersistConfig(ModelConfig):
     hold: float = 0.0
     """By how many nats another class must be likelier than the one that a cell has had, for it to
     change; 0 as published. Small networks forget without it."""
+    doubt: float = 0.0
+    """By how many nats a class must be likelier than air in a cell of which nothing was known; 0 as
+    published. Small networks fill with rubble what they cannot know."""
     sight: float = 0.0
     """By how many nats a class is likelier that a real picture of blocks (`memory.pictures cells`)
     shows in a cell: air before what its depth says, a surface there; 0 for not at all, as
@@ -274,7 +277,7 @@ class PersistConfig(ModelConfig):
                 f"model.{name}.per_frame is false, and every frame of this world has a time of its "
                 "own: use true.",
             )
-        for name in ("hold", "sight"):
+        for name in ("hold", "doubt", "sight"):
             value = getattr(self, name)
             require(value >= 0, f"model.{name} is {value}: use 0 or more nats.")
         for name in ("points", "sight"):

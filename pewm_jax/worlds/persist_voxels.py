@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from pewm_jax.config import PersistConfig
 from pewm_jax.diffusion import noise as noises
 from pewm_jax.geometry import camera_steps
+from pewm_jax.memory.class_edit import EMPTY, UNKNOWN
 from pewm_jax.models import voxel_dit, voxel_vae
 from pewm_jax.models.frame_blocks import FrameCache
 from pewm_jax.models.plain_layers import linear
@@ -73,21 +74,23 @@ def held(
 ) -> Array:
     """Return the class ids (X, Y, Z) that latents (1, …) decode to.
 
-    A cell whose class was known has another one only if that is likelier by ``model.hold``; what a
-    real picture shows of it is likelier by ``model.sight``.
+    A cell whose class was known has another one only if that is likelier by ``model.hold``; one of
+    which nothing was known has air, unless a class is likelier by ``model.doubt``. What a real
+    picture shows of it is likelier by ``model.sight``.
     """
     config = model.backbone.voxel_vae  # type: ignore[attr-defined]
     weights, dtype = params["voxel_vae"], jnp.dtype(model.dtype)
     looked = sight is not None and model.sight > 0
-    if not model.hold and not looked:
+    if not model.hold and not model.doubt and not looked:
         return voxel_vae.decode(config, weights, latents_BxyzC, dtype)[0]
     features = voxel_vae.features(config, weights, latents_BxyzC, dtype)[0]
 
     def likeliest(slab: tuple[Array, Array, Sight | None]) -> Array:
         features, before, sight = slab
         scores = linear(weights["decoder"]["scores"], features).astype(jnp.float32)
-        same = jnp.arange(config.classes) == before[..., None]
-        scores = scores + model.hold * same
+        number, before = jnp.arange(config.classes), before[..., None]
+        scores = scores + model.hold * (number == before)
+        scores = scores + model.doubt * ((before == UNKNOWN) & (number == EMPTY))
         if sight is not None:
             scores = scores + persist_sight.advantage(model, sight, config.classes)
         return scores.argmax(-1).astype(jnp.int32)
