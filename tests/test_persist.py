@@ -286,21 +286,22 @@ def test_without_its_memory_it_begins_anew_and_the_state_is_left(state, monkeypa
     begun, went_on = [], []
     anew = dataclasses.replace(state.map, classes_XYZ=state.map.classes_XYZ + 1)
 
-    def start(model, params, frames):
-        begun.append(frames)
+    def start(model, params, frames, *, real):
+        begun.append((frames, real))
         return dataclasses.replace(state, map=anew)
 
     def step(model, params, past, action, key, given):
         went_on.append(past.grid)
         return past, jax.tree.map(lambda x: x[:1], state.frame)
 
-    monkeypatch.setattr(persist, "start", start)
+    monkeypatch.setattr(persist, "_from_nothing", start)
     monkeypatch.setattr(persist, "step", step)
     with jax.disable_jit():
         for memory in (True, False):
             kept, _ = persist.imagine(MODEL, {}, state, MOVES[:1], KEY, memory=memory)
             equal(kept.map, state.map)
-    equal(begun, [state.frame])
+    equal([frames for frames, _ in begun], [state.frame])
+    assert [real for _, real in begun] == [False]  # an imagined frame is no evidence
     equal(went_on, [state.map, anew])
 
 
@@ -423,10 +424,6 @@ def test_its_settings_travel_and_what_cannot_work_is_refused():
         (
             {"memory": dataclasses.replace(MODEL.memory, pictures="surfaces")},
             "it reads colours of blocks",
-        ),
-        (
-            {"clip": dataclasses.replace(MODEL.clip, depth=False), "points": False},
-            "model.sight needs depth",
         ),
         (
             {
