@@ -1,4 +1,4 @@
-"""PERSIST, small: a world of blocks at 64×64 pixels, half an hour on two cores with its data."""
+"""PERSIST, small: a world of blocks at 64×64 pixels, trained in about half an hour on two cores."""
 
 import dataclasses
 

@@ -16,8 +16,6 @@ once free in it, so that a page whose threads imagine, draw and serve grows as i
 LARGE = 1 << 20
 """Bytes from which a block is taken from the system and given back when it is free. By default that
 limit grows up to 32 MB with what is freed, and maps of steps that are past leave holes."""
-
-
 NEVER = -1
 """The trim threshold at which memory is never given back."""
 PAD = 1 << 28
@@ -39,7 +37,7 @@ def keep_large() -> bool:
     """Keep what was once taken, large blocks as well, and take it again.
 
     For trainings on processors. By default each large array is mapped anew at every step, and the
-    system clears its pages one by one: up to a quarter of the time (``benchmarks/heap.py``).
+    system clears its pages one by one (``benchmarks/heap.py`` says what that takes).
 
     Returns:
         Whether that was possible.

@@ -123,8 +123,7 @@ def _measured(
     config, params, ends = opened.config, opened.params, settings.ends
     first = settings.context - 1
     chosen = [episodes[k] for k in range(settings.walks)]
-    for one in chosen[:1]:
-        require_same_cells(config.model.memory, one)
+    require_same_cells(config.model, chosen[0])
     walks = [horizon.walk_of(one, first, ends[-1], settings.context) for one in chosen]
     tried = _tried(settings, chosen, first)
     of_voxels = isinstance(config.model, PersistConfig)

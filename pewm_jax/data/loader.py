@@ -227,7 +227,7 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Epis
             continue
         _check_size(config, first)
         _check_actions(config, first)
-        require_same_cells(config.model.memory, first)
+        require_same_cells(config.model, first)
         choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
         return first
     raise UserError(f"{source.path}: none of its records can be read; make the split again.")

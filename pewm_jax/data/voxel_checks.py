@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from pewm_jax.config import ConfigError, GridConfig, UserError
-from pewm_jax.config.memory import MemorySettings
+from pewm_jax.config.model import WorldSettings
 from pewm_jax.data.voxel_classes import PALETTE, SIDE_LIMIT, VoxelsConfig
 from pewm_jax.data.voxel_frames import DTYPES, VoxelFrames, VoxelGrid
 from pewm_jax.types import Camera
@@ -26,16 +26,17 @@ LOOKS, STEP = 8, 3
 """Frames looked at, and of these every n-th row and column."""
 
 
-def require_same_cells(memory: MemorySettings, episode: Episode) -> None:
+def require_same_cells(world: WorldSettings, episode: Episode) -> None:
     """Refuse collected grids of other classes, or pictures of something else, than a world expects.
 
     Args:
-        memory: of the world; kinds other than ``grid`` ask for nothing.
+        world: its settings; worlds without a memory of kind ``grid`` ask for nothing.
         episode: of the data. Tables of other makers are not compared.
 
     Raises:
         ConfigError: another table of classes, or pictures of surfaces where cells are expected.
     """
+    memory = getattr(world, "memory", None)
     if not isinstance(memory, GridConfig) or episode.voxel_grid is None:
         return
     for kinds in ("all", "groups"):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pewm_jax.config import ConfigError, GridConfig
+from pewm_jax.config import ConfigError, GridConfig, ModelConfig, NomadWorldConfig, PersistConfig
 from pewm_jax.data import block_pictures
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
@@ -79,13 +79,19 @@ def test_an_episode_of_cells_shows_the_cells_it_records():
     assert settings_of(config, "train")["voxels"]["pictures"] == "cells"
     # A world says which pictures and which classes it expects.
     cell = (0.25, 0.25, 0.25)
-    expects = GridConfig(cell_m=cell, kinds="groups", colours=16, pictures="cells")
+    blocks = GridConfig(cell_m=cell, kinds="groups", colours=16, pictures="cells")
+    expects = PersistConfig(memory=blocks)
+    of_surfaces = PersistConfig(memory=dataclasses.replace(blocks, pictures="surfaces"))
     require_same_cells(expects, episode)
-    require_same_cells(dataclasses.replace(expects, pictures="surfaces"), house)
+    require_same_cells(of_surfaces, house)
     with pytest.raises(ConfigError, match="has pictures of surfaces"):
         require_same_cells(expects, house)
+    fewer = PersistConfig(memory=dataclasses.replace(blocks, colours=8))
     with pytest.raises(ConfigError, match=r"--voxels\.kinds groups --voxels\.colours 16, and"):
-        require_same_cells(dataclasses.replace(expects, colours=8), episode)
+        require_same_cells(fewer, episode)
+    # Worlds without a grid, or without any memory, read every dataset.
+    for world in (ModelConfig(), NomadWorldConfig()):
+        require_same_cells(world, episode)
 
 
 def test_instances_are_not_in_pictures_of_cells():
