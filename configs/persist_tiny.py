@@ -36,10 +36,8 @@ def config() -> Config:
     """
     codec = LearnedCodecConfig(gate=48)
     width = {"head_dim": 40, "gates": "open"}
-    voxels = FrameFlowConfig(
-        per_frame=True, times="uniform", sample_steps=1, shift=1.0, predicts="x0"
-    )
-    pixels = dataclasses.replace(voxels, sample_steps=2, context_noise=0.1)
+    voxels = FrameFlowConfig(per_frame=True, times="ends", sample_steps=1, shift=1.0, predicts="x0")
+    pixels = dataclasses.replace(voxels, times="uniform", sample_steps=2, context_noise=0.1)
     return Config(
         model=PersistConfig(
             clip=ClipConfig(frames=5, height=64, width=64),
@@ -126,7 +124,8 @@ def config() -> Config:
             world_frames=StageConfig(steps=340, batch=6, learning_rate=1.5e-3, warmup=30),
             camera=StageConfig(steps=40, batch=16, learning_rate=1e-3, warmup=10),
             renderer=StageConfig(steps=900, batch=6, learning_rate=1.5e-3, warmup=30),
-            occupied=4.0,
+            occupied=3.0,
+            classes=4.0,
             ema=0.98,
         ),
         evaluate=EvalConfig(clips=24, seeds=(0,), videos=4, video_clips=8, batch=8),

@@ -45,6 +45,7 @@ class Config:
             f"train is a {type(self.train).__name__}, and a {type(self.model).__name__} is trained "
             f"by the stages of a {self.model.TRAIN.__name__}: use that.",
         )
+        self.train.require_fit(self.model)
         encoder = getattr(getattr(self.model, "memory", None), "encoder", None)
         require(
             not self.data.features or getattr(encoder, "WEIGHTS", "encoder") == "encoder",

@@ -20,8 +20,10 @@ class FrameFlowConfig(FlowConfig):
 
     shift: float = 3.0
     """Time shift of the sampler: t → s t / (1 + (s − 1) t)."""
-    times: Literal["uniform", "logit_normal"] = "logit_normal"
-    """Distribution of times in training."""
+    times: Literal["uniform", "logit_normal", "ends"] = "logit_normal"  # type: ignore[assignment]
+    """Distribution of times in training. `ends`: half the frames at the time of those that are
+    given (`context_noise`), half at 1, which is all that a sampler of one step ever meets; it needs
+    `per_frame`. Not as published."""
     shifted_times: bool = False
     """Whether the times of training are shifted, too."""
     sample_steps: int = 20
@@ -41,6 +43,11 @@ class FrameFlowConfig(FlowConfig):
         for name in ("smallest", "context_noise"):
             value = getattr(self, name)
             require(0 <= value < 1, f"noise.{name} is {value}: use 0 or more, below 1.")
+        require(
+            self.times != "ends" or (self.per_frame and self.sample_steps == 1),
+            f"noise.times is ends with noise.per_frame {self.per_frame} and noise.sample_steps "
+            f"{self.sample_steps}: use per_frame true and 1 step, or other times.",
+        )
 
 
 PERSIST_VOXELS = FrameFlowConfig(per_frame=True)

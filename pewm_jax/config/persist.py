@@ -188,16 +188,35 @@ class PersistTrainConfig(TrainSettings):
     occupied: float = 1.0
     """What the error of a world frame's latent counts where anything is in its cells, beside those
     of air, which are most; 1 as published."""
+    classes: float = 0.0
+    """What the classes of a world frame's cells count beside the error of its latents: their
+    cross-entropy through the frozen decoder; 0 as published. It needs a decoder that sees one
+    latent at a time (`voxel_vae.kernel` and `middle_kernel` 1, one number of `widths`)."""
+    compared: int = 256
+    """Latents of a frame whose cells are compared, drawn by what their error counts."""
 
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
         require(self.occupied > 0, f"train.occupied is {self.occupied}: use a number above 0.")
+        require(self.classes >= 0, f"train.classes is {self.classes}: use 0 or more.")
+        require(self.compared >= 1, f"train.compared is {self.compared}: use 1 or more.")
         require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
         require(
             self.hidden == 0 and self.chained == 0,
             f"train.hidden is {self.hidden} and train.chained {self.chained}: they are of worlds "
             "with memory blocks; use 0 for both.",
+        )
+
+    def require_fit(self, model: Any) -> None:
+        """Refuse classes through a decoder that cannot decode a latent alone."""
+        vae = model.backbone.voxel_vae
+        seen = (vae.kernel, vae.middle_kernel, len(vae.widths))
+        require(
+            not self.classes or seen == (1, 1, 1),
+            f"train.classes is {self.classes}, voxel_vae.kernel {seen[0]}, middle_kernel "
+            f"{seen[1]}, and widths has {seen[2]} numbers: use 1, 1 and one number, so that a "
+            "latent can be decoded alone, or train.classes 0.",
         )
 
 

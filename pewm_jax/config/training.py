@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 from pewm_jax.config.errors import is_pattern, require
 from pewm_jax.config.mesh import MeshConfig
@@ -169,6 +169,9 @@ class TrainSettings:
             self.preview_every >= 0,
             f"train.preview_every is {self.preview_every}: use 0 (no pictures) or more steps.",
         )
+
+    def require_fit(self, model: Any) -> None:
+        """Refuse settings that do not go together with the world's."""
 
 
 @dataclasses.dataclass(frozen=True)

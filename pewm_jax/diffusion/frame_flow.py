@@ -26,6 +26,9 @@ levels = flow.levels
 
 def draw(config: FrameFlowConfig, key: Array, batch: int, frames: int) -> Array:
     """Draw times in [0, 1], (B, t) or (B,); shifted only with ``noise.shifted_times``."""
+    if config.times == "ends":
+        ended = jax.random.bernoulli(key, shape=(batch, frames))
+        return jnp.where(ended, 1.0, config.context_noise)
     drawn = config if config.shifted_times else dataclasses.replace(config, shift=1.0)
     return flow.draw(drawn, key, batch, frames)
 

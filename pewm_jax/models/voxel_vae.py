@@ -189,7 +189,7 @@ def loss(
     full = (ids != 0).astype(jnp.float32)
     weight = 1 + (config.occupied_weight - 1) * full
     if config.compared:
-        cells = _drawn(weight.reshape(len(ids), -1), config.compared, cells_key)
+        cells = drawn(weight.reshape(len(ids), -1), config.compared, cells_key)
         ids, full = (jnp.take_along_axis(x.reshape(len(x), -1), cells, 1) for x in (ids, full))
         flat = seen.reshape(len(seen), -1, config.embed)
         missed, right = compare(jnp.take_along_axis(flat, cells[..., None], 1), ids)
@@ -216,7 +216,7 @@ def cubes(config: VoxelVAEConfig, classes_BXYZ: Array, key: Array) -> Array:
     ids = jnp.asarray(classes_BXYZ)
     full = (ids != 0).astype(jnp.float32).reshape(len(ids), -1)
     cells_key, off_key = jax.random.split(key)
-    cells = _drawn(full, config.cubes, cells_key)
+    cells = drawn(full, config.cubes, cells_key)
     place = jnp.stack(jnp.unravel_index(cells, ids.shape[1:]), -1)
     low = place - jax.random.randint(off_key, place.shape, 0, config.cube)
     low = jnp.clip(low // config.factor * config.factor, 0, config.side - config.cube)
@@ -228,6 +228,14 @@ def cubes(config: VoxelVAEConfig, classes_BXYZ: Array, key: Array) -> Array:
 
     made = jax.vmap(lambda grid, lows: jax.vmap(lambda low: cut(grid, low))(lows))(ids, low)
     return made.reshape(-1, *made.shape[2:])
+
+
+def drawn(weight_BN: Array, count: int, key: Array) -> Array:
+    """Draw (B, count) places of each row with a probability in proportion to their weight."""
+    share_BN = jnp.cumsum(weight_BN, 1)
+    at = jax.random.uniform(key, (len(share_BN), count)) * share_BN[:, -1:]
+    places = jax.vmap(lambda share, at: jnp.searchsorted(share, at, side="right"))(share_BN, at)
+    return jnp.minimum(places, share_BN.shape[1] - 1)
 
 
 def require_grids(config: VoxelVAEConfig, classes_BXYZ: Array) -> None:
@@ -281,14 +289,6 @@ def _convolved(config: VoxelVAEConfig, part: Params, x: Array) -> Array:
     return convolve(x, part["kernel"].astype(x.dtype), config.convolution) + part["bias"].astype(
         x.dtype
     )
-
-
-def _drawn(weight_BN: Array, count: int, key: Array) -> Array:
-    """Draw (B, count) places with a probability in proportion to their weight."""
-    share_BN = jnp.cumsum(weight_BN, 1)
-    drawn = jax.random.uniform(key, (len(share_BN), count)) * share_BN[:, -1:]
-    places = jax.vmap(lambda share, at: jnp.searchsorted(share, at, side="right"))(share_BN, drawn)
-    return jnp.minimum(places, share_BN.shape[1] - 1)
 
 
 def _by_slab(config: VoxelVAEConfig, function: Callable[..., Any], *grids_BXYZ: Array) -> Any:

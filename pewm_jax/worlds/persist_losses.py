@@ -30,6 +30,9 @@ from pewm_jax.models import voxel_vae as voxel_vae_model
 from pewm_jax.types import Array, Camera, Params
 
 Measured = dict[str, Array]
+Compare = Callable[[Array, Array, Array], tuple[Array, Array]]
+"""``(x0_BTxyzC, weight_BTxyz, key) -> (error, right)``: another error of what is predicted, () and
+already weighted, and the share that is right; see ``persist_classes.compared``."""
 
 
 def led_to(actions_BTA: Array) -> Array:
@@ -70,6 +73,7 @@ def world_frames(
     blind: float = 0.0,
     known_BTxyz: Array | None = None,
     weight_BTxyz: Array | None = None,
+    compare: Compare | None = None,
     dtype: Any = jnp.float32,
 ) -> tuple[Array, Measured]:
     """Return the squared error of the velocity of voxel frames.
@@ -89,6 +93,7 @@ def world_frames(
         blind: share of frames after the first that are not shown a picture.
         known_BTxyz: bool, which latents a world would know at that frame; None for all.
         weight_BTxyz: what the error of each latent counts; None for 1.
+        compare: an error of the predicted x0 that is added; see ``Compare``.
         dtype: of the computation.
     """
     velocity_key, shown_key = jax.random.split(key)
@@ -112,6 +117,7 @@ def world_frames(
         dtype,
         known=known_BTxyz,
         counts=weight_BTxyz,
+        compare=compare,
     )
 
 
@@ -205,6 +211,7 @@ def _velocity(
     *,
     known: Array | None = None,
     counts: Array | None = None,
+    compare: Compare | None = None,
 ) -> tuple[Array, Measured]:
     """Return the squared error at times drawn for each frame, and that of x0.
 
@@ -217,6 +224,7 @@ def _velocity(
         known: bool, in the shape of x0 without its channels: elsewhere x_t is noise alone, and
             the error does not count.
         counts: in the same shape, what the error counts there; None for 1.
+        compare: an error of the predicted x0 that is added.
     """
     time_key, noise_key = jax.random.split(key)
     times = noises.draw(noise, time_key, *x0.shape[:2])
@@ -229,7 +237,8 @@ def _velocity(
     made = predict(inputs.astype(dtype), network_times).astype(jnp.float32)
     error = jnp.square(made - noises.target(noise, x0, drawn, times))
     weight = noises.spread(noises.weight(noise, times), error.ndim)
-    x0_error = jnp.square(noises.to_x0(noise, made, x_t, times) - x0)
+    made_x0 = noises.to_x0(noise, made, x_t, times)
+    x0_error = jnp.square(made_x0 - x0)
 
     share = jnp.ones(x0.shape[:-1]) if known is None else known.astype(jnp.float32)
 
@@ -237,4 +246,8 @@ def _velocity(
         return (x * (share / jnp.maximum(share.mean(), 1e-6))[..., None]).mean()
 
     counted = share if counts is None else share * counts
-    return mean(error * weight, counted), {"x0_error": mean(x0_error, share)}
+    loss, measured = mean(error * weight, counted), {"x0_error": mean(x0_error, share)}
+    if compare is None:
+        return loss, measured
+    compared, right = compare(made_x0, counted, jax.random.fold_in(key, 2))
+    return loss + compared, measured | {"classes": compared, "classes_right": right}

@@ -122,6 +122,7 @@ def frames(model: PersistConfig, params: Params, clip: Clip) -> Clip:
         "actions": losses.led_to(clip.actions_TA),
         "known": known,
         "occupied": occupied(model, classes),
+        "classes": classes,
     }
     return _prepared(clip, made)
 

@@ -26,8 +26,8 @@ from pewm_jax.models import (
 from pewm_jax.models.costs import Costs, Share
 from pewm_jax.models.voxel_vae_shapes import costs as vae_costs
 from pewm_jax.types import Array, Clip, Params
+from pewm_jax.worlds import persist_classes, persist_prepare
 from pewm_jax.worlds import persist_losses as losses
-from pewm_jax.worlds import persist_prepare
 from pewm_jax.worlds.persist_pictures import reckoning
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -94,6 +94,13 @@ def world_frames(
     assert isinstance(train, PersistTrainConfig)
     made = _of(persist_prepare.frames, model, params, clip)
     config = model.backbone.world_frames  # type: ignore[attr-defined]
+
+    def compare(x0: Array, weight: Array, key: Array) -> tuple[Array, Array]:
+        vae, cells = model.backbone.voxel_vae, made["classes"]  # type: ignore[attr-defined]
+        frozen = params["voxel_vae"]
+        error, right = persist_classes.compared(vae, frozen, x0, cells, weight, train.compared, key)
+        return train.classes * error, right
+
     return losses.world_frames(
         config,
         model.voxel_noise,  # type: ignore[arg-type]
@@ -106,6 +113,7 @@ def world_frames(
         blind=train.blind,
         known_BTxyz=made["known"],
         weight_BTxyz=1 + (train.occupied - 1) * made["occupied"],
+        compare=compare if train.classes else None,
         dtype=jnp.dtype(model.dtype),
     )
 

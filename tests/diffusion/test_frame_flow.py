@@ -102,3 +102,23 @@ def test_given_frames_have_a_little_noise_and_say_so():
 def test_settings_that_cannot_work_are_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         FrameFlowConfig(**wrong)
+
+
+def test_times_at_the_ends_are_those_that_one_step_meets():
+    config = FrameFlowConfig(per_frame=True, times="ends", sample_steps=1, context_noise=0.1)
+    times = np.asarray(frame_flow.draw(config, jax.random.key(0), 500, 4))
+    assert times.shape == (500, 4)
+    assert set(np.unique(times)) == {np.float32(0.1), np.float32(1)}
+    np.testing.assert_allclose(times.mean(0), 0.55, atol=0.05)
+    asked = []
+
+    def denoise(x, time_B, weight):
+        jax.debug.callback(lambda t: asked.append(float(t)), time_B[0])
+        return 0 * x
+
+    noise.sample(config, denoise, jnp.ones((1, 1, 2)))
+    jax.effects_barrier()
+    assert set(asked) <= {1.0}
+    for change in ({"sample_steps": 2}, {"per_frame": False}):
+        with pytest.raises(ConfigError, match=r"noise\.times is ends"):
+            dataclasses.replace(config, **change)
