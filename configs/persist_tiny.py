@@ -107,7 +107,7 @@ def config() -> Config:
             noise=pixels,
             voxel_noise=voxels,
             hold=30.0,
-            doubt=8.0,
+            doubt=2.0,
             sight=60.0,
             points=True,
             dead_reckoning=True,

@@ -15,6 +15,8 @@ ABOUT = (
     "truth by stretches (PSNR) and as sets of windows of 16 frames (FVD, KVD), and, of a world of "
     "voxels, see what its renderer makes of the true ones and whether what is placed in it stays."
 )
+SPARE = 4
+"""One walk in so many more than trials, for those without room for a block."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,12 +149,12 @@ def _measured(
     if i3d is not None:
         facts["distances"] = horizon.distances(made, truth, ends, settings.windows, i3d)
     if tried:
-        facts["edits"] = edit_trials.run(config, params, tried).facts()
+        facts["edits"] = edit_trials.run(config, params, tried, count=settings.trials).facts()
     return facts, {"truth": truth, **made}
 
 
 def _tried(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
-    """Return the walks of the trials, spread over the episodes."""
+    """Return walks for the trials, spread over the episodes, with some to spare."""
     if not settings.trials:
         return []
     from pewm_jax.evaluation import horizon
@@ -164,9 +166,8 @@ def _tried(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
             f"--trial-frames is {settings.trial_frames}, and the shortest episode has {shortest} "
             "frames: take fewer, or collect longer episodes."
         )
-    each = -(-settings.trials // len(chosen))
+    wanted = settings.trials + -(-settings.trials // SPARE)
+    each = -(-wanted // len(chosen))
     places = [starts[len(starts) * k // each] for k in range(each)]
     walks = ((one, at) for at in places for one in chosen)
-    return [horizon.walk_of(one, at, settings.trial_frames, 1) for one, at in walks][
-        : settings.trials
-    ]
+    return [horizon.walk_of(one, at, settings.trial_frames, 1) for one, at in walks][:wanted]

@@ -59,6 +59,11 @@ class MemorySettings(Settings):
         return max(size * count for size, count in zip(self.cell_m, self.cells, strict=True))
 
     @property
+    def room(self) -> int:
+        """How many points it can hold."""
+        return self.capacity
+
+    @property
     def rendered_channels(self) -> int:
         """Channels of the memory's pictures: the colour, or the features that are kept."""
         return self.encoder.channels if self.KEEPS_FEATURES else 3

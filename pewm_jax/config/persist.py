@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.backbone import BackboneSettings
@@ -131,6 +132,11 @@ class GridConfig(MemorySettings):
     floor is a border between cells."""
     reader: ReaderSettings = RenderConfig()
     """Nothing reads it but the networks of the world."""
+
+    @property
+    def room(self) -> int:
+        """How many cells it holds."""
+        return math.prod(self.cells)
 
     def check(self, model: Any) -> None:
         """Refuse a grid that the networks do not fit."""

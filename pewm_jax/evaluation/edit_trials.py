@@ -121,6 +121,7 @@ def run(
     name: str = "",
     batch: int = 8,
     chunk: int = 16,
+    count: int | None = None,
 ) -> Trials:
     """Place, walk and look.
 
@@ -131,6 +132,7 @@ def run(
         name: class of the blocks; see ``class_of``.
         batch: walks imagined at once.
         chunk: frames imagined by one call.
+        count: trials that are enough: walks after these are not looked at; None for all.
 
     Raises:
         UserError: see ``class_of``.
@@ -142,7 +144,11 @@ def run(
     imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
     look = jax.jit(functools.partial(_sight, model))
     ready: list[_Trial] = []
+    looked = 0
     for walk in walks:
+        if len(ready) == count:
+            break
+        looked += 1
         assert walk.first is not None
         frames = jax.tree.map(lambda x: x[-1:], walk.context)
         state = start(params, frames, *walk.first)
@@ -178,7 +184,7 @@ def run(
             meter.advance(len(some))
     shown, visible, within = (int(x) for x in seen)
     frames = steps * len(ready)
-    return Trials(np.array(kept), shown, visible, within, frames, len(walks), model.hold)
+    return Trials(np.array(kept), shown, visible, within, frames, looked, model.hold)
 
 
 def judged(there_hw: np.ndarray, change_HW: np.ndarray) -> tuple[bool, bool]:

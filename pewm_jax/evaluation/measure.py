@@ -81,7 +81,7 @@ def growth(config: Config, long: LongRollouts) -> dict[str, Any] | None:
         "frames": [each * clip for clip in range(long.chain + 1)],
         "occupied": intervals.entry(held, clusters),
         "per_frame": intervals.entry((held[:, -1] - held[:, 0]) / (each * long.chain), clusters),
-        "capacity": config.model.memory.capacity,
+        "capacity": config.model.memory.room,
     }
 
 
@@ -166,12 +166,13 @@ def _memory_of(config: Config, *, remembers: bool) -> dict[str, Any]:
     memory = config.model.memory
     if not remembers:
         return {"memory": "none"} | dict.fromkeys(("encoder", "reader", "positions", "map"))
+    read = f", {memory.tokens} read per clip" if memory.READ_BY_BLOCKS else ""
     return {
         "memory": kinds.of(memory).name,
         "encoder": kinds.of(memory.encoder).name,
         "reader": kinds.of(memory.reader).name,
         "positions": getattr(memory.reader, "positions", ""),
-        "map": f"{memory.capacity} cells of {memory.cell_m} m, {memory.tokens} read per clip",
+        "map": f"{memory.room} cells of {memory.cell_m} m" + read,
     }
 
 

@@ -200,7 +200,8 @@ def _asked(
 ) -> dict[str, Any]:
     """Return what only some models are asked: what the map covers, and whether actions steer."""
     covered = steered = None
-    if runs.remembers(opened):
+    # A memory that is the state of its world has no tokens that could be counted.
+    if runs.remembers(opened) and config.model.memory.READ_BY_BLOCKS:
         covered = score_coverage(config, episodes, model, partials, say, clips)
     if not model.cameras:
         steered = steering.score(config, opened.params, episodes, clips, partials, say)

@@ -78,6 +78,16 @@ def test_in_a_world_where_nothing_happens_all_of_a_block_stays(standing, cell):
     assert found.shown == found.visible == 2 * FRAMES  # of both chunks
 
 
+def test_enough_trials_are_enough(standing):
+    config = Config(model=world(0.25), train=PersistTrainConfig())
+    standing.setattr(edit_trials, "_sight", lambda *_: (jnp.zeros((8, 8), bool), jnp.array(True)))
+    boxes = iter([None, np.array([[1, 0, 0], [1.25, 0.25, 0.25]], np.float32)])
+    standing.setattr(edit_trials, "room", lambda *_: next(boxes))
+    found = edit_trials.run(config, {}, [walk(), walk(), walk()], batch=1, chunk=8, count=1)
+    assert (len(found.kept_N), found.asked) == (1, 2)
+    assert found.facts()["without_room"] == 1
+
+
 def test_what_a_camera_sees_of_a_block_and_whether_it_is_in_the_window(standing):
     model = world(0.5)
     camera = jax.tree.map(lambda x: x[0][None], cameras(1))
