@@ -10,13 +10,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.config import GridConfig, UserError
+from pewm_jax.config.model import WorldSettings
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.importer import ImportConfig, import_recording
 from pewm_jax.data.navigation import NavGrid, is_free, sample_free
 from pewm_jax.data.recording_folders import read_recording
 from pewm_jax.data.render import render
 from pewm_jax.data.simulator import Simulator, move, open_simulator
+from pewm_jax.data.voxel_checks import require_same_cells
 from pewm_jax.geometry.cameras import resize_intrinsics
 from pewm_jax.play.settings import Start
 from pewm_jax.types import Camera, Frames
@@ -72,6 +74,28 @@ def open_place(start: Start, height: int, width: int) -> Place:
     around[:-1, 2] += 2 * np.pi * np.arange(1, LOOKS) / LOOKS
     name = Path(start.scene).name if start.scene else f"house {start.house}"
     return Place(name, simulator.frames(around), planar, simulator)
+
+
+def require_shown(model: WorldSettings, start: Start) -> None:
+    """Refuse to begin with pictures of something else than a world was trained on.
+
+    Args:
+        model: the world.
+        start: what was asked for.
+
+    Raises:
+        UserError: the world knows pictures of blocks, and the drive begins with surfaces.
+    """
+    memory = getattr(model, "memory", None)
+    if not isinstance(memory, GridConfig):
+        return
+    if start.episode:
+        require_same_cells(model, EpisodeSource(Path(start.episode))[start.number])
+    elif memory.pictures == "cells":
+        raise UserError(
+            "This world knows pictures of blocks, and generated houses, meshes and recordings show "
+            "surfaces: begin with an episode of its data, such as --episode data/persist/revisit."
+        )
 
 
 def truth(place: Place, camera: Camera, height: int, width: int) -> Frames | None:

@@ -27,6 +27,7 @@ from pewm_jax.config import (
 from pewm_jax.data.navigation import is_free
 from pewm_jax.play import board, engine, kept, picking, places, session
 from pewm_jax.play.settings import Serve, Start
+from tests.persist_world import MODEL as PERSIST
 from tests.play.tiny_drive import (
     FORWARD,
     LEFT,
@@ -236,6 +237,14 @@ def write_recording(folder, frames):
         pose = frames.camera.world_from_camera[k]
         lines += [f"{k} {k} 1", *(" ".join(map(str, row)) for row in pose.tolist())]
     (folder / "poses.log").write_text("\n".join(lines))
+
+
+def test_a_world_of_blocks_does_not_begin_with_surfaces():
+    places.require_shown(MODEL, Start())
+    with pytest.raises(UserError, match="knows pictures of blocks"):
+        places.require_shown(PERSIST, Start())
+    surfaces = dataclasses.replace(PERSIST.memory, pictures="surfaces")
+    places.require_shown(dataclasses.replace(PERSIST, memory=surfaces, sight=0.0), Start())
 
 
 def test_a_drive_begins_with_a_recording_of_another_shape(tmp_path):
