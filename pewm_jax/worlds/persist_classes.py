@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import VoxelVAEConfig
 from pewm_jax.models import voxel_vae
+from pewm_jax.models.patches import patchify
 from pewm_jax.types import Array, Params
 
 
@@ -59,9 +60,7 @@ def compared(
 
 def cells_of_latents(config: VoxelVAEConfig, classes_BXYZ: Array) -> Array:
     """Return (B, latents, cells of one), a latent's cells in the order X, Y, Z."""
-    batch, count, factor = len(classes_BXYZ), config.latent_side, config.factor
-    cut = classes_BXYZ.reshape(batch, count, factor, count, factor, count, factor)
-    return cut.transpose(0, 1, 3, 5, 2, 4, 6).reshape(batch, count**3, factor**3)
+    return patchify(classes_BXYZ[..., None], config.factor, config.factor)
 
 
 def error_of(
