@@ -43,10 +43,12 @@ from pewm_jax.types import Params
 
 SAMPLER, EMPTY = "sampler, with the map", "sampler, without"
 READING, PLAIN = "reading clips and masks", "PSNR, SSIM, depth"
-LPIPS, I3D = "LPIPS (AlexNet)", "I3D for FVD and KVD (off by default on processors)"
-USES = {SAMPLER: 3, EMPTY: 3, READING: 1, PLAIN: 2 * 3 + 2, LPIPS: 2 * 3 + 2}
+TRUTH, LPIPS = "LPIPS (AlexNet), the truth's pass", "LPIPS (AlexNet), of a method"
+I3D = "I3D for FVD and KVD (off by default on processors)"
+USES = {SAMPLER: 3, EMPTY: 3, READING: 1, PLAIN: 2 * 3 + 2, TRUTH: 1, LPIPS: 2 * 3 + 2}
 """How often each is done for a batch of clips in a report by default: three sampling seeds with the
-map and without, two methods without a network; clips are read once."""
+map and without, two methods without a network; clips are read once, and their truth passes LPIPS's
+network once."""
 CUTS = (2, 5, 8, 10, 12)
 """Where torchvision's AlexNet is cut (lpips/pretrained_networks.py)."""
 
@@ -113,12 +115,18 @@ def parts(clips: int) -> tuple[dict[str, Callable[[], object]], Any, Any]:
         made = load_batch(config, episodes, choices, 0, cameras=False)
         return made.seen, made.unseen
 
+    apart = lpips.towards(batch.targets.rgb_THWC)
+
+    def described() -> Any:
+        return lpips.described(batch.targets.rgb_THWC)
+
     runs: dict[str, Callable[[], object]] = {
         SAMPLER: lambda: batch.imagine(methods, "memory", 0),
         EMPTY: lambda: batch.imagine(methods, "empty", 0),
         READING: read,
         PLAIN: lambda: batch.sums(frames, None),
-        LPIPS: lambda: lpips.frames(frames.rgb_THWC, batch.targets.rgb_THWC),
+        TRUTH: described,
+        LPIPS: lambda: apart(frames.rgb_THWC),
     }
     distance, whole = _i3d(), batch.whole(frames.rgb_THWC)
     runs[I3D] = lambda: distance.features(whole)

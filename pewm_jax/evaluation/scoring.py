@@ -59,7 +59,10 @@ class Scored:
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """Chosen clips, padded to one size by repeating the last; ``real`` of them are asked for."""
+    """Chosen clips, padded to one size by repeating the last; ``real`` of them are asked for.
+
+    ``described`` keeps what LPIPS makes of their truth, from its first use on.
+    """
 
     context: Frames
     targets: Frames
@@ -68,6 +71,7 @@ class Batch:
     seen: Any
     unseen: Any
     real: int
+    described: dict[Any, Callable[[Any], Array]] = dataclasses.field(default_factory=dict)
 
     def seeds(self, seed: int) -> np.ndarray:
         """Return what the sampler's noise is drawn from: sampling seed, clip number."""
@@ -93,8 +97,10 @@ class Batch:
         """Return ``images.error_sums`` of the clips asked for, with LPIPS if it is given."""
         sums = np.asarray(error_sums_batch(frames, self.targets, self.seen, self.unseen))
         if lpips is not None:
-            distances = lpips.frames(frames.rgb_THWC, self.targets.rgb_THWC)
-            sums = with_lpips(sums, np.asarray(distances))
+            known = lpips.net, lpips.sha256
+            if known not in self.described:
+                self.described[known] = lpips.towards(self.targets.rgb_THWC)
+            sums = with_lpips(sums, np.asarray(self.described[known](frames.rgb_THWC)))
         return sums[: self.real]
 
 

@@ -11,6 +11,7 @@ richzhang/PerceptualSimilarity.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
 import jax
@@ -121,10 +122,30 @@ def apply(net: Net, params: Params, a_NHWC: Array, b_NHWC: Array) -> Array:
             "(N, H, W, 3)."
         )
     require_size(net, *a.shape[1:3])
-    both = jnp.concatenate([a, b]).astype(jnp.float32)
-    total = jnp.zeros(len(a))
-    for k, x in enumerate(features(net, params, both)):
-        one, other = jnp.split(_of_length_one(x), 2)
+    both = describe(net, params, jnp.concatenate([a, b]))
+    one, other = zip(*(jnp.split(x, 2) for x in both), strict=True)
+    return distance(params, one, other)
+
+
+def describe(net: Net, params: Params, x_NHWC: Array) -> tuple[Array, ...]:
+    """Return what pictures are compared by: the layers' features, of length 1 at each place.
+
+    Args:
+        net: the network.
+        params: its parameters.
+        x_NHWC: (N, H, W, 3) floats in [−1, 1], as large as ``require_size`` asks.
+
+    Returns:
+        Of each layer (N, h, w, C) float32.
+    """
+    found = features(net, params, jnp.asarray(x_NHWC).astype(jnp.float32))
+    return tuple(_of_length_one(x) for x in found)
+
+
+def distance(params: Params, a: Sequence[Array], b: Sequence[Array]) -> Array:
+    """Return the distance of pictures by their descriptions, (N,); one may have length 1."""
+    total = jnp.zeros(())
+    for k, (one, other) in enumerate(zip(a, b, strict=True)):
         weights_C = params["lin"][f"layer_{k}"].astype(jnp.float32)
         apart = (jnp.square(one - other) * weights_C).sum(-1)
         total = total + apart.mean((1, 2))

@@ -152,8 +152,10 @@ def perceptual(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _lpips(net: Net, params: Params, rgb_PHWC: Array, goal_1HWC: Array) -> Array:
+    goal = lpips.describe(net, params, goal_1HWC)
+
     def one(picture: Array) -> Array:
-        return lpips.apply(net, params, picture[None], goal_1HWC)[0]
+        return lpips.distance(params, lpips.describe(net, params, picture[None]), goal)[0]
 
     return jax.lax.map(one, rgb_PHWC, batch_size=_at_once(rgb_PHWC))
 

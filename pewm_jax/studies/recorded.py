@@ -18,14 +18,17 @@ from typing import Any
 import numpy as np
 
 from pewm_jax import atomic, shipped
-from pewm_jax import config as configuration
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.studies.rows import Row
 from pewm_jax.studies.trainings import Study, backbone_of, settings
-from pewm_jax.training.runs import WEIGHTS
+from pewm_jax.training.runs import WEIGHTS, identity
 
 FOLDER = "recorded"
+VERSION = 1
+"""Raise it when the code changes what is learnt or scored: older scores are then left aside."""
+ELSEWHERE = ("train.start", "data.path")
+"""Folders, which may lie anywhere, in the settings of a training."""
 Arrays = dict[str, np.ndarray]
 
 
@@ -41,16 +44,14 @@ def path(study: Study, row: Row, seed: int, steps: Mapping[str, int], scored: st
     """
     start = study.base.train.start
     facts: list[Any] = [
+        VERSION,
         scored,
         file_hash(Path(study.base.data.path) / "train" / MANIFEST),
         file_hash(shipped.find(start) / WEIGHTS) if start else "",
     ]
     for which in (backbone_of(study.base, row), row):
-        config = configuration.to_dict(settings(study, which, seed, steps[which.name], start="x"))
-        for name in ("run", "start"):  # folders, which may lie anywhere
-            del config["train"][name]
-        del config["data"]["path"]
-        facts.append(config)
+        config = settings(study, which, seed, steps[which.name], start="x")
+        facts.append({k: v for k, v in identity(config).items() if k not in ELSEWHERE})
     name = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     return study.out / FOLDER / f"seed{seed}-{row.name}-{name[:12]}.npz"
 
@@ -69,7 +70,9 @@ def read(file: Path) -> dict[str, Arrays] | None:
 
 
 def write(file: Path, found: Mapping[str, Arrays]) -> None:
-    """Write scores: name of a row → measure → numbers."""
+    """Write scores, name of a row → measure → numbers, unless they are there."""
+    if _same(read(file), found):
+        return
     file.parent.mkdir(parents=True, exist_ok=True)
     flat = {
         f"{name}:{measure}": values
@@ -78,3 +81,13 @@ def write(file: Path, found: Mapping[str, Arrays]) -> None:
     }
     with atomic.replacing(file) as partial, partial.open("wb") as opened:
         np.savez_compressed(opened, **flat)  # pyright: ignore[reportArgumentType]
+
+
+def _same(kept: Mapping[str, Arrays] | None, found: Mapping[str, Arrays]) -> bool:
+    if kept is None or kept.keys() != found.keys():
+        return False
+    return all(
+        kept[name].keys() == found[name].keys()
+        and all(np.array_equal(kept[name][k], found[name][k], equal_nan=True) for k in found[name])
+        for name in found
+    )

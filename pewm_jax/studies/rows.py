@@ -49,6 +49,8 @@ class Row:
         depth: whether the model imagines depth.
         paper: what the paper's Table 1 calls it; "" if it is not there.
         times: how many times the others' training time it gets.
+        control: whether its reader is trained although there is nothing to read: what the readers'
+            parameters and their training do without a memory.
     """
 
     name: str
@@ -56,11 +58,12 @@ class Row:
     depth: bool = True
     paper: str = ""
     times: float = 1.0
+    control: bool = False
 
     @property
-    def remembers(self) -> bool:
-        """Whether it has a memory."""
-        return self.memory.REMEMBERS
+    def reads(self) -> bool:
+        """Whether a reader is trained (stage 2); if not, the backbone is trained on."""
+        return self.memory.REMEMBERS or self.control
 
     @property
     def label(self) -> str:
@@ -83,8 +86,10 @@ def main_rows(base: Config) -> tuple[Row, ...]:
         for kind, scale in ((PointsConfig, POINTS), (SurfelConfig, SURFELS))
     )
     snapshots = max(1, memory.tokens // PATCHES)
+    nothing = _as(memory, NoMemoryConfig, attend)
     return (
-        Row("none", _as(memory, NoMemoryConfig, attend), paper="NWM"),
+        Row("none", nothing, paper="NWM"),
+        Row("none-attend", nothing, control=True),
         Row(
             "images-attend",
             _as(memory, ImagesConfig, attend, snapshots=snapshots),
@@ -162,6 +167,10 @@ def parameters(base: Config, memory: MemorySettings) -> int:
     return sum(leaf.size for leaf in jax.tree.leaves(shapes.get("memory", {})))
 
 
+def _paper_form(base: Config) -> MemorySettings:
+    return next(row.memory for row in main_rows(base) if row.name == PAPER_FORM)
+
+
 def _cell(base: Config, side: str) -> MemorySettings:
     """Another size of a cell on the ground; extent and height stay, smaller ones are more."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
@@ -221,7 +230,7 @@ ABLATIONS: Mapping[str, Ablation] = {
     "extent": Ablation(_extent, ("4", "8", "16", "32"), "side of the map, m"),
     "tokens": Ablation(_tokens, ("96", "192", "384", "768"), "tokens that condition a clip"),
     "features": Ablation(_features, ("colours", "latents", "points"), "what a cell holds"),
-    "time": Ablation(lambda base, _: main_rows(base)[4].memory, ("4",), "times the others' time"),
+    "time": Ablation(lambda base, _: _paper_form(base), ("1", "4"), "times the others' time"),
 }
 """The paper's ablations, of the voxel map read by attention; ``time`` trains the paper's own form
 (``PAPER_FORM``) longer."""
@@ -254,7 +263,7 @@ def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row,
         if not (math.isfinite(times) and times > 0):
             raise UserError(f"the ablation {name} cannot take {value!r}: give {ablation.about}.")
         start = PAPER_FORM if name == "time" else "voxel-attend"
-        own = name != "time" and memory == plain
+        own = times == 1 if name == "time" else memory == plain
         row = Row(start if own else f"{start}-{name}_{value}", memory, times=times)
         found.append(row)
     return tuple(found)

@@ -24,6 +24,7 @@ from pewm_jax.evaluation import protocol_file
 from pewm_jax.evaluation.fixed import Protocol, decide, lay
 from pewm_jax.evaluation.imagine import Imagination, copy_last
 from pewm_jax.evaluation.metrics import load_all
+from pewm_jax.evaluation.metrics.revisits import ways
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.evaluation.reproject import reproject_batch
@@ -42,6 +43,7 @@ SHORTEST = 9
 """Frames of the shortest clip that I3D takes."""
 BASELINES = ("reproject", "copy")
 PROTOCOL, SCORES = "protocol.json", "scores"
+TRUTH = "the_truth"
 Arrays = dict[str, np.ndarray]
 Model = Callable[[Frames, Any, Camera, np.ndarray], Frames]
 """``(context, control, camera, seeds_B2) -> (B, N) frames``."""
@@ -70,13 +72,17 @@ class Scorer:
     say: Callable[[str], Any]
 
     @property
-    def house_of_clip(self) -> np.ndarray:
-        """The number of each clip's house: its scene, or its episode if there is one scene."""
+    def house(self) -> str:
+        """What counts as a house: ``house``, a scene; or ``episode``, if there is one scene."""
         clips, episodes = self.protocol.clips, self.protocol.episodes
-        scenes = [episodes[clip.episode].scene for clip in clips]
-        if len(set(scenes)) == 1:
-            scenes = [episodes[clip.episode].name for clip in clips]
-        return np.unique(scenes, return_inverse=True)[1]
+        return "house" if len({episodes[clip.episode].scene for clip in clips}) > 1 else "episode"
+
+    @property
+    def house_of_clip(self) -> np.ndarray:
+        """The number of each clip's ``house``."""
+        of = "scene" if self.house == "house" else "name"
+        named = [getattr(self.protocol.episodes[c.episode], of) for c in self.protocol.clips]
+        return np.unique(named, return_inverse=True)[1]
 
     @property
     def frames(self) -> int:
@@ -101,7 +107,8 @@ class Scorer:
             return kept
         laid = lay(self.protocol, config)
         batch, context = self.config.evaluate.batch, self.config.data.context
-        model = Imagination(laid, load_finished(run)[1], batch, context, self.say)
+        params, devices = load_finished(run)[1], jax.devices()
+        model = Imagination(laid, params, batch, context, self.say, devices=devices)
 
         def imagine(context: Frames, control: Any, camera: Camera, seeds_B2: np.ndarray) -> Frames:
             del camera
@@ -129,7 +136,7 @@ class Scorer:
     def truth(self, out: Path) -> Arrays:
         """Return the truth's own logits, and the ceiling and floor of SRC."""
         found = Partials(out / SCORES, "no weights", self.name)
-        kept = found.get("truth")
+        kept = found.get(TRUTH)
         if kept is not None:
             return kept
         parts: dict[str, list[np.ndarray]] = {}
@@ -138,7 +145,10 @@ class Scorer:
                 for key, values in self._truth_of(batch).items():
                     parts.setdefault(key, []).append(values[: batch.real])
                 meter.advance(batch.real)
-        return found.put("truth", **{key: np.concatenate(each) for key, each in parts.items()})
+        whole = {key: np.concatenate(each) for key, each in parts.items()}
+        if "walks" in whole:
+            whole |= self._consistency(whole.pop("walks"))
+        return found.put(TRUTH, **whole)
 
     def _truth_of(self, batch: Batch) -> Arrays:
         video = _joined(batch.context, batch.targets)
@@ -146,11 +156,19 @@ class Scorer:
         if "fvd" in self.nets:
             values["logits"] = self.nets["fvd"].features(video)
         if SRC in self.nets:
-            back = _there_and_back(video, self.frames // 2)
-            score = self.nets[SRC].score(back, back)
-            values["src_ceiling"] = np.asarray(score.ceiling_B)
-            values["src_floor"] = np.asarray(score.floor_B)
+            values["walks"] = _there_and_back(video, self.frames // 2)
         return values
+
+    def _consistency(self, walks_CTHWC: np.ndarray) -> Arrays:
+        """Return SRC of the truth, and of each walk with the next clip's way back."""
+        out, back = (np.asarray(way) for way in ways(walks_CTHWC))
+        size, compare = self.config.evaluate.batch, self.nets[SRC].compare
+        found = {}
+        for name, other in (("src_ceiling", back), ("src_floor", np.roll(back, 1, 0))):
+            firsts = range(0, len(out), size)
+            parts = [compare(other[at : at + size], out[at : at + size]) for at in firsts]
+            found[name] = np.concatenate([np.asarray(part) for part in parts])
+        return found
 
     def _score(self, imagine: Model, label: str) -> Arrays:
         parts: dict[str, list[np.ndarray]] = {}
@@ -206,7 +224,7 @@ def open_scorer(
     split = Path(config.data.path) / config.evaluate.split
     episodes = EpisodeSource(split)
     clips = decide(config, episodes, protocol, str(split))[1]
-    nets, left_out = _measures(config, weights)
+    nets, left_out = _measures(config, weights, len(clips))
     for sentence in left_out.values():
         say(sentence)
     size = config.evaluate.batch
@@ -227,7 +245,7 @@ def open_scorer(
 
 
 def _measures(
-    config: Config, weights: Mapping[str, str | Path] | None
+    config: Config, weights: Mapping[str, str | Path] | None, clips: int
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the measures that need weights and can be taken, and why others cannot."""
     nets, left_out = load_all(NETWORKS, weights)
@@ -243,6 +261,9 @@ def _measures(
         if nets.pop(name, None) is not None:
             size = f"{SHORTEST} frames or more, and these have {clip.frames}"
             left_out[name] = f"{name} is left out: I3D needs clips of {size}."
+    for name in ("fvd", "kvd") if clips < 2 else ():
+        if nets.pop(name, None) is not None:
+            left_out[name] = f"{name} is left out: it compares sets, and there is one clip."
     return nets, left_out
 
 

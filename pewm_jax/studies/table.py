@@ -15,17 +15,22 @@ from pewm_jax.studies.scorer import SRC, Arrays
 
 SETS = ("fvd", "kvd")
 """Measures of whole sets of clips, which have no number per clip."""
-LOWER = ("lpips", "dreamsim", "depth_mae", "depth_rel", *SETS)
+LOWER = ("lpips", "dreamsim", "depth_mae", "depth_rel", *SETS, "fvd_half", "kvd_half")
 """Measures of which less is better."""
 CHAIN = (
     "none",
+    "none-attend",
     "images-attend",
     "voxel-attend-without_depth",
     "map2d-attend",
+    "voxel-attend",
     "voxel-attend-sinusoid",
 )
-"""The paper's order, worst first."""
-AGAINST = ("none", "voxel-attend-sinusoid", "voxel-attend", "reproject")
+"""The paper's order, worst first, like beside like: the second is a reader with nothing to read,
+and all read with projective positions but the last, which is the paper's own form."""
+GAP = "psnr/seen - unseen"
+"""How much better seen pixels are; of interest as a difference between rows: what a memory adds."""
+AGAINST = ("none", "none-attend", "voxel-attend", "reproject", "copy")
 """What every row is compared with, clip by clip."""
 
 
@@ -37,6 +42,7 @@ def by_clip(arrays: Arrays) -> dict[str, np.ndarray]:
         for metric, values in by_metric.items()
         if metric != "lpips" or mask == MASKS[-1]
     }
+    found[GAP] = found["psnr/seen"] - found["psnr/unseen"]
     found |= {name: arrays[name] for name in ("src", "dreamsim") if name in arrays}
     return found
 
@@ -51,6 +57,7 @@ def summary(
     truth: Arrays,
     houses_C: np.ndarray,
     nets: Mapping[str, Any],
+    frames: int = 0,
 ) -> dict[str, Any]:
     """Turn scores into the numbers of the table.
 
@@ -59,17 +66,19 @@ def summary(
         truth: from ``Scorer.truth``.
         houses_C: the number of each clip's house.
         nets: the measures that need weights.
+        frames: of the clips that FVD and KVD are of, for their names.
 
     Returns:
         ``rows[name]``: ``seeds``; ``measures[name]`` as ``intervals.entry`` (training seeds are
         averaged within a clip), with ``over_seeds`` where there are several; ``per_frame``; ``fvd``
-        and ``kvd`` with ``per_seed``. ``floors``; and ``differences[against][row][measure]``,
-        paired, row − against, with both intervals.
+        and ``kvd`` of all clips and ``fvd_half`` and ``kvd_half``, which are to be compared with
+        the floor, with ``per_seed``. ``floors``, with the ``name`` of what has so many clips; and
+        ``differences[against][row][measure]``, paired, row − against, with both intervals.
     """
     values = {name: _stacked([by_clip(each) for each in group]) for name, group in pieces.items()}
     rows: dict[str, Any] = {}
     for name, group in pieces.items():
-        frames = _stacked([per_frame(each) for each in group])
+        by_frame = _stacked([per_frame(each) for each in group])
         rows[name] = {
             "seeds": len(group),
             "measures": {
@@ -77,12 +86,12 @@ def summary(
             },
             "per_frame": {
                 measure: intervals.entry(values_KCT.mean(0), houses_C)
-                for measure, values_KCT in frames.items()
+                for measure, values_KCT in by_frame.items()
             },
         }
         for kind in SETS:
             if kind in nets and "logits" in truth:
-                rows[name]["measures"][kind] = _set_distance(nets[kind], group, truth)
+                rows[name]["measures"] |= _set_distances(kind, nets[kind], group, truth)
     floors: dict[str, Any] = {}
     if "src_floor" in truth:
         floors[SRC] = {
@@ -93,6 +102,7 @@ def summary(
         if kind in nets and "logits" in truth:
             score = nets[kind].score(truth["logits"], truth["logits"])
             floors[kind] = {"floor": score.facts()["floor"], "half_clips": score.half_clips}
+            floors[kind]["name"] = nets[kind].name(frames, score.half_clips)
     differences = {
         against: {
             name: _differences(values[name], values[against], houses_C)
@@ -128,17 +138,29 @@ def _entry(values_KC: np.ndarray, houses_C: np.ndarray) -> dict[str, Any]:
     return found
 
 
-def _set_distance(net: Any, group: Sequence[Arrays], truth: Arrays) -> dict[str, Any]:
-    """Return FVD or KVD of each training seed, their mean and Student's interval."""
-    per_seed = [float(net.distance(each["logits"], truth["logits"])) for each in group]
-    over = intervals.over_seeds(per_seed)
-    return {"mean": over["mean"], "per_seed": per_seed, "over_seeds": over}
+def _set_distances(
+    kind: str, net: Any, group: Sequence[Arrays], truth: Arrays
+) -> dict[str, dict[str, Any]]:
+    """Return FVD or KVD of each training seed, their mean and Student's interval; and of halves."""
+    found = [net.score(each["logits"], truth["logits"]) for each in group]
+    values = {kind: [float(score.value) for score in found]}
+    if all(score.half is not None for score in found):
+        values[f"{kind}_half"] = [float(score.half.mean) for score in found]
+    entries = {}
+    for name, per_seed in values.items():
+        over = intervals.over_seeds(per_seed)
+        entries[name] = {"mean": over["mean"], "per_seed": per_seed, "over_seeds": over}
+    return entries
 
 
 def _differences(
     first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray], houses_C: np.ndarray
 ) -> dict[str, Any]:
-    """Return first − second, clip by clip; what has no training seeds counts for each."""
+    """Return first − second, clip by clip, and over training seeds.
+
+    Rows of one training seed share a backbone and are paired; what has no network, and thus no
+    seeds, counts for each.
+    """
     found = {}
     for measure in first:
         if measure not in second:
@@ -149,6 +171,7 @@ def _differences(
             [float(intervals.over_houses(one_C, houses_C)["mean"]) for one_C in group]
             for group in (a_KC, b_KC)
         ]
-        if np.isfinite(np.concatenate(means)).all() and min(map(len, means)) > 1:
-            found[measure]["over_seeds"] = intervals.over_seeds(*means)
+        if np.isfinite(np.concatenate(means)).all() and max(map(len, means)) > 1:
+            apart = np.subtract(*np.broadcast_arrays(*means))
+            found[measure]["over_seeds"] = intervals.over_seeds(apart.tolist())
     return found

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pewm_jax import atomic
-from pewm_jax.config import Config, UserError
+from pewm_jax.config import Config, ModelConfig, UserError
 from pewm_jax.evaluation import intervals
 from pewm_jax.studies import recorded, table, table_page, timing
 from pewm_jax.studies import rows as table_rows
@@ -67,8 +67,10 @@ def run(
         Interrupted: what is done is kept; the same call goes on.
     """
     chosen = _rows(base, only, ablation, values)
-    if not seeds or len(set(seeds)) < len(seeds):
-        raise UserError(f"seeds are {list(seeds)}: give each training seed once, one at least.")
+    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
+        raise UserError(
+            f"seeds are {list(seeds)}: give each training seed once, one at least, from 0 on."
+        )
     study = Study(base, out, minutes, steps)
     scorer = open_scorer(base, out, say, weights)
     title = "-".join(["table1", *([ablation] if ablation else []), *(["part"] if only else [])])
@@ -87,7 +89,7 @@ def run(
                 group = pieces.setdefault(name, [])
                 if len(group) == number:
                     group.append(arrays)
-        numbers = table.summary(pieces, truth, scorer.house_of_clip, scorer.nets)
+        numbers = table.summary(pieces, truth, scorer.house_of_clip, scorer.nets, scorer.frames)
         facts = _facts(study, scorer, chosen, plan, seeds[: number + 1], ablation)
         results = {"about": facts, **numbers}
         text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
@@ -100,6 +102,13 @@ def run(
 def _rows(
     base: Config, only: Sequence[str], ablation: str, values: tuple[str, ...]
 ) -> tuple[Row, ...]:
+    if type(base.model) is not ModelConfig:
+        raise UserError(
+            f"the settings are of a {type(base.model).__name__}, and Table 1 compares memories of "
+            "the world pewm: name a preset of that, such as table1."
+        )
+    if ablation and only:
+        raise UserError("rows are of the table, and not of an ablation: leave them out.")
     if ablation:
         return table_rows.ablated(base, ablation, values)
     if values:
@@ -125,13 +134,15 @@ def _one(
     if before is not None and not study.folder(row.name, seed).exists():
         say(f"{row.name}, training seed {seed}: its scores are recorded in {file.parent}")
         return before
+    others = [] if before else sorted(file.parent.glob(f"seed{seed}-{row.name}-????????????.npz"))
+    if others:
+        say(f"{others[0]} is of other settings, data, weights or code, and is left aside")
     config = train(study, row, seed, steps, say)
-    found = {row.name: scorer.row(config, memory=row.remembers)}
+    found = {row.name: scorer.row(config, memory=row.reads)}
     if row.depth:
         first = settings(study, backbone_of(study.base, row), seed, plan[EMPTY]["steps"], start="")
         found[EMPTY] = scorer.row(first, memory=False)
-    if before is None:
-        recorded.write(file, found)
+    recorded.write(file, found)
     return found
 
 
@@ -153,7 +164,7 @@ def read_hours(path: Path) -> dict[str, tuple[float, float]]:
     """Return for each piece its hours on the clock and of the processor."""
     try:
         return {name: (pair[0], pair[1]) for name, pair in json.loads(path.read_text()).items()}
-    except (FileNotFoundError, ValueError):
+    except (FileNotFoundError, ValueError, AttributeError, TypeError, LookupError):
         return {}
 
 
@@ -175,7 +186,7 @@ def _facts(
             "paper": row.paper,
             "depth": row.depth,
             "times": row.times,
-            "parameters": table_rows.parameters(study.base, row.memory) if row.remembers else 0,
+            "parameters": table_rows.parameters(study.base, row.memory) if row.reads else 0,
             "settings": dataclasses.asdict(row.memory),
         }
         for row in rows
@@ -190,6 +201,7 @@ def _facts(
         "protocol_sha256": scorer.protocol.sha256,
         "clips": len(scorer.protocol.clips),
         "houses": len(set(scorer.house_of_clip.tolist())),
+        "house": scorer.house,
         "frames": scorer.frames,
         "pixels": [study.base.model.clip.height, study.base.model.clip.width],
         "clock": "processor" if timing.clock() is time.process_time else "wall",

@@ -1,34 +1,17 @@
-"""Table 1 for readers: Markdown, LaTeX, CSV and a picture, with the paper's numbers beside ours."""
+"""Table 1 for readers: the page in Markdown, with the paper's numbers beside ours."""
 
 from __future__ import annotations
 
-import csv
-import io
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image, ImageDraw
-
 from pewm_jax import atomic
 from pewm_jax.evaluation import pictures
-from pewm_jax.studies.table import LOWER
+from pewm_jax.studies.table import GAP, LOWER, SETS
+from pewm_jax.studies.table_cells import COLUMNS, best_of, cell, columns_of, heading, label, rows_of
+from pewm_jax.studies.table_formats import as_csv, latex, plot
 
-COLUMNS: Mapping[str, tuple[str, int]] = {
-    "psnr/seen": ("PSNR seen, dB", 2),
-    "psnr/unseen": ("PSNR unseen, dB", 2),
-    "psnr/all": ("PSNR, dB", 2),
-    "ssim/all": ("SSIM", 3),
-    "lpips/all": ("LPIPS", 3),
-    "fvd": ("FVD", 1),
-    "kvd": ("KVD", 2),
-    "dreamsim": ("DreamSim", 3),
-    "src": ("SRC[alex]", 1),
-    "depth_mae/all": ("depth, m", 3),
-}
-"""Measure → heading, decimals."""
 PAPER: Mapping[str, tuple[float, ...]] = {
     "NWM": (17.479, 0.657, 0.308, 194.0, 0.247, 63.4),
     "Image Memory": (18.977, 0.678, 0.271, 124.0, 0.184, 69.4),
@@ -38,14 +21,21 @@ PAPER: Mapping[str, tuple[float, ...]] = {
 }
 """The paper's Table 1 (arXiv 2505.05495): PSNR, SSIM, LPIPS, FVD, DreamSim, SRC."""
 PAPER_HEADINGS = ("PSNR, dB", "SSIM", "LPIPS", "FVD", "DreamSim", "SRC")
-OURS = ("psnr/all", "ssim/all", "lpips/all", "fvd", "dreamsim", "src")
+OURS = ("psnr/all", "ssim/all", "lpips/all", "fvd_half", "dreamsim", "src")
 """Our measure in the place of each of the paper's."""
+STEP_MEASURES: Mapping[str, int] = {"psnr/seen": 2, "psnr/unseen": 2, GAP: 2, "lpips/all": 3}
+"""Measures whose differences are shown → decimals; beside them that of seeds."""
+STEP_HEADINGS = (
+    *("PSNR seen, dB", "PSNR unseen, dB", "seen − unseen, dB", "LPIPS[alex]"),
+    "PSNR seen, over training seeds",
+)
 NOT_COMPARABLE = (
     "The numbers of the paper are of 512 × 512 pictures of scanned houses, a model of about 3 "
     "billion parameters trained on 8 GPUs for days, DINOv2 features, and an FVD and an LPIPS whose "
     "networks are not named; ours are of small pictures and a small model (above). Only the order "
-    "of the rows, and the signs of differences, can be compared. SRC is by AlexNet here and by "
-    "DINOv2 there."
+    "of the rows, and the signs of differences, can be compared. LPIPS and SRC are by AlexNet "
+    "here; SRC is by DINOv2 there, over clips imagined one after the other with the map growing "
+    "between them, and here over a way out and back within one clip: it says nothing of memory."
 )
 
 
@@ -57,77 +47,31 @@ def write(results: Mapping[str, Any], page: Path) -> None:
     pictures.save_png(page.with_suffix(".png"), plot(results))
 
 
-def _order(results: Mapping[str, Any]) -> list[str]:
-    """Return the rows: those of the table as listed, then the backbone, then without a network."""
-    listed = list(results["about"]["rows"])
-    return [*listed, *(name for name in results["rows"] if name not in listed)]
-
-
-def _columns(results: Mapping[str, Any]) -> list[str]:
-    rows = results["rows"].values()
-    return [name for name in COLUMNS if any(name in row["measures"] for row in rows)]
-
-
-def label(results: Mapping[str, Any], name: str) -> str:
-    """Return a row's name for people."""
-    known = {
-        "backbone": "(the backbone alone: every memory, empty)",
-        "reproject": "reprojection, no network",
-        "copy": "copying the last frame",
-    }
-    described = results["about"]["rows"].get(name)
-    return described["label"].replace("_", " ") if described else known.get(name, name)
-
-
-def _cell(results: Mapping[str, Any], name: str, measure: str) -> tuple[str, str]:
-    """Return a number and half its interval, as words; "–" where there is none."""
-    about = results["about"]["rows"].get(name, {})
-    entry = results["rows"][name]["measures"].get(measure)
-    blind = measure.startswith("depth") and about.get("depth") is False
-    if entry is None or entry["mean"] is None or blind:
-        return "–", ""
-    decimals = COLUMNS[measure][1]
-    over = entry if "low" in entry else entry["over_seeds"]
-    half = ""
-    if over["low"] is not None:
-        half = f"{(over['high'] - over['low']) / 2:.{decimals}f}"
-    return f"{entry['mean']:.{decimals}f}", half
-
-
-def _best(results: Mapping[str, Any], names: Sequence[str], measure: str) -> str:
-    """Return the row with the best number among the trained ones."""
-    known = [
-        (results["rows"][name]["measures"][measure]["mean"], name)
-        for name in names
-        if name in results["about"]["rows"] and _cell(results, name, measure)[0] != "–"
-    ]
-    if not known or measure == "src":  # a model that always shows one picture is consistent too
-        return ""
-    lower = measure.split("/", 1)[0] in LOWER
-    return (min if lower else max)(known)[1]
-
-
 def markdown(results: Mapping[str, Any], stem: str) -> str:
     """Return the page."""
-    about, names, columns = results["about"], _order(results), _columns(results)
-    best = {measure: _best(results, names, measure) for measure in columns}
+    about, names, columns = results["about"], rows_of(results), columns_of(results)
+    best = {measure: best_of(results, names, measure) for measure in columns}
     lines = []
     for name in names:
         cells = []
         for measure in columns:
-            mean, half = _cell(results, name, measure)
+            mean, half = cell(results, name, measure)
             text = f"{mean} ± {half}" if half else mean
             cells.append(f"**{text}**" if best[measure] == name else text)
         lines.append([label(results, name), *cells])
+    lines.append(["the truth against itself", *(_floor(results, measure) for measure in columns)])
     parts = [
         _title(about),
         how(results),
-        _table(["memory · reader", *(COLUMNS[m][0] for m in columns)], lines),
+        _table(["memory · reader", *(heading(results, m) for m in columns)], lines),
         _floors(results),
+        _unbeaten(results),
         f"![PSNR over pixels seen before, with intervals]({stem}.png)",
     ]
     if not about["ablation"]:
-        parts += [_order_text(results), _paper(results)]
+        parts += [_order_text(results), _against(results, "none-attend"), _paper(results)]
+    else:
+        parts += [_against(results, "voxel-attend")]
     parts += [_trainings(about)]
     parts += [f"- {sentence}" for sentence in about["left_out"].values()]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -144,16 +88,18 @@ def how(results: Mapping[str, Any]) -> str:
     if about["minutes"]:
         first, second = about["minutes"]
         clock = "processor " if about["clock"] == "processor" else ""
-        equal = f"equal time ({first:g} + {second:g} {clock}minutes of training steps)"
+        times = sorted({row["times"] for row in about["rows"].values()} - {1})
+        but = "".join(f", {time:g} times as long for one row" for time in times)
+        equal = f"equal time ({first:g} + {second:g} {clock}minutes of training steps{but})"
     return (
         f"{len(about['seeds'])} training seed(s), {equal}, batches of {about['batch']}; "
         f"pictures of {size[0]} × {size[1]}; {about['clips']} clips of {about['frames'] - 1} "
-        f"imagined frames in {about['houses']} held-out houses, {about['context']} "
-        "frames of context. Means over houses; ± is half of "
-        "the 95 % interval over houses (bootstrap), of FVD and KVD over training seeds "
-        f"(Student's). Protocol {about['protocol_sha256'][:12]}. The run took "
-        f"{about['hours']['clock']:.1f} hours on the clock, {about['hours']['cpu']:.1f} of the "
-        f"processor; {about['date']}."
+        f"imagined frames in {about['houses']} {about['house']}s, {about['context']} "
+        f"frames of context. Means over {about['house']}s; ± is half of "
+        f"the 95 % interval over {about['house']}s (bootstrap), of FVD and KVD over training seeds "
+        f"(Student's). Protocol {about['protocol_sha256'][:12]}. The pieces took "
+        f"{about['hours']['clock']:.1f} hours on the clock, added up, {about['hours']['cpu']:.1f} "
+        f"of the processor; {about['date']}."
     )
 
 
@@ -164,13 +110,12 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _floors(results: Mapping[str, Any]) -> str:
     floors, said = results["floors"], []
-    for kind in ("fvd", "kvd"):
-        if kind in floors and floors[kind]["floor"]:
-            spread, half = floors[kind]["floor"], floors[kind]["half_clips"]
-            said.append(
-                f"{kind.upper()} of the truth against the truth, {half} clips on each side: "
-                f"{spread['mean']:.4g}."
-            )
+    halves = [floors[kind]["half_clips"] for kind in SETS if floors.get(kind, {}).get("floor")]
+    if halves:
+        said.append(
+            f"FVD and KVD compare {halves[0]} imagined clips with the truth of as many others, "
+            "means over random halves, and so does their floor, the truth against itself."
+        )
     if "src[alex]" in floors:
         src = floors["src[alex]"]
         said.append(
@@ -180,26 +125,74 @@ def _floors(results: Mapping[str, Any]) -> str:
     return " ".join(said)
 
 
+def _floor(results: Mapping[str, Any], measure: str) -> str:
+    """Return what the truth itself gets, as words."""
+    found = results["floors"].get(measure.removesuffix("_half"), {}).get("floor")
+    if measure == "src" and "src[alex]" in results["floors"]:
+        return f"{results['floors']['src[alex]']['ceiling']:.{COLUMNS[measure][1]}f}"
+    return f"{found['mean']:.{COLUMNS[measure][1]}f}" if found else "–"
+
+
+def _unbeaten(results: Mapping[str, Any]) -> str:
+    """Say on which measures no trained row reaches what needs no network."""
+    said = []
+    for rival in ("reproject", "copy"):
+        theirs = results["rows"].get(rival, {"measures": {}})["measures"]
+        better = []
+        for measure in columns_of(results):
+            best, other = best_of(results, rows_of(results), measure), theirs.get(measure)
+            if not best or other is None or other["mean"] is None:
+                continue
+            apart = other["mean"] - results["rows"][best]["measures"][measure]["mean"]
+            if (-apart if measure.split("/")[0] in LOWER else apart) > 0:
+                better.append(heading(results, measure))
+        if better:
+            said.append(f"{label(results, rival)} is better in {', '.join(better)}")
+    if not said:
+        return ""
+    return f"Without a network, and better than every trained row: {'; '.join(said)}."
+
+
+def _against(results: Mapping[str, Any], rival: str) -> str:
+    """Return every trained row's differences from one of them, paired by clip."""
+    if rival not in results["differences"]:
+        return ""
+    rows = []
+    for name, found in results["differences"][rival].items():
+        if name in results["about"]["rows"]:
+            rows.append([label(results, name), *_cells_of(found)])
+    return (
+        f"## Each row minus {label(results, rival)}\n\nPaired by clip, with 95 % intervals.\n\n"
+        + _table(["row", *STEP_HEADINGS], rows)
+    )
+
+
+def _cells_of(differences: Mapping[str, Any]) -> list[str]:
+    """Return the differences that count, as words."""
+    cells = []
+    for measure, decimals in STEP_MEASURES.items():
+        found = differences.get(measure)
+        cells.append(_signed(found, decimals) if found else "–")
+    over = differences["psnr/seen"].get("over_seeds")
+    return [*cells, _signed(over, 2) if over else "–"]
+
+
 def _order_text(results: Mapping[str, Any]) -> str:
     """Return the paper's order, step by step, with differences over pixels seen before."""
     if not results["order"]:
         return ""
     rows = []
     for step in results["order"]:
-        cells = [
-            f"{label(results, step['better'])} − {label(results, step['worse'])}",
-        ]
-        for measure in ("psnr/seen", "psnr/all", "lpips/all"):
-            found = step["differences"].get(measure)
-            cells.append(_signed(found, COLUMNS[measure][1]) if found else "–")
-        over = step["differences"]["psnr/seen"].get("over_seeds")
-        cells.append(_signed(over, 2) if over else "–")
-        rows.append(cells)
-    header = ["step of the paper's order", "PSNR seen, dB", "PSNR, dB", "LPIPS"]
-    text = _table([*header, "PSNR seen, over training seeds"], rows)
+        words = f"{label(results, step['better'])} − {label(results, step['worse'])}"
+        rows.append([words, *_cells_of(step["differences"])])
+    text = _table(["step of the paper's order", *STEP_HEADINGS], rows)
     return (
         "## The paper's order\n\nThe paper has no memory < image memory < no depth < 2D map < 3D "
-        f"map. Each step here, paired by clip, with 95 % intervals:\n\n{text}"
+        "map. Each step here, paired by clip, with 95 % intervals. *None · attend* is ours: a "
+        "reader that was trained as long with nothing to read. All readers place what they read by "
+        "projection; the last step goes to the paper's own positions, a sinusoid. What a memory "
+        "adds shows in seen minus unseen pixels: what helps both alike is no memory.\n\n"
+        f"{text}"
     )
 
 
@@ -217,7 +210,7 @@ def _paper(results: Mapping[str, Any]) -> str:
     for name, described in results["about"]["rows"].items():
         if described["paper"]:
             theirs = PAPER[described["paper"]]
-            ours = [_cell(results, name, measure)[0] for measure in OURS]
+            ours = [cell(results, name, measure)[0] for measure in OURS]
             pairs = [f"{a:g} / {b}" for a, b in zip(theirs, ours, strict=True)]
             rows.append([described["paper"], label(results, name), *pairs])
     text = _table(["the paper's row", "ours", *PAPER_HEADINGS], rows)
@@ -233,77 +226,3 @@ def _trainings(about: Mapping[str, Any]) -> str:
         rows.append([name, count, took, str(training["steps"])])
     header = ["training", "parameters of the reader", "seconds a step", "steps"]
     return f"## What was trained\n\n{_table(header, rows)}"
-
-
-def latex(results: Mapping[str, Any]) -> str:
-    """Return the table for LaTeX, with booktabs."""
-    names, columns = _order(results), _columns(results)
-    best = {measure: _best(results, names, measure) for measure in columns}
-    arrows = {m: r"$\downarrow$" if m.split("/")[0] in LOWER else r"$\uparrow$" for m in columns}
-    head = " & ".join(["memory, reader", *(f"{COLUMNS[m][0]} {arrows[m]}" for m in columns)])
-    lines = [
-        r"\begin{tabular}{l" + "r" * len(columns) + "}",
-        r"\toprule",
-        head + r" \\",
-        r"\midrule",
-    ]
-    for name in names:
-        cells = []
-        for measure in columns:
-            mean, half = _cell(results, name, measure)
-            text = "--" if mean == "–" else mean + (rf" {{\tiny $\pm$ {half}}}" if half else "")
-            cells.append(rf"\textbf{{{text}}}" if best[measure] == name else text)
-        words = label(results, name).replace("·", "--")
-        lines.append(" & ".join([words, *cells]) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
-
-
-def as_csv(results: Mapping[str, Any]) -> str:
-    """Return every number of the table, a line for each row and measure."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["row", "measure", "mean", "low", "high", "seeds", "per_seed"])
-    for name in _order(results):
-        row = results["rows"][name]
-        for measure, entry in row["measures"].items():
-            over = entry if "low" in entry else entry["over_seeds"]
-            seeds = " ".join(f"{value:.6g}" for value in entry.get("per_seed", ()))
-            ends = (entry["mean"], over["low"], over["high"])
-            shown = ["" if value is None else f"{value:.6g}" for value in ends]
-            writer.writerow([name, measure, *shown, row["seeds"], seeds])
-    return file.getvalue()
-
-
-def plot(results: Mapping[str, Any], measure: str = "psnr/seen") -> np.ndarray:
-    """Draw a measure of every row with its interval; returns a (H, W, 3) uint8 picture."""
-    names = [n for n in _order(results) if results["rows"][n]["measures"][measure]["mean"]]
-    entries = [results["rows"][name]["measures"][measure] for name in names]
-    wide, tall, left, top = 900, 34, 330, 64
-    canvas = Image.new("RGB", (wide, top + tall * len(names) + 28), (255, 255, 255))
-    draw = ImageDraw.Draw(canvas)
-    ends = [(e["low"] or e["mean"], e["high"] or e["mean"]) for e in entries]
-    low = math.floor(min(end[0] for end in ends) - 0.2)
-    high = math.ceil(max(end[1] for end in ends) + 0.2)
-
-    def x(value: float) -> float:
-        return left + (value - low) / (high - low) * (wide - left - 150)
-
-    pictures.write(draw, (16, 20), "PSNR over pixels seen before, dB", size=17)
-    caption = "95 % intervals over houses; small dots are training seeds"
-    pictures.write(draw, (16, 44), caption, size=12)
-    bottom = top + tall * len(names)
-    for tick in range(low, high + 1):
-        draw.line([(x(tick), top), (x(tick), bottom)], fill=(228, 228, 228))
-        pictures.write(draw, (x(tick), bottom + 12), str(tick), anchor="mm")
-    for index, (name, entry, (start, end)) in enumerate(zip(names, entries, ends, strict=True)):
-        y = top + tall * index + tall / 2
-        trained = name in results["about"]["rows"]
-        colour = (44, 110, 170) if trained else (130, 130, 130)
-        pictures.write(draw, (left - 12, y), label(results, name), anchor="rm")
-        draw.line([(x(start), y), (x(end), y)], fill=colour, width=3)
-        for value in entry.get("per_seed", ()):
-            draw.ellipse([x(value) - 2, y + 6, x(value) + 2, y + 10], fill=colour)
-        middle = x(entry["mean"])
-        draw.ellipse([middle - 5, y - 5, middle + 5, y + 5], fill=colour)
-        pictures.write(draw, (x(end) + 10, y), f"{entry['mean']:.2f}", anchor="lm")
-    return np.asarray(canvas)

@@ -99,7 +99,7 @@ def _model(study: Study, row: Row) -> str:
     """Return a hash of what the time of a row's step depends on."""
     config = settings(study, row, 0, 1, start=UNREAD)
     assert isinstance(config.model, ModelConfig)
-    facts = [configuration.to_dict(config.model), STAGES[0].settings(config).batch, row.remembers]
+    facts = [configuration.to_dict(config.model), STAGES[0].settings(config).batch, row.reads]
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -132,7 +132,7 @@ def _measure(study: Study, models: dict[str, Row], say: Say) -> Times:
 def _compiled(study: Study, row: Row, say: Say) -> Callable[[], None]:
     """Compile a row's training step; returns a function that does one step, on random weights."""
     config = settings(study, row, 0, 1, start=UNREAD)
-    stage, mesh = STAGES[1 if row.remembers else 0], sharding.make_mesh(jax.devices()[:1])
+    stage, mesh = STAGES[1 if row.reads else 0], sharding.make_mesh(arranged=config.train.mesh)
     batch = next(iter(loader.clips(config, "train", seed=0, batch=stage.settings(config).batch)))
     key = jax.device_put(stage_key(config, stage), sharding.replicated(mesh))
     held = [initial_state(config, stage, mesh, None)]

@@ -81,6 +81,9 @@ def backbone_of(base: Config, row: Row) -> Row:
 def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Config:
     """Return the settings of one training.
 
+    What goes on training a backbone gets the clips that the readers of this seed get, and not once
+    more those of its backbone: clips are chosen by the seed and by the stage's number.
+
     Args:
         study: what all share.
         row: the row, or its backbone.
@@ -92,7 +95,7 @@ def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Co
     clip = dataclasses.replace(base.model.clip, depth=row.depth)
     stages: dict[str, StageConfig] = {}
     for stage in STAGES[:2]:
-        given, trained = stage.settings(base), stage.memory == row.remembers
+        given, trained = stage.settings(base), stage.memory == row.reads
         stages[stage.name] = dataclasses.replace(given, steps=steps if trained else 0)
     first = row.name.startswith("backbone")
     fresh = (r"(backbone|memory|control)/.*",) if first else (r"memory/.*",)
@@ -101,7 +104,7 @@ def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Co
         run=str(study.folder(row.name, seed)),
         start=start,
         fresh=fresh if start else (),
-        seed=seed,
+        seed=seed if first or row.reads else seed + 1,
         preview_every=0,
         **stages,
     )

@@ -21,10 +21,12 @@ HIGHER = ("psnr", "ssim")
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Random weights of AlexNet in a file of ours."""
-    path = tmp_path_factory.mktemp("weights") / "alex.safetensors"
-    weights.save(path, lpips.init("alex", jax.random.key(0)))
-    return {"lpips_alex": path}
+    """Random weights of LPIPS's networks in files of ours."""
+    folder = tmp_path_factory.mktemp("weights")
+    paths = {f"lpips_{net}": folder / f"{net}.safetensors" for net in ("alex", "vgg")}
+    weights.save(paths["lpips_alex"], lpips.init("alex", jax.random.key(0)))
+    weights.save(paths["lpips_vgg"], lpips.init("vgg", jax.random.key(0)))
+    return paths
 
 
 def clips(count=3, frames=2, size=(40, 33)):
@@ -47,17 +49,39 @@ def blurred(truth, size):
 
 
 @pytest.mark.parametrize("distort", [noisy, blurred])
-@pytest.mark.parametrize("name", ["psnr", "ssim", "lpips_alex"])
+@pytest.mark.parametrize("name", ["psnr", "ssim", "lpips_alex", "lpips_vgg"])
 def test_equal_clips_are_best_and_more_distortion_is_worse(name, distort, files):
     metric = metrics.load(name, files.get(name))
     truth = clips()
     found = [np.asarray(metric(truth, truth))]
     found += [np.asarray(metric(distort(truth, size), truth)) for size in (1, 4, 12)]
     assert found[0].shape == (3,)
-    best = {"psnr": 100, "ssim": 1, "lpips_alex": 0}[name]
+    best = {"psnr": 100, "ssim": 1}.get(name, 0)
     np.testing.assert_allclose(found[0], best, atol=1e-5)
     steps = np.diff(found, axis=0)
     assert (steps < 0).all() if name in HIGHER else (steps > 0).all()
+
+
+@pytest.mark.parametrize("name", ["depth_mae", "depth_rel"])
+def test_depth_is_compared_where_both_have_one(name):
+    metric = metrics.load(name)
+    truth = 2 + clips(3)[..., 0]
+    found = [np.asarray(metric(truth + np.float32(size), truth)) for size in (0, 0.1, 0.4)]
+    np.testing.assert_array_equal(found[0], 0)
+    assert (np.diff(found, axis=0) > 0).all()
+    if name == "depth_mae":
+        np.testing.assert_allclose(found[2], 0.4, rtol=1e-4)
+    holes = truth + np.float32(0.1)
+    holes[0], holes[1, :, :10], truth[1, :, 20:] = 0, 0, 0
+    some = np.asarray(metric(holes, truth))
+    assert np.isnan(some[0])
+    assert 0 < some[1] < 0.2
+    again = metric(holes[1:2, ..., None], truth[1:2, ..., None])
+    np.testing.assert_allclose(again, some[1:2], rtol=1e-5)
+    with pytest.raises(UserError, match="depths of shapes"):
+        metric(truth, truth[:, 1:])
+    with pytest.raises(UserError, match="depths of type int32"):
+        metric(truth.astype(np.int32), truth.astype(np.int32))
 
 
 @pytest.mark.parametrize("name", ["psnr", "ssim", "lpips_alex"])
@@ -89,6 +113,25 @@ def test_few_pictures_at_once_give_the_same_distances(files, monkeypatch):
     monkeypatch.setattr(perceptual, "PIXELS", 1)
     np.testing.assert_allclose(metric.frames(guess, truth), whole, rtol=1e-4)
     perceptual._distances.clear_cache()
+
+
+@pytest.mark.parametrize("kept", [2**28, 0])
+def test_a_truth_that_passed_the_network_before_gives_the_same_distances(files, monkeypatch, kept):
+    """And where its features would take too much room, they are made again."""
+    monkeypatch.setattr(perceptual, "KEPT", kept)
+    metric = metrics.load("lpips_alex", files["lpips_alex"])
+    assert isinstance(metric, metrics.Perceptual)
+    truth = clips(3)
+    codes = np.rint(127.5 * (truth + 1)).astype(np.uint8)
+    for given in (truth, codes):
+        to = metric.towards(given)
+        for guess in (np.roll(truth, 1, 0), np.roll(truth, 1, 1)):
+            np.testing.assert_allclose(to(guess), metric.frames(guess, given), rtol=1e-4)
+        np.testing.assert_allclose(to(given), 0, atol=1e-6)
+    with pytest.raises(UserError, match="cannot be compared"):
+        metric.towards(truth)(truth[:, 1:])
+    with pytest.raises(UserError, match="too small for LPIPS"):
+        metric.towards(truth[:, :, :8, :8])
 
 
 def test_what_cannot_work_is_refused_in_a_sentence(files, tmp_path, monkeypatch):

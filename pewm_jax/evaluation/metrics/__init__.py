@@ -12,6 +12,8 @@ psnr             higher decibels, of the mean squared error of all pixels of a c
 ssim             higher structural similarity, 11 × 11 Gaussian windows, averaged over a clip
 lpips_alex       lower  LPIPS with AlexNet, averaged over a clip's frames; pictures are not resized
 lpips_vgg        lower  LPIPS with VGG16, the same
+depth_mae        lower  mean error of depth, m; it takes depths (B, T, H, W) in the place of colours
+depth_rel        lower  the same, divided by the true depth
 dreamsim         lower  DreamSim (0.2, ensemble), averaged over a clip's frames
 fvd              lower  Fréchet distance of the 400 logits of I3D; 9 frames or more; with its floor
 kvd              lower  kernel distance of the same: no bias by the number of clips; may be negative
@@ -22,7 +24,7 @@ mirror[METRIC]   as     clips that go and come back: the way back against the wa
                  METRIC ``ssim``, ``lpips_alex`` or ``lpips_vgg``; with its floor and ceiling
 ================ ====== ===========================================================================
 
-Errors of depth are in ``evaluation.images.error_sums``.
+Errors over seen and over unseen pixels are in ``evaluation.images.error_sums``.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from pewm_jax.evaluation.metrics import dreams, similarity, videos
 from pewm_jax.evaluation.metrics.dreams import DreamSim
 from pewm_jax.evaluation.metrics.perceptual import Perceptual
 from pewm_jax.evaluation.metrics.perceptual import read as read_lpips
-from pewm_jax.evaluation.metrics.pictures import PLAIN, Metric
+from pewm_jax.evaluation.metrics.pictures import DEPTHS, PLAIN, Metric
 from pewm_jax.evaluation.metrics.revisits import Revisit, RevisitScore
 from pewm_jax.evaluation.metrics.similarity import Similarity
 from pewm_jax.evaluation.metrics.videos import SetScore, VideoDistance
@@ -62,6 +64,7 @@ _ENCODERS = {"src": "dinov2", "src[alex]": "alex", "src[vgg]": "vgg"}
 _PICTURES = (*PLAIN, *_NETS)
 NAMES = (
     *_PICTURES,
+    *DEPTHS,
     "dreamsim",
     *videos.DISTANCES,
     *_ENCODERS,
@@ -99,7 +102,7 @@ def load(name: str, weights: str | Path | None = None) -> Metric:
             return videos.read(i3d_weights.find(weights), kind)
     if weights is not None:
         raise UserError(f"the metric {name} is no network and takes no weights, got {weights}.")
-    return PLAIN[name]
+    return (PLAIN | DEPTHS)[name]
 
 
 def load_all(

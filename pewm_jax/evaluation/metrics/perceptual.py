@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -16,6 +17,8 @@ from pewm_jax.types import Array, Params
 
 PIXELS = 2**17
 """Pixels of imagined pictures that are in the network at once, or one picture if it has more."""
+KEPT = 2**28
+"""Bytes of the truth's features that are kept; where there are more, they are made each time."""
 OFF = "off"
 """The setting that leaves LPIPS out."""
 PACKAGED: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
@@ -50,6 +53,32 @@ class Perceptual:
         lpips.require_size(self.net, *imagined.shape[2:4])
         return _distances(self.net, self.params, imagined, truth)
 
+    def towards(self, truth_BTHWC: Array) -> Callable[[Array], Array]:
+        """Return ``frames`` from any clips to these, which pass through the network once.
+
+        Args:
+            truth_BTHWC: as of ``Metric``.
+
+        Returns:
+            ``imagined_BTHWC -> distances (B, T)``, which raises what ``frames`` raises.
+        """
+        made = jax.eval_shape(self.described, truth_BTHWC)
+        if sum(x.size * x.dtype.itemsize for x in made) > KEPT:
+            return lambda imagined_BTHWC: self.frames(imagined_BTHWC, truth_BTHWC)
+        described = self.described(truth_BTHWC)
+
+        def to(imagined_BTHWC: Array) -> Array:
+            imagined, _ = colours(imagined_BTHWC, truth_BTHWC)
+            return _to_described(self.net, self.params, imagined, described)
+
+        return to
+
+    def described(self, truth_BTHWC: Array) -> tuple[Array, ...]:
+        """Return ``lpips.describe`` of all pictures of some clips."""
+        truth, _ = colours(truth_BTHWC, truth_BTHWC)
+        lpips.require_size(self.net, *truth.shape[2:4])
+        return _described(self.net, self.params, truth)
+
     @property
     def about(self) -> str:
         """What is measured, for the protocol."""
@@ -70,8 +99,38 @@ def _distances(net: Net, params: Params, imagined_BTHWC: Array, truth_BTHWC: Arr
     def one(pair: tuple[Array, Array]) -> Array:
         return lpips.apply(net, params, pair[0][None], pair[1][None])[0]
 
-    at_once = max(1, PIXELS // (height * width))
-    return jax.lax.map(one, pairs, batch_size=at_once).reshape(clips, frames)
+    return jax.lax.map(one, pairs, batch_size=_at_once(pairs[0])).reshape(clips, frames)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _described(net: Net, params: Params, truth_BTHWC: Array) -> tuple[Array, ...]:
+    """Describe colours in [0, 1]; pictures first."""
+    pictures = 2 * truth_BTHWC.reshape(-1, *truth_BTHWC.shape[2:]) - 1
+
+    def one(picture: Array) -> tuple[Array, ...]:
+        return tuple(x[0] for x in lpips.describe(net, params, picture[None]))
+
+    return jax.lax.map(one, pictures, batch_size=_at_once(pictures))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _to_described(
+    net: Net, params: Params, imagined_BTHWC: Array, truth: tuple[Array, ...]
+) -> Array:
+    """Compare colours in [0, 1] with what was described."""
+    clips, frames = imagined_BTHWC.shape[:2]
+    pictures = 2 * imagined_BTHWC.reshape(-1, *imagined_BTHWC.shape[2:]) - 1
+
+    def one(pair: tuple[Array, tuple[Array, ...]]) -> Array:
+        mine = lpips.describe(net, params, pair[0][None])
+        return lpips.distance(params, mine, [x[None] for x in pair[1]])[0]
+
+    found = jax.lax.map(one, (pictures, truth), batch_size=_at_once(pictures))
+    return found.reshape(clips, frames)
+
+
+def _at_once(pictures_NHWC: Array) -> int:
+    return max(1, PIXELS // (pictures_NHWC.shape[1] * pictures_NHWC.shape[2]))
 
 
 def read(path: Path, net: Net | None = None) -> Perceptual:

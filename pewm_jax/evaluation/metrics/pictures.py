@@ -1,4 +1,4 @@
-"""Measures without a network: PSNR and SSIM of whole clips."""
+"""Measures without a network: PSNR and SSIM of whole clips, and errors of their depth."""
 
 from __future__ import annotations
 
@@ -74,4 +74,50 @@ def clip_ssim(imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
 
 
 PLAIN: dict[str, Metric] = {"psnr": clip_psnr, "ssim": clip_ssim}
-"""The metrics that need no weights."""
+"""The metrics of colours that need no weights."""
+
+
+@jax.jit
+def clip_depth_mae(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
+    """Return the mean absolute error, m, (B,), where both have a depth; NaN where none has.
+
+    Args:
+        imagined_BTHW: (B, T, H, W) or (B, T, H, W, 1) depths along the optical axis, m; 0 for none.
+        truth_BTHW: the same shape.
+
+    Raises:
+        UserError: the clips are not alike, or no floats.
+    """
+    imagined, truth, both = _depths(imagined_BTHW, truth_BTHW)
+    return _mean_where(both, jnp.abs(imagined - truth))
+
+
+@jax.jit
+def clip_depth_rel(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
+    """Return the mean of |d − d*| / d* (AbsRel; Eigen et al. 2014); see ``clip_depth_mae``."""
+    imagined, truth, both = _depths(imagined_BTHW, truth_BTHW)
+    return _mean_where(both, jnp.abs(imagined - truth) / jnp.where(both, truth, 1))
+
+
+def _depths(imagined_BTHW: Array, truth_BTHW: Array) -> tuple[Array, Array, Array]:
+    """Return both, and where both have a depth."""
+    imagined, truth = jnp.asarray(imagined_BTHW), jnp.asarray(truth_BTHW)
+    shaped = imagined.ndim == 4 or (imagined.ndim == 5 and imagined.shape[-1] == 1)
+    if imagined.shape != truth.shape or not shaped:
+        raise UserError(
+            f"depths of shapes {imagined.shape} and {truth.shape} cannot be compared: give both as "
+            "(B, T, H, W), metres."
+        )
+    for clip in (imagined, truth):
+        if not jnp.issubdtype(clip.dtype, jnp.floating):
+            raise UserError(f"depths of type {clip.dtype} are not known: give floats, metres.")
+    return imagined, truth, (imagined > 0) & (truth > 0)
+
+
+def _mean_where(mask_B: Array, values_B: Array) -> Array:
+    axes = tuple(range(1, mask_B.ndim))
+    return jnp.where(mask_B, values_B, 0).sum(axes) / mask_B.sum(axes)
+
+
+DEPTHS: dict[str, Metric] = {"depth_mae": clip_depth_mae, "depth_rel": clip_depth_rel}
+"""The metrics of depth, which take it in the place of colours."""
