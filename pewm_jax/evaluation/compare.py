@@ -57,6 +57,8 @@ class Report:
             "method": self.samples.own,
             "weights_sha256": said["weights_sha256"],
             "training_seed": said["training_seed"],
+            "sampler": said["sampler"],
+            "sampling_steps": said["sampling_steps"],
         }
 
 
@@ -189,12 +191,14 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
     reports = [*one, *two]
     nets = {report.metrics["protocol"]["lpips_weights_sha256"] for report in reports} - {None}
     skip = {"lpips"} if len(nets) > 1 else set()
+    measured = [_measured(group) for group in (one, two)]
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "protocol_sha256": one[0].protocol.sha256,
         "protocol": _facts(one[0]),
         "how": intervals.how(),
         "left_out": sorted(skip),
+        "measured_by_one": sorted((measured[0] ^ measured[1]) - skip),
     }
     sides = {"a": one, "b": two}
     for side, group in sides.items():
@@ -241,6 +245,12 @@ def _values(group: Sequence[Report], part: str, skip: set[str]) -> dict[str, dic
         }
         for mask in MASKS
     }
+
+
+def _measured(group: Sequence[Report]) -> set[str]:
+    """Return the metrics that all runs of a side have."""
+    tables = [report.samples.table("clips", report.samples.own) for report in group]
+    return set.intersection(*(set(table[MASKS[-1]]) for table in tables))
 
 
 def _map(function: Callable[..., Any], *tables: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

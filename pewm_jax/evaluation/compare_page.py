@@ -77,7 +77,17 @@ def sentences(content: Mapping[str, Any]) -> list[str]:
         if mask != "all"
         else f"Over all pixels: {outcome(content['differences']['clips'][mask], a, b)}"
         for mask in MASK_NAMES
-    ]
+    ] + _samplers(content)
+
+
+def _samplers(content: Mapping[str, Any]) -> list[str]:
+    """Say how each side samples, where that differs."""
+    steps, said = [], []
+    for side in ("a", "b"):
+        ways = [(run["sampling_steps"], run["sampler"]) for run in content[side]["runs"]]
+        steps.append(ways)
+        said.append(f"{side} imagines in {ways[0][0]} sampling steps ({ways[0][1]})")
+    return [] if len({way for ways in steps for way in ways}) == 1 else [f"{', '.join(said)}."]
 
 
 def outcome(entries: Mapping[str, Any], one: str, two: str) -> str:
@@ -163,6 +173,11 @@ def _scores(content: Mapping[str, Any]) -> str:
     left = "".join(
         f" {METRIC_NAMES[name][0]} is left out: the two were measured with different networks."
         for name in content["left_out"]
+    )
+    left += "".join(
+        f" {METRIC_NAMES[name][0]} is left out: only one of the two was measured with it."
+        for name in content["measured_by_one"]
+        if name in METRIC_NAMES
     )
     return (
         table(f"<th></th>{heads}<th>houses</th>", rows)
@@ -260,7 +275,10 @@ def _protocol(content: Mapping[str, Any]) -> str:
     items = [("protocol", content["protocol_sha256"])]
     items += [(key.replace("_", " "), value) for key, value in content["protocol"].items()]
     items += [
-        (f"{side}, training seed {run['training_seed']}", f"{run['run']}, {run['weights_sha256']}")
+        (
+            f"{side}, training seed {run['training_seed']}",
+            f"{run['run']}, {run['weights_sha256']}, {run['sampling_steps']} sampling steps",
+        )
         for side in ("a", "b")
         for run in content[side]["runs"]
     ]

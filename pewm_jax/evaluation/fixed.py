@@ -127,6 +127,17 @@ def chosen(
     return clips, long_choices(config, episodes)
 
 
+def shortened(config: Config, protocol: Protocol) -> str:
+    """Say that long rollouts are shorter than the settings ask, where they are; or ""."""
+    asked = config.evaluate.video_clips * (config.model.clip.frames - 1)
+    if protocol.long_horizon >= asked:
+        return ""
+    return (
+        f"long rollouts have {protocol.long_horizon} frames, and not the {asked} of "
+        "evaluate.video_clips: no walk of these data is long enough"
+    )
+
+
 def fix(
     config: Config,
     episodes: Sequence[Episode],

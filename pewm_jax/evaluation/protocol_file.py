@@ -25,6 +25,7 @@ from pewm_jax.evaluation.fixed import (
     fix,
     hash_of,
     lay,
+    shortened,
 )
 from pewm_jax.evaluation.protocol import VERSION
 
@@ -101,6 +102,8 @@ def write(config: Config, path: Path, say: Callable[[str], Any]) -> Protocol:
         f"{', '.join(map(str, protocol.seeds))}, {protocol.context} frames of context, stride "
         f"{protocol.stride}, driven by {protocol.control}"
     )
+    if short := shortened(config, protocol):
+        say(short)
     return protocol
 
 

@@ -17,7 +17,7 @@ from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import opened as runs
 from pewm_jax.evaluation import protocol_file, samples, steering
 from pewm_jax.evaluation.covered import score_coverage
-from pewm_jax.evaluation.fixed import decide
+from pewm_jax.evaluation.fixed import decide, shortened
 from pewm_jax.evaluation.gallery import ROWS, Gallery, make_gallery
 from pewm_jax.evaluation.imagine import Imagination, print_now
 from pewm_jax.evaluation.long_rollouts import LongRollouts, roll_long
@@ -136,6 +136,8 @@ def evaluate(
     protocol, clips, rollouts = decide(config, episodes, fixed, str(split))
     cameras = protocol.control == "cameras"
     say(f"protocol {protocol.sha256[:12]}: {len(clips)} clips, {len(rollouts)} long rollouts")
+    if not fixed and (short := shortened(config, protocol)):
+        say(short)
 
     def imagination(which: runs.Opened, settings: Config) -> Imagination:
         batch, context = config.evaluate.batch, config.data.context

@@ -46,7 +46,7 @@ def protocol(**changes):
     return dataclasses.replace(made, **changes)
 
 
-def report(folder, errors_SCT, *, chosen=None, seed=0, weights="w", pictures=2, **changes):
+def report(folder, errors_SCT, *, chosen=None, seed=0, weights="w", pictures=2, steps=4, **changes):
     """Write the report of a run whose colour errors are the given ones."""
     chosen = chosen or protocol()
     config = tiny(folder)
@@ -67,6 +67,7 @@ def report(folder, errors_SCT, *, chosen=None, seed=0, weights="w", pictures=2, 
         "seeds": list(chosen.seeds),
     }
     said = {**facts, "training_seed": seed, "config": configs.to_dict(config)}
+    said |= {"sampler": "ddim", "sampling_steps": steps}
     where = folder / "report"
     (where / "rows").mkdir(parents=True)
     samples.save(where, samples.gather(Scored(choices, sums), long, **facts))
@@ -214,6 +215,23 @@ def test_lpips_of_different_networks_is_left_out(tmp_path, errors):
     assert "different networks" in apart.read_text()
     same = compare.compare(tmp_path / "a", tmp_path / "a", say=lambda _: None)
     assert content(same)["differences"]["clips"]["all"]["lpips"]["mean"] == 0
+    report(tmp_path / "c", errors)
+    one = compare.compare(tmp_path / "a", tmp_path / "c", say=lambda _: None)
+    assert content(one)["measured_by_one"] == ["lpips"]
+    assert "only one of the two was measured with it" in one.read_text()
+
+
+def test_sides_that_sample_differently_are_told_apart(tmp_path, errors):
+    said = []
+    for name, steps in (("a", 4), ("b", 2), ("c", 4)):
+        report(tmp_path / name, errors, steps=steps)
+    page = compare.compare(tmp_path / "a", tmp_path / "b", say=said.append)
+    words = "a imagines in 4 sampling steps (ddim), b imagines in 2 sampling steps (ddim)."
+    assert said[-1] == words
+    assert words in page.read_text()
+    said.clear()
+    compare.compare(tmp_path / "a", tmp_path / "c", say=said.append)
+    assert not any("sampling steps" in line for line in said)
 
 
 def test_samples_give_back_what_was_kept(tmp_path, errors):

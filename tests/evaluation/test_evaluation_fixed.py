@@ -72,6 +72,16 @@ def test_every_choice_changes_the_hash(episodes, tmp_path):
     assert others[0].pieces_sha256 != base.pieces_sha256
 
 
+def test_rollouts_shorter_than_asked_are_said(episodes, tmp_path):
+    config = tiny(tmp_path)
+    made = protocol(config, episodes)
+    assert fixed.shortened(config, made) == ""
+    more = dataclasses.replace(config.evaluate, video_clips=1000)
+    asked = dataclasses.replace(config, evaluate=more)
+    again = protocol(asked, episodes)
+    assert f"have {again.long_horizon} frames, and not the " in fixed.shortened(asked, again)
+
+
 def test_what_is_not_chosen_does_not_change_the_hash(episodes, tmp_path):
     config = tiny(tmp_path)
     evaluate = dataclasses.replace(config.evaluate, batch=3, videos=2, lpips="off", none="runs/x")
