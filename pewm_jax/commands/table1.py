@@ -39,7 +39,8 @@ class Settings:
     ablate: Literal["cell", "extent", "tokens", "features", "time"] | None = None
     """Instead of the table vary a setting of the voxel map that attention reads: side of a cell on
     the ground, m; side of the map, m; tokens that condition a clip; what a cell holds (colours,
-    latents or points); or train the paper's own form longer (times the others' time)."""
+    latents, points, or dinov2=FOLDER of `convert import dinov2`); or train the paper's own form
+    longer (times the others' time)."""
     values: tuple[str, ...] = ()
     """Values to try in the place of the ablation's own."""
     clips: int | None = None

@@ -49,6 +49,7 @@ def path(study: Study, row: Row, seed: int, steps: Mapping[str, int], scored: st
         file_hash(Path(study.base.data.path) / "train" / MANIFEST),
         file_hash(shipped.find(start) / WEIGHTS) if start else "",
     ]
+    facts += [file_hash(Path(row.encoder) / WEIGHTS)] if row.encoder else []
     for which in (backbone_of(study.base, row), row):
         config = settings(study, which, seed, steps[which.name], start="x")
         facts.append({k: v for k, v in identity(config).items() if k not in ELSEWHERE})

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ import jax
 from pewm_jax.config import (
     AttentionConfig,
     Config,
+    DINOv2EncoderConfig,
     ImagesConfig,
     LatentsConfig,
     Map2DConfig,
@@ -30,13 +32,15 @@ from pewm_jax.config import (
     UserError,
     VoxelConfig,
 )
-from pewm_jax.models import world_model
+from pewm_jax.models import dinov2, world_model
 
 POINTS, SURFELS = (0.4, 4), (0.12, 24)
 """Size of a cell over the shortest side of a voxel, and capacity over that of voxels."""
 PATCHES = 64
 """Tokens of a snapshot in the image memory, at least."""
 PAPER_FORM = "voxel-attend-sinusoid"
+NETWORK = "dinov2="
+"""Begins the value of the ablation of features that names a folder of DINOv2."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +55,7 @@ class Row:
         times: how many times the others' training time it gets.
         control: whether its reader is trained although there is nothing to read: what the readers'
             parameters and their training do without a memory.
+        encoder: folder of the weights of its image encoder, where that is a network.
     """
 
     name: str
@@ -59,6 +64,7 @@ class Row:
     paper: str = ""
     times: float = 1.0
     control: bool = False
+    encoder: str = ""
 
     @property
     def reads(self) -> bool:
@@ -197,8 +203,12 @@ def _tokens(base: Config, count: str) -> MemorySettings:
 
 
 def _features(base: Config, kind: str) -> MemorySettings:
-    """Other features in the map: colours of patches, the codec's latents, or none (points)."""
+    """Other features: colours of patches, the codec's latents, a DINOv2's, or none (points)."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    if kind.startswith(NETWORK):
+        network = dinov2.load(Path(kind.removeprefix(NETWORK)))[0]
+        side = memory.encoder.grid(base.model.clip)[0] * network.patch  # as many patches as colours
+        return dataclasses.replace(memory, encoder=DINOv2EncoderConfig(size=side, network=network))
     if kind == "points":
         return _as(memory, PointsConfig, memory.reader)
     if kind == "latents":
@@ -207,7 +217,9 @@ def _features(base: Config, kind: str) -> MemorySettings:
         return dataclasses.replace(memory, encoder=latents)
     if kind == "colours":
         return memory
-    raise UserError(f"there are no features {kind!r}; choose colours, latents or points.")
+    raise UserError(
+        f"there are no features {kind!r}; choose colours, latents, points or {NETWORK}FOLDER."
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,6 +276,8 @@ def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row,
             raise UserError(f"the ablation {name} cannot take {value!r}: give {ablation.about}.")
         start = PAPER_FORM if name == "time" else "voxel-attend"
         own = times == 1 if name == "time" else memory == plain
-        row = Row(start if own else f"{start}-{name}_{value}", memory, times=times)
-        found.append(row)
+        folder = value.removeprefix(NETWORK) if name == "features" and NETWORK in value else ""
+        words = f"{NETWORK[:-1]}_{Path(folder).name}" if folder else value
+        row_name = start if own else f"{start}-{name}_{words}"
+        found.append(Row(row_name, memory, times=times, encoder=folder))
     return tuple(found)

@@ -22,6 +22,7 @@ from pewm_jax.config import Config, NoMemoryConfig, StageConfig, UserError
 from pewm_jax.config.errors import require
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.models import dinov2
 from pewm_jax.studies.rows import Row
 from pewm_jax.training import loop
 from pewm_jax.training.runs import WEIGHTS
@@ -131,7 +132,8 @@ def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], say: Say)
     """
     before = backbone_of(study.base, row)
     start = str(_start(study)) if study.base.train.start else ""
-    for which, where in ((before, start), (row, str(study.folder(before.name, seed)))):
+    for which in (before, row):
+        where = start if which is before else str(_start_of(study, row, before, seed))
         config = settings(study, which, seed, steps[which.name], start=where)
         say(f"{which.name}, training seed {seed}: {steps[which.name]} steps")
         _require_same(config)
@@ -139,6 +141,23 @@ def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], say: Say)
         shutil.rmtree(study.folder(which.name, seed) / "checkpoints", ignore_errors=True)
         gc.collect()  # arrays, and programs that no other row needs
     return config
+
+
+def _start_of(study: Study, row: Row, before: Row, seed: int) -> Path:
+    """Return the weights that a row starts from: its backbone's, and those of its image encoder."""
+    backbone = study.folder(before.name, seed)
+    if not row.encoder:
+        return backbone
+    source, folder = Path(row.encoder), study.folder(f"{row.name}-start", seed)
+    mark, digest = folder / MADE_FROM, [file_hash(run / WEIGHTS) for run in (backbone, source)]
+    if not mark.is_file() or json.loads(mark.read_text("utf-8")) != digest:
+        config = configuration.load(backbone / "config.json")
+        memory = dataclasses.replace(config.model.memory, encoder=row.memory.encoder)
+        params = weights.load(backbone / WEIGHTS) | {"encoder": dinov2.load(source)[1]}
+        weights.save(folder / WEIGHTS, params, weights.metadata(backbone / WEIGHTS))
+        configuration.save(config.with_model(memory=memory), folder / "config.json")
+        atomic.write_text(mark, json.dumps(digest) + "\n")
+    return folder
 
 
 def _require_same(config: Config) -> None:

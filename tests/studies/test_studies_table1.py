@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 
 from pewm_jax import config as configuration
-from pewm_jax import presets, weights
+from pewm_jax import presets, tree, weights
 from pewm_jax.commands import table1 as command
-from pewm_jax.config import AttentionConfig, UserError
+from pewm_jax.config import AttentionConfig, DINOv2Config, UserError
+from pewm_jax.convert import dinov2 as convert
 from pewm_jax.data.__main__ import main as data_command
 from pewm_jax.evaluation import metrics
 from pewm_jax.evaluation.images import MASKS, SUMS
 from pewm_jax.geometry.actions import integrate, there_and_back
 from pewm_jax.geometry.cameras import pose_from_yaw
-from pewm_jax.models import lpips
+from pewm_jax.models import dinov2, lpips
 from pewm_jax.studies import recorded, rows, scorer, table, table1, table_page, timing, trainings
 from pewm_jax.training import prepared
 from pewm_jax.worlds.pewm import STAGES
@@ -129,14 +130,46 @@ def test_scores_outlive_the_weights(made):
 
 
 def test_all_rows_start_from_one_backbone_and_keep_it(made):
-    from pewm_jax import tree, weights
-
     out = made[0] / "out" / "seed0"
     before = tree.flatten(weights.load(out / "backbone" / "weights.safetensors"))
     for name in ("voxel-attend-sinusoid", "surfels-render"):
         after = tree.flatten(weights.load(out / name / "weights.safetensors"))
         assert all(np.array_equal(after[leaf], value) for leaf, value in before.items())
         assert any(leaf.startswith("memory/") for leaf in after)
+
+
+def test_the_features_of_a_network_can_be_tried(made):
+    """The paper's own: a DINOv2 behind the map, from the backbone that all rows start from."""
+    folder, said = made[0], []
+    network = DINOv2Config(layers=1, heads=1, width=32, patch=4, pretrained_size=16)
+    source = folder / "encoders" / "small"
+    params = jax.jit(lambda key: dinov2.init(network, key))(jax.random.key(1))
+    convert.write(network, params, source)
+    base = small(folder / "data")
+    values, steps = (f"dinov2={source}",), (2, 2)
+    page = table1.run(
+        base,
+        folder / "out",
+        minutes=(1, 1),
+        steps=steps,
+        seeds=[0],
+        ablation="features",
+        values=values,
+        say=said.append,
+    )
+    results = json.loads((page.parent / "table1-features-results.json").read_text())
+    name = "voxel-attend-features_dinov2_small"
+    assert np.isfinite(results["rows"][name]["measures"]["psnr/all"]["mean"])
+    encoder = results["about"]["rows"][name]["settings"]["encoder"]
+    assert encoder["size"] // network.patch == base.model.memory.encoder.grid(base.model.clip)[0]
+    kept = tree.flatten(weights.load(folder / "out" / "seed0" / name / "weights.safetensors"))
+    for leaf, value in tree.flatten({"encoder": params}).items():
+        np.testing.assert_array_equal(kept[leaf], value)
+    assert not any(line.startswith("stage 1") for line in said)  # the backbone was there
+    with pytest.raises(UserError, match="holds no DINOv2"):
+        rows.ablated(base, "features", ("dinov2=nowhere",))
+    with pytest.raises(UserError, match="there are no features 'hog'; choose colours, "):
+        rows.ablated(base, "features", ("hog",))
 
 
 def test_a_step_is_timed(made):
@@ -161,7 +194,6 @@ def test_what_was_made_from_other_weights_is_refused(made):
 
 
 def test_the_memory_is_what_differs_from_an_empty_one(made):
-    from pewm_jax import weights
     from tests.helpers import randomise
 
     folder = made[0]
