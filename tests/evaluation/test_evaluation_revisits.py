@@ -111,7 +111,8 @@ def test_what_cannot_work_is_refused_in_a_sentence(files, monkeypatch, tmp_path)
 def test_metrics_without_weights_are_left_out_and_it_is_said(files, monkeypatch, tmp_path):
     monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
     monkeypatch.setattr(i3d_weights, "installed", lambda: None)
-    found, left_out = metrics.load_all(metrics.NAMES, {"src": files["src"]})
+    found, left_out = metrics.load_all(weights={"src": files["src"]})
+    assert set(found) | set(left_out) | {"depth_mae", "depth_rel"} == set(metrics.NAMES)
     assert list(found) == ["psnr", "ssim", "src", "mirror[psnr]", "mirror[ssim]"]
     assert {"lpips_alex", "lpips_vgg", "fvd", "kvd", "src[alex]", "dreamsim"} < set(left_out)
     assert left_out["fvd"].startswith("fvd is left out: I3D needs weights, and none are installed")

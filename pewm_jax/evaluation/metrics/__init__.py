@@ -62,14 +62,14 @@ __all__ = [
 _NETS: dict[str, Net] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
 _ENCODERS = {"src": "dinov2", "src[alex]": "alex", "src[vgg]": "vgg"}
 _PICTURES = (*PLAIN, *_NETS)
-NAMES = (
+_COLOURS = (
     *_PICTURES,
-    *DEPTHS,
     "dreamsim",
     *videos.DISTANCES,
     *_ENCODERS,
     *(f"mirror[{name}]" for name in _PICTURES),
 )
+NAMES = (*_COLOURS, *DEPTHS)
 _MIRROR = re.compile(r"mirror\[(.+)\]")
 
 
@@ -106,12 +106,12 @@ def load(name: str, weights: str | Path | None = None) -> Metric:
 
 
 def load_all(
-    names: Iterable[str] = NAMES, weights: Mapping[str, str | Path] | None = None
+    names: Iterable[str] = _COLOURS, weights: Mapping[str, str | Path] | None = None
 ) -> tuple[dict[str, Metric], dict[str, str]]:
     """Return the metrics whose weights are at hand, and why the others are left out.
 
     Args:
-        names: some of ``NAMES``.
+        names: some of ``NAMES``; by default all that take colours.
         weights: metric → file or folder of weights.
 
     Returns:
