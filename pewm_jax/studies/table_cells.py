@@ -21,6 +21,8 @@ COLUMNS: Mapping[str, tuple[str, int]] = {
 }
 """Measure → heading, decimals; FVD and KVD of halves, which have a floor of as many clips."""
 
+TRUTH = "the truth against itself"
+
 
 def rows_of(results: Mapping[str, Any]) -> list[str]:
     """Return the rows: those of the table as listed, then the backbone, then without a network."""
@@ -77,3 +79,12 @@ def best_of(results: Mapping[str, Any], names: Sequence[str], measure: str) -> s
         return ""
     lower = measure.split("/", 1)[0] in LOWER
     return (min if lower else max)(known)[1]
+
+
+def floor_of(results: Mapping[str, Any], measure: str) -> str:
+    """Return what the truth itself gets, as words; "–" where that is not measured."""
+    floors, decimals = results["floors"], COLUMNS[measure][1]
+    if measure == "src" and "src[alex]" in floors:
+        return f"{floors['src[alex]']['ceiling']:.{decimals}f}"
+    found = floors.get(measure.removesuffix("_half"), {}).get("floor")
+    return f"{found['mean']:.{decimals}f}" if found else "–"

@@ -13,7 +13,16 @@ from PIL import Image, ImageDraw
 
 from pewm_jax.evaluation import pictures
 from pewm_jax.studies.table import LOWER
-from pewm_jax.studies.table_cells import best_of, cell, columns_of, heading, label, rows_of
+from pewm_jax.studies.table_cells import (
+    TRUTH,
+    best_of,
+    cell,
+    columns_of,
+    floor_of,
+    heading,
+    label,
+    rows_of,
+)
 
 
 def latex(results: Mapping[str, Any]) -> str:
@@ -32,11 +41,17 @@ def latex(results: Mapping[str, Any]) -> str:
         cells = []
         for measure in columns:
             mean, half = cell(results, name, measure)
-            text = "--" if mean == "–" else mean + (rf" {{\tiny $\pm$ {half}}}" if half else "")
+            text = _tex(mean) + (rf" {{\tiny $\pm$ {half}}}" if half else "")
             cells.append(rf"\textbf{{{text}}}" if best[measure] == name else text)
         words = label(results, name).replace("·", "--")
         lines.append(" & ".join([words, *cells]) + r" \\")
+    truth = [_tex(floor_of(results, measure)) for measure in columns]
+    lines += [r"\midrule", " & ".join([TRUTH, *truth]) + r" \\"]
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def _tex(number: str) -> str:
+    return "--" if number == "–" else number.replace("-", "$-$")
 
 
 def as_csv(results: Mapping[str, Any]) -> str:

