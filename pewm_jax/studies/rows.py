@@ -39,6 +39,8 @@ POINTS, SURFELS = (0.4, 4), (0.12, 24)
 PATCHES = 64
 """Tokens of a snapshot in the image memory, at least."""
 PAPER_FORM = "voxel-attend-sinusoid"
+MOST_CELLS = 2**22
+"""Of a map with other cells than the table's."""
 NETWORK = "dinov2="
 """Begins the value of the ablation of features that names a folder of DINOv2."""
 
@@ -184,6 +186,11 @@ def _cell(base: Config, side: str) -> MemorySettings:
     scale = float(side) / x
     cells = (*(math.ceil(n / scale) for n in memory.cells[:2]), memory.cells[2])
     room = math.ceil(memory.capacity / min(1.0, scale) ** 2)
+    if room > MOST_CELLS:
+        raise UserError(
+            f"cells of {side} m on the ground need a map of {room:,} of them, and {MOST_CELLS:,} "
+            "are the most that is tried: give a longer side."
+        )
     return dataclasses.replace(memory, cell_m=(x * scale, y * scale, z), cells=cells, capacity=room)
 
 

@@ -443,6 +443,7 @@ def test_the_walk_back_passes_the_same_cameras():
         (["--values", "3"], "values are of an ablation"),
         (["--ablate", "cell", "--values", "wide"], "the ablation cell cannot take 'wide'"),
         (["--ablate", "cell", "--values", "0"], "the ablation cell cannot take '0'"),
+        (["--ablate", "cell", "--values", "1e-4"], "cells of 1e-4 m on the ground need a map of"),
         (["--ablate", "time", "--values", "-4"], "the ablation time cannot take '-4'"),
         (["--minutes", "nan", "1"], "minutes are"),
         (["--steps", "0", "1"], "steps are"),
