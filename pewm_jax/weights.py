@@ -78,7 +78,8 @@ def read_others(path: Path, of: str) -> dict[str, np.ndarray]:
         UserError: the file is absent or damaged.
     """
     if not path.is_file():
-        raise UserError(f"{path} does not exist; name a file with the weights of {of}.")
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise UserError(f"{path} {what}; name a file with the weights of {of}.")
     if path.suffix == ".safetensors":
         return dict(tensor_files.read(path))
     return dict(tree.flatten(pickled_tensors.read(path)))

@@ -251,6 +251,10 @@ class EvalConfig:
         require(len(self.seeds) >= 1, "evaluate.seeds needs at least one seed.")
         require(min(self.seeds) >= 0, "evaluate.seeds must be 0 or positive numbers.")
         require(
+            len(set(self.seeds)) == len(self.seeds),
+            "evaluate.seeds has one of them twice: the same noise would count twice.",
+        )
+        require(
             min(self.clips, self.chain, self.stride, self.videos, self.video_clips, self.batch)
             >= 1,
             "evaluate.clips, chain, stride, videos, video_clips and batch must be at least 1.",

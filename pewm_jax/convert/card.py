@@ -13,7 +13,7 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import CodecWorldConfig, Config, UserError, kinds
 from pewm_jax.data.dataset import read_manifest
-from pewm_jax.evaluation.words import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, number
+from pewm_jax.evaluation.words import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, heading, number
 from pewm_jax.types import Params
 
 TRAINED_ON = "train"
@@ -169,8 +169,8 @@ def _scores(metrics: Mapping[str, Any] | None) -> str:
         return head + "None: these weights have no report; `python evaluate.py RUN` makes one."
     protocol = metrics["protocol"]
     shown = {
-        metric: name
-        for metric, name in METRIC_NAMES.items()
+        metric: (heading(metric, protocol), digits)
+        for metric, (_, digits) in METRIC_NAMES.items()
         if any(
             metric in scores for masks in metrics["results"].values() for scores in masks.values()
         )

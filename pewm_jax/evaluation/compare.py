@@ -197,6 +197,7 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
         "protocol_sha256": one[0].protocol.sha256,
         "protocol": _facts(one[0]),
         "how": intervals.how(),
+        "lpips_name": one[0].metrics["protocol"].get("lpips_name"),
         "left_out": sorted(skip),
         "measured_by_one": sorted((measured[0] ^ measured[1]) - skip),
     }

@@ -17,15 +17,17 @@ from pewm_jax.evaluation.page_tables import table
 from pewm_jax.evaluation.pictures import grid, png
 from pewm_jax.evaluation.plots import Line, chart
 from pewm_jax.evaluation.statistics import OURS
-from pewm_jax.evaluation.words import MASK_NAMES, METRIC_NAMES, spread
+from pewm_jax.evaluation.words import MASK_NAMES, METRIC_NAMES, heading, spread
 
 INTRODUCTION = (
     "Two models, scored by one protocol: the same clips of the same houses, the same context, "
     "motion and noise. Differences are taken clip by clip."
 )
 COLOURS = {"a": "#1f6feb", "b": "#e8731a", "differences": "#1a9a6c"}
-LOWER = ("depth_mae", "depth_rel", "lpips")
-"""Metrics of which less is better."""
+NOT_COMPARED = (
+    "Compared is what every clip has a number of. FVD and KVD (one number of a set), the mirror "
+    "test and SRC, drift, and the growth of the map are in the two reports."
+)
 
 
 def side_by_side(protocol: Protocol, one: Path, two: Path) -> list[np.ndarray]:
@@ -77,7 +79,13 @@ def sentences(content: Mapping[str, Any]) -> list[str]:
         if mask != "all"
         else f"Over all pixels: {outcome(content['differences']['clips'][mask], a, b)}"
         for mask in MASK_NAMES
-    ] + _samplers(content)
+    ] + [*_same_weights(content), *_samplers(content)]
+
+
+def _same_weights(content: Mapping[str, Any]) -> list[str]:
+    """Say so where both sides are the same weights."""
+    hashes = [{run["weights_sha256"] for run in content[side]["runs"]} for side in ("a", "b")]
+    return ["a and b are the same weights."] if hashes[0] == hashes[1] else []
 
 
 def _samplers(content: Mapping[str, Any]) -> list[str]:
@@ -163,7 +171,7 @@ def _stills(pictures: Sequence[np.ndarray]) -> str:
 
 def _scores(content: Mapping[str, Any]) -> str:
     measured = [name for name in METRIC_NAMES if name in content["differences"]["clips"]["all"]]
-    heads = "".join(f"<th>{METRIC_NAMES[name][0]}</th>" for name in measured)
+    heads = "".join(f"<th>{heading(name, content)}</th>" for name in measured)
     rows = []
     labels = {"a": "a", "b": "b", "differences": "a − b"}
     for mask, name in MASK_NAMES.items():
@@ -183,7 +191,7 @@ def _scores(content: Mapping[str, Any]) -> str:
         table(f"<th></th>{heads}<th>houses</th>", rows)
         + "<p class='quiet'>Means over houses of the means within a house, sampling and training "
         "seeds averaged first; in brackets the 95 % interval of a bootstrap over houses. A "
-        f"difference whose interval does not hold 0 is clear.{left}</p>"
+        f"difference whose interval does not hold 0 is clear. {NOT_COMPARED}{left}</p>"
     )
 
 

@@ -14,6 +14,7 @@ from pewm_jax.evaluation.words import (
     METHOD_NAMES,
     METRIC_NAMES,
     RIVALS,
+    heading,
     number,
     spread,
 )
@@ -34,7 +35,7 @@ def scores(metrics: Mapping[str, Any]) -> str:
     own = ours(metrics["results"])
     minus = MINUS[own]
     measured = [name for name in METRIC_NAMES if name in metrics["results"][own]["all"]]
-    heads = "".join(f"<th>{METRIC_NAMES[name][0]}</th>" for name in measured)
+    heads = "".join(f"<th>{heading(name, metrics['protocol'])}</th>" for name in measured)
     rows = []
     for mask, name in MASK_NAMES.items():
         rows.append(f'<tr class="head"><td colspan="{len(measured) + 2}">{name}</td></tr>')

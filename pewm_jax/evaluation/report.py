@@ -174,6 +174,7 @@ def evaluate(
         "reproject": choice.facts(),
         "none": runs.none_facts(none, opened) if none else None,
         **measures.about,
+        "lpips_name": measures.lpips_name,
         "mirror": way_out(config, rollouts)[1],
         **measures.hashes,
         "weights_sha256": opened.weights_hash,

@@ -37,7 +37,8 @@ METRIC_NAMES = {
     "depth_rel": ("relative depth error ↓", 3),
     "lpips": ("LPIPS ↓", 3),
 }
-"""Heading and digits of each metric; LPIPS is of whole pictures, where it was measured."""
+"""Heading and digits of each metric; LPIPS is of whole pictures, where it was measured, and has its
+network's name (``heading``)."""
 COVERAGE_NAMES = {
     "held": "held by the map",
     "looked_at": "looked at by the model's reader",
@@ -59,6 +60,17 @@ NONE_HOW = (
     "codec and number of steps with all steps in stage 1 (--train.stage1.steps N "
     "--train.stage2.steps 0) and name its folder by --none."
 )
+
+
+def heading(metric: str, protocol: Mapping[str, Any]) -> str:
+    """Return a metric's heading: LPIPS with the name of its network.
+
+    Args:
+        metric: key of ``METRIC_NAMES``.
+        protocol: of ``metrics.json``.
+    """
+    words, network = METRIC_NAMES[metric][0], protocol.get("lpips_name")
+    return words.replace("LPIPS", network) if network else words
 
 
 def number(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
@@ -155,7 +167,8 @@ def perceived(metrics: Mapping[str, Any]) -> str:
     if not all(found.values()):
         return metrics["protocol"]["lpips"]
     said = (f"{label} {number(found[m], 3)}" for m, label in METHOD_NAMES.items() if m in found)
-    return f"LPIPS of whole pictures, lower is better: {'; '.join(said)}."
+    name = metrics["protocol"].get("lpips_name") or "LPIPS"
+    return f"{name} of whole pictures, lower is better: {'; '.join(said)}."
 
 
 def far_apart(metrics: Mapping[str, Any]) -> str:

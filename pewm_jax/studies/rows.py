@@ -38,7 +38,8 @@ POINTS, SURFELS = (0.4, 4), (0.12, 24)
 """Size of a cell over the shortest side of a voxel, and capacity over that of voxels."""
 PATCHES = 64
 """Tokens of a snapshot in the image memory, at least."""
-PAPER_FORM = "voxel-attend-sinusoid"
+PAPER_FORM, CONTROL = "voxel-attend-sinusoid", "none-attend"
+"""The paper's own form, and a reader of nothing."""
 MOST_CELLS = 2**22
 """Of a map with other cells than the table's."""
 NETWORK = "dinov2="
@@ -97,7 +98,7 @@ def main_rows(base: Config) -> tuple[Row, ...]:
     nothing = _as(memory, NoMemoryConfig, attend)
     return (
         Row("none", nothing, paper="NWM"),
-        Row("none-attend", nothing, control=True),
+        Row(CONTROL, nothing, control=True),
         Row(
             "images-attend",
             _as(memory, ImagesConfig, attend, snapshots=snapshots),
@@ -252,7 +253,7 @@ ABLATIONS: Mapping[str, Ablation] = {
     "time": Ablation(lambda base, _: _paper_form(base), ("1", "4"), "times the others' time"),
 }
 """The paper's ablations, of the voxel map read by attention; ``time`` trains the paper's own form
-(``PAPER_FORM``) longer."""
+(``PAPER_FORM``) longer, and a reader of nothing as long."""
 
 
 def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row, ...]:
@@ -287,4 +288,8 @@ def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row,
         words = f"{NETWORK[:-1]}_{Path(folder).name}" if folder else value
         row_name = start if own else f"{start}-{name}_{words}"
         found.append(Row(row_name, memory, times=times, encoder=folder))
+        if name == "time":  # beside it what so much time does to a reader of nothing
+            row_name = CONTROL if own else f"{CONTROL}-{name}_{words}"
+            nothing = _as(base.model.memory, NoMemoryConfig, _attend(base))
+            found.append(Row(row_name, nothing, times=times, control=True))
     return tuple(found)

@@ -11,6 +11,7 @@ import numpy as np
 from pewm_jax.evaluation import intervals
 from pewm_jax.evaluation.images import MASKS
 from pewm_jax.evaluation.statistics import scores
+from pewm_jax.studies.rows import CONTROL, PAPER_FORM
 from pewm_jax.studies.scorer import SRC, Arrays
 
 SETS = ("fvd", "kvd")
@@ -31,7 +32,8 @@ and all read with projective positions but the last, which is the paper's own fo
 GAP = "psnr/seen - unseen"
 """How much better seen pixels are; of interest as a difference between rows: what a memory adds."""
 AGAINST = ("none", "none-attend", "voxel-attend", "reproject", "copy")
-"""What every row is compared with, clip by clip."""
+"""What every row is compared with, clip by clip; in an ablation also the table's own row, and what
+has nothing to read (``none-attend-…``)."""
 
 
 def by_clip(arrays: Arrays) -> dict[str, np.ndarray]:
@@ -109,8 +111,8 @@ def summary(
             for name in pieces
             if name != against
         }
-        for against in AGAINST
-        if against in pieces
+        for against in pieces
+        if against in AGAINST or against.startswith((CONTROL, PAPER_FORM))
     }
     chain = [name for name in CHAIN if name in pieces]
     order = [

@@ -27,6 +27,8 @@ from pewm_jax.studies.trainings import Study, backbone_of, settings, train
 from pewm_jax.worlds.pewm import STAGES
 
 RESULTS, HOURS = "results.json", "hours.json"
+SCHEMA = 1
+"""Version of the layout of the results, which ``docs/table1.md`` describes."""
 EMPTY = "backbone"
 """The row of the backbone alone: what every row's weights give with an empty memory."""
 
@@ -91,7 +93,7 @@ def run(
                     group.append(arrays)
         numbers = table.summary(pieces, truth, scorer.house_of_clip, scorer.nets, scorer.frames)
         facts = _facts(study, scorer, chosen, plan, seeds[: number + 1], ablation)
-        results = {"about": facts, **numbers}
+        results = {"schema": SCHEMA, "about": facts, **numbers}
         text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
         atomic.write_text(out / f"{title}-{RESULTS}", text + "\n")
         table_page.write(results, page)

@@ -22,6 +22,8 @@ COLUMNS: Mapping[str, tuple[str, int]] = {
 """Measure → heading, decimals; FVD and KVD of halves, which have a floor of as many clips."""
 
 TRUTH = "the truth against itself"
+PLACES = "two different places"
+"""Rows beside the trained ones: what the truth gets, and what says nothing at all (SRC)."""
 
 
 def rows_of(results: Mapping[str, Any]) -> list[str]:
@@ -53,12 +55,16 @@ def label(results: Mapping[str, Any], name: str) -> str:
     return described["label"].replace("_", " ") if described else known.get(name, name)
 
 
+def blind(results: Mapping[str, Any], name: str, measure: str) -> bool:
+    """Return whether a measure is of depth and the row's model imagines none."""
+    about = results["about"]["rows"].get(name, {})
+    return measure.startswith("depth") and about.get("depth") is False
+
+
 def cell(results: Mapping[str, Any], name: str, measure: str) -> tuple[str, str]:
     """Return a number and half its interval, as words; "–" where there is none."""
-    about = results["about"]["rows"].get(name, {})
     entry = results["rows"][name]["measures"].get(measure)
-    blind = measure.startswith("depth") and about.get("depth") is False
-    if entry is None or entry["mean"] is None or blind:
+    if entry is None or entry["mean"] is None or blind(results, name, measure):
         return "–", ""
     decimals = COLUMNS[measure][1]
     over = entry if "low" in entry else entry["over_seeds"]
@@ -88,3 +94,11 @@ def floor_of(results: Mapping[str, Any], measure: str) -> str:
         return f"{floors['src[alex]']['ceiling']:.{decimals}f}"
     found = floors.get(measure.removesuffix("_half"), {}).get("floor")
     return f"{found['mean']:.{decimals}f}" if found else "–"
+
+
+def place_floor(results: Mapping[str, Any], measure: str) -> str:
+    """Return what pictures of two different places get, as words; "–" but for SRC."""
+    floors = results["floors"]
+    if measure != "src" or "src[alex]" not in floors:
+        return "–"
+    return f"{floors['src[alex]']['floor']:.{COLUMNS[measure][1]}f}"

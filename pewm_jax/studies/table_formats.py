@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 from pewm_jax.evaluation import pictures
 from pewm_jax.studies.table import LOWER
 from pewm_jax.studies.table_cells import (
+    PLACES,
     TRUTH,
     best_of,
     cell,
@@ -21,6 +22,7 @@ from pewm_jax.studies.table_cells import (
     floor_of,
     heading,
     label,
+    place_floor,
     rows_of,
 )
 
@@ -45,8 +47,10 @@ def latex(results: Mapping[str, Any]) -> str:
             cells.append(rf"\textbf{{{text}}}" if best[measure] == name else text)
         words = label(results, name).replace("·", "--")
         lines.append(" & ".join([words, *cells]) + r" \\")
-    truth = [_tex(floor_of(results, measure)) for measure in columns]
-    lines += [r"\midrule", " & ".join([TRUTH, *truth]) + r" \\"]
+    lines.append(r"\midrule")
+    for words, found in ((TRUTH, floor_of), (PLACES, place_floor)):
+        numbers = [_tex(found(results, measure)) for measure in columns]
+        lines.append(" & ".join([words, *numbers]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
@@ -69,6 +73,11 @@ def as_csv(results: Mapping[str, Any]) -> str:
             ends = (entry["mean"], over["low"], over["high"])
             shown = ["" if value is None else f"{value:.6g}" for value in ends]
             writer.writerow([name, measure, *shown, kind, row["seeds"], seeds])
+    for measure in columns_of(results):
+        for name, found in ((TRUTH, floor_of), (PLACES, place_floor)):
+            number = found(results, measure)
+            if number != "–":
+                writer.writerow([name, measure, number, "", "", "", "", ""])
     return file.getvalue()
 
 

@@ -8,15 +8,19 @@ from typing import Any
 
 from pewm_jax import atomic
 from pewm_jax.evaluation import pictures
+from pewm_jax.studies.rows import CONTROL, PAPER_FORM
 from pewm_jax.studies.table import GAP, LOWER, SETS
 from pewm_jax.studies.table_cells import (
+    PLACES,
     TRUTH,
     best_of,
+    blind,
     cell,
     columns_of,
     floor_of,
     heading,
     label,
+    place_floor,
     rows_of,
 )
 from pewm_jax.studies.table_formats import as_csv, latex, plot
@@ -32,10 +36,18 @@ PAPER: Mapping[str, tuple[float, ...]] = {
 PAPER_HEADINGS = ("PSNR, dB", "SSIM", "LPIPS", "FVD", "DreamSim", "SRC")
 OURS = ("psnr/all", "ssim/all", "lpips/all", "fvd_half", "dreamsim", "src")
 """Our measure in the place of each of the paper's."""
-STEP_MEASURES: Mapping[str, int] = {"psnr/seen": 2, "psnr/unseen": 2, GAP: 2, "lpips/all": 3}
+STEP_MEASURES: Mapping[str, int] = {
+    "psnr/seen": 2,
+    "psnr/unseen": 2,
+    GAP: 2,
+    "ssim/all": 3,
+    "lpips/all": 3,
+    "depth_mae/all": 3,
+}
 """Measures whose differences are shown → decimals; beside them that of seeds."""
 STEP_HEADINGS = (
-    *("PSNR seen, dB", "PSNR unseen, dB", "seen − unseen, dB", "LPIPS[alex]"),
+    *("PSNR seen, dB", "PSNR unseen, dB", "seen − unseen, dB"),
+    *("SSIM", "LPIPS[alex]", "depth, m"),
     "PSNR seen, over training seeds",
 )
 NOT_COMPARABLE = (
@@ -46,6 +58,15 @@ NOT_COMPARABLE = (
     "here; SRC is by DINOv2 there, over clips imagined one after the other with the map growing "
     "between them, and here over a way out and back within one clip: it says nothing of memory."
 )
+
+
+PAPER_ABLATIONS: Mapping[str, str] = {
+    "cell": "The paper's (its appendix), of 128 / 256 / 384 cells on a side: PSNR 20.6 / 22.5 / "
+    "22.2, LPIPS 0.20 / 0.16 / 0.16. Only the order can be compared.",
+    "features": "The paper's (its appendix), of a map of points / CLIP / DINO features: PSNR 21.2 "
+    "/ 21.5 / 22.5, LPIPS 0.20 / 0.18 / 0.16. Only the order can be compared.",
+}
+"""Ablation → what the paper has of it."""
 
 
 def write(results: Mapping[str, Any], page: Path) -> None:
@@ -69,6 +90,8 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
             cells.append(f"**{text}**" if best[measure] == name else text)
         lines.append([label(results, name), *cells])
     lines.append([TRUTH, *(floor_of(results, measure) for measure in columns)])
+    if "src" in columns:
+        lines.append([PLACES, *(place_floor(results, measure) for measure in columns)])
     parts = [
         _title(about),
         how(results),
@@ -78,9 +101,14 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
         f"![PSNR over pixels seen before, with intervals]({stem}.png)",
     ]
     if not about["ablation"]:
-        parts += [_order_text(results), _against(results, "none-attend"), _paper(results)]
+        rivals = (_against(results, rival) for rival in ("none", "none-attend"))
+        parts += [_order_text(results), *rivals, _paper(results)]
     else:
-        parts += [_against(results, "voxel-attend")]
+        listed = set(about["rows"])
+        controls = [name for name in about["rows"] if name.startswith(CONTROL)]
+        rivals = [*controls, *sorted(listed & {"voxel-attend", PAPER_FORM})]
+        parts += [_against(results, rival) for rival in rivals]
+        parts += [PAPER_ABLATIONS.get(about["ablation"], "")]
     parts += [_trainings(about)]
     parts += [f"- {sentence}" for sentence in about["left_out"].values()]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -161,19 +189,22 @@ def _against(results: Mapping[str, Any], rival: str) -> str:
     rows = []
     for name, found in results["differences"][rival].items():
         if name in results["about"]["rows"]:
-            rows.append([label(results, name), *_cells_of(found)])
+            rows.append([label(results, name), *_cells_of(results, found, (name, rival))])
     return (
         f"## Each row minus {label(results, rival)}\n\nPaired by clip, with 95 % intervals.\n\n"
         + _table(["row", *STEP_HEADINGS], rows)
     )
 
 
-def _cells_of(differences: Mapping[str, Any]) -> list[str]:
-    """Return the differences that count, as words."""
+def _cells_of(
+    results: Mapping[str, Any], differences: Mapping[str, Any], pair: tuple[str, str]
+) -> list[str]:
+    """Return the differences of two rows that count, as words."""
     cells = []
     for measure, decimals in STEP_MEASURES.items():
         found = differences.get(measure)
-        cells.append(_signed(found, decimals) if found else "–")
+        known = not any(blind(results, name, measure) for name in pair)
+        cells.append(_signed(found, decimals) if found and known else "–")
     over = differences["psnr/seen"].get("over_seeds")
     return [*cells, _signed(over, 2) if over else "–"]
 
@@ -185,7 +216,8 @@ def _order_text(results: Mapping[str, Any]) -> str:
     rows = []
     for step in results["order"]:
         words = f"{label(results, step['better'])} − {label(results, step['worse'])}"
-        rows.append([words, *_cells_of(step["differences"])])
+        pair = (step["better"], step["worse"])
+        rows.append([words, *_cells_of(results, step["differences"], pair)])
     text = _table(["step of the paper's order", *STEP_HEADINGS], rows)
     return (
         "## The paper's order\n\nThe paper has no memory < image memory < no depth < 2D map < 3D "

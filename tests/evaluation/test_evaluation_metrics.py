@@ -76,6 +76,9 @@ def test_depth_is_compared_where_both_have_one(name):
     some = np.asarray(metric(holes, truth))
     assert np.isnan(some[0])
     assert 0 < some[1] < 0.2
+    broken = truth.copy()
+    broken[2, 0] = np.nan  # no depth at all is no perfect depth
+    assert np.isnan(metric(broken, truth)[2])
     again = metric(holes[1:2, ..., None], truth[1:2, ..., None])
     np.testing.assert_allclose(again, some[1:2], rtol=1e-5)
     with pytest.raises(UserError, match="depths of shapes"):
@@ -201,6 +204,8 @@ def test_tables_have_lpips_of_whole_pictures_and_only_where_it_was_measured():
     assert "lpips" not in gain["unseen"]
     frames = per_frame(both, clusters)["empty"]["all"]["lpips"]["mean"]
     assert frames == pytest.approx([0.2, 0.3, 0.4, 0.5])
-    said = perceived({"results": results})
-    assert said.startswith("LPIPS of whole pictures, lower is better: with its map 0.250 ± 0.000")
+    said = perceived({"results": results, "protocol": {"lpips_name": "LPIPS[alex]"}})
+    assert said.startswith(
+        "LPIPS[alex] of whole pictures, lower is better: with its map 0.250 ± 0.000"
+    )
     assert "same weights, empty map 0.350" in said

@@ -18,7 +18,8 @@ dreamsim         lower  DreamSim (0.2, ensemble), averaged over a clip's frames
 fvd              lower  Fréchet distance of the 400 logits of I3D; 9 frames or more; with its floor
 kvd              lower  kernel distance of the same: no bias by the number of clips; may be negative
 src              higher clips that go and come back: cosine × 100 of DINOv2's features of both
-                        visits of a place, of the imagined clip alone; with its floor and ceiling
+                        visits of a place, of the imagined clip alone (of the truth only the shape
+                        counts); with its floor and ceiling
 src[alex]        higher the same with LPIPS's AlexNet for an encoder; and src[vgg]
 mirror[METRIC]   as     clips that go and come back: the way back against the way out by ``psnr``,
                  METRIC ``ssim``, ``lpips_alex`` or ``lpips_vgg``; with its floor and ceiling
@@ -85,6 +86,8 @@ def load(name: str, weights: str | Path | None = None) -> Metric:
     Raises:
         UserError: there is no such metric, it takes no weights, or it needs some and has none.
     """
+    if weights is not None and not str(weights):
+        raise UserError(f"the weights of {name} are named by no letters: name a file, or leave it.")
     if name not in NAMES:
         raise UserError(f"there is no metric {name!r}; there is {', '.join(NAMES)}.")
     mirrored = _MIRROR.fullmatch(name)
@@ -118,8 +121,13 @@ def load_all(
         ``(found, left_out)``: name → metric, and name → the reason, a sentence.
 
     Raises:
-        UserError: there is no such metric, or weights that are named are absent or damaged.
+        UserError: there is no such metric, or weights that are named are absent or damaged, or of
+            no metric that is asked for.
     """
+    names = tuple(names)
+    strange = sorted(set(weights or {}) - set(names))
+    if strange:
+        raise UserError(f"weights are named of {', '.join(strange)}, which are not asked for.")
     found: dict[str, Metric] = {}
     left_out: dict[str, str] = {}
     for name in names:

@@ -41,6 +41,11 @@ class Chosen:
     about: dict[str, str]
 
     @property
+    def lpips_name(self) -> str | None:
+        """The name of LPIPS with that of its network, as a heading has it."""
+        return f"LPIPS[{self.lpips.net}]" if self.lpips else None
+
+    @property
     def hashes(self) -> dict[str, Any]:
         """The weights that were used, for the protocol."""
         encoders = {name: one.compare for name, one in self.visits.items()}
@@ -137,6 +142,11 @@ def revisits(
     if not settings and lpips is not None:
         encoders = [Similarity(lpips.net, lpips.net, lpips.params, lpips.sha256)]
     for encoder in encoders:
+        if f"src[{encoder.encoder}]" in found:
+            raise UserError(
+                f"evaluate.src names two encoders of one name, src[{encoder.encoder}]: measure by "
+                "one of them at a time, each in a report of its own (--out)."
+            )
         found[f"src[{encoder.encoder}]"] = Revisit(f"src[{encoder.encoder}]", encoder)
     if not encoders:
         return found, (

@@ -34,6 +34,8 @@ def colours(imagined_BTHWC: Array, truth_BTHWC: Array) -> tuple[Array, Array]:
     Raises:
         UserError: they are not alike, or not colours.
     """
+    if imagined_BTHWC is None or truth_BTHWC is None:
+        raise UserError("there is no clip to compare: give both as (B, T, H, W, 3).")
     pair = jnp.asarray(imagined_BTHWC), jnp.asarray(truth_BTHWC)
     shapes = [clip.shape for clip in pair]
     if shapes[0] != shapes[1] or len(shapes[0]) != 5 or shapes[0][-1] != 3:
@@ -41,6 +43,8 @@ def colours(imagined_BTHWC: Array, truth_BTHWC: Array) -> tuple[Array, Array]:
             f"clips of shapes {shapes[0]} and {shapes[1]} cannot be compared: give both as "
             "(B, T, H, W, 3)."
         )
+    if 0 in shapes[0]:
+        raise UserError(f"clips of shape {shapes[0]} are empty: give one picture at least.")
     for clip in pair:
         if clip.dtype != jnp.uint8 and not jnp.issubdtype(clip.dtype, jnp.floating):
             raise UserError(
@@ -81,6 +85,8 @@ PLAIN: dict[str, Metric] = {"psnr": clip_psnr, "ssim": clip_ssim}
 def clip_depth_mae(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
     """Return the mean absolute error, m, (B,), where both have a depth; NaN where none has.
 
+    A clip with an imagined depth that is no number has no score: NaN.
+
     Args:
         imagined_BTHW: (B, T, H, W) or (B, T, H, W, 1) depths along the optical axis, m; 0 for none.
         truth_BTHW: the same shape.
@@ -89,14 +95,14 @@ def clip_depth_mae(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
         UserError: the clips are not alike, or no floats.
     """
     imagined, truth, both = _depths(imagined_BTHW, truth_BTHW)
-    return _mean_where(both, jnp.abs(imagined - truth))
+    return _mean_where(both, jnp.abs(imagined - truth), imagined)
 
 
 @jax.jit
 def clip_depth_rel(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
     """Return the mean of |d − d*| / d* (AbsRel; Eigen et al. 2014); see ``clip_depth_mae``."""
     imagined, truth, both = _depths(imagined_BTHW, truth_BTHW)
-    return _mean_where(both, jnp.abs(imagined - truth) / jnp.where(both, truth, 1))
+    return _mean_where(both, jnp.abs(imagined - truth) / jnp.where(both, truth, 1), imagined)
 
 
 def _depths(imagined_BTHW: Array, truth_BTHW: Array) -> tuple[Array, Array, Array]:
@@ -114,9 +120,11 @@ def _depths(imagined_BTHW: Array, truth_BTHW: Array) -> tuple[Array, Array, Arra
     return imagined, truth, (imagined > 0) & (truth > 0)
 
 
-def _mean_where(mask_B: Array, values_B: Array) -> Array:
+def _mean_where(mask_B: Array, values_B: Array, imagined_B: Array) -> Array:
+    """Return means under a mask; NaN where that is empty, or what was imagined is not finite."""
     axes = tuple(range(1, mask_B.ndim))
-    return jnp.where(mask_B, values_B, 0).sum(axes) / mask_B.sum(axes)
+    mean_B = jnp.where(mask_B, values_B, 0).sum(axes) / mask_B.sum(axes)
+    return jnp.where(jnp.isfinite(imagined_B).all(axes), mean_B, jnp.nan)
 
 
 DEPTHS: dict[str, Metric] = {"depth_mae": clip_depth_mae, "depth_rel": clip_depth_rel}

@@ -7,7 +7,7 @@ out.
 - **SRC**, scene revisit consistency (Hong et al. 2024, SlowFast-VGen; PEWM, Sec. 4): by the cosine
   between features of an image encoder, times 100. PEWM's encoder is DINOv2; which features, and how
   they are averaged, it does not say. Here it is the class token, and the mean over places.
-- **The mirror test**: by any measure of pictures, ``mirror[psnr]``.
+- **The mirror test** (MIND 2026): by any measure of pictures, ``mirror[psnr]``.
 
 Consistency says nothing of truth: a model that always shows one picture is perfectly consistent.
 So the truth's own number, the ceiling, and what two different places get, the floor, stand beside.
@@ -59,7 +59,10 @@ class Revisit:
     compare: Metric
 
     def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
-        """Return the number of every imagined clip, (B,); the truth must be alike, and no more.
+        """Return the number of every imagined clip, (B,).
+
+        The truth must be of its shape, and no more: what is compared are two visits of one clip.
+        A clip that does not come back is therefore not best even against itself.
 
         Raises:
             UserError: the clips are not alike, or are no way out and back.
