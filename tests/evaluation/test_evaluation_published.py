@@ -1,4 +1,4 @@
-"""Every metric by the weights that users have: what is equal is best, what is spoilt more is worse."""
+"""Every metric by the weights that users have: equal is best, what is spoilt more is worse."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from pewm_jax.evaluation.metrics import Revisit, VideoDistance
 from tests.evaluation.test_evaluation_metrics import blurred, clips, noisy
 
 WITHOUT = ("dreamsim", "src")
-"""Their weights come with no package: tests/parity and test_evaluation_revisits have random ones."""
+"""No package has their weights: tests/parity and test_evaluation_revisits have random ones."""
 HIGHER = ("psnr", "ssim", "src", "mirror[psnr]", "mirror[ssim]")
 
 
