@@ -116,7 +116,8 @@ def test_the_difference_is_paired_and_the_page_needs_no_other_file(tmp_path, err
     assert back["differences"]["clips"]["all"]["psnr"]["mean"] == pytest.approx(-1)
     same = content(compare.compare(a, a, out=tmp_path / "same", say=said.append))
     assert same["differences"]["clips"]["all"]["ssim"]["high"] == 0
-    assert "no clear difference" in said[-1]
+    assert "no clear difference" in said[-2]
+    assert said[-1] == "a and b are the same weights."
 
 
 def test_training_seeds_are_apart_from_houses(tmp_path, errors):
