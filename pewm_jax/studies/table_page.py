@@ -126,7 +126,7 @@ def how(results: Mapping[str, Any]) -> str:
         first, second = about["minutes"]
         clock = "processor " if about["clock"] == "processor" else ""
         times = sorted({row["times"] for row in about["rows"].values()} - {1})
-        but = "".join(f", {time:g} times as long for one row" for time in times)
+        but = "".join(f", {time:g} times as long where a row says so" for time in times)
         equal = f"equal time ({first:g} + {second:g} {clock}minutes of training steps{but})"
     return (
         f"{len(about['seeds'])} training seed(s), {equal}, batches of {about['batch']}; "
