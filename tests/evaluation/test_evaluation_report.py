@@ -282,7 +282,7 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
     assert metrics["protocol"]["lpips_weights_sha256"] is None
     page = (copied / "report" / "index.html").read_text()
     assert "LPIPS is left out" in page
-    assert "LPIPS ↓" not in page
+    assert "LPIPS[" not in page
 
     path = tmp_path / "vgg.safetensors"  # AlexNet takes no pictures this small
     weights.save(path, jax.jit(lambda key: lpips.init("vgg", key))(jax.random.key(0)))
@@ -297,9 +297,9 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
     assert len(metrics["long"]["per_frame"]["copy"]["all"]["lpips"]["mean"]) == 8
     assert metrics["protocol"]["lpips_weights_sha256"] == report.file_hash(path)
     page = (copied / "report" / "index.html").read_text()
-    assert "LPIPS ↓" in page
+    assert "LPIPS[vgg] ↓" in page
     assert "not resized" in page
-    assert any(line.startswith("LPIPS of whole pictures, lower is better") for line in said)
+    assert any(line.startswith("LPIPS[vgg] of whole pictures, lower is better") for line in said)
     said.clear()
     report.evaluate(copied, say=said.append, clips=3, seeds=(0,), lpips=path)
     assert "nothing to do" in said[-1]

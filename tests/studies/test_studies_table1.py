@@ -269,7 +269,7 @@ def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
     chosen = [row for row in rows.main_rows(base) if row.name in ("none", "voxel-attend")]
     chosen += rows.ablated(base, "time", ("4",))
     seconds = {"backbone": 0.5, "none": 0.5, "voxel-attend": 1.0, "map2d-attend": 2.0}
-    seconds["voxel-attend-sinusoid-time_4"] = 1.0
+    seconds |= {"voxel-attend-sinusoid-time_4": 1.0, "none-attend-time_4": 0.8}
     asked, pace = [], 1.0
 
     def measured(study, which, say):
@@ -283,8 +283,9 @@ def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
     assert steps["backbone"] == 2 * 60 / 0.5
     assert (steps["none"], steps["voxel-attend"]) == (120, 60)
     assert steps["voxel-attend-sinusoid-time_4"] == 240
+    assert steps["none-attend-time_4"] == 300  # the control gets the same minutes
     assert timing.planned(study, chosen, print) == plan
-    assert len(asked) == 3  # each once; the row without a memory trains what the backbone does
+    assert len(asked) == 4  # each once; the row without a memory trains what the backbone does
     longer = dataclasses.replace(study, minutes=(2, 2))
     assert timing.planned(longer, chosen[:1], print)["none"]["steps"] == 240
     assert timing.planned(study, chosen, print) == plan  # other minutes have changed nothing
@@ -298,6 +299,7 @@ def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
         "none": 5,
         "voxel-attend": 5,
         "voxel-attend-sinusoid-time_4": 20,
+        "none-attend-time_4": 20,
     }
     (tmp_path / "plan.json").write_text("{")
     with pytest.raises(UserError, match=r"plan\.json is damaged"):
@@ -401,7 +403,7 @@ def test_every_measure_of_the_table_stands_beside_what_it_can_be(measured):
     assert "none · attend − none | +0.00 [+0.00, +0.00] | +0.00 [+0.00, +0.00] |" in text
     with (out / "page.csv").open() as file:
         lines = list(csv.DictReader(file))
-    over = {line["measure"]: line["interval_over"] for line in lines}
+    over = {line["measure"]: line["interval_over"] for line in lines if line["row"] == "none"}
     assert (over["psnr/all"], over["fvd"], over["src"]) == ("houses", "seeds", "houses")
 
 
