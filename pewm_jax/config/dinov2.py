@@ -77,6 +77,17 @@ _SIZES = {
 }
 
 
+def size_name(config: DINOv2Config) -> str:
+    """Return the name of a network's size, such as ``small`` or ``base-registers``.
+
+    Args:
+        config: of any DINOv2; of a size that is not published the name is ``LAYERSxWIDTH``.
+    """
+    sizes = {(entry["layers"], entry["width"]): name for name, entry in _SIZES.items()}
+    size = sizes.get((config.layers, config.width), f"{config.layers}x{config.width}")
+    return f"{size}-registers" if config.registers else size
+
+
 def published(
     size: Literal["small", "base", "large", "giant"], registers: bool = False
 ) -> DINOv2Config:

@@ -54,12 +54,14 @@ def test_batches_of_any_size_give_the_same_mean(name):
     parts = [np.asarray(metric(guess[i:j], truth[i:j])) for i, j in ((0, 1), (1, 3))]
     np.testing.assert_allclose(np.concatenate(parts).mean(), whole.mean(), rtol=1e-4)
     assert isinstance(metric, Revisit) or metric.sha256
+    assert getattr(metric, "name", name) == name  # the package's weights go without a mark
 
 
 def test_sets_of_clips_are_further_from_the_truth_the_more_they_are_spoilt():
     fvd, kvd = metrics.load("fvd"), metrics.load("kvd")
     assert isinstance(fvd, VideoDistance)
     assert isinstance(kvd, VideoDistance)
+    assert (fvd.name(9, 48), kvd.name(17, 8)) == ("FVD-9f@48", "KVD-17f@8")
     truth = clips(4, 9, (48, 48))
     true = fvd.features(truth)
     assert float(fvd.distance(true, true)) == pytest.approx(0, abs=1e-3)

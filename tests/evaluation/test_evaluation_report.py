@@ -297,9 +297,10 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
     assert len(metrics["long"]["per_frame"]["copy"]["all"]["lpips"]["mean"]) == 8
     assert metrics["protocol"]["lpips_weights_sha256"] == report.file_hash(path)
     page = (copied / "report" / "index.html").read_text()
-    assert "LPIPS[vgg] ↓" in page
+    name = f"LPIPS[vgg-{report.file_hash(path)[:8]}]"  # weights of one's own
+    assert f"{name} ↓" in page
     assert "not resized" in page
-    assert any(line.startswith("LPIPS[vgg] of whole pictures, lower is better") for line in said)
+    assert any(line.startswith(f"{name} of whole pictures, lower is better") for line in said)
     said.clear()
     report.evaluate(copied, say=said.append, clips=3, seeds=(0,), lpips=path)
     assert "nothing to do" in said[-1]

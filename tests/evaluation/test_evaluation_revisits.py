@@ -6,6 +6,7 @@ import pytest
 
 from pewm_jax import weights
 from pewm_jax.config import DINOv2Config, UserError
+from pewm_jax.config.dinov2 import published, size_name
 from pewm_jax.convert import dinov2 as convert
 from pewm_jax.evaluation import metrics
 from pewm_jax.evaluation.metrics import revisits, similarity
@@ -69,10 +70,15 @@ def test_the_floor_is_another_place_and_the_middle_belongs_to_neither_way():
 
 def test_a_score_carries_its_encoders_name(files):
     src = metrics.load("src", files["src"])
-    assert src.name == "src[dinov2]"
+    assert src.name == "src[dinov2-1x32]"
     assert "class token of DINOv2 (1 layers of width 32)" in src.compare.about
     other = metrics.load("src[alex]", files["src[alex]"])
-    assert other.name == "src[alex]"
+    mark = other.compare.sha256[:8]  # of weights that are not the package's
+    assert other.name == f"src[alex-{mark}]"
+    mirror = metrics.load("mirror[lpips_alex]", files["src[alex]"])
+    assert mirror.name == f"mirror[lpips_alex-{mark}]"
+    assert size_name(published("base")) == "base"
+    assert size_name(published("small", registers=True)) == "small-registers"
     assert "LPIPS's AlexNet" in other.compare.about
     assert len({src.compare.sha256, other.compare.sha256}) == 2
     assert metrics.load("mirror[ssim]").name == "mirror[ssim]"

@@ -92,7 +92,9 @@ def load(name: str, weights: str | Path | None = None) -> Metric:
         raise UserError(f"there is no metric {name!r}; there is {', '.join(NAMES)}.")
     mirrored = _MIRROR.fullmatch(name)
     if mirrored:
-        return Revisit(name, load(mirrored[1], weights))
+        inside = load(mirrored[1], weights)
+        lpips = isinstance(inside, Perceptual)
+        return Revisit(f"mirror[lpips_{inside.encoder}]" if lpips else name, inside)
     if name in _ENCODERS:
         compare = similarity.read(_ENCODERS[name], weights)
         return Revisit(f"src[{compare.encoder}]", compare)

@@ -43,7 +43,7 @@ class Chosen:
     @property
     def lpips_name(self) -> str | None:
         """The name of LPIPS with that of its network, as a heading has it."""
-        return f"LPIPS[{self.lpips.net}]" if self.lpips else None
+        return f"LPIPS[{self.lpips.encoder}]" if self.lpips else None
 
     @property
     def hashes(self) -> dict[str, Any]:
@@ -134,13 +134,13 @@ def revisits(
     if min(height, width) >= WINDOW:
         compares["ssim"] = PLAIN["ssim"]
     if lpips is not None:
-        compares[f"lpips_{lpips.net}"] = lpips
+        compares[f"lpips_{lpips.encoder}"] = lpips
     found = {f"mirror[{name}]": Revisit(f"mirror[{name}]", one) for name, one in compares.items()}
     if OFF in settings:
         return found, "SRC is left out, as evaluate.src says."
     encoders = [_encoder(setting, height, width) for setting in settings]
     if not settings and lpips is not None:
-        encoders = [Similarity(lpips.net, lpips.net, lpips.params, lpips.sha256)]
+        encoders = [Similarity(lpips.encoder, lpips.net, lpips.params, lpips.sha256)]
     for encoder in encoders:
         if f"src[{encoder.encoder}]" in found:
             raise UserError(

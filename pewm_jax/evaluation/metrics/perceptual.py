@@ -10,7 +10,7 @@ from pathlib import Path
 
 import jax
 
-from pewm_jax.evaluation.metrics.pictures import colours
+from pewm_jax.evaluation.metrics.pictures import colours, marked
 from pewm_jax.models import lpips, lpips_weights
 from pewm_jax.models.lpips import LEAST, NAMES, Net
 from pewm_jax.types import Array, Params
@@ -38,6 +38,11 @@ class Perceptual:
     net: Net
     params: Params = dataclasses.field(repr=False)
     sha256: str = ""
+
+    @property
+    def encoder(self) -> str:
+        """The network's name; weights other than the package's mark it (``alex-1a2b3c4d``)."""
+        return marked(self.net, self.sha256, lpips_weights.PUBLISHED[self.net])
 
     def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
         """Return the mean over each clip's frames, (B,); see ``Metric``."""

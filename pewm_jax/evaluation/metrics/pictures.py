@@ -28,6 +28,17 @@ class Metric(Protocol):
         ...
 
 
+def marked(network: str, sha256: str, published: str) -> str:
+    """Return a network's name, with the first 8 digits of the hash of weights of one's own.
+
+    Args:
+        network: its name.
+        sha256: hash of the file that its weights were read from; empty where they are of no file.
+        published: hash of the file that gives the name alone.
+    """
+    return f"{network}-{sha256[:8]}" if sha256 not in ("", published) else network
+
+
 def colours(imagined_BTHWC: Array, truth_BTHWC: Array) -> tuple[Array, Array]:
     """Return both clips in [0, 1], clipped.
 

@@ -3,8 +3,10 @@
 The encoder's name is part of the measure's: numbers by different encoders cannot be compared.
 
 ============ =====================================================================================
-dinov2       the class token of a DINOv2 after its last norm; pictures resized to 224 × 224
-alex, vgg    the last layer of LPIPS's AlexNet or VGG16, averaged over places; not resized
+dinov2       the class token of a DINOv2 after its last norm; pictures resized to 224 × 224; its
+             size is part of the name, such as ``dinov2-small`` or ``dinov2-base-registers``
+alex, vgg    the last layer of LPIPS's AlexNet or VGG16, averaged over places; not resized; by
+             other weights than the package's with a mark of them, such as ``alex-1a2b3c4d``
 ============ =====================================================================================
 """
 
@@ -14,13 +16,13 @@ import dataclasses
 import functools
 import hashlib
 from pathlib import Path
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import DINOv2Config, UserError
-from pewm_jax.evaluation.metrics.pictures import colours
+from pewm_jax.config.dinov2 import size_name
+from pewm_jax.evaluation.metrics.pictures import colours, marked
 from pewm_jax.models import dinov2, lpips, lpips_weights
 from pewm_jax.models.lpips import Net
 from pewm_jax.types import Array, Params
@@ -31,8 +33,7 @@ PICTURES = 16
 """Pictures that are in an encoder at once."""
 SMALL = 1e-12
 """Added to the product of lengths."""
-EncoderName = Literal["dinov2", "alex", "vgg"]
-ENCODERS: tuple[EncoderName, ...] = ("dinov2", "alex", "vgg")
+ENCODERS = ("dinov2", "alex", "vgg")
 _CNNS: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
 
 
@@ -41,13 +42,13 @@ class Similarity:
     """The cosine between features of pictures, times 100; a ``Metric``.
 
     Attributes:
-        encoder: its name.
+        encoder: its name, as it stands in the measure's.
         network: what the encoder is: settings of a DINOv2, or a network of LPIPS.
         params: its parameters.
         sha256: hash of the file that they were read from.
     """
 
-    encoder: EncoderName
+    encoder: str
     network: DINOv2Config | Net
     params: Params = dataclasses.field(repr=False)
     sha256: str = ""
@@ -131,7 +132,8 @@ def read(encoder: str, path: str | Path | None = None) -> Similarity:
     if encoder in _CNNS:
         file = lpips_weights.find(_CNNS[encoder], path)
         net, params = lpips_weights.read(file, _CNNS[encoder])
-        return Similarity(net, net, jax.device_put(params), _hash(file))
+        name = marked(net, digest := _hash(file), lpips_weights.PUBLISHED[net])
+        return Similarity(name, net, jax.device_put(params), digest)
     if encoder != "dinov2":
         raise UserError(f"there is no encoder {encoder!r}; there is {', '.join(ENCODERS)}.")
     if path is None:
@@ -141,7 +143,9 @@ def read(encoder: str, path: str | Path | None = None) -> Similarity:
         )
     network, params = dinov2.load(Path(path))
     params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
-    return Similarity("dinov2", network, params, _hash(Path(path) / "weights.safetensors"))
+    return Similarity(
+        f"dinov2-{size_name(network)}", network, params, _hash(Path(path) / "weights.safetensors")
+    )
 
 
 def _hash(path: Path) -> str:

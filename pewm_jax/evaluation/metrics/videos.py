@@ -19,7 +19,7 @@ import numpy as np
 
 from pewm_jax.evaluation.metrics import distributions
 from pewm_jax.evaluation.metrics.distributions import Distance, Spread
-from pewm_jax.evaluation.metrics.pictures import colours
+from pewm_jax.evaluation.metrics.pictures import colours, marked
 from pewm_jax.models import i3d, i3d_weights
 from pewm_jax.types import Array, Params
 
@@ -119,8 +119,12 @@ class VideoDistance:
         return SetScore(value, count, half, floor, count // 2)
 
     def name(self, frames: int, clips: int) -> str:
-        """Return the name that says what the number depends on, such as ``FVD-9f@48``."""
-        return f"{self.kind.upper()}-{frames}f@{clips}"
+        """Return the name that says what the number depends on, such as ``FVD-9f@48``.
+
+        By other weights than the package's it is ``FVD[i3d-1a2b3c4d]-9f@48``.
+        """
+        encoder = marked("i3d", self.sha256, i3d_weights.PUBLISHED)
+        return f"{self.kind.upper()}{'' if encoder == 'i3d' else f'[{encoder}]'}-{frames}f@{clips}"
 
     @property
     def about(self) -> str:
