@@ -73,7 +73,7 @@ def _timed(study: Study, models: dict[str, Row], say: Say) -> Times:
     if not missing:
         return kept
     known = {model: row for model, row in models.items() if model in kept}
-    beside = dict(list(known.items())[:1])
+    beside = dict(list(known.items())[-1:])  # a row rather than a backbone, where one is known
     found = _measure(study, {**beside, **missing}, say)
     scale = next((kept[model] / found[model] for model in beside), 1.0)
     kept |= {model: scale * found[model] for model in missing}

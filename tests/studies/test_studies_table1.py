@@ -292,6 +292,11 @@ def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
     pace = 3.0  # what is timed on a busier machine is scaled by what was timed before
     late = [row for row in rows.main_rows(base) if row.name == "map2d-attend"]
     assert timing.planned(study, late, print)["map2d-attend"]["steps"] == 30
+    before = len(asked)  # readers are scaled by one, and not by a backbone
+    more = [row for row in rows.main_rows(base) if row.name in ("voxel-attend", "images-attend")]
+    seconds["images-attend"] = 1.5
+    assert timing.planned(study, more, print)["images-attend"]["steps"] == 40
+    assert asked[before:] == ["voxel-attend", "images-attend"]
     equal = dataclasses.replace(study, steps=(7, 5))
     steps = {name: entry["steps"] for name, entry in timing.planned(equal, chosen, print).items()}
     assert steps == {
