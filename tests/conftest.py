@@ -6,8 +6,10 @@ import mmap
 import os
 import signal
 import sys
+import tempfile
 from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 # No example has a deadline: a busy machine is no fault of the code.
@@ -39,6 +41,29 @@ if next(iter(QUICK)) not in given:  # workers inherit them, as do the programs t
 # A shell that starts the tests in the background tells them to ignore Ctrl-C, and so would every
 # program that they start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+COMPILED = pytest.StashKey[tempfile.TemporaryDirectory]()
+
+
+def pytest_configure(config):
+    """Keep compiled programs while tests run: many compile the same ones once more.
+
+    Each worker has a folder of its own, since JAX's files are not whole until they are written, and
+    programs that tests start have none: they may be killed.
+    """
+    if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
+        import jax
+
+        folder = config.stash[COMPILED] = tempfile.TemporaryDirectory(prefix="compiled-")
+        jax.config.update("jax_compilation_cache_dir", folder.name)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def pytest_unconfigure(config):
+    if COMPILED in config.stash:
+        config.stash[COMPILED].cleanup()
+
 
 SLOW = (
     "test_readme.py",
