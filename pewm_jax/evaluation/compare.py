@@ -189,7 +189,8 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
         See ``docs/evaluation.md``; differences are first − second.
     """
     reports = [*one, *two]
-    nets = {report.metrics["protocol"]["lpips_weights_sha256"] for report in reports} - {None}
+    protocols = [report.metrics["protocol"] for report in reports]
+    nets = {each.get("lpips_name") or each["lpips_weights_sha256"] for each in protocols} - {None}
     skip = {"lpips"} if len(nets) > 1 else set()
     measured = [_measured(group) for group in (one, two)]
     content: dict[str, Any] = {

@@ -197,6 +197,8 @@ def _cell(base: Config, side: str) -> MemorySettings:
 
 def _extent(base: Config, side: str) -> MemorySettings:
     """Another extent of the map on the ground, metres."""
+    if not 0 < float(side) < math.inf:
+        raise ValueError(side)
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
     x, y, _ = memory.cell_m
     cells = (math.ceil(float(side) / x), math.ceil(float(side) / y), memory.cells[2])
@@ -206,6 +208,11 @@ def _extent(base: Config, side: str) -> MemorySettings:
 def _tokens(base: Config, count: str) -> MemorySettings:
     """Another number of tokens that condition a clip."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    if int(count) > MOST_CELLS:
+        raise UserError(
+            f"{count} tokens need a map of as many cells, and {MOST_CELLS:,} are the most that is "
+            "tried: give fewer."
+        )
     most = max(memory.capacity, int(count))
     return dataclasses.replace(memory, tokens=int(count), capacity=most)
 

@@ -75,7 +75,8 @@ def summary(
         averaged within a clip), with ``over_seeds`` where there are several; ``per_frame``; ``fvd``
         and ``kvd`` of all clips and ``fvd_half`` and ``kvd_half``, which are to be compared with
         the floor, with ``per_seed``. ``floors``, with the ``name`` of what has so many clips; and
-        ``differences[against][row][measure]``, paired, row − against, with both intervals.
+        ``differences[against][row][measure]``, paired, row − against, with both intervals (of FVD
+        and KVD over seeds alone).
     """
     values = {name: _stacked([by_clip(each) for each in group]) for name, group in pieces.items()}
     rows: dict[str, Any] = {}
@@ -105,7 +106,7 @@ def summary(
             score = nets[kind].score(truth["logits"], truth["logits"])
             floors[kind] = {"floor": score.facts()["floor"], "half_clips": score.half_clips}
             floors[kind]["name"] = nets[kind].name(frames, score.half_clips)
-    differences = {
+    differences: dict[str, Any] = {
         against: {
             name: _differences(values[name], values[against], houses_C)
             for name in pieces
@@ -114,12 +115,15 @@ def summary(
         for against in pieces
         if against in AGAINST or against.startswith((CONTROL, PAPER_FORM))
     }
+    for against, name in ((a, b) for a, found in differences.items() for b in found):
+        differences[against][name] |= _apart_as_sets(rows[name], rows[against])
     chain = [name for name in CHAIN if name in pieces]
     order = [
         {
             "worse": worse,
             "better": better,
-            "differences": _differences(values[better], values[worse], houses_C),
+            "differences": _differences(values[better], values[worse], houses_C)
+            | _apart_as_sets(rows[better], rows[worse]),
         }
         for worse, better in itertools.pairwise(chain)
     ]
@@ -153,6 +157,18 @@ def _set_distances(
         over = intervals.over_seeds(per_seed)
         entries[name] = {"mean": over["mean"], "per_seed": per_seed, "over_seeds": over}
     return entries
+
+
+def _apart_as_sets(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Return first − second of FVD and KVD, paired by training seed."""
+    found = {}
+    for measure in (f"{kind}{part}" for kind in SETS for part in ("", "_half")):
+        pair = [row["measures"].get(measure) for row in (first, second)]
+        if all(pair):
+            a_K, b_K = np.broadcast_arrays(*(entry["per_seed"] for entry in pair))
+            over = intervals.over_seeds((a_K - b_K).tolist())
+            found[measure] = {"mean": over["mean"], "over_seeds": over}
+    return found
 
 
 def _differences(

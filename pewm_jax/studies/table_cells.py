@@ -87,18 +87,21 @@ def best_of(results: Mapping[str, Any], names: Sequence[str], measure: str) -> s
     return (min if lower else max)(known)[1]
 
 
-def floor_of(results: Mapping[str, Any], measure: str) -> str:
-    """Return what the truth itself gets, as words; "–" where that is not measured."""
-    floors, decimals = results["floors"], COLUMNS[measure][1]
-    if measure == "src" and "src[alex]" in floors:
-        return f"{floors['src[alex]']['ceiling']:.{decimals}f}"
-    found = floors.get(measure.removesuffix("_half"), {}).get("floor")
-    return f"{found['mean']:.{decimals}f}" if found else "–"
-
-
-def place_floor(results: Mapping[str, Any], measure: str) -> str:
-    """Return what pictures of two different places get, as words; "–" but for SRC."""
+def floor_of(results: Mapping[str, Any], measure: str) -> float | None:
+    """Return what the truth itself gets; None where that is not measured."""
     floors = results["floors"]
-    if measure != "src" or "src[alex]" not in floors:
-        return "–"
-    return f"{floors['src[alex]']['floor']:.{COLUMNS[measure][1]}f}"
+    if measure == "src" and "src[alex]" in floors:
+        return floors["src[alex]"]["ceiling"]
+    found = floors.get(measure.removesuffix("_half"), {}).get("floor")
+    return found["mean"] if found else None
+
+
+def place_floor(results: Mapping[str, Any], measure: str) -> float | None:
+    """Return what pictures of two different places get; None but for SRC."""
+    floors = results["floors"]
+    return floors["src[alex]"]["floor"] if measure == "src" and "src[alex]" in floors else None
+
+
+def number_words(number: float | None, measure: str) -> str:
+    """Return a number as words; "–" where there is none."""
+    return "–" if number is None else f"{number:.{COLUMNS[measure][1]}f}"

@@ -22,6 +22,7 @@ from pewm_jax.studies.table_cells import (
     floor_of,
     heading,
     label,
+    number_words,
     place_floor,
     rows_of,
 )
@@ -49,7 +50,7 @@ def latex(results: Mapping[str, Any]) -> str:
         lines.append(" & ".join([words, *cells]) + r" \\")
     lines.append(r"\midrule")
     for words, found in ((TRUTH, floor_of), (PLACES, place_floor)):
-        numbers = [_tex(found(results, measure)) for measure in columns]
+        numbers = [_tex(number_words(found(results, each), each)) for each in columns]
         lines.append(" & ".join([words, *numbers]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
@@ -76,8 +77,8 @@ def as_csv(results: Mapping[str, Any]) -> str:
     for measure in columns_of(results):
         for name, found in ((TRUTH, floor_of), (PLACES, place_floor)):
             number = found(results, measure)
-            if number != "–":
-                writer.writerow([name, measure, number, "", "", "", "", ""])
+            if number is not None:
+                writer.writerow([name, measure, f"{number:.6g}", "", "", "", "", ""])
     return file.getvalue()
 
 

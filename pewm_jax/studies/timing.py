@@ -76,7 +76,7 @@ def _timed(study: Study, models: dict[str, Row], say: Say) -> Times:
     beside = dict(list(known.items())[-1:])  # a row rather than a backbone, where one is known
     found = _measure(study, {**beside, **missing}, say)
     scale = next((kept[model] / found[model] for model in beside), 1.0)
-    kept |= {model: scale * found[model] for model in missing}
+    kept = _kept(path) | kept | {model: scale * found[model] for model in missing}
     study.out.mkdir(parents=True, exist_ok=True)
     atomic.write_text(path, json.dumps(kept, indent=1) + "\n")
     return kept

@@ -83,6 +83,10 @@ def test_depth_is_compared_where_both_have_one(name):
     np.testing.assert_allclose(again, some[1:2], rtol=1e-5)
     with pytest.raises(UserError, match="depths of shapes"):
         metric(truth, truth[:, 1:])
+    with pytest.raises(UserError, match="there is no depth to compare"):
+        metric(None, truth)
+    with pytest.raises(UserError, match="are empty: give one picture at least"):
+        metric(truth[:0], truth[:0])
     with pytest.raises(UserError, match="depths of type int32"):
         metric(truth.astype(np.int32), truth.astype(np.int32))
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pewm_jax import weights
 from pewm_jax.evaluation import metrics
 from pewm_jax.evaluation.metrics import Revisit, VideoDistance
 from tests.evaluation.test_evaluation_metrics import blurred, clips, noisy
@@ -82,3 +83,12 @@ def test_the_fvd_of_two_halves_of_true_clips_falls_with_their_number_as_the_floo
     assert means[0] > means[1] > means[2]
     apart = fvd.distance(features[::2], features[1::2])
     assert apart == pytest.approx(means[2], rel=0.3)
+
+
+def test_the_same_weights_in_another_file_have_the_same_name(tmp_path):
+    alex, fvd = metrics.load("lpips_alex"), metrics.load("fvd")
+    weights.save(tmp_path / "alex.safetensors", alex.params)
+    weights.save(tmp_path / "i3d.safetensors", fvd.params)
+    again = metrics.load("lpips_alex", tmp_path / "alex.safetensors")
+    assert (again.encoder, again.sha256 == alex.sha256) == ("alex", False)
+    assert metrics.load("fvd", tmp_path / "i3d.safetensors").name(9, 48) == "FVD-9f@48"

@@ -22,7 +22,7 @@ import pytest
 from evaluation_scene import tiny, write_split
 from PIL import Image
 
-from pewm_jax import cli, weights
+from pewm_jax import cli, tree, weights
 from pewm_jax import config as configs
 from pewm_jax.commands import protocol as protocol_command
 from pewm_jax.config import StageConfig, TrainConfig, UserError
@@ -297,7 +297,7 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
     assert len(metrics["long"]["per_frame"]["copy"]["all"]["lpips"]["mean"]) == 8
     assert metrics["protocol"]["lpips_weights_sha256"] == report.file_hash(path)
     page = (copied / "report" / "index.html").read_text()
-    name = f"LPIPS[vgg-{report.file_hash(path)[:8]}]"  # weights of one's own
+    name = f"LPIPS[vgg-{tree.digest(weights.load(path))[:8]}]"  # weights of one's own
     assert f"{name} ↓" in page
     assert "not resized" in page
     assert any(line.startswith(f"{name} of whole pictures, lower is better") for line in said)

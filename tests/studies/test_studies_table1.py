@@ -328,6 +328,13 @@ def test_differences_are_paired_by_clip_and_seeds_are_averaged_first():
     assert found["rows"]["none"]["measures"]["psnr/all"]["per_seed"][1] == pytest.approx(
         found["rows"]["none"]["measures"]["psnr/all"]["per_seed"][0] + 1
     )
+    assert not table_page._is_shaky(gain)  # both seeds gain as much
+    apart = table.summary(
+        {"none": pieces["none"], "voxel-attend": [arrays(0.9), arrays(2.2)]}, {}, houses, {}
+    )
+    unsure = apart["differences"]["none"]["voxel-attend"]["psnr/all"]
+    assert unsure["low"] > 0 > unsure["over_seeds"]["low"]  # one seed loses, the other gains more
+    assert table_page._is_shaky(unsure)
     (step,) = found["order"]
     assert (step["worse"], step["better"]) == ("none", "images-attend")
     assert step["differences"]["psnr/all"]["over_seeds"]["mean"] == pytest.approx(2)
@@ -392,6 +399,8 @@ def test_every_measure_of_the_table_stands_beside_what_it_can_be(measured):
     assert results["floors"]["fvd"]["name"] == f"FVD-9f@{count // 2}"
     apart = results["differences"]["none"]["copy"]["psnr/seen"]
     assert apart["over_seeds"] == {"mean": 0, "low": 0, "high": 0}  # paired, and not of two groups
+    apart = results["differences"]["none"]["copy"]["fvd_half"]
+    assert apart == {"mean": 0, "over_seeds": {"mean": 0, "low": 0, "high": 0}}
 
     study = trainings.Study(base, out, (1, 1))
     chosen = [row for row in rows.main_rows(base) if row.name in pieces]
@@ -410,6 +419,16 @@ def test_every_measure_of_the_table_stands_beside_what_it_can_be(measured):
         lines = list(csv.DictReader(file))
     over = {line["measure"]: line["interval_over"] for line in lines if line["row"] == "none"}
     assert (over["psnr/all"], over["fvd"], over["src"]) == ("houses", "seeds", "houses")
+
+
+def test_every_entry_of_the_results_is_documented():
+    docs = Path(__file__).parents[2] / "docs"
+    text = (docs / "table1.md").read_text()
+    for path in (docs / "table1").glob("*-results.json"):
+        results = json.loads(path.read_text())
+        about = results["about"]
+        keys = {*results, *about, *next(iter(about["rows"].values()))} - {"rows", "differences"}
+        assert [key for key in sorted(keys) if f"`{key}`" not in text] == []
 
 
 def test_what_needs_no_network_and_is_better_is_named():
@@ -468,6 +487,8 @@ def test_the_walk_back_passes_the_same_cameras():
         (["--ablate", "cell", "--values", "wide"], "the ablation cell cannot take 'wide'"),
         (["--ablate", "cell", "--values", "0"], "the ablation cell cannot take '0'"),
         (["--ablate", "cell", "--values", "1e-4"], "cells of 1e-4 m on the ground need a map of"),
+        (["--ablate", "tokens", "--values", "999999999"], "999999999 tokens need a map of as many"),
+        (["--ablate", "extent", "--values", "-4"], "ablation extent cannot take '-4'"),
         (["--ablate", "time", "--values", "-4"], "the ablation time cannot take '-4'"),
         (["--minutes", "nan", "1"], "minutes are"),
         (["--steps", "0", "1"], "steps are"),

@@ -33,16 +33,13 @@ class Perceptual:
         net: the network.
         params: its parameters.
         sha256: hash of the file that they were read from.
+        encoder: the network's name; weights other than the package's mark it (``alex-1a2b3c4d``).
     """
 
     net: Net
     params: Params = dataclasses.field(repr=False)
     sha256: str = ""
-
-    @property
-    def encoder(self) -> str:
-        """The network's name; weights other than the package's mark it (``alex-1a2b3c4d``)."""
-        return marked(self.net, self.sha256, lpips_weights.PUBLISHED[self.net])
+    encoder: str = ""
 
     def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
         """Return the mean over each clip's frames, (B,); see ``Metric``."""
@@ -151,7 +148,8 @@ def read(path: Path, net: Net | None = None) -> Perceptual:
     found, params = lpips_weights.read(path, net)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return Perceptual(found, jax.device_put(params), digest)
+    name = marked(found, params, lpips_weights.PUBLISHED[found])
+    return Perceptual(found, jax.device_put(params), digest, name)
 
 
 def chosen(setting: str, height: int, width: int) -> tuple[Perceptual | None, str]:

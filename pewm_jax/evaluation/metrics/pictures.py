@@ -7,9 +7,10 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
+from pewm_jax import tree
 from pewm_jax.config import UserError
 from pewm_jax.evaluation.images import WINDOW, psnr, ssim_map, unit_colours
-from pewm_jax.types import Array
+from pewm_jax.types import Array, Params
 
 
 class Metric(Protocol):
@@ -28,15 +29,16 @@ class Metric(Protocol):
         ...
 
 
-def marked(network: str, sha256: str, published: str) -> str:
-    """Return a network's name, with the first 8 digits of the hash of weights of one's own.
+def marked(network: str, params: Params, published: str) -> str:
+    """Return a network's name, with the first 8 digits of a hash of weights of one's own.
 
     Args:
         network: its name.
-        sha256: hash of the file that its weights were read from; empty where they are of no file.
-        published: hash of the file that gives the name alone.
+        params: its weights.
+        published: ``tree.digest`` of those that need no mark, whatever file they come from.
     """
-    return f"{network}-{sha256[:8]}" if sha256 not in ("", published) else network
+    digest = tree.digest(params)
+    return network if digest == published else f"{network}-{digest[:8]}"
 
 
 def colours(imagined_BTHWC: Array, truth_BTHWC: Array) -> tuple[Array, Array]:
@@ -118,6 +120,8 @@ def clip_depth_rel(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
 
 def _depths(imagined_BTHW: Array, truth_BTHW: Array) -> tuple[Array, Array, Array]:
     """Return both, and where both have a depth."""
+    if imagined_BTHW is None or truth_BTHW is None:
+        raise UserError("there is no depth to compare: give both as (B, T, H, W), metres.")
     imagined, truth = jnp.asarray(imagined_BTHW), jnp.asarray(truth_BTHW)
     shaped = imagined.ndim == 4 or (imagined.ndim == 5 and imagined.shape[-1] == 1)
     if imagined.shape != truth.shape or not shaped:
@@ -125,6 +129,8 @@ def _depths(imagined_BTHW: Array, truth_BTHW: Array) -> tuple[Array, Array, Arra
             f"depths of shapes {imagined.shape} and {truth.shape} cannot be compared: give both as "
             "(B, T, H, W), metres."
         )
+    if 0 in imagined.shape:
+        raise UserError(f"depths of shape {imagined.shape} are empty: give one picture at least.")
     for clip in (imagined, truth):
         if not jnp.issubdtype(clip.dtype, jnp.floating):
             raise UserError(f"depths of type {clip.dtype} are not known: give floats, metres.")

@@ -132,8 +132,8 @@ def read(encoder: str, path: str | Path | None = None) -> Similarity:
     if encoder in _CNNS:
         file = lpips_weights.find(_CNNS[encoder], path)
         net, params = lpips_weights.read(file, _CNNS[encoder])
-        name = marked(net, digest := _hash(file), lpips_weights.PUBLISHED[net])
-        return Similarity(name, net, jax.device_put(params), digest)
+        name = marked(net, params, lpips_weights.PUBLISHED[net])
+        return Similarity(name, net, jax.device_put(params), _hash(file))
     if encoder != "dinov2":
         raise UserError(f"there is no encoder {encoder!r}; there is {', '.join(ENCODERS)}.")
     if path is None:

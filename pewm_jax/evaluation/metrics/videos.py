@@ -25,6 +25,8 @@ from pewm_jax.types import Array, Params
 
 FRAMES = 32
 """Frames that are in the network at once, or one clip if it has more."""
+NAME = "i3d"
+"""The network; a distance by its published weights goes without it."""
 Kind = Literal["fvd", "kvd"]
 DISTANCES: Mapping[Kind, Distance] = {"fvd": distributions.frechet, "kvd": distributions.kernel}
 
@@ -61,11 +63,13 @@ class VideoDistance:
         kind: which of them.
         params: parameters of I3D.
         sha256: hash of the file that they were read from.
+        encoder: the network's name, with a mark of other weights than the package's.
     """
 
     kind: Kind
     params: Params = dataclasses.field(repr=False)
     sha256: str = ""
+    encoder: str = NAME
 
     def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> np.ndarray:
         """Return one number for the whole set, () float64; lower is better, 0 for equal sets.
@@ -123,8 +127,8 @@ class VideoDistance:
 
         By other weights than the package's it is ``FVD[i3d-1a2b3c4d]-9f@48``.
         """
-        encoder = marked("i3d", self.sha256, i3d_weights.PUBLISHED)
-        return f"{self.kind.upper()}{'' if encoder == 'i3d' else f'[{encoder}]'}-{frames}f@{clips}"
+        by = "" if self.encoder == NAME else f"[{self.encoder}]"
+        return f"{self.kind.upper()}{by}-{frames}f@{clips}"
 
     @property
     def about(self) -> str:
@@ -160,4 +164,5 @@ def read(path: Path, kind: Kind) -> VideoDistance:
     params = i3d_weights.read(path)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return VideoDistance(kind, jax.device_put(params), digest)
+    encoder = marked(NAME, params, i3d_weights.PUBLISHED)
+    return VideoDistance(kind, jax.device_put(params), digest, encoder)
