@@ -42,7 +42,8 @@ class ClipChoice:
         scene: where it was recorded.
         start: the present frame; all earlier ones may be context.
         context_S: (S,) frames given to ``worlds.start``, oldest first, the present last. If an
-            episode has fewer, the oldest is repeated, which does not change the map.
+            episode has fewer, the oldest is repeated as padding; ``load_clip`` gives padding no
+            depth, so that nothing of it is remembered twice.
         targets_N: (N,) frames to imagine.
     """
 
@@ -163,13 +164,14 @@ def load_clip(
     Returns:
         ``(context, targets, control)``: S context frames, N true frames, and what leads from the
         present through them: (N, 3) actions composed from the recorded poses, or (N,) cameras.
+        Frames that pad the context have a depth of 0 (not measured) everywhere.
 
     Raises:
         UserError: the recorded actions or the upright motion of poses do not lead to the
             recorded poses, or the frames have another size than the model's.
     """
     episode = episodes[choice.episode]
-    context = episode.frames(list(choice.context_S))
+    context = _without_padding(episode.frames(list(choice.context_S)), choice.context_S)
     targets = episode.frames(list(choice.targets_N))
     size = (config.model.clip.height, config.model.clip.width)
     if targets.rgb_THWC.shape[1:3] != size:
@@ -192,6 +194,13 @@ def load_clip(
         taken = every[[index - choice.start for index in (choice.start, *choice.targets_N)]]
         _check_motion(taken, poses, choice, "recorded actions")
     return context, targets, actions_N3
+
+
+def _without_padding(context: Frames, context_S: Sequence[int]) -> Frames:
+    """Return a context in which frames that are repeated have depth in the last copy alone."""
+    repeated = np.append(np.diff(context_S) == 0, False)
+    depth = np.where(repeated[:, None, None], 0, context.depth_THW).astype(np.float32)
+    return dataclasses.replace(context, depth_THW=depth)
 
 
 _followed = jax.jit(integrate)

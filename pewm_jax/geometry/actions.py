@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import ActionConfig
+from pewm_jax.geometry.cameras import einsum, matmul
 from pewm_jax.types import Array
 
 FORWARD, TURN_LEFT, TURN_RIGHT = 0, 1, 2
@@ -52,8 +53,9 @@ def heading(world_from_camera: Array) -> Array:
 def step_pose(world_from_camera: Array, action_3: Array) -> Array:
     """Return the (4, 4) pose after one (dx, dy, dyaw) action; height and pitch stay."""
     yaw = heading(world_from_camera)
-    move = rotation_z(yaw) @ jnp.stack([action_3[0], action_3[1], jnp.zeros_like(action_3[0])])
-    rotation = rotation_z(action_3[2]) @ world_from_camera[:3, :3]
+    ahead = jnp.stack([action_3[0], action_3[1], jnp.zeros_like(action_3[0])])
+    move = matmul(rotation_z(yaw), ahead)
+    rotation = matmul(rotation_z(action_3[2]), world_from_camera[:3, :3])
     top = jnp.concatenate([rotation, (world_from_camera[:3, 3] + move)[:, None]], 1)
     return jnp.concatenate([top, world_from_camera[3:]], 0)
 
@@ -101,7 +103,7 @@ def actions_between(world_from_camera_T: Array) -> Array:
     pose = jnp.asarray(world_from_camera_T)
     yaw = heading(pose)
     delta = pose[1:, :3, 3] - pose[:-1, :3, 3]
-    body = jnp.einsum("tji,tj->ti", rotation_z(yaw[:-1]), delta)
+    body = einsum("tji,tj->ti", rotation_z(yaw[:-1]), delta)
     turn = (yaw[1:] - yaw[:-1] + jnp.pi) % (2 * jnp.pi) - jnp.pi
     return jnp.stack([body[:, 0], body[:, 1], turn], -1)
 
@@ -117,9 +119,7 @@ def there_and_back(actions_T3: Array) -> Array:
     """
     out = jnp.asarray(actions_T3)
     turn = -out[..., 2:]
-    move = (
-        rotation_z(turn[..., 0])
-        @ jnp.concatenate([out[..., :2], jnp.zeros_like(turn)], -1)[..., None]
-    )
+    ahead = jnp.concatenate([out[..., :2], jnp.zeros_like(turn)], -1)
+    move = matmul(rotation_z(turn[..., 0]), ahead[..., None])
     back = jnp.concatenate([-move[..., :2, 0], turn], -1)
     return jnp.concatenate([out, back[..., ::-1, :]], -2)

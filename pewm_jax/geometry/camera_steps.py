@@ -11,6 +11,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from pewm_jax.geometry.actions import heading, rotation_z
+from pewm_jax.geometry.cameras import einsum
 from pewm_jax.types import Array, Camera
 
 NUMBERS = 10
@@ -56,7 +57,7 @@ def between(before: Camera, after: Camera, width: int) -> Array:
     here, there = (jnp.asarray(x.world_from_camera) for x in (before, after))
     yaw = heading(here)
     away = there[..., :3, 3] - here[..., :3, 3]
-    moved = jnp.einsum("...ji,...j->...i", rotation_z(yaw), away)
+    moved = einsum("...ji,...j->...i", rotation_z(yaw), away)
     turned = (heading(there) - yaw + jnp.pi) % (2 * jnp.pi) - jnp.pi
     tilted = pitch(there) - pitch(here)
     widened = field_of_view(after, width) - field_of_view(before, width)
@@ -72,7 +73,7 @@ def follow(before: Camera, step_6: Array, width: int) -> Camera:
         width: of the images that the intrinsics are for, pixels.
     """
     here, intrinsics = jnp.asarray(before.world_from_camera), jnp.asarray(before.intrinsics_4)
-    moved = jnp.einsum("...ij,...j->...i", rotation_z(heading(here)), step_6[..., :3])
+    moved = einsum("...ij,...j->...i", rotation_z(heading(here)), step_6[..., :3])
     place = here[..., :3, 3] + moved
     up = jnp.clip(pitch(here) + step_6[..., 3], -STEEPEST, STEEPEST)
     yaw = heading(here) + step_6[..., 4]

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import UserError
+from pewm_jax.geometry.cameras import einsum
 from pewm_jax.types import Array, Camera
 
 SIDES, SHIFT, INSIDE = 4, 2, 3
@@ -296,7 +297,7 @@ def through_pixels(
     right = jnp.broadcast_to((columns - cx) / fx, (len(fx), height, width))
     seen = jnp.stack([right, down, jnp.ones_like(right)], -1)
     pose = camera.world_from_camera
-    directions = jnp.einsum("tij,thwj->thwi", pose[:, :3, :3], seen)
+    directions = einsum("tij,thwj->thwi", pose[:, :3, :3], seen)
     origins = jnp.broadcast_to(pose[:, None, None, :3, 3], directions.shape)
     flat = march(ids_XYZ, low_3, cell_m, origins.reshape(-1, 3), directions.reshape(-1, 3), layers)
     return jax.tree.map(lambda x: x.reshape(*directions.shape[:-1], layers), flat)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from pewm_jax.geometry.cameras import ray_directions, relative_to_first
+from pewm_jax.geometry.cameras import matmul, ray_directions, relative_to_first
 from pewm_jax.types import Array, Camera
 
 
@@ -33,7 +33,7 @@ def _unit_directions(camera: Camera, height: int, width: int) -> Array:
 def _moved(direction: Array, camera: Camera) -> Array:
     """Return (o × R d, R d) of directions d in the cameras' own frames; linear in them."""
     rotation = camera.world_from_camera[..., None, :3, :3]
-    direction = direction @ jnp.swapaxes(rotation, -1, -2)
+    direction = matmul(direction, jnp.swapaxes(rotation, -1, -2))
     origin = jnp.broadcast_to(camera.world_from_camera[..., None, None, :3, 3], direction.shape)
     return jnp.concatenate([jnp.cross(origin, direction), direction], -1)
 

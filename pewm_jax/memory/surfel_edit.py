@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import jax.numpy as jnp
 
 from pewm_jax.config import SurfelConfig
-from pewm_jax.geometry.cameras import transform_points
+from pewm_jax.geometry.cameras import matmul, transform_points
 from pewm_jax.memory import cells, voxel_cells
 from pewm_jax.types import Array
 
@@ -76,7 +76,7 @@ def move(
     count, turn = surfels.sums_VC[:, COUNT], transform[:3, :3]
     corner = cells.corners(config, surfels.origin_3, jnp.where(arrives, target, 0))
     rows = surfels.sums_VC.at[:, PLACE].set((there - corner) * count)
-    rows = rows.at[:, NORMAL].set(surfels.sums_VC[:, NORMAL] @ turn.T)
+    rows = rows.at[:, NORMAL].set(matmul(surfels.sums_VC[:, NORMAL], turn.T))
     rows = jnp.where(arrives[:, None], rows, 0)
     size = jnp.where(covered, jnp.inf, after.size_V).at[slot].min(surfels.size_V, mode="drop")
     observed = jnp.where(covered, False, after.observed_V)

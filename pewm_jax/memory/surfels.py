@@ -5,6 +5,8 @@ centimetres, so that what was seen can be shown again (``render``). Each surfel 
 position of what fell into its cell and is as wide as the cell, or as a pixel of the camera that saw
 it was there if that is wider. What was observed beats what was imagined: the first observation of
 an imagined cell replaces it and, with ``memory.protect``, imagined frames change no observed cell.
+Without it, a cell counts as observed as long as it holds observed points: until imagined ones
+replace them (``keep`` newest); a mean of both counts as observed.
 
 Cells are kept sorted, as the voxel map's are. Sums are added up in the order of the pixels, so that
 on a CPU equal frames make equal memories bit for bit.
@@ -138,7 +140,7 @@ def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool =
         cell_V,
         sums.at[target].add(rows, mode="drop"),
         jnp.where(cell_V < none, size, 0),
-        was_observed | touched if observed else was_observed,
+        was_observed | touched if observed else was_observed & stays,
         surfels.origin_3,
         occupied=(cell_V < none).sum(dtype=jnp.int32),
         dropped=surfels.dropped + dropped,

@@ -16,6 +16,7 @@ what was observed alone.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -92,6 +93,31 @@ def first_frames(
     return replaced(made[0], true[0]), replaced(made[1], true[1])
 
 
+def backwards(model: ModelConfig, sight: Sight) -> Sight:
+    """Return what the memory shows clips that are run backwards; leading axes B and T.
+
+    Tokens have no order in time. All else is reversed along T; latents that stand for one frame
+    each are reversed as frames are.
+
+    Raises:
+        UserError: the codec folds several frames into a latent one, and the reader takes latents,
+            which cannot be reversed then.
+    """
+    if sight.encoded is not None and not model.codec.framewise:
+        raise UserError(
+            "train.chained is above 0, which runs clips backwards, but memory.reader.picture is "
+            "latents and the codec folds several frames into one latent: use a codec of single "
+            "frames, memory.reader.picture pixels, or train.chained 0."
+        )
+    parts = {field.name: getattr(sight, field.name) for field in dataclasses.fields(sight)}
+    reversed_parts = {
+        name: jax.tree.map(lambda x: x[:, ::-1], part)
+        for name, part in parts.items()
+        if name != "tokens"
+    }
+    return dataclasses.replace(sight, **reversed_parts)
+
+
 def _looking_back(
     model: ModelConfig,
     params: Params,
@@ -106,10 +132,8 @@ def _looking_back(
         x0 = latents_BthwC[:, ::-1]
     else:
         x0 = codecs.encode_rgbd(model, params, back.rgb_THWC, back.depth_THW)
-    view = None
-    if sight is not None and sight.view is not None:
-        view = jax.tree.map(lambda x: x[:, ::-1], sight.view)
-        sight = Sight(sight.tokens, view)
+    sight = None if sight is None else backwards(model, sight)
+    view = None if sight is None else sight.view
     observed = jax.tree.map(lambda x: x[:, :1], back)
     conditioning = world_model.condition(model, params, observed, Control(back.camera))
     time_key, noise_key = jax.random.split(key)

@@ -22,7 +22,7 @@ from pewm_jax.config import (
     UserError,
 )
 from pewm_jax.diffusion import squared_cosine
-from pewm_jax.geometry import actions
+from pewm_jax.geometry import actions, cameras
 from pewm_jax.models import nomad
 from pewm_jax.models.costs import Costs, Product, Share
 from pewm_jax.models.signals import as_signal
@@ -44,7 +44,7 @@ def waypoints(model: NomadWorldConfig, clip: Clip) -> Array:
     pose = jnp.asarray(clip.frames.camera.world_from_camera)
     here = pose[:, now]
     away = pose[:, now + 1 : now + 1 + count, :3, 3] - here[:, None, :3, 3]
-    turned = jnp.einsum("bji,bnj->bni", actions.rotation_z(actions.heading(here)), away)
+    turned = cameras.einsum("bji,bnj->bni", actions.rotation_z(actions.heading(here)), away)
     return turned[..., :2]
 
 

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
+import jax
 import numpy as np
 import pytest
 from evaluation_scene import record, tiny, write_split
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pewm_jax.config import UserError
+from pewm_jax import worlds
+from pewm_jax.config import (
+    ImagesConfig,
+    Map2DConfig,
+    PointsConfig,
+    SurfelConfig,
+    UserError,
+    VoxelConfig,
+)
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.evaluation.protocol import (
@@ -22,6 +32,7 @@ from pewm_jax.evaluation.protocol import (
     stack,
     way_back,
 )
+from pewm_jax.evaluation.reproject import CANDIDATES, reproject
 from pewm_jax.geometry.actions import integrate
 
 
@@ -135,3 +146,44 @@ def test_fingerprint_names_what_the_numbers_depend_on(tmp_path):
 def test_file_hash_is_sha256(tmp_path):
     (tmp_path / "f").write_bytes(b"abc")
     assert file_hash(tmp_path / "f").startswith("ba7816bf8f01cfea")
+
+
+MEMORIES = {
+    "voxel": VoxelConfig(cells=(64, 64, 16), capacity=512, tokens=16),
+    "map2d": Map2DConfig(tokens=16),
+    "points": PointsConfig(cells=(64, 64, 16), capacity=512, tokens=16),
+    "images": ImagesConfig(tokens=16, snapshots=2),
+    "mean": SurfelConfig(cells=(64, 64, 16), capacity=2048, tokens=16, keep="mean"),
+    "newest": SurfelConfig(cells=(64, 64, 16), capacity=2048, tokens=16, keep="newest"),
+}
+
+
+@pytest.mark.parametrize("kind", MEMORIES)
+def test_padding_of_a_short_context_is_not_remembered(episodes, tmp_path, kind):
+    """A context of 4 frames, padded to 6, makes the memory of the 4 frames alone."""
+    config = tiny(tmp_path).with_model(memory=MEMORIES[kind])
+    (choice,) = choose(config, episodes, 1, 1)
+    choice = dataclasses.replace(choice, context_S=context_frames(3, 6))
+    assert choice.context_S == (0, 0, 0, 1, 2, 3)
+    padded, _, _ = load_clip(config, episodes, dataclasses.replace(choice, start=3, targets_N=(4,)))
+    alone = jax.tree.map(lambda x: x[2:], padded)
+    assert not padded.depth_THW[:2].any()
+    assert (alone.depth_THW.max((1, 2)) > 0).all()
+    np.testing.assert_array_equal(padded.rgb_THWC[0], alone.rgb_THWC[0])
+    params = jax.jit(functools.partial(worlds.init, config.model))(jax.random.key(0))
+    start = jax.jit(functools.partial(worlds.start, config.model))
+    one, other = (start(params, frames).map for frames in (padded, alone))
+    for a, b in zip(*map(jax.tree.leaves, (one, other)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+@pytest.mark.parametrize("settings", CANDIDATES, ids=str)
+def test_padding_of_a_short_context_is_not_reprojected_twice(episodes, tmp_path, settings):
+    config = tiny(tmp_path)
+    (choice,) = choose(config, episodes, 1, 1)
+    choice = dataclasses.replace(choice, context_S=(0, 0, 0, 1, 2, 3), start=3, targets_N=(4, 5))
+    padded, targets, _ = load_clip(config, episodes, choice)
+    alone = jax.tree.map(lambda x: x[2:], padded)
+    one, other = (reproject(settings, frames, targets.camera) for frames in (padded, alone))
+    np.testing.assert_allclose(one.rgb_THWC, other.rgb_THWC, atol=1e-5)
+    np.testing.assert_allclose(one.depth_THW, other.depth_THW, atol=1e-5)

@@ -1,13 +1,20 @@
+import ast
 import math
+from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.geometry import cameras
-from pewm_jax.types import Camera
-from tests.helpers import random_camera, rigid
+import pewm_jax
+from pewm_jax.config import ImagesConfig, Map2DConfig, PointsConfig, SurfelConfig, VoxelConfig
+from pewm_jax.geometry import actions, camera_steps, cameras, plucker
+from pewm_jax.memory import memories
+from pewm_jax.types import Camera, Frames
+from tests.helpers import random_camera, rigid, tiny_model
 
 
 @settings(max_examples=20, deadline=None)
@@ -59,3 +66,91 @@ def test_inverse_and_relative_poses(seed):
     moved = Camera(camera.intrinsics_4, motion @ camera.world_from_camera)
     again = cameras.relative_to_first(moved)
     np.testing.assert_allclose(again.world_from_camera, relative.world_from_camera, atol=1e-5)
+
+
+GEOMETRY = sorted((Path(pewm_jax.__file__).parent / "geometry").glob("*.py"))
+
+
+def products(jaxpr):
+    """Yield the precision of every matrix product in a jaxpr and in those inside it."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield equation.params["precision"]
+        for value in equation.params.values():
+            for each in value if isinstance(value, (tuple, list)) else (value,):
+                inner = getattr(each, "jaxpr", each)
+                if hasattr(inner, "eqns"):
+                    yield from products(inner)
+
+
+CAMERA = Camera(jnp.array([[8.0, 8, 8, 8]] * 3), jnp.broadcast_to(jnp.eye(4), (3, 4, 4)))
+POSE, DEPTH, POINTS = jnp.eye(4), jnp.ones((3, 16, 16)), jnp.ones((3, 5, 3))
+EXACT = {
+    "invert": lambda: cameras.invert_rigid(POSE),
+    "relative": lambda: cameras.relative_to_first(CAMERA),
+    "transform": lambda: cameras.transform_points(POSE, POINTS[0]),
+    "unproject": lambda: cameras.unproject(DEPTH, CAMERA),
+    "project": lambda: cameras.project(POINTS, CAMERA),
+    "rays": lambda: plucker.plucker(CAMERA, 16, 16),
+    "ray latents": lambda: plucker.camera_latents(CAMERA, 16, 16, 8, 1),
+    "step": lambda: actions.step_pose(POSE, jnp.ones(3)),
+    "integrate": lambda: actions.integrate(POSE, jnp.ones((2, 3))),
+    "between": lambda: actions.actions_between(CAMERA.world_from_camera),
+    "back": lambda: actions.there_and_back(jnp.ones((2, 3))),
+    "camera steps": lambda: camera_steps.between(CAMERA, CAMERA, 16),
+    "follow": lambda: camera_steps.follow(CAMERA, jnp.zeros((3, 6)), 16),
+}
+"""Functions that multiply positions and rotations, called with arrays of their own."""
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_geometry_multiplies_in_full_precision(name):
+    """The default is bfloat16 products on TPUs and TF32 on GPUs."""
+    found = list(products(jax.make_jaxpr(EXACT[name])().jaxpr))
+    assert found
+    highest = jax.lax.Precision.HIGHEST
+    assert all(each == (highest, highest) for each in found)
+
+
+MEMORIES = {
+    "surfels": SurfelConfig(cells=(16, 16, 16), capacity=64, tokens=8),
+    "voxel": VoxelConfig(cells=(16, 16, 16), capacity=64, tokens=8),
+    "points": PointsConfig(cells=(16, 16, 16), capacity=64, tokens=8),
+    "map2d": Map2DConfig(tokens=8),
+    "images": ImagesConfig(tokens=8, snapshots=1),
+}
+
+
+@pytest.mark.parametrize("kind", MEMORIES)
+def test_memories_place_and_show_points_in_full_precision(kind):
+    model = tiny_model(memory=MEMORIES[kind])
+    clip = model.clip
+    camera = jax.tree.map(lambda x: x[:2], CAMERA)
+    depth = jnp.ones((2, clip.height, clip.width))
+    frames = Frames(jnp.zeros((*depth.shape, 3)), depth, camera)
+    features = jnp.zeros((2, 2, 2, model.memory.encoder.channels))
+
+    def all_of_it():
+        memory = memories.empty(model, jnp.zeros(3))
+        memory = memories.remember(model, memory, frames, features)
+        seen = memories.tokens(model, memory, camera)
+        return seen, memories.render(model, memory, camera, clip.height, clip.width)
+
+    highest = jax.lax.Precision.HIGHEST
+    found = list(products(jax.make_jaxpr(all_of_it)().jaxpr))
+    assert all(each == (highest, highest) for each in found)
+    assert found
+
+
+@pytest.mark.parametrize("path", GEOMETRY, ids=lambda path: path.stem)
+def test_products_in_geometry_go_through_the_two_functions_of_full_precision(path):
+    """So that a new function of geometry is exact without being listed above."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+            found.append(node.lineno)
+        named = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+        products = ("matmul", "einsum", "dot", "tensordot", "vdot", "inner")
+        if named and node.value.id == "jnp" and node.attr in products:
+            found.append(node.lineno)
+    assert len(found) == (2 if path.stem == "cameras" else 0), (path, found)

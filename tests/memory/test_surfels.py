@@ -54,7 +54,7 @@ def by_loop(config, batches):
         shown = {}
         for p in np.flatnonzero(new.valid_P):
             cell = tuple(place[p])
-            if observed or not (cell in held and held[cell][3]):
+            if observed or not config.protect or not (cell in held and held[cell][3]):
                 shown.setdefault(cell, []).append(p)
         for cell, every in shown.items():
             members = every
@@ -62,9 +62,11 @@ def by_loop(config, batches):
                 newest = max(new.time_P[p] for p in members)
                 members = [p for p in members if new.time_P[p] == newest]
             rows = [new.points_P3[members], new.values_PC[members], new.size_P[members]]
-            if config.keep == "mean" and cell in held and held[cell][3] == observed:
+            mixed = False
+            if config.keep == "mean" and cell in held and (held[cell][3] or not observed):
                 rows = [np.concatenate(x) for x in zip(held[cell], rows, strict=False)]
-            held[cell] = (*rows, observed)
+                mixed = held[cell][3]
+            held[cell] = (*rows, observed or mixed)
     return held
 
 
@@ -85,9 +87,12 @@ def compare(config, memory, held):
 
 
 @settings(max_examples=15)
-@given(seed=st.integers(0, 100_000), keep=st.sampled_from(["mean", "newest"]))
-def test_a_cell_keeps_what_a_plain_loop_keeps(seed, keep):
-    config = dataclasses.replace(SMALL, capacity=512, keep=keep)
+@given(
+    seed=st.integers(0, 100_000), keep=st.sampled_from(["mean", "newest"]), protect=st.booleans()
+)
+def test_a_cell_keeps_what_a_plain_loop_keeps(seed, keep, protect):
+    """Also whether it was observed: with ``protect`` False, until imagined points replace it."""
+    config = dataclasses.replace(SMALL, capacity=512, keep=keep, protect=protect)
     rng = np.random.default_rng(seed)
     batches = [(drawn(seed + k), bool(rng.random() < 0.5)) for k in range(3)]
     memory = blank(config)

@@ -15,7 +15,7 @@ from pewm_jax.config import BothConfig, ConfigError, PixelConfig, TrainConfig, U
 from pewm_jax.memory import memories
 from pewm_jax.models import codecs, world_model
 from pewm_jax.models.signals import as_signal
-from pewm_jax.types import MapTokens, Sight, View
+from pewm_jax.types import EncodedView, MapTokens, Sight, View
 from pewm_jax.worlds import chained, objective
 from pewm_jax.worlds import costs as world_costs
 from tests.helpers import TINY, init_world, randomise, tiny_config
@@ -210,3 +210,26 @@ def test_the_forward_pass_of_chained_clips_is_counted():
         forward = sum(2 * p.macs for p in costs.products)
         expected = flops + (0.25 * forward if part in ("backbone", "memory") else 0)
         assert all_of_it == pytest.approx(expected), part
+
+
+@pytest.mark.parametrize("field", [f.name for f in dataclasses.fields(Sight) if f.name != "tokens"])
+def test_a_clip_that_is_run_backwards_is_shown_the_memory_backwards(field):
+    """Every part of what the memory shows, also one that is added later."""
+    sight = shows(CONFIG)
+    latents = np.random.default_rng(1).normal(size=(BATCH, 5, 4, 4, 3)).astype(np.float32)
+    sight = dataclasses.replace(sight, encoded=EncodedView(latents, sight.view.seen_THW))
+    back = chained.backwards(CONFIG.model, sight)
+    assert back.tokens is sight.tokens
+    forward, there = (jax.tree.leaves(getattr(each, field)) for each in (sight, back))
+    assert forward
+    for a, b in zip(forward, there, strict=True):
+        np.testing.assert_array_equal(b, a[:, ::-1])
+
+
+def test_encoded_pictures_of_folded_frames_cannot_be_run_backwards():
+    folded = config_of(PixelConfig(spatial=4, temporal=4)).model
+    sight = shows(CONFIG)
+    seen = sight.view.seen_THW
+    sight = Sight(sight.tokens, None, EncodedView(np.zeros((BATCH, 2, 4, 4, 3)), seen))
+    with pytest.raises(UserError, match="folds several frames into one latent: use a codec of"):
+        chained.backwards(folded, sight)
