@@ -51,7 +51,7 @@ def child(settings: Settings) -> None:
     from pewm_jax import cli, presets, worlds
     from pewm_jax.data import loader
     from pewm_jax.training import sharding
-    from pewm_jax.training.step import compile_step, initial_state, stage_key
+    from pewm_jax.training.step import compile_step, initial_state, noise_key
 
     config = presets.load(settings.preset)
     config = dataclasses.replace(
@@ -60,7 +60,7 @@ def child(settings: Settings) -> None:
     cli.cache_compilation("runs/heap")
     stage, mesh = worlds.stages(config.model)[0], sharding.make_mesh(jax.devices()[:1])
     batch = next(iter(loader.clips(config, "train", seed=0, batch=stage.settings(config).batch)))
-    key = jax.device_put(stage_key(config, stage), sharding.replicated(mesh))
+    key = jax.device_put(noise_key(config, stage), sharding.replicated(mesh))
     state = initial_state(config, stage, mesh, None)
     if config.data.prepared and stage.prepare is not None:
         batch = jax.jit(functools.partial(stage.prepare, config.model))(state.params, batch)

@@ -35,7 +35,7 @@ from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.geometry.cameras import invert_rigid, unproject
 from pewm_jax.memory import rendering, views
 from pewm_jax.training import sharding
-from pewm_jax.training.step import abstract_state, compile_step, stage_key
+from pewm_jax.training.step import abstract_state, compile_step, noise_key
 from pewm_jax.types import Array, Camera, Clip
 from pewm_jax.worlds.pewm import STAGES
 
@@ -154,7 +154,7 @@ def readings(batch: int) -> dict[tuple[str, str], Callable[[], object]]:
         config = config.with_model(memory=dataclasses.replace(config.model.memory, reader=reader))
         mesh = sharding.make_mesh(jax.devices()[:1])
         state = filled(abstract_state(config, stage, mesh))
-        clips, key = jax.device_put((walk(config, batch), stage_key(config, stage)))
+        clips, key = jax.device_put((walk(config, batch), noise_key(config, stage)))
         prepare = jax.jit(functools.partial(stage.prepare, config.model))
         frozen = {"codec": jax.tree.map(jnp.copy, state.params["codec"])}
         ready = prepare(frozen, clips)

@@ -93,7 +93,7 @@ def measure(preset: str, number: int, batch: int, repeats: int) -> dict[str, Any
     found: dict[str, Any] = {"batch": batch, **predicted(config, stage, chip)}
     mesh = sharding.make_mesh([device], config.train.mesh)
     clip = jax.device_put(random_clip(config, stage), sharding.of_batch(mesh))
-    key = jax.device_put(step.stage_key(config, stage), sharding.replicated(mesh))
+    key = jax.device_put(step.noise_key(config, stage), sharding.replicated(mesh))
     began = time.perf_counter()
     compiled = step.compile_step(config, stage, mesh, clip)
     found["compile_s"] = time.perf_counter() - began

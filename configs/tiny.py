@@ -35,7 +35,13 @@ def config() -> Config:
         ),
         data=DataConfig(path="data/tiny", stride_max=2, context=4),
         train=TrainConfig(
-            run="runs/tiny", stage1=stage, stage2=stage, save_every=3, log_every=1, preview_every=0
+            run="runs/tiny",
+            stage1=stage,
+            stage2=stage,
+            save_every=3,
+            log_every=1,
+            preview_every=0,
+            noise_key="weights",  # its published losses were drawn so
         ),
         evaluate=EvalConfig(clips=2, seeds=(0, 1), videos=1, video_clips=2, batch=2),
     )

@@ -245,14 +245,18 @@ def cache_compilation(folder: Path) -> None:
     """Make JAX cache compiled programs in a folder, so that the next start is faster.
 
     There is one cache per set of processor features, for which programs are compiled. Call this
-    from command lines only: it sets a global option of JAX.
+    from command lines only: it sets a global option of JAX. A folder that the caller has chosen, by
+    ``JAX_COMPILATION_CACHE_DIR`` or ``jax.config``, stays, and so does a cache that the caller has
+    switched off (``JAX_ENABLE_COMPILATION_CACHE``).
     """
+    import jax  # noqa: PLC0415 - takes seconds, and refusals do not need it
+
+    if jax.config.jax_compilation_cache_dir or not jax.config.jax_enable_compilation_cache:
+        return
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else [platform.processor()]
     features = next((line for line in lines if line.startswith(("flags", "Features"))), lines[0])
     kind = hashlib.sha256(features.encode()).hexdigest()[:12]
-    import jax  # noqa: PLC0415 - takes seconds, and refusals do not need it
-
     jax.config.update("jax_compilation_cache_dir", str((folder / ".cache" / kind).resolve()))
 
 

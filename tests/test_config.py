@@ -186,7 +186,7 @@ def test_what_the_checks_must_not_refuse():
             {"model": {"codec": [1]}},
             "model.codec must be a table of settings, got list",
         ),
-        ({"version": 4}, "of version 4, .* versions up to 3: install a newer pewm_jax"),
+        ({"version": 5}, "of version 5, .* versions up to 4: install a newer pewm_jax"),
         *(({"version": v}, "must be a whole number from 1") for v in (0, -1, "2", 2.0, True, None)),
         ({"version": 2, "dit": {}}, "no setting dit"),
     ],
@@ -294,7 +294,7 @@ def test_every_combination_of_kinds_goes_to_json_and_back(config):
     assert there_and_back(config, Config) == config
 
 
-@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("version", [2, 3, 4])
 def test_a_reader_of_an_earlier_version_is_known_by_its_name_of_now(version):
     reader = {"kind": "attention" if version == 2 else "attend", "looks": 7}
     table = {"version": version, "model": {"memory": {"reader": reader}}}
@@ -315,7 +315,9 @@ def test_what_is_written_says_its_version(tmp_path):
 
 
 def test_an_earlier_version_s_preset_is_the_preset():
-    assert configuration.load(VERSION_1 / "pewm_2b.json") == presets.load("pewm_2b")
+    now = presets.load("pewm_2b")
+    train = dataclasses.replace(now.train, noise_key="weights", beta2=0.999)  # as they were then
+    assert configuration.load(VERSION_1 / "pewm_2b.json") == dataclasses.replace(now, train=train)
 
 
 def test_every_setting_of_an_earlier_version_finds_its_place():
@@ -354,3 +356,34 @@ def test_a_learned_table_of_an_earlier_version_does_what_it_did():
     assert configuration.from_dict(Config, {"model": {"backbone": now}}).model.backbone.learned == (
         "exact"
     )
+
+
+def test_runs_of_earlier_versions_keep_one_key_for_weights_and_noise():
+    whole = configuration.to_dict(Config())
+    whole["version"] = 3
+    del whole["train"]["noise_key"]
+    assert configuration.from_dict(Config, whole).train.noise_key == "weights"
+    assert Config().train.noise_key == "own"
+    overlay = {"version": 3, "model": {}, "train": {"seed": 3}}
+    assert configuration.from_dict(Config, overlay).train.noise_key == "own"
+    for name in ("tiny", "demo", "small"):  # published with the earlier derivation
+        assert presets.load(name).train.noise_key == "weights"
+
+
+@pytest.mark.parametrize(("name", "value"), [("beta1", 1.0), ("beta2", -0.1), ("epsilon", 0.0)])
+def test_settings_of_adam_are_refused_outside_their_ranges(name, value):
+    with pytest.raises(ConfigError, match=rf"train\.{name} is {value}: use a"):
+        TrainConfig(**{name: value})
+
+
+def test_large_presets_have_the_decays_of_their_sources():
+    decays = {
+        "pewm_2b": 0.95,
+        "pewm_5b": 0.95,
+        "pewm_5b_i2v": 0.95,
+        "egowm_cosmos2b": 0.99,
+        "persist_xl": 0.99,
+        "egowm_svd": 0.999,
+        "tiny": 0.999,
+    }
+    assert {name: presets.load(name).train.beta2 for name in decays} == decays

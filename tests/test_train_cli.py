@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -433,3 +434,21 @@ def test_absent_data_are_a_sentence_and_the_run_can_be_started_again(tmp_path):
     code, _, err = finish(start(*argv))
     assert code == 2
     assert re.fullmatch(r"error: .*none.*train does not exist.*\n", err)
+
+
+def test_a_compilation_cache_that_the_caller_chose_stays(tmp_path):
+    old = jax.config.jax_compilation_cache_dir
+    try:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "mine"))
+        cli.cache_compilation(tmp_path / "runs")
+        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "mine")
+        jax.config.update("jax_compilation_cache_dir", None)
+        jax.config.update("jax_enable_compilation_cache", False)
+        cli.cache_compilation(tmp_path / "runs")
+        assert jax.config.jax_compilation_cache_dir is None
+        jax.config.update("jax_enable_compilation_cache", True)
+        cli.cache_compilation(tmp_path / "runs")
+        assert jax.config.jax_compilation_cache_dir.startswith(str(tmp_path / "runs"))
+    finally:
+        jax.config.update("jax_enable_compilation_cache", True)
+        jax.config.update("jax_compilation_cache_dir", old)

@@ -89,7 +89,8 @@ def cosmos_experiment(
     The paper's are the clip, the learning rates, and the form of the actions' layers: two layers
     and two convolutions over time, which are ten times as fast. Steps, batch and noise levels in
     training are ours; of guidance it says nothing, so there is none. The observed frame gets no
-    noise.
+    noise. The paper does not state Adam's decays; they are those of Cosmos-Predict2's own training
+    (0.9 and 0.99, cosmos-predict2 ``cosmos_predict2/configs/base/defaults/optimizer.py``).
 
     Args:
         transformer: the network.
@@ -116,6 +117,7 @@ def cosmos_experiment(
             mesh=MeshConfig(fsdp=8),
             image_noise_mean=-10.0,
             image_noise_std=0.0,
+            beta2=0.99,
             ema=0.9999,
             preview_every=0,
         ),

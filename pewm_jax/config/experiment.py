@@ -10,7 +10,7 @@ from pewm_jax.config.kinds import require_section
 from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.training import DataConfig, EvalConfig, TrainConfig, TrainSettings
 
-VERSION = 3
+VERSION = 4
 """The version of ``config.json`` that is written; ``migrations`` upgrades earlier ones."""
 
 

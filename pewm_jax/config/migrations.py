@@ -93,6 +93,18 @@ def from_2(values: Values, where: str, under: Kinds) -> Values:
     return values
 
 
+def from_3(values: Values, where: str, under: Kinds) -> Values:
+    """Let whole experiments draw noise from the key of their initial weights, as they did.
+
+    A file that is laid over other settings, and does not hold all of ``train``, changes no key.
+    """
+    del where, under
+    train = values.get("train")
+    if isinstance(train, dict) and {"run", "seed", "ema"} <= train.keys():
+        train.setdefault("noise_key", "weights")
+    return values
+
+
 def kind_now(section: str, name: Any) -> Any:
     """Return the present name of a kind that earlier versions may have called otherwise."""
     return RENAMED_KINDS.get((section, name), name) if isinstance(name, str) else name
@@ -149,7 +161,7 @@ def _move(old: Values, name: str, new: Values, to: str) -> None:
         new[to] = old.pop(name)
 
 
-MIGRATIONS: dict[int, Callable[[Values, str, Kinds], Values]] = {1: from_1, 2: from_2}
+MIGRATIONS: dict[int, Callable[[Values, str, Kinds], Values]] = {1: from_1, 2: from_2, 3: from_3}
 """Version → the function that upgrades its values to the next version."""
 
 RENAMED_KINDS = {("reader", "attention"): "attend"}

@@ -83,6 +83,7 @@ def experiment(
             run=f"runs/{run}",
             stage1=STAGE,
             stage2=STAGE,
+            beta2=0.95,
             ema=0.9995,
             save_every=250,
             keep_every=5000,

@@ -87,6 +87,12 @@ class TrainSettings:
     optimizer: Literal["adam", "muon"] = "adam"
     """`adam`, or `muon` for the matrices of hidden layers (orthogonalised momentum, with Adam's
     size of step) and Adam for the rest; Muon needs fewer steps, and keeps one moment less."""
+    beta1: float = 0.9
+    """Adam's decay of the first moment, also for the leaves that Muon leaves to Adam."""
+    beta2: float = 0.999
+    """Adam's decay of the second moment."""
+    epsilon: float = 1e-8
+    """Adam's ε, added to the root of the second moment."""
     weight_decay: float = 0.0
     """Decoupled weight decay on matrices."""
     clip_norm: float = 1.0
@@ -95,6 +101,9 @@ class TrainSettings:
     """Decay of the exponential moving average of the weights, which inference uses."""
     seed: int = 0
     """Seed of weights, noise and data order."""
+    noise_key: Literal["own", "weights"] = "own"
+    """PRNG key that the noise of training is drawn from: its `own`, or that of the initial
+    `weights`, as in runs of versions up to 3. A run that is resumed keeps its own."""
     save_every: int = 100
     """Steps between checkpoints."""
     keep: int = 2
@@ -137,6 +146,10 @@ class TrainSettings:
     def __post_init__(self):
         """Validate."""
         require(0 <= self.ema < 1, f"train.ema is {self.ema}: use a decay in [0, 1).")
+        for name in ("beta1", "beta2"):
+            value = getattr(self, name)
+            require(0 <= value < 1, f"train.{name} is {value}: use a decay in [0, 1).")
+        require(self.epsilon > 0, f"train.epsilon is {self.epsilon}: use a number above 0.")
         require(self.clip_norm > 0, "train.clip_norm must be above 0.")
         require(
             min(self.save_every, self.log_every, self.keep) >= 1,

@@ -74,11 +74,41 @@ def _alone(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implemen
         )
     if works and implementation != "xla":
         q, k, v = (x.swapaxes(1, 2) for x in (q_BKND, k_BKMD, v_BKMD))
-        return jax.nn.dot_product_attention(q, k, v, implementation="cudnn").swapaxes(1, 2)
+        return flash(q, k, v, "cudnn").swapaxes(1, 2)
     logits = batch * queries * k_BKMD.shape[2]
     if heads * logits <= LOGITS:
         return layers.attention(q_BKND, k_BKMD, v_BKMD)
     return _attention(q_BKND, k_BKMD, v_BKMD, min(math.ceil(logits / LOGITS), queries))
+
+
+def flash(q_BNKD: Array, k_BMKD: Array, v_BMKD: Array, implementation: Any) -> Array:
+    """Compute attention (B, N, K, d) by a kernel of ``jax.nn.dot_product_attention``.
+
+    The gradient of cuDNN's kernel refuses odd numbers of queries or keys (jax 0.10), so these get
+    one token of padding, which is masked and dropped.
+
+    Args:
+        q_BNKD: queries.
+        k_BMKD: keys.
+        v_BMKD: values.
+        implementation: of ``jax.nn.dot_product_attention``.
+    """
+    batch, queries, keys = *q_BNKD.shape[:2], k_BMKD.shape[1]
+    if queries % 2 == 0 and keys % 2 == 0:
+        return jax.nn.dot_product_attention(q_BNKD, k_BMKD, v_BMKD, implementation=implementation)
+
+    def even(x: Array) -> Array:
+        return jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0)))
+
+    out = jax.nn.dot_product_attention(
+        even(q_BNKD),
+        even(k_BMKD),
+        even(v_BMKD),
+        query_seq_lengths=jnp.full((batch,), queries, jnp.int32),
+        key_value_seq_lengths=jnp.full((batch,), keys, jnp.int32),
+        implementation=implementation,
+    )
+    return out[:, :queries]
 
 
 def has_flash() -> bool:

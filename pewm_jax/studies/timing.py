@@ -27,7 +27,7 @@ from pewm_jax.data import loader
 from pewm_jax.studies.rows import Row
 from pewm_jax.studies.trainings import Say, Study, backbone_of, settings
 from pewm_jax.training import sharding
-from pewm_jax.training.step import compile_step, initial_state, stage_key
+from pewm_jax.training.step import compile_step, initial_state, noise_key
 from pewm_jax.worlds.pewm import STAGES
 
 ROUNDS = 7
@@ -134,7 +134,7 @@ def _compiled(study: Study, row: Row, say: Say) -> Callable[[], None]:
     config = settings(study, row, 0, 1, start=UNREAD)
     stage, mesh = STAGES[1 if row.reads else 0], sharding.make_mesh(arranged=config.train.mesh)
     batch = next(iter(loader.clips(config, "train", seed=0, batch=stage.settings(config).batch)))
-    key = jax.device_put(stage_key(config, stage), sharding.replicated(mesh))
+    key = jax.device_put(noise_key(config, stage), sharding.replicated(mesh))
     held = [initial_state(config, stage, mesh, None)]
     if config.data.prepared:
         assert stage.prepare is not None

@@ -36,7 +36,7 @@ from pewm_jax.training.step import (
     abstract_state,
     compile_step,
     initial_state,
-    stage_key,
+    noise_key,
 )
 from pewm_jax.training.watch import Watch
 from pewm_jax.types import Clip, Params
@@ -70,6 +70,7 @@ def train(
         Interrupted: Ctrl-C or SIGTERM came; everything is saved. (Where saving takes longer than
             ``train.grace_s``, and at a second signal, the process ends itself.)
     """
+    config = runs.resumed(config, say if processes.is_primary() else _silent)
     planned = stages.planned(config)
     starting.require_weights(config)
     if config.train.wandb:
@@ -104,6 +105,10 @@ def train(
 def _print_error(line: str) -> None:
     """Print what only this process knows; standard output belongs to the first process."""
     print(line, file=sys.stderr, flush=True)
+
+
+def _silent(line: str) -> None:
+    del line
 
 
 class _Worker:
@@ -194,7 +199,7 @@ class _Worker:
             bad=self.bad,
             rows=rows_of(where, settings.batch),
         )
-        make_key = functools.partial(stage_key, config, self.stage)
+        make_key = functools.partial(noise_key, config, self.stage)
         key = jax.jit(make_key, out_shardings=sharding.replicated(self.mesh))()
         traced = Profile(
             self.path,
@@ -255,8 +260,11 @@ class _Worker:
                 self.config, "train", seed=chosen, batch=batch, bad=self.bad, start_step=first
             )
 
+        digest = ""
+        if self.config.data.prepared_path:
+            digest = prepared.start_digest(self.path, self.stage, state.params, done)
         clips = prepared.gather(
-            self.config, self.stage, state.params, read, self.stop.unless_requested
+            self.config, self.stage, state.params, read, self.stop.unless_requested, digest
         )
         if clips is None:
             raise self.stop.interrupted(self.stage.title, done)

@@ -64,9 +64,10 @@ def make(config: Config, stage: Stage) -> optax.GradientTransformation:
 
     settings = stage.settings(config)
     chosen = settings.optimizer or config.train.optimizer
+    adam = optax.scale_by_adam(config.train.beta1, config.train.beta2, config.train.epsilon)
     trains = optax.chain(
         optax.clip_by_global_norm(config.train.clip_norm),
-        muon() if chosen == "muon" else optax.scale_by_adam(),
+        muon(adam) if chosen == "muon" else adam,
         optax.add_decayed_weights(config.train.weight_decay, mask=decayed),
         optax.scale_by_learning_rate(schedule(settings)),
         *([_rates(stage)] if stage.rates else []),
@@ -91,8 +92,8 @@ MUON_RMS = 0.2
 both (Liu et al. 2025, "Muon is scalable for LLM training", Eq. 4)."""
 
 
-def muon() -> optax.GradientTransformation:
-    """Return Muon for the matrices of hidden layers, and Adam for everything else.
+def muon(adam: optax.GradientTransformation) -> optax.GradientTransformation:
+    """Return Muon for the matrices of hidden layers, and ``adam`` for everything else.
 
     Muon steps along the nearest orthogonal matrix to the momentum (Jordan 2024; ``optax.contrib``).
     A convolution is a matrix from all its inputs to its outputs; layers that are stacked count one
@@ -108,7 +109,7 @@ def muon() -> optax.GradientTransformation:
         return jax.tree_util.tree_map_with_path(_sized, updates)
 
     hidden = optax.chain(scale_by_muon(weight_dimension_numbers=_axes), optax.stateless(sized))
-    return optax.partition({"muon": hidden, "adam": optax.scale_by_adam()}, names)
+    return optax.partition({"muon": hidden, "adam": adam}, names)
 
 
 def _axes(updates: Any) -> Any:

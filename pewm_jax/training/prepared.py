@@ -21,14 +21,16 @@ from typing import Any
 import jax
 import numpy as np
 
+from pewm_jax import atomic, tensor_files, tree
 from pewm_jax import config as configuration
-from pewm_jax import tensor_files, tree
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import read_manifest
 from pewm_jax.data.progress import Meter
 from pewm_jax.training.stages import Stage
 from pewm_jax.types import Clip, Params
 
+DIGESTS = "prepared.json"
+"""In the run's folder: stage → digest of the weights that prepared its clips."""
 VERSION = 1
 """Of what prepared clips hold; another one prepares them again."""
 
@@ -60,15 +62,17 @@ def gather(
     params: Params,
     read: Callable[[int], Iterator[Clip]],
     unless_stopped: Callable[[Callable[[], Any]], Any],
+    digest: str = "",
 ) -> list[Clip] | None:
     """Prepare at least ``data.prepared`` clips, no more than are drawn, or find them prepared.
 
     Args:
         config: the experiment.
         stage: says how (``Stage.prepare``).
-        params: the weights; those that prepare clips are frozen.
+        params: the weights.
         read: returns the batches of clips to prepare, from that of the given number on.
         unless_stopped: calls what it is given, or returns None when training shall stop.
+        digest: from ``start_digest``; if empty, that of ``params``.
 
     Returns:
         Batches of NumPy arrays, in memory or in files that are mapped; None if training shall stop.
@@ -76,7 +80,9 @@ def gather(
     assert stage.prepare is not None
     make = jax.jit(functools.partial(stage.prepare, config.model))
     count = _batches(config, stage)
-    folder = _folder(config, stage, params) if config.data.prepared_path else None
+    folder = None
+    if config.data.prepared_path:
+        folder = _folder(config, stage, digest or _digest(stage, params))
     kept: list[Clip] = []
     if folder is not None:
         like = jax.eval_shape(make, params, next(read(0)))
@@ -101,13 +107,45 @@ def gather(
     return kept
 
 
+def start_digest(run: Path, stage: Stage, params: Params, done: int) -> str:
+    """Return the digest of the weights that prepare clips, as the stage started with them.
+
+    A stage may train some of them, as stage ``gate`` trains a part of the codec. So the digest is
+    written into the run's folder before the first step, and read when the stage is resumed.
+
+    Args:
+        run: the run's folder.
+        stage: the stage.
+        params: all parameters after ``done`` steps.
+        done: steps of the stage done before.
+    """
+    file = run / DIGESTS
+    known = json.loads(file.read_text("utf-8")) if file.is_file() else {}
+    if done and stage.name in known:
+        return known[stage.name]
+    found = _digest(stage, params)
+    if not done and known.get(stage.name) != found:
+        atomic.write_text(file, json.dumps(known | {stage.name: found}, indent=1) + "\n")
+    return found
+
+
+def _digest(stage: Stage, params: Params) -> str:
+    return tree.digest({name: params[name] for name in stage.prepares_by if name in params})
+
+
 def seed(config: Config, stage: Stage) -> int:
     """Return the seed by which clips to prepare are chosen, alike in stages that read a memory."""
     return config.train.seed + 1 + stage.memory
 
 
-def _folder(config: Config, stage: Stage, params: Params) -> Path:
-    """Return the folder of these clips, named after all that they depend on."""
+def _folder(config: Config, stage: Stage, weights: str) -> Path:
+    """Return the folder of these clips, named after all that they depend on.
+
+    Args:
+        config: the experiment.
+        stage: the stage.
+        weights: from ``start_digest``.
+    """
     model = configuration.to_dict(config.model)
     if "backbone" not in stage.prepares_by:
         for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
@@ -119,13 +157,12 @@ def _folder(config: Config, stage: Stage, params: Params) -> Path:
     split = read_manifest(Path(config.data.path) / "train")
     for setting in ("path", "features", "prepared", "prepared_path", "workers", "bad_records"):
         data.pop(setting)
-    frozen = {name: params[name] for name in stage.prepares_by if name in params}
     facts = {
         "version": VERSION,
         "model": model,
         "data": data,
         "split": [shard.sha256 for shard in split.shards],
-        "weights": tree.digest(frozen),
+        "weights": weights,
         "memory": stage.memory,
         "by": stage.prepares_by,
         "seed": seed(config, stage),

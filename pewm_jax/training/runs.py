@@ -15,9 +15,10 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import fcntl
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,8 @@ FREE = (
 ``data.features`` is one: the features are checked by their hashes when they are opened. So is
 ``data.prepared_path``: folders in it are named by what the clips in them depend on.
 """
+KEPT = ("noise_key", "beta1", "beta2", "epsilon")
+"""Settings of ``train`` that versions up to 3 did not have; ``resumed`` keeps a run's own."""
 
 
 def identity(config: Config) -> dict[str, Any]:
@@ -109,15 +112,39 @@ def check(config: Config) -> Path:
             f"train.run {run} cannot be made ({error.strerror}); choose another."
         ) from None
     path = run / CONFIG
-    begun = (run / WEIGHTS).exists() or any(run.glob("checkpoints/*/[0-9]*"))
-    if begun:
-        wrong = differences(identity(configuration.load(path)), identity(config))
+    if has_begun(run):
+        there, here = configuration.load(path), resumed(config, lambda _: None)
+        wrong = differences(identity(there), identity(here))
         if wrong:
             raise ConfigError(
                 f"{run} was trained with another configuration ({phrase(wrong)}): give this one "
                 f"its own folder with --train.run, or put the settings back, or delete {run}."
             )
     return run
+
+
+def has_begun(run: Path) -> bool:
+    """Return whether a folder holds weights or checkpoints of a training."""
+    return (run / WEIGHTS).exists() or any(run.glob("checkpoints/*/[0-9]*"))
+
+
+def resumed(config: Config, say: Callable[[str], None] = print) -> Config:
+    """Return the settings with which a run is resumed.
+
+    A run begun by version 3 or earlier has the settings ``KEPT`` as they were fixed then; where a
+    preset has other values now, the run's own are kept, and ``say`` gets a line.
+    """
+    run = Path(config.train.run)
+    if not has_begun(run):
+        return config
+    there = configuration.load(run / CONFIG).train
+    kept = {name: getattr(there, name) for name in KEPT}
+    kept = {name: value for name, value in kept.items() if value != getattr(config.train, name)}
+    if there.noise_key != "weights" or not kept:
+        return config
+    listed = ", ".join(f"train.{name} {value}" for name, value in kept.items())
+    say(f"{run} keeps the settings that it was begun with: {listed}")
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, **kept))
 
 
 def prepare(config: Config) -> Path:

@@ -42,7 +42,7 @@ def train_step(
         stage: what is trained (static).
         state: the state before.
         clip: a batch with leading B, uint8 colours and metric depth.
-        key: the stage's PRNG key, the same for all steps; the step's number is folded in.
+        key: from ``noise_key``, the same for all steps; the step's number is folded in.
         given: weights that only the loss needs, see ``Stage.given``.
 
     Returns:
@@ -86,14 +86,28 @@ def train_step(
     return after, jax.tree.map(jnp.asarray, metrics)
 
 
-def stage_key(config: Config, stage: Stage) -> Array:
-    """Return the PRNG key of a stage, from which weights and noise are drawn."""
-    return jax.random.fold_in(jax.random.key(config.train.seed), stage.number)
+def weights_key(config: Config, stage: Stage) -> Array:
+    """Return the PRNG key that a stage's initial weights are drawn from."""
+    return _keys(config, stage)[0]
+
+
+def noise_key(config: Config, stage: Stage) -> Array:
+    """Return the PRNG key that the noise of a stage's steps is drawn from."""
+    return _keys(config, stage)[1]
+
+
+def _keys(config: Config, stage: Stage) -> tuple[Array, Array]:
+    """Return the keys of weights and noise; both are one key in runs of versions up to 3."""
+    key = jax.random.fold_in(jax.random.key(config.train.seed), stage.number)
+    if config.train.noise_key == "weights":
+        return key, key
+    weights, noise = jax.random.split(key)
+    return weights, noise
 
 
 def abstract_state(config: Config, stage: Stage, mesh: Mesh) -> Any:
     """Return the state's shapes, types and placements without computing anything."""
-    shapes = jax.eval_shape(functools.partial(create, config, stage), stage_key(config, stage))
+    shapes = jax.eval_shape(functools.partial(create, config, stage), weights_key(config, stage))
     return sharding.abstract(shapes, sharding.of_state(config.model, mesh, shapes))
 
 
@@ -111,7 +125,7 @@ def initial_state(
         require_start(config, stage, start, like.params)
         start = sharding.place(start, like.params)
     make = jax.jit(functools.partial(create, config, stage), out_shardings=shardings)
-    return make(stage_key(config, stage), start)
+    return make(weights_key(config, stage), start)
 
 
 def given_weights(config: Config, stage: Stage, mesh: Mesh) -> Params | None:
@@ -143,7 +157,7 @@ def _lower(
     placed = jax.tree.map(lambda leaf: leaf.sharding, state)
     split = sharding.of_batch(mesh)
     batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split), clip)
-    key = stage_key(config, stage)
+    key = noise_key(config, stage)
     extra = () if given is None else (given,)
     step = jax.jit(
         functools.partial(train_step, config, stage),

@@ -1,6 +1,7 @@
 """Attention in pieces is attention, whatever the number of pieces."""
 
 import functools
+import types
 
 import jax
 import jax.numpy as jnp
@@ -93,8 +94,8 @@ def test_flash_attention_is_refused_where_there_is_none_and_taken_where_there_is
         blocked_attention.attention(q, k, v, "cudnn")
     asked = []
 
-    def flash(q, k, v, implementation):
-        asked.append((q.shape, implementation))
+    def flash(q, k, v, implementation, **lengths):
+        asked.append((q.shape, implementation, {name: int(x[0]) for name, x in lengths.items()}))
         return q + v[:, :1] * k[:, :1]
 
     monkeypatch.setattr(blocked_attention, "has_flash", lambda: True)
@@ -103,4 +104,42 @@ def test_flash_attention_is_refused_where_there_is_none_and_taken_where_there_is
     assert blocked_attention.attention(*half).shape == q.shape
     blocked_attention.attention(*half, "xla")
     blocked_attention.attention(q, k, v)
-    assert asked == [((2, 13, 3, 8), "cudnn")], "16 bits alone, batch and tokens in front of heads"
+    lengths = {"query_seq_lengths": 13, "key_value_seq_lengths": 11}
+    assert asked == [((2, 14, 3, 8), "cudnn", lengths)], "16 bits alone, tokens in front of heads"
+
+
+ODD = [(9, 9), (9, 10), (10, 9), (1, 1), (17, 2), (8, 8)]
+
+
+@pytest.mark.parametrize(("queries", "keys"), ODD)
+def test_cudnn_traces_gradients_of_any_length(monkeypatch, queries, keys):
+    """Stable Video Diffusion attends over 9 frames; cuDNN's gradient wants even lengths."""
+    from jax._src.cudnn import fused_attention_stablehlo as cudnn
+
+    version = types.SimpleNamespace(cudnn_get_version=lambda: 91000)
+    monkeypatch.setattr(cudnn, "cuda_versions", version)  # JAX asks for it while tracing
+    monkeypatch.setattr(blocked_attention, "has_flash", lambda: True)
+    half = [x.astype(jnp.bfloat16) for x in inputs(queries=queries, keys=keys)]
+
+    def total(*x):
+        return blocked_attention.attention(*x).astype(jnp.float32).sum()
+
+    traced = str(jax.make_jaxpr(jax.grad(total, (0, 1, 2)))(*half))
+    assert "dot_product_attention_bwd_wrapper" in traced
+
+
+@pytest.mark.parametrize(("queries", "keys"), ODD)
+def test_padding_for_odd_lengths_changes_neither_results_nor_gradients(queries, keys):
+    q, k, v = inputs(queries=queries, keys=keys)
+    weight = jnp.asarray(np.random.default_rng(1).normal(size=q.shape))
+
+    def padded(q, k, v):
+        swapped = (x.swapaxes(1, 2) for x in (q, k, v))
+        return blocked_attention.flash(*swapped, "xla").swapaxes(1, 2)
+
+    def slopes(attend):
+        return jax.grad(lambda *x: (attend(*x) * weight).sum(), (0, 1, 2))(q, k, v)
+
+    np.testing.assert_allclose(padded(q, k, v), layers.attention(q, k, v), rtol=1e-5, atol=1e-5)
+    for got, want in zip(slopes(padded), slopes(layers.attention), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)

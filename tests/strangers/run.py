@@ -83,7 +83,7 @@ def losses(mesh, devices):
     for stage in worlds.stages(config.model)[:2]:
         state = step.initial_state(config, stage, placed, start)
         batch = jax.device_put(clip(config), sharding.of_batch(placed))
-        key = jax.device_put(step.stage_key(config, stage), sharding.replicated(placed))
+        key = jax.device_put(step.noise_key(config, stage), sharding.replicated(placed))
         run = step.compile_step(config, stage, placed, batch)
         for _ in range(2):
             state, metrics = run(state, batch, key)

@@ -22,7 +22,7 @@ def train(config, stage, run, steps, every=1):
     state = step.initial_state(config, stage, mesh)
     step_fn = step.compile_step(config, stage, mesh, fakes.clip(config, 8, 0))
     clip = jax.device_put(fakes.clip(config, 8, 0), sharding.of_batch(mesh))
-    key, saved = step.stage_key(config, stage), {}
+    key, saved = step.noise_key(config, stage), {}
     with Checkpoints(run, config, stage) as checkpoints:
         for number in range(1, steps + 1):
             state, _ = step_fn(state, clip, key)

@@ -67,7 +67,7 @@ def trained(config, stage, steps=3, start=None):
     compiled = step.lower_step(config, stage, mesh, batch).compile(compiler_options=QUICK)
     now = step.initial_state(config, stage, mesh, start)
     first = jax.tree.map(np.array, now.params)
-    key, losses = step.stage_key(config, stage), []
+    key, losses = step.noise_key(config, stage), []
     for _ in range(steps):
         now, metrics = compiled(now, batch, jax.device_put(key, sharding.replicated(mesh)))
         losses.append(float(metrics["loss"]))

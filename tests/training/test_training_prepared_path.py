@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import shutil
 import types
 
 import jax
@@ -138,7 +139,7 @@ def test_the_folder_is_named_by_all_that_the_clips_depend_on(tmp_path, split):
     config = fakes.with_stage(experiment(tmp_path), "joint", batch=8)
 
     def folder(config=config, params=PARAMS, stage=STAGE):
-        return prepared._folder(config, stage, params)
+        return prepared._folder(config, stage, prepared._digest(stage, params))
 
     def with_data(**changes):
         return dataclasses.replace(config, data=dataclasses.replace(config.data, **changes))
@@ -193,3 +194,36 @@ def test_a_training_learns_the_same_with_clips_in_memory_and_on_disk(
         assert file_bytes(tmp_path / run) == file_bytes(tmp_path / "memory")
     elsewhere = str(tmp_path / "elsewhere")  # where they lie alters nothing of what was learnt
     assert "already trained" in train(config("first", prepared_path=elsewhere))[0]
+
+
+def test_a_resumed_stage_finds_its_clips_although_it_trains_what_prepares_them(
+    fake_model, tmp_path, monkeypatch, capsys
+):
+    """As stage ``gate`` does: it prepares by the codec and trains a part of it."""
+    both = tuple(
+        dataclasses.replace(s, prepare=prepare, prepares_by=("backbone", "codec"))
+        for s in pewm.STAGES
+    )
+    monkeypatch.setattr(pewm, "STAGES", both)
+
+    def config(run, **train_settings):
+        made = fakes.config(stage1=6, stage2=0)
+        made = fakes.with_train(made, run=str(tmp_path / run), save_every=2, **train_settings)
+        data = {"prepared": 16, "prepared_path": str(tmp_path / "clips")}
+        return dataclasses.replace(made, data=dataclasses.replace(made.data, **data))
+
+    train(config("undisturbed"))
+    (folder,) = (tmp_path / "clips").iterdir()
+    written = files(folder)
+    shutil.copytree(tmp_path / "undisturbed", tmp_path / "resumed")
+    (tmp_path / "resumed" / "weights.safetensors").unlink()
+    for step in (tmp_path / "resumed" / "checkpoints" / "stage1").glob("[0-9]*"):
+        if int(step.name) > 4:
+            shutil.rmtree(step)
+    train(config("resumed"))
+    assert "going on after step 4" in capsys.readouterr().out
+    assert list((tmp_path / "clips").iterdir()) == [folder]
+    assert files(folder) == written
+    assert losses(tmp_path / "resumed") == losses(tmp_path / "undisturbed")
+    train(config("other", seed=5))  # other weights and clips: another folder
+    assert len(list((tmp_path / "clips").iterdir())) == 2

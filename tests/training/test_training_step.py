@@ -27,7 +27,7 @@ def run(config, stage, steps, start=None):
     now = step.initial_state(config, stage, mesh, start)
     before = jax.tree.map(np.array, now)
     step_fn = step.compile_step(config, stage, mesh, fakes.clip(config, batch, 0))
-    key = step.stage_key(config, stage)
+    key = step.noise_key(config, stage)
     history, losses = [], []
     for number in range(steps):
         placed = jax.device_put(fakes.clip(config, batch, number), sharding.of_batch(mesh))
@@ -87,7 +87,7 @@ def test_inference_uses_the_average_where_trained_and_the_frozen_weights_elsewhe
 
 def test_the_noise_of_a_step_depends_on_its_number_and_on_nothing_else(fake_model):
     config = fakes.config()
-    clip, key = fakes.clip(config, 8, 0), step.stage_key(config, ONE)
+    clip, key = fakes.clip(config, 8, 0), step.noise_key(config, ONE)
     now = state.create(config, ONE, key)
     loss = [
         float(step.train_step(config, ONE, s, clip, key)[1]["loss"])

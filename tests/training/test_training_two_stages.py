@@ -67,7 +67,7 @@ def test_frozen_leaves_stay_bit_identical_and_only_trained_ones_have_moments(sta
     now = step.initial_state(CONFIG, TWO, one_device(), start)
     before = jax.tree.map(np.array, now)
     clip = jax.device_put(CLIP, sharding.of_batch(one_device()))
-    key = step.stage_key(CONFIG, TWO)
+    key = step.noise_key(CONFIG, TWO)
     for _ in range(3):
         now, _ = stage_2(now, clip, key)
     after, start = tree.flatten(now.params), tree.flatten(before.params)
@@ -120,7 +120,7 @@ def test_stage_2_learns_from_pictures_and_changes_nothing_but_the_reader():
     state = step.initial_state(config, TWO, mesh, start)
     before = jax.tree.map(np.array, state.params)  # copies: the step takes the buffers
     run = step.compile_step(config, TWO, mesh, clip)
-    key, losses = step.stage_key(config, TWO), []
+    key, losses = step.noise_key(config, TWO), []
     for _ in range(12):  # the same noise at every step
         same = dataclasses.replace(state, step=jax.numpy.zeros_like(state.step))
         state, metrics = run(same, clip, key)

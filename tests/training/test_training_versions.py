@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 import training_fakes as fakes
+from test_training_loop import train
 
 import pewm_jax
 from pewm_jax import config as configuration
@@ -114,7 +115,8 @@ def test_every_value_moves_to_its_place_and_none_is_lost_or_invented(memory, enc
     values["codec"]["kind"] = codec
     values["memory"] |= {"kind": memory, "encoder": encoder}
     before = flat(configuration.upgrade(values, "here"))
-    arrived = {"version", "model.memory.reader.kind"}  # version 1 knew one reader, unnamed
+    # Version 1 knew one reader, unnamed, and one key for weights and noise.
+    arrived = {"version", "model.memory.reader.kind", "train.noise_key"}
     for path in flat(values):
         there = now_called(path, memory, encoder, codec)
         if path in ("codec.kind", "memory.kind", "memory.encoder"):
@@ -130,7 +132,9 @@ def test_every_value_moves_to_its_place_and_none_is_lost_or_invented(memory, enc
 
 @pytest.mark.parametrize("name", ["tiny", "pewm_2b"])
 def test_the_settings_of_a_preset_are_those_of_now(name):
-    assert parsed(written(name)) == presets.load(name)
+    now = presets.load(name)
+    train = dataclasses.replace(now.train, noise_key="weights", beta2=0.999)  # as they were fixed
+    assert parsed(written(name)) == dataclasses.replace(now, train=train)
 
 
 @pytest.mark.parametrize("kind", MEMORIES)
@@ -302,3 +306,39 @@ def test_another_configuration_than_that_of_version_1_is_refused_by_the_names_of
     other = config.with_model(backbone=dataclasses.replace(config.model.backbone, layers=3))
     with pytest.raises(ConfigError, match=r"model\.backbone\.layers 2 there, 3 here"):
         loop.train(other, say=lambda _: None)
+
+
+@pytest.mark.parametrize("noise_key", ["own", "weights"])
+def test_weights_and_noise_have_keys_of_their_own_except_in_runs_of_earlier_versions(noise_key):
+    config = fakes.with_train(fakes.config(), noise_key=noise_key)
+    keys = [step.weights_key(config, stage) for stage in fakes.STAGES[:2]]
+    keys += [step.noise_key(config, stage) for stage in fakes.STAGES[:2]]
+    different = {tuple(np.asarray(jax.random.key_data(key)).tolist()) for key in keys}
+    assert len(different) == (4 if noise_key == "own" else 2)
+    old = jax.random.fold_in(jax.random.key(config.train.seed), fakes.STAGES[0].number)
+    assert bool((old == keys[0]).all()) == (noise_key == "weights")
+
+
+def test_a_run_of_an_earlier_version_is_resumed_with_its_own_settings(fake_model, tmp_path):
+    """Its file names neither keys nor Adam's decays; the same command now has others."""
+    run = tmp_path / "run"
+    old = {"noise_key": "weights", "beta2": 0.999}
+    begun = fakes.with_train(fakes.config(stage1=6, stage2=2), run=str(run), save_every=2, **old)
+    train(begun)
+    whole = losses(run)
+    (run / "weights.safetensors").unlink()
+    shutil.rmtree(run / "checkpoints" / "stage2")
+    for folder in (run / "checkpoints" / "stage1").glob("[0-9]*"):
+        if int(folder.name) > 4:
+            shutil.rmtree(folder)
+    values = json.loads((run / "config.json").read_text())
+    values["version"] = 3
+    for name in ("noise_key", "beta1", "beta2", "epsilon"):
+        del values["train"][name]
+    (run / "config.json").write_text(json.dumps(values))
+    for _ in range(2):  # the second start finds what the first one wrote
+        now = fakes.with_train(begun, noise_key="own", beta2=0.95)
+        said = "\n".join(map(str, train(now)))
+        assert "keeps the settings that it was begun with: " in said
+        assert "train.beta2 0.999" in said
+    assert losses(run) == whole

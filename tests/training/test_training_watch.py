@@ -54,7 +54,7 @@ def test_stopping_writes_the_step_and_the_records_and_names_the_file(nan_at_5, t
 def test_a_skipped_update_leaves_all_but_the_step_as_it_was(fake_model):
     stage, config = fakes.replaced(fakes.loss_of_depth)[1], fakes.config(on_nonfinite="skip")
     mesh = make_mesh(jax.devices()[:1])
-    key = step.stage_key(config, stage)
+    key = step.noise_key(config, stage)
     good = fakes.clip(config, 8, 0)
     bad = fakes.without_depth(good)
     take = step.compile_step(config, stage, mesh, good)

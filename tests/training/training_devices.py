@@ -93,7 +93,7 @@ def fresh(config, stage, mesh):
     like = step.abstract_state(config, stage, mesh)
     where = jax.tree.map(lambda leaf: leaf.sharding, like)
     make = jax.jit(functools.partial(create, config, stage), out_shardings=where)
-    compiled = make.lower(step.stage_key(config, stage), None).compile()
+    compiled = make.lower(step.noise_key(config, stage), None).compile()
     memory = compiled.memory_analysis()
     assert memory is not None
     return {
@@ -106,7 +106,7 @@ def fresh(config, stage, mesh):
 def run(config, stage, mesh, state, steps=STEPS):
     step_fn = step.compile_step(config, stage, mesh, clip(config, 0))
     where, whole = sharding.of_batch(mesh), sharding.replicated(mesh)
-    key = jax.device_put(step.stage_key(config, stage), whole)
+    key = jax.device_put(step.noise_key(config, stage), whole)
     losses = []
     for number in range(steps):
         placed = jax.device_put(clip(config, number), where)
