@@ -59,7 +59,7 @@ HOMES = {
     "pickle": {"pickled_tensors"},
     "ray": {"data/engines"},
     "safetensors": {"tensor_files", "weights", "convert"},
-    "scipy": {"data", "houses"},
+    "scipy": {"data", "evaluation/intervals", "houses"},
     "tensorboardX": {"training/log"},
     "torch": {"convert", "evaluation/metrics/sam2"},
     "transformers": {"convert", "evaluation/metrics/sam2"},

@@ -15,19 +15,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from pewm_jax.evaluation.images import MASKS
 from pewm_jax.evaluation.statistics import ours, scores
 
 DRAWS, SEED, LEVEL = 10_000, 0, 0.95
 """Bootstrap samples, the seed that they are drawn from, and the share that an interval holds."""
-STUDENT = (
-    *(12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228),
-    *(2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086),
-    *(2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042),
-)
-"""The 97.5 % quantiles of Student's distribution with 1 to 30 degrees of freedom; the last one
-stands for more, which makes an interval wider by up to 4 %."""
 
 
 def how() -> dict[str, Any]:
@@ -84,10 +78,9 @@ def over_houses(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, np.nda
     shape, means_HN = means_HX.shape[1:], means_HX.reshape(len(means_HX), -1)
     known_HN = np.isfinite(means_HN)
     houses_N, filled_HN = known_HN.sum(0), np.where(known_HN, means_HN, 0)
-    counts_DH = drawn(len(means_HN))
     with np.errstate(invalid="ignore"):
         mean_N = filled_HN.sum(0) / houses_N
-        sample_DN = (counts_DH @ filled_HN) / (counts_DH @ known_HN)
+    sample_DN = _samples(means_HN)
     tail = (1 - LEVEL) / 2
     ends_2N = np.full((2, len(mean_N)), np.nan)
     for n in np.flatnonzero(houses_N > 1):
@@ -95,6 +88,69 @@ def over_houses(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, np.nda
         ends_2N[:, n] = np.quantile(sample_D, [tail, 1 - tail])
     found = {"mean": mean_N, "low": ends_2N[0], "high": ends_2N[1], "houses": houses_N}
     return {name: array.reshape(shape) for name, array in found.items()}
+
+
+def _samples(means_HN: np.ndarray) -> np.ndarray:
+    """Return the mean of each bootstrap sample of houses, (draws, N); NaN where there is none."""
+    known_HN = np.isfinite(means_HN)
+    counts_DH = drawn(len(means_HN))
+    with np.errstate(invalid="ignore"):
+        return (counts_DH @ np.where(known_HN, means_HN, 0)) / (counts_DH @ known_HN)
+
+
+def p_over_houses(values_C: np.ndarray, houses_C: np.ndarray) -> float | None:
+    """Return the two-sided p value of a mean of 0, from the bootstrap that makes the intervals.
+
+    It is twice the smaller share of samples on one side of 0, counted as (k + 1) / (draws + 1)
+    (Davison & Hinkley 1997, section 4.4), so that it is below 0.05 where the 95 % interval leaves
+    out 0. None where fewer than two houses have a number.
+
+    Args:
+        values_C: (C,) a difference per clip; NaN where a clip has none.
+        houses_C: (C,) the number of each clip's house.
+    """
+    means_H = within_houses(np.asarray(values_C, np.float64), np.asarray(houses_C))
+    if np.isfinite(means_H).sum() < 2:
+        return None
+    sample_D = _samples(means_H[:, None])[:, 0]
+    sample_D = sample_D[np.isfinite(sample_D)]
+    side = min(int((sample_D <= 0).sum()), int((sample_D >= 0).sum()))
+    return min(1.0, 2 * (side + 1) / (len(sample_D) + 1))
+
+
+def p_over_seeds(values: Sequence[float]) -> float | None:
+    """Return the two-sided p value of a mean of 0 over training seeds: Student's, of one sample.
+
+    None where there are fewer than two.
+    """
+    if len(values) < 2:
+        return None
+    mean, spread = float(np.mean(values)), float(np.std(values, ddof=1))
+    if spread == 0:
+        return 1.0 if mean == 0 else 0.0
+    statistic = abs(mean) / (spread / math.sqrt(len(values)))
+    return float(2 * stats.t.sf(statistic, len(values) - 1))
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """Adjust p values of several comparisons by Holm's step-down method (Holm 1979).
+
+    If the comparisons whose adjusted value is below α are called significant, the probability that
+    any of them is a false positive is at most α.
+
+    Args:
+        p_values: of one family of comparisons; None where there is none, which does not count.
+
+    Returns:
+        The adjusted values, in the same order.
+    """
+    known = sorted((p, k) for k, p in enumerate(p_values) if p is not None)
+    adjusted: list[float | None] = [None] * len(p_values)
+    largest = 0.0
+    for rank, (p, k) in enumerate(known):
+        largest = max(largest, min(1.0, (len(known) - rank) * p))
+        adjusted[k] = largest
+    return adjusted
 
 
 def entry(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, Any]:
@@ -177,5 +233,5 @@ def over_seeds(values: Sequence[float], others: Sequence[float] = ()) -> dict[st
         return {"mean": mean, "low": mean, "high": mean}
     parts = zip(squares, groups, strict=True)
     freedom = int(total**2 / sum(s**2 / (len(group) - 1) for s, group in parts) + 1e-9)
-    half = STUDENT[min(max(freedom, 1), len(STUDENT)) - 1] * math.sqrt(total)
+    half = float(stats.t.ppf((1 + LEVEL) / 2, max(freedom, 1))) * math.sqrt(total)
     return {"mean": mean, "low": mean - half, "high": mean + half}

@@ -15,7 +15,7 @@ from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.evaluation import opened as runs
-from pewm_jax.evaluation import protocol_file, samples, steering
+from pewm_jax.evaluation import protocol_file, reproject_choice, samples, steering
 from pewm_jax.evaluation.covered import score_coverage
 from pewm_jax.evaluation.fixed import decide, shortened
 from pewm_jax.evaluation.gallery import ROWS, Gallery, make_gallery
@@ -29,8 +29,6 @@ from pewm_jax.evaluation.page import render
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.pictures import save_png
 from pewm_jax.evaluation.protocol import ClipChoice, file_hash, fingerprint
-from pewm_jax.evaluation.reproject_choice import SPLIT as BASELINE_SPLIT
-from pewm_jax.evaluation.reproject_choice import choose_settings
 from pewm_jax.evaluation.scoring import Scored, score_table
 from pewm_jax.evaluation.shares import first_alone
 from pewm_jax.evaluation.words import score_lines, summary_lines
@@ -109,18 +107,18 @@ def evaluate(
     data_hash = file_hash(split / MANIFEST)
     measures = chosen.choose(config, accelerator=jax.default_backend() != "cpu")
     lpips = measures.lpips
-    chooses = Path(config.data.path) / BASELINE_SPLIT / MANIFEST
+    validation = reproject_choice.data_hash(config)
     name = fingerprint(
         config,
         opened.weights_hash,
         data_hash,
         lpips.sha256 if lpips else "",
         fixed.pieces_sha256 if fixed else "",
-        file_hash(chooses) if fixed and chooses.is_file() else "",
+        validation if fixed else "",
     )
     folder = Path(out) if out else runs.report_folder(opened, config)
     processes.meet("evaluate: begin")
-    complete = is_complete(folder, config, name, none_weights, measures.hashes)
+    complete = is_complete(folder, config, name, none_weights, measures.hashes, validation)
     processes.meet("evaluate: decided")  # nobody writes before all have looked
     if complete:
         say("the report is complete for these weights and this protocol; nothing to do")
@@ -131,7 +129,9 @@ def evaluate(
     )
     if lpips is None:
         say(measures.about["lpips"])
-    choice = first_alone(lambda: choose_settings(config, partials, say), "reprojection")
+    choice = first_alone(
+        lambda: reproject_choice.choose_settings(config, partials, say), "reprojection"
+    )
     say(f"reprojection: {choice.why}")
     protocol, clips, rollouts = decide(config, episodes, fixed, str(split))
     cameras = protocol.control == "cameras"
@@ -263,6 +263,7 @@ def is_complete(
     name: str,
     none_weights: str = "",
     extras: Mapping[str, Any] | None = None,
+    validation: str = "",
 ) -> bool:
     """Tell whether a folder holds the complete report for a fingerprint, seeds, videos and rival.
 
@@ -272,6 +273,9 @@ def is_complete(
         name: the fingerprint of weights and protocol.
         none_weights: sha256 of the weights of the model without a memory; "" if there is none.
         extras: entries of the protocol on measures that can be left out.
+        validation: sha256 of the index of the split that chooses the reprojection's settings; ""
+            if there is none. Reports of version 0.1 do not state it and are not complete: their
+            partial scores are kept, and the report is written again.
     """
     try:
         metrics = json.loads((folder / METRICS).read_text("utf-8"))
@@ -281,6 +285,7 @@ def is_complete(
             and protocol["report_version"] == REPORT_VERSION
             and protocol["seeds"] == list(config.evaluate.seeds)
             and (protocol["none"] or {}).get("weights_sha256", "") == none_weights
+            and protocol["reproject"]["dataset_sha256"] == validation
             and protocol["config"]["evaluate"]["videos"] == config.evaluate.videos
             and protocol["config"]["evaluate"]["mirror"] == config.evaluate.mirror
             and {key: protocol[key] for key in extras or {}} == (extras or {})

@@ -42,17 +42,20 @@ class ReprojectChoice:
             where nothing could be tried.
         clips: how many clips they were tried on.
         why: a sentence for people.
+        data: sha256 of the index of the validation split; "" if there is none.
     """
 
     settings: ReprojectSettings
     scores: dict[str, float]
     clips: int
     why: str
+    data: str = ""
 
     def facts(self) -> dict[str, Any]:
         """Return what the report says of it."""
         return {
             "split": SPLIT if self.scores else None,
+            "dataset_sha256": self.data,
             "clips": self.clips,
             "candidates": [
                 {"settings": dataclasses.asdict(item), "psnr": self.scores.get(item.name)}
@@ -61,6 +64,12 @@ class ReprojectChoice:
             "chosen": dataclasses.asdict(self.settings),
             "why": self.why,
         }
+
+
+def data_hash(config: Config) -> str:
+    """Return the sha256 of the index of the validation split; "" if there is none."""
+    manifest = Path(config.data.path) / SPLIT / MANIFEST
+    return file_hash(manifest) if manifest.is_file() else ""
 
 
 def choose_settings(
@@ -77,10 +86,10 @@ def choose_settings(
         partials: where scores are kept.
         say: shows a line.
     """
-    folder = Path(config.data.path) / SPLIT
+    folder, data = Path(config.data.path) / SPLIT, data_hash(config)
     try:
         episodes = EpisodeSource(folder)
-        found = partials.get(name := _piece(config, file_hash(folder / MANIFEST)))
+        found = partials.get(name := _piece(config, data))
         if found is None:
             say(f"choosing the settings of the reprojection on {folder} …")
             batch = _cut(config, episodes)
@@ -91,7 +100,8 @@ def choose_settings(
             )
     except UserError as error:
         usual = ReprojectSettings()
-        return ReprojectChoice(usual, {}, 0, f"{usual}: the default, nothing was tried ({error})")
+        why = f"{usual}: the default, nothing was tried ({error})"
+        return ReprojectChoice(usual, {}, 0, why, data)
     values, count = [float(value) for value in found["psnr"]], int(found["clips"])
     best = CANDIDATES[int(np.nanargmax(values))]
     why = (
@@ -99,7 +109,7 @@ def choose_settings(
         f"of {folder} ({max(values):.2f} dB; the worst {min(values):.2f})"
     )
     tried = {item.name: value for item, value in zip(CANDIDATES, values, strict=True)}
-    return ReprojectChoice(best, tried, count, why)
+    return ReprojectChoice(best, tried, count, why, data)
 
 
 def _piece(config: Config, data: str) -> str:

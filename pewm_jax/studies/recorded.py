@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from pewm_jax import atomic, shipped
+from pewm_jax.config import Config
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.studies.rows import Row
@@ -29,6 +30,14 @@ VERSION = 1
 """Raise it when the code changes what is learnt or scored: older scores are then left aside."""
 ELSEWHERE = ("train.start", "data.path")
 """Folders, which may lie anywhere, in the settings of a training."""
+ADDED: Mapping[str, Any] = {
+    "train.noise_key": "weights",
+    "train.beta1": 0.9,
+    "train.beta2": 0.999,
+    "train.epsilon": 1e-8,
+}
+"""Settings that came later, with the values that stand for what was done before; with these they
+are left out of the name."""
 Arrays = dict[str, np.ndarray]
 
 
@@ -52,9 +61,19 @@ def path(study: Study, row: Row, seed: int, steps: Mapping[str, int], scored: st
     facts += [file_hash(Path(row.encoder) / WEIGHTS)] if row.encoder else []
     for which in (backbone_of(study.base, row), row):
         config = settings(study, which, seed, steps[which.name], start="x")
-        facts.append({k: v for k, v in identity(config).items() if k not in ELSEWHERE})
+        facts.append(_settings(config))
     name = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
     return study.out / FOLDER / f"seed{seed}-{row.name}-{name[:12]}.npz"
+
+
+def _settings(config: Config) -> dict[str, Any]:
+    """Return the settings that name a training's scores, as version 3 of the settings has them."""
+    found = identity(config) | {"version": 3}
+    return {
+        name: value
+        for name, value in found.items()
+        if name not in ELSEWHERE and not (name in ADDED and value == ADDED[name])
+    }
 
 
 def read(file: Path) -> dict[str, Arrays] | None:

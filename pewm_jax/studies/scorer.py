@@ -28,7 +28,7 @@ from pewm_jax.evaluation.metrics.revisits import ways
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.evaluation.reproject import reproject_batch
-from pewm_jax.evaluation.reproject_choice import choose_settings
+from pewm_jax.evaluation.reproject_choice import ReprojectChoice, choose_settings
 from pewm_jax.evaluation.scoring import Batch, load_batch
 from pewm_jax.geometry.actions import there_and_back
 from pewm_jax.models.lpips import LEAST
@@ -116,14 +116,20 @@ class Scorer:
 
         return found.put(piece, **self._score(imagine, f"scoring {run.name} ({piece})"))
 
+    def reprojection(self, out: Path) -> ReprojectChoice:
+        """Return the settings of ``reproject``, chosen on the validation split, or found chosen."""
+        found = Partials(out / SCORES, "no weights", self.name)
+        return choose_settings(self.config, found, self.say)
+
     def baseline(self, name: str, out: Path) -> Arrays:
         """Score ``reproject`` or ``copy``, which have no network, or find it scored."""
-        found = Partials(out / SCORES, "no weights", self.name)
-        kept = found.get(name)
+        found, piece = Partials(out / SCORES, "no weights", self.name), name
+        if name == "reproject":
+            chosen = self.reprojection(out).settings
+            piece = f"{name}-{chosen.name}"
+        kept = found.get(piece)
         if kept is not None:
             return kept
-        if name == "reproject":
-            chosen = choose_settings(self.config, found, self.say).settings
 
         def imagine(context: Frames, control: Any, camera: Camera, seeds_B2: np.ndarray) -> Frames:
             del control, seeds_B2
@@ -131,7 +137,7 @@ class Scorer:
                 return copy_last(context, camera.intrinsics_4.shape[1])
             return reproject_batch(chosen, context, camera)
 
-        return found.put(name, **self._score(imagine, f"scoring {name}"))
+        return found.put(piece, **self._score(imagine, f"scoring {name}"))
 
     def truth(self, out: Path) -> Arrays:
         """Return the truth's own logits, and the ceiling and floor of SRC."""

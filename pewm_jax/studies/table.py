@@ -76,7 +76,8 @@ def summary(
         and ``kvd`` of all clips and ``fvd_half`` and ``kvd_half``, which are to be compared with
         the floor, with ``per_seed``. ``floors``, with the ``name`` of what has so many clips; and
         ``differences[against][row][measure]``, paired, row − against, with both intervals (of FVD
-        and KVD over seeds alone).
+        and KVD over seeds alone), p values over houses and over seeds (``p``, ``p_seeds``), and
+        those adjusted for the rows of the table (``adjust``).
     """
     values = {name: _stacked([by_clip(each) for each in group]) for name, group in pieces.items()}
     rows: dict[str, Any] = {}
@@ -127,7 +128,29 @@ def summary(
         }
         for worse, better in itertools.pairwise(chain)
     ]
+    for family in (*(list(found.values()) for found in differences.values()), _steps(order)):
+        adjust(family)
     return {"rows": rows, "floors": floors, "differences": differences, "order": order}
+
+
+def _steps(order: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    return [step["differences"] for step in order]
+
+
+def adjust(family: Sequence[Mapping[str, dict[str, Any]]]) -> None:
+    """Add Holm's adjusted p values to the differences of one table of the page, column by column.
+
+    Args:
+        family: for each row of the table, its differences by measure; ``p_holm`` and
+            ``p_seeds_holm`` are added to each that has ``p`` and ``p_seeds``.
+    """
+    for measure in {name for found in family for name in found}:
+        column = [found[measure] for found in family if measure in found]
+        for name in ("p", "p_seeds"):
+            adjusted = intervals.holm([each.get(name) for each in column])
+            for each, value in zip(column, adjusted, strict=True):
+                if value is not None:
+                    each[f"{name}_holm"] = value
 
 
 def _stacked(each: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -166,8 +189,9 @@ def _apart_as_sets(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[
         pair = [row["measures"].get(measure) for row in (first, second)]
         if all(pair):
             a_K, b_K = np.broadcast_arrays(*(entry["per_seed"] for entry in pair))
-            over = intervals.over_seeds((a_K - b_K).tolist())
-            found[measure] = {"mean": over["mean"], "over_seeds": over}
+            apart = (a_K - b_K).tolist()
+            over, p = intervals.over_seeds(apart), intervals.p_over_seeds(apart)
+            found[measure] = {"mean": over["mean"], "over_seeds": over, "p_seeds": p}
     return found
 
 
@@ -184,7 +208,9 @@ def _differences(
         if measure not in second:
             continue
         a_KC, b_KC = first[measure], second[measure]
-        found[measure] = intervals.entry(a_KC.mean(0) - b_KC.mean(0), houses_C)
+        paired_C = a_KC.mean(0) - b_KC.mean(0)
+        found[measure] = intervals.entry(paired_C, houses_C)
+        found[measure]["p"] = intervals.p_over_houses(paired_C, houses_C)
         means = [
             [float(intervals.over_houses(one_C, houses_C)["mean"]) for one_C in group]
             for group in (a_KC, b_KC)
@@ -192,4 +218,5 @@ def _differences(
         if np.isfinite(np.concatenate(means)).all() and max(map(len, means)) > 1:
             apart = np.subtract(*np.broadcast_arrays(*means))
             found[measure]["over_seeds"] = intervals.over_seeds(apart.tolist())
+            found[measure]["p_seeds"] = intervals.p_over_seeds(apart.tolist())
     return found

@@ -27,7 +27,7 @@ from pewm_jax.studies.trainings import Study, backbone_of, settings, train
 from pewm_jax.worlds.pewm import STAGES
 
 RESULTS, HOURS = "results.json", "hours.json"
-SCHEMA = 1
+SCHEMA = 2
 """Version of the layout of the results, which ``docs/table1.md`` describes."""
 EMPTY = "backbone"
 """The row of the backbone alone: what every row's weights give with an empty memory."""
@@ -210,6 +210,7 @@ def _facts(
         "context": scorer.config.data.context,
         "batch": STAGES[0].settings(study.base).batch,
         "left_out": dict(scorer.left_out),
+        "reproject": scorer.reprojection(study.out).facts(),
         "hours": {"clock": sum(pair[0] for pair in hours), "cpu": sum(p[1] for p in hours)},
         "how": intervals.how(),
     }

@@ -34,11 +34,17 @@ PAPER: Mapping[str, tuple[float, ...]] = {
     "Ours": (22.458, 0.759, 0.157, 91.9, 0.086, 81.7),
 }
 """The paper's Table 1 (arXiv 2505.05495): PSNR, SSIM, LPIPS, FVD, DreamSim, SRC."""
-SHAKY = "°"
-"""Marks a difference that is clear over houses and not over training seeds."""
+ALPHA = 0.05
+"""Level of significance, after Holm's correction."""
+SIGNIFICANT, HOUSES_ONLY = "*", "°"
+"""Mark differences that are significant over houses and over training seeds, and those that are
+significant over houses and not over training seeds."""
 PAIRED = (
     "Paired by clip, with 95 % intervals over houses; FVD, of sets, is paired by training seed. "
-    f"{SHAKY}: over training seeds (Student's) the interval holds 0."
+    "Intervals are not adjusted for the number of comparisons; marks are: "
+    f"{SIGNIFICANT} significant (p < {ALPHA}) over houses and over training seeds, {HOUSES_ONLY} "
+    "over houses and not over training seeds (or there is one seed), both after Holm's correction "
+    "for the comparisons of a column; without a mark, not significant over houses."
 )
 PAPER_HEADINGS = ("PSNR, dB", "SSIM", "LPIPS", "FVD", "DreamSim", "SRC")
 OURS = ("psnr/all", "ssim/all", "lpips/all", "fvd_half", "dreamsim", "src")
@@ -218,8 +224,8 @@ def _cells_of(
         found = differences.get(measure)
         sees = not any(blind(results, name, measure) for name in pair)
         cells.append(_signed(found, decimals) if found and sees else "–")
-        if found and sees and _is_shaky(found):
-            cells[-1] += SHAKY
+        if found and sees:
+            cells[-1] += mark_of(found)
     over = differences["psnr/seen"].get("over_seeds")
     return [*cells, _signed(over, 2) if over else "–"]
 
@@ -244,12 +250,15 @@ def _order_text(results: Mapping[str, Any]) -> str:
     )
 
 
-def _is_shaky(entry: Mapping[str, Any]) -> bool:
-    """Return whether a difference is clear over houses and not over training seeds."""
-    over = entry.get("over_seeds")
-    if not over or None in (entry.get("low"), over["low"]):
-        return False
-    return (entry["low"] > 0 or entry["high"] < 0) and over["low"] <= 0 <= over["high"]
+def mark_of(entry: Mapping[str, Any]) -> str:
+    """Return the mark of a difference; FVD and KVD, of sets, have p values over seeds alone."""
+    houses, seeds = entry.get("p_holm"), entry.get("p_seeds_holm")
+    over_seeds = seeds is not None and seeds < ALPHA
+    if "p" not in entry:
+        return SIGNIFICANT if over_seeds else ""
+    if houses is None or houses >= ALPHA:
+        return ""
+    return SIGNIFICANT if over_seeds else HOUSES_ONLY
 
 
 def _signed(entry: Mapping[str, Any], decimals: int) -> str:

@@ -6,10 +6,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 from test_evaluation_statistics import sums_of
 
 from pewm_jax.evaluation import intervals
-from pewm_jax.evaluation.intervals import DRAWS, SEED, entry, over_houses, over_seeds, table
+from pewm_jax.evaluation.intervals import (
+    DRAWS,
+    SEED,
+    entry,
+    holm,
+    over_houses,
+    over_seeds,
+    p_over_houses,
+    p_over_seeds,
+    table,
+)
 
 
 def looped(values, houses):
@@ -123,3 +134,49 @@ def test_students_interval_is_symmetric_and_swaps_its_sign(seed, count):
     assert there["mean"] == pytest.approx(-back["mean"])
     assert there["low"] == pytest.approx(-back["high"])
     assert there["high"] - there["mean"] == pytest.approx(there["mean"] - there["low"])
+
+
+@settings(max_examples=50)
+@given(st.lists(st.one_of(st.none(), st.floats(0, 1)), min_size=1, max_size=12))
+def test_holms_correction_rejects_what_its_steps_reject(p_values):
+    """The steps: the k-th smallest of m is compared with α / (m − k + 1), until one fails."""
+    adjusted = holm(p_values)
+    known = sorted(p for p in p_values if p is not None)
+    for alpha in (0.01, 0.05, 0.3):
+        rejected = 0
+        while rejected < len(known) and known[rejected] * (len(known) - rejected) < alpha:
+            rejected += 1
+        threshold = known[rejected - 1] if rejected else -1.0
+        expected = [p is not None and p <= threshold for p in p_values]
+        assert [p is not None and p < alpha for p in adjusted] == expected
+    for before, after in zip(p_values, adjusted, strict=True):
+        assert (before is None) == (after is None)
+        assert before is None or before <= after <= 1
+
+
+def test_holms_correction_of_a_textbook_example():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == []
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31), st.integers(2, 9), st.floats(-0.6, 0.6))
+def test_p_values_over_houses_agree_with_the_interval(seed, count, shift):
+    rng = np.random.default_rng(seed)
+    houses = np.repeat(np.arange(count), 3)
+    values = rng.standard_normal(3 * count) + shift
+    interval, p = over_houses(values, houses), p_over_houses(values, houses)
+    if p < 0.045:
+        assert interval["low"] > 0 or interval["high"] < 0
+    if p > 0.055:
+        assert interval["low"] <= 0 <= interval["high"]
+    assert p_over_houses(-values, houses) == pytest.approx(p, abs=2e-3)
+    assert p_over_houses(values[:3], houses[:3]) is None
+
+
+def test_p_values_over_seeds_are_students():
+    values = [1.0, 2.0, 4.0]
+    assert p_over_seeds(values) == pytest.approx(stats.ttest_1samp(values, 0).pvalue)
+    assert p_over_seeds([1.0]) is None
+    assert p_over_seeds([0.0, 0.0]) == 1
+    assert p_over_seeds([1.0, 1.0]) == 0

@@ -275,6 +275,26 @@ def test_a_damaged_page_is_drawn_again_without_imagining(copied, monkeypatch):
     assert page.read_bytes() == whole
 
 
+def test_a_report_with_another_validation_split_is_not_complete(run, tmp_path):
+    """The settings of ``reproject`` are chosen on that split, also without a protocol's file."""
+    base = tmp_path / "copy"
+    shutil.copytree(run.parent, base)
+    data, folder = base / "data", base / "run"
+    report.evaluate(folder, data=data, out=tmp_path / "report", say=lambda _: None)
+    before = json.loads((tmp_path / "report" / "metrics.json").read_text())
+    shutil.rmtree(data / "validation")
+    write_split(data / "validation", episodes=1)
+    said = []
+    report.evaluate(folder, data=data, out=tmp_path / "report", say=said.append)
+    assert not any("nothing to do" in line for line in said)
+    after = json.loads((tmp_path / "report" / "metrics.json").read_text())
+    hashes = [each["protocol"]["reproject"]["dataset_sha256"] for each in (before, after)]
+    assert hashes[0] != hashes[1]
+    assert hashes[1] == report.file_hash(data / "validation" / report.MANIFEST)
+    report.evaluate(folder, data=data, out=tmp_path / "report", say=said.append)
+    assert "nothing to do" in said[-1]
+
+
 def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(copied, tmp_path):
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     assert "lpips" not in metrics["results"]["memory"]["all"]

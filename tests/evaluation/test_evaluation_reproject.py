@@ -10,10 +10,12 @@ import pytest
 from evaluation_scene import look, record, tiny, write_split
 
 from pewm_jax.config import ConfigError
+from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.evaluation import reproject_choice
 from pewm_jax.evaluation.images import unit_colours
 from pewm_jax.evaluation.partial import Partials
+from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.evaluation.reproject import (
     CANDIDATES,
     ReprojectSettings,
@@ -121,6 +123,7 @@ def test_the_best_on_validation_is_taken_and_kept(tmp_path, monkeypatch):
     facts = found.facts()
     assert facts["split"] == "validation"
     assert facts["chosen"] in [item["settings"] for item in facts["candidates"]]
+    assert facts["dataset_sha256"] == file_hash(tmp_path / "data" / "validation" / MANIFEST)
     monkeypatch.setattr(reproject_choice, "_score", None)
     assert reproject_choice.choose_settings(config, partials, said.append) == found
     assert len(said) == 1
@@ -131,7 +134,7 @@ def test_without_fitting_validation_data_the_default_is_taken_and_said(tmp_path)
     found = reproject_choice.choose_settings(tiny(tmp_path), partials, print)
     assert found.settings == ReprojectSettings()
     assert "does not exist" in found.why
-    assert found.facts()["split"] is None
+    assert (found.facts()["split"], found.facts()["dataset_sha256"]) == (None, "")
     write_split(tmp_path / "data" / "validation", episodes=1, size=24)
     found = reproject_choice.choose_settings(tiny(tmp_path), partials, print)
     assert (found.settings, found.scores) == (ReprojectSettings(), {})
