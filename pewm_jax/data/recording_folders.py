@@ -1,13 +1,15 @@
 """Recordings in the folders of Open3D and TUM: which files form a frame, and its camera pose.
 
-Two shapes of folders are read. Open3D's: a folder of colour images, a folder of depth images and a
-``.log`` trajectory (a line of three integers, then a 4×4 camera-to-world matrix, per frame). TUM's:
+Two layouts are read. Open3D's: a folder of colour images, a folder of depth images and a ``.log``
+trajectory (a line of three integers, then a 4×4 camera-to-world matrix, per frame). Its images
+are taken in natural order (2.png before 10.png), and frames are matched by their position. TUM's:
 ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt`` whose lines begin with a time stamp.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -84,14 +86,65 @@ def _read_log_folder(folder: Path, trajectory: Path) -> list[RecordedFrame]:
             f"{folder} has {len(colours)} colour images, {len(depths)} depth images and "
             f"{len(poses)} poses in {trajectory.name}: the counts must match, one per frame."
         )
+    _require_same_numbers(folder, colours, depths)
     return [RecordedFrame(*frame) for frame in zip(colours, depths, poses, strict=True)]
+
+
+def natural_key(path: Path) -> tuple[tuple[tuple[int, int | str], ...], str]:
+    """Return a sort key in which numbers inside a name count as numbers: 2.png before 10.png."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return tuple((0, int(p)) if p.isdecimal() else (1, p) for p in parts if p), path.name
+
+
+def _require_same_numbers(folder: Path, colours: list[Path], depths: list[Path]) -> None:
+    """Refuse colour and depth images that are numbered and do not have the same numbers.
+
+    The first or the last number in a name may count the frames (the other can be a time stamp).
+    Two series that begin with different numbers, or count in different steps, are matched by
+    position.
+    """
+    differing = None
+    for place in (0, -1):
+        one, other = (_numbers(files, place) for files in (colours, depths))
+        if one is None or other is None:
+            continue
+        if set(one) == set(other) or (_is_series(one) and _is_series(other)):
+            return
+        differing = differing or (one, other)
+    if differing is None:
+        return
+    one, other = differing
+    number = min(set(one) ^ set(other))
+    has, lacks = ("colour", "depth") if number in one else ("depth", "colour")
+    raise UserError(
+        f"{folder} has a {has} image {number} and no {lacks} image {number}: give the images of a "
+        "frame the same number, and remove frames that are not complete."
+    )
+
+
+def _numbers(files: list[Path], place: int) -> list[int] | None:
+    """Return a number of each name; None if a name has none, or two names share one.
+
+    Args:
+        files: the files.
+        place: which of the numbers in a name, by its index.
+    """
+    found = [re.findall(r"[0-9]+", path.stem) for path in files]
+    numbers = [int(each[place]) for each in found if each]
+    return numbers if len(set(numbers)) == len(files) else None
+
+
+def _is_series(numbers: list[int]) -> bool:
+    """Return whether numbers are evenly spaced."""
+    return len(set(np.diff(numbers).tolist())) <= 1
 
 
 def _images(folder: Path, names: tuple[str, ...], what: str) -> list[Path]:
     for name in names:
         if (folder / name).is_dir():
             files = (folder / name).iterdir()
-            return sorted(path for path in files if path.suffix.lower() in SUFFIXES)
+            images = (path for path in files if path.suffix.lower() in SUFFIXES)
+            return sorted(images, key=natural_key)
     raise UserError(f"{folder} has no folder of {what} images; it must be named {names[0]}/.")
 
 
@@ -110,7 +163,7 @@ def read_log(path: Path) -> np.ndarray:
     poses = np.empty((len(lines) // 5, 4, 4))
     for k, (number, fields) in enumerate(lines):
         if k % 5:
-            poses[k // 5, k % 5 - 1] = _numbers(path, number, fields, 4)
+            poses[k // 5, k % 5 - 1] = _floats(path, number, fields, 4)
     return poses
 
 
@@ -156,12 +209,12 @@ def _stamped_lines(path: Path) -> list[tuple[int, float, list[str]]]:
     for number, line in enumerate(_lines(path), 1):
         fields = line.split()
         if fields and not fields[0].startswith("#"):
-            rows.append((number, float(_numbers(path, number, fields[:1], 1)[0]), fields[1:]))
+            rows.append((number, float(_floats(path, number, fields[:1], 1)[0]), fields[1:]))
     return rows
 
 
 def _from_quaternion(path: Path, number: int, fields: list[str]) -> np.ndarray:
-    values = _numbers(path, number, fields, 7)
+    values = _floats(path, number, fields, 7)
     norm = float(np.linalg.norm(values[3:]))
     if not abs(norm - 1) < 1e-2:
         raise UserError(f"{path}, line {number}: the quaternion has length {norm:.3g}, not 1.")
@@ -178,7 +231,7 @@ def _lines(path: Path) -> list[str]:
         raise UserError(f"{path} does not read as text ({error}).") from None
 
 
-def _numbers(path: Path, line: int, fields: list[str], count: int) -> np.ndarray:
+def _floats(path: Path, line: int, fields: list[str], count: int) -> np.ndarray:
     try:
         values = np.array([float(field) for field in fields])
     except ValueError:

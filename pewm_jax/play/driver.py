@@ -32,12 +32,14 @@ from pewm_jax.play.requests import (
     Shown,
     Undo,
 )
-from pewm_jax.play.session import Drive, Event, Session
+from pewm_jax.play.session import Drive, Event, Session, Walls
 from pewm_jax.play.settings import Start
 from pewm_jax.types import WorldState
 
-MOST_UNDO, MOST_WAITING = 4, 32
-"""Edits that can be undone, and events that may wait."""
+MOST_UNDO, MOST_WAITING, MOST_WAY = 4, 32, 64
+"""Edits that can be undone, requests that may wait, and steps that one drag may take."""
+NEWEST = ((Drive, GoTo), (Walls,), (Sampler,), (Begin,))
+"""Kinds of requests of which only the newest waits: it replaces an earlier one of its group."""
 PAUSE_S = 0.1
 """Seconds for a browser on the same machine to draw before the next step is imagined ahead."""
 PATIENCE_S = 5.0
@@ -92,15 +94,24 @@ class Driver:
         self._say(sentence, failed=True)
 
     def put(self, request: Request) -> None:
-        """Ask for something; returns at once."""
+        """Ask for something; returns at once.
+
+        A request replaces an earlier one of its group (``NEWEST``) that still waits. A request that
+        finds ``MOST_WAITING`` others waiting is dropped, and the page says so.
+        """
         with self._changed:
-            self._idle.clear()
-            if isinstance(request, (Drive, GoTo)):
-                kept_ones = [w for w in self._waiting if not isinstance(w[0], (Drive, GoTo))]
-                self._waiting = collections.deque(kept_ones)
-            if len(self._waiting) < MOST_WAITING:
-                self._waiting.append((request, time.monotonic()))
+            group = next((kinds for kinds in NEWEST if isinstance(request, kinds)), ())
+            waiting = [w for w in self._waiting if not isinstance(w[0], group)]
+            dropped = len(waiting) >= MOST_WAITING
+            if not dropped:
+                self._idle.clear()
+                self._waiting = collections.deque([*waiting, (request, time.monotonic())])
             self._changed.notify()
+        if dropped:
+            self.tell(
+                f"{len(waiting)} requests are waiting: {type(request).__name__} was dropped. Wait "
+                "until the picture changes, then ask again."
+            )
 
     def close(self) -> None:
         """End the thread after what it is doing, and finish a video that is being recorded.
@@ -173,7 +184,13 @@ class Driver:
         elif isinstance(request, GoTo):
             steps, target = engine.model.actions, np.asarray(request.planar, np.float64)
             parts = places.way(now.planar_3, target, steps.step_m, steps.turn_deg)
-            self._todo = collections.deque(Drive((x, y, turn)) for x, y, turn in parts.tolist())
+            if len(parts) > MOST_WAY:
+                self._say(
+                    f"That place is {len(parts)} steps away: driving the first {MOST_WAY}; drag "
+                    "again from there."
+                )
+            steps_3 = parts[:MOST_WAY].tolist()
+            self._todo = collections.deque(Drive((x, y, turn)) for x, y, turn in steps_3)
         elif isinstance(request, Sampler):
             self._sample_in(engine.with_sampler_steps(request.steps), now)
         elif isinstance(request, Record):

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 from data_world import HIGH, LOW, arrays, split
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pewm_jax.config import ConfigError, UserError
@@ -20,7 +22,7 @@ from pewm_jax.data.importer import (
     planar_actions,
     world_from_recording,
 )
-from pewm_jax.data.recording_folders import RecordedFrame, read_recording
+from pewm_jax.data.recording_folders import RecordedFrame, natural_key, read_recording
 from pewm_jax.geometry.cameras import unproject
 
 SIZE = 48
@@ -404,3 +406,52 @@ def test_tum_frames_without_a_partner_are_left_out(tmp_path, walk):
 def test_settings_that_cannot_work_are_refused(tmp_path, options, says):
     with pytest.raises(ConfigError, match=says):
         config(tmp_path, tmp_path, **options)
+
+
+def renamed(folder, colour, depth):
+    """Rename the images of a recording, k-th by k-th."""
+    for name, new in (("image", colour), ("depth", depth)):
+        for k, path in enumerate(sorted((folder / name).iterdir())):
+            path.rename(path.with_name(f"{new(k)}.new{path.suffix}"))
+        for path in (folder / name).iterdir():
+            path.rename(path.with_name(path.name.replace(".new", "")))
+
+
+def test_images_are_taken_in_natural_order(tmp_path, walk):
+    """1.png … 24.png: as text, 10 comes before 2."""
+    record(tmp_path / "rec", walk)
+    renamed(tmp_path / "rec", lambda k: f"{k + 1}", lambda k: f"frame{k + 1}.depth")
+    import_recording(config(tmp_path / "rec", tmp_path / "out"), lambda _: None)
+    np.testing.assert_array_equal(imported(tmp_path / "out").frames().rgb_THWC, walk.rgb_THWC)
+
+
+@given(
+    numbers=st.sets(st.integers(0, 10**6), min_size=1, max_size=30),
+    before=st.sampled_from(["", "rgb", "frame-", "cam0_"]),
+    after=st.sampled_from(["", "_colour", ".color"]),
+)
+def test_the_natural_order_is_that_of_the_numbers(numbers, before, after):
+    files = [Path(f"{before}{number}{after}.png") for number in numbers]
+    expected = [Path(f"{before}{number}{after}.png") for number in sorted(numbers)]
+    assert sorted(files, key=natural_key) == expected
+
+
+@pytest.mark.parametrize(
+    ("colour", "depth", "fits"),
+    [
+        (lambda k: k + 1, lambda k: k + 1, True),
+        (lambda k: k + 1, lambda k: k, True),  # counted from 1 and from 0
+        (lambda k: f"{k:04}-{k * 33366}", lambda k: f"{k:04}-{k * 33371 + 7}", True),  # time stamps
+        (lambda k: k + 1, lambda k: k + 1 + (k > 20), False),  # frame 22 has no depth
+        (lambda k: k + (k > 3), lambda k: k, False),
+        (lambda k: f"a{chr(97 + k)}", lambda k: f"b{chr(97 + k)}", True),
+    ],
+)
+def test_colour_and_depth_of_different_numbers_are_refused(tmp_path, walk, colour, depth, fits):
+    record(tmp_path / "rec", walk)
+    renamed(tmp_path / "rec", colour, depth)
+    if fits:
+        assert len(read_recording(tmp_path / "rec")) == 24
+        return
+    with pytest.raises(UserError, match=r"rec has a .* image \d+ and no .* image \d+: give"):
+        read_recording(tmp_path / "rec")

@@ -208,3 +208,54 @@ def test_a_video_has_a_frame_for_each_step_and_is_whole_however_it_ends(drives, 
     last = board.board(board.pictures(a_toy(), one._session), "toy")
     assert frames[-1].shape == last.shape
     assert np.abs(frames[-1].astype(float) - last).mean() < 8
+
+
+def test_a_request_that_finds_too_many_waiting_is_dropped_and_said(drives):
+    slow = a_slow()
+    one, told = drives(lambda: slow)
+    slow.go.clear()
+    slow.begun.clear()
+    one.put(LEFT)
+    assert slow.begun.wait(LONG)
+    for number in range(driver.MOST_WAITING):
+        one.put(requests.Save(f"w{number:02}"))
+    assert not [shown for shown in told.told if shown.failed]
+    one.put(requests.Save("lost"))
+    one.put(requests.Undo())
+    said = [shown.said for shown in told.told if shown.failed]
+    assert len(said) == 2
+    assert "32 requests are waiting: Save was dropped." in said[0]
+    assert "Undo was dropped" in said[1]
+    slow.go.set()
+    assert one.wait(LONG)
+    assert kept.names(one._folder) == [f"w{number:02}" for number in range(driver.MOST_WAITING)]
+
+
+def test_drags_and_switches_are_coalesced_while_a_step_is_imagined(drives):
+    slow = a_slow()
+    one, told = drives(lambda: slow)
+    x, y, yaw = told.session.planar_3.tolist()
+    slow.go.clear()
+    slow.begun.clear()
+    one.put(LEFT)
+    assert slow.begun.wait(LONG)
+    for number in range(200):
+        one.put(requests.GoTo((x, y, yaw + number)))
+        one.put(session.Walls(number % 2 == 0))
+    assert len(one._waiting) == 2
+    assert not [shown for shown in told.told if shown.failed]
+    one.put(requests.GoTo((x, y, yaw)))
+    slow.go.set()
+    assert one.wait(LONG)
+    np.testing.assert_allclose(told.session.planar_3, [x, y, yaw], atol=1e-6)
+    assert not told.session.walls
+
+
+def test_one_drag_drives_a_bounded_number_of_steps_and_says_so(drives):
+    one, told = drives()
+    before = told.session
+    one.put(session.Walls(False))
+    one.put(requests.GoTo((before.planar_3[0] + 1000.0, *before.planar_3[1:].tolist())))
+    assert one.wait(LONG)
+    assert told.session.steps == before.steps + driver.MOST_WAY
+    assert any(f"driving the first {driver.MOST_WAY}" in said for said in told.sentences)
