@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import gc
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -501,3 +503,18 @@ def test_sixty_four_candidates_hold_one_map():
     copies = jax.vmap(functools.partial(worlds.imagine, model), (None, None, 0, 0))
     after, _ = jax.eval_shape(copies, params, state, actions, keys)
     assert after.map.features_VF.shape == (64, *features), "each remembers what it imagined"
+
+
+def test_the_tutorial_compares_many_futures(capsys):
+    """Its two blocks run, and give the same; neither copies the map."""
+    page = (Path(__file__).parents[1] / "docs" / "tutorial.md").read_text()
+    section = page.split("## Compare many futures\n")[1]
+    first, second = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    names = dict(zip(("config", "params", "state"), made("pewm"), strict=True))
+    names |= {"jax": jax, "pewm_jax": pewm_jax}
+    exec(first, names)
+    assert capsys.readouterr().out == "(3, 3, 16, 24, 3)\n"
+    expected = names["clips"].rgb_THWC
+    exec(second, names)
+    np.testing.assert_allclose(names["clips"].rgb_THWC, expected, atol=2e-3)
+    assert names["after"].map.features_VF.shape == names["state"].map.features_VF.shape

@@ -98,13 +98,14 @@ def step(
         UserError: the action has none of these forms; or, outside of jit, vmap and grad, it is
             unknown or not finite.
     """
+    control, single = action, False
     if not isinstance(action, (Camera, Control)):
-        action = as_array(action, "step", "actions")
-    single = _is_single(action)
-    control = action[None] if single else action
+        control = as_array(action, "step", "actions")
+        single = _is_single(control)
+        control = control[None] if single else control
     world, frames = worlds.imagine(model, params, state.world, control, key)
-    count = frames.depth_THW.shape[0]
-    return ImaginedState(world, state.steps + count), _shown(frames, single=single)
+    steps, seen = _after(state.steps, frames, single=single)
+    return ImaginedState(world, steps), seen
 
 
 def observation(state: ImaginedState) -> dict[str, Array]:
@@ -140,12 +141,16 @@ def satisfied(seen: dict[str, Array], cost: Callable[[Array], Array], at_most: f
     return jnp.asarray(cost(seen["rgb"]) <= at_most)
 
 
-def _is_single(action: Any) -> bool:
+def _is_single(action: Array) -> bool:
     """Tell one action from a block of them."""
-    if isinstance(action, (Camera, Control)):
-        return False
     whole = jnp.issubdtype(action.dtype, jnp.integer)
     return action.ndim == 0 or (action.ndim == 1 and not whole)
+
+
+@functools.partial(jax.jit, static_argnames="single", inline=True)
+def _after(steps: Array, frames: Frames, *, single: bool) -> tuple[Array, dict[str, Array]]:
+    """Return the number of steps after more frames, and the frames as observations."""
+    return steps + frames.depth_THW.shape[0], _shown(frames, single=single)
 
 
 @functools.partial(jax.jit, static_argnames="single", inline=True)

@@ -79,10 +79,10 @@ def start(
             Values are not checked under jit, vmap and grad.
     """
     model = model_of(model)
-    act = functions(model).start
-    if _imagines(model):
+    module = functions(model)
+    if _imagines(module):
         frames = checks.check_frames(frames, "start", depth_scale)
-    return _start(act, model, params, frames, depth_scale)
+    return _start(module.start, model, params, frames, depth_scale)
 
 
 def observe(
@@ -109,11 +109,11 @@ def observe(
         UserError: as for ``start``.
     """
     model = model_of(model)
-    act = functions(model).observe
-    if _imagines(model):
+    module = functions(model)
+    if _imagines(module):
         _require_state(state, "observe")
         frames = checks.check_frames(frames, "observe", depth_scale)
-    return _observe(act, model, params, state, frames, depth_scale)
+    return _observe(module.observe, model, params, state, frames, depth_scale)
 
 
 def imagine(
@@ -157,12 +157,12 @@ def imagine(
             is not rigid.
     """
     model = model_of(model)
-    act = functions(model).imagine
-    if _imagines(model):
+    module = functions(model)
+    if _imagines(module):
         _require_state(state, "imagine")
         control = checks.check_control(control, "imagine")
     after, frames = _imagine(
-        act, model, params, state, control, key, remember=remember, memory=memory
+        module.imagine, model, params, state, control, key, remember=remember, memory=memory
     )
     return (after if remember else WorldState(after.frame, state.map)), frames
 
@@ -200,7 +200,7 @@ def imagine_many(
     """
     model = model_of(model)
     module = functions(model)
-    if _imagines(model):
+    if _imagines(module):
         _require_state(state, "imagine_many")
         controls = checks.check_control(controls, "imagine_many")
     own = getattr(module, "imagine_many", None)
@@ -220,9 +220,9 @@ def imagine_many(
     return WorldState(frame, state.map), frames
 
 
-def _imagines(model: WorldSettings) -> bool:
+def _imagines(module: Any) -> bool:
     """Return False for a policy or a codec, whose functions refuse by themselves."""
-    return getattr(functions(model), "IMAGINES", True)
+    return getattr(module, "IMAGINES", True)
 
 
 def _require_state(state: Any, who: str) -> None:
@@ -243,7 +243,7 @@ def _start(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    given = checks.in_metres(frames, depth_scale) if _imagines(model) else frames
+    given = checks.in_metres(frames, depth_scale) if _imagines(functions(model)) else frames
     return act(model, params, given)
 
 
@@ -256,7 +256,7 @@ def _observe(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    given = checks.in_metres(frames, depth_scale) if _imagines(model) else frames
+    given = checks.in_metres(frames, depth_scale) if _imagines(functions(model)) else frames
     after = act(model, params, state, given)
     ok = checks.valid((), state.frame.camera)
     return WorldState(checks.poisoned(ok, after.frame), checks.kept(ok, after.map, state.map))

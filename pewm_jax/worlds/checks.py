@@ -250,9 +250,11 @@ def _check_values(frames: Frames, who: str) -> None:
     }
     known: dict[str, Any] = jax.device_get({k: v for k, v in named.items() if _is_known(v)})
     if "rgb" in known:
-        _check_colors(rgb.dtype, *known["rgb"], who)
+        low, high = known["rgb"]
+        _check_colors(rgb.dtype, low, high, who)
     if "depth" in known:
-        _check_depth(*known["depth"], who)
+        low, high = known["depth"]
+        _check_depth(low, high, who)
     if "poses" in known:
         _check_poses(known["poses"], who)
     if "intrinsics" in known:
@@ -288,7 +290,7 @@ def _device_ranges(x: Array) -> tuple[Array, Array]:
     return values.min(1), values.max(1)
 
 
-def _first(wrong: np.ndarray) -> int | None:
+def _first(wrong: Any) -> int | None:
     """Return the number of the first frame that is wrong."""
     return int(np.argmax(wrong)) if wrong.any() else None
 
