@@ -54,7 +54,12 @@ class ImaginedState:
 
 
 def reset(
-    model: Config | WorldSettings, params: Params, frames: Frames, key: Array
+    model: Config | WorldSettings,
+    params: Params,
+    frames: Frames,
+    key: Array,
+    *,
+    depth_scale: float | None = None,
 ) -> ImaginedState:
     """Begin with what has been seen.
 
@@ -63,12 +68,14 @@ def reset(
         params: the world model's parameters.
         frames: S ≥ 1 posed RGB-D frames; the last one is the present.
         key: for worlds that begin at random; none of the library's does.
+        depth_scale: as for ``worlds.start``.
 
     Raises:
         UserError: the frames do not fit the model, or cannot be used; see ``worlds.start``.
     """
     del key
-    return ImaginedState(worlds.start(model, params, frames), jnp.zeros((), jnp.int32))
+    world = worlds.start(model, params, frames, depth_scale=depth_scale)
+    return ImaginedState(world, jnp.zeros((), jnp.int32))
 
 
 def step(

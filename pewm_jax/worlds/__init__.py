@@ -14,7 +14,7 @@ controls copies it only if each result has a memory of its own; to share it, say
 not batched, neither on the way in nor on the way out::
 
     one = functools.partial(imagine, model, params, remember=False)
-    shared = WorldState(0, None)  # type: the frame has the axis, the memory has none
+    shared = WorldState(0, None)  # the frame has the axis, the memory has none
     many = jax.vmap(one, in_axes=(None, 0, 0), out_axes=(shared, 0))
 
 ``jax.vmap`` over *states* is for worlds that differ; it needs one memory for each.
@@ -28,8 +28,8 @@ A world is a ``WorldSettings`` and a module (or object) with these three functio
     costs(config, stage, share) -> {part: Costs}   see ``models.costs``
 
 and, if it can share work among candidates, an ``imagine_many``, a ``to_compare`` and ``views`` of
-its own.
-``worlds.pewm`` is an example.
+its own. The module of a policy or a codec, which imagines nothing, sets ``IMAGINES = False``, and
+these functions raise ``UserError``. ``worlds.pewm`` is an example.
 """
 
 from __future__ import annotations
