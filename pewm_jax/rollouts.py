@@ -6,7 +6,9 @@
 
 ``pewm_jax.worlds`` says it all.
 
-``rollout`` is pure: jit it with ``static_argnums=0``, vmap it over states, actions and keys.
+``rollout`` is pure, and compiled once for each model and set of shapes. Under a jit of the
+caller's the model is static. Each rollout remembers what it imagines, so ``jax.vmap`` makes a map
+for each; to compare actions from one state use ``worlds.imagine_many``, which shares its map.
 """
 
 from __future__ import annotations
@@ -83,9 +85,11 @@ def rollout(
 
     Returns:
         ``(state, frames)``: the world after the last frame, and the n imagined frames, colours
-        float32 in [−1, 1], depth in metres.
+        float32 in [−1, 1], depth in metres. Under jit, vmap and grad an unknown or non-finite
+        action gives NaN frames and leaves the map as it was; see ``worlds.imagine``.
 
     Raises:
-        UserError: there are no actions, or they have another form.
+        UserError: there are no actions, or they have another form; or, outside of jit, vmap and
+            grad, they are unknown or not finite.
     """
     return worlds.imagine(config, params, state, actions, key, memory=memory)

@@ -24,3 +24,33 @@ def once(folder):
         for name, value in before.items():
             jax.config.update(name, value)
         compilation_cache.reset_cache()
+
+
+_COUNTERS: list["Compiled"] = []
+
+
+class Compiled:
+    """How many programs were compiled, or loaded from a folder of compiled ones."""
+
+    programs = 0
+
+
+def _count(event, seconds, **_):
+    del seconds
+    if event == "/jax/core/compile/backend_compile_duration":
+        for counter in _COUNTERS:
+            counter.programs += 1
+
+
+jax.monitoring.register_event_duration_secs_listener(_count)
+
+
+@contextlib.contextmanager
+def counted():
+    """Count the programs that are compiled meanwhile."""
+    counter = Compiled()
+    _COUNTERS.append(counter)
+    try:
+        yield counter
+    finally:
+        _COUNTERS.remove(counter)

@@ -22,6 +22,7 @@ from pewm_jax.config import Config, UserError, WorldSettings
 from pewm_jax.config.errors import require
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.types import Array, Frames, Params, WorldState
+from pewm_jax.worlds.checks import check_control
 
 Rollout: TypeAlias = Callable[[Any], Frames]
 """``rollout(actions_KN) -> Frames``, leading shape (K, N) or, of the last ones, (K, 1)."""
@@ -90,8 +91,11 @@ class Imagination:
 
         Args:
             actions_KN: (K, N) discrete or (K, N, 3) continuous actions; see ``worlds.imagine``.
+
+        Raises:
+            UserError: they have another shape, are unknown, or are not finite.
         """
-        actions = np.asarray(actions_KN)
+        actions = np.asarray(check_control(actions_KN, "imagine_many"))
         if actions.ndim not in (2, 3) or 0 in actions.shape:
             raise UserError(
                 f"candidates of shape {actions.shape} cannot be imagined: give (K, N) discrete "

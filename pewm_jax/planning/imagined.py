@@ -1,6 +1,6 @@
 """Any world as a pure functional environment.
 
-Jit, vmap and scan its two functions, with the model static::
+Its two functions work eagerly, and under jit, vmap and scan with the model static::
 
     state = reset(model, params, frames, key)               # posed RGB-D frames
     state, seen = step(model, params, state, action, key)   # one action
@@ -19,6 +19,7 @@ Walls are not known here: a move goes where it leads, and what is seen there is 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -29,7 +30,8 @@ from pewm_jax import worlds
 from pewm_jax.config import Config, WorldSettings
 from pewm_jax.geometry.actions import heading
 from pewm_jax.models.signals import rgb_from_signal
-from pewm_jax.types import Array, Frames, Params, WorldState
+from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
+from pewm_jax.worlds.checks import as_array
 
 
 @jax.tree_util.register_dataclass
@@ -52,7 +54,12 @@ class ImaginedState:
 
 
 def reset(
-    model: Config | WorldSettings, params: Params, frames: Frames, key: Array
+    model: Config | WorldSettings,
+    params: Params,
+    frames: Frames,
+    key: Array,
+    *,
+    depth_scale: float | None = None,
 ) -> ImaginedState:
     """Begin with what has been seen.
 
@@ -61,12 +68,14 @@ def reset(
         params: the world model's parameters.
         frames: S ≥ 1 posed RGB-D frames; the last one is the present.
         key: for worlds that begin at random; none of the library's does.
+        depth_scale: as for ``worlds.start``.
 
     Raises:
-        UserError: the frames do not fit the model.
+        UserError: the frames do not fit the model, or cannot be used; see ``worlds.start``.
     """
     del key
-    return ImaginedState(worlds.start(model, params, frames), jnp.zeros((), jnp.int32))
+    world = worlds.start(model, params, frames, depth_scale=depth_scale)
+    return ImaginedState(world, jnp.zeros((), jnp.int32))
 
 
 def step(
@@ -88,24 +97,27 @@ def step(
 
     Returns:
         ``(state, observation)``; the observation has ``rgb`` (H, W, 3) uint8, ``depth`` (H, W)
-        metres and ``pose`` (4, 4), with a leading axis n for a block.
+        metres and ``pose`` (4, 4), with a leading axis n for a block. Under jit, vmap and grad an
+        unknown or non-finite action gives NaN depth and pose and an arbitrary ``rgb``, whose bytes
+        have no NaN; the state's frame is NaN and its memory is the one before the step.
 
     Raises:
-        UserError: the action has none of these forms.
+        UserError: the action has none of these forms; or, outside of jit, vmap and grad, it is
+            unknown or not finite.
     """
-    single = _is_single(action)
-    control = jnp.asarray(action)[None] if single else action
+    control, single = action, False
+    if not isinstance(action, (Camera, Control)):
+        control = as_array(action, "step", "actions")
+        single = _is_single(control)
+        control = control[None] if single else control
     world, frames = worlds.imagine(model, params, state.world, control, key)
-    seen = _shown(frames)
-    count = frames.depth_THW.shape[0]
-    if single:
-        seen = jax.tree.map(lambda x: x[0], seen)
-    return ImaginedState(world, state.steps + count), seen
+    steps, seen = _after(state.steps, frames, single=single)
+    return ImaginedState(world, steps), seen
 
 
 def observation(state: ImaginedState) -> dict[str, Array]:
     """Return what is seen at present: after ``reset`` the last frame that was given."""
-    return jax.tree.map(lambda x: x[0], _shown(state.world.frame))
+    return _shown(state.world.frame, single=True)
 
 
 def distance(pose: Array, goal: Array) -> Array:
@@ -136,22 +148,24 @@ def satisfied(seen: dict[str, Array], cost: Callable[[Array], Array], at_most: f
     return jnp.asarray(cost(seen["rgb"]) <= at_most)
 
 
-def _is_single(action: Any) -> bool:
+def _is_single(action: Array) -> bool:
     """Tell one action from a block of them."""
-    if isinstance(action, (int, float)):
-        return True
-    if not hasattr(action, "ndim"):
-        if not isinstance(action, (list, tuple)):
-            return False  # cameras, or a Control
-        action = jnp.asarray(action)
     whole = jnp.issubdtype(action.dtype, jnp.integer)
     return action.ndim == 0 or (action.ndim == 1 and not whole)
 
 
-def _shown(frames: Frames) -> dict[str, Array]:
-    """Return frames (T, …) as observations."""
-    return {
+@functools.partial(jax.jit, static_argnames="single", inline=True)
+def _after(steps: Array, frames: Frames, *, single: bool) -> tuple[Array, dict[str, Array]]:
+    """Return the number of steps after more frames, and the frames as observations."""
+    return steps + frames.depth_THW.shape[0], _shown(frames, single=single)
+
+
+@functools.partial(jax.jit, static_argnames="single", inline=True)
+def _shown(frames: Frames, *, single: bool) -> dict[str, Array]:
+    """Return frames (T, …) as observations; of a ``single`` one without the axis T."""
+    seen = {
         "rgb": rgb_from_signal(frames.rgb_THWC),
         "depth": jnp.asarray(frames.depth_THW, jnp.float32),
         "pose": jnp.asarray(frames.camera.world_from_camera, jnp.float32),
     }
+    return jax.tree.map(lambda x: x[0], seen) if single else seen

@@ -32,9 +32,6 @@ from pewm_jax.planning.house import HouseEnv
 from pewm_jax.planning.house_config import HouseConfig
 from pewm_jax.types import Frames, Params
 
-_reset = jax.jit(imagined.reset, static_argnums=0)
-_step = jax.jit(imagined.step, static_argnums=0)
-
 
 class WorldModelEnv(gymnasium.Env):
     """A world to walk in, imagined; spaces and settings are the house's.
@@ -110,14 +107,14 @@ class WorldModelEnv(gymnasium.Env):
                 of the house begins, where the agent first looks around.
 
         Raises:
-            UserError: the frames do not fit the model, or there is no goal.
+            UserError: the frames do not fit the model or cannot be used, or there is no goal.
         """
         super().reset(seed=seed)
         self._house_seed = self._house_seed if seed is None else seed
         frames, self._goal = self._begin(options or {})
         self.intrinsics_4 = np.asarray(frames.camera.intrinsics_4[-1], np.float32)
         self._key = jax.random.key(int(self.np_random.integers(2**31)))
-        state = _reset(self._model, self._params, frames, self._key)
+        state = imagined.reset(self._model, self._params, frames, self._key)
         self._steps, self._walked, self._over = 0, 0.0, False
         self._look(imagined.observation(state))
         self._state = state
@@ -134,7 +131,7 @@ class WorldModelEnv(gymnasium.Env):
             raise UserError("step() was called outside of an episode: call reset() first.")
         move = observations.require_action(self.config, action).astype(np.float32)
         key = jax.random.fold_in(self._key, self._steps)
-        self._state, seen = _step(self._model, self._params, self._state, move, key)
+        self._state, seen = imagined.step(self._model, self._params, self._state, move, key)
         before = self._seen["pose"]
         self._look(seen)
         self._steps += 1

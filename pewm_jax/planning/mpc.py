@@ -71,14 +71,10 @@ def imagining(
         return Imagination(model, params, state, key, batch, last, memory)
 
     return Mind(
-        functools.partial(_start, model, params),
-        functools.partial(_observe, model, params),
+        functools.partial(worlds.start, model, params),
+        functools.partial(worlds.observe, model, params),
         rollout,
     )
-
-
-_start = jax.jit(worlds.start, static_argnums=0)
-_observe = jax.jit(worlds.observe, static_argnums=0)
 
 
 def knowing(rollout_from: Callable[[Frames], Rollout]) -> Mind:

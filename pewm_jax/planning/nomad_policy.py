@@ -10,6 +10,7 @@ walks by itself.
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -46,7 +47,10 @@ def propose(
     key: Array,
     count: int,
 ) -> Array:
-    """Draw ways to go on; pure: jit it with config and count static.
+    """Draw ways to go on.
+
+    Pure, and compiled once for each configuration, count and set of shapes; under a jit of the
+    caller's, config and count are static.
 
     Args:
         config: the policy.
@@ -63,6 +67,18 @@ def propose(
     Raises:
         UserError: another number of pictures.
     """
+    return _propose(config, params, rgb_THWC, goal_HWC, key, count)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 5), inline=True)
+def _propose(
+    config: NomadConfig,
+    params: Params,
+    rgb_THWC: Array,
+    goal_HWC: Array | None,
+    key: Array,
+    count: int,
+) -> Array:
     seen = nomad.preprocess(config, signal_from_rgb(rgb_THWC))[None]
     shown = (
         seen[:, -1]
@@ -79,6 +95,7 @@ def propose(
     return nomad.waypoints(config, steps)
 
 
+@functools.partial(jax.jit, static_argnums=0, inline=True)
 def distance(config: NomadConfig, params: Params, rgb_THWC: Array, goal_HWC: Array) -> Array:
     """Return how many steps the policy believes the goal to be away, (); see ``propose``."""
     seen = nomad.preprocess(config, signal_from_rgb(rgb_THWC))[None]
@@ -156,10 +173,6 @@ def _nearest(table: np.ndarray, points_N2: np.ndarray) -> np.ndarray:
     return taken[np.argmin(np.round(costs, 9))]
 
 
-compiled = jax.jit(propose, static_argnums=(0, 5))
-"""``propose``, compiled."""
-
-
 class Policy:
     """A policy for environments: from an observation to an action, by one proposal at a time.
 
@@ -210,7 +223,7 @@ class Policy:
             goal = goal if goal is not None and np.ndim(goal) == 3 else None
             key, self.made = jax.random.fold_in(self.key, self.made), self.made + 1
             seen = history(self.config, np.stack(list(self.seen)))
-            way = np.asarray(compiled(self.config, self.params, seen, goal, key, 1))[0]
+            way = np.asarray(propose(self.config, self.params, seen, goal, key, 1))[0]
             found = continuous(way) if self.actions is None else discrete(self.actions, way)
             self.waiting = list(found[: self.steps])
         action = self.waiting.pop(0)

@@ -13,12 +13,10 @@ the same whatever the world imagines.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, TypeAlias
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import worlds
@@ -157,7 +155,7 @@ class Imagined:
         count = len(self.seen.depth_THW)
         order = np.array([*(n for n in range(count) if n != number), number])
         seen = jax.tree.map(lambda x: np.asarray(x)[order], self.seen)
-        state = _start(self.config.model, self.params, seen)
+        state = worlds.start(self.config.model, self.params, seen)
         return state, jax.tree.map(lambda x: x[-1:], seen)
 
     def possible(self, state: Any, actions_N: np.ndarray) -> int:
@@ -172,8 +170,9 @@ class Imagined:
 
     def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames]:
         """Imagine, and remember."""
-        given = jnp.asarray(actions_N, jnp.int32)
-        state, frames = _imagine(self.config.model, self.params, state, given, key, self.memory)
+        state, frames = worlds.imagine(
+            self.config.model, self.params, state, actions_N, key, memory=self.memory
+        )
         camera = jax.tree.map(np.asarray, frames.camera)
         rgb = np.asarray(rgb_from_signal(frames.rgb_THWC))
         return state, Frames(rgb, np.asarray(frames.depth_THW), camera)
@@ -240,17 +239,7 @@ def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Act:
 
     def act(rgb_SHWC: np.ndarray, goal_HWC: np.ndarray | None, key: jax.Array) -> np.ndarray:
         seen = nomad_policy.history(config, rgb_SHWC)
-        way = nomad_policy.compiled(config, params, seen, goal_HWC, key, 1)
+        way = nomad_policy.propose(config, params, seen, goal_HWC, key, 1)
         return nomad_policy.discrete(motion, np.asarray(way))[0]
 
     return act
-
-
-_start = jax.jit(worlds.start, static_argnums=0)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 5))
-def _imagine(
-    model: Any, params: Params, state: Any, actions_N: Any, key: jax.Array, memory: bool
-) -> Any:
-    return worlds.imagine(model, params, state, actions_N, key, memory=memory)

@@ -19,9 +19,6 @@ from pewm_jax.config.errors import require
 from pewm_jax.memory import memories, views
 from pewm_jax.types import Array, Frames, Params, WorldState
 
-_start = jax.jit(worlds.start, static_argnums=0)
-_imagine = jax.jit(worlds.imagine, static_argnums=0)
-_blind = jax.jit(functools.partial(worlds.imagine, remember=False, memory=False), static_argnums=0)
 _points = jax.jit(memories.to_points, static_argnums=0)
 _erase = jax.jit(memories.erase, static_argnums=0)
 _move = jax.jit(memories.move, static_argnums=0, static_argnames="leave")
@@ -79,17 +76,19 @@ class Engine:
 
     def start(self, frames: Frames) -> WorldState:
         """Begin a world; see ``worlds.start``."""
-        return _start(self.model, self.params, frames)
+        return worlds.start(self.model, self.params, frames)
 
     def imagine(self, world: WorldState, action_3: np.ndarray, key: Array) -> WorldState:
         """Return the world after one action (dx, dy, dyaw); its frame is what is seen then."""
-        action = jnp.asarray(action_3, jnp.float32)[None]
-        return _imagine(self.model, self.params, world, action, key)[0]
+        action = np.asarray(action_3, np.float32)[None]
+        return worlds.imagine(self.model, self.params, world, action, key)[0]
 
     def imagine_blind(self, world: WorldState, action_3: np.ndarray, key: Array) -> WorldState:
         """Return the same, the memory neither looked at nor added to."""
-        action = jnp.asarray(action_3, jnp.float32)[None]
-        return _blind(self.model, self.params, world, action, key)[0]
+        action = np.asarray(action_3, np.float32)[None]
+        return worlds.imagine(
+            self.model, self.params, world, action, key, remember=False, memory=False
+        )[0]
 
     def points(self, world: WorldState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the map: (N, 3) points in metres, (N, 3) uint8 colours, (N,) bool if observed.

@@ -29,7 +29,6 @@ MINDS = ("empty", "memory", "truth")
 Policy: TypeAlias = Callable[[Asked, int], np.ndarray]
 """``policy(asked, count) -> (count, N)`` discrete actions: proposals, the policy's own choice
 first."""
-_start = jax.jit(worlds.start, static_argnums=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Minds:
         """Return what a mind rolls candidates out with."""
         if mind == "truth":
             return goal.seen
-        state = _start(worlds.model_of(self.config), self.params, goal.context)
+        state = worlds.start(worlds.model_of(self.config), self.params, goal.context)
         key = jax.random.key(goal.number)
         memory = mind == "memory"
         return Imagination(self.config, self.params, state, key, self.batch, memory=memory)
@@ -169,7 +168,7 @@ def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Policy:
         seen = nomad_policy.history(config, np.asarray(asked.context.rgb_THWC))
         key = jax.random.key(asked.number)
         goal = np.asarray(asked.frame.rgb_THWC)[0]
-        ways = nomad_policy.compiled(config, params, seen, goal, key, count)
+        ways = nomad_policy.propose(config, params, seen, goal, key, count)
         return nomad_policy.discrete(motion, np.asarray(ways)[:, : asked.actions])
 
     return propose

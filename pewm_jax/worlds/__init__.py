@@ -1,12 +1,23 @@
 """Chapter 6, worlds: what is imagined next.
 
-Every world is driven by the same three functions, whatever networks it has. They are pure: jit them
-with the model static, vmap them over states, controls and keys. ::
+Every world is driven by the same three functions, whatever networks it has. They are pure. Called
+eagerly, they check the values they are given and run a program that is compiled once for each model
+and each set of shapes. They can also be called under jit (with the model static), vmap and grad. ::
 
     state = start(model, params, frames)                        # a few posed RGB-D frames
     state = observe(model, params, state, frames)               # more real frames, later
     state, frames = imagine(model, params, state, control, key) # what will be seen
     state, frames = imagine_many(model, params, state, controls, keys)  # many candidates
+
+``imagine_many`` compares candidates without copying the memory. ``jax.vmap`` of ``imagine`` over
+controls copies it only if each result has a memory of its own; to share it, say that the state is
+not batched, neither on the way in nor on the way out::
+
+    one = functools.partial(imagine, model, params, remember=False)
+    shared = WorldState(0, None)  # the frame has the axis, the memory has none
+    many = jax.vmap(one, in_axes=(None, 0, 0), out_axes=(shared, 0))
+
+``jax.vmap`` over *states* is for worlds that differ; it needs one memory for each.
 
 A world is a ``WorldSettings`` and a module (or object) with these three functions and
 
@@ -17,8 +28,8 @@ A world is a ``WorldSettings`` and a module (or object) with these three functio
     costs(config, stage, share) -> {part: Costs}   see ``models.costs``
 
 and, if it can share work among candidates, an ``imagine_many``, a ``to_compare`` and ``views`` of
-its own.
-``worlds.pewm`` is an example.
+its own. The module of a policy or a codec, which imagines nothing, sets ``IMAGINES = False``, and
+these functions raise ``UserError``. ``worlds.pewm`` is an example.
 """
 
 from __future__ import annotations
@@ -29,8 +40,9 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import Config, WorldSettings, functions
+from pewm_jax.config import Config, UserError, WorldSettings, functions
 from pewm_jax.types import Array, Frames, Params, WorldState
+from pewm_jax.worlds import checks
 from pewm_jax.worlds.stages import Stage
 
 
@@ -39,41 +51,69 @@ def model_of(config: Config | WorldSettings) -> Any:
     return config.model if isinstance(config, Config) else config
 
 
-def start(model: Config | WorldSettings, params: Params, frames: Frames) -> WorldState:
+def start(
+    model: Config | WorldSettings,
+    params: Params,
+    frames: Frames,
+    *,
+    depth_scale: float | None = None,
+) -> WorldState:
     """Begin a world from a few posed RGB-D frames.
 
     Args:
         model: the model's settings, or an experiment's, which contain them.
         params: the world model's parameters; those of the image encoder are used, if it has any.
-        frames: S ≥ 1 frames (S, H, W, …), uint8 or float colours; all are remembered, the last one
-            is the present.
+        frames: S ≥ 1 frames (S, H, W, …); all are remembered, the last one is the present. Colours
+            are uint8, or floats in [−1, 1]; depth is float metres along z, 0 where nothing was
+            measured; intrinsics are in pixels of these images; poses are rigid.
+        depth_scale: metres per unit of depth, required where depth is integers: 0.001 for
+            millimetres. Values of 65535 in uint16 then count as not measured.
 
     Returns:
         The state to imagine from.
 
     Raises:
-        UserError: the frames' shapes do not agree with each other or with the model.
+        UserError: the frames' shapes do not agree with each other or with the model, or their
+            values cannot be used: other colours, depth that is negative, not finite or of an
+            unknown unit, poses that are not finite or not rigid, intrinsics of another image size.
+            Values are not checked under jit, vmap and grad.
     """
     model = model_of(model)
-    return functions(model).start(model, params, frames)
+    module = functions(model)
+    if _imagines(module):
+        frames = checks.check_frames(frames, "start", depth_scale)
+    return _start(module.start, model, params, frames, depth_scale)
 
 
 def observe(
-    model: Config | WorldSettings, params: Params, state: WorldState, frames: Frames
+    model: Config | WorldSettings,
+    params: Params,
+    state: WorldState,
+    frames: Frames,
+    *,
+    depth_scale: float | None = None,
 ) -> WorldState:
     """Remember real frames; the last one becomes the present.
+
+    A state that an invalid control has turned into NaN (see ``imagine``) stays NaN: observe from
+    the state before.
 
     Args:
         model: as for ``start``.
         params: the world model's parameters.
         state: the world so far.
         frames: S ≥ 1 frames, as for ``start``.
+        depth_scale: as for ``start``.
 
     Raises:
         UserError: as for ``start``.
     """
     model = model_of(model)
-    return functions(model).observe(model, params, state, frames)
+    module = functions(model)
+    if _imagines(module):
+        _require_state(state, "observe")
+        frames = checks.check_frames(frames, "observe", depth_scale)
+    return _observe(module.observe, model, params, state, frames, depth_scale)
 
 
 def imagine(
@@ -106,13 +146,25 @@ def imagine(
         float32 in [−1, 1], depth in metres. Whole clips are imagined; surplus frames of the last
         one are dropped.
 
+        Under jit, vmap and grad the values of a control cannot be refused. If any of its actions is
+        unknown, or any number is not finite, then colours, depth and poses of all n frames and of
+        the state's present frame are NaN, and the memory is the one before the call. Whatever is
+        imagined from that state is NaN, too.
+
     Raises:
-        UserError: the control is empty or has none of these forms.
+        UserError: the control is empty or has none of these forms; or, outside of jit, vmap and
+            grad, it has an unknown discrete action, a number that is not finite, or a camera that
+            is not rigid.
     """
     model = model_of(model)
-    return functions(model).imagine(
-        model, params, state, control, key, remember=remember, memory=memory
+    module = functions(model)
+    if _imagines(module):
+        _require_state(state, "imagine")
+        control = checks.check_control(control, "imagine")
+    after, frames = _imagine(
+        module.imagine, model, params, state, control, key, remember=remember, memory=memory
     )
+    return (after if remember else WorldState(after.frame, state.map)), frames
 
 
 def imagine_many(
@@ -140,18 +192,128 @@ def imagine_many(
 
     Returns:
         ``(state, frames)``: K present frames with the shared memory, which is not copied, and
-        (K, n) imagined frames.
+        (K, n) imagined frames. Under jit, vmap and grad the frames of a candidate with an unknown
+        action are NaN, as for ``imagine``; the other candidates are not affected.
+
+    Raises:
+        UserError: as for ``imagine``.
     """
     model = model_of(model)
-    own = getattr(functions(model), "imagine_many", None)
-    if own is not None:
+    module = functions(model)
+    if _imagines(module):
+        _require_state(state, "imagine_many")
+        controls = checks.check_control(controls, "imagine_many")
+    own = getattr(module, "imagine_many", None)
+    act = module.imagine if own is None else own
+    frame, frames = _imagine_many(
+        act,
+        model,
+        params,
+        state,
+        controls,
+        keys,
+        views,
+        many=own is not None,
+        memory=memory,
+        last=last,
+    )
+    return WorldState(frame, state.map), frames
+
+
+def _imagines(module: Any) -> bool:
+    """Return False for a policy or a codec, whose functions refuse by themselves."""
+    return getattr(module, "IMAGINES", True)
+
+
+def _require_state(state: Any, who: str) -> None:
+    if not isinstance(state, WorldState):
+        raise UserError(
+            f"{who}() got a state of type {type(state).__name__}; give the WorldState that start() "
+            "or an earlier call returned."
+        )
+
+
+# One program for each world, model and set of shapes. They are inlined under a caller's own jit, so
+# that its program is the same as if the world were called directly.
+@functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
+def _start(
+    act: Callable[..., WorldState],
+    model: WorldSettings,
+    params: Params,
+    frames: Frames,
+    depth_scale: Array | None,
+) -> WorldState:
+    given = checks.in_metres(frames, depth_scale) if _imagines(functions(model)) else frames
+    return act(model, params, given)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
+def _observe(
+    act: Callable[..., WorldState],
+    model: WorldSettings,
+    params: Params,
+    state: WorldState,
+    frames: Frames,
+    depth_scale: Array | None,
+) -> WorldState:
+    given = checks.in_metres(frames, depth_scale) if _imagines(functions(model)) else frames
+    after = act(model, params, state, given)
+    ok = checks.valid((), state.frame.camera)
+    return WorldState(checks.poisoned(ok, after.frame), checks.kept(ok, after.map, state.map))
+
+
+@functools.partial(
+    jax.jit, static_argnums=(0, 1), static_argnames=("remember", "memory"), inline=True
+)
+def _imagine(
+    act: Callable[..., tuple[WorldState, Frames]],
+    model: WorldSettings,
+    params: Params,
+    state: WorldState,
+    control: Any,
+    key: Array,
+    *,
+    remember: bool,
+    memory: bool,
+) -> tuple[WorldState, Frames]:
+    """Imagine; without ``remember`` the state has no memory: the caller's is not copied."""
+    after, frames = act(model, params, state, control, key, remember=remember, memory=memory)
+    ok = checks.valid(control, state.frame.camera)
+    kept = checks.kept(ok, after.map, state.map) if remember else None
+    return WorldState(checks.poisoned(ok, after.frame), kept), checks.poisoned(ok, frames)
+
+
+@functools.partial(
+    jax.jit, static_argnums=(0, 1), static_argnames=("many", "memory", "last"), inline=True
+)
+def _imagine_many(
+    act: Callable[..., tuple[WorldState, Frames]],
+    model: WorldSettings,
+    params: Params,
+    state: WorldState,
+    controls: Any,
+    keys: Array,
+    views: Any,
+    *,
+    many: bool,
+    memory: bool,
+    last: bool,
+) -> tuple[Frames, Frames]:
+    """Return (K, 1) present frames, and (K, n) imagined ones or the last of them.
+
+    ``act`` is the world's own ``imagine_many`` if ``many``, else its ``imagine``.
+    """
+    if many:
         given = {} if views is None else {"views": views}
-        return own(model, params, state, controls, keys, memory=memory, last=last, **given)
-    candidate = functools.partial(imagine, model, remember=False, memory=memory)
-    shared = WorldState(0, None)  # type: ignore[arg-type]
-    many = jax.vmap(candidate, (None, None, 0, 0), (shared, 0))
-    after, frames = many(params, state, controls, keys)
-    return after, jax.tree.map(lambda x: x[:, -1:], frames) if last else frames
+        after, frames = act(model, params, state, controls, keys, memory=memory, last=last, **given)
+    else:
+        candidate = functools.partial(act, model, remember=False, memory=memory)
+        shared = WorldState(0, None)  # type: ignore[arg-type]
+        each = jax.vmap(candidate, (None, None, 0, 0), (shared, 0))
+        after, frames = each(params, state, controls, keys)
+        frames = jax.tree.map(lambda x: x[:, -1:], frames) if last else frames
+    ok = checks.valid(controls, state.frame.camera, leading=1)
+    return checks.poisoned(ok, after.frame), checks.poisoned(ok, frames)
 
 
 def to_compare(model: Config | WorldSettings, state: WorldState) -> WorldState:

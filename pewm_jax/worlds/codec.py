@@ -28,6 +28,9 @@ SMALL = 1e-4
 PULL = 1e-2
 """Weight of what keeps each channel of the latents near mean 0 and variance 1."""
 
+IMAGINES = False
+"""Whether this is a world model; if not, its functions refuse."""
+
 
 def init(model: CodecWorldConfig, key: Array) -> Params:
     """Return random parameters, under ``codec`` as in every model."""

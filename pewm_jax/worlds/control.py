@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 
 from pewm_jax.config import ModelConfig, UserError, kinds
 from pewm_jax.geometry import actions as action_geometry
@@ -24,8 +22,8 @@ def control_of(model: ModelConfig, present: Camera, control: Any) -> Control:
         control: actions, a ``Camera`` or a ``Control``; see ``worlds.imagine``.
 
     Raises:
-        UserError: the control is empty, has none of these forms, or holds an unknown discrete
-            action (under jit, vmap and grad the values of actions are not checked).
+        UserError: the control is empty or has none of these forms. Values are checked by
+            ``worlds.checks``.
     """
     found = _in_one_form(model, present, control)
     require_actions(model, found.actions_TA, "imagine()")
@@ -78,7 +76,6 @@ def _in_one_form(model: ModelConfig, present: Camera, control: Any) -> Control:
     count = actions.shape[0] if actions.ndim else 0
     if count == 0:
         raise UserError("imagine() got no actions; give at least one.")
-    _require_known(actions)
     moves = action_geometry.continuous(model.actions, actions)
     if moves.ndim != 2 or moves.shape[1] != 3:
         raise UserError(
@@ -105,16 +102,3 @@ def _require_cameras(camera: Camera) -> int:
             "and (n, 4), a camera for each of n ≥ 1 frames to imagine."
         )
     return count
-
-
-def _require_known(actions: Array) -> None:
-    """Refuse unknown discrete actions, which a table lookup would clamp to the last row."""
-    if isinstance(actions, Tracer) or not jnp.issubdtype(actions.dtype, jnp.integer):
-        return
-    wrong = sorted({int(a) for a in np.ravel(actions)} - set(range(len(action_geometry.NAMES))))
-    if wrong:
-        known = ", ".join(f"{a} {name}" for a, name in enumerate(action_geometry.NAMES))
-        raise UserError(
-            f"imagine() got the discrete actions {wrong}; there is {known} (continuous actions are "
-            "floats of shape (n, 3))."
-        )

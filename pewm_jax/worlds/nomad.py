@@ -32,6 +32,9 @@ from pewm_jax.worlds.stages import TRAIN, Stage
 SMALL = 1e-2
 """Added to the shares by which losses are divided, as in the reference."""
 
+IMAGINES = False
+"""Whether this is a world model; if not, its functions refuse."""
+
 
 def init(model: NomadWorldConfig, key: Array) -> Params:
     """Return random parameters, under ``policy``."""

@@ -12,6 +12,7 @@ Where actions steer, the camera model says where they lead; cameras that are giv
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -26,7 +27,7 @@ from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models import persist_nets
 from pewm_jax.models.signals import as_signal
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
-from pewm_jax.worlds import persist_stages, pewm
+from pewm_jax.worlds import checks, persist_stages, pewm
 from pewm_jax.worlds import persist_windows as windows
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.persist_past import Given, Past, encoded
@@ -72,7 +73,13 @@ def start(model: PersistConfig, params: Params, frames: Frames) -> WorldState:
 
 
 def start_in(
-    model: PersistConfig, params: Params, frames: Frames, classes_XYZ: Array, origin_3: Array
+    model: PersistConfig,
+    params: Params,
+    frames: Frames,
+    classes_XYZ: Array,
+    origin_3: Array,
+    *,
+    depth_scale: float | None = None,
 ) -> WorldState:
     """Begin a world from a known grid; what of the first window is not in it is generated.
 
@@ -83,10 +90,25 @@ def start_in(
         classes_XYZ: (n, n, n) class ids around the first frame's camera, such as an episode has;
             −1 where nothing is known.
         origin_3: (3,) world position of its lowest corner, metres.
+        depth_scale: as for ``worlds.start``.
 
     Raises:
         UserError: as for ``worlds.start``, or no grid around the camera.
     """
+    frames = checks.check_frames(frames, "start_in", depth_scale)
+    return _start_in(model, params, frames, classes_XYZ, origin_3, depth_scale)
+
+
+@functools.partial(jax.jit, static_argnums=0, inline=True)
+def _start_in(
+    model: PersistConfig,
+    params: Params,
+    frames: Frames,
+    classes_XYZ: Array,
+    origin_3: Array,
+    depth_scale: Array | None,
+) -> WorldState:
+    frames = checks.in_metres(frames, depth_scale)
     pewm.require_frames(model, frames, "start_in")
     if jnp.ndim(classes_XYZ) != 3 or jnp.shape(origin_3) != (3,):
         raise UserError(
@@ -164,6 +186,7 @@ def edit(state: WorldState, change: Callable[..., ClassGrid], *arguments: Any) -
     return WorldState(state.frame, dataclasses.replace(changed, history=state.map.history))
 
 
+@functools.partial(jax.jit, static_argnums=0, inline=True)
 def render_true(
     model: PersistConfig,
     params: Params,

@@ -17,13 +17,13 @@ import numpy as np
 
 from pewm_jax.config import ModelConfig
 from pewm_jax.memory import memories
-from pewm_jax.types import Camera, Params, View, WorldState
+from pewm_jax.types import Array, Camera, Params, View, WorldState
 from pewm_jax.worlds.control import control_of
 
 FINE = 2.0**-20
 """Numbers of cameras are rounded to multiples of this, about a millionth of a metre."""
 AT_ONCE = 8
-"""Cameras that are rendered by one call while so many are missing."""
+"""Cameras that one call renders at most. The program has this size, however many are missing."""
 MOST = 512 * 2**20
 """Bytes of views that are kept; when there would be more, all are forgotten."""
 
@@ -54,8 +54,7 @@ class Views:
         first = {name: number for number, name in reversed(list(enumerate(names)))}
         missing = [first[name] for name in wanted if name not in self._known]
         while missing:
-            count = AT_ONCE if len(missing) >= AT_ONCE else 1
-            now, missing = missing[:count], missing[count:]
+            now, missing = missing[:AT_ONCE], missing[AT_ONCE:]
             self._render([names[n] for n in now], Camera(*(x[now] for x in rounded)))
         leading = asked.world_from_camera.shape[:-2]
         stacked = [np.stack(one) for one in zip(*(self._known[n] for n in names), strict=True)]
@@ -63,7 +62,8 @@ class Views:
         return jax.tree.unflatten(self._form, shaped)
 
     def _render(self, names: list[bytes], camera: Camera) -> None:
-        shown = jax.device_get(_rendered(self.model, self.state.map, camera))
+        filled = jax.tree.map(lambda x: np.resize(x, (AT_ONCE, *x.shape[1:])), camera)
+        shown = jax.device_get(_rendered(self.model, self.state.map, filled, len(names)))
         leaves, self._form = jax.tree.flatten(shown)
         self._bytes = sum(leaf[0].nbytes for leaf in leaves)
         for number, name in enumerate(names):
@@ -90,8 +90,21 @@ def _rounded(x: np.ndarray) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _rendered(model: ModelConfig, memory: Any, camera: Camera) -> View:
-    return memories.render(model, memory, camera, model.clip.height, model.clip.width)
+def _rendered(model: ModelConfig, memory: Any, camera: Camera, count: Array) -> View:
+    """Render the first ``count`` of (n,) cameras one after the other; the other views are 0."""
+
+    def render(number: Array) -> View:
+        one = jax.tree.map(lambda x: x[number][None], camera)
+        return memories.render(model, memory, one, model.clip.height, model.clip.width)
+
+    def add(number: Array, pictures: View) -> View:
+        return jax.tree.map(lambda all_, x: all_.at[number].set(x[0]), pictures, render(number))
+
+    like = jax.eval_shape(render, 0)
+    room = jax.tree.map(
+        lambda x: jnp.zeros((len(camera.intrinsics_4), *x.shape[1:]), x.dtype), like
+    )
+    return jax.lax.fori_loop(0, count, add, room)
 
 
 @functools.partial(jax.jit, static_argnums=0)

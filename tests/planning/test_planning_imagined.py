@@ -17,7 +17,7 @@ from pewm_jax.config.codec_world import CodecWorldConfig
 from pewm_jax.data.simulator import open_simulator
 from pewm_jax.data.trajectories import advance
 from pewm_jax.geometry.cameras import pose_from_yaw
-from pewm_jax.planning import imagined, imagined_env, oracle
+from pewm_jax.planning import imagined, oracle
 from pewm_jax.planning.house import HouseEnv
 from pewm_jax.planning.house_config import HouseConfig
 from pewm_jax.planning.imagined_env import WorldModelEnv
@@ -38,8 +38,8 @@ CONFIG = TINY.with_model(
 """The preset ``tiny``, smaller still."""
 MODEL = CONFIG.model
 KEY = jax.random.key(3)
-reset, step = imagined_env._reset, imagined_env._step
-"""Compiled once, for the environment too."""
+reset, step = imagined.reset, imagined.step
+"""Compiled once by themselves, for the environment too."""
 
 
 def close(a, b, atol=1e-4):

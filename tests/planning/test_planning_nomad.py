@@ -42,7 +42,7 @@ def params():
 
 @pytest.fixture(scope="module")
 def propose():
-    return nomad_policy.compiled
+    return nomad_policy.propose
 
 
 def pictures(seed, count=2):

@@ -30,6 +30,7 @@ from pewm_jax.planning.ranking import rank, rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig, RandomShooting
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import pewm_views
+from tests.compiled import counted
 from tests.helpers import init_world, random_frames, randomise
 
 CONFIG = presets.load("tiny")
@@ -120,6 +121,59 @@ def test_the_size_of_a_batch_changes_nothing_and_compiles_once():
         rollout(PLANS[0])
     with pytest.raises(ConfigError, match="batch is 0"):
         Imagination(model, params, state, KEY, batch=0)
+
+
+def test_a_planner_with_64_candidates_holds_one_map():
+    model, params, state = world("tiny")
+    features, held = state.map.features_VF, []
+
+    def bytes_of_maps():
+        """Count every copy that is alive, those of candidates with a leading axis included."""
+        shapes = (x.shape for x in jax.live_arrays() if x.shape[-2:] == features.shape)
+        return sum(int(np.prod(shape)) for shape in shapes)
+
+    def cost(frames, goal):
+        held.append(bytes_of_maps())
+        assert frames.depth_THW.shape[0] == 64
+        return np.arange(64.0)
+
+    before = bytes_of_maps()
+    rollout = Imagination(model, params, state, KEY, batch=BATCH)
+    assert rollout.state.map.features_VF is features
+    rank(model, params, state, np.resize(SHORT_PLANS, (64, 3)), cost, None, KEY, batch=BATCH)
+    config = PlanConfig(horizon=3, candidates=64, elites=8, rounds=2)
+    plan(CEM(), config, lambda actions, _: cost(rollout(actions), None), KEY, progress=False)
+    assert held == [before] * 3
+
+
+def test_planning_again_compiles_nothing():
+    """Neither a plan nor a ranking, of other candidates from another key."""
+    model, params, state = world("surfels")
+    goal = jax.tree.map(lambda x: x[:1], random_frames(np.random.default_rng(1), 1, 16, 16))
+    config = PlanConfig(horizon=3, candidates=5, elites=2, rounds=2)
+    rng = np.random.default_rng(0)
+
+    def once(number):
+        key = jax.random.key(number)
+        rank(model, params, state, rng.integers(0, 3, (5, 3)), costs.Pixels(), goal, key)
+        judged = Judged(Imagination(model, params, state, key), costs.Pixels(), goal)
+        return plan(CEM(), config, judged, key, progress=False)
+
+    once(0)
+    with counted() as compiled:
+        once(1)
+        once(2)
+    assert compiled.programs == 0
+
+
+@pytest.mark.parametrize("wrong", [7, -1])
+def test_unknown_actions_are_not_ranked(wrong):
+    model, params, state = world("tiny")
+    proposals = np.array([[0, 1, 2], [0, wrong, 0]])
+    with pytest.raises(UserError, match=rf"discrete actions \[{wrong}\]; .* 3 in all"):
+        rank(model, params, state, proposals, costs.Pixels(), None, KEY)
+    with pytest.raises(UserError, match="not finite"):
+        rank(model, params, state, np.full((2, 3, 3), np.nan), costs.Pixels(), None, KEY)
 
 
 def test_what_was_judged_is_not_imagined_again():

@@ -93,7 +93,7 @@ def test_it_learns_to_walk_as_it_was_shown(tmp_path, clips):
     clip, kinds = batch(config, 12, 99)
     sides = []
     for seen in clip.frames.rgb_THWC:
-        way = nomad_policy.compiled(TINY, params["policy"], seen[:2], None, jax.random.key(1), 8)
+        way = nomad_policy.propose(TINY, params["policy"], seen[:2], None, jax.random.key(1), 8)
         sides.append(float(np.median(np.asarray(way)[:, -1, 1])))
     told = np.digitize(sides, [-0.1, 0.1])
     assert (told == np.array([1, 2, 0])[kinds]).mean() > 0.8  # chance: a third

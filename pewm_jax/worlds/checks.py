@@ -1,0 +1,410 @@
+"""Checks of the frames and controls that users give to a world.
+
+Shapes and dtypes are always checked. Values are checked where they are known: not under ``jit``,
+``vmap`` and ``grad``, which trace them. There, ``valid`` and ``poisoned`` turn the result of an
+invalid control into NaN.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from pewm_jax.config import UserError
+from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.types import Array, Camera, Control, Frames
+
+COLOR_TOLERANCE = 1e-3
+"""Float colours may exceed [−1, 1] by this much, which is rounding."""
+RIGID_TOLERANCE = 2e-3
+"""Largest deviation of RᵀR from the identity in a pose that counts as rigid."""
+HALF_TOLERANCE = 1e-2
+"""The same for poses in half precision."""
+RESIZED = (0.1, 0.02)
+"""A principal point this far from the centre, as a share of the image's size, along both axes alike
+to within the second number, belongs to intrinsics of another image size."""
+NO_MEASUREMENT_16 = 65535
+"""Value of 16-bit depth images where nothing was measured, as 0 is."""
+
+
+def check_frames(frames: Any, who: str, depth_scale: float | None = None) -> Frames:
+    """Return frames as arrays, or refuse those that no camera can have taken.
+
+    Frames whose shapes do not agree are returned as they are: the world refuses them.
+
+    Args:
+        frames: S posed RGB-D frames; see ``worlds.start``.
+        who: the function that was called, for the message.
+        depth_scale: metres per unit of depth.
+
+    Raises:
+        UserError: colours that are no uint8 or floats in [−1, 1], integer depth without a scale,
+            depth that is negative or not finite, poses that are not finite or not rigid, or
+            intrinsics that do not fit the size of the images.
+    """
+    if not isinstance(frames, Frames) or not isinstance(frames.camera, Camera):
+        raise UserError(
+            f"{who}() got frames of type {type(frames).__name__}; give pewm_jax.Frames with a "
+            "pewm_jax.Camera."
+        )
+    frames = jax.tree.map(
+        lambda x: as_array(x, who, "frames"), frames, is_leaf=lambda x: isinstance(x, (list, tuple))
+    )
+    missing = [name for name, value in _fields(frames) if value is None]
+    if missing:
+        raise UserError(
+            f"{who}() got frames without {' and '.join(missing)}; give colours, depth and cameras."
+        )
+    _check_dtypes(frames, who, depth_scale)
+    if _shapes_agree(frames):
+        with jax.ensure_compile_time_eval():
+            _check_values(frames, who)
+    return frames
+
+
+def in_metres(frames: Frames, depth_scale: Array | float | None) -> Frames:
+    """Return frames whose floats are float32 and whose depth is in metres.
+
+    Args:
+        frames: the frames.
+        depth_scale: metres per unit of depth, None for 1. Depth of 65535 in uint16 is no
+            measurement, and becomes 0.
+    """
+
+    def single(x: Array) -> Array:
+        floating = jnp.issubdtype(x.dtype, jnp.floating)
+        return x.astype(jnp.float32) if floating and x.dtype != jnp.float32 else x
+
+    depth = frames.depth_THW
+    if depth_scale is not None:
+        units = jnp.asarray(depth, jnp.float32)
+        if depth.dtype == jnp.uint16:
+            units = jnp.where(depth == NO_MEASUREMENT_16, 0, units)
+        depth = units * jnp.asarray(depth_scale, jnp.float32)
+    return jax.tree.map(single, dataclasses.replace(frames, depth_THW=depth))
+
+
+def check_control(control: Any, who: str) -> Any:
+    """Return a control with arrays in the place of lists, or refuse values that steer nothing.
+
+    Args:
+        control: see ``worlds.imagine``; any leading axes.
+        who: the function that was called, for the message.
+
+    Raises:
+        UserError: this is no control; or it holds an unknown discrete action, an action that is not
+            finite, or a camera that is not rigid.
+    """
+    if isinstance(control, Control):
+        arrays = {
+            name: None if value is None else as_array(value, who, name)
+            for name, value in (("actions", control.actions_TA), ("state", control.state_A))
+        }
+        for name, value in arrays.items():
+            if value is not None:
+                _check_finite(value, who, name)
+        return Control(_check_cameras(control.camera, who), arrays["actions"], arrays["state"])
+    if isinstance(control, Camera):
+        return _check_cameras(control, who)
+    actions = as_array(control, who, "actions")
+    if jnp.issubdtype(actions.dtype, jnp.integer):
+        _check_discrete(actions, who)
+    else:
+        _check_finite(actions, who, "actions")
+    return actions
+
+
+def as_array(value: Any, who: str, what: str) -> Array:
+    """Return an array of numbers; lists become arrays on the host, arrays stay where they are.
+
+    Raises:
+        UserError: these are no numbers, or lists of unequal lengths.
+    """
+    if isinstance(value, (jax.Array, np.ndarray, Tracer)):
+        found = value
+    elif any(isinstance(leaf, (Tracer, jax.Array)) for leaf in jax.tree.leaves(value)):
+        try:
+            found = jnp.asarray(value)
+        except (TypeError, ValueError):
+            found = None
+    else:
+        try:
+            found = np.asarray(value)
+        except ValueError:
+            found = None
+    if found is None or not _is_number(found.dtype):
+        kind = f"an array of {found.dtype}" if isinstance(found, np.ndarray) else "no array"
+        raise UserError(
+            f"{who}() got {what} of type {type(value).__name__}, {kind}; give numbers as an array, "
+            "or a list of equally long lists."
+        )
+    return found
+
+
+def valid(control: Any, present: Camera, leading: int = 0) -> Array:
+    """Return whether all of a control is known and finite, and so is the present pose.
+
+    Args:
+        control: from ``check_control``.
+        present: the camera of the present frame, shared by all controls.
+        leading: leading axes of the control to keep: 0 gives (), 1 gives (K,) bool.
+    """
+
+    def fine(x: Array) -> Array:
+        whole = (
+            jnp.isfinite(x) if jnp.issubdtype(x.dtype, jnp.floating) else jnp.ones(x.shape, bool)
+        )
+        if not isinstance(control, (Camera, Control)) and jnp.issubdtype(x.dtype, jnp.integer):
+            whole = (x >= 0) & (x < len(action_geometry.NAMES))
+        return whole.all(tuple(range(leading, whole.ndim)))
+
+    found = jnp.isfinite(present.world_from_camera).all()
+    for leaf in jax.tree.leaves(control):
+        found = found & fine(jnp.asarray(leaf))
+    return found
+
+
+def poisoned(ok: Array, frames: Frames) -> Frames:
+    """Return frames with NaN colours, depth and poses where ``ok``, () or (K,), is False."""
+
+    def mark(x: Array) -> Array:
+        if not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        return jnp.where(ok.reshape(*ok.shape, *(1,) * (x.ndim - ok.ndim)), x, jnp.nan)
+
+    pose = mark(frames.camera.world_from_camera)
+    camera = dataclasses.replace(frames.camera, world_from_camera=pose)
+    return Frames(mark(frames.rgb_THWC), mark(frames.depth_THW), camera)
+
+
+def kept(ok: Array, new: Any, old: Any) -> Any:
+    """Return the new memory, or the old one where ``ok`` is False."""
+    if jax.tree.structure(new) != jax.tree.structure(old):
+        return new
+    return jax.tree.map(lambda a, b: jnp.where(ok, a, b) if a.shape == b.shape else a, new, old)
+
+
+def _fields(frames: Frames) -> tuple[tuple[str, Any], ...]:
+    return (
+        ("colours", frames.rgb_THWC),
+        ("depth", frames.depth_THW),
+        ("poses", frames.camera.world_from_camera),
+        ("intrinsics", frames.camera.intrinsics_4),
+    )
+
+
+def _is_number(dtype: Any) -> bool:
+    real = (jnp.integer, jnp.floating, jnp.bool_)
+    return any(jnp.issubdtype(dtype, kind) for kind in real)
+
+
+def _check_dtypes(frames: Frames, who: str, depth_scale: float | None) -> None:
+    """Refuse dtypes without a meaning; works on traced frames, too."""
+    for name, value in _fields(frames):
+        if jnp.issubdtype(value.dtype, jnp.bool_):
+            raise UserError(
+                f"{who}() got {name} of type bool; give colours as uint8 or floats in [−1, 1], and "
+                "depth, poses and intrinsics as float32."
+            )
+    depth = frames.depth_THW
+    if depth_scale is None and jnp.issubdtype(depth.dtype, jnp.integer):
+        raise UserError(
+            f"{who}() got depth as {depth.dtype} integers, whose unit is not known; say the metres "
+            "per unit, such as depth_scale=0.001 for millimetres, or give float metres."
+        )
+    if depth_scale is None or isinstance(depth_scale, Tracer):
+        return
+    try:
+        scale = float(depth_scale)
+    except (TypeError, ValueError):
+        scale = math.nan
+    if not (math.isfinite(scale) and scale > 0):
+        raise UserError(
+            f"{who}() got depth_scale {depth_scale!r}; give the metres per unit of depth, a number "
+            "above 0, such as 0.001 for millimetres."
+        )
+
+
+def _shapes_agree(frames: Frames) -> bool:
+    """Tell whether these are S ≥ 1 frames of one size with a camera each."""
+    rgb, depth, poses, intrinsics = (value.shape for _, value in _fields(frames))
+    if len(depth) != 3 or 0 in depth:
+        return False
+    count = depth[0]
+    return rgb == (*depth, 3) and poses == (count, 4, 4) and intrinsics == (count, 4)
+
+
+def _check_values(frames: Frames, who: str) -> None:
+    rgb, depth = frames.rgb_THWC, frames.depth_THW
+    named = {
+        "rgb": _ranges(rgb),
+        "depth": _ranges(depth),
+        "poses": frames.camera.world_from_camera,
+        "intrinsics": frames.camera.intrinsics_4,
+    }
+    known: dict[str, Any] = jax.device_get({k: v for k, v in named.items() if _is_known(v)})
+    if "rgb" in known:
+        low, high = known["rgb"]
+        _check_colors(rgb.dtype, low, high, who)
+    if "depth" in known:
+        low, high = known["depth"]
+        _check_depth(low, high, who)
+    if "poses" in known:
+        _check_poses(known["poses"], who)
+    if "intrinsics" in known:
+        _check_intrinsics(known["intrinsics"], depth.shape[1:], who)
+
+
+def _is_known(value: Any) -> bool:
+    """Tell whether values can be read here: not traced, and not on other processes' devices."""
+    leaves = jax.tree.leaves(value)
+    return bool(leaves) and not any(
+        isinstance(x, Tracer) or (isinstance(x, jax.Array) and not x.is_fully_addressable)
+        for x in leaves
+    )
+
+
+def _ranges(x: Array) -> tuple[Array, Array] | None:
+    """Return the lowest and highest value of each frame, NaN if there is any; None if unknown.
+
+    They are computed where the array is, so that no images are copied from an accelerator.
+    """
+    if not _is_known(x):
+        return None
+    if isinstance(x, jax.Array) and any(device.platform != "cpu" for device in x.devices()):
+        return _device_ranges(x)
+    values = np.asarray(x).reshape(len(x), -1)
+    with np.errstate(invalid="ignore"):
+        return values.min(1), values.max(1)
+
+
+@jax.jit
+def _device_ranges(x: Array) -> tuple[Array, Array]:
+    values = x.reshape(len(x), -1)
+    return values.min(1), values.max(1)
+
+
+def _first(wrong: Any) -> int | None:
+    """Return the number of the first frame that is wrong."""
+    return int(np.argmax(wrong)) if wrong.any() else None
+
+
+def _check_colors(dtype: Any, low: np.ndarray, high: np.ndarray, who: str) -> None:
+    if jnp.issubdtype(dtype, jnp.integer):
+        least, most = 0.0, 255.0
+    else:
+        least, most = -1.0 - COLOR_TOLERANCE, 1.0 + COLOR_TOLERANCE
+    low, high = low.astype(np.float64), high.astype(np.float64)
+    frame = _first(~((low >= least) & (high <= most)))
+    if frame is not None:
+        raise UserError(
+            f"{who}() got {dtype} colours from {low[frame]:g} to {high[frame]:g} in frame {frame}; "
+            "give uint8 in [0, 255], or floats in [−1, 1] (bytes / 127.5 − 1)."
+        )
+
+
+def _check_depth(low: np.ndarray, high: np.ndarray, who: str) -> None:
+    low, high = low.astype(np.float64), high.astype(np.float64)
+    frame = _first(~((low >= 0) & (high < np.inf)))
+    if frame is not None:
+        raise UserError(
+            f"{who}() got depth from {low[frame]:g} to {high[frame]:g} in frame {frame}; give "
+            "finite metres along z, and 0 where nothing was measured."
+        )
+
+
+def _check_poses(poses: np.ndarray, who: str) -> None:
+    """Refuse poses (…, 4, 4) that are not rigid; frames are counted along the leading axes."""
+    half = np.asarray(poses).dtype.itemsize < 4
+    tolerance = HALF_TOLERANCE if half else RIGID_TOLERANCE
+    flat = np.asarray(poses, np.float64).reshape(-1, 4, 4)
+    frame = _first(~np.isfinite(flat).all((1, 2)))
+    if frame is not None:
+        raise UserError(
+            f"{who}() got a camera pose that is not finite in frame {frame}; leave the frame out, "
+            "or give its world_from_camera, 4 × 4, in metres."
+        )
+    rotation = flat[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = np.abs(np.einsum("nji,njk->nik", rotation, rotation) - np.eye(3)).max((1, 2))
+        turned = np.linalg.det(rotation)
+    last = np.abs(flat[:, 3] - np.array([0, 0, 0, 1.0])).max(1)
+    frame = _first(~((apart <= tolerance) & (turned > 0) & (last <= tolerance)))
+    if frame is not None:
+        row = ", ".join(f"{x:g}" for x in flat[frame, 3])
+        raise UserError(
+            f"{who}() got a camera pose that is not rigid in frame {frame} (RᵀR is up to "
+            f"{apart[frame]:.2g} off the identity, the determinant is {turned[frame]:.3g}, the "
+            f"last row is [{row}]); give world_from_camera with a rotation R, a translation in "
+            "metres and the last row [0, 0, 0, 1]."
+        )
+
+
+def _check_intrinsics(intrinsics: np.ndarray, size: tuple[int, ...] | None, who: str) -> None:
+    """Refuse intrinsics (…, 4) of no camera, or of images of another size than (H, W)."""
+    flat = np.asarray(intrinsics, np.float64).reshape(-1, 4)
+    wrong = ~(np.isfinite(flat).all(1) & (flat[:, :2] > 0).all(1))
+    why = "focal lengths are positive and finite"
+    if size is not None and not wrong.any():
+        height, width = size
+        share = flat[:, 2:] / np.array([width, height])
+        outside = ~((share > 0) & (share < 1)).all(1)
+        away, apart = np.abs(share - 0.5).min(1), np.abs(share[:, 0] - share[:, 1])
+        wrong = outside | ((away > RESIZED[0]) & (apart < RESIZED[1]))
+        why = f"these are not of the {width} × {height} images given"
+    frame = _first(wrong)
+    if frame is not None:
+        numbers = ", ".join(f"{x:g}" for x in flat[frame])
+        raise UserError(
+            f"{who}() got the intrinsics ({numbers}) in frame {frame}; {why}: give fx, fy, cx, cy "
+            "in pixels, scaled together with the images."
+        )
+
+
+def _check_cameras(camera: Any, who: str) -> Camera:
+    """Return cameras as arrays; values are checked where they are known and the shapes fit."""
+    if not isinstance(camera, Camera):
+        raise UserError(
+            f"{who}() got cameras of type {type(camera).__name__}; give a pewm_jax.Camera."
+        )
+    poses = as_array(camera.world_from_camera, who, "poses")
+    intrinsics = as_array(camera.intrinsics_4, who, "intrinsics")
+    if poses.shape[-2:] == (4, 4) and poses.size and _is_known(poses):
+        _check_poses(np.asarray(poses), who)
+    if intrinsics.shape[-1:] == (4,) and intrinsics.size and _is_known(intrinsics):
+        _check_intrinsics(np.asarray(intrinsics), None, who)
+    return Camera(intrinsics, poses)
+
+
+def _check_finite(values: Array, who: str, what: str) -> None:
+    if jnp.issubdtype(values.dtype, jnp.bool_):
+        raise UserError(f"{who}() got {what} of type bool; give integers or floats.")
+    if not jnp.issubdtype(values.dtype, jnp.floating) or not _is_known(values):
+        return
+    found = np.asarray(values)
+    wrong = found[~np.isfinite(found)]
+    if wrong.size:
+        raise UserError(
+            f"{who}() got {what} that are not finite ({wrong.ravel()[0]}); give metres and radians."
+        )
+
+
+def _check_discrete(actions: Array, who: str) -> None:
+    """Refuse unknown discrete actions, which a table lookup would clamp."""
+    if not _is_known(actions):
+        return
+    found = np.asarray(actions).ravel()
+    names = action_geometry.NAMES
+    wrong = sorted({int(a) for a in found[(found < 0) | (found >= len(names))]})
+    if wrong:
+        known = ", ".join(f"{number} {name}" for number, name in enumerate(names))
+        raise UserError(
+            f"{who}() got the discrete actions {wrong}; there is {known}, {len(names)} in all "
+            "(continuous actions are floats of shape (n, 3))."
+        )
