@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -60,6 +61,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
 
     serve, start = _part(Serve, settings), _part(Start, settings)
     home = shipped.home(argv[0])
+    _require_usable(argv[0], start, settings.worlds)
     folder = settings.worlds or home / "worlds"
     name, say = Path(argv[0]).name, functools.partial(print, flush=True)
     page = pages.Page(lambda: _load(argv[0], home), start, serve, folder, name, say)
@@ -72,6 +74,30 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
     finally:
         page.close()
     return 0
+
+
+def _require_usable(name: str, start: Start, worlds: Path | None) -> None:
+    """Refuse, before the page opens, what cannot be loaded, begun with or written.
+
+    Weights are mapped and not read.
+    """
+    from pewm_jax import config as configuration
+    from pewm_jax.play import places
+    from pewm_jax.rollouts import load_finished
+
+    run = shipped.find(name)
+    clip = configuration.load(run / "config.json").model.clip
+    if (run / "weights.safetensors").is_file():
+        load_finished(name, lazily=True)
+    if start.scene or start.episode or start.recording:
+        places.open_place(start, clip.height, clip.width)
+    if worlds is not None:
+        there = next(path for path in (worlds, *worlds.absolute().parents) if path.exists())
+        if not there.is_dir() or not os.access(there, os.W_OK):
+            raise cli.ConfigError(
+                f"--worlds is {worlds}, and {there} is no folder that can be written: choose "
+                "another one."
+            )
 
 
 def _load(name: str, home: Path):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import ActionConfig
+from pewm_jax.geometry.arguments import require_array
 from pewm_jax.geometry.cameras import einsum, matmul
 from pewm_jax.types import Array
 
@@ -69,7 +70,12 @@ def integrate(world_from_camera: Array, actions_T3: Array) -> Array:
 
     Returns:
         (T + 1, 4, 4) poses of frames 0 … T.
+
+    Raises:
+        UserError: an argument has another type or shape, or is not finite.
     """
+    require_array("integrate", "world_from_camera", world_from_camera, 4, 4)
+    require_array("integrate", "actions_T3", actions_T3, None, 3)
 
     def step(pose, action):
         after = step_pose(pose, action)

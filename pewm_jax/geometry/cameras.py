@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pewm_jax.config import UserError
+from pewm_jax.geometry.arguments import require_array
 from pewm_jax.types import Array, Camera
 
 
@@ -28,7 +30,24 @@ def einsum(equation: str, *operands: Array) -> Array:
 
 
 def intrinsics_from_fov(height: int, width: int, horizontal_fov_deg: float) -> np.ndarray:
-    """Return (4,) fx, fy, cx, cy of square pixels with the principal point in the middle."""
+    """Return (4,) fx, fy, cx, cy of square pixels with the principal point in the middle.
+
+    Args:
+        height: of the images, pixels.
+        width: of the images, pixels.
+        horizontal_fov_deg: the horizontal field of view, degrees, between 0 and 180.
+
+    Raises:
+        UserError: an argument is no number, or out of its range.
+    """
+    given = {"height": height, "width": width, "horizontal_fov_deg": horizontal_fov_deg}
+    for name, value in given.items():
+        require_array("intrinsics_from_fov", name, value)
+    if min(height, width) < 1 or not 0 < horizontal_fov_deg < 180:
+        raise UserError(
+            f"intrinsics_from_fov() got height {height}, width {width} and horizontal_fov_deg "
+            f"{horizontal_fov_deg}: give sizes of 1 pixel or more, and degrees between 0 and 180."
+        )
     focal = width / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
     return np.array([focal, focal, width / 2, height / 2], np.float32)
 
@@ -45,7 +64,13 @@ def pose_from_yaw(position_3: np.ndarray, yaw: float, pitch: float = 0.0) -> np.
         position_3: camera centre in the world, metres.
         yaw: heading, radians, counter-clockwise from above; 0 looks along world +x.
         pitch: radians, positive looks up.
+
+    Raises:
+        UserError: an argument is no number, or the position has another shape than (3,).
     """
+    require_array("pose_from_yaw", "position_3", position_3, 3)
+    for name, value in (("yaw", yaw), ("pitch", pitch)):
+        require_array("pose_from_yaw", name, value)
     cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
     forward = np.array([cy * cp, sy * cp, sp])
     right = np.array([sy, -cy, 0.0])

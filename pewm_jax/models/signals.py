@@ -7,6 +7,7 @@ import math
 import jax.numpy as jnp
 
 from pewm_jax.config import ClipConfig
+from pewm_jax.geometry.arguments import require_array
 from pewm_jax.types import Array, Frames
 
 
@@ -36,7 +37,15 @@ def signal_from_rgb(rgb: Array) -> Array:
 
 
 def rgb_from_signal(signal: Array) -> Array:
-    """Map floats in [−1, 1] to uint8 colours, rounded and clipped."""
+    """Map floats in [−1, 1] to uint8 colours, rounded and clipped.
+
+    Args:
+        signal: (..., 3) colours.
+
+    Raises:
+        UserError: it has another type or shape, or is not finite.
+    """
+    require_array("rgb_from_signal", "signal", signal, ..., 3)
     return jnp.round(jnp.clip((signal + 1) * 127.5, 0, 255)).astype(jnp.uint8)
 
 

@@ -6,6 +6,7 @@ Only inference weights are read: a checkpoint's optimizer state may be missing o
 from __future__ import annotations
 
 import functools
+import os
 import warnings
 from pathlib import Path
 
@@ -35,6 +36,11 @@ def load(path: str | Path) -> tuple[Config, Params]:
     Raises:
         UserError: something is absent or damaged, or the weights do not fit the configuration.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise UserError(
+            f"load() got a path of type {type(path).__name__}: give the folder of a run, or the "
+            "name of weights that come with the library, such as 'small'."
+        )
     folder = shipped.find(path)
     if (folder / step_folders.WEIGHTS_ITEM).is_dir():
         return _read(folder)
