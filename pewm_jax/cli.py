@@ -251,7 +251,8 @@ def cache_compilation(folder: Path) -> None:
     """
     import jax  # noqa: PLC0415 - takes seconds, and refusals do not need it
 
-    if jax.config.jax_compilation_cache_dir or not jax.config.jax_enable_compilation_cache:
+    chosen: Any = jax.config
+    if chosen.jax_compilation_cache_dir or not chosen.jax_enable_compilation_cache:
         return
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else [platform.processor()]

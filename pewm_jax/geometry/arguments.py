@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import numpy as np
+from jax.core import Tracer
 
 from pewm_jax.config import UserError
 
 
-def require_array(who: str, name: str, value: Any, *shape: int | None) -> None:
+def require_array(who: str, name: str, value: Any, *shape: Any) -> None:
     """Refuse what is no array of finite numbers of a shape.
 
     Values are not looked at under jit, vmap and grad; types and shapes are.
@@ -26,7 +26,7 @@ def require_array(who: str, name: str, value: Any, *shape: int | None) -> None:
         UserError: it has another type or shape, or holds NaN or infinity.
     """
     free, sizes = shape[:1] == (...,), tuple(n for n in shape if n is not ...)
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         found, kind, values = value.shape, "f", None
     else:
         try:
