@@ -42,6 +42,9 @@ from pewm_jax.studies.practice_piece import (
 )
 
 Say = Callable[[str], Any]
+DECIDED_BY, LEVEL = "success", 0.01
+"""The score by which practice in the house itself has to beat chance before worlds are compared,
+and the level of that test."""
 
 
 def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: Say = print) -> Path:
@@ -141,6 +144,26 @@ def _first_walk(place: Place, home: Goal, begun: OpenedPolicy, errand: Errand) -
     return next(practice.walks(place, home.context, act_of(begun), errand.practice, seed))
 
 
+def power(practised_C: np.ndarray, chance_C: np.ndarray, houses_C: np.ndarray) -> float | None:
+    """Return the p value that practice in the house itself is better than chance.
+
+    Practice in the true house bounds what practice in any world can teach. Where it does not beat
+    walking without looking, the task cannot tell worlds apart. The p value is one-sided, from the
+    bootstrap over houses; None where there are fewer than two houses.
+
+    Args:
+        practised_C: the score of each goal after practice in the house itself; more is better.
+        chance_C: that of walking without looking.
+        houses_C: the number of each goal's house.
+    """
+    gain_C = practised_C - chance_C
+    p_value = intervals.p_over_houses(gain_C, houses_C)
+    if p_value is None:
+        return None
+    better = intervals.over_houses(gain_C, houses_C)["mean"] > 0
+    return p_value / 2 if better else 1 - p_value / 2
+
+
 def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
     """Return means over houses with 95 % intervals, and differences, paired by task and seed."""
     houses = np.unique(
@@ -153,7 +176,14 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
         }
         for how, pieces in made.items()
     }
-    differences = ((MEMORY, BEFORE), (MEMORY, EMPTY), (REAL, MEMORY), (BEFORE, CHANCE))
+    differences = (
+        (REAL, CHANCE),
+        (MEMORY, BEFORE),
+        (MEMORY, EMPTY),
+        (REAL, MEMORY),
+        (BEFORE, CHANCE),
+    )
+    p_value = power(values[REAL][DECIDED_BY], values[CHANCE][DECIDED_BY], houses)
     walked = {
         how: {
             name: float(np.mean([piece["walked"][name] for piece in pieces]))
@@ -163,6 +193,12 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
         if pieces[0]["walked"]
     }
     return {
+        "power": {
+            "metric": DECIDED_BY,
+            "p": p_value,
+            "level": LEVEL,
+            "compares": p_value is not None and p_value < LEVEL,
+        },
         "rows": {
             how: {metric: intervals.entry(x, houses) for metric, x in by.items()}
             for how, by in values.items()

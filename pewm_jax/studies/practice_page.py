@@ -57,6 +57,7 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
             (name.split(" - "), by) for name, by in results["differences"].items()
         )
     ]
+    compares = results.get("power", {}).get("compares", False)
     walked = [
         [LABELS[how], f"{by['forward']:.1f}", f"{by['through_walls']:.1f}"]
         for how, by in results["walked"].items()
@@ -78,8 +79,15 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
             (
                 "# Practice in imagination",
                 how,
+                _power(results),
                 table(["", *headings], rows),
-                "## Differences\n\nPaired by goal and seed.\n\n" + table(["", *headings], gains),
+                *(
+                    [
+                        "## Differences\n\nPaired by goal and seed.\n\n"
+                        + table(["", *headings], gains)
+                    ]
+                    * compares
+                ),
                 "## What it learned from\n\nOf the actions of its walks in per cent, how many went "
                 "forward, and of these how many through real walls.\n\n"
                 + table(["", "forward", "through walls"], walked),
@@ -90,6 +98,30 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
             )
         )
         + "\n"
+    )
+
+
+def _power(results: Mapping[str, Any]) -> str:
+    """Return whether the task can tell worlds apart, or that it was not tested."""
+    test = results.get("power")
+    if test is None:  # results of version 0.1, which holds no score of each goal
+        one, other = (results["rows"][how]["success"]["mean"] for how in ("real", "chance"))
+        return (
+            f"**Practice in the house itself reaches {one:.1f} % of the goals, walking without "
+            f"looking {other:.1f} %. That one beats the other was not tested, and no comparison "
+            "between worlds is drawn.**"
+        )
+    if test["p"] is None:
+        return "One house gives no p value: no comparison is drawn."
+    words = (
+        f"Practice in the house itself against walking without looking: p = {test['p']:.2g} "
+        f"(one-sided, {COLUMNS[test['metric']][0]}, bootstrap over houses)."
+    )
+    if test["compares"]:
+        return f"{words} Below {test['level']:g}: the task can tell worlds apart."
+    return (
+        f"**{words} Not below {test['level']:g}: the task has no power, since even practice in the "
+        "house itself does not beat chance. No comparison between worlds is drawn from it.**"
     )
 
 

@@ -17,8 +17,9 @@ from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.planning import practice
 from pewm_jax.planning.floor_map import FloorMap
 from pewm_jax.planning.practice import Imagined, Practice, Real
-from pewm_jax.studies import deciders, goals, policies
+from pewm_jax.studies import deciders, goals, policies, practice_page
 from pewm_jax.studies import practice as study
+from pewm_jax.studies.practice_page import COLUMNS
 from pewm_jax.studies.practice_piece import LEARNED, ROWS, Errand
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import nomad as nomad_world
@@ -296,3 +297,43 @@ def test_a_bad_errand_is_refused(wrong):
 def test_bad_practice_is_refused(wrong):
     with pytest.raises(ConfigError, match="practice"):
         Practice(**wrong)
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_worlds_are_compared_only_where_the_house_itself_beats_chance(better):
+    """It bounds what any world can teach; without it the page has no differences."""
+    rng = np.random.default_rng(0)
+
+    def pieces(share):
+        return [
+            {
+                "house": f"house{house}",
+                "walked": {},
+                "tasks": [
+                    dict.fromkeys(COLUMNS, 100.0 * (rng.random() < share)) for _ in range(12)
+                ],
+            }
+            for house in range(12)
+        ]
+
+    shares = dict.fromkeys(("chance", "before", "memory", "empty"), 0.1)
+    shares["real"] = 0.6 if better else 0.1
+    made = {how: pieces(share) for how, share in shares.items()}
+    found = study.summary(made)
+    assert found["power"]["compares"] == better
+    assert (found["power"]["p"] < 0.01) == better
+    about = {
+        "model": "small",
+        "tasks": 12,
+        "seeds": [0],
+        "practice": {"walks": 1, "blocks": 1},
+        "steps": 1,
+        "actions": 8,
+        "most": 24,
+        "within_m": 0.35,
+        "within_deg": 45.0,
+        "date": "today",
+    }
+    text = practice_page.markdown(found | {"about": about}, "")
+    assert ("## Differences" in text) == better
+    assert ("No comparison between worlds is drawn" in text) == (not better)
