@@ -38,7 +38,7 @@ from pewm_jax.training import processes
 
 TRAINED_ON = "train"
 """The split that training reads."""
-REPORT_VERSION = 9
+REPORT_VERSION = 10
 """Increase it whenever the same scores would give another report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
@@ -161,7 +161,7 @@ def evaluate(
     scored = score_table(config, episodes, methods, partials, say, lpips, clips, measures.i3d)
     long = roll_long(config, episodes, methods, partials, say, lpips, rollouts)
     back = look_back(config, episodes, methods, partials, rollouts, measures.visits, say)
-    asked = _asked(opened, config, episodes, methods.model, partials, say, clips)
+    asked, about_steering = _asked(opened, config, episodes, methods.model, partials, say, clips)
     if not processes.is_primary():
         processes.meet("evaluate: report")  # devices that wait for one another would give up
         return folder / PAGE
@@ -176,6 +176,7 @@ def evaluate(
         **measures.about,
         "lpips_name": measures.lpips_name,
         "mirror": way_out(config, rollouts)[1],
+        "steering": about_steering,
         **measures.hashes,
         "weights_sha256": opened.weights_hash,
         "dataset_sha256": data_hash,
@@ -200,18 +201,19 @@ def _asked(
     partials: Partials,
     say: Callable[[str], Any],
     clips: Sequence[ClipChoice],
-) -> dict[str, Any]:
-    """Return what only some models are asked: what the map covers, and whether actions steer."""
-    covered = steered = None
+) -> tuple[dict[str, Any], str | None]:
+    """Return what only some models are asked: what the map covers, and whether actions steer.
+
+    The second value is a sentence on the clips that say whether actions steer, or on why that is
+    not measured; None of a model that is not steered by actions.
+    """
+    covered = steered = about = None
     # A memory that is the state of its world has no tokens that could be counted.
     if runs.remembers(opened) and config.model.memory.READ_BY_BLOCKS:
         covered = score_coverage(config, episodes, model, partials, say, clips)
     if not model.cameras:
-        steered = steering.score(config, opened.params, episodes, clips, partials, say)
-    return {
-        "coverage": covered,
-        "steering": steered and {"all": steered.table(), "per_frame": steered.per_frame()},
-    }
+        steered, about = steering.score(config, opened.params, episodes, clips, partials, say)
+    return {"coverage": covered, "steering": steered and steered.facts()}, about
 
 
 def _write(

@@ -51,8 +51,10 @@ ACTIONS_NAMES = {
     "true": "the true actions",
     "shuffled": "another clip's actions",
     "none": "no actions",
+    "copy": "the observed frame, repeated",
     "true - shuffled": "true minus another clip's",
     "true - none": "true minus none",
+    "true - copy": "true minus the observed frame",
 }
 """Names of the kinds of actions by which a model was steered, and of their differences."""
 NONE_HOW = (
@@ -205,10 +207,14 @@ def came_back(metrics: Mapping[str, Any]) -> str:
 
 
 def followed(metrics: Mapping[str, Any]) -> list[str]:
-    """Return a sentence on whether the model follows its actions, if that was measured."""
+    """Return a sentence on whether the model follows its actions, or on why that is not known.
+
+    There is none of a model that is not steered by actions.
+    """
     found = metrics.get("steering")
     if not found:
-        return []
+        about = metrics["protocol"].get("steering")
+        return [about] if about else []
     less = (
         f"{ACTIONS_NAMES[name.removeprefix('true - ')]}: {spread(entry, 2, sign=True)} dB"
         for name, entry in found["all"].items()
