@@ -115,8 +115,8 @@ def steering(metrics: Mapping[str, Any]) -> str:
         + f"<p class='quiet'>{found['clips']} walks with the same noise: "
         f"{100 * found['forward']:.0f} % of their steps go forward. Another clip's actions are of "
         f"one in another house; they differ in {100 * found['different']:.0f} % of the steps. "
-        "Means over houses, in brackets the interval of a bootstrap over them. A world that follows "
-        "its actions is nearest to the truth with the true ones.</p>"
+        "Means over houses, in brackets the interval of a bootstrap over them. A world that "
+        "follows its actions is nearest to the truth with the true ones.</p>"
     )
 
 

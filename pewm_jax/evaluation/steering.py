@@ -77,7 +77,7 @@ class Walks:
             )
 
     @property
-    def houses_C(self) -> np.ndarray:
+    def houses(self) -> np.ndarray:
         """(C,) the number of each clip's house."""
         return np.unique([choice.scene for choice in self.choices], return_inverse=True)[1]
 
@@ -85,7 +85,7 @@ class Walks:
     def about(self) -> str:
         """What the clips are, in a sentence."""
         return (
-            f"{len(self.choices)} walks in {len(set(self.houses_C))} houses: "
+            f"{len(self.choices)} walks in {len(set(self.houses))} houses: "
             f"{100 * self.forward_C.mean():.1f} % of the steps go forward (in each clip at least "
             f"{100 * self.forward_C.min():.0f} %); the other actions differ in "
             f"{100 * self.different_C.mean():.1f} % of the steps (in each clip at least "
@@ -226,11 +226,6 @@ class Steered:
     walks: Walks
 
     @property
-    def houses_C(self) -> np.ndarray:
-        """(C,) the number of each clip's house."""
-        return self.walks.houses_C
-
-    @property
     def psnr(self) -> dict[str, np.ndarray]:
         """PSNR of each clip, by kind of actions, dB."""
         return {name: np.asarray(psnr(each.mean(1))) for name, each in self.errors.items()}
@@ -254,9 +249,9 @@ class Steered:
         }
 
     def _entries(self, values: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-        each = {name: intervals.entry(found, self.houses_C) for name, found in values.items()}
+        each = {name: intervals.entry(found, self.walks.houses) for name, found in values.items()}
         more = {
-            f"{TRUE} - {name}": intervals.entry(values[TRUE] - found, self.houses_C)
+            f"{TRUE} - {name}": intervals.entry(values[TRUE] - found, self.walks.houses)
             for name, found in values.items()
             if name != TRUE
         }

@@ -1,4 +1,4 @@
-"""True actions against another house's and none, on walks, paired by clip, with a world that obeys."""
+"""True actions against another house's and none on walks, paired by clip; a world that obeys."""
 
 import dataclasses
 import types
@@ -202,7 +202,7 @@ def test_continuous_motion_is_told_apart_in_steps_and_turns():
     motion = np.array([[step, 0, 0], [0.9 * step, 0, 0.5 * turn], [0, 0, turn], [0, 0, 0]])
     assert forward_steps(UNITS, motion).tolist() == [True, True, False, False]
     assert not different_steps(UNITS, motion, motion).any()
-    noisy = motion + [0.2 * step, 0.1 * step, 0.2 * turn]
+    noisy = motion + np.array([0.2 * step, 0.1 * step, 0.2 * turn])
     assert not different_steps(UNITS, motion, noisy).any()
     assert different_steps(UNITS, motion[:3], motion[[2, 3, 0]]).all()
     around = np.array([0, 0, np.pi - 0.01]), np.array([0, 0, -np.pi + 0.01])
