@@ -79,7 +79,7 @@ class CollectConfig:
     continuous: bool = False
     """Small continuous (dx, dy, dyaw) actions instead of forward / turn left / turn right."""
     ids: bool = False
-    """Also write instance ids."""
+    """Also write instance ids, and the names of the instances."""
     moving: bool = False
     """Made houses have doors that open as the agent comes near, and robots on their rounds."""
     voxels: VoxelsConfig = UNRECORDED
@@ -259,6 +259,8 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         "step_m": config.step_m,
         "turn_deg": config.turn_deg,
     }
+    if config.ids:
+        info["objects"] = list(scene.objects)
     if config.moving:
         info["moving"] = True
     if config.voxels.pictures != UNRECORDED.pictures:

@@ -120,6 +120,37 @@ def steering(metrics: Mapping[str, Any]) -> str:
     )
 
 
+def structure(metrics: Mapping[str, Any]) -> str:
+    """Return SCS of every method and its ceiling; "" where it was not measured."""
+    found = metrics.get("scs")
+    if not found:
+        return ""
+    ends = [0, len(found["ceiling_per_frame"]["mean"]) - 1]
+
+    def row(label: str, whole: Mapping[str, Any], steps: Mapping[str, Any]) -> str:
+        at = [{key: steps[key][t] for key in ("mean", "low", "high")} for t in ends]
+        cells = "".join(f"<td>{spread(e, 1)}</td>" for e in (whole, *at))
+        return f"<tr><td>{label}</td>{cells}<td>{whole['houses']}</td></tr>"
+
+    rows = [
+        row(label, found["results"][method], found["per_frame"][method])
+        for method, label in METHOD_NAMES.items()
+        if method in found["results"]
+    ]
+    rows.append(row("the true clip", found["ceiling"], found["ceiling_per_frame"]))
+    heads = "".join(f"<th>frame {t + 1}</th>" for t in ends)
+    return (
+        "<h2>Are things where they should be?</h2>"
+        + table(f"<th>{found['name']}</th><th>all frames</th>{heads}<th>houses</th>", rows)
+        + "<p class='quiet'>Structural consistency score: 100 × IoU of the masks of things in the "
+        "imagined and the true clip, mean over things and frames; higher is better. Frames count "
+        "until nothing that the present frame shows is visible any more. The masks of imagined "
+        "clips come from a segmenter, and the last row is the true clip with the same segmenter. "
+        f"{found['clips']} clips, first sampling seed; means over houses, in brackets the interval "
+        "of a bootstrap over them.</p>"
+    )
+
+
 def drift(metrics: Mapping[str, Any]) -> str:
     """Return PSNR over pixels seen before along long rollouts, by quarter."""
     rows = []

@@ -253,7 +253,7 @@ def fingerprint(
             settings; "" if there is none.
     """
     settings = to_dict(config)
-    for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src"):
+    for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src", "scs"):
         settings["evaluate"].pop(key)
     for key in ("train", "data"):
         settings.pop(key)

@@ -58,7 +58,7 @@ def override(config: Config, **changes: Any) -> Config:
     """
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
-    for name in ("none", "lpips", "protocol", "fvd"):
+    for name in ("none", "lpips", "protocol", "fvd", "scs"):
         if name in changes:
             changes[name] = str(changes[name])
     if steps is not None:
@@ -107,7 +107,11 @@ def evaluate(
     none = runs.open_none(opened, config)
     none_weights = none.weights_hash if none else ""
     data_hash = file_hash(split / MANIFEST)
-    measures = chosen.choose(config, accelerator=jax.default_backend() != "cpu")
+    measures = chosen.choose(
+        config,
+        accelerator=jax.default_backend() != "cpu",
+        ids=all(episodes[index].has_ids for index in range(len(episodes))),
+    )
     lpips = measures.lpips
     chooses = Path(config.data.path) / BASELINE_SPLIT / MANIFEST
     name = fingerprint(
@@ -158,7 +162,9 @@ def evaluate(
         none_weights,
         remembers,
     )
-    scored = score_table(config, episodes, methods, partials, say, lpips, clips, measures.i3d)
+    scored = score_table(
+        config, episodes, methods, partials, say, lpips, clips, measures.i3d, measures.structure
+    )
     long = roll_long(config, episodes, methods, partials, say, lpips, rollouts)
     back = look_back(config, episodes, methods, partials, rollouts, measures.visits, say)
     asked, about_steering = _asked(opened, config, episodes, methods.model, partials, say, clips)
@@ -166,7 +172,7 @@ def evaluate(
         processes.meet("evaluate: report")  # devices that wait for one another would give up
         return folder / PAGE
     say("drawing the report …")
-    metrics = measure(config, scored, long, back, measures.i3d)
+    metrics = measure(config, scored, long, back, measures.i3d, measures.structure)
     metrics |= asked
     if cameras:
         metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"

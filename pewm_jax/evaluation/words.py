@@ -206,6 +206,20 @@ def came_back(metrics: Mapping[str, Any]) -> str:
     )
 
 
+def consistent(metrics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on SCS, if it was measured."""
+    found = metrics.get("scs")
+    if not found:
+        return []
+    values = "; ".join(
+        f"{label} {spread(found['results'][method], 1)}"
+        for method, label in METHOD_NAMES.items()
+        if method in found["results"]
+    )
+    ceiling = spread(found["ceiling"], 1)
+    return [f"{found['name']}, higher is better: {values}; the true clip {ceiling}."]
+
+
 def followed(metrics: Mapping[str, Any]) -> list[str]:
     """Return a sentence on whether the model follows its actions, or on why that is not known.
 
@@ -256,7 +270,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     lines += [perceived(metrics), far_apart(metrics)]
     lines += [covered(metrics["coverage"])] if metrics["coverage"] else []
     lines += [drifted(metrics["long"]["drift"][own]), *grew(metrics)]
-    return [*lines, *followed(metrics), came_back(metrics)]
+    return [*lines, *followed(metrics), *consistent(metrics), came_back(metrics)]
 
 
 def score_lines(metrics: Mapping[str, Any]) -> list[str]:
