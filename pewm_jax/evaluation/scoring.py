@@ -212,7 +212,7 @@ class Task:
         who = "truth" if self.method == TRUTH else methods.piece(self.method)
         kind = f"i3d-{i3d.sha256[:16]}" if i3d and self.kept == "features" else "table"
         if structure and self.kept == "structure":
-            kind = f"scs-{structure.encoder}-{structure.sha256[:16]}"
+            kind = "-".join(filter(None, ("scs", structure.encoder, structure.sha256[:16])))
         return f"{kind}-{who}-seed{self.seed}-clip{self.first:04d}"
 
 

@@ -139,7 +139,7 @@ def test_what_is_no_mask_and_no_clip_is_refused():
         scs(squares(), squares()[:1], EVER[:3])
     with pytest.raises(UserError, match="of bool"):
         scs(squares().astype(float), squares(), EVER[:3])
-    with pytest.raises(UserError, match="one value of visible_T per frame"):
+    with pytest.raises(UserError, match="one bool per frame"):
         scs(squares(), squares(), EVER[:2])
     truth, masks = walk([0, 1])
     with pytest.raises(UserError, match="has no masks of shape"):

@@ -98,7 +98,7 @@ class Consistency:
                 f"a clip of shape {frames.shape} and type {frames.dtype} has no masks of shape "
                 f"{masks.shape}: give uint8 colours (T, H, W, 3) and masks (K, T, H, W)."
             )
-        end = max(frames_in_view(visible_T), 1)
+        end = max(_end(visible_T, len(frames)), 1)
         found = np.zeros_like(masks)
         found[:, :end] = self.segment(frames[:end], masks[:, 0])
         return overlaps(found, masks, visible_T)
@@ -134,15 +134,11 @@ def overlaps(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -
         UserError: the masks are not alike, or no masks, or there are not as many frames.
     """
     pred, true = _masks(masks_pred_KTHW, masks_true_KTHW)
-    if np.shape(visible_T) != true.shape[1:2]:
-        raise UserError(
-            f"masks of {true.shape[1]} frames need one value of visible_T per frame, got shape "
-            f"{np.shape(visible_T)}: take it from first_visible."
-        )
+    end = _end(visible_T, true.shape[1])
     both = np.logical_and(pred, true).sum((2, 3))
     either = np.logical_or(pred, true).sum((2, 3))
     found = np.where(either > 0, 100 * both / np.maximum(either, 1), np.nan)
-    found[:, frames_in_view(visible_T) :] = np.nan
+    found[:, end:] = np.nan
     return found[:, 1:]
 
 
@@ -161,6 +157,21 @@ def frames_in_view(visible_T: Array) -> int:
     """
     gone = np.flatnonzero(~np.asarray(visible_T, bool))
     return int(gone[0]) if gone.size else len(np.asarray(visible_T))
+
+
+def _end(visible_T: Array, frames: int) -> int:
+    """Return ``frames_in_view``.
+
+    Raises:
+        UserError: it is no value per frame.
+    """
+    if np.shape(visible_T) != (frames,) or np.asarray(visible_T).dtype != np.bool_:
+        raise UserError(
+            f"visible_T of shape {np.shape(visible_T)} and type {np.asarray(visible_T).dtype} does "
+            f"not say which of {frames} frames show what the first shows: give one bool per frame, "
+            "such as first_visible returns."
+        )
+    return frames_in_view(visible_T)
 
 
 def first_visible(depth_THW: Array, camera: Camera) -> np.ndarray:
