@@ -54,6 +54,9 @@ class Settings:
     src: tuple[str, ...] | None = None
     """Encoders of SRC in the mirror test: `alex` or `vgg` of LPIPS, folders with DINOv2, or `off`.
     By default that of LPIPS, where LPIPS is measured."""
+    scs: str | None = None
+    """Segmenter of SCS, for episodes that were collected with --ids: a folder with SAM 2, `flow`
+    (optical flow, without weights), or `off`. By default `flow`."""
     out: Path | None = None
     """Folder of the report; by default RUN/report, or RUN/report-NAME for other data than the
     run's own."""

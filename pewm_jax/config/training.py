@@ -254,6 +254,10 @@ class EvalConfig:
     src: tuple[str, ...] = ()
     """Encoders of SRC in the mirror test: `alex` or `vgg` of the installed LPIPS, folders with
     DINOv2, or `off`; if empty, that of LPIPS where LPIPS is measured."""
+    scs: str = ""
+    """Segmenter of SCS, for episodes with instance ids: a folder with SAM 2 (`pip install
+    'pewm-jax[sam2]'`), or `flow`, optical flow, which needs no weights; `off` leaves SCS out; if
+    empty, it is measured with `flow` where the episodes have instance ids."""
     protocol: str = ""
     """File written by `pewm-jax protocol` before training: the clips that are scored, with their
     context, motion and noise; it stands above the settings here. If empty, or `off`, clips are

@@ -29,7 +29,8 @@ from pewm_jax.houses.moving_pieces import ROBOT_HEIGHT_M
 from pewm_jax.types import Camera
 
 SPLITS = ("train", "validation", "revisit")
-"""Folders written; ``revisit`` holds the test scenes, walked out and back."""
+"""Folders written; ``revisit`` holds the test scenes, by default walked out and back
+(``CollectConfig.test_policy``)."""
 HOUSES_PER_SEED = 1_000_000
 _NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
 """Settings that do not change the files."""
@@ -53,7 +54,8 @@ class CollectConfig:
     validation: int = 8
     """Episodes to watch training with."""
     test: int = 24
-    """Revisit episodes (out and back over the same places) in test scenes, in revisit/."""
+    """Episodes in test scenes, in revisit/: out and back over the same places, unless test_policy
+    says otherwise."""
     frames: int = 96
     """Frames of an episode."""
     size: int = 64
@@ -70,10 +72,14 @@ class CollectConfig:
     """Probability of a full turn at the start of an episode; revisit episodes always have it."""
     policy: Literal["follow", "walk"] = "follow"
     """`follow`: shortest paths between far goals. `walk`: straight on until something is there."""
+    test_policy: Policy = "revisit"
+    """How test scenes are walked: `revisit` turns around, goes out and comes back the same way;
+    `follow` and `walk` are those of `policy`. A revisit turns by 540 degrees in all: with turns of
+    10 degrees these are 54 actions, so a short episode has few others."""
     continuous: bool = False
     """Small continuous (dx, dy, dyaw) actions instead of forward / turn left / turn right."""
     ids: bool = False
-    """Also write instance ids."""
+    """Also write instance ids, and the names of the instances."""
     moving: bool = False
     """Made houses have doors that open as the agent comes near, and robots on their rounds."""
     voxels: VoxelsConfig = UNRECORDED
@@ -166,6 +172,8 @@ def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
     settings = dataclasses.asdict(config)
     for name in (*_NOT_IN_FILES, "train", "validation", "test"):
         del settings[name]
+    if split != "revisit" or config.test_policy == "revisit":  # as before there was a choice
+        del settings["test_policy"]
     if not config.moving:  # datasets of before there was a choice stay what they are
         del settings["moving"]
     if settings["voxels"]["pictures"] == UNRECORDED.pictures:
@@ -210,7 +218,7 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         scene, grid = moving.scene, moving.grid
     else:
         scene, grid = _house(house_seed(config, split, index), config.camera_height)
-    policy: Policy = "revisit" if split == "revisit" else config.policy
+    policy: Policy = config.test_policy if split == "revisit" else config.policy
     walk = make_trajectory(
         grid,
         config.actions,
@@ -251,6 +259,8 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         "step_m": config.step_m,
         "turn_deg": config.turn_deg,
     }
+    if config.ids:
+        info["objects"] = list(scene.objects)
     if config.moving:
         info["moving"] = True
     if config.voxels.pictures != UNRECORDED.pictures:

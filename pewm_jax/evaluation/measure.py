@@ -7,11 +7,13 @@ from importlib import metadata
 from typing import Any
 
 import jax
+import numpy as np
 
 from pewm_jax.config import Config, kinds, to_dict
 from pewm_jax.evaluation import intervals, mirror, statistics
 from pewm_jax.evaluation.long_rollouts import LongRollouts
 from pewm_jax.evaluation.metrics import VideoDistance
+from pewm_jax.evaluation.metrics.structure import Consistency
 from pewm_jax.evaluation.metrics.videos import DISTANCES
 from pewm_jax.evaluation.mirror import Mirror
 from pewm_jax.evaluation.scoring import TRUTH, Scored
@@ -27,6 +29,7 @@ def measure(
     long: LongRollouts,
     back: Mirror | None = None,
     i3d: VideoDistance | None = None,
+    consistency: Consistency | None = None,
 ) -> dict[str, Any]:
     """Turn errors into the content of ``metrics.json``, except for hashes.
 
@@ -38,7 +41,7 @@ def measure(
         ``drift[method]`` (see ``statistics.drift``) and ``growth``, what the map holds; ``houses``,
         means over houses with 95 % intervals (see ``intervals.table``), with the same of long
         rollouts in ``long``; ``videos``, FVD and KVD; ``mirror``, the mirror test (see
-        ``mirror.facts``); None where something was not measured.
+        ``mirror.facts``); ``scs``, see ``structure``; None where something was not measured.
     """
     return {
         "schema": SCHEMA,
@@ -51,6 +54,7 @@ def measure(
         },
         "videos": videos(config, scored, i3d) if i3d else None,
         "mirror": mirror.facts(back) if back else None,
+        "scs": structure(config, scored, consistency) if consistency else None,
         "houses": {
             "how": intervals.how(),
             "house": scored.clustered_by,
@@ -82,6 +86,28 @@ def growth(config: Config, long: LongRollouts) -> dict[str, Any] | None:
         "occupied": intervals.entry(held, clusters),
         "per_frame": intervals.entry((held[:, -1] - held[:, 0]) / (each * long.chain), clusters),
         "capacity": config.model.memory.room,
+    }
+
+
+def structure(config: Config, scored: Scored, consistency: Consistency) -> dict[str, Any]:
+    """Return SCS of every method and its ceiling, over houses; ``docs/evaluation.md`` says more."""
+
+    def entry(values: np.ndarray) -> dict[str, Any]:
+        return intervals.entry(values, scored.clusters)
+
+    values = {method: scs for method, scs in scored.structure.items() if method != TRUTH}
+    truth, own = scored.structure[TRUTH], values[statistics.ours(values)]
+    return {
+        "name": consistency.name,
+        "seed": config.evaluate.seeds[0],
+        "clips": int(np.isfinite(truth[:, 0]).sum()),
+        "results": {method: entry(scs[:, 0]) for method, scs in values.items()},
+        "per_frame": {method: entry(scs[:, 1:]) for method, scs in values.items()},
+        "ceiling": entry(truth[:, 0]),
+        "ceiling_per_frame": entry(truth[:, 1:]),
+        "margins": {
+            method: entry(own[:, 0] - scs[:, 0]) for method, scs in values.items() if scs is not own
+        },
     }
 
 

@@ -104,6 +104,7 @@ def render(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         page_tables.scores(metrics),
         page_tables.houses(metrics),
         page_tables.steering(metrics),
+        page_tables.structure(metrics),
         page_long.videos(metrics),
         _curves(metrics),
         page_tables.drift(metrics),

@@ -112,9 +112,42 @@ def steering(metrics: Mapping[str, Any]) -> str:
     return (
         "<h2>Do the actions steer?</h2>"
         + table(f"<th>PSNR, dB</th><th>all frames</th>{heads}", rows)
-        + "<p class='quiet'>The same clips with the same noise; another clip's actions are of "
-        "one in another house. Means over houses, in brackets the interval of a bootstrap over "
-        "them. A world that follows its actions is nearest to the truth with the true ones.</p>"
+        + f"<p class='quiet'>{found['clips']} walks with the same noise: "
+        f"{100 * found['forward']:.0f} % of their steps go forward. Another clip's actions are of "
+        f"one in another house; they differ in {100 * found['different']:.0f} % of the steps. "
+        "Means over houses, in brackets the interval of a bootstrap over them. A world that "
+        "follows its actions is nearest to the truth with the true ones.</p>"
+    )
+
+
+def structure(metrics: Mapping[str, Any]) -> str:
+    """Return SCS of every method and its ceiling; "" where it was not measured."""
+    found = metrics.get("scs")
+    if not found:
+        return ""
+    ends = [0, len(found["ceiling_per_frame"]["mean"]) - 1]
+
+    def row(label: str, whole: Mapping[str, Any], steps: Mapping[str, Any]) -> str:
+        at = [{key: steps[key][t] for key in ("mean", "low", "high")} for t in ends]
+        cells = "".join(f"<td>{spread(e, 1)}</td>" for e in (whole, *at))
+        return f"<tr><td>{label}</td>{cells}<td>{whole['houses']}</td></tr>"
+
+    rows = [
+        row(label, found["results"][method], found["per_frame"][method])
+        for method, label in METHOD_NAMES.items()
+        if method in found["results"]
+    ]
+    rows.append(row("the true clip", found["ceiling"], found["ceiling_per_frame"]))
+    heads = "".join(f"<th>frame {t + 1}</th>" for t in ends)
+    return (
+        "<h2>Are things where they should be?</h2>"
+        + table(f"<th>{found['name']}</th><th>all frames</th>{heads}<th>houses</th>", rows)
+        + "<p class='quiet'>Structural consistency score: 100 × IoU of the masks of things in the "
+        "imagined and the true clip, mean over things and frames; higher is better. Frames count "
+        "until nothing that the present frame shows is visible any more. The masks of imagined "
+        "clips come from a segmenter, and the last row is the true clip with the same segmenter. "
+        f"{found['clips']} clips, first sampling seed; means over houses, in brackets the interval "
+        "of a bootstrap over them.</p>"
     )
 
 

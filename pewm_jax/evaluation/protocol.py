@@ -97,18 +97,8 @@ def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) 
         first = min(way_back(episode), last)
         starts = np.unique(np.round(np.linspace(first, last, per_episode)).astype(int))
         for rank, start in enumerate(starts):
-            targets = int(start) + config.evaluate.stride * np.arange(
-                1, length // config.evaluate.stride + 1
-            )
-            choice = ClipChoice(
-                episode=index,
-                name=episode.name,
-                scene=episode.scene,
-                start=int(start),
-                context_S=context_frames(int(start), config.data.context),
-                targets_N=tuple(int(target) for target in targets),
-            )
-            ranked.append((rank, choice))
+            count = length // config.evaluate.stride
+            ranked.append((rank, choice_of(config, episode, index, int(start), count)))
     if not ranked:
         raise UserError(
             f"no episode of {config.data.path}/{config.evaluate.split} is long enough: "
@@ -117,6 +107,27 @@ def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) 
         )
     ranked.sort(key=lambda item: item[0])
     return [choice for _, choice in ranked[:clips]]
+
+
+def choice_of(config: Config, episode: Episode, index: int, start: int, count: int) -> ClipChoice:
+    """Return the clip of an episode that begins at a frame.
+
+    Args:
+        config: gives ``data.context`` and ``evaluate.stride``.
+        episode: the episode.
+        index: its place among the episodes.
+        start: the present frame.
+        count: frames to imagine.
+    """
+    targets = start + config.evaluate.stride * np.arange(1, count + 1)
+    return ClipChoice(
+        episode=index,
+        name=episode.name,
+        scene=episode.scene,
+        start=start,
+        context_S=context_frames(start, config.data.context),
+        targets_N=tuple(int(target) for target in targets),
+    )
 
 
 def long_choices(config: Config, episodes: Sequence[Episode]) -> list[ClipChoice]:
@@ -251,7 +262,7 @@ def fingerprint(
             settings; "" if there is none.
     """
     settings = to_dict(config)
-    for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src"):
+    for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src", "scs"):
         settings["evaluate"].pop(key)
     for key in ("train", "data"):
         settings.pop(key)

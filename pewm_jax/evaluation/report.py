@@ -36,7 +36,7 @@ from pewm_jax.training import processes
 
 TRAINED_ON = "train"
 """The split that training reads."""
-REPORT_VERSION = 9
+REPORT_VERSION = 10
 """Increase it whenever the same scores would give another report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
@@ -56,7 +56,7 @@ def override(config: Config, **changes: Any) -> Config:
     """
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
-    for name in ("none", "lpips", "protocol", "fvd"):
+    for name in ("none", "lpips", "protocol", "fvd", "scs"):
         if name in changes:
             changes[name] = str(changes[name])
     if steps is not None:
@@ -105,7 +105,11 @@ def evaluate(
     none = runs.open_none(opened, config)
     none_weights = none.weights_hash if none else ""
     data_hash = file_hash(split / MANIFEST)
-    measures = chosen.choose(config, accelerator=jax.default_backend() != "cpu")
+    measures = chosen.choose(
+        config,
+        accelerator=jax.default_backend() != "cpu",
+        ids=all(episodes[index].has_ids for index in range(len(episodes))),
+    )
     lpips = measures.lpips
     validation = reproject_choice.data_hash(config)
     name = fingerprint(
@@ -158,15 +162,17 @@ def evaluate(
         none_weights,
         remembers,
     )
-    scored = score_table(config, episodes, methods, partials, say, lpips, clips, measures.i3d)
+    scored = score_table(
+        config, episodes, methods, partials, say, lpips, clips, measures.i3d, measures.structure
+    )
     long = roll_long(config, episodes, methods, partials, say, lpips, rollouts)
     back = look_back(config, episodes, methods, partials, rollouts, measures.visits, say)
-    asked = _asked(opened, config, episodes, methods.model, partials, say, clips)
+    asked, about_steering = _asked(opened, config, episodes, methods.model, partials, say, clips)
     if not processes.is_primary():
         processes.meet("evaluate: report")  # devices that wait for one another would give up
         return folder / PAGE
     say("drawing the report …")
-    metrics = measure(config, scored, long, back, measures.i3d)
+    metrics = measure(config, scored, long, back, measures.i3d, measures.structure)
     metrics |= asked
     if cameras:
         metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
@@ -176,6 +182,7 @@ def evaluate(
         **measures.about,
         "lpips_name": measures.lpips_name,
         "mirror": way_out(config, rollouts)[1],
+        "steering": about_steering,
         **measures.hashes,
         "weights_sha256": opened.weights_hash,
         "dataset_sha256": data_hash,
@@ -200,18 +207,19 @@ def _asked(
     partials: Partials,
     say: Callable[[str], Any],
     clips: Sequence[ClipChoice],
-) -> dict[str, Any]:
-    """Return what only some models are asked: what the map covers, and whether actions steer."""
-    covered = steered = None
+) -> tuple[dict[str, Any], str | None]:
+    """Return what only some models are asked: what the map covers, and whether actions steer.
+
+    The second value is a sentence on the clips that say whether actions steer, or on why that is
+    not measured; None of a model that is not steered by actions.
+    """
+    covered = steered = about = None
     # A memory that is the state of its world has no tokens that could be counted.
     if runs.remembers(opened) and config.model.memory.READ_BY_BLOCKS:
         covered = score_coverage(config, episodes, model, partials, say, clips)
     if not model.cameras:
-        steered = steering.score(config, opened.params, episodes, clips, partials, say)
-    return {
-        "coverage": covered,
-        "steering": steered and {"all": steered.table(), "per_frame": steered.per_frame()},
-    }
+        steered, about = steering.score(config, opened.params, episodes, clips, partials, say)
+    return {"coverage": covered, "steering": steered and steered.facts()}, about
 
 
 def _write(

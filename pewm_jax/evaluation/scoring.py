@@ -20,6 +20,13 @@ from pewm_jax.evaluation.images import error_sums_batch, unit_colours, with_lpip
 from pewm_jax.evaluation.imagine import print_now
 from pewm_jax.evaluation.methods import SAMPLED, Methods
 from pewm_jax.evaluation.metrics import Perceptual, VideoDistance
+from pewm_jax.evaluation.metrics.structure import (
+    Consistency,
+    average,
+    first_visible,
+    object_masks,
+    things_of,
+)
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import ClipChoice, choose, load_clip, stack
 from pewm_jax.evaluation.seen import seen_masks_batch
@@ -39,11 +46,14 @@ class Scored:
         sums: method → (seeds, C, N, 3, 9) as ``images.error_sums``; one seed without a network.
         features: where video distances are measured, method → (C, 400) features of the clips of
             the first seed (``metrics.videos``), and those of ``truth``.
+        structure: where SCS is measured, method → (C, 1 + N): SCS of each clip of the first seed
+            and of each imagined frame, NaN where nothing counts, and the ceiling of ``truth``.
     """
 
     choices: list[ClipChoice]
     sums: dict[str, np.ndarray]
     features: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    structure: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def clustered_by(self) -> str:
@@ -58,10 +68,36 @@ class Scored:
 
 
 @dataclasses.dataclass(frozen=True)
+class Tracked:
+    """What SCS knows of a true clip.
+
+    Attributes:
+        ids_THW: (T, H, W) instance ids of the present frame and the N frames to imagine.
+        things: ids of the things that may be followed, or None for all.
+        visible_T: (T,) bool, whether each frame shows a point that the present frame shows.
+    """
+
+    ids_THW: np.ndarray
+    things: list[int] | None
+    visible_T: np.ndarray
+
+    def score(self, measure: Consistency, video_THWC: np.ndarray) -> np.ndarray:
+        """Return (T,) SCS of a clip, and of each of its frames but the first.
+
+        Args:
+            measure: SCS with a segmenter.
+            video_THWC: (T, H, W, 3) uint8, the present frame and the N imagined ones.
+        """
+        found = measure(video_THWC, object_masks(self.ids_THW, self.things), self.visible_T)
+        return np.concatenate([average(found)[None], average(found, 0)])
+
+
+@dataclasses.dataclass(frozen=True)
 class Batch:
     """Chosen clips, padded to one size by repeating the last; ``real`` of them are asked for.
 
-    ``described`` keeps what LPIPS makes of their truth, from its first use on.
+    ``described`` keeps what LPIPS makes of their truth, from its first use on. ``tracked`` holds
+    what SCS needs of the clips asked for, where it is measured.
     """
 
     context: Frames
@@ -72,6 +108,7 @@ class Batch:
     unseen: Any
     real: int
     described: dict[Any, Callable[[Any], Array]] = dataclasses.field(default_factory=dict)
+    tracked: tuple[Tracked, ...] = ()
 
     def seeds(self, seed: int) -> np.ndarray:
         """Return what the sampler's noise is drawn from: sampling seed, clip number."""
@@ -93,6 +130,13 @@ class Batch:
         parts = self.context.rgb_THWC[:, -1:], rgb_BTHWC
         return jnp.concatenate([2 * unit_colours(part) - 1 for part in parts], 1)
 
+    def structure(self, frames: Frames, measure: Consistency) -> np.ndarray:
+        """Return SCS of the clips asked for and of their frames, see ``Scored.structure``."""
+        whole = unit_colours(self.whole(frames.rgb_THWC)[: self.real])
+        videos = np.rint(255 * np.asarray(whole)).astype(np.uint8)
+        pairs = zip(self.tracked, videos, strict=True)
+        return np.stack([tracked.score(measure, video) for tracked, video in pairs])
+
     def sums(self, frames: Frames, lpips: Perceptual | None) -> np.ndarray:
         """Return ``images.error_sums`` of the clips asked for, with LPIPS if it is given."""
         sums = np.asarray(error_sums_batch(frames, self.targets, self.seen, self.unseen))
@@ -111,17 +155,37 @@ def load_batch(
     first: int,
     *,
     cameras: bool,
+    track: bool = False,
 ) -> Batch:
-    """Read clips, the first of them number ``first``, and find what was seen before."""
+    """Read clips, the first of them number ``first``, and find what was seen before.
+
+    Args:
+        config: the experiment.
+        episodes: held-out episodes.
+        choices: the clips.
+        first: number of the first of them.
+        cameras: see ``load_clip``.
+        track: whether to read the instance ids, for SCS.
+
+    Raises:
+        UserError: see ``load_clip``; or ids are asked for and an episode has none.
+    """
     size = config.evaluate.batch
     parts = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
     context = stack([part[0] for part in parts], size)
     targets = stack([part[1] for part in parts], size)
     control = stack([part[2] for part in parts], size)
     seen, unseen = seen_masks_batch(targets, context)
-    return Batch(
-        context, targets, control, first + np.arange(size), seen, unseen, real=len(choices)
-    )
+    tracked = tuple(_tracked(episodes[one.episode], one) for one in choices) if track else ()
+    numbers, real = first + np.arange(size), len(choices)
+    return Batch(context, targets, control, numbers, seen, unseen, real=real, tracked=tracked)
+
+
+def _tracked(episode: Episode, choice: ClipChoice) -> Tracked:
+    frames = [choice.start, *choice.targets_N]
+    clip = episode.frames(frames)
+    visible_T = first_visible(np.asarray(clip.depth_THW), clip.camera)
+    return Tracked(episode.ids(frames), things_of(episode.info), visible_T)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +196,8 @@ class Task:
         method: one of ``Methods.names``, or ``truth``.
         seed: of the sampling noise.
         first: number of the batch's first clip.
-        kept: ``sums`` of the errors, or ``features`` for the distances of videos.
+        kept: ``sums`` of the errors, ``features`` for the distances of videos, or ``structure`` for
+            SCS.
     """
 
     method: str
@@ -140,10 +205,14 @@ class Task:
     first: int
     kept: str
 
-    def name(self, methods: Methods, i3d: VideoDistance | None) -> str:
+    def name(
+        self, methods: Methods, i3d: VideoDistance | None, structure: Consistency | None = None
+    ) -> str:
         """Return the name of its file, which says what its content depends on beside the clips."""
         who = "truth" if self.method == TRUTH else methods.piece(self.method)
         kind = f"i3d-{i3d.sha256[:16]}" if i3d and self.kept == "features" else "table"
+        if structure and self.kept == "structure":
+            kind = "-".join(filter(None, ("scs", structure.encoder, structure.sha256[:16])))
         return f"{kind}-{who}-seed{self.seed}-clip{self.first:04d}"
 
 
@@ -156,12 +225,13 @@ def score_table(
     lpips: Perceptual | None = None,
     choices: list[ClipChoice] | None = None,
     i3d: VideoDistance | None = None,
+    structure: Consistency | None = None,
 ) -> Scored:
     """Score ``evaluate.clips`` choices, chains of ``evaluate.chain`` clips, by method and seed.
 
-    Pieces that ``partials`` already holds are reused. Without ``lpips`` that is left out, and
-    without ``i3d`` the features of whole clips. Without ``choices`` they are those of ``choose``.
-    Several processes share the work, and all return the whole table.
+    Pieces that ``partials`` already holds are reused. Without ``lpips`` that is left out, without
+    ``i3d`` the features of whole clips, and without ``structure`` SCS. Without ``choices`` they are
+    those of ``choose``. Several processes share the work, and all return the whole table.
 
     Raises:
         UserError: no episode is long enough, the data is inconsistent or does not fit the model,
@@ -170,8 +240,9 @@ def score_table(
     if choices is None:
         choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
     size, starts = config.evaluate.batch, range(0, len(choices), config.evaluate.batch)
-    tasks = _tasks(config, methods, starts, i3d)
-    names = {task: task.name(methods, i3d) for task in tasks}
+    extras = [kept for kept, one in (("features", i3d), ("structure", structure)) if one]
+    tasks = _tasks(config, methods, starts, extras)
+    names = {task: task.name(methods, i3d, structure) for task in tasks}
     known = {task: piece for task in tasks if (piece := partials.get(names[task])) is not None}
     # What is kept of one imagination is one process's, so that nothing is imagined twice.
     groups = list(dict.fromkeys((task.first, task.method, task.seed) for task in tasks))
@@ -189,14 +260,18 @@ def score_table(
             if loaded is None or loaded[0] != task.first:
                 chosen = choices[task.first : task.first + size]
                 cameras = methods.model.cameras
-                batch = load_batch(config, episodes, chosen, task.first, cameras=cameras)
+                track = structure is not None
+                batch = load_batch(
+                    config, episodes, chosen, task.first, cameras=cameras, track=track
+                )
                 loaded, made = (task.first, batch), None
             batch, group = loaded[1], (task.method, task.seed)
             if task.method == TRUTH:
                 made = group, batch.targets
             elif made is None or made[0] != group:
                 made = group, batch.imagine(methods, task.method, task.seed)[2]
-            known[task] = partials.put(names[task], **_kept(task, batch, made[1], lpips, i3d))
+            kept = _kept(task, batch, made[1], lpips, i3d, structure)
+            known[task] = partials.put(names[task], **kept)
             meter.advance(frames_each * batch.real)
     if todo:
         say(meter.summary())
@@ -207,15 +282,15 @@ def score_table(
 
     seeds = {method: methods.seeds(method, config.evaluate.seeds) for method in methods.names}
     sums = {name: np.stack([joined(name, seed, "sums") for seed in seeds[name]]) for name in seeds}
-    features = {}
-    if i3d is not None:
-        firsts = {name: some[0] for name, some in seeds.items()} | {TRUTH: 0}
-        features = {name: joined(name, seed, "features") for name, seed in firsts.items()}
-    return Scored(choices, sums, features)
+    firsts = {name: some[0] for name, some in seeds.items()} | {TRUTH: 0}
+    more = {
+        kept: {name: joined(name, seed, kept) for name, seed in firsts.items()} for kept in extras
+    }
+    return Scored(choices, sums, **more)
 
 
 def _tasks(
-    config: Config, methods: Methods, starts: Sequence[int], i3d: VideoDistance | None
+    config: Config, methods: Methods, starts: Sequence[int], extras: Sequence[str]
 ) -> list[Task]:
     """Return all pieces, those of one batch and of one imagination beside each other."""
     tasks = []
@@ -223,10 +298,9 @@ def _tasks(
         for method in methods.names:
             for place, seed in enumerate(methods.seeds(method, config.evaluate.seeds)):
                 tasks.append(Task(method, seed, first, "sums"))
-                if i3d is not None and place == 0:
-                    tasks.append(Task(method, seed, first, "features"))
-        if i3d is not None:
-            tasks.append(Task(TRUTH, 0, first, "features"))
+                if place == 0:
+                    tasks += [Task(method, seed, first, kept) for kept in extras]
+        tasks += [Task(TRUTH, 0, first, kept) for kept in extras]
     return tasks
 
 
@@ -236,8 +310,12 @@ def _kept(
     frames: Frames,
     lpips: Perceptual | None,
     i3d: VideoDistance | None,
+    structure: Consistency | None,
 ) -> dict[str, np.ndarray]:
     if task.kept == "sums":
         return {"sums": batch.sums(frames, lpips)}
+    if task.kept == "structure":
+        assert structure is not None
+        return {"structure": batch.structure(frames, structure)}
     assert i3d is not None
     return {"features": i3d.features(batch.whole(frames.rgb_THWC))[: batch.real]}

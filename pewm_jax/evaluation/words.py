@@ -51,8 +51,10 @@ ACTIONS_NAMES = {
     "true": "the true actions",
     "shuffled": "another clip's actions",
     "none": "no actions",
+    "copy": "the observed frame, repeated",
     "true - shuffled": "true minus another clip's",
     "true - none": "true minus none",
+    "true - copy": "true minus the observed frame",
 }
 """Names of the kinds of actions by which a model was steered, and of their differences."""
 NONE_HOW = (
@@ -204,11 +206,29 @@ def came_back(metrics: Mapping[str, Any]) -> str:
     )
 
 
-def followed(metrics: Mapping[str, Any]) -> list[str]:
-    """Return a sentence on whether the model follows its actions, if that was measured."""
-    found = metrics.get("steering")
+def consistent(metrics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on SCS, if it was measured."""
+    found = metrics.get("scs")
     if not found:
         return []
+    values = "; ".join(
+        f"{label} {spread(found['results'][method], 1)}"
+        for method, label in METHOD_NAMES.items()
+        if method in found["results"]
+    )
+    ceiling = spread(found["ceiling"], 1)
+    return [f"{found['name']}, higher is better: {values}; the true clip {ceiling}."]
+
+
+def followed(metrics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on whether the model follows its actions, or on why that is not known.
+
+    There is none of a model that is not steered by actions.
+    """
+    found = metrics.get("steering")
+    if not found:
+        about = metrics["protocol"].get("steering")
+        return [about] if about else []
     less = (
         f"{ACTIONS_NAMES[name.removeprefix('true - ')]}: {spread(entry, 2, sign=True)} dB"
         for name, entry in found["all"].items()
@@ -250,7 +270,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     lines += [perceived(metrics), far_apart(metrics)]
     lines += [covered(metrics["coverage"])] if metrics["coverage"] else []
     lines += [drifted(metrics["long"]["drift"][own]), *grew(metrics)]
-    return [*lines, *followed(metrics), came_back(metrics)]
+    return [*lines, *followed(metrics), *consistent(metrics), came_back(metrics)]
 
 
 def score_lines(metrics: Mapping[str, Any]) -> list[str]:

@@ -24,8 +24,15 @@ from pewm_jax.data.checks import check_episode
 from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import EpisodeSource, write_shard
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.data.make_episode import CollectConfig, house_seed, make_episode, scenes_of
+from pewm_jax.data.make_episode import (
+    CollectConfig,
+    house_seed,
+    make_episode,
+    scenes_of,
+    settings_of,
+)
 from pewm_jax.data.validate import ValidateConfig, validate
+from pewm_jax.geometry.actions import FORWARD
 
 ROOT = Path(__file__).parents[2]
 
@@ -221,6 +228,24 @@ def test_an_episode_in_a_made_house_is_valid_and_reproducible():
     assert episode.scene == "house-000000"
     assert len(np.unique(episode.ids())) > 3
     assert np.median(episode.frames().depth_THW) > 0.5
+
+
+def test_test_scenes_are_revisited_or_walked_as_asked():
+    config = CollectConfig(Path("x"), frames=64, size=8, turn_deg=10, step_m=0.12, turn_around=0)
+    walked = dataclasses.replace(config, test_policy="follow")
+    there, through = (read_episode(make_episode(c, "revisit", 0)) for c in (config, walked))
+    assert there.scene == through.scene
+    assert (there.info["policy"], through.info["policy"]) == ("revisit", "follow")
+    assert "return_frame" in there.info
+    assert "return_frame" not in through.info
+    forward = [np.mean(one.action_ids == FORWARD) for one in (there, through)]
+    assert forward[0] < 0.2
+    assert forward[1] > 0.5
+    # Datasets collected before there was a choice are complete, and other splits do not change.
+    assert "test_policy" not in settings_of(config, "revisit")
+    assert settings_of(walked, "revisit")["test_policy"] == "follow"
+    for split in ("train", "validation"):
+        assert settings_of(walked, split) == settings_of(config, split)
 
 
 @pytest.mark.parametrize("index", [1, 5])

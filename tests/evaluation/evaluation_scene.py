@@ -63,6 +63,21 @@ def look(pose, intrinsics, offset=0.0, size=SIZE):
     return 0.5 + 0.4 * jnp.sin(2 * waves + offset), depth
 
 
+NAMES = ["room0-living-wall0", *(f"room0-picture-{k}" for k in range(8))]
+"""Instances of the room: its shell, and eight pictures, one in each octant of the view around."""
+
+
+def instances(poses, intrinsics, depth):
+    """Return (T, H, W) instance ids: what is near the height of the eyes is a picture."""
+    found = []
+    for pose, depth_HW in zip(np.asarray(poses), np.asarray(depth), strict=True):
+        rays = np.asarray(ray_directions(intrinsics, *depth_HW.shape)) @ pose[:3, :3].T
+        points = pose[:3, 3] + rays * depth_HW[..., None]
+        octant = np.int32(4 * (np.arctan2(points[..., 1], points[..., 0]) / np.pi + 1)) % 8
+        found.append(np.where(abs(points[..., 2] - 1.25) < 0.5, 1 + octant, 0))
+    return np.stack(found).astype(np.int32)
+
+
 def walk(length, seed):
     """Discrete actions: look around, go, turn, come back."""
     rng = np.random.default_rng(seed)
@@ -72,17 +87,20 @@ def walk(length, seed):
     return np.array(actions[: length - 1])
 
 
-def record(index, length=24, size=SIZE, scene=None, nod=0.0):
-    """One episode of the room; from frame 14 on the camera is pitched by ``nod`` radians."""
-    ids = walk(length, index)
+def record(index, length=24, size=SIZE, scene=None, nod=0.0, ids=False):
+    """One episode of the room; from frame 14 on the camera is pitched by ``nod`` radians.
+
+    With ``ids`` it has those of ``instances``.
+    """
+    turns = walk(length, index)
     pose = pose_from_yaw(np.array([-0.5, 0.1 * index, 1.25]), 0.4 * index)
-    moves = discrete_table(ActionConfig())[ids]
+    moves = discrete_table(ActionConfig())[turns]
     poses = np.asarray(integrate(pose, moves))
     if nod:
         cos, sin = np.cos(nod), np.sin(nod)
         poses = poses.copy()
         poses[14:, :3, :3] = poses[14:, :3, :3] @ [[1, 0, 0], [0, cos, -sin], [0, sin, cos]]
-        moves, ids = None, None
+        moves, turns = None, None
     intrinsics = intrinsics_from_fov(size, size, 90.0)
     colour, depth = jax.vmap(lambda p: look(p, intrinsics, 0.0, size))(poses)
     arrays = EpisodeArrays(
@@ -91,9 +109,10 @@ def record(index, length=24, size=SIZE, scene=None, nod=0.0):
         intrinsics,
         poses,
         moves,
-        None if ids is None else ids.astype(np.int32),
+        None if turns is None else turns.astype(np.int32),
+        instances(poses, intrinsics, depth) if ids else None,
     )
-    info = {"return_frame": 12}
+    info = {"return_frame": 12} | ({"objects": NAMES} if ids else {})
     return write_episode(arrays, f"room-{index}/revisit", scene or f"room-{index}", info)
 
 

@@ -149,6 +149,35 @@ def test_metrics_hold_means_over_houses_with_intervals(run):
     assert "House by house" in (run / "report" / "index.html").read_text()
 
 
+def test_things_are_followed_where_the_episodes_have_instance_ids(run, copied, tmp_path, command):
+    protocol = json.loads((run / "report" / "metrics.json").read_text())["protocol"]
+    assert protocol["scs"].startswith("SCS is left out, since the episodes have no instance ids")
+    assert protocol["scs_segmenter"] is None
+    with pytest.raises(UserError, match=r"evaluate\.scs is flow, and .* collect them with --ids"):
+        report.evaluate(copied, say=lambda _: None, scs="flow")
+    write_split(tmp_path / "data" / "revisit", episodes=2, ids=True)
+    said = []
+    page = report.evaluate(copied, say=said.append, data=tmp_path / "data", lpips="off")
+    metrics = json.loads((page.parent / "metrics.json").read_text())
+    found = metrics["scs"]
+    assert (found["name"], found["clips"], found["seed"]) == ("SCS[flow]", 4, 0)
+    assert set(found["results"]) == {"memory", "empty", "reproject", "copy"}
+    assert set(found["margins"]) == {"empty", "reproject", "copy"}
+    for entry in (*found["results"].values(), found["ceiling"]):
+        assert 0 <= entry["low"] <= entry["mean"] <= entry["high"] <= 100
+        assert entry["houses"] == 2
+    assert len(found["per_frame"]["memory"]["mean"]) == 4
+    assert page.read_text().count("SCS[flow]") >= 3  # the table, the sentence, the protocol
+    assert any(line.startswith("SCS[flow], higher is better: ") for line in said)
+    fingerprint = metrics["protocol"]["fingerprint"]
+    page = report.evaluate(copied, say=said.append, data=tmp_path / "data", lpips="off", scs="off")
+    metrics = json.loads((page.parent / "metrics.json").read_text())
+    assert metrics["scs"] is None
+    assert metrics["protocol"]["scs"] == "SCS is left out, as evaluate.scs says."
+    assert metrics["protocol"]["fingerprint"] == fingerprint  # other scores are kept
+    assert command([str(copied), "--data", str(tmp_path / "data"), "--scs", "nowhere"]) == 2
+
+
 def test_the_page_on_evaluation_names_every_entry(run):
     page = (ROOT / "docs" / "evaluation.md").read_text()
     metrics = json.loads((run / "report" / "metrics.json").read_text())

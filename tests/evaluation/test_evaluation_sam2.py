@@ -9,7 +9,7 @@ import torch
 import transformers
 
 from pewm_jax.config import UserError
-from pewm_jax.evaluation.metrics import sam2
+from pewm_jax.evaluation.metrics import chosen, sam2
 from pewm_jax.evaluation.metrics.structure import structural_consistency
 
 SIDE, WIDTH = 64, 128
@@ -108,9 +108,22 @@ def test_it_follows_as_the_reference_does(folder):
 def test_it_scores_a_clip(folder):
     video, first = clip(48)
     true = np.repeat(first[:, None], len(video), 1)
-    score = structural_consistency(video, video, true, sam2.read(folder))
+    score = structural_consistency(video, video, true, np.ones(len(video), bool), sam2.read(folder))
     assert score.value == score.ceiling
     assert score.objects == 2
+
+
+def test_a_report_measures_scs_with_it_where_it_is_named(folder):
+    measure, about = chosen.structure(str(folder), ids=True)
+    assert measure is not None
+    assert measure.name == "SCS[sam2]"
+    assert len(measure.sha256) == 64
+    assert about.endswith(f"SAM 2 of {folder} follows the masks.")
+    video, first = clip(48)
+    true = np.repeat(first[:, None], len(video), 1)
+    assert measure(video, true, np.ones(len(video), bool)).shape == (2, len(video) - 1)
+    with pytest.raises(UserError, match="no instance ids"):
+        chosen.structure(str(folder), ids=False)
 
 
 def test_what_is_no_sam_2_is_refused(folder, tmp_path, monkeypatch):

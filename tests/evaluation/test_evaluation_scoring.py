@@ -13,7 +13,9 @@ from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.evaluation import imagine, long_rollouts, scoring
 from pewm_jax.evaluation.imagine import Imagination
+from pewm_jax.evaluation.measure import structure
 from pewm_jax.evaluation.methods import Methods
+from pewm_jax.evaluation.metrics.structure import Consistency, average, first_visible, overlaps
 from pewm_jax.evaluation.partial import Partials
 from pewm_jax.evaluation.protocol import choose
 from pewm_jax.evaluation.reproject import ReprojectSettings
@@ -118,6 +120,51 @@ def test_scored_pieces_are_not_done_again(monkeypatch, knowing_model, episodes, 
     assert "scored before" in said[0]
     for method in whole.sums:
         np.testing.assert_array_equal(whole.sums[method], resumed.sums[method])
+
+
+def test_things_are_followed_through_the_clips_of_the_first_seed(
+    monkeypatch, knowing_model, tmp_path
+):
+    episodes = EpisodeSource(write_split(tmp_path / "revisit", episodes=2, ids=True))
+    config, model, asked = tiny(tmp_path, clips=3), knowing_model(), []
+
+    def bright(video, first):
+        asked.append(first)
+        return first[:, None] & (video.mean(-1) > 100)
+
+    measure = Consistency(bright, "bright", "1234")
+    partials = Partials(tmp_path / "partial", "e" * 64, "f" * 64)
+    args = config, episodes, model, partials, print
+    scored = scoring.score_table(*args, structure=measure)
+    assert set(scored.structure) == {"memory", "empty", "reproject", "copy", "truth"}
+    assert len(asked) == 5 * 3  # one seed
+    for number, choice in enumerate(scored.choices):
+        episode, frames = episodes[choice.episode], [choice.start, *choice.targets_N]
+        truth = episode.frames(frames)
+        ids = episode.ids(frames)
+        first = np.unique(ids[0])
+        masks = np.stack([ids == thing for thing in first[first > 0]])  # 0 is the room's shell
+        np.testing.assert_array_equal(asked[(0, 1, 10)[number]], masks[:, 0])  # 5 of each batch
+        visible = first_visible(truth.depth_THW, truth.camera)
+        still = np.repeat(truth.rgb_THWC[:1], len(frames), 0)
+        for method, video in (("truth", truth.rgb_THWC), ("copy", still)):
+            found = overlaps(bright(video, masks[:, 0]), masks, visible)
+            values = scored.structure[method][number]
+            np.testing.assert_allclose(values[0], average(found))
+            np.testing.assert_allclose(values[1:], average(found, 0))
+        # This model knows the room: it is scored as the truth is.
+        np.testing.assert_allclose(
+            scored.structure["memory"][number], scored.structure["truth"][number], atol=3
+        )
+    monkeypatch.setattr(Consistency, "__call__", None)  # nothing is followed again
+    again = scoring.score_table(*args, structure=measure)
+    for method, values in scored.structure.items():
+        np.testing.assert_array_equal(again.structure[method], values)
+    assert scoring.score_table(*args).structure == {}
+    facts = structure(config, scored, measure)
+    assert facts["name"] == "SCS[bright]"
+    assert set(facts["margins"]) == {"empty", "reproject", "copy"}
+    assert facts["clips"] == 3
 
 
 def test_clips_of_one_scene_are_one_cluster(tmp_path):

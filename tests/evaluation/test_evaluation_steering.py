@@ -1,4 +1,4 @@
-"""True actions against another house's and none, paired by clip, with a world that obeys."""
+"""True actions against another house's and none on walks, paired by clip; a world that obeys."""
 
 import dataclasses
 import types
@@ -10,11 +10,22 @@ import pytest
 from pewm_jax.config import Config, EgoWMConfig, EgoWMTrainConfig, UserError
 from pewm_jax.evaluation import page_tables, steering
 from pewm_jax.evaluation.partial import Partials
+from pewm_jax.evaluation.protocol import choose
+from pewm_jax.evaluation.steering import (
+    Walks,
+    choose_walks,
+    different_steps,
+    forward_steps,
+)
 from pewm_jax.evaluation.words import ACTIONS_NAMES, followed
+from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT, discrete_table, integrate
+from pewm_jax.geometry.cameras import pose_from_yaw
+from pewm_jax.types import Frames
 from tests.helpers import tiny_config
 
 CONFIG = Config(model=EgoWMConfig(), train=EgoWMTrainConfig())
 PARAMS = {"control": {"kernel": np.ones(())}}
+UNITS, IMAGINED = CONFIG.model.actions, CONFIG.model.clip.frames - 1
 
 
 @pytest.fixture
@@ -29,71 +40,170 @@ def obeying(monkeypatch):
     def load_clip(config, episodes, choice):
         actions = np.full((2, 3), choice.start / 60, np.float32)
         rgb = np.full((2, 4, 4, 3), actions.sum() + 0.01, np.float32)
-        return np.zeros(1), types.SimpleNamespace(rgb_THWC=rgb), actions
+        present = Frames(np.zeros((1, 4, 4, 3), np.float32), np.zeros(()), np.zeros(()))
+        return present, dataclasses.replace(present, rgb_THWC=rgb), actions
 
-    def stack(trees, size):
-        trees = trees + [trees[-1]] * (size - len(trees))
-        if hasattr(trees[0], "rgb_THWC"):
-            return types.SimpleNamespace(rgb_THWC=np.stack([t.rgb_THWC for t in trees]))
-        return np.stack(trees)
-
-    def use(scenes):
-        choices = [types.SimpleNamespace(start=k, scene=s) for k, s in enumerate(scenes)]
-        monkeypatch.setattr(steering, "choose", lambda *_: choices)
+    def use(scenes, others):
+        clips = [types.SimpleNamespace(start=k, scene=s, episode=k) for k, s in enumerate(scenes)]
+        share = np.full(len(clips), 0.75)
+        walks = Walks(clips, [clips[k] for k in others], share, share)
+        monkeypatch.setattr(steering, "choose_walks", lambda *_: walks)
+        return clips
 
     monkeypatch.setattr(steering, "_imagined", imagined)
     monkeypatch.setattr(steering, "load_clip", load_clip)
-    monkeypatch.setattr(steering, "stack", stack)
     return use
 
 
-def test_true_actions_are_compared_with_those_of_another_house_and_with_none(obeying):
-    obeying("aabbc")
+def test_true_actions_are_compared_with_those_of_another_house_with_none_and_with_a_copy(obeying):
+    other = [2, 2, 4, 4, 0]
+    obeying("aabbc", other)
     config = dataclasses.replace(CONFIG, evaluate=dataclasses.replace(CONFIG.evaluate, batch=2))
     found = steering.measure(config, PARAMS, [], 5)
     true = -10 * np.log10((0.01 / 2) ** 2)
     np.testing.assert_allclose(found.psnr["true"], true, atol=0.1)
-    other = np.array([2, 2, 4, 4, 0])  # the next clip of another house
-    apart = 6 * (np.arange(5) - other) / 60 + 0.01
+    apart = 6 * (np.arange(5) - np.array(other)) / 60 + 0.01
     np.testing.assert_allclose(found.psnr["shuffled"], -20 * np.log10(abs(apart) / 2), atol=0.1)
     alone = 6 * np.arange(5) / 60 + 0.01
-    np.testing.assert_allclose(found.psnr["none"], -20 * np.log10(alone / 2), atol=0.1)
+    for name in ("none", "copy"):  # the observed frame is as grey as what no action imagines
+        np.testing.assert_allclose(found.psnr[name], -20 * np.log10(alone / 2), atol=0.1)
     table = found.table()
     assert table["true - shuffled"]["houses"] == 3
     assert table["true - shuffled"]["low"] > 0
-    assert len(found.lines()) == 6
+    assert len(found.lines()) == 2 + len(ACTIONS_NAMES)
+    assert "75.0 % of the steps go forward" in found.lines()[0]
 
 
 def test_a_report_keeps_its_pieces_and_says_what_came_out(obeying, monkeypatch, tmp_path):
-    obeying("aabbc")
+    choices = obeying("aabbc", [2, 2, 4, 4, 0])
     config = dataclasses.replace(CONFIG, evaluate=dataclasses.replace(CONFIG.evaluate, batch=2))
-    choices, partials = steering.choose(), Partials(tmp_path, "weights", "fingerprint")
+    partials = Partials(tmp_path, "weights", "fingerprint")
     said = []
-    found = steering.score(config, PARAMS, [], choices, partials, said.append)
+    found, about = steering.score(config, PARAMS, [], choices, partials, said.append)
     whole = steering.measure(config, PARAMS, [], 5)
     for name, errors in whole.errors.items():
         np.testing.assert_array_equal(found.errors[name], errors)
     monkeypatch.setattr(steering, "load_clip", None)  # nothing is imagined again
-    again = steering.score(config, PARAMS, [], choices, partials, said.append)
+    again, _ = steering.score(config, PARAMS, [], choices, partials, said.append)
     np.testing.assert_array_equal(again.errors["none"], found.errors["none"])
     assert len(said) == 1
-    metrics = {"steering": {"all": found.table(), "per_frame": found.per_frame()}}
+    metrics = {"steering": found.facts(), "protocol": {"steering": about}}
     page = page_tables.steering(metrics)
     assert page.count("<tr") == 1 + len(ACTIONS_NAMES)
     assert f"{found.psnr['true'].mean():.2f} [" in page
+    assert "75 % of their steps go forward" in page
     (sentence,) = followed(metrics)
     assert "its lead over another clip's actions: +" in sentence
-    assert followed({"steering": None}) == []
-    assert page_tables.steering({"steering": None}) == ""
-    obeying("aa")
-    assert steering.score(config, PARAMS, [], steering.choose(), partials, said.append) is None
-    obeying("ab")
-    assert steering.score(tiny_config(), {}, [], steering.choose(), partials, said.append) is None
 
 
-def test_what_cannot_be_asked_is_left_out_or_refused(obeying):
-    obeying("ab")
-    assert set(steering.measure(tiny_config(), {}, [], 2).psnr) == {"true", "shuffled"}
-    obeying("aa")
-    with pytest.raises(UserError, match="all clips are of one house"):
-        steering.measure(CONFIG, PARAMS, [], 2)
+def test_what_was_not_measured_is_said(obeying, monkeypatch, tmp_path):
+    choices, said = obeying("ab", [1, 0]), []
+    partials = Partials(tmp_path, "weights", "fingerprint")
+    unsteered = steering.score(tiny_config(), {}, [], choices, partials, said.append)
+    assert unsteered == (None, None)
+    monkeypatch.setattr(steering, "choose_walks", choose_walks)
+    found, about = steering.score(CONFIG, PARAMS, [], [], partials, said.append)
+    assert found is None
+    assert said == []
+    metrics = {"steering": None, "protocol": {"steering": about}}
+    assert page_tables.steering(metrics) == ""
+    assert followed(metrics) == [about]
+    assert about.startswith("Whether the actions steer is not measured: no episode of")
+    assert followed({"steering": None, "protocol": {"steering": None}}) == []
+
+
+def test_a_world_without_embeddings_of_actions_is_not_asked_for_none(obeying):
+    obeying("ab", [1, 0])
+    found = steering.measure(tiny_config(), {}, [], 2)
+    assert set(found.psnr) == {"true", "shuffled", "copy"}
+
+
+def episode(ids, scene, **info):
+    """An episode of discrete actions, without pictures."""
+    start = pose_from_yaw(np.array([0.3, -0.2, 1.25]), 0.7)
+    poses = np.asarray(integrate(start, discrete_table(UNITS)[np.asarray(ids)]))
+    return types.SimpleNamespace(
+        world_from_camera=poses, length=len(poses), name=f"{scene}/walk", scene=scene, info=info
+    )
+
+
+def recorded(episodes, choice):
+    """Return the discrete actions of a clip, from the poses, one by one."""
+    poses = episodes[choice.episode].world_from_camera
+    found = []
+    for before, after in zip((choice.start, *choice.targets_N), choice.targets_N, strict=False):
+        step = np.linalg.inv(poses[before]) @ poses[after]
+        if np.linalg.norm(step[:3, 3]) > 0.5 * UNITS.step_m:
+            found.append(FORWARD)
+        else:
+            found.append(TURN_LEFT if step[0, 2] < 0 else TURN_RIGHT)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_clip_is_a_walk_and_its_other_actions_differ_in_half_of_the_steps(seed):
+    rng = np.random.default_rng(seed)
+    share = rng.uniform(0.3, 0.9, 6)
+    episodes = [
+        episode(rng.choice(3, 63, p=[p, (1 - p) / 2, (1 - p) / 2]), f"house-{k // 2}")
+        for k, p in enumerate(share)
+    ]
+    walks = choose_walks(CONFIG, episodes, 12)
+    assert 6 <= len(walks.choices) <= 12
+    assert len({(c.episode, c.start) for c in walks.choices}) == len(walks.choices)
+    facts = zip(walks.choices, walks.others, walks.forward_C, walks.different_C, strict=True)
+    for choice, other, forward, different in facts:
+        true, shuffled = recorded(episodes, choice), recorded(episodes, other)
+        assert len(true) == len(shuffled) == IMAGINED
+        assert forward == (true == FORWARD).mean() >= 0.5
+        assert different == (true != shuffled).mean() >= 0.5
+        assert choice.scene != other.scene
+        assert choice.start >= episodes[choice.episode].length // 2
+    again = choose_walks(CONFIG, episodes, 12)
+    assert (again.choices, again.others) == (walks.choices, walks.others)
+    assert set(range(6)) >= {
+        c.episode for c in choose_walks(CONFIG, episodes, 12, 1, [2, 5]).choices
+    }
+
+
+def test_spins_are_skipped_and_refused_where_there_is_nothing_else():
+    spin = [TURN_LEFT] * 63
+    walk = [FORWARD, FORWARD, TURN_LEFT, FORWARD, FORWARD, TURN_RIGHT] * 10
+    spins = [episode(spin, "a"), episode(spin, "b")]
+    assert choose(CONFIG, spins, 4, 1)  # a report scores them
+    with pytest.raises(UserError, match="fewer than half of the steps go forward"):
+        choose_walks(CONFIG, spins, 4)
+    mixed = [episode(spin, "a"), episode(walk, "b"), episode(spin, "c")]
+    walks = choose_walks(CONFIG, mixed, 6)
+    assert {choice.scene for choice in walks.choices} == {"b"}
+    assert {other.scene for other in walks.others} <= {"a", "c"}
+    with pytest.raises(UserError, match="can be given other actions"):
+        choose_walks(CONFIG, [episode(walk, "b")] * 2, 4)  # of one house
+    straight = [episode([FORWARD] * 63, scene) for scene in "ab"]
+    with pytest.raises(UserError, match="can be given other actions"):
+        choose_walks(CONFIG, straight, 4)  # all go the same way
+    with pytest.raises(UserError, match="long enough for 9 frames"):
+        choose_walks(CONFIG, [episode(walk[:5], "a")], 4)
+
+
+def test_clips_that_cannot_show_steering_are_no_walks():
+    a, b = (types.SimpleNamespace(scene=scene) for scene in "ab")
+    half = np.array([0.5])
+    assert "1 walks in 1 houses" in Walks([a], [b], half, half).about
+    for pair in ((half - 0.1, half), (half, half - 0.1)):
+        with pytest.raises(ValueError, match="40%"):
+            Walks([a], [b], *pair)
+    with pytest.raises(ValueError, match="its own house"):
+        Walks([a], [a], half, half)
+
+
+def test_continuous_motion_is_told_apart_in_steps_and_turns():
+    step, turn = UNITS.step_m, np.radians(UNITS.turn_deg)
+    motion = np.array([[step, 0, 0], [0.9 * step, 0, 0.5 * turn], [0, 0, turn], [0, 0, 0]])
+    assert forward_steps(UNITS, motion).tolist() == [True, True, False, False]
+    assert not different_steps(UNITS, motion, motion).any()
+    noisy = motion + np.array([0.2 * step, 0.1 * step, 0.2 * turn])
+    assert not different_steps(UNITS, motion, noisy).any()
+    assert different_steps(UNITS, motion[:3], motion[[2, 3, 0]]).all()
+    around = np.array([0, 0, np.pi - 0.01]), np.array([0, 0, -np.pi + 0.01])
+    assert not different_steps(UNITS, *around)

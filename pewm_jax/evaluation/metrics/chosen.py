@@ -9,17 +9,21 @@ from typing import Any
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.evaluation.images import WINDOW
-from pewm_jax.evaluation.metrics import videos
+from pewm_jax.evaluation.metrics import sam2, videos
 from pewm_jax.evaluation.metrics.perceptual import PACKAGED, Perceptual
 from pewm_jax.evaluation.metrics.perceptual import chosen as choose_lpips
 from pewm_jax.evaluation.metrics.pictures import PLAIN
 from pewm_jax.evaluation.metrics.revisits import Revisit
 from pewm_jax.evaluation.metrics.similarity import Similarity
 from pewm_jax.evaluation.metrics.similarity import read as read_encoder
+from pewm_jax.evaluation.metrics.structure import Consistency, follow_by_flow
 from pewm_jax.evaluation.metrics.videos import VideoDistance
+from pewm_jax.evaluation.protocol import file_hash
 from pewm_jax.models import i3d, i3d_weights, lpips_weights
 from pewm_jax.models.lpips import LEAST
 
+FLOW = "flow"
+"""The setting that takes optical flow as the segmenter of SCS."""
 OFF, ON = "off", "on"
 """The settings that leave a measure out, and that take the weights of the installed package."""
 
@@ -32,12 +36,14 @@ class Chosen:
         lpips: LPIPS, or None.
         i3d: FVD, or None; KVD goes with it.
         visits: name → measure of the mirror test.
-        about: ``lpips``, ``fvd`` and ``src``: what is measured, or why it is not.
+        structure: SCS, or None.
+        about: ``lpips``, ``fvd``, ``src`` and ``scs``: what is measured, or why it is not.
     """
 
     lpips: Perceptual | None
     i3d: VideoDistance | None
     visits: dict[str, Revisit]
+    structure: Consistency | None
     about: dict[str, str]
 
     @property
@@ -55,15 +61,18 @@ class Chosen:
             "src_weights_sha256": {
                 name: one.sha256 for name, one in encoders.items() if isinstance(one, Similarity)
             },
+            "scs_segmenter": self.structure.encoder if self.structure else None,
+            "scs_weights_sha256": (self.structure.sha256 or None) if self.structure else None,
         }
 
 
-def choose(config: Config, *, accelerator: bool) -> Chosen:
+def choose(config: Config, *, accelerator: bool, ids: bool = False) -> Chosen:
     """Return the measures that an experiment's settings ask for.
 
     Args:
         config: gives the clip and ``evaluate``.
         accelerator: whether the machine has one; without, I3D must be asked for.
+        ids: whether the episodes have instance ids, without which there is no SCS.
 
     Raises:
         UserError: what is asked for by name is not there, is damaged, or cannot take such pictures.
@@ -73,8 +82,40 @@ def choose(config: Config, *, accelerator: bool) -> Chosen:
     frames = settings.chain * (clip.frames - 1) + 1
     distance, about_fvd = video(settings.fvd, frames, accelerator=accelerator)
     visits, about_src = revisits(settings.src, lpips, clip.height, clip.width)
-    about = {"lpips": about_lpips, "fvd": about_fvd, "src": about_src}
-    return Chosen(lpips, distance, visits, about)
+    consistency, about_scs = structure(settings.scs, ids=ids)
+    about = {"lpips": about_lpips, "fvd": about_fvd, "src": about_src, "scs": about_scs}
+    return Chosen(lpips, distance, visits, consistency, about)
+
+
+def structure(setting: str, *, ids: bool) -> tuple[Consistency | None, str]:
+    """Return SCS with the segmenter that a setting names, and a sentence on it or on why not.
+
+    Args:
+        setting: ``evaluate.scs``.
+        ids: whether the episodes have instance ids.
+
+    Raises:
+        UserError: a segmenter is named and the episodes have no ids, or it cannot be read.
+    """
+    if setting == OFF:
+        return None, "SCS is left out, as evaluate.scs says."
+    if not ids:
+        lacking = "the episodes have no instance ids: collect them with --ids"
+        if setting:
+            raise UserError(f"evaluate.scs is {setting}, and {lacking}, or leave it out.")
+        return None, f"SCS is left out, since {lacking}."
+    exact = (
+        "things of the present frame, with exact masks of the true clip; frames count until no "
+        "point of the present frame is visible any more (from true depth and poses)"
+    )
+    if setting in ("", FLOW):
+        return Consistency(follow_by_flow, FLOW), (
+            f"SCS[{FLOW}]: {exact}; optical flow follows the masks through imagined clips, so a "
+            "score is comparable with its ceiling, the true clip with the same segmenter, and not "
+            "with scores by SAM 2."
+        )
+    measure = Consistency(sam2.read(setting), "sam2", file_hash(Path(setting, "model.safetensors")))
+    return measure, f"{measure.name}: {exact}; SAM 2 of {setting} follows the masks."
 
 
 def video(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDistance | None, str]:

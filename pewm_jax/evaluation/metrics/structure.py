@@ -1,29 +1,39 @@
-"""SCS, the structural consistency score: does each thing stay where it really is (EgoWM, Eq. 7)?
+"""SCS, the structural consistency score: whether things are where they really are (EgoWM, Eq. 7).
 
 The mean over things and frames of IoU(mask in the imagined clip, mask in the true one), times 100
-(arXiv 2601.15284). Frame 0 is the observed one: it says which things there are and does not count.
-Frames from the first on in which none of them is in view are dropped. A pair of masks that are both
-empty does not count either: that a thing is out of view in both is no overlap.
+(arXiv 2601.15284). Frame 0 is the observed one: it defines the things and does not count. A pair of
+masks that are both empty does not count either, since there is no overlap to measure.
+
+The paper trims every sequence where all points that are visible in the first frame have left the
+view, so that no frame counts that shows only new places. These points include walls, floors and
+ceilings, which are no tracked things. So a thing that has left the view while a wall of the first
+frame is still visible keeps counting: a model that still shows it scores 0 there. The paper finds
+the end with a point tracker. Here it is computed from depth and poses (``first_visible``).
 
 Masks of the truth are exact, from a renderer's instance ids (``object_masks``). Those of an
 imagined clip need a segmenter, a function ``(video_THWC, first_KHW) -> masks_KTHW`` that follows
 the first frame's masks. The paper's is SAM 2. ``follow_by_flow`` is a stand-in without weights,
 which follows pixels by optical flow: it loses things that the model redraws elsewhere, and its
-scores are not to be compared with the paper's. So a score stands beside its ceiling, that of the
-true clip through the same segmenter.
+scores are not comparable with the paper's. So each score is reported beside its ceiling, the score
+of the true clip with the same segmenter.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias
 
 import cv2
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.types import Array
+from pewm_jax.evaluation.seen import visible_in
+from pewm_jax.geometry.cameras import unproject
+from pewm_jax.houses.kinds import SHELL, kind_of
+from pewm_jax.types import Array, Camera
 
 Segmenter: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """``(video_THWC uint8, first_KHW bool) -> masks_KTHW bool``: follows K things through T frames."""
@@ -42,7 +52,7 @@ class Structure:
     Attributes:
         value: of the imagined clip; NaN where no frame or no thing counts.
         ceiling: of the true clip through the same segmenter.
-        frames: frames that count.
+        frames: imagined frames that count.
         objects: things that are followed.
     """
 
@@ -52,37 +62,163 @@ class Structure:
     objects: int
 
 
-def scs(masks_pred_KTHW: Array, masks_true_KTHW: Array) -> float:
+@dataclasses.dataclass(frozen=True)
+class Consistency:
+    """SCS with a segmenter.
+
+    Attributes:
+        segment: follows the first frame's masks through a video.
+        encoder: name of the segmenter, such as ``flow`` or ``sam2``.
+        sha256: hash of its weights; "" if it has none.
+    """
+
+    segment: Segmenter
+    encoder: str
+    sha256: str = ""
+
+    @property
+    def name(self) -> str:
+        """The name that says what the number depends on, such as ``SCS[flow]``."""
+        return f"SCS[{self.encoder}]"
+
+    def __call__(self, video_THWC: Array, masks_true_KTHW: Array, visible_T: Array) -> np.ndarray:
+        """Return ``overlaps`` of a clip, whose masks the segmenter makes.
+
+        Args:
+            video_THWC: (T, H, W, 3) uint8; frame 0 is the observed one.
+            masks_true_KTHW: (K, T, H, W) exact masks of the true clip.
+            visible_T: (T,) bool, as ``first_visible`` returns it.
+
+        Raises:
+            UserError: the clip and the masks are not alike.
+        """
+        masks, frames = np.asarray(masks_true_KTHW), np.asarray(video_THWC)
+        if frames.dtype != np.uint8 or frames.shape != (*masks.shape[1:], 3):
+            raise UserError(
+                f"a clip of shape {frames.shape} and type {frames.dtype} has no masks of shape "
+                f"{masks.shape}: give uint8 colours (T, H, W, 3) and masks (K, T, H, W)."
+            )
+        end = max(_end(visible_T, len(frames)), 1)
+        found = np.zeros_like(masks)
+        found[:, :end] = self.segment(frames[:end], masks[:, 0])
+        return overlaps(found, masks, visible_T)
+
+
+def scs(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -> float:
     """Return SCS of one clip, 0 … 100; NaN where nothing counts.
 
     Args:
         masks_pred_KTHW: (K, T, H, W) bool, K things in T imagined frames; frame 0 is the observed
             one, whose masks are not compared.
         masks_true_KTHW: the same in the true clip.
+        visible_T: (T,) bool, whether each frame still shows a point that frame 0 shows, of a thing
+            or of anything else (``first_visible``). Frames from the first False on do not count.
 
     Raises:
-        UserError: the masks are not alike, or no masks.
+        UserError: the masks are not alike, or no masks, or there are not as many frames.
+    """
+    return float(average(overlaps(masks_pred_KTHW, masks_true_KTHW, visible_T)))
+
+
+def overlaps(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -> np.ndarray:
+    """Return (K, T - 1) float64, 100 × IoU of each thing in each frame but the first.
+
+    NaN where the frame does not count, or the thing is in view in neither clip.
+
+    Args:
+        masks_pred_KTHW: as for ``scs``.
+        masks_true_KTHW: as for ``scs``.
+        visible_T: as for ``scs``.
+
+    Raises:
+        UserError: the masks are not alike, or no masks, or there are not as many frames.
     """
     pred, true = _masks(masks_pred_KTHW, masks_true_KTHW)
-    end = frames_in_view(true)
-    pred, true = pred[:, 1:end], true[:, 1:end]
+    end = _end(visible_T, true.shape[1])
     both = np.logical_and(pred, true).sum((2, 3))
     either = np.logical_or(pred, true).sum((2, 3))
-    counted = either > 0
-    if not counted.any():
-        return float("nan")
-    return float(100 * np.mean(both[counted] / either[counted]))
+    found = np.where(either > 0, 100 * both / np.maximum(either, 1), np.nan)
+    found[:, end:] = np.nan
+    return found[:, 1:]
 
 
-def frames_in_view(masks_true_KTHW: Array) -> int:
+def average(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Return the mean of the values that are not NaN; NaN where there is none."""
+    known = np.isfinite(values)
+    total, count = np.where(known, values, 0).sum(axis), known.sum(axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def frames_in_view(visible_T: Array) -> int:
     """Return how many leading frames there are before all that was first visible has left the view.
 
     Args:
-        masks_true_KTHW: (K, T, H, W) bool, of things visible in frame 0.
+        visible_T: (T,) bool, whether each frame shows a point that frame 0 shows.
     """
-    seen_T = np.asarray(masks_true_KTHW, bool).sum((0, 2, 3)) > 0
-    gone = np.flatnonzero(~seen_T)
-    return int(gone[0]) if gone.size else seen_T.size
+    gone = np.flatnonzero(~np.asarray(visible_T, bool))
+    return int(gone[0]) if gone.size else len(np.asarray(visible_T))
+
+
+def _end(visible_T: Array, frames: int) -> int:
+    """Return ``frames_in_view``.
+
+    Raises:
+        UserError: it is no value per frame.
+    """
+    if np.shape(visible_T) != (frames,) or np.asarray(visible_T).dtype != np.bool_:
+        raise UserError(
+            f"visible_T of shape {np.shape(visible_T)} and type {np.asarray(visible_T).dtype} does "
+            f"not say which of {frames} frames show what the first shows: give one bool per frame, "
+            "such as first_visible returns."
+        )
+    return frames_in_view(visible_T)
+
+
+def first_visible(depth_THW: Array, camera: Camera) -> np.ndarray:
+    """Return (T,) bool: whether each frame shows a surface point that frame 0 shows.
+
+    The points of frame 0's pixels are projected into the other frames. A point is visible where it
+    lies inside the picture and agrees with the depth there (``seen.visible_in``), so points that
+    are hidden behind something do not count: a frame that shows none shows only new places.
+
+    Args:
+        depth_THW: (T, H, W) true z-depth, metres; 0 = no measurement.
+        camera: (T,) true cameras, intrinsics (T, 4) in pixels.
+
+    Raises:
+        UserError: there are no frames, or the first has no depth.
+    """
+    depth = np.asarray(depth_THW, np.float32)
+    if depth.ndim != 3 or not len(depth) or not (depth[0] > 0).any():
+        raise UserError(
+            f"depth of shape {depth.shape} has no measurement in its first frame: what is first "
+            "visible is computed from depth (T, H, W) in metres, such as the renderer's."
+        )
+    return np.asarray(_first_visible(depth, camera))
+
+
+@jax.jit
+def _first_visible(depth_THW: Array, camera: Camera) -> Array:
+    points = unproject(depth_THW[0], jax.tree.map(lambda x: x[0], camera)).reshape(-1, 3)
+
+    def shows(frame: tuple[Array, Camera]) -> Array:
+        return (visible_in(points, *frame) & (depth_THW[0].reshape(-1) > 0)).any()
+
+    return jax.lax.map(shows, (depth_THW, jax.tree.map(jnp.asarray, camera)))
+
+
+def things_of(info: Mapping[str, Any]) -> list[int] | None:
+    """Return the instance ids of the static things of an episode, or None if it has no names.
+
+    Walls, floors, ceilings, doorways and windows are no things. What moves by itself, such as
+    robots and doors, has ids of its own after those of the named objects, and is no thing either:
+    the score is about apparent motion that the camera's motion causes.
+
+    Args:
+        info: facts on an episode; ``objects`` are the names of instances, by id.
+    """
+    names = info.get("objects")
+    return None if names is None else [i for i, n in enumerate(names) if kind_of(n) not in SHELL]
 
 
 def object_masks(
@@ -114,6 +250,7 @@ def structural_consistency(
     imagined_THWC: Array,
     truth_THWC: Array,
     masks_true_KTHW: Array,
+    visible_T: Array,
     segment: Segmenter | None = None,
 ) -> Structure:
     """Return SCS of an imagined clip with its ceiling.
@@ -122,24 +259,20 @@ def structural_consistency(
         imagined_THWC: (T, H, W, 3) uint8; frame 0 is the observed one.
         truth_THWC: the true clip, the same shape.
         masks_true_KTHW: (K, T, H, W) exact masks of the true clip, such as ``object_masks``.
+        visible_T: (T,) bool, whether each true frame still shows a point that frame 0 shows, such
+            as ``first_visible``; frames from the first False on do not count.
         segment: how masks are followed; by default ``follow_by_flow``, the stand-in.
 
     Raises:
-        UserError: clips or masks that are not alike.
+        UserError: clips, masks or numbers of frames that are not alike.
     """
-    follow = follow_by_flow if segment is None else segment
-    masks = np.asarray(masks_true_KTHW, bool)
-    end = frames_in_view(masks)
-    scores = []
-    for video in (imagined_THWC, truth_THWC):
-        frames = np.asarray(video)
-        if frames.dtype != np.uint8 or frames.shape != (*masks.shape[1:], 3):
-            raise UserError(
-                f"a clip of shape {frames.shape} and type {frames.dtype} has no masks of shape "
-                f"{masks.shape}: give uint8 colours (T, H, W, 3) and masks (K, T, H, W)."
-            )
-        scores.append(scs(follow(frames[:end], masks[:, 0]), masks[:, :end]))
-    return Structure(scores[0], scores[1], max(end - 1, 0), len(masks))
+    measure = Consistency(follow_by_flow if segment is None else segment, "")
+    value, ceiling = (
+        float(average(measure(video, masks_true_KTHW, visible_T)))
+        for video in (imagined_THWC, truth_THWC)
+    )
+    counted = max(frames_in_view(visible_T) - 1, 0)
+    return Structure(value, ceiling, counted, len(np.asarray(masks_true_KTHW)))
 
 
 def follow_by_flow(video_THWC: np.ndarray, first_KHW: np.ndarray) -> np.ndarray:
