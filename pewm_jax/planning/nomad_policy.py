@@ -173,6 +173,10 @@ def _nearest(table: np.ndarray, points_N2: np.ndarray) -> np.ndarray:
     return taken[np.argmin(np.round(costs, 9))]
 
 
+compiled = propose
+"""The former name of the compiled ``propose``."""
+
+
 class Policy:
     """A policy for environments: from an observation to an action, by one proposal at a time.
 
