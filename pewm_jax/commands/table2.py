@@ -12,10 +12,10 @@ from pewm_jax.commands import imports
 from pewm_jax.config import kinds
 
 ABOUT = (
-    "Let a policy alone, its proposals ranked by a world model, and plans (MPC) decide the same "
-    "tasks in held-out houses, each with an empty memory, with the memory, and with the renderer "
-    "itself as the model, and write a table, a plot and videos. What is decided is kept: the same "
-    "command goes on."
+    "Let a policy alone, its proposals ranked by a world model, one plan (open loop) and plans in a "
+    "closed loop (MPC) decide the same tasks in held-out houses, each with an empty memory, by "
+    "reprojection without a network, with the memory, and with the renderer itself as the model, "
+    "and write a table, a plot and videos. Decisions are kept: the same command resumes."
 )
 
 
@@ -40,7 +40,12 @@ class Settings:
     rounds: int = 12
     """Rounds of planning."""
     horizon: int = 8
-    """Actions of a walk and of a plan, a multiple of what the model imagines at once."""
+    """Actions of the shortest walk to a goal, a multiple of what the model imagines at once."""
+    multiples: tuple[int, ...] = (1, 2, 3)
+    """Goals are so many times --horizon actions away, and plans are as long."""
+    none: str = ""
+    """A run that was trained without memory (`pewm-jax train small --train.stage2.steps 0
+    --train.joint.steps 0 --train.gate.steps 0 …`), which gets rows of its own."""
     policy: str = "wander"
     """`wander` (walks that know nothing), the folder of a trained NoMaD (`runs/nomad`), or
     MODULE:FUNCTION, see `studies.deciders.Policy`."""
@@ -71,6 +76,9 @@ def main(argv: Sequence[str], prog: str = "pewm-jax table2") -> int:
         raise cli.ConfigError(
             "--proposals needs different numbers from 1 on, such as --proposals 8 16."
         )
+    far = settings.multiples
+    if not far or far[0] != 1 or min(far) < 1 or list(far) != sorted(set(far)):
+        raise cli.ConfigError("--multiples needs growing numbers from 1 on, such as 1 2 3.")
     # Imported here and not above: help and refusals come at once.
     from pewm_jax.planning import costs
     from pewm_jax.planning.settings import PlanConfig
@@ -82,7 +90,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax table2") -> int:
         elites=settings.elites,
         rounds=settings.rounds,
     )
-    shared = ("tasks", "houses", "proposals", "policy", "cost", "videos")
+    shared = ("tasks", "houses", "proposals", "policy", "cost", "videos", "multiples", "none")
     chosen = {name: getattr(settings, name) for name in shared}
     chosen["policy"], policy = _policy(settings.policy)
     errand = table2.Errand(plan=plan, **chosen)

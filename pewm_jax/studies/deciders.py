@@ -1,7 +1,16 @@
-"""How Table 2 decides: a policy alone, its proposals ranked, and plans, each by some mind.
+"""How Table 2 decides: a policy alone, its proposals ranked, one plan, and plans in a closed loop.
 
-A mind says what would be seen: the model with an ``empty`` memory, the model with its ``memory``,
-or the ``truth``, the renderer itself, which bounds what any model can reach.
+Each but the first needs a predictor of what would be seen:
+
+* ``empty``: the model with an empty memory;
+* ``none``: a model that was trained without memory, if one is given;
+* ``reproject``: no network, the pixels observed before moved to where the camera would look;
+* ``memory``: the model with its memory;
+* ``truth``: the renderer itself, which bounds what any model can reach.
+
+``mpc-…`` is one plan that is carried out whole (open loop; the name is that of decisions kept by
+earlier versions). ``loop-…`` is model predictive control: after each clip's actions the agent
+observes what is really seen, remembers it, and plans the rest anew.
 """
 
 from __future__ import annotations
@@ -12,10 +21,13 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import worlds
 from pewm_jax.config import ActionConfig, Config, NomadConfig, UserError
+from pewm_jax.evaluation.reproject import ReprojectSettings, reproject
+from pewm_jax.geometry.actions import continuous, integrate
 from pewm_jax.planning import nomad_policy
 from pewm_jax.planning.candidates import Imagination, Judged, Rollout
 from pewm_jax.planning.costs import FrameCost
@@ -23,9 +35,13 @@ from pewm_jax.planning.plan import plan
 from pewm_jax.planning.ranking import rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig
 from pewm_jax.studies.goals import Asked, Goal, wander
-from pewm_jax.types import Params
+from pewm_jax.types import Camera, Frames, Params
 
-MINDS = ("empty", "memory", "truth")
+MINDS = ("empty", "reproject", "memory", "truth")
+NONE = "none"
+REPROJECTION = ReprojectSettings(footprint=2)
+"""How ``reproject`` draws: what ``pewm-jax evaluate small`` chose on the validation split of its
+data."""
 Policy: TypeAlias = Callable[[Asked, int], np.ndarray]
 """``policy(asked, count) -> (count, N)`` discrete actions: proposals, the policy's own choice
 first."""
@@ -59,25 +75,87 @@ class Minds:
     config: Config
     params: Params = dataclasses.field(repr=False)
     batch: int = 6
+    none: tuple[Config, Params] | None = dataclasses.field(default=None, repr=False)
+
+    @property
+    def predictors(self) -> tuple[str, ...]:
+        """The predictors, worst first as one would expect."""
+        return (MINDS[0], NONE, *MINDS[1:]) if self.none else MINDS
 
     def rollout(self, mind: str, goal: Goal) -> Rollout:
-        """Return what a mind rolls candidates out with."""
+        """Return what a predictor rolls candidates out with, from a task's start."""
+        return self.rollout_from(mind, self.begin(mind, goal), goal, goal.walk_T3[0])
+
+    def begin(self, mind: str, goal: Goal) -> Any:
+        """Return a predictor's state after a task's context was observed."""
+        if mind in ("truth", "reproject"):
+            return goal.context
+        return worlds.start(*self._model(mind), goal.context)
+
+    def observe(self, mind: str, state: Any, frames: Frames) -> Any:
+        """Return a predictor's state after more real frames."""
+        if mind in ("truth", "reproject"):
+            return jax.tree.map(lambda *x: np.concatenate(x), state, frames)
+        return worlds.observe(*self._model(mind), state, frames)
+
+    def rollout_from(self, mind: str, state: Any, goal: Goal, planar_3: np.ndarray) -> Rollout:
+        """Return what a predictor rolls candidates out with, from a place."""
         if mind == "truth":
-            return goal.seen
-        state = worlds.start(worlds.model_of(self.config), self.params, goal.context)
+            return functools.partial(goal.seen, start_3=planar_3)
+        if mind == "reproject":
+            return Reprojection(self.config.model.actions, REPROJECTION, state)
+        config, params = self._model(mind)
         key = jax.random.key(goal.number)
-        memory = mind == "memory"
-        return Imagination(self.config, self.params, state, key, self.batch, memory=memory)
+        return Imagination(config, params, state, key, self.batch, memory=mind == "memory")
+
+    def _model(self, mind: str) -> tuple[Config, Params]:
+        if mind != NONE:
+            return self.config, self.params
+        assert self.none is not None
+        return self.none
 
 
-def names(proposals: tuple[int, ...]) -> tuple[str, ...]:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Reprojection:
+    """A rollout without a network: observed pixels, drawn where each candidate's walk ends.
+
+    Attributes:
+        motion: what an action does.
+        settings: how pixels are drawn.
+        observed: (S,) observed frames; the last one is the present.
+    """
+
+    motion: ActionConfig
+    settings: ReprojectSettings
+    observed: Frames
+
+    def __call__(self, actions_KN: Any) -> Frames:
+        """Return what is seen after each candidate's last action, (K, 1) frames."""
+        moves = continuous(self.motion, np.asarray(actions_KN))
+        return jax.device_get(_reprojected(self.settings, self.observed, moves))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _reprojected(settings: ReprojectSettings, observed: Frames, moves_KN3: Any) -> Frames:
+    present = jax.tree.map(lambda x: jnp.asarray(x)[-1], observed.camera)
+
+    def one(moves_N3: Any) -> Frames:
+        pose = integrate(present.world_from_camera, moves_N3)[-1:]
+        return reproject(settings, observed, Camera(present.intrinsics_4[None], pose))
+
+    return jax.lax.map(one, moves_KN3)
+
+
+def names(proposals: tuple[int, ...], minds: tuple[str, ...] = MINDS) -> tuple[str, ...]:
     """Return the methods of the table.
 
     Args:
         proposals: numbers of proposals that are ranked.
+        minds: the predictors.
     """
-    ranked = (f"rank{count}-{mind}" for count in proposals for mind in MINDS)
-    return ("policy", *ranked, *(f"mpc-{mind}" for mind in MINDS))
+    ranked = (f"rank{count}-{mind}" for count in proposals for mind in minds)
+    plans = (f"{what}-{mind}" for what in ("mpc", "loop") for mind in minds)
+    return ("policy", *ranked, *plans)
 
 
 def decide(
@@ -99,6 +177,8 @@ def decide(
     what, _, mind = name.partition("-")
     if what == "policy":
         return Decision(proposed(policy, goal, 1)[0])
+    if what == "loop":
+        return _closed_loop(mind, goal, minds, cost, config)
     rollout = minds.rollout(mind, goal)
     if what.startswith("rank"):
         proposals = proposed(policy, goal, int(what.removeprefix("rank")))
@@ -108,6 +188,43 @@ def decide(
     watched = _Watched(Judged(rollout, cost, goal.frame))
     found = plan(CEM(), config, watched, jax.random.key(goal.number), progress=False)
     return Decision(np.asarray(found.actions), float(found.cost), watched.found)
+
+
+def _closed_loop(
+    mind: str, goal: Goal, minds: Minds, cost: FrameCost, config: PlanConfig
+) -> Decision:
+    """Plan, carry out one clip's actions, observe, and plan the rest anew.
+
+    The horizon shrinks with what is left of the task's actions. When they are spent, the agent may
+    correct once more, by one clip, if that is foreseen to cost less than what is seen now. It is
+    never told whether it is at the goal.
+    """
+    clip = minds.config.model.clip.frames - 1
+    state, planar = minds.begin(mind, goal), goal.walk_T3[0]
+    total, done, foreseen = len(goal.expert_N), list[int](), float("nan")
+    present = jax.tree.map(lambda x: x[-1:], goal.context)
+    while len(done) < total + clip:
+        here = float(np.asarray(cost(jax.tree.map(lambda x: x[None], present), goal.frame))[0])
+        horizon = max(total - len(done), clip)
+        judged = Judged(minds.rollout_from(mind, state, goal, planar), cost, goal.frame)
+        key = jax.random.fold_in(jax.random.key(goal.number), len(done))
+        found = plan(
+            CEM(),
+            dataclasses.replace(config, horizon=horizon, action_block=1),
+            judged,
+            key,
+            progress=False,
+        )
+        if len(done) >= total and float(found.cost) >= here:
+            break
+        foreseen = float(found.cost)
+        chosen = np.asarray(found.actions)[:clip]
+        walk = goal.walked(chosen, planar)
+        seen = goal.simulator.frames(walk[1:])
+        state, planar = minds.observe(mind, state, seen), walk[-1]
+        present = jax.tree.map(lambda x: x[-1:], seen)
+        done += [int(action) for action in chosen]
+    return Decision(np.array(done), foreseen)
 
 
 class _Watched:

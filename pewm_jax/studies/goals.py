@@ -79,13 +79,14 @@ class Goal:
         """What a policy may know of it."""
         return Asked(self.number, len(self.expert_N), self.context, self.frame)
 
-    def walked(self, actions_N: np.ndarray) -> np.ndarray:
-        """Return the poses (N + 1, 3) that actions lead through; walls hold."""
-        return walked(self.simulator, self.table_A3, self.walk_T3[0], actions_N)
+    def walked(self, actions_N: np.ndarray, start_3: np.ndarray | None = None) -> np.ndarray:
+        """Return the poses (N + 1, 3) that actions lead through, from the start; walls hold."""
+        start = self.walk_T3[0] if start_3 is None else start_3
+        return walked(self.simulator, self.table_A3, start, actions_N)
 
-    def seen(self, actions_KN: np.ndarray) -> Frames:
+    def seen(self, actions_KN: np.ndarray, start_3: np.ndarray | None = None) -> Frames:
         """Return what is truly seen after each candidate's last action, (K, 1) frames."""
-        ends = np.stack([self.walked(actions)[-1] for actions in np.asarray(actions_KN)])
+        ends = np.stack([self.walked(actions, start_3)[-1] for actions in np.asarray(actions_KN)])
         return jax.tree.map(lambda x: x[:, None], self.simulator.frames(ends))
 
 

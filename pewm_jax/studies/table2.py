@@ -19,7 +19,7 @@ from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.progress import Meter
 from pewm_jax.evaluation import intervals
-from pewm_jax.evaluation.opened import open_run, remembers
+from pewm_jax.evaluation.opened import Opened, open_run, remembers
 from pewm_jax.planning import scores
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.settings import PlanConfig
@@ -46,6 +46,8 @@ class Errand:
         policy: its name.
         cost: its name.
         videos: tasks that are shown.
+        multiples: goals are so many times ``plan.actions`` actions away.
+        none: a run that was trained without memory, or "".
     """
 
     tasks: int = 48
@@ -55,6 +57,8 @@ class Errand:
     policy: str = "wander"
     cost: str = "lpips"
     videos: int = 3
+    multiples: tuple[int, ...] = (1, 2, 3)
+    none: str = ""
 
 
 def run(
@@ -96,27 +100,42 @@ def run(
         size = f"{config.model.clip.width}×{config.model.clip.height}"
         raise UserError(f"{model} imagines pictures of {size}, and Table 2 needs square ones.")
     kept.require_same(out, about, ADDED, "decisions")
-    minds = Minds(config, params)
-    methods = deciders.names(errand.proposals)
-    made: dict[str, list[dict[str, Any]]] = {name: [] for name in methods}
-    with Meter("deciding", errand.tasks * len(methods), "decisions") as meter:
-        for number in range(errand.tasks):
-            goal: Goal | None = None
-            for name in methods:
-                file = out / _folder(name, errand) / f"{number:04d}.json"
-                found = kept.read(file)
-                goal = goal or _goal(errand, config, number)
-                if found is None:
-                    found = _decided(name, goal, minds, policy, cost, errand)
-                    kept.write(file, found)
-                scores_here = _scored(goal, np.array(found["actions"]))
-                made[name].append(found | {"scores": scores_here})
-                meter.advance(1)
+    none = open_run(errand.none) if errand.none else None
+    if none is not None:
+        _require_alike(none, opened, errand.none, model)
+    minds = Minds(config, params, none=(none.config, none.params) if none else None)
+    methods = deciders.names(errand.proposals, minds.predictors)
+    count = len(errand.multiples) * errand.tasks * len(methods)
+    by_distance: dict[int, dict[str, list[dict[str, Any]]]] = {}
+    with Meter("deciding", count, "decisions") as meter:
+        for times in errand.multiples:
+            made: dict[str, list[dict[str, Any]]] = {name: [] for name in methods}
+            by_distance[times * errand.plan.actions] = made
+            for number in range(errand.tasks):
+                goal: Goal | None = None
+                for name in methods:
+                    if name == "policy" and times > 1:
+                        meter.advance(1)
+                        continue
+                    file = out / _folder(name, errand, times, none) / f"{number:04d}.json"
+                    found = kept.read(file)
+                    goal = goal or _goal(errand, config, number, times)
+                    if found is None:
+                        found = _decided(name, goal, minds, policy, cost, errand)
+                        kept.write(file, found)
+                    scores_here = _scored(goal, np.array(found["actions"]))
+                    made[name].append(found | {"scores": scores_here})
+                    meter.advance(1)
     say(meter.summary())
+    made = next(iter(by_distance.values()))
     results = summary(made) | {
+        "distances": {
+            str(actions): summary({name: each for name, each in found.items() if each})
+            for actions, found in by_distance.items()
+        },
         "about": about
         | {"date": dt.datetime.now(dt.UTC).date().isoformat(), "how": intervals.how()}
-        | {"within_m": WITHIN_M, "within_deg": WITHIN_DEG, "model": str(model)}
+        | {"within_m": WITHIN_M, "within_deg": WITHIN_DEG, "model": str(model)},
     }
     text = json.dumps(results, indent=1, allow_nan=False)
     atomic.write_text(out / "results.json", text + "\n")
@@ -126,21 +145,36 @@ def run(
     return page
 
 
-ADDED = ("tasks", "videos", "policy", "proposals")
+ADDED = ("tasks", "videos", "policy", "proposals", "multiples", "none")
 """Settings that may change from call to call: decisions of others are found again."""
 
 
-def _folder(name: str, errand: Errand) -> str:
+def _folder(name: str, errand: Errand, times: int, none: Opened | None) -> str:
     """Return the folder of a method's decisions; plans do not depend on the policy."""
-    whose = "" if name.startswith("mpc") else f"{errand.policy.replace(':', '.')}/"
-    return f"decisions/{whose}{name}"
+    planned = name.startswith(("mpc", "loop"))
+    whose = "" if planned else f"{errand.policy.replace(':', '.')}/"
+    far = f"{times * errand.plan.actions}-actions/" if times > 1 else ""
+    own = f"-{none.weights_hash[:8]}" if none and name.endswith("-none") else ""
+    return f"decisions/{far}{whose}{name}{own}"
 
 
-def _goal(errand: Errand, config: Config, number: int) -> Goal:
+def _require_alike(none: Opened, opened: Opened, name: str, model: str | Path) -> None:
+    """Refuse a model without memory that has a memory, or does not fit the other."""
+    if remembers(none):
+        raise UserError(f"{name} was trained with a memory: name a run trained in stage 1 alone.")
+    one, other = none.config.model, opened.config.model
+    if (one.clip, one.actions) != (other.clip, other.actions):
+        raise UserError(
+            f"{name} imagines other clips or takes other steps than {model}: train it with the "
+            "same settings."
+        )
+
+
+def _goal(errand: Errand, config: Config, number: int, times: int = 1) -> Goal:
     return open_goal(
         number,
         houses=errand.houses,
-        actions=errand.plan.actions,
+        actions=times * errand.plan.actions,
         context=config.data.context,
         motion=config.model.actions,
         size=config.model.clip.height,
@@ -152,7 +186,9 @@ def _decided(
 ) -> dict[str, Any]:
     """Return what a method chose, where it led, and how good that is."""
     began = time.perf_counter()
-    choice = deciders.decide(name, goal, minds, policy, cost, errand.plan)
+    blocks = len(goal.expert_N) // errand.plan.action_block
+    config = dataclasses.replace(errand.plan, horizon=blocks)
+    choice = deciders.decide(name, goal, minds, policy, cost, config)
     seconds = time.perf_counter() - began
     curve = {str(n): _scored(goal, actions)["sim"] for n, actions in choice.found.items()}
     return {
@@ -168,9 +204,10 @@ def _scored(goal: Goal, actions_N: np.ndarray) -> dict[str, float]:
     """Return how near actions led to the goal, and by which way."""
     made, true = goal.walked(actions_N), goal.walk_T3
     reached = scores.success(made[-1], true[-1], WITHIN_M, WITHIN_DEG)
+    along = made[: len(true)]  # a closed loop may have gone on
     return {
-        "ate": scores.ate(true, made),
-        "rpe": scores.rpe(true, made),
+        "ate": scores.ate(true, along),
+        "rpe": scores.rpe(true, along),
         "position_error": scores.position_error(made[-1], true[-1]),
         "yaw_error": float(np.degrees(scores.yaw_error(made[-1], true[-1]))),
         "sim": scores.sim(true[0], made[-1], true[-1]),

@@ -44,7 +44,13 @@ NOT_COMPARABLE = (
     "The paper does not say how far its goals are, nor what its SIM is; its policy is a NoMaD "
     "trained on its own walks. Only the order of the rows can be compared."
 )
-COLOURS = {"empty": (232, 115, 26), "memory": (31, 111, 235), "truth": (90, 96, 105)}
+COLOURS = {
+    "empty": (232, 115, 26),
+    "none": (176, 60, 60),
+    "reproject": (46, 139, 87),
+    "memory": (31, 111, 235),
+    "truth": (90, 96, 105),
+}
 
 
 def write(results: Mapping[str, Any], page: Path, videos: Sequence[Path]) -> None:
@@ -60,13 +66,17 @@ def label(name: str) -> str:
     what, _, mind = name.partition("-")
     words = {
         "empty": "the model, empty memory",
+        "none": "a model trained without memory",
+        "reproject": "reprojection, no network",
         "memory": "the model with its memory",
         "truth": "the renderer itself",
     }
     if what == "policy":
         return "policy alone"
     if what == "mpc":
-        return f"MPC · {words[mind]}"
+        return f"one plan, open loop · {words[mind]}"
+    if what == "loop":
+        return f"MPC, closed loop · {words[mind]}"
     return f"ranking × {what.removeprefix('rank')} · {words[mind]}"
 
 
@@ -87,14 +97,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> str:
     """Return the page."""
     headings = [heading for heading, _ in COLUMNS.values()]
-    rows = [
-        [
-            label(name),
-            *(cell(row[m], digits) for m, (_, digits) in COLUMNS.items()),
-            f"{row['seconds']:.2f}",
-        ]
-        for name, row in results["rows"].items()
-    ]
+    rows = _rows(results)
     gains = [
         [
             label(f"{what}-memory").split(" · ", maxsplit=1)[0],
@@ -110,6 +113,7 @@ def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> s
         "# Table 2: does a world model help to decide, and does its memory?",
         _how(results),
         table(["method", *headings, "seconds"], rows),
+        *_farther(results),
         "## What the memory adds\n\nWith memory minus empty, paired by task, 95 % intervals over "
         "houses; of errors less is better.\n\n" + table(["method", *headings], gains),
         f"## The curve of planning\n\n![SIM against samples]({stem}.png)",
@@ -123,14 +127,38 @@ def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> s
     return "\n\n".join(parts) + "\n"
 
 
+def _rows(results: Mapping[str, Any]) -> list[list[str]]:
+    """Return the rows of one distance."""
+    return [
+        [
+            label(name),
+            *(cell(row[m], digits) for m, (_, digits) in COLUMNS.items()),
+            f"{row['seconds']:.2f}",
+        ]
+        for name, row in results["rows"].items()
+    ]
+
+
+def _farther(results: Mapping[str, Any]) -> list[str]:
+    """Return a section for each distance but the first."""
+    header = ["method", *(heading for heading, _ in COLUMNS.values()), "seconds"]
+    return [
+        f"## Goals {actions} actions away\n\n{table(header, _rows(found))}"
+        for actions, found in list(results.get("distances", {}).items())[1:]
+    ]
+
+
 def _how(results: Mapping[str, Any]) -> str:
     about, plan = results["about"], results["about"]["plan"]
     return (
         f"{about['model']}; {results['tasks']} tasks in {results['houses']} held-out houses; the "
         f"goal is where a walk of {plan['horizon'] * plan['action_block']} actions ends. Policy: "
-        f"{about['policy']}; cost: {about['cost']} to the goal's picture; MPC: one plan of "
-        f"{plan['candidates']} candidates, {plan['elites']} elites, {plan['rounds']} rounds, "
-        "carried out. ATE and RPE against that walk, unaligned; SIM = 50 (max(0, 1 − what is left "
+        f"{about['policy']}; cost: {about['cost']} to the goal's picture; plans by CEM with "
+        f"{plan['candidates']} candidates, {plan['elites']} elites, {plan['rounds']} rounds. Open "
+        "loop: one plan, carried out whole. Closed loop: after each clip's actions the agent "
+        "observes what is really seen and plans the rest anew; at the end it may correct by one "
+        "more clip, where that is foreseen to cost less. ATE and RPE against that walk, unaligned; "
+        "SIM = 50 (max(0, 1 − what is left "
         "/ the way) + 1 − heading error / π); success within "
         f"{about['within_m']:g} m and {about['within_deg']:g}°. Means over houses; ± is half of "
         f"the 95 % interval (bootstrap over houses). {about['date']}."

@@ -15,12 +15,20 @@ from pewm_jax.config import ActionConfig, ConfigError, UserError
 from pewm_jax.planning import costs, scores
 from pewm_jax.planning.settings import PlanConfig
 from pewm_jax.studies import deciders, goals, table2
+from pewm_jax.worlds import pewm
 from tests.helpers import init_world, randomise
 
 MOTION = ActionConfig()
 PLAN = PlanConfig(horizon=4, candidates=6, elites=2, rounds=2)
 ERRAND = table2.Errand(
-    tasks=3, houses=2, proposals=(2,), plan=PLAN, policy="wander", cost="pixels", videos=1
+    tasks=3,
+    houses=2,
+    proposals=(2,),
+    plan=PLAN,
+    policy="wander",
+    cost="pixels",
+    videos=1,
+    multiples=(1, 2),
 )
 
 
@@ -46,10 +54,14 @@ def test_the_whole_table_is_made(made):
     results = json.loads((page.parent / "results.json").read_text())
     names = deciders.names((2,))
     assert tuple(results["rows"]) == names
-    assert set(results["memory_minus_empty"]) == {"rank2", "mpc"}
+    assert set(results["memory_minus_empty"]) == {"rank2", "mpc", "loop"}
+    assert set(results["distances"]) == {"4", "8"}
+    assert set(results["distances"]["8"]["rows"]) == set(names) - {"policy"}
     assert set(results["curves"]["mpc-memory"]) == {"6", "12"}
     text = page.read_text()
-    assert text.count("\n| MPC · ") == 3
+    assert text.count("\n| one plan, open loop · ") == 2 * 4 + 0
+    assert text.count("\n| MPC, closed loop · ") == 2 * 4
+    assert "## Goals 8 actions away" in text
     assert "The paper does not say how far its goals are" in text
     with page.with_suffix(".csv").open() as file:
         assert {line["method"] for line in csv.DictReader(file)} == set(names)
@@ -62,7 +74,7 @@ def test_what_is_decided_is_kept_and_more_can_be_added(made):
     folder, page = made
     files = sorted((folder / "out").glob("decisions/**/*.json"))
     before = [file.stat().st_mtime_ns for file in files]
-    assert len(files) == 3 * len(deciders.names((2,)))
+    assert len(files) == 3 * (2 * len(deciders.names((2,))) - 1)
 
     def other(asked, count):
         return deciders.wanderer(asked, count, seed=1)
@@ -178,3 +190,86 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):
     with pytest.raises(ConfigError, match=words):
         command.main([*argv, "--cost", "pixels", "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
+
+
+def test_reprojection_predicts_what_was_observed_where_nothing_moved():
+    goal = task(0, actions=4)
+    minds = deciders.Minds(presets.load("tiny"), {})
+    there_and_back = np.array([[1, 2, 1, 2], [1, 1, 2, 2]])  # turns that cancel each other
+    seen = np.asarray(minds.rollout("reproject", goal)(there_and_back).rgb_THWC)
+    present = np.asarray(goal.context.rgb_THWC[-1], np.float32) / 127.5 - 1
+    assert seen.shape == (2, 1, *present.shape)
+    for one in seen[:, 0]:
+        assert np.mean((one - present) ** 2) < 0.02
+    away = np.asarray(minds.rollout("reproject", goal)(np.array([[1, 1, 1, 1]])).rgb_THWC)
+    assert np.mean((away[0, 0] - present) ** 2) > 0.05
+
+
+class _Spied(deciders.Minds):
+    """Predictors that note what they observe."""
+
+    def observe(self, mind, state, frames):
+        self.seen.append(frames)
+        return super().observe(mind, state, frames)
+
+
+@pytest.mark.parametrize("mind", ["truth", "reproject", "memory"])
+def test_a_closed_loop_observes_what_is_really_seen_after_each_clip(mind):
+    config = presets.load("tiny")  # 4 actions at once
+    minds = _Spied(config, randomise(init_world(config, jax.random.key(0)), scale=0.3))
+    object.__setattr__(minds, "seen", [])
+    goal = task(1, actions=8)
+    one = dataclasses.replace(PLAN, horizon=8, rounds=1)
+    found = deciders.decide(f"loop-{mind}", goal, minds, None, costs.Pixels(), one)
+    assert len(found.actions_N) in (8, 12)  # and one clip to correct, where that promises more
+    walk = goal.walked(found.actions_N)
+    assert len(minds.seen) == len(found.actions_N) // 4
+    for number, frames in enumerate(minds.seen):
+        real = goal.simulator.frames(walk[1 + 4 * number : 5 + 4 * number])
+        np.testing.assert_array_equal(frames.rgb_THWC, real.rgb_THWC)
+        np.testing.assert_allclose(
+            frames.camera.world_from_camera, real.camera.world_from_camera, atol=1e-6
+        )
+
+
+def test_a_closed_loop_with_the_truth_and_a_true_cost_comes_to_the_goal():
+    goal = task(2, actions=8)
+    minds = deciders.Minds(presets.load("tiny"), {})
+    plan = dataclasses.replace(PLAN, horizon=8, candidates=40, elites=10, rounds=6)
+    reached = deciders.decide(
+        "loop-truth", goal, minds, None, costs.Distance(costs.straight), plan
+    ).actions_N
+    before = scores.position_error(goal.walk_T3[0], goal.walk_T3[-1])
+    after = scores.position_error(goal.walked(reached)[-1], goal.walk_T3[-1])
+    assert after < 0.3 < before
+
+
+def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
+    folder, _ = made
+    config = presets.load("tiny")
+    stage2 = dataclasses.replace(config.train.stage2, steps=0)
+    config = dataclasses.replace(config, train=dataclasses.replace(config.train, stage2=stage2))
+    params = pewm.init(config.model, jax.random.key(1), memory=False)
+    weights.save(tmp_path / "none" / "weights.safetensors", params)
+    configuration.save(config, tmp_path / "none" / "config.json")
+    errand = dataclasses.replace(
+        ERRAND, tasks=1, videos=0, multiples=(1,), none=str(tmp_path / "none")
+    )
+    page = table2.run(
+        folder / "run", tmp_path / "out", errand, deciders.wanderer, costs.Pixels(), lambda _: None
+    )
+    text = page.read_text()
+    for what in ("ranking × 2", "one plan, open loop", "MPC, closed loop"):
+        assert f"| {what} · a model trained without memory |" in text
+        assert f"| {what} · reprojection, no network |" in text
+    wrong = dataclasses.replace(errand, none=str(folder / "run"))
+    with pytest.raises(UserError, match="was trained with a memory: name a run trained in stage 1"):
+        table2.run(
+            folder / "run", tmp_path / "o", wrong, deciders.wanderer, costs.Pixels(), lambda _: None
+        )
+
+
+@pytest.mark.parametrize("far", [["2"], ["1", "1"], ["3", "1"], ["0"]])
+def test_distances_of_goals_that_cannot_be_are_refused(far):
+    with pytest.raises(ConfigError, match="--multiples needs growing numbers from 1 on"):
+        command.main(["--multiples", *far])
