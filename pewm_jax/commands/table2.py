@@ -12,8 +12,8 @@ from pewm_jax.commands import imports
 from pewm_jax.config import kinds
 
 ABOUT = (
-    "Let a policy alone, its proposals ranked by a world model, one plan (open loop) and plans in a "
-    "closed loop (MPC) decide the same tasks in held-out houses, each with an empty memory, by "
+    "Let a policy alone, its proposals ranked by a world model, one plan (open loop) and plans in "
+    "a closed loop (MPC) decide the same tasks in held-out houses, each with an empty memory, by "
     "reprojection without a network, with the memory, and with the renderer itself as the model, "
     "and write a table, a plot and videos. Decisions are kept: the same command resumes."
 )
