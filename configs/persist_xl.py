@@ -36,7 +36,7 @@ def config() -> Config:
         data=DataConfig(path="data/persist_xl", context=8, stride_max=1),
         train=PersistTrainConfig(
             run="runs/persist_xl",
-            beta2=0.99,
+            beta2=0.99,  # as the paper's AdamW
             weight_decay=2e-3,
             clip_norm=1.0,
             ema=0.9999,

@@ -47,7 +47,9 @@ def experiment(
     clipped at norm 1, bfloat16. The map has 256 × 256 × 32 cells of 0.25 × 0.25 × 1 m, read through
     positions relative to the clip's first camera. What the paper does not say is chosen: 512 cells
     per clip, 16 frames of context, the size of a memory block (see ``READER``), 256 clips per step;
-    weights split over 8 devices, a node of GPUs, and copied beyond.
+    weights split over 8 devices, a node of GPUs, and copied beyond. The paper does not state Adam's
+    decays; they are those of CogVideoX's own fine-tuning (0.9 and 0.95, ε 1e-8; CogVideo's
+    ``sat/configs/sft.yaml``).
 
     Args:
         backbone: the video model's transformer.
