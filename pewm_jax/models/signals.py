@@ -40,12 +40,12 @@ def rgb_from_signal(signal: Array) -> Array:
     """Map floats in [−1, 1] to uint8 colours, rounded and clipped.
 
     Args:
-        signal: (..., 3) colours.
+        signal: colours of any shape.
 
     Raises:
-        UserError: it has another type or shape, or is not finite.
+        UserError: it is no array of numbers, or not finite.
     """
-    require_array("rgb_from_signal", "signal", signal, ..., 3)
+    require_array("rgb_from_signal", "signal", signal, ...)
     return jnp.round(jnp.clip((signal + 1) * 127.5, 0, 255)).astype(jnp.uint8)
 
 
