@@ -2,8 +2,8 @@
 
 import sys
 
-from pewm_jax import cli
-from pewm_jax.commands.train import main
+from pewm_jax.cli.train import main
+from pewm_jax.config import command_line as cli
 
 if __name__ == "__main__":
     sys.exit(cli.run(main))

@@ -26,7 +26,8 @@ import torch
 
 from pewm_jax.config import DiTConfig, published
 from pewm_jax.convert import assemble, transformer
-from pewm_jax.models import dit, positions
+from pewm_jax.models.cogvideox import model as dit
+from pewm_jax.nn import positions
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -30,10 +30,12 @@ import numpy as np
 import optax
 import record
 
-from pewm_jax import atomic, cli
 from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig, published
+from pewm_jax.config import command_line as cli
 from pewm_jax.diffusion import sampler, schedule
-from pewm_jax.models import dit, vae
+from pewm_jax.io import atomic
+from pewm_jax.models.cogvideox import model as dit
+from pewm_jax.models.cogvideox import vae
 
 NAME = "cogvideox_gpu"
 OURS = ("ceiling", "forward", "train", "clip", "decode")

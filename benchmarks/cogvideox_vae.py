@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from record import machine, record, table
 
-from pewm_jax import tree
 from pewm_jax.config import VAEConfig
 from pewm_jax.convert import vae as converter
-from pewm_jax.models import vae
+from pewm_jax.io import tree
+from pewm_jax.models.cogvideox import vae
 
 NAME = "cogvideox_vae"
 GOAL = 0.8

@@ -22,10 +22,10 @@ import torch
 from cogvideox_vae import compare
 from svd import HEADER, Row, same_weights
 
-from pewm_jax import tree
 from pewm_jax.convert import cosmos_transformer, wan_vae
-from pewm_jax.models import cosmos as transformer_model
-from pewm_jax.models import wan_vae as vae_model
+from pewm_jax.io import tree
+from pewm_jax.models.cosmos import model as transformer_model
+from pewm_jax.models.wan import vae as vae_model
 from pewm_jax.types import Params
 
 with warnings.catch_warnings():

@@ -23,7 +23,7 @@ from transformers import Dinov2Config, Dinov2Model
 from pewm_jax.config.dinov2 import published
 from pewm_jax.convert import assemble
 from pewm_jax.convert.dinov2 import entries
-from pewm_jax.models import dinov2
+from pewm_jax.models.dinov2 import model as dinov2
 
 SIZE = 518
 BATCHES = (1, 4)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pewm_jax
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.evaluation import steering
+from pewm_jax.eval import steering
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
     python benchmarks/heap.py --preset demo --record
 
-``pewm-jax train`` asks glibc to keep what was once taken (``pewm_jax.heap``). Here the same step
+``pewm-jax train`` asks glibc to keep what was once taken (``pewm_jax.io.heap``). Here the same step
 runs in processes of their own, in turn with and without.
 """
 
@@ -40,7 +40,7 @@ class Settings:
 
 def child(settings: Settings) -> None:
     """Time steps in this process and print them as JSON."""
-    from pewm_jax import heap
+    from pewm_jax.io import heap
 
     if settings.child == "kept":
         assert heap.keep_large(), "this C library is not glibc"
@@ -48,10 +48,11 @@ def child(settings: Settings) -> None:
 
     import jax
 
-    from pewm_jax import cli, presets, worlds
+    from pewm_jax import presets, worlds
+    from pewm_jax.config import command_line as cli
     from pewm_jax.data import loader
-    from pewm_jax.training import sharding
-    from pewm_jax.training.step import compile_step, initial_state, noise_key
+    from pewm_jax.train import sharding
+    from pewm_jax.train.step import compile_step, initial_state, noise_key
 
     config = presets.load(settings.preset)
     config = dataclasses.replace(

@@ -19,13 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from pewm_jax import rollouts, worlds
+from pewm_jax import worlds
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.evaluation import edit_trials
-from pewm_jax.evaluation.pictures import as_bytes, grid, save_png
+from pewm_jax.eval import edit_trials
 from pewm_jax.memory import class_edit, class_grid, memories
+from pewm_jax.report.pictures import as_bytes, grid, save_png
 from pewm_jax.types import Camera
-from pewm_jax.worlds import persist
+from pewm_jax.worlds import rollouts
+from pewm_jax.worlds.persist import world as persist
 
 TURN_DEG, STEP_M = 30.0, 0.25
 PIXELS = 96

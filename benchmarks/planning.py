@@ -20,18 +20,19 @@ from record import machine, record, table
 
 import pewm_jax
 from pewm_jax import worlds
+from pewm_jax.codecs import interface as codecs
 from pewm_jax.data.collect import CollectConfig
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import make_episode
 from pewm_jax.memory import memories
-from pewm_jax.models import codecs, world_model
 from pewm_jax.planning import costs
 from pewm_jax.planning.candidates import Imagination, Judged
 from pewm_jax.planning.plan import plan
 from pewm_jax.planning.settings import CEM, PlanConfig
 from pewm_jax.types import Control, Frames, Sight
-from pewm_jax.worlds import pewm_many, sampling
+from pewm_jax.worlds import sampling, world_model
 from pewm_jax.worlds.control import control_of
+from pewm_jax.worlds.pewm import many as pewm_many
 
 CONTEXT = 24
 """Frames that are seen before; the goal is 8 frames on."""

@@ -17,8 +17,8 @@ from typing import Any
 
 from record import machine, record, table
 
-from pewm_jax.commands import evaluate, train
-from pewm_jax.data.__main__ import main as data_command
+from pewm_jax.cli import evaluate, train
+from pewm_jax.cli.data import main as data_command
 
 VOXELS = [
     *("--model.memory.kind", "voxel", "--model.memory.cell_m", "0.25", "0.25", "1.0"),

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from pewm_jax import atomic
+from pewm_jax.io import atomic
 
 sys.path.append(str(Path(__file__).parents[1]))  # train.py lies beside the library
 RESULTS = Path(__file__).with_name("RESULTS.md")

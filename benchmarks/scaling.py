@@ -19,12 +19,12 @@ from record import machine, record, table
 
 from pewm_jax import presets as configs
 from pewm_jax.config import ClipConfig, Config, MeshConfig
-from pewm_jax.scaling import plan, suggest
-from pewm_jax.scaling.footprint import MeshSizes
-from pewm_jax.scaling.plan_text import arranged, rate, size, work
-from pewm_jax.training import chips, stages
-from pewm_jax.training.log import duration
-from pewm_jax.training.stages import Stage
+from pewm_jax.plan import plan, suggest
+from pewm_jax.plan.footprint import MeshSizes
+from pewm_jax.plan.text import arranged, rate, size, work
+from pewm_jax.train import chips, stages
+from pewm_jax.train.log import duration
+from pewm_jax.train.stages import Stage
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
 DEVICES = (8, 64, 256)

@@ -26,19 +26,21 @@ import torch
 from record import machine, record, table
 
 import pewm_jax
-from pewm_jax import tree
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode, read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
-from pewm_jax.evaluation import metrics
-from pewm_jax.evaluation.imagine import Imagination
-from pewm_jax.evaluation.methods import Methods
-from pewm_jax.evaluation.metrics import Perceptual, VideoDistance
-from pewm_jax.evaluation.metrics.videos import read as read_video
-from pewm_jax.evaluation.protocol import choose
-from pewm_jax.evaluation.reproject import ReprojectSettings
-from pewm_jax.evaluation.scoring import load_batch
-from pewm_jax.models import i3d, i3d_weights, lpips_weights
+from pewm_jax.eval import metrics
+from pewm_jax.eval.imagine import Imagination
+from pewm_jax.eval.methods import Methods
+from pewm_jax.eval.metrics import Perceptual, VideoDistance
+from pewm_jax.eval.metrics.videos import read as read_video
+from pewm_jax.eval.protocol import choose
+from pewm_jax.eval.reproject import ReprojectSettings
+from pewm_jax.eval.scoring import load_batch
+from pewm_jax.io import tree
+from pewm_jax.models.i3d import model as i3d
+from pewm_jax.models.i3d import weights as i3d_weights
+from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.types import Params
 
 SAMPLER, EMPTY = "sampler, with the map", "sampler, without"

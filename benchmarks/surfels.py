@@ -34,10 +34,10 @@ from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.geometry.cameras import invert_rigid, unproject
 from pewm_jax.memory import rendering, views
-from pewm_jax.training import sharding
-from pewm_jax.training.step import abstract_state, compile_step, noise_key
+from pewm_jax.train import sharding
+from pewm_jax.train.step import abstract_state, compile_step, noise_key
 from pewm_jax.types import Array, Camera, Clip
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.worlds.pewm.world import STAGES
 
 POINTS = 200_000
 

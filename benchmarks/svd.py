@@ -22,11 +22,11 @@ import record
 import torch
 from cogvideox_vae import compare
 
-from pewm_jax import tree
 from pewm_jax.convert import svd_unet, svd_vae
 from pewm_jax.convert.mapping import Entry
-from pewm_jax.models import svd_unet as unet_model
-from pewm_jax.models import svd_vae as vae_model
+from pewm_jax.io import tree
+from pewm_jax.models.svd import unet as unet_model
+from pewm_jax.models.svd import vae as vae_model
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -29,16 +29,17 @@ import jax
 import numpy as np
 import record
 
-from pewm_jax import atomic, cli
 from pewm_jax import presets as configs
 from pewm_jax.config import Config, MeshConfig, UserError
+from pewm_jax.config import command_line as cli
 from pewm_jax.data import abstract
-from pewm_jax.scaling import suggest
-from pewm_jax.scaling.footprint import MeshSizes
-from pewm_jax.training import chips, sharding, stages, step
+from pewm_jax.io import atomic
+from pewm_jax.plan import suggest
+from pewm_jax.plan.footprint import MeshSizes
+from pewm_jax.train import chips, sharding, stages, step
 from pewm_jax.types import Clip
 from pewm_jax.worlds import costs
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.worlds.pewm.world import STAGES
 
 NAME = "training_gpu"
 BATCHES = (1, 2, 4, 8, 16, 32)

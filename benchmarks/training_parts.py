@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from pewm_jax import cli
 from pewm_jax import presets as configs
 from pewm_jax.config import Config
+from pewm_jax.config import command_line as cli
 
 Spans = dict[str, list[tuple[float, float]]]
 """What was done → when it began and ended, each time (seconds of ``time.time``)."""
@@ -35,10 +35,10 @@ def clocks(interrupt: tuple[int, int] | None = None) -> Iterator[Spans]:
     Args:
         interrupt: stage and how many steps of it to begin before Ctrl-C comes; never by default.
     """
-    from pewm_jax.training import loop
-    from pewm_jax.training.checkpoint import Checkpoints
-    from pewm_jax.training.feed import Feed
-    from pewm_jax.training.log import LiveView, MetricsLog
+    from pewm_jax.train import loop
+    from pewm_jax.train.checkpoint import Checkpoints
+    from pewm_jax.train.feed import Feed
+    from pewm_jax.train.log import LiveView, MetricsLog
 
     spans: Spans = {}
 

@@ -26,7 +26,7 @@ from record import table
 from pewm_jax import presets
 from pewm_jax.config import VoxelVAEConfig
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.models import voxel_vae
+from pewm_jax.models.persist import voxel_vae
 
 SMALL = VoxelVAEConfig(
     side=32,

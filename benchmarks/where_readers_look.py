@@ -26,12 +26,14 @@ from record import machine, record, table
 import pewm_jax
 from pewm_jax.config import AttentionConfig, Config, UserError
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.evaluation.protocol import choose, load_clip
+from pewm_jax.eval.protocol import choose, load_clip
 from pewm_jax.geometry.cameras import project
-from pewm_jax.models import attention_reader, memory_block, world_model
-from pewm_jax.models.memory_geometry import NEAREST_M, patch_pixels
-from pewm_jax.rollouts import load_finished
+from pewm_jax.readers import attention as attention_reader
+from pewm_jax.readers import memory_block
+from pewm_jax.readers.geometry import NEAREST_M, patch_pixels
 from pewm_jax.types import Array, Params
+from pewm_jax.worlds import world_model
+from pewm_jax.worlds.rollouts import load_finished
 
 REACH = 1.0
 """A token is in place if it projects at most so many patches from a patch's centre, each way."""

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from pewm_jax.config import Config, ConfigError, ModelConfig, UserError
     from pewm_jax.geometry.actions import integrate
     from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
-    from pewm_jax.models.signals import rgb_from_signal
-    from pewm_jax.rollouts import rollout
-    from pewm_jax.training.loading import load
+    from pewm_jax.nn.signals import rgb_from_signal
+    from pewm_jax.train.loading import load
     from pewm_jax.types import Camera, Clip, Control, Frames, VoxelMap, WorldState
     from pewm_jax.worlds import imagine, imagine_many, observe, start
+    from pewm_jax.worlds.rollouts import rollout
 
 __version__ = "0.2.0.dev0"
 
@@ -33,20 +33,20 @@ _HOME = {
     "Config": "config",
     "Control": "types",
     "ModelConfig": "config",
-    "ConfigError": "config",
+    "ConfigError": "errors",
     "Frames": "types",
-    "UserError": "config",
+    "UserError": "errors",
     "VoxelMap": "types",
     "WorldState": "types",
     "integrate": "geometry.actions",
     "imagine": "worlds",
     "imagine_many": "worlds",
     "intrinsics_from_fov": "geometry.cameras",
-    "load": "training.loading",
+    "load": "train.loading",
     "observe": "worlds",
     "pose_from_yaw": "geometry.cameras",
-    "rgb_from_signal": "models.signals",
-    "rollout": "rollouts",
+    "rgb_from_signal": "nn.signals",
+    "rollout": "worlds.rollouts",
     "start": "worlds",
 }
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from pewm_jax.commands.main import main
+from pewm_jax.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

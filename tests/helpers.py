@@ -18,8 +18,8 @@ from pewm_jax.config import (
     VoxelConfig,
 )
 from pewm_jax.geometry import cameras
-from pewm_jax.models import world_model
 from pewm_jax.types import Camera, Frames
+from pewm_jax.worlds import world_model
 
 TINY = ModelConfig(
     clip=ClipConfig(frames=9, height=16, width=24),

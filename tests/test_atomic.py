@@ -2,7 +2,7 @@
 
 import pytest
 
-from pewm_jax import atomic
+from pewm_jax.io import atomic
 
 
 def test_a_file_is_replaced_whole(tmp_path):

@@ -8,7 +8,7 @@ import jax
 import pytest
 
 from pewm_jax.config import UserError
-from pewm_jax.models import dit
+from pewm_jax.models.cogvideox import model as dit
 
 
 @pytest.fixture

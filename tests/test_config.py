@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax import cli, presets
 from pewm_jax import config as configuration
+from pewm_jax import presets
+from pewm_jax import registry as kinds
 from pewm_jax.config import (
     ActionConfig,
     AttentionConfig,
@@ -39,8 +40,8 @@ from pewm_jax.config import (
     TrainConfig,
     VAEConfig,
     VoxelConfig,
-    kinds,
 )
+from pewm_jax.config import command_line as cli
 
 VERSION_1 = Path(__file__).parent / "version_1"
 """Settings as they were written before there were versions."""

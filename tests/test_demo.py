@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pewm_jax.commands import demo
+from pewm_jax.cli import demo
 from pewm_jax.config import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -94,7 +94,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made(called):
 def test_without_the_renderer_it_names_the_command_that_installs_it(tmp_path):
     code = (
         "import sys; sys.modules['embreex'] = None\n"
-        "from pewm_jax.commands.main import main; sys.exit(main(['demo']))"
+        "from pewm_jax.cli.main import main; sys.exit(main(['demo']))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],

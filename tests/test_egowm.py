@@ -24,9 +24,9 @@ from pewm_jax.config import (
     UserError,
 )
 from pewm_jax.geometry import actions as action_geometry
-from pewm_jax.models import world_model
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Control
+from pewm_jax.worlds import world_model
 from tests.helpers import init_world, random_frames, randomise
 
 MODEL = EgoWMConfig(

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pewm_jax import cli, flags, presets
 from pewm_jax import config as configuration
+from pewm_jax import presets
+from pewm_jax import registry as kinds
 from pewm_jax.config import (
     Config,
     ConfigError,
@@ -16,8 +17,9 @@ from pewm_jax.config import (
     FlowConfig,
     ImagesConfig,
     VAEConfig,
-    kinds,
+    flags,
 )
+from pewm_jax.config import command_line as cli
 
 TINY = presets.load("tiny")
 VERSION_1 = Path(__file__).parent / "version_1"

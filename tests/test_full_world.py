@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pewm_jax import config as configs
-from pewm_jax import rollouts, tree, weights, worlds
+from pewm_jax import worlds
+from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import (
     AttentionConfig,
     ConfigError,
@@ -24,9 +25,12 @@ from pewm_jax.config import (
     VoxelConfig,
 )
 from pewm_jax.data import loader
-from pewm_jax.models import codecs, encoders, signals, world_model
-from pewm_jax.training import loop
+from pewm_jax.encoders import interface as encoders
+from pewm_jax.io import tree, weights
+from pewm_jax.nn import signals
+from pewm_jax.train import loop
 from pewm_jax.types import Clip, Control
+from pewm_jax.worlds import rollouts, world_model
 from tests.helpers import random_frames, randomise, tiny_config
 
 VAE = VAEConfig(widths=(8, 8, 8), resnets=1, groups=4, latent_channels=4, sample_height=16)

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pewm_jax import heap
+from pewm_jax.io import heap
 
 THREADS = 6
 COUNT = f"""

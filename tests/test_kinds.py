@@ -9,9 +9,11 @@ import textwrap
 
 import pytest
 
-from pewm_jax import cli, flags, presets
 from pewm_jax import config as configuration
-from pewm_jax.commands import evaluate, imports, train
+from pewm_jax import presets
+from pewm_jax import registry as kinds
+from pewm_jax.cli import evaluate, train
+from pewm_jax.cli import plugins as imports
 from pewm_jax.config import (
     AttentionConfig,
     CameraConfig,
@@ -24,9 +26,10 @@ from pewm_jax.config import (
     PixelConfig,
     VoxelConfig,
     WorldSettings,
-    kinds,
+    flags,
     register,
 )
+from pewm_jax.config import command_line as cli
 from tests.strangers import run as strangers
 
 TINY = presets.load("tiny")
@@ -132,7 +135,7 @@ def test_a_file_in_the_current_folder_is_imported_for_training(spelling, tmp_pat
     package(tmp_path, "mine_here", PART.format(name="here"), entry=False)
     monkeypatch.chdir(tmp_path)
     seen = []
-    from pewm_jax.scaling import plan
+    from pewm_jax.plan import plan
 
     monkeypatch.setattr(plan, "show", lambda config, launch: seen.append(config))
     chosen = ["--noise.kind", "here", "--noise.strength", "2"]
@@ -148,7 +151,7 @@ def test_evaluation_imports_before_it_opens_the_run(tmp_path, monkeypatch):
     package(tmp_path, "mine_first", PART.format(name="first"), entry=False)
     package(tmp_path, "mine_second", PART.format(name="second"), entry=False)
     monkeypatch.chdir(tmp_path)
-    from pewm_jax.evaluation import report
+    from pewm_jax.eval import report
 
     seen = []
     monkeypatch.setattr(

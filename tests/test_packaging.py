@@ -15,7 +15,7 @@ import pytest
 
 import pewm_jax
 from pewm_jax import presets
-from pewm_jax.commands import main as command
+from pewm_jax.cli import main as command
 
 ROOT = Path(__file__).parents[1]
 HELPERS = ("train.py", "evaluate.py", "configs", "tests", "benchmarks", "docs")
@@ -126,7 +126,7 @@ def run(site, cwd, *argv):
 def test_without_embree_collecting_is_refused_in_a_sentence(tmp_path):
     code = (
         "import sys; sys.modules['embreex'] = None\n"
-        "from pewm_jax.commands.main import main; sys.exit(main(sys.argv[1:]))"
+        "from pewm_jax.cli.main import main; sys.exit(main(sys.argv[1:]))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, "data", "collect", str(tmp_path / "x"), "--train", "1"],

@@ -21,12 +21,16 @@ from pewm_jax.diffusion import noise as noises
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.geometry import camera_steps
 from pewm_jax.memory import class_edit, class_grid, memories
-from pewm_jax.models import frame_blocks, voxel_dit, voxel_vae
+from pewm_jax.models.persist import blocks as frame_blocks
+from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Clip, Control, Frames
-from pewm_jax.worlds import persist, persist_pictures, persist_prepare, persist_voxels
-from pewm_jax.worlds import persist_windows as windows
-from pewm_jax.worlds.persist_past import encoded
+from pewm_jax.worlds.persist import pictures as persist_pictures
+from pewm_jax.worlds.persist import prepare as persist_prepare
+from pewm_jax.worlds.persist import voxels as persist_voxels
+from pewm_jax.worlds.persist import windows
+from pewm_jax.worlds.persist import world as persist
+from pewm_jax.worlds.persist.past import encoded
 from tests.helpers import random_frames
 from tests.persist_world import MODEL, NOISE
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import ConfigError, VoxelVAEConfig
-from pewm_jax.models import voxel_vae
+from pewm_jax.models.persist import voxel_vae
 from pewm_jax.presets import persist_tiny
-from pewm_jax.worlds import persist_classes
+from pewm_jax.worlds.persist import classes as persist_classes
 from tests.persist_nets import normal, weights
 
 VAE = VoxelVAEConfig(

@@ -15,9 +15,9 @@ from pewm_jax.config import (
 from pewm_jax.diffusion import frame_flow
 from pewm_jax.geometry import camera_steps, cameras
 from pewm_jax.geometry.march import Layers
-from pewm_jax.models import camera_model, voxel_dit, voxel_renderer, voxel_vae
+from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.types import Camera
-from pewm_jax.worlds import persist_losses
+from pewm_jax.worlds.persist import losses as persist_losses
 from tests.persist_nets import normal, weights
 
 BLOCKS = BlocksConfig(layers=1, heads=2, head_dim=8, mlp_ratio=2, context=3)

@@ -15,8 +15,10 @@ from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, unproj
 from pewm_jax.geometry.march import through_pixels
 from pewm_jax.memory import class_grid
 from pewm_jax.types import Camera
-from pewm_jax.worlds import persist, persist_sight, persist_voxels
-from pewm_jax.worlds import persist_windows as windows
+from pewm_jax.worlds.persist import sight as persist_sight
+from pewm_jax.worlds.persist import voxels as persist_voxels
+from pewm_jax.worlds.persist import windows
+from pewm_jax.worlds.persist import world as persist
 from tests.helpers import random_frames
 from tests.persist_world import MODEL
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from pewm_jax import pickled_tensors
 from pewm_jax.config import UserError
+from pewm_jax.io import pickles as pickled_tensors
 
 RNG = np.random.default_rng(0)
 TABLE = {

@@ -15,7 +15,7 @@ import trimesh
 
 from pewm_jax import config as configuration
 from pewm_jax import presets
-from pewm_jax.commands.main import COMMANDS
+from pewm_jax.cli.main import COMMANDS
 from pewm_jax.data.scenes import load_scene
 from pewm_jax.houses.generate import generate_house
 

@@ -21,10 +21,12 @@ import numpy as np
 import pytest
 
 import pewm_jax
-from pewm_jax import atomic, cli, presets
 from pewm_jax import config as configuration
-from pewm_jax.commands import main as program
+from pewm_jax import presets
+from pewm_jax.cli import main as program
 from pewm_jax.config import UserError
+from pewm_jax.config import command_line as cli
+from pewm_jax.io import atomic
 
 SECONDS = 120
 """No refusal takes so long; what does has begun to work."""
@@ -349,7 +351,7 @@ def test_a_function_of_worlds_refuses_strange_arguments(name, what):
 
 def test_metrics_and_episodes_refuse_bad_files(bad):
     from pewm_jax.data.dataset import EpisodeSource
-    from pewm_jax.evaluation import metrics
+    from pewm_jax.eval import metrics
 
     for path in bad.paths.values():
         with pytest.raises(UserError):

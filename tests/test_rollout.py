@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax import rollouts, worlds
+from pewm_jax import worlds
 from pewm_jax.config import UserError
+from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import memories, voxel_map
-from pewm_jax.models import encoders
 from pewm_jax.types import Frames
+from pewm_jax.worlds import rollouts
 from tests.helpers import init_world, random_frames, randomise, tiny_config
 
 CONFIG = tiny_config()

@@ -16,10 +16,11 @@ import pytest
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import flags, tree, worlds
-from pewm_jax.config import Config, UserError
+from pewm_jax import worlds
+from pewm_jax.config import Config, UserError, flags
 from pewm_jax.data import loader
-from pewm_jax.training import loop
+from pewm_jax.io import tree
+from pewm_jax.train import loop
 from pewm_jax.types import Control
 from tests.helpers import random_camera, random_frames
 from tests.strangers import run as strangers

@@ -18,14 +18,15 @@ import pytest
 
 import pewm_jax
 import train
-from pewm_jax import cli, presets
 from pewm_jax import config as configuration
-from pewm_jax.commands import main as command
+from pewm_jax import presets
+from pewm_jax.cli import main as command
 from pewm_jax.config import Config, Launch
+from pewm_jax.config import command_line as cli
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
-from pewm_jax.evaluation import preview
-from pewm_jax.training import loop
+from pewm_jax.eval import preview
+from pewm_jax.train import loop
 
 ROOT = Path(__file__).parents[1]
 
@@ -295,7 +296,7 @@ def test_a_subcommand_says_the_words_it_was_called_by(name):
 def test_help_and_refusals_load_nothing_heavy(name):
     heavy = {"jax", "flax", "orbax", "trimesh", "embreex", "tensorboardX", "cv2", "scipy"}
     code = (
-        "import sys\nfrom pewm_jax.commands.main import main\n"
+        "import sys\nfrom pewm_jax.cli.main import main\n"
         f"try: main([{name!r}, '--help'])\nexcept SystemExit: pass\n"
         f"assert main([{name!r}, '--nothing']) == 2"
     )
@@ -315,7 +316,7 @@ def test_ctrl_c_during_the_imports_is_told(tmp_path, argv):
 
 @pytest.mark.parametrize("asked", ["flag", "command"])
 def test_a_plan_is_a_flag_and_a_command(asked, monkeypatch):
-    from pewm_jax.scaling import plan
+    from pewm_jax.plan import plan
 
     shown = []
     monkeypatch.setattr(plan, "show", lambda *given: shown.append(given))

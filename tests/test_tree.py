@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from pewm_jax import tree
+from pewm_jax.io import tree
 
 PARAMS = {
     "backbone": {"block": {"kernel": np.ones((2, 3)), "bias": np.zeros(3)}, "scale": np.ones(2)},

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pewm_jax import tensor_files, weights
 from pewm_jax.config import UserError
+from pewm_jax.io import tensor_files, weights
 
 PARAMS = {
     "backbone": {

@@ -11,9 +11,9 @@ import pytest
 
 from pewm_jax import worlds
 from pewm_jax.config import Config, DDPMConfig, UserError
+from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import memories
-from pewm_jax.models import encoders
 from pewm_jax.types import Camera, Control, Frames, WorldState
 from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
 from tests.memory.test_memory_rivals import KINDS, model_of

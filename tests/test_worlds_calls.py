@@ -17,7 +17,8 @@ from pewm_jax.config import DDPMConfig, UserError
 from pewm_jax.geometry import cameras
 from pewm_jax.planning import imagined
 from pewm_jax.types import Camera, Control, WorldState
-from pewm_jax.worlds import checks, persist
+from pewm_jax.worlds import checks
+from pewm_jax.worlds.persist import world as persist
 from tests import persist_world, test_egowm
 from tests.compiled import counted
 from tests.helpers import TINY, random_frames, tiny_model

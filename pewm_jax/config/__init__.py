@@ -20,11 +20,9 @@ from pewm_jax.config.encoder import (
     LatentsConfig,
     PatchColoursConfig,
 )
-from pewm_jax.config.errors import ConfigError, UserError
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.frame_blocks import BlocksConfig
 from pewm_jax.config.frame_flow import PERSIST_PIXELS, PERSIST_VOXELS, FrameFlowConfig
-from pewm_jax.config.kinds import Settings, functions, register
 from pewm_jax.config.launch import Join, Launch
 from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.memory import (
@@ -57,29 +55,31 @@ from pewm_jax.config.vae import VAEConfig
 from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
 from pewm_jax.config.voxel_vae import VoxelVAEConfig
 from pewm_jax.config.wan_vae import WanVAEConfig
+from pewm_jax.errors import ConfigError, UserError
+from pewm_jax.registry import Settings, functions, register
 
-register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm")
+register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm.world")
 register("world", "codec", CodecWorldConfig, "pewm_jax.worlds.codec")
-register("world", "egowm", EgoWMConfig, "pewm_jax.worlds.egowm")
-register("world", "persist", PersistConfig, "pewm_jax.worlds.persist")
+register("world", "egowm", EgoWMConfig, "pewm_jax.worlds.egowm.world")
+register("world", "persist", PersistConfig, "pewm_jax.worlds.persist.world")
 register("world", "nomad", NomadWorldConfig, "pewm_jax.worlds.nomad")
-register("backbone", "dit", DiTConfig, "pewm_jax.models.dit_backbone")
-register("backbone", "svd_unet", SVDUNetConfig, "pewm_jax.models.svd_backbone")
-register("backbone", "cosmos", CosmosConfig, "pewm_jax.models.cosmos_backbone")
-register("backbone", "persist", PersistNetsConfig, "pewm_jax.models.persist_nets")
-register("codec", "pixel", PixelConfig, "pewm_jax.models.pixel_codec")
-register("codec", "vae", VAEConfig, "pewm_jax.models.vae_codec")
-register("codec", "svd_vae", SVDVAEConfig, "pewm_jax.models.svd_vae_codec")
-register("codec", "wan_vae", WanVAEConfig, "pewm_jax.models.wan_vae_codec")
-register("codec", "learned", LearnedCodecConfig, "pewm_jax.models.learned_codec")
-register("control", "camera", CameraConfig, "pewm_jax.models.camera_control")
-register("control", "actions", ModulationConfig, "pewm_jax.models.action_control")
-register("encoder", "patch_colours", PatchColoursConfig, "pewm_jax.models.patch_colours")
-register("encoder", "latents", LatentsConfig, "pewm_jax.models.latent_encoder")
-register("encoder", "dinov2", DINOv2EncoderConfig, "pewm_jax.models.dinov2_encoder")
-register("reader", "attend", AttentionConfig, "pewm_jax.models.attention_reader")
-register("reader", "render", RenderConfig, "pewm_jax.models.render_reader")
-register("reader", "both", BothConfig, "pewm_jax.models.both_reader")
+register("backbone", "dit", DiTConfig, "pewm_jax.models.cogvideox.backbone")
+register("backbone", "svd_unet", SVDUNetConfig, "pewm_jax.models.svd.backbone")
+register("backbone", "cosmos", CosmosConfig, "pewm_jax.models.cosmos.backbone")
+register("backbone", "persist", PersistNetsConfig, "pewm_jax.models.persist.nets")
+register("codec", "pixel", PixelConfig, "pewm_jax.codecs.pixel")
+register("codec", "vae", VAEConfig, "pewm_jax.models.cogvideox.vae_codec")
+register("codec", "svd_vae", SVDVAEConfig, "pewm_jax.models.svd.vae_codec")
+register("codec", "wan_vae", WanVAEConfig, "pewm_jax.models.wan.codec")
+register("codec", "learned", LearnedCodecConfig, "pewm_jax.codecs.learned")
+register("control", "camera", CameraConfig, "pewm_jax.controls.camera")
+register("control", "actions", ModulationConfig, "pewm_jax.controls.actions")
+register("encoder", "patch_colours", PatchColoursConfig, "pewm_jax.encoders.patch_colours")
+register("encoder", "latents", LatentsConfig, "pewm_jax.encoders.latents")
+register("encoder", "dinov2", DINOv2EncoderConfig, "pewm_jax.models.dinov2.encoder")
+register("reader", "attend", AttentionConfig, "pewm_jax.readers.attention")
+register("reader", "render", RenderConfig, "pewm_jax.readers.render")
+register("reader", "both", BothConfig, "pewm_jax.readers.both")
 register("memory", "voxel", VoxelConfig, "pewm_jax.memory.voxel_memory")
 register("memory", "map2d", Map2DConfig, "pewm_jax.memory.map2d")
 register("memory", "points", PointsConfig, "pewm_jax.memory.points")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar
 
-from pewm_jax.config.errors import require
-from pewm_jax.config.kinds import Settings
+from pewm_jax.errors import require
+from pewm_jax.registry import Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Places:
 
 
 class BackboneSettings(Settings):
-    """Settings that every backbone has; see ``pewm_jax.models.backbones`` for its functions.
+    """Settings that every backbone has; see ``pewm_jax.models.interface`` for its functions.
 
     Attributes:
         places: where a memory reader runs; None where none can.

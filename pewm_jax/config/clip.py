@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from pewm_jax.config.errors import require
+from pewm_jax.errors import require
 
 SMALLEST = 12
 """Smallest side of a clip in pixels: the evaluation's SSIM slides a window of 11 over the image."""

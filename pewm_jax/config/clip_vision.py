@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from pewm_jax.config.errors import require, require_positive
+from pewm_jax.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)

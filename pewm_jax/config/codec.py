@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar
 
-from pewm_jax.config.errors import require, require_positive
-from pewm_jax.config.kinds import Settings
+from pewm_jax.errors import require, require_positive
+from pewm_jax.registry import Settings
 
 
 class CodecSettings(Settings):
-    """Settings that every codec has; see ``pewm_jax.models.codecs`` for its functions.
+    """Settings that every codec has; see ``pewm_jax.codecs.interface`` for its functions.
 
     Attributes:
         spatial: pixels per latent cell, along height and along width.

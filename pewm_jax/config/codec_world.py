@@ -7,11 +7,11 @@ from typing import ClassVar, Literal
 
 from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.codec import CodecSettings
-from pewm_jax.config.errors import require
 from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.memory import MemorySettings, SurfelConfig
 from pewm_jax.config.model import WorldSettings
 from pewm_jax.config.training import StageConfig, TrainSettings
+from pewm_jax.errors import require
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,12 +6,12 @@ import dataclasses
 import math
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.errors import require, require_positive
-from pewm_jax.config.kinds import Settings
+from pewm_jax.errors import require, require_positive
+from pewm_jax.registry import Settings
 
 
 class ControlSettings(Settings):
-    """Settings that every control has; see ``pewm_jax.models.controls`` for its functions.
+    """Settings that every control has; see ``pewm_jax.controls.interface`` for its functions.
 
     Attributes:
         MODULATES: whether it adds to the time embedding of each latent frame.

@@ -6,8 +6,8 @@ import dataclasses
 from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.backbone import BackboneSettings, Places
-from pewm_jax.config.errors import require, require_positive
 from pewm_jax.config.noise import EDMConfig, FlowConfig
+from pewm_jax.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from pewm_jax.config.errors import ConfigError, require, require_positive
+from pewm_jax.errors import ConfigError, require, require_positive
 
 HEAD_DIM = 64
 """Width of a head in every published DINOv2."""

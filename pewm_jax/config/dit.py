@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any, Literal
 
 from pewm_jax.config.backbone import BackboneSettings, Places
-from pewm_jax.config.errors import ConfigError, require, require_positive
+from pewm_jax.errors import ConfigError, require, require_positive
 
 Positions = Literal["rope_integer", "rope_crop", "rope_learned", "sincos"]
 """How positions are encoded; see ``DiTConfig.positions``."""

@@ -6,11 +6,11 @@ import dataclasses
 from typing import ClassVar
 
 from pewm_jax.config.control import ControlSettings, ModulationConfig
-from pewm_jax.config.errors import require
 from pewm_jax.config.memory import MemorySettings, NoMemoryConfig
 from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.reader import RenderConfig
 from pewm_jax.config.training import StageConfig, TrainSettings
+from pewm_jax.errors import require
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,12 +6,12 @@ import dataclasses
 from typing import Any, ClassVar
 
 from pewm_jax.config.dinov2 import DINOv2Config
-from pewm_jax.config.errors import require, require_positive
-from pewm_jax.config.kinds import Settings
+from pewm_jax.errors import require, require_positive
+from pewm_jax.registry import Settings
 
 
 class EncoderSettings(Settings):
-    """Settings that every image encoder has; see ``pewm_jax.models.encoders`` for its functions.
+    """Settings that every image encoder has; see ``pewm_jax.encoders.interface`` for its functions.
 
     Attributes:
         channels: F, number of features of a patch.

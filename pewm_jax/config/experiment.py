@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from pewm_jax.config.errors import require
-from pewm_jax.config.kinds import require_section
 from pewm_jax.config.model import ModelConfig, WorldSettings
 from pewm_jax.config.training import DataConfig, EvalConfig, TrainConfig, TrainSettings
+from pewm_jax.errors import require
+from pewm_jax.registry import require_section
 
 VERSION = 4
 """The version of ``config.json`` that is written; ``migrations`` upgrades earlier ones."""

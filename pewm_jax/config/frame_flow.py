@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from pewm_jax.config.errors import require
 from pewm_jax.config.noise import FlowConfig
+from pewm_jax.errors import require
 
 
 @dataclasses.dataclass(frozen=True)

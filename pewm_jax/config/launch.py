@@ -6,7 +6,7 @@ import dataclasses
 import re
 from typing import Any
 
-from pewm_jax.config.errors import require
+from pewm_jax.errors import require
 
 COMPILED = ("auto", "on", "off")
 """Whether a plan compiles the step."""

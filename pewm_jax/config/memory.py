@@ -7,9 +7,9 @@ import math
 from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.encoder import EncoderSettings, PatchColoursConfig
-from pewm_jax.config.errors import require, require_positive
-from pewm_jax.config.kinds import Settings
 from pewm_jax.config.reader import AttentionConfig, ReaderSettings
+from pewm_jax.errors import require, require_positive
+from pewm_jax.registry import Settings
 
 
 @dataclasses.dataclass(frozen=True)

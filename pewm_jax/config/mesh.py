@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from pewm_jax.config.errors import ConfigError, require
+from pewm_jax.errors import ConfigError, require
 
 AXES = ("data", "fsdp", "tensor", "context")
 """The mesh axes, outermost first; devices along the last ones communicate most."""

@@ -10,8 +10,8 @@ import copy
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from pewm_jax.config.errors import ConfigError, require
 from pewm_jax.config.experiment import VERSION
+from pewm_jax.errors import ConfigError, require
 
 Values = dict[str, Any]
 Kinds = Mapping[str, Any]

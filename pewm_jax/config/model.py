@@ -10,11 +10,11 @@ from pewm_jax.config.clip import ActionConfig, ClipConfig
 from pewm_jax.config.codec import CodecSettings, PixelConfig
 from pewm_jax.config.control import CameraConfig, ControlSettings
 from pewm_jax.config.dit import DiTConfig
-from pewm_jax.config.errors import require
-from pewm_jax.config.kinds import Settings, require_section
 from pewm_jax.config.memory import MemorySettings, VoxelConfig
 from pewm_jax.config.noise import DDPMConfig, NoiseSettings
 from pewm_jax.config.training import TrainConfig, TrainSettings
+from pewm_jax.errors import require
+from pewm_jax.registry import Settings, require_section
 
 
 class WorldSettings(Settings):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.errors import require, require_positive
-from pewm_jax.config.kinds import Settings
+from pewm_jax.errors import require, require_positive
+from pewm_jax.registry import Settings
 
 
 class NoiseSettings(Settings):

@@ -6,9 +6,9 @@ import dataclasses
 from typing import ClassVar, Literal
 
 from pewm_jax.config.clip import ActionConfig, ClipConfig
-from pewm_jax.config.errors import require, require_positive
 from pewm_jax.config.model import WorldSettings
 from pewm_jax.config.training import StageConfig, TrainSettings
+from pewm_jax.errors import require, require_positive
 
 PLANE = 2
 """Numbers of a waypoint: metres forward and metres left of the present place."""

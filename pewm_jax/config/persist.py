@@ -10,7 +10,6 @@ from pewm_jax.config.backbone import BackboneSettings
 from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.codec import CodecSettings
 from pewm_jax.config.control import ControlSettings, ModulationConfig
-from pewm_jax.config.errors import require
 from pewm_jax.config.frame_flow import PERSIST_PIXELS, PERSIST_VOXELS
 from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.memory import MemorySettings
@@ -20,6 +19,7 @@ from pewm_jax.config.reader import ReaderSettings, RenderConfig
 from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
 from pewm_jax.config.voxel_vae import VoxelVAEConfig
+from pewm_jax.errors import require
 
 POINT_WAVES = 4
 """Wavelengths of the sinusoids of a place, with ``model.points``."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.errors import require, require_positive
-from pewm_jax.config.kinds import Settings
+from pewm_jax.errors import require, require_positive
+from pewm_jax.registry import Settings
 
 
 class ReaderSettings(Settings):
-    """Settings that every reader has; see ``pewm_jax.models.readers`` for its functions.
+    """Settings that every reader has; see ``pewm_jax.readers.interface`` for its functions.
 
     Attributes:
         READS_TOKENS: whether it takes the points that a clip's cameras see (``Sight.tokens``).

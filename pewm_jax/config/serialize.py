@@ -8,11 +8,12 @@ import typing
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pewm_jax import atomic
-from pewm_jax.config import kinds, migrations
-from pewm_jax.config.errors import ConfigError, require
+from pewm_jax import registry as kinds
+from pewm_jax.config import migrations
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.training import TrainSettings
+from pewm_jax.errors import ConfigError, require
+from pewm_jax.io import atomic
 
 T = TypeVar("T")
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from pewm_jax.config.backbone import BackboneSettings
 from pewm_jax.config.clip_vision import CLIPVisionConfig
-from pewm_jax.config.errors import require, require_positive
+from pewm_jax.errors import require, require_positive
 
 GROUPS = 32
 """Groups of every group norm in the reference."""

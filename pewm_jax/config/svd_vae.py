@@ -6,8 +6,8 @@ import dataclasses
 from typing import ClassVar
 
 from pewm_jax.config.codec import CodecSettings
-from pewm_jax.config.errors import require, require_positive
 from pewm_jax.config.svd_unet import GROUPS
+from pewm_jax.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
-from pewm_jax.config.errors import is_pattern, require
 from pewm_jax.config.mesh import MeshConfig
+from pewm_jax.errors import is_pattern, require
 
 
 @dataclasses.dataclass(frozen=True)

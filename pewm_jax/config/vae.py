@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.codec import CodecSettings
-from pewm_jax.config.errors import ConfigError, require, require_positive
+from pewm_jax.errors import ConfigError, require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from pewm_jax.config.errors import require, require_positive
 from pewm_jax.config.frame_blocks import BlocksConfig
+from pewm_jax.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)

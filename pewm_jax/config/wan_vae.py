@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.codec import CodecSettings
-from pewm_jax.config.errors import require, require_positive
+from pewm_jax.errors import require, require_positive
 
 MEAN_16 = (
     *(-0.7571, -0.7089, -0.9113, 0.1075, -0.1745, 0.9653, -0.1517, 1.5508),

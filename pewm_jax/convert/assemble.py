@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator, Sequence
 import jax
 import numpy as np
 
-from pewm_jax import tree
 from pewm_jax.config import UserError
 from pewm_jax.convert.mapping import Entry
 from pewm_jax.convert.sources import Source
+from pewm_jax.io import tree
 from pewm_jax.types import Array, Params
 
 FLOATS = ("float32", "bfloat16", "float16")

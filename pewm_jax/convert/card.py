@@ -10,10 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from pewm_jax import registry as kinds
 from pewm_jax import worlds
-from pewm_jax.config import CodecWorldConfig, Config, UserError, kinds
+from pewm_jax.config import CodecWorldConfig, Config, UserError
 from pewm_jax.data.dataset import read_manifest
-from pewm_jax.evaluation.words import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, heading, number
+from pewm_jax.report.labels import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, heading, number
 from pewm_jax.types import Params
 
 TRAINED_ON = "train"
@@ -92,8 +93,8 @@ def _use(facts: Facts) -> str:
     if isinstance(facts.config.model, CodecWorldConfig):
         return (
             "## Use\n\nA model whose `codec.kind` is `learned` starts from it, `train.start` "
-            f"{facts.name}: see the preset `demo`. In Python, `pewm_jax.models.codecs` encodes and "
-            "decodes."
+            f"{facts.name}: see the preset `demo`. In Python, `pewm_jax.codecs.interface` encodes "
+            "and decodes."
         )
     clip, actions = facts.config.model.clip, facts.config.model.actions
     length = clip.frames - 1

@@ -22,12 +22,12 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax import tensor_files, tree, weights
 from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig
 from pewm_jax.convert import assemble, base, output, scheduler, sources, transformer, vae
 from pewm_jax.convert.mapping import Entry
-from pewm_jax.models import dit as dit_model
-from pewm_jax.models import vae as vae_model
+from pewm_jax.io import tensor_files, tree, weights
+from pewm_jax.models.cogvideox import model as dit_model
+from pewm_jax.models.cogvideox import vae as vae_model
 from pewm_jax.types import Array, Params
 
 PIPELINES = (
@@ -92,7 +92,7 @@ def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[DiTC
             stored one.
 
     Returns:
-        ``(config, params)`` for ``pewm_jax.models.dit.apply``, NumPy arrays.
+        ``(config, params)`` for ``pewm_jax.models.cogvideox.model.apply``, NumPy arrays.
 
     Raises:
         UserError: a tensor that is missing, left over or of another shape, a damaged file, a
@@ -105,7 +105,7 @@ def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[VAEConfig, P
     """Read the VAE of a CogVideoX checkpoint; see ``read_transformer``.
 
     Returns:
-        ``(config, params)`` for ``pewm_jax.models.vae.encode`` and ``decode``.
+        ``(config, params)`` for ``pewm_jax.models.cogvideox.vae.encode`` and ``decode``.
     """
     return read_network(VAE, Path(folder), dtype)
 

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pewm_jax import cli
 from pewm_jax.config import (
     Config,
     DDPMConfig,
@@ -17,6 +16,7 @@ from pewm_jax.config import (
     UserError,
     VAEConfig,
 )
+from pewm_jax.config import command_line as cli
 from pewm_jax.config.dit import Learned
 from pewm_jax.convert import (
     base,
@@ -41,7 +41,7 @@ from pewm_jax.convert.options import (
     ImportDINOv2,
     ImportSVD,
 )
-from pewm_jax.models import dinov2 as dinov2_model
+from pewm_jax.models.dinov2 import model as dinov2_model
 from pewm_jax.types import Params
 
 

@@ -19,8 +19,8 @@ from pewm_jax.convert import (
     wan_vae,
 )
 from pewm_jax.convert.cogvideox import Network
-from pewm_jax.models import cosmos as transformer_model
-from pewm_jax.models import wan_vae as vae_model
+from pewm_jax.models.cosmos import model as transformer_model
+from pewm_jax.models.wan import vae as vae_model
 from pewm_jax.types import Params
 
 TRANSFORMER = Network(
@@ -42,7 +42,7 @@ def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[Cosm
             one.
 
     Returns:
-        ``(config, params)`` for ``pewm_jax.models.cosmos.apply``, NumPy arrays.
+        ``(config, params)`` for ``pewm_jax.models.cosmos.model.apply``, NumPy arrays.
 
     Raises:
         UserError: a tensor that is missing, left over or of another shape, a damaged file, a
@@ -75,7 +75,7 @@ def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[WanVAEConfig
     """Read the autoencoder of a checkpoint; see ``read_transformer``.
 
     Returns:
-        ``(config, params)`` for ``pewm_jax.models.wan_vae.encode`` and ``decode``.
+        ``(config, params)`` for ``pewm_jax.models.wan.vae.encode`` and ``decode``.
     """
     return cogvideox.read_network(VAE, Path(folder), dtype)
 

@@ -12,7 +12,7 @@ from typing import Any
 from pewm_jax.config import CosmosConfig, UserError
 from pewm_jax.convert import settings
 from pewm_jax.convert.mapping import LINEAR, SAME, Entry
-from pewm_jax.models import cosmos
+from pewm_jax.models.cosmos import model as cosmos
 
 CLASS = "CosmosTransformer3DModel"
 """The reference's class."""

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from pewm_jax import config as configuration
-from pewm_jax import weights
 from pewm_jax.config import Config, UserError
 from pewm_jax.convert import base, cogvideox, output, widen
 from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS, Network
+from pewm_jax.io import weights
 from pewm_jax.types import Params
 
 _TEXT = ("text_encoder", "tokenizer")

@@ -4,7 +4,7 @@ A ``transformers`` folder has its settings in ``config.json``. For a state dict 
 repository (such as ``dinov2_vits14_pretrain.pth``, or the same tensors as safetensors) they follow
 from the tensors' shapes: every published model has heads of 64 channels. Both fill the same tree;
 the network follows ``transformers`` in how position embeddings are interpolated (see
-``pewm_jax.models.dinov2``).
+``pewm_jax.models.dinov2.model``).
 
 The mask token, which only pretraining uses, and an image classifier's last layer are left behind;
 every other tensor must be used.
@@ -21,14 +21,14 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax import tree, weights
 from pewm_jax.config import DINOv2Config, UserError
 from pewm_jax.config.dinov2 import HEAD_DIM
 from pewm_jax.convert import assemble, output, sources
 from pewm_jax.convert.dinov2_source import open_source, with_transformers_names
 from pewm_jax.convert.mapping import LINEAR, SAME, Entry, Turn
 from pewm_jax.convert.sources import Source
-from pewm_jax.models import dinov2
+from pewm_jax.io import tree, weights
+from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.types import Params
 
 _FIXED = {"hidden_act": "gelu", "num_channels": 3, "qkv_bias": True}
@@ -221,7 +221,7 @@ def read(src: Path | str, dtype: str | None = None) -> tuple[DINOv2Config, Param
         dtype: of the parameters; by default the stored one.
 
     Returns:
-        The configuration, and NumPy parameters for ``pewm_jax.models.dinov2``.
+        The configuration, and NumPy parameters for ``pewm_jax.models.dinov2.model``.
 
     Raises:
         UserError: not DINOv2, a tensor missing, left over or of a wrong shape, a damaged file, or

@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax import tree
 from pewm_jax.config import UserError
 from pewm_jax.convert import sources
 from pewm_jax.convert.sources import Source
+from pewm_jax.io import tree
 from pewm_jax.types import Array
 
 _LEFT_BEHIND = re.compile(r"(embeddings\.)?mask_token|classifier\.(weight|bias)")

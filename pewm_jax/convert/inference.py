@@ -24,14 +24,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax import __version__, rollouts, tensor_files, tree, weights
+from pewm_jax import __version__
 from pewm_jax import config as configuration
 from pewm_jax.config import Config, NomadWorldConfig, UserError
 from pewm_jax.convert import card, output, sources
-from pewm_jax.evaluation.protocol import file_hash
-from pewm_jax.evaluation.report import METRICS
-from pewm_jax.training import runs
+from pewm_jax.eval.protocol import file_hash
+from pewm_jax.eval.report import METRICS
+from pewm_jax.io import tensor_files, tree, weights
+from pewm_jax.train import runs
 from pewm_jax.types import Params
+from pewm_jax.worlds import rollouts
 
 CARD = "README.md"
 REPORT = Path("report") / METRICS

@@ -45,7 +45,7 @@ class Entry:
 
     Attributes:
         theirs: its name in the foreign file.
-        path: our leaf, keys joined by slashes (see ``pewm_jax.tree``).
+        path: our leaf, keys joined by slashes (see ``pewm_jax.io.tree``).
         turn: the change of layout.
         layer: position on the leading axis of our leaf where layers are stacked, else None.
     """

@@ -16,10 +16,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pewm_jax import tree, weights
 from pewm_jax.config import NomadConfig, UserError
 from pewm_jax.convert.mapping import CONV, LINEAR, Entry, Turn
-from pewm_jax.models import efficientnet, nomad, unet1d
+from pewm_jax.io import tree, weights
+from pewm_jax.models.nomad import efficientnet, unet1d
+from pewm_jax.models.nomad import model as nomad
 from pewm_jax.types import Params
 
 UNUSED = (

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pewm_jax import atomic
 from pewm_jax.config import UserError
 from pewm_jax.data.progress import Meter
+from pewm_jax.io import atomic
 
 _MEGABYTE = 1 << 20
 

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pewm_jax import tensor_files, tree
 from pewm_jax.config import UserError
+from pewm_jax.io import tensor_files, tree
 from pewm_jax.types import Array
 
 

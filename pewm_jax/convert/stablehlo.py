@@ -32,7 +32,7 @@ import jax
 import jax.export
 import numpy as np
 
-from pewm_jax import __version__, rollouts, tree
+from pewm_jax import __version__
 from pewm_jax.config import Config, DiTConfig, UserError
 from pewm_jax.convert import output, standalone
 from pewm_jax.convert.stablehlo_programs import (
@@ -43,8 +43,10 @@ from pewm_jax.convert.stablehlo_programs import (
     rollout_programs,
 )
 from pewm_jax.geometry import actions as action_geometry
-from pewm_jax.training import runs
+from pewm_jax.io import tree
+from pewm_jax.train import runs
 from pewm_jax.types import Params
+from pewm_jax.worlds import rollouts
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 """Where a program shall run, if it can be lowered for all."""

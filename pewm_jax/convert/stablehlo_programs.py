@@ -11,12 +11,14 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax import tree, worlds
-from pewm_jax.config import Config, DDPMConfig, UserError, kinds
+from pewm_jax import registry as kinds
+from pewm_jax import worlds
+from pewm_jax.config import Config, DDPMConfig, UserError
 from pewm_jax.data import abstract
+from pewm_jax.io import tree
 from pewm_jax.memory import memories
-from pewm_jax.models import world_model
 from pewm_jax.types import Array, Camera, Control, Params, Sight
+from pewm_jax.worlds import world_model
 
 Arrays: TypeAlias = dict[str, Array]
 """Name → array, or anything with a shape and a dtype."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 
-from pewm_jax import tensor_files
 from pewm_jax.config import CLIPVisionConfig, EDMConfig, SVDUNetConfig, SVDVAEConfig
 from pewm_jax.convert import (
     assemble,
@@ -24,9 +23,10 @@ from pewm_jax.convert import (
     svd_vae,
 )
 from pewm_jax.convert.cogvideox import Network
-from pewm_jax.models import clip_vision as clip_model
-from pewm_jax.models import svd_unet as unet_model
-from pewm_jax.models import svd_vae as vae_model
+from pewm_jax.io import tensor_files
+from pewm_jax.models.clip import model as clip_model
+from pewm_jax.models.svd import unet as unet_model
+from pewm_jax.models.svd import vae as vae_model
 from pewm_jax.types import Params
 
 UNET = Network("unet", svd_unet.CLASS, SVDUNetConfig, svd_unet, unet_model.init)
@@ -42,7 +42,7 @@ def read_unet(folder: str | Path, dtype: str | None = None) -> tuple[SVDUNetConf
             one.
 
     Returns:
-        ``(config, params)`` for ``pewm_jax.models.svd_unet.apply``, NumPy arrays.
+        ``(config, params)`` for ``pewm_jax.models.svd.unet.apply``, NumPy arrays.
 
     Raises:
         UserError: a tensor that is missing, left over or of another shape, a damaged file, a
@@ -72,7 +72,7 @@ def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[SVDVAEConfig
     """Read the autoencoder of a checkpoint; see ``read_unet``.
 
     Returns:
-        ``(config, params)`` for ``pewm_jax.models.svd_vae.encode`` and ``decode``.
+        ``(config, params)`` for ``pewm_jax.models.svd.vae.encode`` and ``decode``.
     """
     return cogvideox.read_network(VAE, Path(folder), dtype)
 
@@ -90,7 +90,7 @@ def read_image_encoder(
     """Read the image encoder of a checkpoint, in the layout of transformers; see ``read_unet``.
 
     Returns:
-        ``(config, params)`` for ``pewm_jax.models.clip_vision.apply``.
+        ``(config, params)`` for ``pewm_jax.models.clip.model.apply``.
     """
     inside = sources.component(Path(folder), "image_encoder")
     path = inside / "config.json"

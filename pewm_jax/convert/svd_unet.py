@@ -13,7 +13,7 @@ import numpy as np
 from pewm_jax.config import SVDUNetConfig, UserError
 from pewm_jax.convert import settings
 from pewm_jax.convert.mapping import CONV, LINEAR, SAME, Entry, Turn
-from pewm_jax.models import svd_shapes
+from pewm_jax.models.svd import shapes as svd_shapes
 
 CLASS = "UNetSpatioTemporalConditionModel"
 """The reference's class."""

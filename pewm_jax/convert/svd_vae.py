@@ -11,7 +11,7 @@ from pewm_jax.config import SVDVAEConfig, UserError
 from pewm_jax.convert import settings
 from pewm_jax.convert.mapping import Entry
 from pewm_jax.convert.svd_unet import POINTWISE, RULES, renamed, turn
-from pewm_jax.models import svd_vae
+from pewm_jax.models.svd import vae as svd_vae
 
 CLASS = "AutoencoderKLTemporalDecoder"
 """The reference's class."""

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pewm_jax import tree
 from pewm_jax.config import UserError
 from pewm_jax.convert import output, sources
+from pewm_jax.io import tree
 
 
 def encode(

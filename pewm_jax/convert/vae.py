@@ -10,7 +10,7 @@ from typing import Any
 
 from pewm_jax.config import UserError, VAEConfig
 from pewm_jax.convert.mapping import CONV, SAME, Entry
-from pewm_jax.models import vae
+from pewm_jax.models.cogvideox import vae
 
 CLASS = "AutoencoderKLCogVideoX"
 """The reference's class."""

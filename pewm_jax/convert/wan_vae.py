@@ -15,7 +15,7 @@ from pewm_jax.config.wan_vae import MEAN_16, STD_16
 from pewm_jax.convert import settings
 from pewm_jax.convert.mapping import CONV, SAME, Entry, Turn
 from pewm_jax.convert.svd_unet import POINTWISE, TIME_CONV
-from pewm_jax.models import wan_vae
+from pewm_jax.models.wan import vae as wan_vae
 
 CLASS = "AutoencoderKLWan"
 """The reference's class."""

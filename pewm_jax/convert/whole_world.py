@@ -9,11 +9,11 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax import tensor_files, tree
 from pewm_jax.config import Config
+from pewm_jax.controls import interface as controls
 from pewm_jax.convert import output
 from pewm_jax.convert.cogvideox import CONFIG, WEIGHTS
-from pewm_jax.models import controls
+from pewm_jax.io import tensor_files, tree
 from pewm_jax.types import Array, Params
 
 Specs = dict[str, jax.ShapeDtypeStruct]

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pewm_jax.config import DiTConfig, UserError
-from pewm_jax.models import patches
+from pewm_jax.nn import patches
 from pewm_jax.types import Array, Params
 
 

@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax import tensor_files, tree
 from pewm_jax.config import (
     ClipConfig,
     Config,
@@ -28,7 +27,9 @@ from pewm_jax.config import (
 )
 from pewm_jax.convert import base, cogvideox, output, widen
 from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS
-from pewm_jax.models import positions, readers
+from pewm_jax.io import tensor_files, tree
+from pewm_jax.nn import positions
+from pewm_jax.readers import interface as readers
 from pewm_jax.types import Array, Params
 
 

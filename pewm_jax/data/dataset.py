@@ -20,10 +20,10 @@ from typing import Any
 import array_record.python.array_record_module as array_file
 from grain import sources
 
-from pewm_jax import atomic
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import Episode, read_episode
 from pewm_jax.data.record_format import VERSION, DamagedError
+from pewm_jax.io import atomic
 
 MANIFEST = "dataset.json"
 UNFINISHED = "collecting.json"

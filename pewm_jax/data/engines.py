@@ -28,11 +28,11 @@ from typing import Any
 import cv2
 import jax
 
-from pewm_jax import atomic
 from pewm_jax.config import UserError
 from pewm_jax.data.dataset import Shard, describe_shard, write_shard
 from pewm_jax.data.interrupts import sigint_ignored, sigint_postponed
 from pewm_jax.data.make_episode import CollectConfig, make_episode
+from pewm_jax.io import atomic
 
 SHARDS_PER_PROCESSOR = 2
 """Shards submitted to a cluster per processor: one that is made and one that waits."""

@@ -25,7 +25,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from pewm_jax.config import ConfigError, UserError, kinds
+from pewm_jax import registry as kinds
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.checks import check_episode
 from pewm_jax.data.episodes import EpisodeArrays, read_episode, write_episode
 from pewm_jax.data.importer import planar_actions

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import tyro
 
-from pewm_jax import atomic
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.voxel_pictures import above, ahead
+from pewm_jax.io import atomic
 
 THUMB = 128
 """Height of a thumbnail, pixels."""

@@ -18,7 +18,7 @@ from pewm_jax.config import AttentionConfig, Map2DConfig, MemorySettings, ModelC
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.plucker import fold_frames
 from pewm_jax.memory import cells, map2d, memories, rendering
-from pewm_jax.models.memory_geometry import group_latents, sightings
+from pewm_jax.readers.geometry import group_latents, sightings
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
 

@@ -13,11 +13,12 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax import tree, weights
 from pewm_jax.config import EncoderSettings, UserError
 from pewm_jax.data.dataset import EpisodeSource, write_json
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.progress import Meter
+from pewm_jax.encoders import interface as encoders
+from pewm_jax.io import tree, weights
 from pewm_jax.memory.feature_cache import (
     MANIFEST,
     TENSOR,
@@ -30,8 +31,7 @@ from pewm_jax.memory.feature_cache import (
     read_json,
     refuse_stale,
 )
-from pewm_jax.models import encoders
-from pewm_jax.models.signals import signal_from_rgb
+from pewm_jax.nn.signals import signal_from_rgb
 from pewm_jax.types import Array, Params
 
 

@@ -18,11 +18,12 @@ from typing import Any, Literal
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax import tensor_files, tree
-from pewm_jax.config import EncoderSettings, UserError, kinds
+from pewm_jax import registry as kinds
+from pewm_jax.config import EncoderSettings, UserError
 from pewm_jax.data.dataset import Manifest, read_manifest
 from pewm_jax.data.episodes import Episode
-from pewm_jax.models import encoders
+from pewm_jax.encoders import interface as encoders
+from pewm_jax.io import tensor_files, tree
 from pewm_jax.types import Params
 
 MANIFEST = "cache.json"

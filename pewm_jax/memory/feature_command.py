@@ -17,7 +17,7 @@ from pewm_jax.config import (
 from pewm_jax.data import dataset
 from pewm_jax.memory import feature_build
 from pewm_jax.memory.feature_cache import Dtype
-from pewm_jax.models import dinov2
+from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.types import Params
 
 

@@ -33,9 +33,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import ModelConfig, UserError, functions, kinds
+from pewm_jax import registry as kinds
+from pewm_jax.codecs import interface as codecs
+from pewm_jax.config import ModelConfig, UserError, functions
+from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import rendering, views
-from pewm_jax.models import codecs, encoders
 from pewm_jax.types import Array, Camera, EncodedView, Frames, MapTokens, Params, Sight, View
 
 Memory: TypeAlias = Any

@@ -15,10 +15,10 @@ from typing import Literal
 
 import numpy as np
 
-from pewm_jax import atomic
 from pewm_jax.config import MemorySettings, UserError
+from pewm_jax.encoders import interface as encoders
+from pewm_jax.io import atomic
 from pewm_jax.memory import voxel_core
-from pewm_jax.models import encoders
 from pewm_jax.types import Array, VoxelMap
 
 FILLED = 0.9

@@ -8,8 +8,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax import weights
 from pewm_jax.config import MemorySettings, UserError
+from pewm_jax.io import weights
 from pewm_jax.memory import voxel_cells
 from pewm_jax.types import VoxelMap
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from pewm_jax import worlds
 from pewm_jax.config import Config, UserError, WorldSettings
-from pewm_jax.config.errors import require
+from pewm_jax.errors import require
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.types import Array, Frames, Params, WorldState
 from pewm_jax.worlds.checks import check_control

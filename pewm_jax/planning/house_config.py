@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pewm_jax.config import ActionConfig, ConfigError
-from pewm_jax.config.errors import require
+from pewm_jax.errors import require
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 from pewm_jax import worlds
 from pewm_jax.config import Config, WorldSettings
 from pewm_jax.geometry.actions import heading
-from pewm_jax.models.signals import rgb_from_signal
+from pewm_jax.nn.signals import rgb_from_signal
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds.checks import as_array
 

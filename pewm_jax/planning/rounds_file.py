@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax import atomic
 from pewm_jax.config import UserError
+from pewm_jax.io import atomic
 from pewm_jax.planning.planners import Search
 from pewm_jax.planning.settings import PlanConfig, Planner
 from pewm_jax.types import Array

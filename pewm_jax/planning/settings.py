@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import TypeAlias
 
-from pewm_jax.config.errors import require, require_positive
+from pewm_jax.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)

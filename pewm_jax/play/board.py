@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pewm_jax.evaluation.pictures import as_bytes, write
 from pewm_jax.play import places
 from pewm_jax.play.engine import Engine
 from pewm_jax.play.session import Session, pose
+from pewm_jax.report.pictures import as_bytes, write
 from pewm_jax.types import Camera
 
 DARK, TILE, LIGHT, QUIET, ACCENT = (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pewm_jax.evaluation.video import Film
+from pewm_jax.report.video import Film
 
 FPS = 6
 """Steps shown a second."""

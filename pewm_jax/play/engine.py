@@ -15,7 +15,7 @@ import numpy as np
 
 from pewm_jax import worlds
 from pewm_jax.config import Config, ModelConfig, UserError
-from pewm_jax.config.errors import require
+from pewm_jax.errors import require
 from pewm_jax.memory import memories, views
 from pewm_jax.types import Array, Frames, Params, WorldState
 

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax import tree, weights
 from pewm_jax.config import UserError, serialize
-from pewm_jax.config.errors import require
+from pewm_jax.errors import require
+from pewm_jax.io import tree, weights
 from pewm_jax.play.engine import Engine
 from pewm_jax.types import WorldState
 

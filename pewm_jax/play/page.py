@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.config import ActionConfig
-from pewm_jax.evaluation.pictures import as_bytes
 from pewm_jax.play import board, picking, requests, serving, session, status
 from pewm_jax.play.driver import Driver
 from pewm_jax.play.extra import viser
@@ -25,6 +24,7 @@ from pewm_jax.play.files_panel import FilesPanel
 from pewm_jax.play.map_view import MapView, eye_of
 from pewm_jax.play.requests import Request, Shown
 from pewm_jax.play.settings import Serve, Start
+from pewm_jax.report.pictures import as_bytes
 
 VIEW_WIDTH, PANEL_WIDTH = 540, 310
 """Widths of the pictures and of the controls, pixels."""

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Literal
 
-from pewm_jax.config.errors import require
+from pewm_jax.errors import require
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 """Hosts that only this machine reaches."""

@@ -26,7 +26,7 @@ import numpy as np
 
 from pewm_jax import worlds
 from pewm_jax.config import ActionConfig, Config, NomadConfig, UserError
-from pewm_jax.evaluation.reproject import ReprojectSettings, reproject
+from pewm_jax.eval.reproject import ReprojectSettings, reproject
 from pewm_jax.geometry.actions import continuous, integrate
 from pewm_jax.planning import nomad_policy
 from pewm_jax.planning.candidates import Imagination, Judged, Rollout

@@ -7,8 +7,8 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from pewm_jax import atomic
 from pewm_jax.config import UserError
+from pewm_jax.io import atomic
 
 SETTINGS = "settings.json"
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax import atomic
-from pewm_jax.evaluation import pictures
+from pewm_jax.io import atomic
 from pewm_jax.planning.practice import Walk
+from pewm_jax.report import pictures
 from pewm_jax.studies.table2_page import cell, table
 
 COLUMNS: Mapping[str, tuple[str, int]] = {

@@ -17,19 +17,19 @@ import jax
 import numpy as np
 
 from pewm_jax.config import ActionConfig, Config
-from pewm_jax.config.errors import require
 from pewm_jax.data import unfinished
 from pewm_jax.data.dataset import EpisodeSource, describe_shard, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.navigation import line_is_free
-from pewm_jax.evaluation.opened import Opened
+from pewm_jax.errors import require
+from pewm_jax.eval.loaded_run import Opened
 from pewm_jax.geometry.actions import FORWARD, discrete_table
 from pewm_jax.planning import practice, scores
 from pewm_jax.planning.practice import Act, Imagined, Place, Practice, Real, Walk
 from pewm_jax.studies import goals
 from pewm_jax.studies.goals import Goal
 from pewm_jax.studies.policies import OpenedPolicy, open_policy
-from pewm_jax.training import loop
+from pewm_jax.train import loop
 
 CHANCE, BEFORE, REAL, MEMORY, EMPTY = "chance", "before", "real", "memory", "empty"
 LEARNED = (MEMORY, EMPTY, REAL)

@@ -17,13 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax import atomic, shipped
+from pewm_jax import shipped
 from pewm_jax.config import Config
 from pewm_jax.data.dataset import MANIFEST
-from pewm_jax.evaluation.protocol import file_hash
+from pewm_jax.eval.protocol import file_hash
+from pewm_jax.io import atomic
 from pewm_jax.studies.rows import Row
 from pewm_jax.studies.trainings import Study, backbone_of, settings
-from pewm_jax.training.runs import WEIGHTS, identity
+from pewm_jax.train.runs import WEIGHTS, identity
 
 FOLDER = "recorded"
 VERSION = 1

@@ -32,7 +32,8 @@ from pewm_jax.config import (
     UserError,
     VoxelConfig,
 )
-from pewm_jax.models import dinov2, world_model
+from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.worlds import world_model
 
 POINTS, SURFELS = (0.4, 4), (0.12, 24)
 """Size of a cell over the shortest side of a voxel, and capacity over that of voxels."""

@@ -20,21 +20,21 @@ import numpy as np
 from pewm_jax.config import Config, to_dict
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.progress import Meter
-from pewm_jax.evaluation import protocol_file
-from pewm_jax.evaluation.fixed import Protocol, decide, lay
-from pewm_jax.evaluation.imagine import Imagination, copy_last
-from pewm_jax.evaluation.metrics import load_all
-from pewm_jax.evaluation.metrics.revisits import ways
-from pewm_jax.evaluation.partial import Partials
-from pewm_jax.evaluation.protocol import file_hash
-from pewm_jax.evaluation.reproject import reproject_batch
-from pewm_jax.evaluation.reproject_choice import ReprojectChoice, choose_settings
-from pewm_jax.evaluation.scoring import Batch, load_batch
+from pewm_jax.eval import protocol_file
+from pewm_jax.eval.fixed import Protocol, decide, lay
+from pewm_jax.eval.imagine import Imagination, copy_last
+from pewm_jax.eval.metrics import load_all
+from pewm_jax.eval.metrics.revisits import ways
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import file_hash
+from pewm_jax.eval.reproject import reproject_batch
+from pewm_jax.eval.reproject_choice import ReprojectChoice, choose_settings
+from pewm_jax.eval.scoring import Batch, load_batch
 from pewm_jax.geometry.actions import there_and_back
-from pewm_jax.models.lpips import LEAST
-from pewm_jax.rollouts import load_finished
-from pewm_jax.training.runs import WEIGHTS
+from pewm_jax.models.lpips.model import LEAST
+from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.types import Camera, Frames
+from pewm_jax.worlds.rollouts import load_finished
 
 NETWORKS = ("lpips_alex", "fvd", "kvd", "src[alex]", "dreamsim")
 """Measures that need weights; those that are not at hand are left out, and said."""

@@ -15,16 +15,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pewm_jax import atomic
 from pewm_jax.config import Config, ModelConfig, UserError
-from pewm_jax.evaluation import intervals
+from pewm_jax.eval import intervals
+from pewm_jax.io import atomic
 from pewm_jax.studies import recorded, table, table_page, timing
 from pewm_jax.studies import rows as table_rows
 from pewm_jax.studies.rows import Row
 from pewm_jax.studies.scorer import BASELINES, Arrays, Scorer, open_scorer
 from pewm_jax.studies.timing import planned
 from pewm_jax.studies.trainings import Study, backbone_of, settings, train
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.worlds.pewm.world import STAGES
 
 RESULTS, HOURS = "results.json", "hours.json"
 SCHEMA = 2

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax import atomic
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.progress import Meter
-from pewm_jax.evaluation import intervals
-from pewm_jax.evaluation.opened import Opened, open_run, remembers
+from pewm_jax.eval import intervals
+from pewm_jax.eval.loaded_run import Opened, open_run, remembers
+from pewm_jax.io import atomic
 from pewm_jax.planning import scores
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.settings import PlanConfig

@@ -13,10 +13,11 @@ import jax
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pewm_jax import atomic, worlds
+from pewm_jax import worlds
 from pewm_jax.config import Config
-from pewm_jax.evaluation import pictures
-from pewm_jax.evaluation.video import encode_h264, side_by_side
+from pewm_jax.io import atomic
+from pewm_jax.report import pictures
+from pewm_jax.report.video import encode_h264, side_by_side
 from pewm_jax.studies.goals import Goal
 from pewm_jax.types import Params
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pewm_jax.evaluation import pictures
+from pewm_jax.report import pictures
 from pewm_jax.studies.table import LOWER
 from pewm_jax.studies.table_cells import (
     PLACES,

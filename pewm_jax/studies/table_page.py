@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pewm_jax import atomic
-from pewm_jax.evaluation import pictures
+from pewm_jax.io import atomic
+from pewm_jax.report import pictures
 from pewm_jax.studies.rows import CONTROL, PAPER_FORM
 from pewm_jax.studies.table import GAP, LOWER, SETS
 from pewm_jax.studies.table_cells import (

@@ -20,15 +20,15 @@ from typing import Any
 
 import jax
 
-from pewm_jax import atomic
 from pewm_jax import config as configuration
 from pewm_jax.config import ModelConfig, UserError
 from pewm_jax.data import loader
+from pewm_jax.io import atomic
 from pewm_jax.studies.rows import Row
 from pewm_jax.studies.trainings import Say, Study, backbone_of, settings
-from pewm_jax.training import sharding
-from pewm_jax.training.step import compile_step, initial_state, noise_key
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.train import sharding
+from pewm_jax.train.step import compile_step, initial_state, noise_key
+from pewm_jax.worlds.pewm.world import STAGES
 
 ROUNDS = 7
 """Steps of each training that are timed, in turn; one more before them is not."""

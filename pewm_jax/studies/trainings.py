@@ -16,17 +16,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pewm_jax import atomic, shipped, weights
 from pewm_jax import config as configuration
+from pewm_jax import shipped
 from pewm_jax.config import Config, NoMemoryConfig, StageConfig, UserError
-from pewm_jax.config.errors import require
 from pewm_jax.data.dataset import MANIFEST
-from pewm_jax.evaluation.protocol import file_hash
-from pewm_jax.models import dinov2
+from pewm_jax.errors import require
+from pewm_jax.eval.protocol import file_hash
+from pewm_jax.io import atomic, weights
+from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.studies.rows import Row
-from pewm_jax.training import loop
-from pewm_jax.training.runs import WEIGHTS
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.train import loop
+from pewm_jax.train.runs import WEIGHTS
+from pewm_jax.worlds.pewm.world import STAGES
 
 CODEC, MADE_FROM = "codec", "made_from.json"
 Say = Callable[[str], Any]

@@ -23,11 +23,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ModelConfig, UserError
 from pewm_jax.diffusion import noise as noises
 from pewm_jax.memory import memories
-from pewm_jax.models import codecs, world_model
 from pewm_jax.types import Array, Control, Frames, Params, Sight, View
+from pewm_jax.worlds import world_model
 
 
 def first_frames(

@@ -14,11 +14,13 @@ from typing import Any, NoReturn
 import jax
 import jax.numpy as jnp
 
+from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings, UserError
 from pewm_jax.geometry import holes
-from pewm_jax.models import learned_codec, lpips, lpips_weights
-from pewm_jax.models.costs import Costs, Product, Share
-from pewm_jax.models.signals import as_signal, depth_from_signal, signal_from_depth
+from pewm_jax.models.lpips import model as lpips
+from pewm_jax.models.lpips import weights as lpips_weights
+from pewm_jax.nn.costs import Costs, Product, Share
+from pewm_jax.nn.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.codec_gate import macs, mix
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage

@@ -6,7 +6,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from pewm_jax.config import ModelConfig, UserError, kinds
+from pewm_jax import registry as kinds
+from pewm_jax.config import ModelConfig, UserError
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.types import Array, Camera, Control
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from pewm_jax.config import Config, functions
-from pewm_jax.models.costs import Costs, Product, Share
+from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.worlds.stages import Stage
 
 WHOLE_CLIP = Share()

@@ -23,9 +23,9 @@ from pewm_jax.config import (
 )
 from pewm_jax.diffusion import squared_cosine
 from pewm_jax.geometry import actions, cameras
-from pewm_jax.models import nomad
-from pewm_jax.models.costs import Costs, Product, Share
-from pewm_jax.models.signals import as_signal
+from pewm_jax.models.nomad import model as nomad
+from pewm_jax.nn.costs import Costs, Product, Share
+from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.stages import TRAIN, Stage
 

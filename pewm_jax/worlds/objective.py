@@ -8,13 +8,15 @@ import functools
 import jax
 import jax.numpy as jnp
 
+from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ModelConfig, TrainSettings
 from pewm_jax.diffusion import noise as noises
+from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import memories
-from pewm_jax.models import codecs, encoders, placement, world_model
-from pewm_jax.models.signals import as_signal, signal_from_rgb
+from pewm_jax.nn import placement
+from pewm_jax.nn.signals import as_signal, signal_from_rgb
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, Params, Sight
-from pewm_jax.worlds import chained
+from pewm_jax.worlds import chained, world_model
 from pewm_jax.worlds.control import require_actions
 
 BROAD = 8

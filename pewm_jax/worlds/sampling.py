@@ -6,8 +6,9 @@ import jax
 
 from pewm_jax.config import ModelConfig
 from pewm_jax.diffusion import noise as noises
-from pewm_jax.models import backbones, world_model
+from pewm_jax.models import interface as backbones
 from pewm_jax.types import Array, Params, Sight
+from pewm_jax.worlds import world_model
 
 
 def draw(

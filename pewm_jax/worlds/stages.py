@@ -12,8 +12,8 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from pewm_jax import tree
 from pewm_jax.config import Config, StageConfig
+from pewm_jax.io import tree
 from pewm_jax.types import Array, Clip, Params
 
 TRAIN, FREEZE = "train", "freeze"
@@ -31,7 +31,7 @@ class Stage:
         name: names its settings (``train.NAME``), folders and log entries.
         number: its place among the world's stages, from 1; seeds its weights, noise and data order.
         rules: (pattern, ``TRAIN`` or ``FREEZE``) over parameter paths, the first match wins (see
-            ``pewm_jax.tree``); a leaf that none matches is an error.
+            ``pewm_jax.io.tree``); a leaf that none matches is an error.
         init: ``init(model, key) -> params``, all the parameters that the stage needs.
         loss: what it minimises.
         memory: whether it reads the clips' context, and so may use cached image features.

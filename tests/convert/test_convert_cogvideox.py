@@ -21,13 +21,16 @@ from transformers import AutoTokenizer, T5EncoderModel
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import presets, tensor_files, weights
+from pewm_jax import presets
+from pewm_jax.cli.convert import main
 from pewm_jax.config import published
 from pewm_jax.convert import assemble, base, cogvideox, mapping, sources, widen, world
-from pewm_jax.convert.__main__ import main
-from pewm_jax.models import dit, readers, world_model
-from pewm_jax.models.backbones import Conditioning
+from pewm_jax.io import tensor_files, weights
+from pewm_jax.models.cogvideox import model as dit
+from pewm_jax.models.interface import Conditioning
+from pewm_jax.readers import interface as readers
 from pewm_jax.types import Camera, MapTokens, Sight
+from pewm_jax.worlds import world_model
 
 WORLD = ["--rgbd", "--camera", "--memory", "--frames", "9", "--height", "32", "--width", "32"]
 

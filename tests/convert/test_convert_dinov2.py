@@ -10,7 +10,7 @@ from safetensors.numpy import save_file
 
 from pewm_jax.config import DINOv2Config, UserError
 from pewm_jax.convert import assemble, dinov2
-from pewm_jax.models import dinov2 as model
+from pewm_jax.models.dinov2 import model
 
 CONFIG = DINOv2Config(layers=2, heads=1, width=64, pretrained_size=28, registers=2, antialias=True)
 SETTINGS = {

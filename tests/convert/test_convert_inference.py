@@ -9,13 +9,14 @@ import pytest
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import tree, weights, worlds
+from pewm_jax import worlds
 from pewm_jax.config import ClipConfig, DDPMConfig, UserError
 from pewm_jax.convert import inference
-from pewm_jax.evaluation.protocol import file_hash
-from pewm_jax.evaluation.words import MASK_NAMES, METHOD_NAMES, METRIC_NAMES
-from pewm_jax.models import world_model
-from pewm_jax.training import runs
+from pewm_jax.eval.protocol import file_hash
+from pewm_jax.io import tree, weights
+from pewm_jax.report.labels import MASK_NAMES, METHOD_NAMES, METRIC_NAMES
+from pewm_jax.train import runs
+from pewm_jax.worlds import world_model
 from tests.helpers import random_frames, tiny_config
 
 CONFIG = tiny_config(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pewm_jax.convert.__main__ import COMMANDS, main
+from pewm_jax.cli.convert import COMMANDS, main
 
 WEIGHTS = "diffusion_pytorch_model"
 INDEX = f"{WEIGHTS}.safetensors.index.json"
@@ -286,7 +286,7 @@ def test_the_help_explains_every_command(capsys):
 
 
 def test_a_bfloat16_file_of_another_writer_is_read(tmp_path):
-    from pewm_jax import weights
+    from pewm_jax.io import weights
 
     values = np.linspace(-3, 3, 7).astype(ml_dtypes.bfloat16)
     safetensors.numpy.save_file({"a/b": values}, tmp_path / "w")

@@ -12,11 +12,12 @@ import pytest
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import tree, worlds
+from pewm_jax import worlds
 from pewm_jax.config import AttentionConfig, ClipConfig, DDPMConfig, UserError, VoxelConfig
 from pewm_jax.convert import stablehlo, stablehlo_programs
-from pewm_jax.models import world_model
-from pewm_jax.training import runs
+from pewm_jax.io import tree
+from pewm_jax.train import runs
+from pewm_jax.worlds import world_model
 from tests.helpers import random_frames, tiny_config
 
 CONFIG = tiny_config(

@@ -13,11 +13,12 @@ from diffusers import (
 from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
 import pewm_jax
-from pewm_jax import tree, worlds
+from pewm_jax import worlds
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.convert import commands, svd, svd_unet, svd_vae
 from pewm_jax.convert.options import ImportSVD
-from pewm_jax.training import starting
+from pewm_jax.io import tree
+from pewm_jax.train import starting
 from tests.helpers import random_frames
 
 UNET = {

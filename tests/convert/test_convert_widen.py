@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pewm_jax.config import DiTConfig, UserError
 from pewm_jax.convert import widen
-from pewm_jax.models import patches
+from pewm_jax.nn import patches
 
 
 def build(patch, patch_t, latents, *, image):

@@ -12,7 +12,7 @@ import cv2
 import pytest
 from data_world import split
 
-from pewm_jax.data.__main__ import COMMANDS, main
+from pewm_jax.cli.data import COMMANDS, main
 from pewm_jax.data.progress import Meter
 from pewm_jax.data.validate import Verdict
 from pewm_jax.presets.demo import config as demo

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pewm_jax.data.__main__ import main
+from pewm_jax.cli.data import main
 from pewm_jax.data.consistency import share_floating
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry.cameras import unproject

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from pewm_jax.cli.data import main
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data import engines
-from pewm_jax.data.__main__ import main
 from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.engines import Job

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from test_data_import import config as import_config
 from test_data_import import record
 
+from pewm_jax.cli.data import main
 from pewm_jax.config import ConfigError, DataConfig, UserError
 from pewm_jax.data import clips, loader
-from pewm_jax.data.__main__ import main
 from pewm_jax.data.checks import check_episode
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode, write_episode

@@ -7,10 +7,10 @@ import pytest
 
 from pewm_jax.config import ConfigError, DDPMConfig, TrainConfig
 from pewm_jax.diffusion import sampler, schedule
-from pewm_jax.models import world_model
-from pewm_jax.models.signals import as_signal
+from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Clip, Control
-from pewm_jax.worlds import objective, pewm
+from pewm_jax.worlds import objective, world_model
+from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import TINY, init_world, random_frames, randomise, tiny_model
 
 

@@ -10,14 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import (
-    DDPMConfig,
-    EDMConfig,
-    FlowConfig,
-    FrameFlowConfig,
-    TrainConfig,
-    kinds,
-)
+from pewm_jax import registry as kinds
+from pewm_jax.config import DDPMConfig, EDMConfig, FlowConfig, FrameFlowConfig, TrainConfig
 from pewm_jax.diffusion import flow, noise
 from pewm_jax.worlds import objective
 from tests.diffusion.test_diffusion import make_clip

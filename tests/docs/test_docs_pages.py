@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from docs.generate import code, links, pages
-from pewm_jax import cli
-from pewm_jax.commands.main import COMMANDS
-from pewm_jax.commands.main import main as pewm
+from pewm_jax.cli.main import COMMANDS
+from pewm_jax.cli.main import main as pewm
+from pewm_jax.config import command_line as cli
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted(ROOT.glob("notebooks/*.ipynb"))
@@ -305,12 +305,13 @@ def test_a_notebook_becomes_a_page_with_its_pictures():
 
 def test_links_are_moved_to_the_site():
     text = (
-        "[a](../README.md) [b](../pewm_jax/worlds/pewm.py) [c](play.md#driving) [d](../Makefile)\n"
+        "[a](../README.md) [b](../pewm_jax/worlds/pewm/world.py) [c](play.md#driving) "
+        "[d](../Makefile)\n"
         "```\n[e](../README.md)\n```"
     )
     moved = links.moved("docs/x.md", "x.md", text)
     assert "[a](index.md)" in moved
-    assert "[b](reference/worlds.md#pewm_jax.worlds.pewm)" in moved
+    assert "[b](reference/worlds.md#pewm_jax.worlds.pewm.world)" in moved
     assert "[c](play.md#driving) d\n" in moved
     assert "[e](../README.md)" in moved
     assert "(../planning.md)" in links.moved(

@@ -12,20 +12,20 @@ from pathlib import Path
 import numpy as np
 from evaluation_scene import knowing_rollout, tiny
 
-from pewm_jax import cli
 from pewm_jax.config import Join
+from pewm_jax.config import command_line as cli
 
 
 def score(folder, devices):
     """Return all scores of a model that knows the room, as arrays by name."""
     from pewm_jax.data.dataset import EpisodeSource
-    from pewm_jax.evaluation import imagine
-    from pewm_jax.evaluation.long_rollouts import roll_long
-    from pewm_jax.evaluation.methods import Methods
-    from pewm_jax.evaluation.partial import Partials
-    from pewm_jax.evaluation.reproject import ReprojectSettings
-    from pewm_jax.evaluation.scoring import score_table
-    from pewm_jax.evaluation.shares import first_alone
+    from pewm_jax.eval import imagine
+    from pewm_jax.eval.long_rollouts import roll_long
+    from pewm_jax.eval.methods import Methods
+    from pewm_jax.eval.partial import Partials
+    from pewm_jax.eval.reproject import ReprojectSettings
+    from pewm_jax.eval.scoring import score_table
+    from pewm_jax.eval.shares import first_alone
 
     config = tiny(folder, batch=4, clips=6)
     episodes = EpisodeSource(folder / "data" / "revisit")
@@ -46,7 +46,7 @@ def score(folder, devices):
 def main(argv):
     """Join, score, and write."""
     join, (folder,) = cli.take(Join, argv)
-    from pewm_jax.training import processes
+    from pewm_jax.train import processes
 
     with processes.joined(join):
         import jax

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import Config, PersistTrainConfig, UserError
-from pewm_jax.evaluation import edit_trials
+from pewm_jax.eval import edit_trials
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.types import Camera, Frames, WorldState
-from pewm_jax.worlds import persist
+from pewm_jax.worlds.persist import world as persist
 from tests.persist_world import MODEL
 
 FRAMES = 5

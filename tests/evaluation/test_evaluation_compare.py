@@ -13,15 +13,15 @@ from evaluation_scene import tiny
 from PIL import Image
 from test_evaluation_statistics import sums_of
 
-from pewm_jax import cli
 from pewm_jax import config as configs
-from pewm_jax.commands import compare as command
+from pewm_jax.cli import compare as command
 from pewm_jax.config import UserError
-from pewm_jax.evaluation import compare, protocol_file, samples
-from pewm_jax.evaluation.fixed import ClipKey, EpisodeKey, Protocol
-from pewm_jax.evaluation.long_rollouts import LongRollouts
-from pewm_jax.evaluation.protocol import ClipChoice
-from pewm_jax.evaluation.scoring import Scored
+from pewm_jax.config import command_line as cli
+from pewm_jax.eval import compare, protocol_file, samples
+from pewm_jax.eval.fixed import ClipKey, EpisodeKey, Protocol
+from pewm_jax.eval.long_rollouts import LongRollouts
+from pewm_jax.eval.protocol import ClipChoice
+from pewm_jax.eval.scoring import Scored
 
 CLIPS, FRAMES, LONG = 12, 4, 8
 

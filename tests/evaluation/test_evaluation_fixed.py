@@ -12,8 +12,8 @@ from evaluation_scene import record, tiny, write_split
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.evaluation import fixed, protocol_file
-from pewm_jax.evaluation.protocol import choose, long_choices
+from pewm_jax.eval import fixed, protocol_file
+from pewm_jax.eval.protocol import choose, long_choices
 
 
 @pytest.fixture(scope="module")

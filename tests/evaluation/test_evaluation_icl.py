@@ -10,10 +10,11 @@ from evaluation_scene import tiny
 
 import pewm_jax
 from pewm_jax import config as configs
-from pewm_jax import weights, worlds
-from pewm_jax.data.__main__ import main
+from pewm_jax import worlds
+from pewm_jax.cli.data import main
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.evaluation import report
+from pewm_jax.eval import report
+from pewm_jax.io import weights
 
 RECORDING = Path(__file__).parents[3] / "shared" / "data" / "icl_livingroom"
 FLAGS = ["--intrinsics", "525", "525", "319.5", "239.5", "--stride", "8", "--size", "16", "16"]

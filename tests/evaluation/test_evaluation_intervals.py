@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import stats
 from test_evaluation_statistics import sums_of
 
-from pewm_jax.evaluation import intervals
-from pewm_jax.evaluation.intervals import (
+from pewm_jax.eval import intervals
+from pewm_jax.eval.intervals import (
     DRAWS,
     SEED,
     entry,

@@ -7,14 +7,15 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax import weights
 from pewm_jax.config import UserError
-from pewm_jax.evaluation import metrics
-from pewm_jax.evaluation.images import MASKS, SUMS, with_lpips
-from pewm_jax.evaluation.metrics import perceptual
-from pewm_jax.evaluation.statistics import margins, per_frame, table
-from pewm_jax.evaluation.words import perceived
-from pewm_jax.models import lpips, lpips_weights
+from pewm_jax.eval import metrics
+from pewm_jax.eval.images import MASKS, SUMS, with_lpips
+from pewm_jax.eval.metrics import perceptual
+from pewm_jax.eval.statistics import margins, per_frame, table
+from pewm_jax.io import weights
+from pewm_jax.models.lpips import model as lpips
+from pewm_jax.models.lpips import weights as lpips_weights
+from pewm_jax.report.labels import perceived
 
 HIGHER = ("psnr", "ssim")
 

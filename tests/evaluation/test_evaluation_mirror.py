@@ -11,17 +11,17 @@ from evaluation_scene import knowing_rollout, tiny, write_split
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.evaluation import imagine, measure, mirror
-from pewm_jax.evaluation.imagine import Imagination
-from pewm_jax.evaluation.long_rollouts import LongRollouts
-from pewm_jax.evaluation.methods import Methods
-from pewm_jax.evaluation.metrics import VideoDistance, chosen
-from pewm_jax.evaluation.partial import Partials
-from pewm_jax.evaluation.protocol import long_choices
-from pewm_jax.evaluation.reproject import ReprojectSettings
-from pewm_jax.evaluation.scoring import Scored, score_table
+from pewm_jax.eval import imagine, measure, mirror
+from pewm_jax.eval.imagine import Imagination
+from pewm_jax.eval.long_rollouts import LongRollouts
+from pewm_jax.eval.methods import Methods
+from pewm_jax.eval.metrics import VideoDistance, chosen
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import long_choices
+from pewm_jax.eval.reproject import ReprojectSettings
+from pewm_jax.eval.scoring import Scored, score_table
 from pewm_jax.geometry.actions import integrate
-from pewm_jax.models import i3d_weights
+from pewm_jax.models.i3d import weights as i3d_weights
 
 SAMPLED = {"memory", "empty"}
 

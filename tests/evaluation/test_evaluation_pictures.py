@@ -15,17 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from pewm_jax.evaluation.pictures import (
-    as_bytes,
-    depth_colours,
-    dim,
-    from_above,
-    grid,
-    png,
-    save_png,
-)
-from pewm_jax.evaluation.plots import Line, chart, ticks
-from pewm_jax.evaluation.video import encode_h264, side_by_side
+from pewm_jax.report.pictures import as_bytes, depth_colours, dim, from_above, grid, png, save_png
+from pewm_jax.report.plots import Line, chart, ticks
+from pewm_jax.report.video import encode_h264, side_by_side
 
 
 def plain(value, size=8):
@@ -47,7 +39,7 @@ def test_video_is_h264_with_every_frame_in_order():
 
 ENCODE = """
 import hashlib, numpy as np
-from pewm_jax.evaluation.video import encode_h264
+from pewm_jax.report.video import encode_h264
 noise = np.random.default_rng(0).integers(0, 255, (12, 15, 20, 3)).astype(np.uint8)
 film = encode_h264([picture.repeat(8, 0).repeat(8, 1) for picture in noise])
 print(hashlib.sha256(film).hexdigest())

@@ -13,7 +13,7 @@ import pytest
 from evaluation_processes import score
 from evaluation_scene import write_split
 
-from pewm_jax.evaluation import imagine, shares
+from pewm_jax.eval import imagine, shares
 
 HERE = Path(__file__).parent
 SCRIPT = str(HERE / "evaluation_processes.py")

@@ -23,7 +23,7 @@ from pewm_jax.config import (
 )
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.evaluation.protocol import (
+from pewm_jax.eval.protocol import (
     choose,
     context_frames,
     file_hash,
@@ -32,7 +32,7 @@ from pewm_jax.evaluation.protocol import (
     stack,
     way_back,
 )
-from pewm_jax.evaluation.reproject import CANDIDATES, reproject
+from pewm_jax.eval.reproject import CANDIDATES, reproject
 from pewm_jax.geometry.actions import integrate
 
 

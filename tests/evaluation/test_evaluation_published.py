@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pewm_jax import weights
-from pewm_jax.evaluation import metrics
-from pewm_jax.evaluation.metrics import Revisit, VideoDistance
+from pewm_jax.eval import metrics
+from pewm_jax.eval.metrics import Revisit, VideoDistance
+from pewm_jax.io import weights
 from tests.evaluation.test_evaluation_metrics import blurred, clips, noisy
 
 WITHOUT = ("dreamsim", "src")

@@ -22,19 +22,21 @@ import pytest
 from evaluation_scene import tiny, write_split
 from PIL import Image
 
-from pewm_jax import cli, tree, weights
 from pewm_jax import config as configs
-from pewm_jax.commands import protocol as protocol_command
+from pewm_jax.cli import protocol as protocol_command
 from pewm_jax.config import StageConfig, TrainConfig, UserError
-from pewm_jax.evaluation import compare, imagine, preview, report
-from pewm_jax.evaluation import opened as runs
-from pewm_jax.evaluation.imagine import Imagination
-from pewm_jax.evaluation.methods import Methods
-from pewm_jax.evaluation.page import introduction
-from pewm_jax.evaluation.words import comparison, drifted, number, verdict
-from pewm_jax.models import lpips, world_model
+from pewm_jax.config import command_line as cli
+from pewm_jax.eval import compare, imagine, preview, report
+from pewm_jax.eval import loaded_run as runs
+from pewm_jax.eval.imagine import Imagination
+from pewm_jax.eval.methods import Methods
+from pewm_jax.io import tree, weights
+from pewm_jax.models.lpips import model as lpips
+from pewm_jax.report.labels import comparison, drifted, number, verdict
+from pewm_jax.report.page import introduction
 from pewm_jax.types import Frames
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.worlds import world_model
+from pewm_jax.worlds.pewm.world import STAGES
 
 ROOT = Path(__file__).parents[2]
 FLAT = Frames(np.zeros((1, 1, 2, 2, 3)), np.zeros((1, 1, 2, 2)), None)

@@ -12,17 +12,11 @@ from evaluation_scene import look, record, tiny, write_split
 from pewm_jax.config import ConfigError
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.evaluation import reproject_choice
-from pewm_jax.evaluation.images import unit_colours
-from pewm_jax.evaluation.partial import Partials
-from pewm_jax.evaluation.protocol import file_hash
-from pewm_jax.evaluation.reproject import (
-    CANDIDATES,
-    ReprojectSettings,
-    draw,
-    reproject,
-    reproject_batch,
-)
+from pewm_jax.eval import reproject_choice
+from pewm_jax.eval.images import unit_colours
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import file_hash
+from pewm_jax.eval.reproject import CANDIDATES, ReprojectSettings, draw, reproject, reproject_batch
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera, Frames
 

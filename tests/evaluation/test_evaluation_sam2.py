@@ -9,8 +9,8 @@ import torch
 import transformers
 
 from pewm_jax.config import UserError
-from pewm_jax.evaluation.metrics import chosen, sam2
-from pewm_jax.evaluation.metrics.structure import structural_consistency
+from pewm_jax.eval.metrics import chosen, sam2
+from pewm_jax.eval.metrics.structure import structural_consistency
 
 SIDE, WIDTH = 64, 128
 

@@ -11,15 +11,15 @@ from evaluation_scene import knowing_rollout, record, tiny, write_split
 
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.evaluation import imagine, long_rollouts, scoring
-from pewm_jax.evaluation.imagine import Imagination
-from pewm_jax.evaluation.measure import structure
-from pewm_jax.evaluation.methods import Methods
-from pewm_jax.evaluation.metrics.structure import Consistency, average, first_visible, overlaps
-from pewm_jax.evaluation.partial import Partials
-from pewm_jax.evaluation.protocol import choose
-from pewm_jax.evaluation.reproject import ReprojectSettings
-from pewm_jax.evaluation.statistics import margin, table
+from pewm_jax.eval import imagine, long_rollouts, scoring
+from pewm_jax.eval.imagine import Imagination
+from pewm_jax.eval.measure import structure
+from pewm_jax.eval.methods import Methods
+from pewm_jax.eval.metrics.structure import Consistency, average, first_visible, overlaps
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import choose
+from pewm_jax.eval.reproject import ReprojectSettings
+from pewm_jax.eval.statistics import margin, table
 
 PARAMS = {"offset": np.float32(0)}
 

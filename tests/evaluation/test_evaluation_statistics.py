@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.evaluation.images import MASKS, SUMS
-from pewm_jax.evaluation.statistics import (
+from pewm_jax.eval.images import MASKS, SUMS
+from pewm_jax.eval.statistics import (
     METRICS,
     drift,
     margin,

@@ -8,18 +8,14 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import Config, EgoWMConfig, EgoWMTrainConfig, UserError
-from pewm_jax.evaluation import page_tables, steering
-from pewm_jax.evaluation.partial import Partials
-from pewm_jax.evaluation.protocol import choose
-from pewm_jax.evaluation.steering import (
-    Walks,
-    choose_walks,
-    different_steps,
-    forward_steps,
-)
-from pewm_jax.evaluation.words import ACTIONS_NAMES, followed
+from pewm_jax.eval import steering
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import choose
+from pewm_jax.eval.steering import Walks, choose_walks, different_steps, forward_steps
 from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT, discrete_table, integrate
 from pewm_jax.geometry.cameras import pose_from_yaw
+from pewm_jax.report import page_tables
+from pewm_jax.report.labels import ACTIONS_NAMES, followed
 from pewm_jax.types import Frames
 from tests.helpers import tiny_config
 

@@ -11,8 +11,8 @@ from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, house_seed, make_episode
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
-from pewm_jax.evaluation.metrics import structure
-from pewm_jax.evaluation.metrics.structure import (
+from pewm_jax.eval.metrics import structure
+from pewm_jax.eval.metrics.structure import (
     average,
     first_visible,
     frames_in_view,

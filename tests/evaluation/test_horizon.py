@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pewm_jax.cli import ConfigError
-from pewm_jax.commands import horizon as command
+from pewm_jax.cli import horizon as command
 from pewm_jax.config import UserError, VoxelVAEConfig
-from pewm_jax.evaluation import edit_trials, horizon, horizon_page, voxel_score
-from pewm_jax.models import voxel_vae
+from pewm_jax.config.command_line import ConfigError
+from pewm_jax.eval import edit_trials, horizon, voxel_score
+from pewm_jax.models.persist import voxel_vae
+from pewm_jax.report import horizon_page
 
 
 def test_stretches_are_of_their_frames_alone():

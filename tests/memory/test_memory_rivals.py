@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pewm_jax import registry as kinds
 from pewm_jax.config import (
     ConfigError,
     ImagesConfig,
@@ -20,12 +21,12 @@ from pewm_jax.config import (
     PointsConfig,
     SurfelConfig,
     VoxelConfig,
-    kinds,
 )
+from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import cells, images, map2d, memories, points, voxel_map
-from pewm_jax.models import encoders, world_model
 from pewm_jax.types import Camera, Frames
+from pewm_jax.worlds import world_model
 from tests.helpers import TINY, random_camera, random_frames, tiny_model, with_reader
 
 KINDS = {

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
+from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import voxel_map
-from pewm_jax.models import encoders
 from pewm_jax.types import Camera, Frames
 from tests.helpers import TINY, random_frames
 

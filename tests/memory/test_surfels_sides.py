@@ -9,7 +9,7 @@ from pewm_jax.config import SurfelConfig
 from pewm_jax.geometry.cameras import pose_from_yaw
 from pewm_jax.memory import memories, rendering, surfels, views
 from pewm_jax.types import Camera, Frames, Sight, View
-from pewm_jax.worlds import pewm
+from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import random_camera, tiny_model
 
 SIZE = (16, 24)

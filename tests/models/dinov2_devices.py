@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from pewm_jax.config import DINOv2Config
-from pewm_jax.models import blocked_attention, dinov2
+from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.nn import attention as blocked_attention
 
 blocked_attention.LOGITS = 64  # a few tokens are cut like a thousand
 config = DINOv2Config(layers=2, heads=2, width=16, pretrained_size=42, registers=1)

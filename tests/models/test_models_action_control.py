@@ -16,7 +16,9 @@ from pewm_jax.config import (
     RenderConfig,
     UserError,
 )
-from pewm_jax.models import action_control, backbones, controls
+from pewm_jax.controls import actions as action_control
+from pewm_jax.controls import interface as controls
+from pewm_jax.models import interface as backbones
 from pewm_jax.types import Control
 from tests.helpers import TINY, random_camera, random_frames, randomise, tiny_model
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import UserError
-from pewm_jax.models import blocked_attention, layers
+from pewm_jax.nn import attention as blocked_attention
+from pewm_jax.nn import layers
 
 
 def inputs(batch=2, heads=3, queries=13, keys=11, channels=8):

@@ -4,8 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ClipConfig, PixelConfig
-from pewm_jax.models import codecs, signals
+from pewm_jax.nn import signals
 from tests.helpers import TINY
 
 encode = jax.jit(codecs.encode, static_argnums=0)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.models import convolution3d
+from pewm_jax.nn import convolution3d
 
 FORMS = {"whole": convolution3d.convolve, "halved": convolution3d.halved}
 

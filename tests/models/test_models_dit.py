@@ -8,9 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.config import PUBLISHED, ConfigError, DiTConfig, UserError, published
-from pewm_jax.models import dit, dit_block, layers, patches, positions, world_model
-from pewm_jax.models.token_layout import TokenLayout
+from pewm_jax.models.cogvideox import block as dit_block
+from pewm_jax.models.cogvideox import model as dit
+from pewm_jax.nn import layers, patches, positions
+from pewm_jax.nn.token_layout import TokenLayout
 from pewm_jax.types import Sight
+from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, randomise
 from tests.models.test_models_world_model import setup as world
 

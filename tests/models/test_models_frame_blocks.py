@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax import tree
 from pewm_jax.config import (
     BlocksConfig,
     CameraModelConfig,
@@ -17,8 +16,10 @@ from pewm_jax.config import (
     VoxelDiTConfig,
     VoxelRendererConfig,
 )
-from pewm_jax.models import camera_model, frame_blocks, voxel_dit, voxel_renderer
-from pewm_jax.models.costs import Share
+from pewm_jax.io import tree
+from pewm_jax.models.persist import blocks as frame_blocks
+from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer
+from pewm_jax.nn.costs import Share
 from tests.persist_nets import normal, weights
 
 BLOCKS = BlocksConfig(layers=2, heads=2, head_dim=8, mlp_ratio=2, context=3)

@@ -7,11 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.models import backbones, dit, dit_block, world_model
-from pewm_jax.models.backbones import Conditioning, Readers
-from pewm_jax.models.memory_block import MemoryBlock
-from pewm_jax.models.token_layout import TokenLayout
+from pewm_jax.models import interface as backbones
+from pewm_jax.models.cogvideox import block as dit_block
+from pewm_jax.models.cogvideox import model as dit
+from pewm_jax.models.interface import Conditioning, Readers
+from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.readers.memory_block import MemoryBlock
 from pewm_jax.types import Sight
+from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, randomise, with_reader
 from tests.models.test_models_dit import CONFIG, inputs, random_params
 from tests.models.test_models_world_model import setup as world

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax import tree, worlds
+from pewm_jax import registry as kinds
+from pewm_jax import worlds
+from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import (
     AttentionConfig,
     BothConfig,
@@ -27,14 +29,16 @@ from pewm_jax.config import (
     SurfelConfig,
     UserError,
     VoxelConfig,
-    kinds,
 )
 from pewm_jax.convert import stablehlo_programs
+from pewm_jax.encoders import interface as encoders
+from pewm_jax.io import tree
 from pewm_jax.memory import feature_cache, memories
-from pewm_jax.models import codecs, encoders, readers, world_model
-from pewm_jax.training import prepared
+from pewm_jax.readers import interface as readers
+from pewm_jax.train import prepared
 from pewm_jax.types import Clip, Control, EncodedView, Frames, Sight, View
-from pewm_jax.worlds import objective, pewm
+from pewm_jax.worlds import objective, world_model
+from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
 
 CODEC = LearnedCodecConfig(

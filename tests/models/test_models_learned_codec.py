@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.config import (
     ClipConfig,
     CodecSettings,
@@ -18,7 +20,6 @@ from pewm_jax.config import (
     from_dict,
     functions,
 )
-from pewm_jax.models import codecs, learned_codec
 from pewm_jax.worlds import objective
 from tests.helpers import init_world, random_frames, randomise, tiny_model
 

@@ -10,16 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax import rollouts, worlds
+from pewm_jax import worlds
 from pewm_jax.config import NoMemoryConfig, TrainConfig, VoxelConfig
 from pewm_jax.geometry.cameras import project
-from pewm_jax.models import world_model
-from pewm_jax.models.memory_block import MemoryBlock, masked_attention
-from pewm_jax.models.memory_geometry import sightings, sinusoid_3d
-from pewm_jax.models.signals import as_signal
-from pewm_jax.models.token_layout import TokenLayout
+from pewm_jax.nn.signals import as_signal
+from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.readers.geometry import sightings, sinusoid_3d
+from pewm_jax.readers.memory_block import MemoryBlock, masked_attention
 from pewm_jax.types import Camera, Clip, Control, Frames, MapTokens, Sight
-from pewm_jax.worlds import objective
+from pewm_jax.worlds import objective, rollouts, world_model
 from tests.helpers import TINY, random_camera, random_frames, randomise, rigid, with_reader
 
 BOTH = pytest.mark.parametrize("positions", ["projective", "sinusoid"])

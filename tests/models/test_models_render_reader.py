@@ -17,9 +17,11 @@ from pewm_jax.config import (
     VoxelConfig,
 )
 from pewm_jax.memory import memories
-from pewm_jax.models import readers, render_reader, world_model
+from pewm_jax.readers import interface as readers
+from pewm_jax.readers import render as render_reader
 from pewm_jax.types import Clip, Control, Frames, MapTokens, Sight, View
-from pewm_jax.worlds import objective, pewm
+from pewm_jax.worlds import objective, world_model
+from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
 
 READERS = {

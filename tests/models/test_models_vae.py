@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pewm_jax.config import ConfigError, UserError, VAEConfig
 from pewm_jax.convert import vae as converter
-from pewm_jax.models import vae, vae_convolution, vae_layers, vae_tiles
+from pewm_jax.models.cogvideox import vae, vae_convolution, vae_layers, vae_tiles
 from tests.helpers import randomise
 
 TINY = VAEConfig(

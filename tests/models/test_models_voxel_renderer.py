@@ -11,7 +11,7 @@ import torch
 from pewm_jax.config import BlocksConfig, UserError, VoxelRendererConfig
 from pewm_jax.geometry import cameras
 from pewm_jax.geometry.march import Layers
-from pewm_jax.models import voxel_renderer
+from pewm_jax.models.persist import voxel_renderer
 from pewm_jax.types import Camera
 from tests.persist_nets import weights
 

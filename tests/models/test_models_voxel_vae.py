@@ -10,10 +10,10 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax import tree
 from pewm_jax.config import ConfigError, UserError, VoxelVAEConfig
-from pewm_jax.models import voxel_vae, voxel_vae_shapes
-from pewm_jax.models.costs import Share
+from pewm_jax.io import tree
+from pewm_jax.models.persist import voxel_vae, voxel_vae_shapes
+from pewm_jax.nn.costs import Share
 from tests.persist_nets import weights
 
 LIKE_PUBLISHED = VoxelVAEConfig(

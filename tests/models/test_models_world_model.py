@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.models import world_model
 from pewm_jax.types import Camera, Control, Frames, MapTokens, Sight
+from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, random_camera, randomise, rigid, with_reader
 
 condition = jax.jit(world_model.condition, static_argnums=0)
@@ -108,7 +108,7 @@ def test_each_latent_frame_looks_through_its_own_cameras():
     params = randomise(init_world(model, jax.random.key(0), memory=True))
     # One memory layer and no attention between frames would be needed to read this off the
     # output, so ask the geometry: only latent frame 2 (frames 5 to 8) may change with frame 6.
-    from pewm_jax.models.memory_geometry import sightings
+    from pewm_jax.readers.geometry import sightings
 
     camera = conditioning.camera
     seen = sightings(model, model.memory.reader, camera, tokens.points_world_M3, tokens.valid_M)
@@ -123,8 +123,8 @@ def test_each_latent_frame_looks_through_its_own_cameras():
 
 
 def test_a_head_peaks_at_the_patch_a_cell_projects_into():
-    from pewm_jax.models import layers
-    from pewm_jax.models.memory_geometry import frequencies
+    from pewm_jax.nn import layers
+    from pewm_jax.readers.geometry import frequencies
 
     head_dim, grid = 16, 8
     f = frequencies(head_dim, grid)

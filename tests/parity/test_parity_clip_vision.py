@@ -13,7 +13,7 @@ from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWi
 from pewm_jax import config as configuration
 from pewm_jax.config import UserError
 from pewm_jax.convert import assemble, clip_vision, svd
-from pewm_jax.models import clip_vision as model
+from pewm_jax.models.clip import model
 from tests.parity.svd_references import distance, draw, randomise
 
 

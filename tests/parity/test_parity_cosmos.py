@@ -17,10 +17,10 @@ from diffusers.models.transformers.transformer_cosmos import (
 )
 from safetensors.numpy import load_file, save_file
 
-from pewm_jax import tree
 from pewm_jax.config import COSMOS_2B, COSMOS_14B, CosmosConfig, UserError
 from pewm_jax.convert import assemble, cosmos, cosmos_transformer
-from pewm_jax.models import cosmos as model
+from pewm_jax.io import tree
+from pewm_jax.models.cosmos import model
 from tests.parity.cosmos_references import channels_first, channels_last, transformer
 from tests.parity.svd_references import distance, draw
 

@@ -13,8 +13,8 @@ from diffusers import FlowMatchEulerDiscreteScheduler
 from pewm_jax.config import ConfigError, EDMConfig, UserError
 from pewm_jax.convert import cosmos, cosmos_scheduler
 from pewm_jax.diffusion import noise
-from pewm_jax.models import cosmos as model
-from pewm_jax.models import wan_vae
+from pewm_jax.models.cosmos import model
+from pewm_jax.models.wan import vae as wan_vae
 from tests.parity.cosmos_references import channels_first, channels_last, scheduler, small_pipeline
 from tests.parity.svd_references import distance, draw
 

@@ -14,14 +14,16 @@ from diffusers import Cosmos2VideoToWorldPipeline
 from transformers import AutoTokenizer, T5EncoderModel
 
 import pewm_jax
-from pewm_jax import tree, worlds
+from pewm_jax import worlds
+from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ConfigError, EgoWMConfig, UserError
 from pewm_jax.convert import commands, cosmos
 from pewm_jax.convert.options import ImportCosmos2
-from pewm_jax.models import backbones, codecs, world_model
-from pewm_jax.training import starting
+from pewm_jax.io import tree
+from pewm_jax.models import interface as backbones
+from pewm_jax.train import starting
 from pewm_jax.types import Camera, Control, Frames
-from pewm_jax.worlds import sampling
+from pewm_jax.worlds import sampling, world_model
 from tests.convert.convert_pipelines import save_text
 from tests.helpers import random_frames
 from tests.parity.cosmos_references import channels_first, channels_last, small_pipeline

@@ -15,10 +15,11 @@ from diffusers.pipelines.cogvideo.pipeline_cogvideox import get_resize_crop_regi
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax import tree
 from pewm_jax.config import PUBLISHED, UserError, published
 from pewm_jax.convert import transformer
-from pewm_jax.models import dit, positions
+from pewm_jax.io import tree
+from pewm_jax.models.cogvideox import model as dit
+from pewm_jax.nn import positions
 
 LENGTH = 7
 OLDER = {"sample_height": 8, "sample_width": 12, "sample_frames": 9}

@@ -10,8 +10,9 @@ from safetensors.torch import save_file
 from torch import nn
 
 from pewm_jax.config import UserError
-from pewm_jax.evaluation import metrics
-from pewm_jax.models import dreamsim, dreamsim_weights
+from pewm_jax.eval import metrics
+from pewm_jax.models.dreamsim import model as dreamsim
+from pewm_jax.models.dreamsim import weights as dreamsim_weights
 
 WIDTH, DEPTH, PATCH, GRID, RANK, ALPHA = 128, 2, 4, 3, 3, 0.5
 

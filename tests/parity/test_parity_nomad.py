@@ -14,7 +14,8 @@ from torch.nn import functional
 from pewm_jax.config import NomadConfig, UserError
 from pewm_jax.convert import nomad as converter
 from pewm_jax.diffusion import squared_cosine
-from pewm_jax.models import efficientnet, nomad
+from pewm_jax.models.nomad import efficientnet
+from pewm_jax.models.nomad import model as nomad
 
 nn = torch.nn
 SMALL = NomadConfig(

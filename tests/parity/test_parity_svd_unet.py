@@ -13,7 +13,7 @@ from safetensors.numpy import load_file, save_file
 
 from pewm_jax.config import SVDUNetConfig, UserError
 from pewm_jax.convert import assemble, svd, svd_unet
-from pewm_jax.models import svd_unet as model
+from pewm_jax.models.svd import unet as model
 from tests.parity.svd_references import distance, draw, first, randomise
 
 SHRUNKEN = {

@@ -11,7 +11,7 @@ from safetensors.numpy import load_file
 
 from pewm_jax.config import SVDVAEConfig, UserError
 from pewm_jax.convert import assemble, svd, svd_vae
-from pewm_jax.models import svd_vae as model
+from pewm_jax.models.svd import vae as model
 from tests.parity.svd_references import distance, draw, first, randomise
 
 WIDTHS = (32, 64)

@@ -9,10 +9,10 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX
 
-from pewm_jax import tree
 from pewm_jax.config import UserError, VAEConfig
 from pewm_jax.convert import vae as converter
-from pewm_jax.models import vae
+from pewm_jax.io import tree
+from pewm_jax.models.cogvideox import vae
 
 SHRUNKEN = {
     "block_out_channels": (8, 12, 12, 16),

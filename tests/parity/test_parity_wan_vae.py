@@ -11,7 +11,7 @@ from safetensors.numpy import load_file
 
 from pewm_jax.config import UserError, WanVAEConfig
 from pewm_jax.convert import assemble, cosmos, wan_vae
-from pewm_jax.models import wan_vae as model
+from pewm_jax.models.wan import vae as model
 from tests.parity.cosmos_references import channels_first, channels_last
 from tests.parity.svd_references import distance, draw, randomise
 

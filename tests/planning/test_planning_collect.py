@@ -8,8 +8,8 @@ import re
 import numpy as np
 import pytest
 
+from pewm_jax.cli import data
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data import __main__ as data
 from pewm_jax.data.collect_env import collect_env
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.env_episode import CollectEnvConfig, open_env

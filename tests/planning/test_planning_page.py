@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from pewm_jax.commands.main import main
+from pewm_jax.cli.main import main
 from tests.planning.planning_page import blocks, section
 
 ROBOT = """

@@ -21,7 +21,8 @@ from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
 from pewm_jax.geometry.actions import discrete_table, rotation_z
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
-from pewm_jax.models import lpips, lpips_weights
+from pewm_jax.models.lpips import model as lpips
+from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.planning import candidates, costs
 from pewm_jax.planning.candidates import Imagination, Judged
 from pewm_jax.planning.mpc import imagining, knowing, mpc
@@ -29,7 +30,7 @@ from pewm_jax.planning.plan import plan
 from pewm_jax.planning.ranking import rank, rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig, RandomShooting
 from pewm_jax.types import Camera, Frames
-from pewm_jax.worlds import pewm_views
+from pewm_jax.worlds.pewm import views as pewm_views
 from tests.compiled import counted
 from tests.helpers import init_world, random_frames, randomise
 

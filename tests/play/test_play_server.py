@@ -14,7 +14,7 @@ import viser.transforms
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from pewm_jax.commands import play
+from pewm_jax.cli import play
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.play import page, requests, serving, status, visitors
 from pewm_jax.play.settings import Serve, Start
@@ -217,7 +217,7 @@ def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
             play.main(argv)
     code = (
         "import sys; sys.modules['viser'] = None\n"
-        "from pewm_jax.commands.main import main\n"
+        "from pewm_jax.cli.main import main\n"
         "sys.exit(main(['play', 'small']))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

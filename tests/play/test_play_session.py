@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pewm_jax
-from pewm_jax import cli, worlds
-from pewm_jax.commands import play
+from pewm_jax import worlds
+from pewm_jax.cli import play
 from pewm_jax.config import (
     CodecTrainConfig,
     CodecWorldConfig,
@@ -24,6 +24,7 @@ from pewm_jax.config import (
     ImagesConfig,
     UserError,
 )
+from pewm_jax.config import command_line as cli
 from pewm_jax.data.navigation import is_free
 from pewm_jax.play import board, engine, kept, picking, places, session
 from pewm_jax.play.settings import Serve, Start

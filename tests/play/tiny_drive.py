@@ -8,13 +8,13 @@ import jax
 import numpy as np
 
 from pewm_jax.config import Config, DDPMConfig, SurfelConfig
-from pewm_jax.evaluation.pictures import as_bytes
 from pewm_jax.geometry.cameras import pose_from_yaw, unproject
-from pewm_jax.models import world_model
-from pewm_jax.models.signals import as_signal
+from pewm_jax.nn.signals import as_signal
 from pewm_jax.play import engine, places, session
 from pewm_jax.play.settings import Start
+from pewm_jax.report.pictures import as_bytes
 from pewm_jax.types import Camera, WorldState
+from pewm_jax.worlds import world_model
 from tests.helpers import TINY, tiny_model
 
 MODEL = tiny_model(

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import BackboneSettings, Places, register
-from pewm_jax.models import backbones, layers
-from pewm_jax.models.costs import Costs, Product, video_tokens
+from pewm_jax.models import interface as backbones
+from pewm_jax.nn import layers
+from pewm_jax.nn.costs import Costs, Product, video_tokens
 
 SHARDING = (
     (r"backbone/(into|out)", P(None, "fsdp")),

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
+from pewm_jax.codecs.pixel import fold
 from pewm_jax.config import CodecSettings, register
-from pewm_jax.models.costs import Costs, Product
-from pewm_jax.models.pixel_codec import fold
+from pewm_jax.nn.costs import Costs, Product
 
 SHARDING = ((r"codec/(colour|depth)", P(None, "fsdp")),)
 

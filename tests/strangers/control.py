@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import ControlSettings, register
-from pewm_jax.models.backbones import Conditioning
-from pewm_jax.models.costs import Costs, Product
+from pewm_jax.models.interface import Conditioning
+from pewm_jax.nn.costs import Costs, Product
 
 SHARDING = ((r"control/project", P(None, "fsdp")),)
 

@@ -19,8 +19,8 @@ from pewm_jax.config import (
     TrainConfig,
 )
 from pewm_jax.data import abstract
-from pewm_jax.scaling import plan
-from pewm_jax.training import sharding, step
+from pewm_jax.plan import plan
+from pewm_jax.train import sharding, step
 from pewm_jax.worlds import costs
 from tests.helpers import random_frames
 from tests.strangers.backbone import PerceptronConfig

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from pewm_jax import config as configuration
-from pewm_jax import presets, weights
-from pewm_jax.commands import table2 as table2_command
+from pewm_jax import presets
+from pewm_jax.cli import table2 as table2_command
 from pewm_jax.config import ActionConfig, ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.simulator import move
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+from pewm_jax.io import weights
 from pewm_jax.planning import practice
 from pewm_jax.planning.floor_map import FloorMap
 from pewm_jax.planning.practice import Imagined, Practice, Real

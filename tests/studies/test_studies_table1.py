@@ -14,16 +14,18 @@ import numpy as np
 import pytest
 
 from pewm_jax import config as configuration
-from pewm_jax import presets, tree, weights
-from pewm_jax.commands import table1 as command
+from pewm_jax import presets
+from pewm_jax.cli import table1 as command
+from pewm_jax.cli.data import main as data_command
 from pewm_jax.config import AttentionConfig, DINOv2Config, UserError
 from pewm_jax.convert import dinov2 as convert
-from pewm_jax.data.__main__ import main as data_command
-from pewm_jax.evaluation import metrics
-from pewm_jax.evaluation.images import MASKS, SUMS
+from pewm_jax.eval import metrics
+from pewm_jax.eval.images import MASKS, SUMS
 from pewm_jax.geometry.actions import integrate, there_and_back
 from pewm_jax.geometry.cameras import pose_from_yaw
-from pewm_jax.models import dinov2, lpips
+from pewm_jax.io import tree, weights
+from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.lpips import model as lpips
 from pewm_jax.studies import (
     recorded,
     rows,
@@ -35,8 +37,8 @@ from pewm_jax.studies import (
     timing,
     trainings,
 )
-from pewm_jax.training import prepared
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.train import prepared
+from pewm_jax.worlds.pewm.world import STAGES
 
 SIZE = ["--size", "16", "--frames", "30"]
 
@@ -65,7 +67,9 @@ def made(tmp_path_factory):
     said = io.StringIO()
     with (
         mock.patch.object(presets, "load", return_value=small(folder / "data")),
-        mock.patch("pewm_jax.cli.cache_compilation"),  # it sets an option of all of JAX
+        mock.patch(
+            "pewm_jax.config.command_line.cache_compilation"
+        ),  # it sets an option of all of JAX
         contextlib.redirect_stdout(said),
     ):
         argv = ["--data", str(folder / "data"), "--out", str(folder / "out")]

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from pewm_jax import config as configuration
-from pewm_jax import presets, weights
-from pewm_jax.commands import table2 as command
+from pewm_jax import presets
+from pewm_jax.cli import table2 as command
 from pewm_jax.config import ActionConfig, ConfigError, UserError
+from pewm_jax.io import weights
 from pewm_jax.planning import costs, scores
 from pewm_jax.planning.settings import PlanConfig
 from pewm_jax.studies import deciders, goals, table2
-from pewm_jax.worlds import pewm
+from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import init_world, randomise
 
 MOTION = ActionConfig()

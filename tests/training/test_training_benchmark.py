@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import training_fakes as fakes
 
-from pewm_jax import cli
 from pewm_jax import presets as configs
 from pewm_jax.config import Config, UserError
+from pewm_jax.config import command_line as cli
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
-from pewm_jax.training import loop
+from pewm_jax.train import loop
 
 ROOT = Path(__file__).parents[2]
 

@@ -10,7 +10,7 @@ import training_fakes as fakes
 
 from pewm_jax import presets as configs
 from pewm_jax.config import UserError
-from pewm_jax.worlds import pewm
+from pewm_jax.worlds.pewm import world as pewm
 
 
 @pytest.fixture

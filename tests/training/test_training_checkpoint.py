@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import training_fakes as fakes
 
-from pewm_jax import tree
 from pewm_jax.config import UserError
-from pewm_jax.training import checkpoint, runs, sharding, step, step_folders
-from pewm_jax.training.checkpoint import Checkpoints
+from pewm_jax.io import tree
+from pewm_jax.train import checkpoint, runs, sharding, step, step_folders
+from pewm_jax.train.checkpoint import Checkpoints
 
 ONE, TWO = fakes.STAGES[:2]
 

@@ -3,7 +3,7 @@
 import pytest
 
 from pewm_jax.config import ConfigError
-from pewm_jax.training import chips
+from pewm_jax.train import chips
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import pytest
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import presets, tree, weights, worlds
-from pewm_jax.commands import evaluate
+from pewm_jax import presets, worlds
+from pewm_jax.cli import evaluate
 from pewm_jax.config import (
     ClipConfig,
     CodecTrainConfig,
@@ -28,10 +28,12 @@ from pewm_jax.config import (
 from pewm_jax.data import abstract, loader
 from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
-from pewm_jax.evaluation import codec_score, report
-from pewm_jax.models import lpips, lpips_weights
-from pewm_jax.scaling import plan
-from pewm_jax.training import loop, stages, starting, step
+from pewm_jax.eval import codec_score, report
+from pewm_jax.io import tree, weights
+from pewm_jax.models.lpips import model as lpips
+from pewm_jax.models.lpips import weights as lpips_weights
+from pewm_jax.plan import plan
+from pewm_jax.train import loop, stages, starting, step
 from pewm_jax.worlds import codec as world
 from pewm_jax.worlds import costs
 from tests.helpers import random_camera

@@ -10,7 +10,8 @@ import pytest
 import training_fakes as fakes
 from test_training_egowm import changed, trained
 
-from pewm_jax import tree, worlds
+from pewm_jax import worlds
+from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import (
     ClipConfig,
     Config,
@@ -26,11 +27,12 @@ from pewm_jax.config import (
     TrainConfig,
     WanVAEConfig,
 )
-from pewm_jax.models import codecs, controls, world_model
-from pewm_jax.scaling import hlo
-from pewm_jax.scaling.plan import QUICK
-from pewm_jax.training import sharding, state
-from pewm_jax.worlds import costs
+from pewm_jax.controls import interface as controls
+from pewm_jax.io import tree
+from pewm_jax.plan import hlo
+from pewm_jax.plan.plan import QUICK
+from pewm_jax.train import sharding, state
+from pewm_jax.worlds import costs, world_model
 from tests.helpers import TINY, init_world, random_frames, randomise, with_reader
 
 COSMOS = CosmosConfig(

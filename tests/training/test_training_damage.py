@@ -9,8 +9,8 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax.config import UserError
-from pewm_jax.training import integrity, loop
-from pewm_jax.training.checkpoint import Checkpoints
+from pewm_jax.train import integrity, loop
+from pewm_jax.train.checkpoint import Checkpoints
 
 
 class PowerCutError(RuntimeError):

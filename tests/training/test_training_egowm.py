@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import training_fakes as fakes
 
-from pewm_jax import tree, worlds
+from pewm_jax import worlds
 from pewm_jax.config import (
     ClipConfig,
     CLIPVisionConfig,
@@ -27,11 +27,13 @@ from pewm_jax.config import (
     SVDVAEConfig,
     TrainConfig,
 )
-from pewm_jax.models import backbones, svd_backbone
-from pewm_jax.models.backbones import Conditioning
-from pewm_jax.scaling import hlo
-from pewm_jax.scaling.plan import QUICK
-from pewm_jax.training import sharding, state, step
+from pewm_jax.io import tree
+from pewm_jax.models import interface as backbones
+from pewm_jax.models.interface import Conditioning
+from pewm_jax.models.svd import backbone as svd_backbone
+from pewm_jax.plan import hlo
+from pewm_jax.plan.plan import QUICK
+from pewm_jax.train import sharding, state, step
 from pewm_jax.worlds import costs
 from tests.helpers import TINY, randomise, with_reader
 

@@ -10,8 +10,9 @@ import pytest
 from pewm_jax.config import ClipConfig, ConfigError, PatchColoursConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.memory import feature_build, feature_cache
-from pewm_jax.training import loop, runs, stages, starting
-from pewm_jax.worlds import objective, pewm
+from pewm_jax.train import loop, runs, stages, starting
+from pewm_jax.worlds import objective
+from pewm_jax.worlds.pewm import world as pewm
 from tests.data import data_world
 from tests.helpers import tiny_config
 

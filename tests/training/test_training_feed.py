@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import UserError
-from pewm_jax.training import sharding
-from pewm_jax.training.feed import AHEAD, Feed
+from pewm_jax.train import sharding
+from pewm_jax.train.feed import AHEAD, Feed
 
 WHERE = sharding.of_batch(sharding.make_mesh(jax.devices()[:1]))
 

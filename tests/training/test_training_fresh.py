@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import training_fakes as fakes
 
-from pewm_jax import tree, weights
 from pewm_jax.config import ConfigError
-from pewm_jax.training import loop, state
+from pewm_jax.io import tree, weights
+from pewm_jax.train import loop, state
 
 TWO = fakes.STAGES[1]
 KEY = jax.random.key(7)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import pewm_jax
-from pewm_jax import shipped, tree, worlds
+from pewm_jax import shipped, worlds
+from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.config import (
     AttentionConfig,
     ClipConfig,
@@ -24,11 +25,14 @@ from pewm_jax.config import (
     UserError,
 )
 from pewm_jax.data import abstract
-from pewm_jax.models import gates, learned_codec, lpips, lpips_weights
-from pewm_jax.rollouts import load_finished
-from pewm_jax.training import loop, stages
+from pewm_jax.io import tree
+from pewm_jax.models.lpips import model as lpips
+from pewm_jax.models.lpips import weights as lpips_weights
+from pewm_jax.nn import gates
+from pewm_jax.train import loop, stages
 from pewm_jax.types import Frames
 from pewm_jax.worlds import codec_gate
+from pewm_jax.worlds.rollouts import load_finished
 from tests.helpers import TINY, init_world, random_camera, randomise, tiny_config
 
 CODEC = LearnedCodecConfig(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.scaling import hlo, hlo_text
+from pewm_jax.plan import hlo, hlo_text
 
 
 def program(function, *shapes):

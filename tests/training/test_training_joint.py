@@ -7,9 +7,9 @@ import numpy as np
 import training_fakes as fakes
 
 from pewm_jax import presets as configs
-from pewm_jax import tree, weights
-from pewm_jax.training import loop, sharding, stages
-from pewm_jax.worlds import pewm
+from pewm_jax.io import tree, weights
+from pewm_jax.train import loop, sharding, stages
+from pewm_jax.worlds.pewm import world as pewm
 
 JOINT = pewm.STAGES[2]
 

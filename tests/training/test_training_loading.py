@@ -8,10 +8,10 @@ import pytest
 import training_fakes as fakes
 
 import pewm_jax
-from pewm_jax import tree, weights
 from pewm_jax.config import UserError
-from pewm_jax.training import loop
-from pewm_jax.training.checkpoint import Checkpoints
+from pewm_jax.io import tree, weights
+from pewm_jax.train import loop
+from pewm_jax.train.checkpoint import Checkpoints
 
 
 class PowerCutError(RuntimeError):

@@ -6,8 +6,8 @@ import json
 import pytest
 from rich.console import Console
 
-from pewm_jax.training import log
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.train import log
+from pewm_jax.worlds.pewm.world import STAGES
 
 ONE, TWO = STAGES[:2]
 METRICS = {

@@ -11,12 +11,12 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax import config as configuration
-from pewm_jax import weights
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data import loader
-from pewm_jax.training import loop, runs
-from pewm_jax.training.samples import Previewed
-from pewm_jax.training.signals import Interrupted
+from pewm_jax.io import weights
+from pewm_jax.train import loop, runs
+from pewm_jax.train.samples import Previewed
+from pewm_jax.train.signals import Interrupted
 
 PICTURE = Previewed((Path("picture.png"),))
 

@@ -11,10 +11,10 @@ from test_training_loop import StopAt, file_bytes, losses, train
 from test_training_step import run
 
 from pewm_jax import presets as configs
-from pewm_jax import tree
-from pewm_jax.training import optimizer, stages
-from pewm_jax.training.signals import Interrupted
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.io import tree
+from pewm_jax.train import optimizer, stages
+from pewm_jax.train.signals import Interrupted
+from pewm_jax.worlds.pewm.world import STAGES
 
 FIRST_AND_LAST = ("patch_embed", "text_embed", "proj_out", "modulate_out", "embed_1", "tokens")
 """Of the matrices, those that read the inputs or make the outputs."""

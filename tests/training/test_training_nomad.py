@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pewm_jax
-from pewm_jax import presets, tree
+from pewm_jax import presets
 from pewm_jax.config import (
     ClipConfig,
     Config,
@@ -20,11 +20,12 @@ from pewm_jax.config import (
     UserError,
 )
 from pewm_jax.data import abstract, loader
-from pewm_jax.evaluation import opened
+from pewm_jax.eval import loaded_run as opened
 from pewm_jax.geometry.actions import discrete_table, integrate
 from pewm_jax.geometry.cameras import pose_from_yaw
+from pewm_jax.io import tree
 from pewm_jax.planning import nomad_policy
-from pewm_jax.training import loop
+from pewm_jax.train import loop
 from pewm_jax.worlds import nomad as world
 from tests.planning.test_planning_nomad import STEPS
 from tests.planning.test_planning_nomad import TINY as POLICY

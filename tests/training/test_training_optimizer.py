@@ -9,8 +9,8 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax.config import ConfigError, StageConfig
-from pewm_jax.training import optimizer, stages
-from pewm_jax.worlds import pewm
+from pewm_jax.train import optimizer, stages
+from pewm_jax.worlds.pewm import world as pewm
 
 PARAMS = {"backbone": {"dense": {"kernel": jnp.full((4, 4), 2.0), "bias": jnp.full((4,), 2.0)}}}
 

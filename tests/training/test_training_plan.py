@@ -14,13 +14,14 @@ import training_fakes as fakes
 from pewm_jax import presets as configs
 from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
 from pewm_jax.data import abstract
-from pewm_jax.models import vae_codec
-from pewm_jax.models.costs import SPLIT, Share
-from pewm_jax.scaling import plan, plan_text, predict, suggest
-from pewm_jax.scaling.footprint import MeshSizes, counts, footprint
-from pewm_jax.training import chips
+from pewm_jax.models.cogvideox import vae_codec
+from pewm_jax.nn.costs import SPLIT, Share
+from pewm_jax.plan import plan, predict, suggest
+from pewm_jax.plan import text as plan_text
+from pewm_jax.plan.footprint import MeshSizes, counts, footprint
+from pewm_jax.train import chips
 from pewm_jax.worlds import costs
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.worlds.pewm.world import STAGES
 
 ROOT = Path(__file__).parents[2]
 H200 = chips.named("h200")

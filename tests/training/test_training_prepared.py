@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pewm_jax import worlds
-from pewm_jax.training import prepared
+from pewm_jax.train import prepared
 from pewm_jax.types import Clip
 from tests.helpers import init_world, random_frames, randomise, tiny_config
 

@@ -13,8 +13,8 @@ import training_fakes as fakes
 from test_training_loop import file_bytes, losses, train
 
 from pewm_jax.config import UserError
-from pewm_jax.training import prepared
-from pewm_jax.worlds import pewm
+from pewm_jax.train import prepared
+from pewm_jax.worlds.pewm import world as pewm
 
 CLIPS = 20
 """Three batches of 8."""

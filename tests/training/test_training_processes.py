@@ -10,12 +10,12 @@ import pytest
 import training_processes as jobs
 
 import train
-from pewm_jax import cli
 from pewm_jax.config import Launch, UserError
+from pewm_jax.config import command_line as cli
 from pewm_jax.data import loader
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
-from pewm_jax.training import processes
+from pewm_jax.train import processes
 
 FAKE = {"FAKE": "1"}
 STAGES = ("--train.stage1.batch", 8, "--train.stage2.batch", 8, "--train.save_every", 5)

@@ -11,7 +11,6 @@ import training_fakes as fakes
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax import presets as configs
-from pewm_jax import tree, weights
 from pewm_jax.config import (
     AXES,
     ConfigError,
@@ -21,8 +20,9 @@ from pewm_jax.config import (
     VAEConfig,
     published,
 )
-from pewm_jax.training import sharding, state
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.io import tree, weights
+from pewm_jax.train import sharding, state
+from pewm_jax.worlds.pewm.world import STAGES
 
 ONE, TWO = STAGES[:2]
 MESH = jax.sharding.AbstractMesh((1, 4, 2, 1), AXES)

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from pewm_jax.training.signals import Interrupted, Stop
+from pewm_jax.train.signals import Interrupted, Stop
 
 ROOT = Path(__file__).parents[2]
 BUSY = """
 import hashlib, sys
-from pewm_jax.training import signals
+from pewm_jax.train import signals
 signals.LINGER_S = 0.3
 
 def busy():  # a call of compiled code that knows no signals and lets other threads run

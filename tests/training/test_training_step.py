@@ -10,11 +10,11 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax import presets as configs
-from pewm_jax import tree
 from pewm_jax.config import AXES, ConfigError, DiTConfig
-from pewm_jax.models import world_model
-from pewm_jax.training import optimizer, sharding, stages, state, step
-from pewm_jax.worlds import pewm
+from pewm_jax.io import tree
+from pewm_jax.train import optimizer, sharding, stages, state, step
+from pewm_jax.worlds import world_model
+from pewm_jax.worlds.pewm import world as pewm
 
 ONE, TWO = fakes.STAGES[:2]
 REAL = pewm.STAGES[1]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets as configs
-from pewm_jax import tree
 from pewm_jax.config import DiTConfig, RenderConfig, SurfelConfig
-from pewm_jax.models import world_model
-from pewm_jax.training import sharding, stages, step
+from pewm_jax.io import tree
+from pewm_jax.train import sharding, stages, step
 from pewm_jax.types import Clip
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.worlds import world_model
+from pewm_jax.worlds.pewm.world import STAGES
 from tests.helpers import init_world, random_frames, randomise, with_reader
 
 TWO = STAGES[1]

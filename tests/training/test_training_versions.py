@@ -17,7 +17,7 @@ from test_training_loop import train
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import presets, tree, weights
+from pewm_jax import presets
 from pewm_jax.config import (
     AttentionConfig,
     ConfigError,
@@ -33,9 +33,10 @@ from pewm_jax.config import (
     VAEConfig,
     VoxelConfig,
 )
-from pewm_jax.training import integrity, loop, runs, sharding, step
-from pewm_jax.training.checkpoint import CONFIG_ITEM, Checkpoints
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.io import tree, weights
+from pewm_jax.train import integrity, loop, runs, sharding, step
+from pewm_jax.train.checkpoint import CONFIG_ITEM, Checkpoints
+from pewm_jax.worlds.pewm.world import STAGES
 
 HERE = Path(__file__).parent / "version1"
 KEY = jax.random.key(0)

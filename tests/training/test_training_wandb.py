@@ -7,7 +7,7 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax.config import UserError
-from pewm_jax.training import loop, runs
+from pewm_jax.train import loop, runs
 
 
 class FakeError(Exception):

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import training_fakes as fakes
 
-from pewm_jax import weights
 from pewm_jax.config import UserError
 from pewm_jax.data import loader
-from pewm_jax.training import chips, loop, optimizer, samples, step, watch
-from pewm_jax.training.sharding import make_mesh
-from pewm_jax.training.signals import Interrupted
+from pewm_jax.io import weights
+from pewm_jax.train import chips, loop, optimizer, samples, step, watch
+from pewm_jax.train.sharding import make_mesh
+from pewm_jax.train.signals import Interrupted
 from pewm_jax.worlds import costs
 
 BAD = 5

@@ -14,19 +14,12 @@ from jax.sharding import PartitionSpec as P
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import tree
-from pewm_jax.config import (
-    Config,
-    ConfigError,
-    StageConfig,
-    TrainSettings,
-    WorldSettings,
-    kinds,
-    register,
-)
+from pewm_jax import registry as kinds
+from pewm_jax.config import Config, ConfigError, StageConfig, TrainSettings, WorldSettings, register
 from pewm_jax.data import loader
-from pewm_jax.models.costs import Costs, Product
-from pewm_jax.training import loop, samples, stages
+from pewm_jax.io import tree
+from pewm_jax.nn.costs import Costs, Product
+from pewm_jax.train import loop, samples, stages
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 STEPS = StageConfig(steps=4, batch=8, warmup=0, learning_rate=0.1)

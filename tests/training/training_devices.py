@@ -23,13 +23,13 @@ import numpy as np
 import training_fakes as fakes
 
 from pewm_jax import presets as configs
-from pewm_jax import tree
 from pewm_jax.config import MeshConfig
-from pewm_jax.models import world_model
-from pewm_jax.training import sharding, step
-from pewm_jax.training.checkpoint import Checkpoints
-from pewm_jax.training.state import create
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.io import tree
+from pewm_jax.train import sharding, step
+from pewm_jax.train.checkpoint import Checkpoints
+from pewm_jax.train.state import create
+from pewm_jax.worlds import world_model
+from pewm_jax.worlds.pewm.world import STAGES
 from tests.helpers import random_camera
 
 STEPS = 20

@@ -10,9 +10,9 @@ import pytest
 
 from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, StageConfig, TrainConfig
 from pewm_jax.data import loader
-from pewm_jax.training import sharding
+from pewm_jax.train import sharding
 from pewm_jax.types import Camera, Clip, Frames
-from pewm_jax.worlds import pewm
+from pewm_jax.worlds.pewm import world as pewm
 
 SIZE = 16
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 import training_fakes as fakes
 
-from pewm_jax import cli
-from pewm_jax.training import integrity, loop, runs, step_folders
-from pewm_jax.training.checkpoint import Checkpoints
-from pewm_jax.training.log import MetricsLog
+from pewm_jax.config import command_line as cli
+from pewm_jax.train import integrity, loop, runs, step_folders
+from pewm_jax.train.checkpoint import Checkpoints
+from pewm_jax.train.log import MetricsLog
 
 
 def fill(folder):

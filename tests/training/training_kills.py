@@ -19,7 +19,7 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax.data import loader
-from pewm_jax.training import checkpoint, loop, step_folders
+from pewm_jax.train import checkpoint, loop, step_folders
 
 EVERY, STEPS = 3, 27
 

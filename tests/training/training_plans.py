@@ -25,10 +25,10 @@ from pewm_jax.config import (
     VAEConfig,
     VoxelConfig,
 )
-from pewm_jax.scaling import hlo, plan, predict
-from pewm_jax.scaling.footprint import MeshSizes
+from pewm_jax.plan import hlo, plan, predict
+from pewm_jax.plan.footprint import MeshSizes
 from pewm_jax.worlds import costs
-from pewm_jax.worlds.pewm import STAGES
+from pewm_jax.worlds.pewm.world import STAGES
 
 DINOV2 = DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56)
 ENCODERS = {

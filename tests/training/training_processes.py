@@ -24,9 +24,9 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from pewm_jax import cli
 from pewm_jax.config import Launch
-from pewm_jax.training import feed, processes
+from pewm_jax.config import command_line as cli
+from pewm_jax.train import feed, processes
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]

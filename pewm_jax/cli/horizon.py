@@ -1,0 +1,174 @@
+"""``pewm-jax horizon``: hundreds of imagined frames, by one world or several beside each other."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pewm_jax.cli import named
+from pewm_jax.cli import plugins as imports
+from pewm_jax.config import command_line as cli
+
+ABOUT = (
+    "Imagine long walks through held-out houses with the recorded actions, compare them with the "
+    "truth by stretches (PSNR) and as sets of windows of 16 frames (FVD, KVD), and, of a world of "
+    "voxels, see what its renderer makes of the true ones and whether what is placed in it stays."
+)
+SPARE = 4
+"""One walk in so many more than trials, for those without room for a block."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What is imagined and measured."""
+
+    data: Path = Path("data/persist_long")
+    """Folder of the data set; its episodes must be longer than the horizon."""
+    split: str = "revisit"
+    """Folder inside it."""
+    beside: tuple[str, ...] = ()
+    """Other worlds, runs' folders or names of models that come with the library, which go the same
+    ways."""
+    ends: tuple[int, ...] = (200, 400, 600)
+    """Frames at which windows end, and between which PSNR is averaged."""
+    walks: int = 4
+    """Walks, one of each episode; those of one episode's trials may overlap."""
+    context: int = 8
+    """Observed frames before each."""
+    fvd: Literal["on", "off"] = "off"
+    """Whether FVD and KVD are measured (`pip install 'pewm-jax[metrics]'`); on processors that
+    takes longer than imagining."""
+    windows: int = 4
+    """Windows of each walk before each end."""
+    trials: int = 0
+    """Walks in whose beginning a block is placed in a world of voxels, such as 40."""
+    trial_frames: int = 64
+    """Frames that are imagined after a block was placed."""
+    out: Path | None = None
+    """Folder of the report; by default RUN/horizon."""
+
+
+def main(argv: Sequence[str], prog: str = "pewm-jax horizon") -> int:
+    """Measure, write RUN/horizon/horizon.html and print the numbers.
+
+    Args:
+        argv: the arguments: a run's folder and settings.
+        prog: the words that the command was called by, for help and refusals.
+
+    Returns:
+        The exit code.
+    """
+    missing = f"Name a run folder first: {prog} runs/persist_tiny."
+    run, flags = named.take(imports.take(argv), "RUN", missing)
+    settings = cli.parse(
+        Settings,
+        flags,
+        default=Settings(),
+        prog=f"{prog} RUN",
+        description=f"{ABOUT} Beside these settings:\n{imports.HELP}",
+    )
+    ends = settings.ends
+    if not ends or sorted(set(ends)) != list(ends) or ends[0] < 16:
+        raise cli.ConfigError(
+            f"--ends is {ends}: name rising numbers of frames from 16 on, such as 200 400 600."
+        )
+    if min(settings.walks, settings.context, settings.windows, settings.trial_frames) < 1:
+        raise cli.ConfigError("--walks, --context, --windows and --trial-frames must be above 0.")
+    # Imported here and not above: help and refusals come at once.
+    from pewm_jax.eval.loaded_run import open_run
+    from pewm_jax.report import horizon_page
+
+    opened = open_run(run)
+    others = [(name, open_run(name)) for name in settings.beside]
+    cli.cache_compilation(opened.home.parent)
+    facts, videos = _measured(settings, opened, others)
+    facts["protocol"] = {
+        "run": run,
+        "weights_sha256": opened.weights_hash,
+        "data": f"{settings.data}/{settings.split}",
+        "walks": settings.walks,
+        "observed frames": settings.context,
+        "windows of each walk before each end": settings.windows,
+        **{f"weights_sha256 of {name}": other.weights_hash for name, other in others},
+    }
+    page = horizon_page.write(settings.out or opened.home / "horizon", facts, videos, ends)
+    print("\n".join(horizon_page.lines(facts, ends)))
+    print(f"report: {page}")
+    return 0
+
+
+def _measured(
+    settings: Settings, opened: Any, others: Sequence[tuple[str, Any]]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what is measured, and (B, T, H, W, 3) pictures by method, the truth first.
+
+    Raises:
+        ConfigError: the episodes are too few or too short, or trials are asked of another world.
+    """
+    import numpy as np
+
+    from pewm_jax.config import PersistConfig
+    from pewm_jax.data.dataset import EpisodeSource
+    from pewm_jax.data.voxel_checks import require_same_cells
+    from pewm_jax.eval import edit_trials, horizon, voxel_score
+    from pewm_jax.eval.metrics.videos import read
+    from pewm_jax.models.i3d import weights as i3d_weights
+
+    i3d = read(i3d_weights.find(None), "fvd") if settings.fvd == "on" else None
+    episodes = EpisodeSource(settings.data / settings.split)
+    if len(episodes) < settings.walks:
+        raise cli.ConfigError(
+            f"--walks is {settings.walks}, and {settings.data}/{settings.split} has "
+            f"{len(episodes)} episodes: ask for as many, or collect more."
+        )
+    config, params, ends = opened.config, opened.params, settings.ends
+    first = settings.context - 1
+    chosen = [episodes[k] for k in range(settings.walks)]
+    require_same_cells(config.model, chosen[0])
+    walks = [horizon.walk_of(one, first, ends[-1], settings.context) for one in chosen]
+    tried = _tried(settings, chosen, first)
+    of_voxels = isinstance(config.model, PersistConfig)
+    if tried:  # before hours of imagining
+        if not of_voxels:
+            raise cli.ConfigError("--trials places blocks in a world of voxels; this has none.")
+        edit_trials.class_of(config, tried)
+    truth = np.stack([walk.truth_THWC for walk in walks])
+    made: dict[str, Any] = {"world": horizon.roll(config, params, walks)}
+    facts: dict[str, Any] = {}
+    if of_voxels:
+        made["without"] = horizon.roll(config, params, walks, memory=False, say="without voxels")
+        grids = [walk.classes_TXYZ for walk in walks if walk.classes_TXYZ is not None]
+        if len(grids) == len(walks):
+            made["known"] = horizon.roll(config, params, walks, known=True, say="from known grids")
+            made["bound"] = horizon.bound(config, params, walks)
+            facts["autoencoder"] = voxel_score.given_back(config.model, params, grids)
+    for name, other in others:
+        made[name] = horizon.roll(other.config, other.params, walks, say=name)
+    facts["psnr"] = {name: horizon.stretches(video, truth, ends) for name, video in made.items()}
+    if i3d is not None:
+        facts["distances"] = horizon.distances(made, truth, ends, settings.windows, i3d)
+    if tried:
+        facts["edits"] = edit_trials.run(config, params, tried, count=settings.trials).facts()
+    return facts, {"truth": truth, **made}
+
+
+def _tried(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
+    """Return walks for the trials, spread over the episodes, with some to spare."""
+    if not settings.trials:
+        return []
+    from pewm_jax.eval import horizon
+
+    shortest = min(episode.length for episode in chosen)
+    starts = range(first, shortest - settings.trial_frames)
+    if not starts:
+        raise cli.ConfigError(
+            f"--trial-frames is {settings.trial_frames}, and the shortest episode has {shortest} "
+            "frames: take fewer, or collect longer episodes."
+        )
+    wanted = settings.trials + -(-settings.trials // SPARE)
+    each = -(-wanted // len(chosen))
+    places = [starts[len(starts) * k // each] for k in range(each)]
+    walks = ((one, at) for at in places for one in chosen)
+    return [horizon.walk_of(one, at, settings.trial_frames, 1) for one, at in walks][:wanted]

@@ -1,0 +1,86 @@
+"""The pixel codec: no parameters, exactly invertible.
+
+Space-to-depth of s × s pixels, and q frames folded into one latent frame, with CogVideoX's frame
+rule: q·k + 1 frames become k + 1 latent frames, the first of which holds q copies of frame 0.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import ModelConfig, PixelConfig
+from pewm_jax.geometry.plucker import fold_frames
+from pewm_jax.nn.costs import Costs, Share
+from pewm_jax.types import Array, Params
+
+SHARDING = ()
+"""It has no parameters."""
+
+
+def init(config: PixelConfig, key: Array) -> Params:
+    """Return the parameters: none."""
+    del config, key
+    return {}
+
+
+def costs(model: ModelConfig, share: Share) -> Costs:
+    """Return the costs, which are negligible."""
+    del model, share
+    return Costs()
+
+
+def encode(
+    config: PixelConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
+) -> Array:
+    """Encode a video (B, q·k + 1, H, W, C); see ``fold``."""
+    del params, condition
+    return fold(video_BTHWC, config.spatial, config.temporal)
+
+
+def fold(video_BTHWC: Array, spatial: int, temporal: int) -> Array:
+    """Gather s × s pixels of q frames into the channels of one latent cell.
+
+    Args:
+        video_BTHWC: (B, q·k + 1, H, W, C) float.
+        spatial: s.
+        temporal: q.
+
+    Returns:
+        (B, k + 1, H/s, W/s, q·s·s·C) latents.
+
+    Raises:
+        ValueError: the frame count is not q·k + 1, or s does not divide the image.
+    """
+    batch, frames, height, width, channels = video_BTHWC.shape
+    s, q = spatial, temporal
+    if (frames - 1) % q or height % s or width % s:
+        raise ValueError(
+            f"a video of {frames}×{height}×{width} cannot be folded: the codec needs {q}k + 1 "
+            f"frames and multiples of {s} pixels."
+        )
+    folded = jax.vmap(lambda video: fold_frames(video, q))(video_BTHWC)
+    grid = folded.reshape(batch, -1, q, height // s, s, width // s, s, channels)
+    grid = grid.transpose(0, 1, 3, 5, 2, 4, 6, 7)
+    return grid.reshape(*grid.shape[:4], q * s * s * channels)
+
+
+def decode(config: PixelConfig, params: Params, latents_BthwC: Array) -> Array:
+    """Invert ``encode``; the q copies of the first frame are averaged.
+
+    Args:
+        config: the codec.
+        params: none.
+        latents_BthwC: (B, k + 1, h, w, q·s·s·C).
+
+    Returns:
+        (B, q·k + 1, h·s, w·s, C) video.
+    """
+    del params
+    batch, latent_frames, h, w, width = latents_BthwC.shape
+    s, q = config.spatial, config.temporal
+    grid = latents_BthwC.reshape(batch, latent_frames, h, w, q, s, s, width // (q * s * s))
+    grid = grid.transpose(0, 1, 4, 2, 5, 3, 6, 7)
+    video = grid.reshape(batch, latent_frames, q, h * s, w * s, -1)
+    rest = video[:, 1:].reshape(batch, -1, *video.shape[3:])
+    return jnp.concatenate([video[:, :1].mean(2), rest], 1)

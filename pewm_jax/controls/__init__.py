@@ -1,0 +1,1 @@
+"""Controls: cameras and actions as conditioning of the denoiser."""

@@ -1,0 +1,170 @@
+"""The numbers of a codec: what is left of frames that it never saw, encoded and decoded.
+
+Frames are scored at the size that they were recorded at, which need not be the one trained on.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax import shipped
+from pewm_jax.codecs import learned as learned_codec
+from pewm_jax.config import CodecWorldConfig, UserError
+from pewm_jax.data.dataset import MANIFEST, EpisodeSource
+from pewm_jax.eval.images import psnr, unit_colours
+from pewm_jax.eval.imagine import print_now
+from pewm_jax.eval.protocol import file_hash
+from pewm_jax.geometry import holes
+from pewm_jax.io import atomic
+from pewm_jax.nn.signals import depth_from_signal, signal_from_depth, signal_from_rgb
+from pewm_jax.train import runs
+from pewm_jax.types import Array, Frames, Params
+from pewm_jax.worlds.rollouts import load_finished
+
+FRAMES = 16
+"""Frames of an episode that are scored, evenly spread over it."""
+
+
+def score(
+    run: str | Path,
+    *,
+    data: str | Path | None = None,
+    split: str | None = None,
+    say: Callable[[str], Any] = print_now,
+) -> Path:
+    """Score a trained codec on a split and print and write the numbers.
+
+    Args:
+        run: the folder of a finished run of the world `codec`, or the name of a codec that comes
+            with the library.
+        data: the data set's folder; by default the run's.
+        split: the folder inside it; by default the run's ``evaluate.split``.
+        say: told the numbers.
+
+    Returns:
+        The file written, ``RUN/report/codec-SPLIT.json`` (``runs/NAME/report/…`` of a codec that
+        comes with the library). Scores are means over frames, then over
+        episodes, then over scenes; ``error`` is the standard error over scenes.
+
+    Raises:
+        UserError: the run, its weights or the data are absent, damaged, or do not fit together.
+    """
+    home, run = shipped.home(run), shipped.find(run)
+    config, params = load_finished(run)
+    if not isinstance(config.model, CodecWorldConfig):
+        raise UserError(f"{run} holds a world model and no codec alone: use pewm-jax evaluate.")
+    if not runs.is_finished(run, config):
+        raise UserError(
+            f"{run} is not trained to its end: run the training's command again, which goes on "
+            "where it stopped and fits the latents' statistics last."
+        )
+    folder = Path(data or config.data.path) / (split or config.evaluate.split)
+    episodes = EpisodeSource(folder)
+    measure = jax.jit(functools.partial(measures, config.model))
+    scenes: dict[str, list[dict[str, float]]] = {}
+    for episode in episodes:
+        count = min(FRAMES, episode.length)
+        frames = episode.frames(np.linspace(0, episode.length - 1, count).round().astype(int))
+        found = jax.device_get(measure(params["codec"], frames))
+        scenes.setdefault(episode.scene, []).append(_mean_of_frames(found))
+    sizes = sorted({f"{episode.width}×{episode.height}" for episode in episodes})
+    numbers = {
+        name: _over_scenes([[one[name] for one in scene] for scene in scenes.values()])
+        for name in next(iter(scenes.values()))[0]
+    }
+    result = {
+        "data": str(folder),
+        "dataset_sha256": file_hash(folder / MANIFEST),
+        "weights_sha256": file_hash(run / "weights.safetensors"),
+        "size": sizes,
+        "scenes": len(scenes),
+        "episodes": len(episodes),
+        "frames_of_each": FRAMES,
+        "parameters": sum(x.size for x in jax.tree.leaves(params["codec"])),
+        "numbers": numbers,
+    }
+    path = home / "report" / f"codec-{folder.name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(path, json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    say(f"{folder}: {len(scenes)} scenes, {', '.join(sizes)} pixels")
+    for line in _lines(numbers):
+        say(line)
+    return path
+
+
+def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[str, Array]:
+    """Measure one episode's frames, encoded and decoded.
+
+    Args:
+        model: the world.
+        params: the codec's parameters.
+        frames: (T, H, W, …) of any size that the codec takes, colours uint8.
+
+    Returns:
+        Of each frame (T,): ``psnr`` of colour in decibels; of measured pixels within the model's
+        range ``depth_cm``, the mean absolute error in centimetres, and ``depth_relative`` (not a
+        number where nothing was measured); ``square_rgb`` and ``square_depth``, the mean squares of
+        the normalised latents, together 1 on average where the frames are like those trained on.
+    """
+    rgb = signal_from_rgb(frames.rgb_THWC)
+    depth = jnp.asarray(frames.depth_THW)
+    whole = holes.fill_depth(depth, model.clip.far_m)
+    grey = jnp.broadcast_to(signal_from_depth(model.clip, whole)[..., None], rgb.shape)
+    both = jnp.stack([rgb, grey])
+    latents = learned_codec.encode(model.codec, params, both)  # type: ignore[arg-type]
+    made = learned_codec.decode(model.codec, params, latents)  # type: ignore[arg-type]
+    squared = jnp.square(unit_colours(made[0]) - unit_colours(frames.rgb_THWC))
+    inside = (depth >= model.clip.near_m) & (depth <= model.clip.far_m)
+    off = jnp.abs(depth_from_signal(model.clip, made[1].mean(-1)) - depth) * inside
+    count = inside.sum((1, 2))
+    return {
+        "psnr": psnr(squared.mean((1, 2, 3))),
+        "depth_cm": 100 * off.sum((1, 2)) / count,
+        "depth_relative": (off / jnp.where(inside, depth, 1)).sum((1, 2)) / count,
+        "square_rgb": jnp.square(latents[0]).mean((1, 2, 3)),
+        "square_depth": jnp.square(latents[1]).mean((1, 2, 3)),
+    }
+
+
+def _mean_of_frames(found: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Average over the frames that have a number."""
+    means = {}
+    for name, values in found.items():
+        known = values[np.isfinite(values)]
+        means[name] = float(known.mean()) if len(known) else float("nan")
+    return means
+
+
+def _over_scenes(scenes: list[list[float]]) -> dict[str, float | None]:
+    """Average episodes, then scenes; None where there is nothing to average."""
+    means = np.array([np.mean(scene) for scene in scenes])
+    means = means[np.isfinite(means)]
+    many = len(means) > 1
+    return {
+        "mean": float(means.mean()) if len(means) else None,
+        "error": float(means.std(ddof=1) / np.sqrt(len(means))) if many else None,
+    }
+
+
+def _lines(numbers: Mapping[str, Mapping[str, float | None]]) -> list[str]:
+    units = {
+        "psnr": "colour, PSNR, dB",
+        "depth_cm": "depth off by, cm",
+        "depth_relative": "depth off by, share",
+        "square_rgb": "latents of colour, mean square",
+        "square_depth": "latents of depth, mean square",
+    }
+    lines = []
+    for name, about in units.items():
+        mean, error = numbers[name]["mean"], numbers[name]["error"]
+        shown = "nothing measured" if mean is None else f"{mean:.3f}"
+        lines.append(f"  {about:<30} {shown}" + (f" ± {error:.3f}" if error is not None else ""))
+    return lines

@@ -1,0 +1,312 @@
+"""Two scored runs side by side: differences clip by clip, under one protocol or not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pewm_jax import config as configuration
+from pewm_jax import shipped
+from pewm_jax.config import Config, UserError
+from pewm_jax.eval import intervals, protocol_file, samples
+from pewm_jax.eval.fixed import Protocol, difference
+from pewm_jax.eval.images import MASKS
+from pewm_jax.eval.loaded_run import OWN
+from pewm_jax.eval.measure import SCHEMA as REPORT_SCHEMA
+from pewm_jax.eval.report import METRICS, PAGE, PROTOCOL, make_folder
+from pewm_jax.io import atomic
+from pewm_jax.report import compare_page
+from pewm_jax.train import runs
+
+SCHEMA = 1
+"""Version of the layout of ``comparison.json``, which ``docs/evaluation.md`` describes."""
+COMPARISON = "comparison.json"
+SEED, DATA = "train.seed", "data.path"
+"""Settings in which seeds of one training may differ; in a report the path is that of the data that
+were scored, which may lie anywhere."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """A report that was read from its folder.
+
+    Attributes:
+        name: the run, as it was named.
+        folder: the report's.
+        metrics: the content of ``metrics.json``.
+        samples: the scores of every clip.
+        protocol: what they were scored by.
+    """
+
+    name: str
+    folder: Path
+    metrics: Mapping[str, Any]
+    samples: samples.Samples
+    protocol: Protocol
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the comparison says of it."""
+        said = self.metrics["protocol"]
+        return {
+            "run": self.name,
+            "report": str(self.folder),
+            "method": self.samples.own,
+            "weights_sha256": said["weights_sha256"],
+            "training_seed": said["training_seed"],
+            "sampler": said["sampler"],
+            "sampling_steps": said["sampling_steps"],
+        }
+
+
+def compare(
+    one: str | Path,
+    two: str | Path,
+    *,
+    also_one: Sequence[str | Path] = (),
+    also_two: Sequence[str | Path] = (),
+    out: str | Path | None = None,
+    say: Callable[[str], Any] = print,
+) -> Path:
+    """Write a page and ``comparison.json`` on two runs that were scored by one protocol.
+
+    Args:
+        one: a scored run, or the folder of one of its reports.
+        two: the same.
+        also_one: runs that differ from ``one`` in the training seed alone.
+        also_two: the same of ``two``.
+        out: the folder to write; by default ``compare-TWO`` beside the first one's report.
+        say: shows a line.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        UserError: a run has no report, or not of this version; the protocols differ; or runs that
+            should differ in the training seed alone do not.
+    """
+    groups = [[read(name) for name in names] for names in ([one, *also_one], [two, *also_two])]
+    first = groups[0][0]
+    for report in (*groups[0][1:], *groups[1]):
+        _require_same_protocol(first, report)
+    for group in groups:
+        _require_seeds(group)
+    content = content_of(*groups)
+    folder = Path(out) if out else first.folder.parent / f"compare-{_short(groups[1][0])}"
+    make_folder(folder)
+    pictures = compare_page.side_by_side(first.protocol, first.folder, groups[1][0].folder)
+    atomic.write_text(folder / PAGE, compare_page.render(content, pictures))
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+    atomic.write_text(folder / COMPARISON, text + "\n")
+    for line in compare_page.sentences(content):
+        say(line)
+    return folder / PAGE
+
+
+def read(name: str | Path) -> Report:
+    """Read a run's report.
+
+    Args:
+        name: a run's folder, the name of weights that come with the library, or the folder of a
+            report itself.
+
+    Raises:
+        UserError: there is none, it is of another version, or its files do not belong together.
+    """
+    folder = Path(name)
+    if not (folder / METRICS).is_file():
+        folder = shipped.home(name) / OWN
+    again = f"score it with `pewm-jax evaluate {name}`; what is scored is kept"
+    try:
+        metrics = json.loads((folder / METRICS).read_text("utf-8"))
+    except OSError:
+        raise UserError(f"{name} has no report in {folder}: {again}.") from None
+    except ValueError as error:
+        raise UserError(f"{folder / METRICS} is not JSON ({error}): {again}.") from None
+    if isinstance(metrics, dict) and "protocol_sha256" not in (metrics.get("protocol") or {}):
+        raise UserError(
+            f"the report in {folder} holds no protocol: it is of a codec, whose frames are not "
+            f"compared, or of an earlier version of the library; in that case {again}."
+        )
+    if not isinstance(metrics, dict) or metrics.get("schema") != REPORT_SCHEMA:
+        raise UserError(f"the report in {folder} is of another version of the library: {again}.")
+    report = Report(
+        str(name), folder, metrics, samples.load(folder), protocol_file.load(folder / PROTOCOL)
+    )
+    said, about = metrics["protocol"], report.samples.about
+    hashes = {said["protocol_sha256"], about["protocol_sha256"], report.protocol.sha256}
+    if len(hashes) > 1 or said["weights_sha256"] != about["weights_sha256"]:
+        raise UserError(f"the files of {folder} are not of one evaluation: {again}.")
+    return report
+
+
+def _require_same_protocol(one: Report, two: Report) -> None:
+    if one.protocol.sha256 != two.protocol.sha256:
+        file = one.folder / PROTOCOL
+        raise UserError(
+            f"{one.name} and {two.name} were scored by different protocols "
+            f"({one.protocol.sha256[:12]} and {two.protocol.sha256[:12]}: "
+            f"{difference(one.protocol, two.protocol)}), so their clips cannot be paired; score "
+            f"one by the other's: `pewm-jax evaluate {two.name} --protocol {file}`."
+        )
+
+
+def _require_seeds(group: Sequence[Report]) -> None:
+    """Refuse runs that are not trainings of the same, each with a seed of its own."""
+    if len(group) == 1:
+        return
+    settings = [
+        runs.identity(configuration.from_dict(Config, dict(report.metrics["protocol"]["config"])))
+        for report in group
+    ]
+    for report, there in zip(group[1:], settings[1:], strict=True):
+        here = settings[0] | {name: there.get(name) for name in (SEED, DATA)}
+        wrong = runs.differences(here, there)
+        if wrong:
+            raise UserError(
+                f"{report.name} and {group[0].name} are no two seeds of one training: "
+                f"{'; '.join(wrong)}; compare them with each other instead."
+            )
+    seeds = [found.get(SEED) for found in settings]
+    if len(set(seeds)) < len(seeds):
+        raise UserError(
+            f"of {', '.join(report.name for report in group)} two were trained with the same seed "
+            f"({', '.join(map(str, seeds))}); train each with another --train.seed."
+        )
+
+
+def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
+    """Return the content of ``comparison.json``.
+
+    Args:
+        one: reports of the first model's training seeds, all by one protocol.
+        two: the same of the second.
+
+    Returns:
+        See ``docs/evaluation.md``; differences are first − second.
+    """
+    reports = [*one, *two]
+    protocols = [report.metrics["protocol"] for report in reports]
+    nets = {each.get("lpips_name") or each["lpips_weights_sha256"] for each in protocols} - {None}
+    skip = {"lpips"} if len(nets) > 1 else set()
+    measured = [_measured(group) for group in (one, two)]
+    content: dict[str, Any] = {
+        "schema": SCHEMA,
+        "protocol_sha256": one[0].protocol.sha256,
+        "protocol": _facts(one[0]),
+        "how": intervals.how(),
+        "lpips_name": one[0].metrics["protocol"].get("lpips_name"),
+        "left_out": sorted(skip),
+        "measured_by_one": sorted((measured[0] ^ measured[1]) - skip),
+    }
+    sides = {"a": one, "b": two}
+    for side, group in sides.items():
+        content[side] = {"name": group[0].name, "runs": [report.facts for report in group]}
+    content["differences"] = {}
+    for part in samples.PARTS:
+        houses_C = np.unique(one[0].samples.houses(part), return_inverse=True)[1]
+        values = {side: _values(group, part, skip) for side, group in sides.items()}
+        averaged = {side: _map(lambda x: x.mean(0), found) for side, found in values.items()}
+        averaged["differences"] = _map(np.subtract, averaged["a"], averaged["b"])
+        for side, found in averaged.items():
+            content[side][part] = _map(lambda x, h=houses_C: intervals.entry(x, h), found)
+        if part == "clips":
+            content["training_seeds"] = _over_seeds(values, houses_C)
+            content["by_house"] = _by_house(one[0], averaged, houses_C)
+    return content
+
+
+def _facts(report: Report) -> dict[str, Any]:
+    """Return what the page says of the protocol."""
+    chosen = report.protocol
+    return {
+        "episodes": len(chosen.episodes),
+        "houses": len(set(report.samples.houses("clips"))),
+        "house": report.samples.about["clustered_by"],
+        "clips": len(chosen.clips),
+        "rollouts": len(chosen.rollouts),
+        "sampling_seeds": list(chosen.seeds),
+        **{
+            name: getattr(chosen, name)
+            for name in ("split", "context", "stride", "horizon", "long_horizon", "control")
+        },
+    }
+
+
+def _values(group: Sequence[Report], part: str, skip: set[str]) -> dict[str, dict[str, Any]]:
+    """Return ``[mask][metric]`` as (K, C, …): training seeds, clips; sampling seeds averaged."""
+    tables = [report.samples.table(part, report.samples.own) for report in group]
+    return {
+        mask: {
+            metric: np.stack([table[mask][metric].mean(0) for table in tables])
+            for metric in tables[0][mask]
+            if metric not in skip and all(metric in table[mask] for table in tables)
+        }
+        for mask in MASKS
+    }
+
+
+def _measured(group: Sequence[Report]) -> set[str]:
+    """Return the metrics that all runs of a side have."""
+    tables = [report.samples.table("clips", report.samples.own) for report in group]
+    return set.intersection(*(set(table[MASKS[-1]]) for table in tables))
+
+
+def _map(function: Callable[..., Any], *tables: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Apply a function to the entries ``[mask][metric]`` that all tables have."""
+    return {
+        mask: {
+            metric: function(*(table[mask][metric] for table in tables))
+            for metric in tables[0][mask]
+            if all(metric in table[mask] for table in tables)
+        }
+        for mask in MASKS
+    }
+
+
+def _over_seeds(values: Mapping[str, Any], houses_C: np.ndarray) -> dict[str, Any]:
+    """Return each training seed's mean over houses, and intervals over training seeds."""
+
+    def means(values_KC: np.ndarray) -> list[float]:
+        return [float(intervals.over_houses(values_C, houses_C)["mean"]) for values_C in values_KC]
+
+    def entry(*groups: list[float]) -> dict[str, Any]:
+        if not np.isfinite(np.concatenate(groups)).all():
+            return {"mean": None, "low": None, "high": None}
+        return intervals.over_seeds(*groups)
+
+    per_seed = {side: _map(means, found) for side, found in values.items()}
+    found = {side: _map(entry, table) for side, table in per_seed.items()}
+    for side, table in found.items():
+        for mask, by_metric in table.items():
+            for metric, numbers in by_metric.items():
+                plain = per_seed[side][mask][metric]
+                numbers["per_seed"] = [value if np.isfinite(value) else None for value in plain]
+    return {**found, "differences": _map(entry, per_seed["a"], per_seed["b"])}
+
+
+def _by_house(
+    report: Report, averaged: Mapping[str, Any], houses_C: np.ndarray
+) -> list[dict[str, Any]]:
+    """Return for every house its clips and the difference of PSNR under each mask."""
+    names, counts = np.unique(report.samples.houses("clips"), return_counts=True)
+    found = {
+        mask: intervals.within_houses(averaged["differences"][mask]["psnr"], houses_C)
+        for mask in MASKS
+    }
+    return [
+        {"house": str(name), "clips": int(count)}
+        | {m: float(x[i]) if np.isfinite(x[i]) else None for m, x in found.items()}
+        for i, (name, count) in enumerate(zip(names, counts, strict=True))
+    ]
+
+
+def _short(report: Report) -> str:
+    """Return a name for a folder: the run's, with the report's where it is not the run's own."""
+    run = report.folder.parent.resolve().name
+    return run if report.folder.name == OWN else f"{run}-{report.folder.resolve().name}"

@@ -1,0 +1,86 @@
+"""What the model's memory covers of the pixels that it will be scored on, clip by clip."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import Config, ModelConfig
+from pewm_jax.data.episodes import Episode
+from pewm_jax.eval.imagine import Imagination, print_now
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import ClipChoice, choose
+from pewm_jax.eval.scoring import Batch, load_batch
+from pewm_jax.eval.shares import gathered, share
+from pewm_jax.memory import memories
+from pewm_jax.memory.coverage import Coverage, coverage
+from pewm_jax.types import Array, Frames
+
+
+def score_coverage(
+    config: Config,
+    episodes: Sequence[Episode],
+    model: Imagination,
+    partials: Partials,
+    say: Callable[[str], Any] = print_now,
+    choices: Sequence[ClipChoice] | None = None,
+) -> dict[str, float] | None:
+    """Count over the first clip of every chain that is scored; kept with the partial results.
+
+    Without ``choices`` they are those of ``choose``.
+
+    Returns:
+        The shares of the pixels seen before: ``held``, ``chosen``, ``attended``, ``rendered``,
+        ``looked_at`` (see ``memory.coverage.Coverage``); None if no pixel was seen before.
+
+    Raises:
+        UserError: as for ``scoring.score_table``.
+    """
+    if choices is None:
+        choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
+    starts = range(0, len(choices), config.evaluate.batch)
+    names = {first: f"coverage2-clip{first:04d}" for first in starts}
+    known = {first: piece for first in starts if (piece := partials.get(names[first])) is not None}
+    todo = [first for first in share(starts) if first not in known]
+    if todo:
+        say("counting what the map covers …")
+    for first in todo:
+        chosen = choices[first : first + config.evaluate.batch]
+        batch = load_batch(config, episodes, chosen, first, cameras=model.cameras)
+        known[first] = partials.put(names[first], counts=_count(config.model, model, batch))
+    found = gathered(partials, names, known, "coverage")
+    counts = [found[first]["counts"].sum(0) for first in starts]
+    total = dict(zip(_names(), np.sum(counts, 0).astype(float), strict=True))
+    seen = total.pop("seen")
+    return {name: count / seen for name, count in total.items()} if seen else None
+
+
+def _names() -> list[str]:
+    return [field.name for field in dataclasses.fields(Coverage)]
+
+
+def _count(config: ModelConfig, model: Imagination, batch: Batch) -> np.ndarray:
+    """Return (clips, 6) pixels, in the order of ``Coverage``'s fields."""
+    state, length = model.begin(batch.context), config.clip.frames - 1
+    targets, seen = jax.tree.map(lambda x: x[:, :length], (batch.targets, batch.seen))
+    present = jax.tree.map(lambda x: x[:, -1:], batch.context)
+    frames = jax.tree.map(lambda a, b: np.concatenate([a, b], 1), present, targets)
+    seen = np.concatenate([np.zeros_like(seen[:, :1]), seen], 1)  # the present is not imagined
+    counted = _coverage_of_clips(config, state.map, frames, seen)
+    return np.stack([getattr(counted, name) for name in _names()], -1)[: batch.real]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _coverage_of_clips(config: ModelConfig, maps: Any, frames: Frames, seen: Array) -> Coverage:
+    def one(clip: tuple[Any, Frames, Array]) -> Coverage:
+        memory, frames, seen_THW = clip
+        tokens = memories.tokens(config, memory, frames.camera)
+        return coverage(config, memory, tokens, frames, seen_THW)
+
+    return jax.lax.map(one, jax.tree.map(jnp.asarray, (maps, frames, seen)))

@@ -1,0 +1,253 @@
+"""Does what is placed in a world stay? Measured in its voxels, after many imagined frames.
+
+In each trial a world begins in a recorded grid. A block of one class is put on the floor in front
+of the agent, which then walks as recorded. Beside it the same walk without the block is imagined.
+What is outside of the window around the agent cannot change, and inside ``model.hold`` keeps it:
+how many frames had a part of the block in their window stands beside what stayed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import Config, PersistConfig, UserError
+from pewm_jax.data.progress import Meter
+from pewm_jax.eval.horizon import Walk
+from pewm_jax.geometry.actions import heading
+from pewm_jax.memory import class_edit, class_grid
+from pewm_jax.memory.class_grid import ClassGrid
+from pewm_jax.models.persist import voxel_renderer
+from pewm_jax.types import Array, Params, WorldState
+from pewm_jax.worlds.persist import windows
+from pewm_jax.worlds.persist import world as persist
+
+AHEAD_M = (1.25, 1.75, 2.25, 0.75)
+"""Distances in front of the agent at which there may be room, metres, the best first."""
+BLOCK_M = (0.5, 0.5, 0.75)
+"""Size of the block along x, y, z, metres."""
+STAYS = 0.5
+"""Share of a block's cells that must still have its class."""
+SEEN = 4
+"""Rays of a frame that must meet the block first for it to count as in sight."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trials:
+    """What came of the trials.
+
+    Attributes:
+        kept_N: share of each block's cells that have its class in the end.
+        shown: in how many frames a block was in sight of its camera, and not all that was.
+        visible: in how many of these the picture is changed more there than elsewhere.
+        within: in how many frames a block was in the window that may change.
+        frames: how many frames there were, of all walks with a block.
+        asked: how many walks there were, with room for a block or without.
+        hold: ``model.hold``, nats.
+    """
+
+    kept_N: np.ndarray
+    shown: int
+    visible: int
+    within: int
+    frames: int
+    asked: int
+    hold: float
+
+    def facts(self) -> dict[str, Any]:
+        """Return plain values, for a report."""
+        kept = self.kept_N
+        return {
+            "trials": len(kept),
+            "without_room": self.asked - len(kept),
+            "stayed": int((kept >= STAYS).sum()),
+            "share_of_trials": float((kept >= STAYS).mean()) if len(kept) else 0.0,
+            "share_of_cells": float(kept.mean()) if len(kept) else 0.0,
+            "frames_in_sight": int(self.shown),
+            "changed_in_sight": int(self.visible),
+            "frames": int(self.frames),
+            "frames_in_window": int(self.within),
+            "hold": float(self.hold),
+        }
+
+
+def room(model: PersistConfig, state: WorldState, floor_z: float) -> np.ndarray | None:
+    """Return a box (2, 3), metres, of empty cells on the floor in front of the agent, or None."""
+    cells = np.asarray(state.map.classes_XYZ)
+    low, size = np.asarray(state.map.low_3), windows.cell_m(model)
+    pose = np.asarray(state.frame.camera.world_from_camera)[0]
+    yaw = float(heading(pose))
+    for away in AHEAD_M:
+        middle = pose[:2, 3] + away * np.array([np.cos(yaw), np.sin(yaw)])
+        corner = np.array([*(middle - np.array(BLOCK_M[:2]) / 2), floor_z])
+        first = np.round((corner - low) / size).astype(int)
+        count = np.round(np.array(BLOCK_M) / size).astype(int)
+        a, b = first, first + count
+        if (a < 0).any() or (b > cells.shape).any():
+            continue
+        if (cells[a[0] : b[0], a[1] : b[1], a[2] : b[2]] == 0).all():
+            return np.stack([low + first * size, low + (first + count) * size]).astype(np.float32)
+    return None
+
+
+def class_of(config: Config, walks: Sequence[Walk], name: str = "") -> int:
+    """Return the id of the class that blocks are made of.
+
+    Args:
+        config: an experiment of a ``persist`` world.
+        walks: one for each trial.
+        name: of the class; by default the first kind of furniture.
+
+    Raises:
+        UserError: the walks have no voxels, or there is no such class.
+    """
+    if any(walk.first is None for walk in walks):
+        raise UserError("the walks have no voxels: collect them with --voxels.")
+    table = class_grid.names(config.model.memory)
+    furniture = (each for each in table if each.startswith("furniture"))
+    return class_grid.number_of(config.model.memory, name or next(furniture, table[-1]))
+
+
+def run(
+    config: Config,
+    params: Params,
+    walks: Sequence[Walk],
+    name: str = "",
+    batch: int = 8,
+    chunk: int = 16,
+    count: int | None = None,
+) -> Trials:
+    """Place, walk and look.
+
+    Args:
+        config: an experiment of a ``persist`` world.
+        params: its weights.
+        walks: one for each trial, of one length, with voxels.
+        name: class of the blocks; see ``class_of``.
+        batch: walks imagined at once.
+        chunk: frames imagined by one call.
+        count: trials that are enough: walks after these are not looked at; None for all.
+
+    Raises:
+        UserError: see ``class_of``.
+    """
+    model: PersistConfig = config.model
+    number = class_of(config, walks, name)
+    start = jax.jit(functools.partial(persist.start_in, model))
+    imagine = functools.partial(persist.imagine, model)
+    imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
+    look = jax.jit(functools.partial(_sight, model))
+    ready: list[_Trial] = []
+    looked = 0
+    for walk in walks:
+        if len(ready) == count:
+            break
+        looked += 1
+        assert walk.first is not None
+        frames = jax.tree.map(lambda x: x[-1:], walk.context)
+        state = start(params, frames, *walk.first)
+        floor = float(frames.camera.world_from_camera[0, 2, 3]) - model.memory.eye_m  # type: ignore[attr-defined]
+        box = room(model, state, floor)
+        if box is not None:
+            edited = persist.edit(state, class_edit.place, model.memory, box, number)
+            cells = _cells(model, edited.map, box, number)
+            ready.append(_Trial(state, edited, box, walk.actions_T3, cells))
+    kept, seen = [], np.zeros(3, int)
+    steps = len(walks[0].actions_T3)
+    with Meter("trials", len(ready), "trials") as meter:
+        for at in range(0, len(ready), batch):
+            some = ready[at : at + batch]
+            filled = some + some[:1] * (batch - len(some))
+            plain, edited = (_stacked([x[k] for x in filled]) for k in (0, 1))
+            actions = np.stack([trial.actions_T3 for trial in filled])
+            for first in range(0, steps, chunk):
+                keys = jax.random.split(jax.random.key(at * 1000 + first), batch)
+                part = actions[:, first : first + chunk]
+                plain, without = imagine(params, plain, part, keys)
+                edited, made = imagine(params, edited, part, keys)
+                change = np.abs(np.asarray(made.rgb_THWC) - np.asarray(without.rgb_THWC)).mean(-1)
+                for k, trial in enumerate(some):
+                    grid = jax.tree.map(lambda x, k=k: x[k], edited.map)
+                    for t in range(change.shape[1]):
+                        camera = jax.tree.map(lambda x, k=k, t=t: x[k, t][None], made.camera)
+                        there, within = look(grid, camera, jnp.asarray(trial.box_23))
+                        seen += [*judged(np.asarray(there), change[k, t]), bool(within)]
+            for k, trial in enumerate(some):
+                grid = jax.tree.map(lambda x, k=k: x[k], edited.map)
+                kept.append(_cells(model, grid, trial.box_23, number) / trial.cells)
+            meter.advance(len(some))
+    shown, visible, within = (int(x) for x in seen)
+    frames = steps * len(ready)
+    return Trials(np.array(kept), shown, visible, within, frames, looked, model.hold)
+
+
+def judged(there_hw: np.ndarray, change_HW: np.ndarray) -> tuple[bool, bool]:
+    """Return whether a block is in sight, and whether the picture is changed more there.
+
+    Args:
+        there_hw: bool, rays that meet the block first.
+        change_HW: by how much pixels differ from those of the same walk without it.
+    """
+    rows, columns = (
+        np.arange(size) * rays // size
+        for size, rays in zip(change_HW.shape, there_hw.shape, strict=True)
+    )
+    large = there_hw[rows][:, columns]
+    if there_hw.sum() < SEEN or large.all():
+        return False, False
+    return True, bool(change_HW[large].mean() > 2 * change_HW[~large].mean())
+
+
+class _Trial(NamedTuple):
+    """A walk with room for a block: its world without it and with it."""
+
+    plain: WorldState
+    edited: WorldState
+    box_23: np.ndarray
+    actions_T3: np.ndarray
+    cells: int
+
+
+def _cells(model: PersistConfig, grid: ClassGrid, box_23: np.ndarray, number: int) -> int:
+    """Return how many cells of a box have a class."""
+    held = class_edit.copy(model.memory, grid, jnp.asarray(box_23))
+    return int((held.classes_XYZ == number).sum())
+
+
+def _sight(model: PersistConfig, grid: ClassGrid, camera: Any, box_23: Any) -> tuple[Array, Array]:
+    """Return which rays of a camera first meet a cell of a box, and whether its window has some.
+
+    Returns:
+        (rows, columns) bool, and () bool: a part of the box is in the window around the camera.
+    """
+    place = camera.world_from_camera[0, :3, 3]
+    first = windows.first_cell(model, grid.low_3, place)
+    marked = class_edit.place(model.memory, grid, box_23, 1)
+    unmarked = class_edit.place(model.memory, grid, box_23, 0)
+    both = [
+        voxel_renderer.look(
+            model.backbone.renderer,  # type: ignore[attr-defined]
+            jnp.maximum(windows.window(model, one.classes_XYZ, first), 0)[None],
+            (grid.low_3 + first * windows.cell_m(model))[None],
+            windows.cell_m(model),
+            camera,
+            (model.clip.height, model.clip.width),
+        )
+        for one in (marked, unmarked)
+    ]
+    apart = [(one.ids_L[0, ..., 0], one.distance_L[0, ..., 0]) for one in both]
+    (ids, depth), (other, beyond) = apart
+    low = grid.low_3 + first * windows.cell_m(model)
+    high = low + windows.side(model) * windows.cell_m(model)
+    within = jnp.all((box_23[1] > low) & (box_23[0] < high))
+    return (ids != other) | (jnp.abs(depth - beyond) > 1e-3), within
+
+
+def _stacked(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(part) for part in x]), *trees)

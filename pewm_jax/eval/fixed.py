@@ -1,0 +1,307 @@
+"""The protocol as a value with a hash: what is scored, whatever model it is scored with.
+
+It says which episodes (by the hash of what they hold), starts, context, motion, noise and horizon.
+It knows nothing of a model, so any two models of its size can be scored by it and compared clip by
+clip. Equal choices have equal hashes, wherever the data lie (``protocol_file.py`` keeps them).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.config import Config, UserError
+from pewm_jax.data.episodes import Episode
+from pewm_jax.eval.protocol import VERSION, ClipChoice, choose, long_choices, needs_cameras
+
+NOISE = "key(seed), folded with the clip's place in the list and its number in the chain"
+"""How noise follows from a seed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeKey:
+    """An episode, recognised by ``sha256`` of its record: every picture, depth, pose and action."""
+
+    name: str
+    scene: str
+    sha256: str
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipKey:
+    """A clip to imagine.
+
+    Attributes:
+        episode: place in ``Protocol.episodes``.
+        start: the present frame.
+        context: frames observed, oldest first, the present last.
+        targets: frames to imagine.
+        motion_sha256: hash of the recorded poses at the start and the targets, and of the actions
+            recorded between them.
+    """
+
+    episode: int
+    start: int
+    context: tuple[int, ...]
+    targets: tuple[int, ...]
+    motion_sha256: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """Everything that is chosen.
+
+    Attributes:
+        split: name of the folder that the episodes were chosen from.
+        height: of a picture, pixels.
+        width: the same.
+        context: frames observed before each clip.
+        stride: recorded actions between two imagined frames.
+        horizon: frames imagined from each start.
+        long_horizon: the same of long rollouts.
+        seeds: of the sampling noise; long rollouts take the first.
+        control: ``actions`` or ``cameras``: what drives the model.
+        episodes: those that clips are of.
+        clips: what is scored, in the order that gives each clip its noise.
+        rollouts: the long rollouts.
+        noise: how noise follows from a seed.
+        scoring: version of the rules by which pixels are scored.
+    """
+
+    split: str
+    height: int
+    width: int
+    context: int
+    stride: int
+    horizon: int
+    long_horizon: int
+    seeds: tuple[int, ...]
+    control: str
+    episodes: tuple[EpisodeKey, ...]
+    clips: tuple[ClipKey, ...]
+    rollouts: tuple[ClipKey, ...]
+    noise: str = NOISE
+    scoring: int = VERSION
+
+    @property
+    def sha256(self) -> str:
+        """The hash of all choices."""
+        return hash_of(dataclasses.asdict(self))
+
+    @property
+    def pieces_sha256(self) -> str:
+        """The hash of all choices but the seeds: what the scores of one seed depend on."""
+        return hash_of(dataclasses.asdict(self) | {"seeds": None})
+
+
+def hash_of(content: Any) -> str:
+    """Return the sha256 of a JSON value, whatever the order of its keys."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def chosen(
+    config: Config, episodes: Sequence[Episode]
+) -> tuple[list[ClipChoice], list[ClipChoice]]:
+    """Choose clips and long rollouts by an experiment's settings, on the way back of every episode.
+
+    Args:
+        config: gives the length of clips, ``data.context`` and ``evaluate``.
+        episodes: held-out episodes.
+
+    Raises:
+        UserError: no episode is long enough.
+    """
+    clips = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
+    return clips, long_choices(config, episodes)
+
+
+def shortened(config: Config, protocol: Protocol) -> str:
+    """Say that long rollouts are shorter than the settings ask, where they are; or ""."""
+    asked = config.evaluate.video_clips * (config.model.clip.frames - 1)
+    if protocol.long_horizon >= asked:
+        return ""
+    return (
+        f"long rollouts have {protocol.long_horizon} frames, and not the {asked} of "
+        "evaluate.video_clips: no walk of these data is long enough"
+    )
+
+
+def fix(
+    config: Config,
+    episodes: Sequence[Episode],
+    clips: Sequence[ClipChoice],
+    rollouts: Sequence[ClipChoice],
+) -> Protocol:
+    """Return the protocol of chosen clips and long rollouts.
+
+    Args:
+        config: gives the size of pictures, ``data.context`` and ``evaluate``.
+        episodes: held-out episodes.
+        clips: what is scored.
+        rollouts: the long rollouts.
+
+    Raises:
+        UserError: the episodes have other frames than the clip's.
+    """
+    shape, keys, clip_keys = config.model.clip, [], {}
+    for index in sorted({choice.episode for choice in (*clips, *rollouts)}):
+        episode = episodes[index]
+        if (episode.height, episode.width) != (shape.height, shape.width):
+            raise UserError(
+                f"episode {episode.name} has frames of {episode.height}×{episode.width} and clips "
+                f"are of {shape.height}×{shape.width}: collect or import the data at that size."
+            )
+        for choice in (*clips, *rollouts):
+            if choice.episode == index:
+                clip_keys[choice] = ClipKey(
+                    len(keys),
+                    choice.start,
+                    choice.context_S,
+                    choice.targets_N,
+                    motion_hash(episode, choice),
+                )
+        keys.append(EpisodeKey(episode.name, episode.scene, content_hash(episode)))
+    return Protocol(
+        split=config.evaluate.split,
+        height=shape.height,
+        width=shape.width,
+        context=config.data.context,
+        stride=config.evaluate.stride,
+        horizon=len(clips[0].targets_N),
+        long_horizon=len(rollouts[0].targets_N),
+        seeds=tuple(config.evaluate.seeds),
+        control="cameras" if needs_cameras(episodes, [*rollouts, *clips]) else "actions",
+        episodes=tuple(keys),
+        clips=tuple(clip_keys[choice] for choice in clips),
+        rollouts=tuple(clip_keys[choice] for choice in rollouts),
+    )
+
+
+def content_hash(episode: Episode) -> str:
+    """Return the sha256 of an episode's record."""
+    return hashlib.sha256(episode.record).hexdigest()
+
+
+def motion_hash(episode: Episode, choice: ClipChoice) -> str:
+    """Return the hash of a clip's motion, as it was recorded and before any arithmetic."""
+    poses = episode.world_from_camera[[choice.start, *choice.targets_N]]
+    digest = hashlib.sha256(np.ascontiguousarray(poses, "<f4").tobytes())
+    if episode.actions is not None:
+        steps = episode.actions[choice.start : choice.targets_N[-1]]
+        digest.update(np.ascontiguousarray(steps, "<f4").tobytes())
+    return digest.hexdigest()
+
+
+def find(
+    protocol: Protocol, episodes: Sequence[Episode], where: str
+) -> tuple[list[ClipChoice], list[ClipChoice]]:
+    """Find a protocol's clips in a data set; its episodes may lie in any order, among others.
+
+    Args:
+        protocol: what was chosen.
+        episodes: the data set.
+        where: its name in messages.
+
+    Returns:
+        ``(clips, rollouts)``.
+
+    Raises:
+        UserError: an episode is missing, or is not the same any more.
+    """
+    wanted, found, names = {key.name for key in protocol.episodes}, {}, set()
+    for index in range(len(episodes)):
+        episode = episodes[index]
+        names.add(episode.name)
+        if episode.name in wanted:  # the record holds its name, so no other can be the same
+            found[content_hash(episode)] = index
+    for key in protocol.episodes:
+        if key.sha256 not in found:
+            there = "holds another one of that name" if key.name in names else "does not hold it"
+            raise UserError(
+                f"the protocol scores episode {key.name} (sha256 {key.sha256[:12]}…), and {where} "
+                f"{there}; name the folder of the protocol's data by --data and --split, or write "
+                "a protocol of this one."
+            )
+
+    def choice(clip: ClipKey) -> ClipChoice:
+        key = protocol.episodes[clip.episode]
+        index = found[key.sha256]
+        return ClipChoice(index, key.name, key.scene, clip.start, clip.context, clip.targets)
+
+    return [choice(clip) for clip in protocol.clips], [choice(clip) for clip in protocol.rollouts]
+
+
+def decide(
+    config: Config, episodes: Sequence[Episode], fixed: Protocol | None, where: str
+) -> tuple[Protocol, list[ClipChoice], list[ClipChoice]]:
+    """Return the protocol with its clips and long rollouts: those that are fixed, or chosen now.
+
+    Args:
+        config: the experiment, under the protocol that is fixed.
+        episodes: the data set.
+        fixed: a protocol that was chosen before, or None.
+        where: the data set's name in messages.
+
+    Raises:
+        UserError: as ``find``, ``chosen`` and ``fix``.
+    """
+    if fixed is not None:
+        return fixed, *find(fixed, episodes, where)
+    clips, rollouts = chosen(config, episodes)
+    return fix(config, episodes, clips, rollouts), clips, rollouts
+
+
+def lay(protocol: Protocol, config: Config) -> Config:
+    """Return an experiment's settings with those that the protocol fixes in their place.
+
+    Raises:
+        UserError: the model's clips have another size, or do not fill the horizon.
+    """
+    clip = config.model.clip
+    if (clip.height, clip.width) != (protocol.height, protocol.width):
+        raise UserError(
+            f"the protocol is of pictures of {protocol.height}×{protocol.width} and this model "
+            f"makes {clip.height}×{clip.width}: write a protocol of data of the model's size."
+        )
+    each = clip.frames - 1
+    for horizon in (protocol.horizon, protocol.long_horizon):
+        if horizon % each:
+            raise UserError(
+                f"the protocol asks for {horizon} imagined frames and this model imagines {each} "
+                f"at once: write a protocol whose horizon is a multiple of {each}."
+            )
+    evaluate = dataclasses.replace(
+        config.evaluate,
+        split=protocol.split,
+        clips=len(protocol.clips),
+        chain=protocol.horizon // each,
+        stride=protocol.stride,
+        seeds=protocol.seeds,
+        video_clips=protocol.long_horizon // each,
+    )
+    data = dataclasses.replace(config.data, context=protocol.context)
+    return dataclasses.replace(config, evaluate=evaluate, data=data)
+
+
+def difference(one: Protocol, two: Protocol) -> str:
+    """Return in a few words what differs between two protocols; "" if nothing does."""
+    for field in dataclasses.fields(Protocol):
+        first, second = getattr(one, field.name), getattr(two, field.name)
+        if first == second:
+            continue
+        if field.name not in ("episodes", "clips", "rollouts"):
+            return f"{field.name.replace('_', ' ')} {first} and {second}"
+        if len(first) != len(second):
+            return f"{len(first)} and {len(second)} {field.name}"
+        if field.name == "episodes":
+            return "other episodes"
+        pair = next((a, b) for a, b in zip(first, second, strict=True) if a != b)
+        starts = " and ".join(f"frame {key.start}" for key in pair)
+        return f"other {field.name}, such as one from {starts}"
+    return ""

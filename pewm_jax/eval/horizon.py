@@ -1,0 +1,220 @@
+"""Long horizons: hundreds of frames from one start, with the recorded actions, by several worlds.
+
+PERSIST's protocol (arXiv 2603.03482): windows of 16 frames that end at 200, 400 and 600 imagined
+frames of held-out walks, compared with the true ones as sets (FVD, KVD). Beside that PSNR by
+stretches of the walk, which says how stable a world is; for ``persist`` also that of its renderer
+given the true voxels, which bounds it, and what is left of it without its voxels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax import worlds
+from pewm_jax.config import Config, PersistConfig, UserError
+from pewm_jax.data.episodes import Episode
+from pewm_jax.data.progress import Meter
+from pewm_jax.eval.images import psnr, unit_colours
+from pewm_jax.eval.metrics.videos import DISTANCES, VideoDistance
+from pewm_jax.geometry.actions import PLANAR
+from pewm_jax.report.pictures import as_bytes
+from pewm_jax.types import Camera, Control, Params
+from pewm_jax.worlds.persist import world as persist
+
+WINDOW = 16
+"""Frames of a window."""
+CHUNK = 40
+"""Frames that are imagined by one call."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    """A held-out walk.
+
+    Attributes:
+        name: of the episode.
+        context: (S) observed frames, the present last.
+        actions_T3: the recorded actions after it.
+        truth_THWC: uint8 colours of the frames that they lead to.
+        camera: (T) cameras of these.
+        classes_TXYZ: recorded voxels of these, or None.
+        origin_T3: their lowest corners, or None.
+        first: voxels and corner of the present frame, or None.
+    """
+
+    name: str
+    context: Any
+    actions_T3: np.ndarray
+    truth_THWC: np.ndarray
+    camera: Camera
+    classes_TXYZ: np.ndarray | None
+    origin_T3: np.ndarray | None
+    first: tuple[np.ndarray, np.ndarray] | None
+
+
+def walk_of(episode: Episode, start: int, frames: int, context: int) -> Walk:
+    """Read a walk of ``frames`` frames after frame ``start`` of an episode.
+
+    Raises:
+        UserError: it is too short, or has no planar actions.
+    """
+    if start + frames >= episode.length or start + 1 < context:
+        raise UserError(
+            f"episode {episode.name} has {episode.length} frames, and {context} observed ones and "
+            f"{frames} more from {start} on do not lie in it: collect longer episodes (pewm-jax "
+            "data collect DATA --frames …)."
+        )
+    if episode.actions is None or episode.actions.shape[1] != PLANAR:
+        raise UserError(f"episode {episode.name} has no planar actions, by which worlds are led.")
+    after = np.arange(start + 1, start + frames + 1)
+    seen = episode.frames(range(start + 1 - context, start + 1))
+    true = episode.frames(after)
+    found = first = None
+    if episode.voxel_grid is not None:
+        found, here = episode.voxels(after), episode.voxels([start])
+        first = here.classes_TXYZ[0], here.origin_T3[0]
+    return Walk(
+        episode.name,
+        seen,
+        np.asarray(episode.actions[start : start + frames], np.float32),
+        true.rgb_THWC,
+        true.camera,
+        None if found is None else found.classes_TXYZ,
+        None if found is None else found.origin_T3,
+        first,
+    )
+
+
+def roll(
+    config: Config,
+    params: Params,
+    walks: Sequence[Walk],
+    *,
+    memory: bool = True,
+    known: bool = False,
+    say: str = "imagining",
+) -> np.ndarray:
+    """Imagine all walks at once; returns (B, T, H, W, 3) uint8 colours.
+
+    Args:
+        config: the experiment.
+        params: its weights.
+        walks: of one length.
+        memory: False goes on from the last picture alone, clip after clip.
+        known: begins in the recorded grid of the present frame, of a ``persist`` world.
+        say: what the progress is called.
+    """
+    model = config.model
+    each = CHUNK if memory else model.clip.frames - 1
+    imagine = functools.partial(worlds.imagine, model, memory=memory)
+    imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
+    if known:
+        state = _begun(config, params, walks)
+    else:
+        start = jax.jit(jax.vmap(functools.partial(worlds.start, model), (None, 0)))
+        state = start(params, _stacked([walk.context for walk in walks]))
+    actions = np.stack([walk.actions_T3 for walk in walks])
+    keys = jax.random.split(jax.random.key(0), len(walks))
+    return _in_chunks(
+        actions.shape[1],
+        each,
+        say,
+        state,
+        lambda state, at: imagine(params, state, actions[:, at : at + each], _folded(keys, at)),
+    )
+
+
+def bound(config: Config, params: Params, walks: Sequence[Walk]) -> np.ndarray:
+    """Return what the renderer of a ``persist`` world makes of the true voxels and cameras."""
+    model: PersistConfig = config.model
+    render = functools.partial(persist.render_true, model)
+    render = jax.jit(jax.vmap(render, (None, 0, 0, 0, 0, 0)))
+    state = _begun(config, params, walks)
+    whole: Any = _stacked(
+        [
+            (Control(walk.camera, walk.actions_T3), walk.classes_TXYZ, walk.origin_T3)
+            for walk in walks
+        ]
+    )
+    keys = jax.random.split(jax.random.key(0), len(walks))
+
+    def made(state: Any, at: int) -> Any:
+        part = jax.tree.map(lambda x: x[:, at : at + CHUNK], whole)
+        return render(params, state, *part, _folded(keys, at))
+
+    count = walks[0].actions_T3.shape[0]
+    return _in_chunks(count, CHUNK, "rendering true voxels", state, made)
+
+
+def _begun(config: Config, params: Params, walks: Sequence[Walk]) -> Any:
+    """Return the worlds that begin in the recorded grids of the present frames."""
+    context = _stacked([jax.tree.map(lambda x: x[-1:], walk.context) for walk in walks])
+    firsts = [walk.first for walk in walks if walk.first is not None]
+    cells, corners = (np.stack(part) for part in zip(*firsts, strict=True))
+    start = functools.partial(persist.start_in, config.model)
+    return jax.jit(jax.vmap(start, (None, 0, 0, 0)))(params, context, cells, corners)
+
+
+def stretches(made: np.ndarray, truth: np.ndarray, ends: Sequence[int]) -> list[float]:
+    """Return the PSNR, decibels, of the frames from each end to the next, the mean of frames'."""
+    error = np.square(np.asarray(unit_colours(made)) - np.asarray(unit_colours(truth)))
+    each = np.asarray(psnr(error.mean((0, 2, 3, 4))))
+    return [float(each[low:high].mean()) for low, high in zip((0, *ends[:-1]), ends, strict=True)]
+
+
+def windows(video_BTHWC: np.ndarray, end: int, count: int) -> np.ndarray:
+    """Return the last ``count`` windows of 16 frames before an end, of every walk."""
+    first = max(0, end - count * WINDOW)
+    cut = video_BTHWC[:, first:end]
+    cut = cut[:, len(cut[0]) % WINDOW :]
+    return cut.reshape(-1, WINDOW, *cut.shape[2:])
+
+
+def distances(
+    made: dict[str, np.ndarray],
+    truth: np.ndarray,
+    ends: Sequence[int],
+    count: int,
+    i3d: VideoDistance,
+) -> dict[str, Any]:
+    """Return FVD and KVD of all methods at each end, with their floors."""
+    kinds = {kind: dataclasses.replace(i3d, kind=kind) for kind in DISTANCES}
+    found: dict[str, Any] = {name: {} for name in made}
+    with Meter("I3D", len(ends) * (len(made) + 1), "sets") as meter:
+        for end in ends:
+            true = i3d.features(windows(truth, end, count))
+            meter.advance(1)
+            for name, video in made.items():
+                seen = i3d.features(windows(video, end, count))
+                meter.advance(1)
+                found[name][str(end)] = {
+                    kind: metric.score(seen, true).facts() for kind, metric in kinds.items()
+                }
+    return found
+
+
+def _in_chunks(
+    count: int, each: int, say: str, state: Any, make: Callable[[Any, int], Any]
+) -> np.ndarray:
+    parts = []
+    with Meter(say, count, "frames") as meter:
+        for at in range(0, count, each):
+            state, frames = make(state, at)
+            parts.append(as_bytes(np.asarray(frames.rgb_THWC)))
+            meter.advance(min(each, count - at))
+    return np.concatenate(parts, 1)
+
+
+def _stacked(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *x: np.stack(x), *trees)
+
+
+def _folded(keys: Any, at: int) -> Any:
+    return jax.vmap(jax.random.fold_in, (0, None))(keys, jnp.uint32(at))

@@ -1,0 +1,174 @@
+"""Long rollouts: clip after clip from the model's own last frame; can be resumed.
+
+What is kept of them: the errors of every frame, the frames and the map of the first few, and how
+much the memory of the model holds after each clip.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax.config import Config
+from pewm_jax.data.episodes import Episode
+from pewm_jax.data.progress import Meter
+from pewm_jax.eval.images import unit_colours
+from pewm_jax.eval.imagine import print_now
+from pewm_jax.eval.methods import SAMPLED, Methods
+from pewm_jax.eval.metrics import Perceptual
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import ClipChoice, long_choices
+from pewm_jax.eval.scoring import Batch, Scored, load_batch
+from pewm_jax.eval.shares import gathered, share
+from pewm_jax.memory import memories
+from pewm_jax.types import WorldState
+
+
+@dataclasses.dataclass(frozen=True)
+class LongRollouts:
+    """Scored long rollouts; the frames of the first few are stored, to be shown.
+
+    Attributes:
+        scored: errors over all of them.
+        chain: clips generated one after the other.
+        shown: number of rollouts whose frames are stored.
+        kept: per method ``rgb`` (shown, N, H, W, 3) uint8 and ``depth`` (shown, N, H, W) metres;
+            for ``memory`` also the map at the start and the end: ``first_points``,
+            ``first_features``, ``first_valid``, and the same with ``last``; and ``occupied``
+            (rollouts, chain + 1), what the map holds at the start and after each clip.
+    """
+
+    scored: Scored
+    chain: int
+    shown: int
+    kept: dict[str, dict[str, np.ndarray]]
+
+
+def roll_long(
+    config: Config,
+    episodes: Sequence[Episode],
+    methods: Methods,
+    partials: Partials,
+    say: Callable[[str], Any] = print_now,
+    lpips: Perceptual | None = None,
+    choices: list[ClipChoice] | None = None,
+) -> LongRollouts:
+    """Make long rollouts with every method (first seed), score all, store the first few.
+
+    Without ``lpips`` that is left out. Without ``choices`` they are those of ``long_choices``.
+    Several processes share the work, and all return all of it.
+
+    Raises:
+        UserError: as for ``scoring.score_table``.
+    """
+    if choices is None:
+        choices = long_choices(config, episodes)
+    count, size = len(choices[0].targets_N), config.evaluate.batch
+    shown, seed = min(config.evaluate.videos, len(choices)), config.evaluate.seeds[0]
+    starts = range(0, len(choices), size)
+    keys = [(method, first) for first in starts for method in methods.names]
+    names = {
+        (method, first): f"rollouts-{methods.piece(method)}-seed{seed}-clip{first:04d}"
+        for method, first in keys
+    }
+    pieces = {
+        key: piece
+        for key in keys
+        if (piece := partials.get(names[key])) is not None
+        and len(piece["rgb"]) >= _shown(shown, key[1], len(choices), size)
+    }
+    own = set(share(keys, lambda key: key[0] not in SAMPLED))
+    todo = [key for key in keys if key not in pieces and key in own]
+    if todo:
+        methods.prepare(method for method, _ in todo)
+        total = count * sum(min(size, len(choices) - first) for _, first in todo)
+        with Meter("long rollouts", total, "frames") as meter:
+            loaded: tuple[int, Batch] | None = None
+            for method, first in todo:
+                if loaded is None or loaded[0] != first:
+                    chosen, cameras = choices[first : first + size], methods.model.cameras
+                    batch = load_batch(config, episodes, chosen, first, cameras=cameras)
+                    loaded = first, batch
+                batch, here = loaded[1], _shown(shown, first, len(choices), size)
+                made = _roll(config, methods, method, batch, here, lpips)
+                pieces[method, first] = partials.put(names[method, first], **made)
+                meter.advance(count * batch.real)
+        say(meter.summary())
+    found = gathered(partials, names, pieces, "long rollouts")
+    kept = {
+        method: _joined([found[method, first] for first in starts], shown)
+        for method in methods.names
+    }
+    sums = {method: piece["sums"][None] for method, piece in kept.items()}
+    chain = count // (config.model.clip.frames - 1)
+    return LongRollouts(Scored(choices, sums), chain, shown, kept)
+
+
+def _shown(shown: int, first: int, rollouts: int, size: int) -> int:
+    """Return how many rollouts of a batch are shown."""
+    return min(max(shown - first, 0), size, rollouts - first)
+
+
+def _joined(parts: Sequence[dict[str, np.ndarray]], shown: int) -> dict[str, np.ndarray]:
+    """Join batches; of what is shown no more than was asked for now."""
+    joined = {key: np.concatenate([part[key] for part in parts if key in part]) for key in parts[0]}
+    every = ("sums", "occupied")
+    return {key: array if key in every else array[:shown] for key, array in joined.items()}
+
+
+def _roll(
+    config: Config,
+    methods: Methods,
+    method: str,
+    batch: Batch,
+    shown: int,
+    lpips: Perceptual | None,
+) -> dict[str, np.ndarray]:
+    """Imagine a batch of long rollouts; frames and maps of the first ``shown`` are kept."""
+    held: list[np.ndarray] = []
+
+    def count(state: WorldState) -> None:
+        held.append(np.asarray(occupied(config, state.map))[: batch.real])
+
+    remembers = method == "memory"
+    first, last, frames = batch.imagine(
+        methods, method, config.evaluate.seeds[0], count if remembers else None
+    )
+    colours = np.asarray(unit_colours(frames.rgb_THWC[:shown]))
+    kept = {
+        "sums": batch.sums(frames, lpips),
+        "rgb": np.rint(colours * 255).astype(np.uint8),
+        "depth": np.asarray(frames.depth_THW[:shown], np.float32),
+    }
+    if remembers:
+        kept["occupied"] = np.stack(held, -1)
+        if shown:
+            kept |= _map_points(config, first.map, shown, "first")
+            kept |= _map_points(config, last.map, shown, "last")
+    return kept
+
+
+def occupied(config: Config, maps: Any) -> np.ndarray:
+    """Return how many points each map of a batch holds, (B,): cells, surfels or patches."""
+    return np.asarray(_occupied(config, maps))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _occupied(config: Config, maps: Any) -> jax.Array:
+    return jax.vmap(lambda one: memories.to_points(config.model, one)[2].sum())(maps)
+
+
+def _map_points(config: Config, maps: Any, shown: int, when: str) -> dict[str, np.ndarray]:
+    maps = jax.tree.map(lambda leaf: leaf[:shown], maps)
+    to_points = functools.partial(memories.to_points, config.model)
+    points, features, valid = jax.vmap(to_points)(maps)
+    return {
+        f"{when}_points": np.asarray(points),
+        f"{when}_features": np.asarray(features),
+        f"{when}_valid": np.asarray(valid),
+    }

@@ -1,0 +1,210 @@
+"""The content of ``metrics.json``: scores, margins, and the protocol that they were made by."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib import metadata
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax import registry as kinds
+from pewm_jax.config import Config, to_dict
+from pewm_jax.eval import intervals, mirror, statistics
+from pewm_jax.eval.long_rollouts import LongRollouts
+from pewm_jax.eval.metrics import VideoDistance
+from pewm_jax.eval.metrics.structure import Consistency
+from pewm_jax.eval.metrics.videos import DISTANCES
+from pewm_jax.eval.mirror import Mirror
+from pewm_jax.eval.scoring import TRUTH, Scored
+
+SCHEMA = 1
+"""Version of the layout of ``metrics.json``, which ``docs/evaluation.md`` describes. Entries may be
+added; increase it when one goes or comes to mean something else."""
+
+
+def measure(
+    config: Config,
+    scored: Scored,
+    long: LongRollouts,
+    back: Mirror | None = None,
+    i3d: VideoDistance | None = None,
+    consistency: Consistency | None = None,
+) -> dict[str, Any]:
+    """Turn errors into the content of ``metrics.json``, except for hashes.
+
+    Returns:
+        ``schema``; ``protocol``; ``results[method][mask][metric] = {mean, stderr, n}``;
+        ``margins[method][mask][metric]``, the model minus that method, clip by clip, and
+        ``margin``, the one over ``empty`` (None of a model without a memory);
+        ``per_frame[method][mask][metric]``; ``long`` with the same of long rollouts,
+        ``drift[method]`` (see ``statistics.drift``) and ``growth``, what the map holds; ``houses``,
+        means over houses with 95 % intervals (see ``intervals.table``), with the same of long
+        rollouts in ``long``; ``videos``, FVD and KVD; ``mirror``, the mirror test (see
+        ``mirror.facts``); ``scs``, see ``structure``; None where something was not measured.
+    """
+    return {
+        "schema": SCHEMA,
+        "protocol": protocol_of(config, scored, long),
+        **_scores(scored),
+        "long": {
+            **_scores(long.scored),
+            "drift": statistics.drift(long.scored.sums, long.scored.clusters),
+            "growth": growth(config, long),
+        },
+        "videos": videos(config, scored, i3d) if i3d else None,
+        "mirror": mirror.facts(back) if back else None,
+        "scs": structure(config, scored, consistency) if consistency else None,
+        "houses": {
+            "how": intervals.how(),
+            "house": scored.clustered_by,
+            **intervals.table(scored.sums, scored.clusters),
+            "long": intervals.table(long.scored.sums, long.scored.clusters),
+        },
+    }
+
+
+def _scores(scored: Scored) -> dict[str, Any]:
+    margins = statistics.margins(scored.sums, scored.clusters)
+    return {
+        "results": statistics.table(scored.sums, scored.clusters),
+        "margin": margins.get("empty"),
+        "margins": margins,
+        "per_frame": statistics.per_frame(scored.sums, scored.clusters),
+    }
+
+
+def growth(config: Config, long: LongRollouts) -> dict[str, Any] | None:
+    """Return how much the map holds along long rollouts, or None where there is none."""
+    held = long.kept.get("memory", {}).get("occupied")
+    if held is None:
+        return None
+    each = config.model.clip.frames - 1
+    clusters = long.scored.clusters
+    return {
+        "frames": [each * clip for clip in range(long.chain + 1)],
+        "occupied": intervals.entry(held, clusters),
+        "per_frame": intervals.entry((held[:, -1] - held[:, 0]) / (each * long.chain), clusters),
+        "capacity": config.model.memory.room,
+    }
+
+
+def structure(config: Config, scored: Scored, consistency: Consistency) -> dict[str, Any]:
+    """Return SCS of every method and its ceiling, over houses; ``docs/evaluation.md`` says more."""
+
+    def entry(values: np.ndarray) -> dict[str, Any]:
+        return intervals.entry(values, scored.clusters)
+
+    values = {method: scs for method, scs in scored.structure.items() if method != TRUTH}
+    truth, own = scored.structure[TRUTH], values[statistics.ours(values)]
+    return {
+        "name": consistency.name,
+        "seed": config.evaluate.seeds[0],
+        "clips": int(np.isfinite(truth[:, 0]).sum()),
+        "results": {method: entry(scs[:, 0]) for method, scs in values.items()},
+        "per_frame": {method: entry(scs[:, 1:]) for method, scs in values.items()},
+        "ceiling": entry(truth[:, 0]),
+        "ceiling_per_frame": entry(truth[:, 1:]),
+        "margins": {
+            method: entry(own[:, 0] - scs[:, 0]) for method, scs in values.items() if scs is not own
+        },
+    }
+
+
+def videos(config: Config, scored: Scored, i3d: VideoDistance) -> dict[str, Any] | None:
+    """Return FVD and KVD of every method with their floors; None of fewer than two clips."""
+    features = dict(scored.features)
+    truth, clips = features.pop(TRUTH), len(scored.choices)
+    if clips < 2:
+        return None
+    frames = len(scored.choices[0].targets_N) + 1
+    kinds_of = {kind: dataclasses.replace(i3d, kind=kind) for kind in DISTANCES}
+    return {
+        "frames": frames,
+        "clips": clips,
+        "seed": config.evaluate.seeds[0],
+        "names": {kind: metric.name(frames, clips) for kind, metric in kinds_of.items()},
+        "results": {
+            method: {kind: metric.score(found, truth).facts() for kind, metric in kinds_of.items()}
+            for method, found in features.items()
+        },
+    }
+
+
+def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
+    """Describe the measurement completely enough to repeat it."""
+    clip, choices, own = config.model.clip, scored.choices, statistics.ours(scored.sums)
+    remembers = own == "memory"
+    scenes = sorted({choice.scene for choice in choices + long.scored.choices})
+    return {
+        "scenes": len(scenes),
+        "episodes": len({choice.episode for choice in choices}),
+        "clips": len(choices),
+        "training_seed": getattr(config.train, "seed", None),
+        "seeds": list(config.evaluate.seeds),
+        "chain": config.evaluate.chain,
+        "context": config.data.context,
+        "frames": clip.frames,
+        "imagined_frames": config.evaluate.chain * (clip.frames - 1),
+        "stride": config.evaluate.stride,
+        "noise": kinds.of(config.model.noise).name,
+        "sampler": getattr(config.model.noise, "sampler", "euler"),
+        "sampling_steps": config.model.noise.sample_steps,
+        "guidance": config.model.noise.guidance,
+        "resolution": f"{clip.width} × {clip.height} pixels",
+        "method": own,
+        **_memory_of(config, remembers=remembers),
+        "dataset": config.data.path,
+        "split": config.evaluate.split,
+        "starts": "spread evenly over the way back of every episode; no randomness",
+        "observed": "context frames spread evenly over the episode's past, the present one last; "
+        + (
+            "all go into the map, and the model also sees the present one itself"
+            if remembers
+            else "the model has no memory and sees the present one alone"
+        ),
+        "motion": "the recorded one; poses integrated from actions agree with the recorded poses",
+        "seen": "a pixel whose true point projects into an observed frame where the true depth "
+        "agrees (nearest pixel or interpolated, larger of 5 cm and 3 %)",
+        "seen_share": round(statistics.seen_share(scored.sums[own]), 4),
+        "psnr": "of colours in [0, 1], from the mean squared error of all masked pixels of a clip; "
+        "equal images count as 100 dB",
+        "ssim": "11 × 11 Gaussian window, σ 1.5, valid windows, averaged over masked pixels",
+        "depth": "mean absolute error in metres, and relative to the true depth",
+        "stderr": "over clips, seeds averaged within a clip, clustered by " + scored.clustered_by,
+        "clustered_by": scored.clustered_by,
+        "long_rollouts": {
+            "rollouts": len(long.scored.choices),
+            "clips_each": long.chain,
+            "frames_each": long.chain * (clip.frames - 1),
+            "seed": config.evaluate.seeds[0],
+            "shown": long.shown,
+        },
+        "versions": {"pewm_jax": _version(), "jax": jax.__version__},
+        "scene_names": scenes,
+        "clip_list": [[choice.name, choice.start] for choice in choices],
+        "config": to_dict(config),
+    }
+
+
+def _memory_of(config: Config, *, remembers: bool) -> dict[str, Any]:
+    """Return what is said of the memory; nulls where the model has none."""
+    memory = config.model.memory
+    if not remembers:
+        return {"memory": "none"} | dict.fromkeys(("encoder", "reader", "positions", "map"))
+    read = f", {memory.tokens} read per clip" if memory.READ_BY_BLOCKS else ""
+    return {
+        "memory": kinds.of(memory).name,
+        "encoder": kinds.of(memory.encoder).name,
+        "reader": kinds.of(memory.reader).name,
+        "positions": getattr(memory.reader, "positions", ""),
+        "map": f"{memory.room} cells of {memory.cell_m} m" + read,
+    }
+
+
+def _version() -> str:
+    try:
+        return metadata.version("pewm-jax")
+    except metadata.PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,186 @@
+"""LPIPS of clips: frame by frame, a bounded number of pictures at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+from pewm_jax.eval.metrics.pictures import colours, marked
+from pewm_jax.models.lpips import model as lpips
+from pewm_jax.models.lpips import weights as lpips_weights
+from pewm_jax.models.lpips.model import LEAST, NAMES, Net
+from pewm_jax.types import Array, Params
+
+PIXELS = 2**17
+"""Pixels of imagined pictures that are in the network at once, or one picture if it has more."""
+KEPT = 2**28
+"""Bytes of the truth's features that are kept; where there are more, they are made each time."""
+OFF = "off"
+"""The setting that leaves LPIPS out."""
+PACKAGED: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
+"""The settings that stand for a network of the installed package."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Perceptual:
+    """LPIPS with its weights; a ``Metric``.
+
+    Attributes:
+        net: the network.
+        params: its parameters.
+        sha256: hash of the file that they were read from.
+        encoder: the network's name; weights other than the package's mark it (``alex-1a2b3c4d``).
+    """
+
+    net: Net
+    params: Params = dataclasses.field(repr=False)
+    sha256: str = ""
+    encoder: str = ""
+
+    def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
+        """Return the mean over each clip's frames, (B,); see ``Metric``."""
+        return self.frames(imagined_BTHWC, truth_BTHWC).mean(1)
+
+    def frames(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
+        """Return the distance of every frame, (B, T); arguments as of ``Metric``.
+
+        Raises:
+            UserError: the clips are not alike, or too small for the network.
+        """
+        imagined, truth = colours(imagined_BTHWC, truth_BTHWC)
+        lpips.require_size(self.net, *imagined.shape[2:4])
+        return _distances(self.net, self.params, imagined, truth)
+
+    def towards(self, truth_BTHWC: Array) -> Callable[[Array], Array]:
+        """Return ``frames`` from any clips to these, which pass through the network once.
+
+        Args:
+            truth_BTHWC: as of ``Metric``.
+
+        Returns:
+            ``imagined_BTHWC -> distances (B, T)``, which raises what ``frames`` raises.
+        """
+        made = jax.eval_shape(self.described, truth_BTHWC)
+        if sum(x.size * x.dtype.itemsize for x in made) > KEPT:
+            return lambda imagined_BTHWC: self.frames(imagined_BTHWC, truth_BTHWC)
+        described = self.described(truth_BTHWC)
+
+        def to(imagined_BTHWC: Array) -> Array:
+            imagined, _ = colours(imagined_BTHWC, truth_BTHWC)
+            return _to_described(self.net, self.params, imagined, described)
+
+        return to
+
+    def described(self, truth_BTHWC: Array) -> tuple[Array, ...]:
+        """Return ``lpips.describe`` of all pictures of some clips."""
+        truth, _ = colours(truth_BTHWC, truth_BTHWC)
+        lpips.require_size(self.net, *truth.shape[2:4])
+        return _described(self.net, self.params, truth)
+
+    @property
+    def about(self) -> str:
+        """What is measured, for the protocol."""
+        return (
+            f"version 0.1 with {NAMES[self.net]}, of colours in [−1, 1], whole pictures, not "
+            "resized, averaged over a clip's frames; lower is better"
+        )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _distances(net: Net, params: Params, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
+    """Compare colours in [0, 1], frame by frame."""
+    clips, frames, height, width, _ = imagined_BTHWC.shape
+    pairs = tuple(
+        2 * x.reshape(clips * frames, height, width, 3) - 1 for x in (imagined_BTHWC, truth_BTHWC)
+    )
+
+    def one(pair: tuple[Array, Array]) -> Array:
+        return lpips.apply(net, params, pair[0][None], pair[1][None])[0]
+
+    return jax.lax.map(one, pairs, batch_size=_at_once(pairs[0])).reshape(clips, frames)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _described(net: Net, params: Params, truth_BTHWC: Array) -> tuple[Array, ...]:
+    """Describe colours in [0, 1]; pictures first."""
+    pictures = 2 * truth_BTHWC.reshape(-1, *truth_BTHWC.shape[2:]) - 1
+
+    def one(picture: Array) -> tuple[Array, ...]:
+        return tuple(x[0] for x in lpips.describe(net, params, picture[None]))
+
+    return jax.lax.map(one, pictures, batch_size=_at_once(pictures))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _to_described(
+    net: Net, params: Params, imagined_BTHWC: Array, truth: tuple[Array, ...]
+) -> Array:
+    """Compare colours in [0, 1] with what was described."""
+    clips, frames = imagined_BTHWC.shape[:2]
+    pictures = 2 * imagined_BTHWC.reshape(-1, *imagined_BTHWC.shape[2:]) - 1
+
+    def one(pair: tuple[Array, tuple[Array, ...]]) -> Array:
+        mine = lpips.describe(net, params, pair[0][None])
+        return lpips.distance(params, mine, [x[None] for x in pair[1]])[0]
+
+    found = jax.lax.map(one, (pictures, truth), batch_size=_at_once(pictures))
+    return found.reshape(clips, frames)
+
+
+def _at_once(pictures_NHWC: Array) -> int:
+    return max(1, PIXELS // (pictures_NHWC.shape[1] * pictures_NHWC.shape[2]))
+
+
+def read(path: Path, net: Net | None = None) -> Perceptual:
+    """Read LPIPS from a file of weights.
+
+    Args:
+        path: the file.
+        net: the network that it must be of; by default whichever it is.
+
+    Raises:
+        UserError: see ``models.lpips_weights.read``.
+    """
+    found, params = lpips_weights.read(path, net)
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    name = marked(found, params, lpips_weights.PUBLISHED[found])
+    return Perceptual(found, jax.device_put(params), digest, name)
+
+
+def chosen(setting: str, height: int, width: int) -> tuple[Perceptual | None, str]:
+    """Return the LPIPS that a setting asks for, and a sentence on it or on why there is none.
+
+    Args:
+        setting: ``evaluate.lpips``.
+        height: of the pictures that are scored, pixels.
+        width: the same.
+
+    Raises:
+        UserError: what is asked for by name is not there, is damaged, or cannot take such pictures.
+    """
+    if setting == OFF:
+        return None, "LPIPS is left out, as evaluate.lpips says."
+    if setting:
+        net = PACKAGED.get(setting)
+        metric = read(lpips_weights.find(net) if net else Path(setting), net)
+        lpips.require_size(metric.net, height, width)
+        return metric, metric.about
+    path = lpips_weights.installed("alex")
+    if path is None:
+        return None, (
+            f"LPIPS is left out, since no weights of it are installed: {lpips_weights.INSTALL}, or "
+            "name a file of them by --lpips."
+        )
+    if min(height, width) < LEAST["alex"]:
+        return None, (
+            f"LPIPS is left out: its {NAMES['alex']} needs pictures of {LEAST['alex']} pixels each "
+            f"way and these have {width} × {height}; --lpips vgg takes smaller ones."
+        )
+    metric = read(path, "alex")
+    return metric, metric.about

@@ -1,0 +1,331 @@
+"""SCS, the structural consistency score: whether things are where they really are (EgoWM, Eq. 7).
+
+The mean over things and frames of IoU(mask in the imagined clip, mask in the true one), times 100
+(arXiv 2601.15284). Frame 0 is the observed one: it defines the things and does not count. A pair of
+masks that are both empty does not count either, since there is no overlap to measure.
+
+The paper trims every sequence where all points that are visible in the first frame have left the
+view, so that no frame counts that shows only new places. These points include walls, floors and
+ceilings, which are no tracked things. So a thing that has left the view while a wall of the first
+frame is still visible keeps counting: a model that still shows it scores 0 there. The paper finds
+the end with a point tracker. Here it is computed from depth and poses (``first_visible``).
+
+Masks of the truth are exact, from a renderer's instance ids (``object_masks``). Those of an
+imagined clip need a segmenter, a function ``(video_THWC, first_KHW) -> masks_KTHW`` that follows
+the first frame's masks. The paper's is SAM 2. ``follow_by_flow`` is a stand-in without weights,
+which follows pixels by optical flow: it loses things that the model redraws elsewhere, and its
+scores are not comparable with the paper's. So each score is reported beside its ceiling, the score
+of the true clip with the same segmenter.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import UserError
+from pewm_jax.eval.seen import visible_in
+from pewm_jax.geometry.cameras import unproject
+from pewm_jax.houses.kinds import SHELL, kind_of
+from pewm_jax.types import Array, Camera
+
+Segmenter: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""``(video_THWC uint8, first_KHW bool) -> masks_KTHW bool``: follows K things through T frames."""
+
+SMALLEST = 0.002
+"""Share of the first frame's pixels below which a thing is not followed."""
+RETURN = 1.5
+"""Pixels by which flow there and back may miss its start; where it misses by more, pixels are new
+or hidden, and belong to nothing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Structure:
+    """SCS of one clip.
+
+    Attributes:
+        value: of the imagined clip; NaN where no frame or no thing counts.
+        ceiling: of the true clip through the same segmenter.
+        frames: imagined frames that count.
+        objects: things that are followed.
+    """
+
+    value: float
+    ceiling: float
+    frames: int
+    objects: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Consistency:
+    """SCS with a segmenter.
+
+    Attributes:
+        segment: follows the first frame's masks through a video.
+        encoder: name of the segmenter, such as ``flow`` or ``sam2``.
+        sha256: hash of its weights; "" if it has none.
+    """
+
+    segment: Segmenter
+    encoder: str
+    sha256: str = ""
+
+    @property
+    def name(self) -> str:
+        """The name that says what the number depends on, such as ``SCS[flow]``."""
+        return f"SCS[{self.encoder}]"
+
+    def __call__(self, video_THWC: Array, masks_true_KTHW: Array, visible_T: Array) -> np.ndarray:
+        """Return ``overlaps`` of a clip, whose masks the segmenter makes.
+
+        Args:
+            video_THWC: (T, H, W, 3) uint8; frame 0 is the observed one.
+            masks_true_KTHW: (K, T, H, W) exact masks of the true clip.
+            visible_T: (T,) bool, as ``first_visible`` returns it.
+
+        Raises:
+            UserError: the clip and the masks are not alike.
+        """
+        masks, frames = np.asarray(masks_true_KTHW), np.asarray(video_THWC)
+        if frames.dtype != np.uint8 or frames.shape != (*masks.shape[1:], 3):
+            raise UserError(
+                f"a clip of shape {frames.shape} and type {frames.dtype} has no masks of shape "
+                f"{masks.shape}: give uint8 colours (T, H, W, 3) and masks (K, T, H, W)."
+            )
+        end = max(_end(visible_T, len(frames)), 1)
+        found = np.zeros_like(masks)
+        found[:, :end] = self.segment(frames[:end], masks[:, 0])
+        return overlaps(found, masks, visible_T)
+
+
+def scs(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -> float:
+    """Return SCS of one clip, 0 … 100; NaN where nothing counts.
+
+    Args:
+        masks_pred_KTHW: (K, T, H, W) bool, K things in T imagined frames; frame 0 is the observed
+            one, whose masks are not compared.
+        masks_true_KTHW: the same in the true clip.
+        visible_T: (T,) bool, whether each frame still shows a point that frame 0 shows, of a thing
+            or of anything else (``first_visible``). Frames from the first False on do not count.
+
+    Raises:
+        UserError: the masks are not alike, or no masks, or there are not as many frames.
+    """
+    return float(average(overlaps(masks_pred_KTHW, masks_true_KTHW, visible_T)))
+
+
+def overlaps(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -> np.ndarray:
+    """Return (K, T - 1) float64, 100 × IoU of each thing in each frame but the first.
+
+    NaN where the frame does not count, or the thing is in view in neither clip.
+
+    Args:
+        masks_pred_KTHW: as for ``scs``.
+        masks_true_KTHW: as for ``scs``.
+        visible_T: as for ``scs``.
+
+    Raises:
+        UserError: the masks are not alike, or no masks, or there are not as many frames.
+    """
+    pred, true = _masks(masks_pred_KTHW, masks_true_KTHW)
+    end = _end(visible_T, true.shape[1])
+    both = np.logical_and(pred, true).sum((2, 3))
+    either = np.logical_or(pred, true).sum((2, 3))
+    found = np.where(either > 0, 100 * both / np.maximum(either, 1), np.nan)
+    found[:, end:] = np.nan
+    return found[:, 1:]
+
+
+def average(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Return the mean of the values that are not NaN; NaN where there is none."""
+    known = np.isfinite(values)
+    total, count = np.where(known, values, 0).sum(axis), known.sum(axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def frames_in_view(visible_T: Array) -> int:
+    """Return how many leading frames there are before all that was first visible has left the view.
+
+    Args:
+        visible_T: (T,) bool, whether each frame shows a point that frame 0 shows.
+    """
+    gone = np.flatnonzero(~np.asarray(visible_T, bool))
+    return int(gone[0]) if gone.size else len(np.asarray(visible_T))
+
+
+def _end(visible_T: Array, frames: int) -> int:
+    """Return ``frames_in_view``.
+
+    Raises:
+        UserError: it is no value per frame.
+    """
+    if np.shape(visible_T) != (frames,) or np.asarray(visible_T).dtype != np.bool_:
+        raise UserError(
+            f"visible_T of shape {np.shape(visible_T)} and type {np.asarray(visible_T).dtype} does "
+            f"not say which of {frames} frames show what the first shows: give one bool per frame, "
+            "such as first_visible returns."
+        )
+    return frames_in_view(visible_T)
+
+
+def first_visible(depth_THW: Array, camera: Camera) -> np.ndarray:
+    """Return (T,) bool: whether each frame shows a surface point that frame 0 shows.
+
+    The points of frame 0's pixels are projected into the other frames. A point is visible where it
+    lies inside the picture and agrees with the depth there (``seen.visible_in``), so points that
+    are hidden behind something do not count: a frame that shows none shows only new places.
+
+    Args:
+        depth_THW: (T, H, W) true z-depth, metres; 0 = no measurement.
+        camera: (T,) true cameras, intrinsics (T, 4) in pixels.
+
+    Raises:
+        UserError: there are no frames, or the first has no depth.
+    """
+    depth = np.asarray(depth_THW, np.float32)
+    if depth.ndim != 3 or not len(depth) or not (depth[0] > 0).any():
+        raise UserError(
+            f"depth of shape {depth.shape} has no measurement in its first frame: what is first "
+            "visible is computed from depth (T, H, W) in metres, such as the renderer's."
+        )
+    return np.asarray(_first_visible(depth, camera))
+
+
+@jax.jit
+def _first_visible(depth_THW: Array, camera: Camera) -> Array:
+    points = unproject(depth_THW[0], jax.tree.map(lambda x: x[0], camera)).reshape(-1, 3)
+
+    def shows(frame: tuple[Array, Camera]) -> Array:
+        return (visible_in(points, *frame) & (depth_THW[0].reshape(-1) > 0)).any()
+
+    return jax.lax.map(shows, (depth_THW, jax.tree.map(jnp.asarray, camera)))
+
+
+def things_of(info: Mapping[str, Any]) -> list[int] | None:
+    """Return the instance ids of the static things of an episode, or None if it has no names.
+
+    Walls, floors, ceilings, doorways and windows are no things. What moves by itself, such as
+    robots and doors, has ids of its own after those of the named objects, and is no thing either:
+    the score is about apparent motion that the camera's motion causes.
+
+    Args:
+        info: facts on an episode; ``objects`` are the names of instances, by id.
+    """
+    names = info.get("objects")
+    return None if names is None else [i for i, n in enumerate(names) if kind_of(n) not in SHELL]
+
+
+def object_masks(
+    ids_THW: np.ndarray, objects: Sequence[int] | None = None, smallest: float = SMALLEST
+) -> np.ndarray:
+    """Return (K, T, H, W) exact masks of the things in the first frame.
+
+    Args:
+        ids_THW: (T, H, W) instance ids, below 0 where there is nothing: ``ids_THW`` of
+            ``data.render.render``.
+        objects: ids of the things to follow, such as furniture without walls; None follows all.
+        smallest: share of the first frame's pixels that a thing must have.
+
+    Raises:
+        UserError: no instance ids of frames.
+    """
+    ids = np.asarray(ids_THW)
+    if ids.ndim != 3 or not np.issubdtype(ids.dtype, np.integer):
+        raise UserError(
+            f"instance ids of shape {ids.shape} and type {ids.dtype}: give whole numbers (T, H, W)."
+        )
+    found, pixels = np.unique(ids[0], return_counts=True)
+    large = found[(pixels >= smallest * ids[0].size) & (found >= 0)]
+    kept = large if objects is None else large[np.isin(large, objects)]
+    return ids[None] == kept[:, None, None, None]
+
+
+def structural_consistency(
+    imagined_THWC: Array,
+    truth_THWC: Array,
+    masks_true_KTHW: Array,
+    visible_T: Array,
+    segment: Segmenter | None = None,
+) -> Structure:
+    """Return SCS of an imagined clip with its ceiling.
+
+    Args:
+        imagined_THWC: (T, H, W, 3) uint8; frame 0 is the observed one.
+        truth_THWC: the true clip, the same shape.
+        masks_true_KTHW: (K, T, H, W) exact masks of the true clip, such as ``object_masks``.
+        visible_T: (T,) bool, whether each true frame still shows a point that frame 0 shows, such
+            as ``first_visible``; frames from the first False on do not count.
+        segment: how masks are followed; by default ``follow_by_flow``, the stand-in.
+
+    Raises:
+        UserError: clips, masks or numbers of frames that are not alike.
+    """
+    measure = Consistency(follow_by_flow if segment is None else segment, "")
+    value, ceiling = (
+        float(average(measure(video, masks_true_KTHW, visible_T)))
+        for video in (imagined_THWC, truth_THWC)
+    )
+    counted = max(frames_in_view(visible_T) - 1, 0)
+    return Structure(value, ceiling, counted, len(np.asarray(masks_true_KTHW)))
+
+
+def follow_by_flow(video_THWC: np.ndarray, first_KHW: np.ndarray) -> np.ndarray:
+    """Follow masks by dense optical flow from frame to frame; a stand-in, and not SAM 2.
+
+    Every pixel takes what the pixel that it comes from had in the frame before (dense inverse
+    search, Kroeger et al. 2016). Pixels whose flow does not lead back belong to nothing. No weights
+    are needed, and nothing is known of things: errors add up over frames.
+
+    Args:
+        video_THWC: (T, H, W, 3) uint8.
+        first_KHW: (K, H, W) bool, masks of the first frame; where they overlap, the last counts.
+
+    Returns:
+        (K, T, H, W) bool.
+    """
+    frames, height, width = video_THWC.shape[:3]
+    labels = np.zeros((frames, height, width), np.int32)
+    for number, mask in enumerate(np.asarray(first_KHW, bool), 1):
+        labels[0][mask] = number
+    grey = [cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_RGB2GRAY) for frame in video_THWC]
+    rows, columns = np.mgrid[:height, :width].astype(np.float32)
+    for now in range(1, frames):
+        back, forth = _flow(grey[now], grey[now - 1]), _flow(grey[now - 1], grey[now])
+        x, y = columns + back[..., 0], rows + back[..., 1]
+        there = cv2.remap(forth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        missed = np.hypot(*np.moveaxis(back + there, -1, 0))
+        column, row = np.rint(x).astype(int), np.rint(y).astype(int)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        from_there = labels[now - 1][row.clip(0, height - 1), column.clip(0, width - 1)]
+        labels[now] = np.where(inside & (missed <= RETURN), from_there, 0)
+    return labels[None] == np.arange(1, len(first_KHW) + 1)[:, None, None, None]
+
+
+def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return (H, W, 2) pixels, right and down, by which pixels of one picture move to the other."""
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    method.setFinestScale(0)
+    method.setPatchStride(2)
+    return np.asarray(method.calc(one, other, np.zeros((*one.shape, 2), np.float32)))
+
+
+def _masks(pred: Array, true: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Return two sets of masks.
+
+    Raises:
+        UserError: they are not alike, or no masks.
+    """
+    pair = np.asarray(pred), np.asarray(true)
+    shapes = [masks.shape for masks in pair]
+    if shapes[0] != shapes[1] or pair[0].ndim != 4 or any(x.dtype != np.bool_ for x in pair):
+        raise UserError(
+            f"masks of shapes {shapes[0]} and {shapes[1]} and types {pair[0].dtype} and "
+            f"{pair[1].dtype} cannot be compared: give both as (K, T, H, W) of bool."
+        )
+    return pair

@@ -1,0 +1,256 @@
+"""The mirror test: the agent goes a way and comes back the same way. Does it find what it left?
+
+From the start of each long rollout the model imagines the first frames of the recorded way, then
+the same way back: it was walked, so it is free. Each place is thus visited twice, and the later a
+place lies on the way out, the fewer frames are between both visits. What is imagined at the second
+visit is compared with the first (``metrics.revisits``), and both with the truth: a model that
+always shows one picture comes back to it perfectly.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import Config
+from pewm_jax.data.episodes import Episode
+from pewm_jax.data.progress import Meter
+from pewm_jax.eval import intervals
+from pewm_jax.eval.images import psnr, unit_colours
+from pewm_jax.eval.imagine import print_now
+from pewm_jax.eval.methods import SAMPLED, Methods
+from pewm_jax.eval.metrics import Revisit
+from pewm_jax.eval.metrics.revisits import ways
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import ClipChoice, load_clip, stack
+from pewm_jax.eval.scoring import TRUTH, Batch, Scored
+from pewm_jax.eval.shares import gathered, share
+from pewm_jax.eval.statistics import ours
+from pewm_jax.geometry.actions import there_and_back
+from pewm_jax.types import Frames
+
+USUAL, LONG = 32, 64
+"""Frames on the way out where nothing else is asked for, in long rollouts of at least so many."""
+VERSION = 1
+"""Increase it whenever the same settings would give other numbers."""
+PAIRS = ("again", "out", "back")
+"""The second visit against the first; the first and the second against the truth; PSNR."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Mirror:
+    """What the mirror test found.
+
+    Attributes:
+        scored: the R rollouts, without errors.
+        out: frames on the way out, K.
+        values: method → measure → (R,), both visits compared; of ``truth`` the ceiling.
+        floor: measure → (R,), the truth's way out against another rollout's way back; empty where
+            there is but one rollout.
+        pairs: method → one of ``PAIRS`` → (R, K) decibels, by ``distances``; NaN where the first
+            visit is the observed frame.
+    """
+
+    scored: Scored
+    out: int
+    values: dict[str, dict[str, np.ndarray]]
+    floor: dict[str, np.ndarray]
+    pairs: dict[str, dict[str, np.ndarray]]
+
+    @property
+    def distances(self) -> list[int]:
+        """Frames between both visits: 2, 4, …, 2 K."""
+        return [2 * (k + 1) for k in range(self.out)]
+
+
+def way_out(config: Config, rollouts: Sequence[ClipChoice]) -> tuple[int, str]:
+    """Return how many frames the agent goes before it comes back, 0 for no test, and a sentence.
+
+    Args:
+        config: gives ``evaluate.mirror`` and the length of clips: whole ones are imagined.
+        rollouts: the long rollouts.
+    """
+    asked, there = config.evaluate.mirror, len(rollouts[0].targets_N)
+    if asked == 0:
+        return 0, "The mirror test is left out, as evaluate.mirror says."
+    if asked < 0 and there < LONG:
+        return 0, (
+            f"The mirror test is left out: long rollouts have {there} frames and not {LONG}; "
+            f"--mirror {USUAL} asks for it, or as many frames as they have."
+        )
+    each = config.model.clip.frames - 1
+    fits = [k for k in range(1, min(asked if asked > 0 else USUAL, there) + 1) if not 2 * k % each]
+    if not fits:
+        return 0, (
+            f"The mirror test is left out: {asked} frames out and back do not fill a clip of "
+            f"{each} imagined frames; name more by --mirror."
+        )
+    return fits[-1], (
+        f"{fits[-1]} frames along the recorded way and back the same way, {len(rollouts)} "
+        f"rollouts, sampling seed {config.evaluate.seeds[0]}"
+    )
+
+
+def look_back(
+    config: Config,
+    episodes: Sequence[Episode],
+    methods: Methods,
+    partials: Partials,
+    rollouts: Sequence[ClipChoice],
+    measures: Mapping[str, Revisit],
+    say: Callable[[str], Any] = print_now,
+) -> Mirror | None:
+    """Do the mirror test with every method that is a network (first seed); None if it is left out.
+
+    Pieces that ``partials`` holds are reused; several processes share the others.
+
+    Args:
+        config: the experiment.
+        episodes: held-out episodes.
+        methods: who imagines.
+        partials: where scores are kept.
+        rollouts: the long rollouts, of whose ways the first frames are taken.
+        measures: by which both visits are compared (``metrics.chosen.revisits``).
+        say: shows a line.
+
+    Raises:
+        UserError: as for ``scoring.score_table``.
+    """
+    out, _ = way_out(config, rollouts)
+    if not out:
+        return None
+    choices = [dataclasses.replace(one, targets_N=one.targets_N[:out]) for one in rollouts]
+    seed, size = config.evaluate.seeds[0], config.evaluate.batch
+    starts, names = range(0, len(choices), size), {}
+    for first in starts:
+        for method in (*[name for name in methods.names if name in SAMPLED], TRUTH):
+            who = TRUTH if method == TRUTH else methods.piece(method)
+            name = f"mirror-{who}-seed{seed}-out{out}-{_digest(measures)}-clip{first:04d}"
+            names[method, first] = name
+    known = {key: piece for key, name in names.items() if (piece := partials.get(name)) is not None}
+    own = share(list(names), lambda key: key[0] == TRUTH)
+    todo = [key for key in own if key not in known]
+    if todo:
+        methods.prepare(method for method, _ in todo)
+        total = 2 * out * sum(min(size, len(choices) - first) for _, first in todo)
+        with Meter("mirror test", total, "frames") as meter:
+            for method, first in todo:
+                chosen = choices[first : first + size]
+                batch = _there_and_back(config, episodes, chosen, first, methods.model.cameras)
+                if method == TRUTH:
+                    others = [choices[(first + k - 1) % len(choices)] for k in range(len(chosen))]
+                    other = None
+                    if len(choices) > 1:
+                        other = _there_and_back(config, episodes, others, first, True)
+                    made = _of_truth(batch, other, measures)
+                else:
+                    frames = batch.imagine(methods, method, seed)[2]
+                    made = _of_model(batch, frames, measures)
+                made = {name: array[: batch.real] for name, array in made.items()}
+                known[method, first] = partials.put(names[method, first], **made)
+                meter.advance(2 * out * batch.real)
+        say(meter.summary())
+    found = gathered(partials, names, known, "mirror test")
+
+    def joined(method: str, kind: str) -> dict[str, np.ndarray]:
+        parts = [found[method, first] for first in starts]
+        return {
+            name.partition("/")[2]: np.concatenate([part[name] for part in parts])
+            for name in parts[0]
+            if name.partition("/")[0] == kind
+        }
+
+    everyone = list(dict.fromkeys(method for method, _ in names))
+    return Mirror(
+        scored=Scored(choices, {}),
+        out=out,
+        values={method: joined(method, "value") for method in everyone},
+        floor=joined(TRUTH, "floor"),
+        pairs={method: joined(method, "pair") for method in everyone if method != TRUTH},
+    )
+
+
+def _digest(measures: Mapping[str, Revisit]) -> str:
+    """Return a hash of what both visits are compared by."""
+    content = [VERSION, [[n, getattr(m.compare, "sha256", "")] for n, m in measures.items()]]
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
+
+
+def _there_and_back(
+    config: Config,
+    episodes: Sequence[Episode],
+    choices: Sequence[ClipChoice],
+    first: int,
+    cameras: bool,
+) -> Batch:
+    """Read a batch of ways out, and turn each round at its end; the targets are all 2 K frames."""
+    size = config.evaluate.batch
+    parts = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
+    context, targets = stack([part[0] for part in parts], size), stack([p[1] for p in parts], size)
+    present = jax.tree.map(lambda x: x[:, -1:], context)
+    way = jax.tree.map(lambda a, b: np.concatenate([a, b], 1), present, targets)
+    whole = jax.tree.map(lambda x: np.concatenate([x[:, 1:], x[:, -2::-1]], 1), way)
+    control: Any = whole.camera
+    if not cameras:
+        control = np.asarray(there_and_back(stack([part[2] for part in parts], size)))
+    numbers = first + np.arange(size)
+    return Batch(context, whole, control, numbers, None, None, real=len(choices))
+
+
+def _of_truth(
+    batch: Batch, other: Batch | None, measures: Mapping[str, Revisit]
+) -> dict[str, np.ndarray]:
+    """Return the ceilings and, given the ways of other rollouts, the floors."""
+    truth = batch.whole(batch.targets.rgb_THWC)
+    made = {f"value/{name}": measure(truth, truth) for name, measure in measures.items()}
+    if other is not None:
+        out, back = ways(truth)[0], ways(other.whole(other.targets.rgb_THWC))[1]
+        made |= {f"floor/{name}": one.compare(back, out) for name, one in measures.items()}
+    return {name: np.asarray(array) for name, array in made.items()}
+
+
+def _of_model(
+    batch: Batch, frames: Frames, measures: Mapping[str, Revisit]
+) -> dict[str, np.ndarray]:
+    """Return the measures of imagined ways, and PSNR by distance."""
+    truth, imagined = batch.whole(batch.targets.rgb_THWC), batch.whole(frames.rgb_THWC)
+    made = {f"value/{name}": measure(imagined, truth) for name, measure in measures.items()}
+    (out, back), (real, _) = ways(imagined), ways(truth)
+    pairs = {"again": (back, out), "out": (out, real), "back": (back, real)}
+    for name, (one, two) in pairs.items():
+        error = jnp.square(unit_colours(one) - unit_colours(two)).mean((2, 3, 4))
+        made[f"pair/{name}"] = psnr(error)[:, ::-1]
+    arrays = {name: np.array(array) for name, array in made.items()}
+    arrays["pair/out"][:, -1] = np.nan  # the observed frame, which nobody imagined
+    return arrays
+
+
+def facts(mirror: Mirror) -> dict[str, Any]:
+    """Return the numbers for ``metrics.json``; ``docs/evaluation.md`` describes them."""
+    houses = mirror.scored.clusters
+    own, truth = ours(mirror.pairs), mirror.values[TRUTH]
+
+    def entries(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        return {name: intervals.entry(values, houses) for name, values in arrays.items()}
+
+    def minus(method: str) -> dict[str, np.ndarray]:
+        return {name: mirror.pairs[own][name] - mirror.pairs[method][name] for name in PAIRS}
+
+    rivals = [method for method in mirror.pairs if method != own]
+    return {
+        "out": mirror.out,
+        "rollouts": len(mirror.scored.choices),
+        "distances": mirror.distances,
+        "results": {method: entries(mirror.values[method]) for method in mirror.pairs},
+        "ceiling": entries(truth),
+        "floor": entries(mirror.floor),
+        "by_distance": {method: entries(pairs) for method, pairs in mirror.pairs.items()},
+        "margins": {method: entries(minus(method)) for method in rivals},
+    }

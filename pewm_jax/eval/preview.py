@@ -1,0 +1,144 @@
+"""Previews during training: a few fixed held-out clips, imagined and scored at intervals."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.config import Config, UserError
+from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.eval.images import psnr, unit_colours
+from pewm_jax.eval.imagine import Imagination, print_now
+from pewm_jax.eval.protocol import choose, load_clip, needs_cameras, stack
+from pewm_jax.io import atomic
+from pewm_jax.report.pictures import as_bytes, farthest, grid, save_png
+from pewm_jax.report.video import encode_h264, side_by_side
+from pewm_jax.train.samples import IMAGINED, Preview, Previewed
+from pewm_jax.train.stages import Stage
+from pewm_jax.types import Frames, Params
+
+SPLIT, CLIPS, SHOWN = "validation", 8, 3
+"""The split of previews, the number of clips scored, and the number of clips shown."""
+
+
+def make_preview(
+    config: Config, run: Path, say: Callable[[str], Any] = print_now
+) -> Preview | None:
+    """Prepare previews for a training run, if its data allows any.
+
+    Previews are optional. Without validation data, or if it is too short, a line says so and there
+    are no previews.
+
+    Args:
+        config: the experiment; clips come from ``data.path``/validation.
+        run: the run's folder; images and videos go to its folder ``previews/``.
+        say: shows a line that says why there are no previews.
+
+    Returns:
+        ``preview(params, stage, step)``. It imagines the clips with the current weights and
+        measures their PSNR: with its map and with an empty map, or, in a stage without memory (such
+        as PEWM's stage 1), of the model without one. It writes ``previews/stage2-000250.png`` with
+        rows truth, with its map, empty map, and ``previews/stage2-000250.mp4``, the same side by
+        side. It is compiled once per stage. None if there is nothing to preview.
+    """
+    quick = dataclasses.replace(config.evaluate, split=SPLIT, batch=CLIPS)
+    config = dataclasses.replace(config, evaluate=quick)
+    try:
+        episodes = EpisodeSource(Path(config.data.path) / SPLIT)
+        choices = choose(config, episodes, CLIPS, 1)
+        cameras = needs_cameras(episodes, choices)
+        clips = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
+    except UserError as error:
+        say(f"no previews of this training: {error}")
+        return None
+    context = stack([clip[0] for clip in clips], CLIPS)
+    control = stack([clip[2] for clip in clips], CLIPS)
+    seeds = np.stack([np.zeros(CLIPS, int), np.arange(CLIPS)], -1)
+    models: dict[str, Imagination] = {}
+
+    def preview(params: Params, stage: Stage, step: int) -> Previewed:
+        if stage.name not in models:
+            models[stage.name] = Imagination(
+                config, params, CLIPS, config.data.context, cameras=cameras
+            )
+        variants = {"memory": True, "empty": False} if stage.memory else {"model": False}
+        made: dict[str, Frames] = {}
+        for name, memory in variants.items():
+            _, _, made[name] = models[stage.name].run(
+                context, control, seeds, memory=memory, params=params
+            )
+        name = f"{stage.name}-{step:06d}"
+        shown = clips[:SHOWN]
+        picture = _picture(shown, made, f"{stage.title}, step {step}")
+        return Previewed(
+            (
+                save_png(run / "previews" / f"{name}.png", picture),
+                _save_video(run / "previews" / f"{name}.mp4", shown, made, f"step {step}"),
+            ),
+            {name: _score(clips, frames) for name, frames in made.items()},
+        )
+
+    return preview
+
+
+_Loaded = tuple[Frames, Frames, Any]
+"""Context, true frames and control of a clip, as returned by ``protocol.load_clip``."""
+
+
+def _score(clips: Sequence[_Loaded], frames: Frames) -> float:
+    """Return the mean PSNR, decibels, over frames and clips (B, N)."""
+    truth = np.stack([true.rgb_THWC for _, true, _ in clips])
+    difference = unit_colours(frames.rgb_THWC[: len(clips)]) - unit_colours(truth)
+    return float(psnr((difference**2).mean((2, 3, 4))).mean())
+
+
+def _picture(clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str) -> np.ndarray:
+    """Arrange the frames of every clip: a row for the truth, a row for each variant."""
+    rows = []
+    for index, (seen, true, _) in enumerate(clips):
+        present = seen.rgb_THWC[-1]
+        rows.append(("truth", [present, *true.rgb_THWC]))
+        rows += [
+            (IMAGINED[name], [present, *as_bytes(frames.rgb_THWC[index])])
+            for name, frames in made.items()
+        ]
+    count = len(clips[0][1].depth_THW)
+    columns = ["observed", *(f"{index + 1}" for index in range(count))]
+    return grid(rows, columns, title=title, cell=96)
+
+
+def _save_video(
+    path: Path, clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str
+) -> Path:
+    """Write a video, atomically: clip after clip, truth and variants side by side."""
+    pictures = []
+    for index, (seen, true, _) in enumerate(clips):
+        columns = [
+            (name, _with_present(seen, rgb), _with_present_depth(seen, depth))
+            for name, rgb, depth in (
+                ("truth", true.rgb_THWC, true.depth_THW),
+                *(
+                    (IMAGINED[name], as_bytes(frames.rgb_THWC[index]), frames.depth_THW[index])
+                    for name, frames in made.items()
+                ),
+            )
+        ]
+        times = range(len(true.depth_THW) + 1)
+        where = f"{title}, clip {index + 1} of {len(clips)}"
+        footers = [f"{where}: {f'imagined {time}' if time else 'observed'}" for time in times]
+        pictures += side_by_side(columns, footers, far_m=farthest(true), cell=192)
+    with atomic.replacing(path) as partial:
+        partial.write_bytes(encode_h264(pictures))
+    return path
+
+
+def _with_present(seen: Frames, rgb_THWC: np.ndarray) -> np.ndarray:
+    return np.concatenate([seen.rgb_THWC[-1:], rgb_THWC])
+
+
+def _with_present_depth(seen: Frames, depth_THW: np.ndarray) -> np.ndarray:
+    return np.concatenate([seen.depth_THW[-1:], np.asarray(depth_THW, np.float32)])

@@ -1,0 +1,321 @@
+"""Scoring: imagine every chosen clip with every method and sum the errors; can be resumed.
+
+Every piece of work is a file of its own: one batch of clips, one method, one sampling seed. Several
+processes share them (``shares``).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import Config
+from pewm_jax.data.episodes import Episode
+from pewm_jax.data.progress import Meter
+from pewm_jax.eval.images import error_sums_batch, unit_colours, with_lpips
+from pewm_jax.eval.imagine import print_now
+from pewm_jax.eval.methods import SAMPLED, Methods
+from pewm_jax.eval.metrics import Perceptual, VideoDistance
+from pewm_jax.eval.metrics.structure import (
+    Consistency,
+    average,
+    first_visible,
+    object_masks,
+    things_of,
+)
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import ClipChoice, choose, load_clip, stack
+from pewm_jax.eval.seen import seen_masks_batch
+from pewm_jax.eval.shares import gathered, share
+from pewm_jax.types import Array, Frames
+
+TRUTH = "truth"
+"""Whose features are kept beside the methods'."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scored:
+    """Errors of a set of clips.
+
+    Attributes:
+        choices: the C clips.
+        sums: method → (seeds, C, N, 3, 9) as ``images.error_sums``; one seed without a network.
+        features: where video distances are measured, method → (C, 400) features of the clips of
+            the first seed (``metrics.videos``), and those of ``truth``.
+        structure: where SCS is measured, method → (C, 1 + N): SCS of each clip of the first seed
+            and of each imagined frame, NaN where nothing counts, and the ceiling of ``truth``.
+    """
+
+    choices: list[ClipChoice]
+    sums: dict[str, np.ndarray]
+    features: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    structure: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+    @property
+    def clustered_by(self) -> str:
+        """How standard errors are clustered: ``scene``, or ``episode`` if there is one scene."""
+        return "scene" if len({choice.scene for choice in self.choices}) > 1 else "episode"
+
+    @property
+    def clusters(self) -> np.ndarray:
+        """(C,) the cluster number of every clip; clips of one cluster show the same rooms."""
+        names = [getattr(choice, self.clustered_by) for choice in self.choices]
+        return np.unique(names, return_inverse=True)[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracked:
+    """What SCS knows of a true clip.
+
+    Attributes:
+        ids_THW: (T, H, W) instance ids of the present frame and the N frames to imagine.
+        things: ids of the things that may be followed, or None for all.
+        visible_T: (T,) bool, whether each frame shows a point that the present frame shows.
+    """
+
+    ids_THW: np.ndarray
+    things: list[int] | None
+    visible_T: np.ndarray
+
+    def score(self, measure: Consistency, video_THWC: np.ndarray) -> np.ndarray:
+        """Return (T,) SCS of a clip, and of each of its frames but the first.
+
+        Args:
+            measure: SCS with a segmenter.
+            video_THWC: (T, H, W, 3) uint8, the present frame and the N imagined ones.
+        """
+        found = measure(video_THWC, object_masks(self.ids_THW, self.things), self.visible_T)
+        return np.concatenate([average(found)[None], average(found, 0)])
+
+
+@dataclasses.dataclass(frozen=True)
+class Batch:
+    """Chosen clips, padded to one size by repeating the last; ``real`` of them are asked for.
+
+    ``described`` keeps what LPIPS makes of their truth, from its first use on. ``tracked`` holds
+    what SCS needs of the clips asked for, where it is measured.
+    """
+
+    context: Frames
+    targets: Frames
+    control: Any
+    numbers_B: np.ndarray
+    seen: Any
+    unseen: Any
+    real: int
+    described: dict[Any, Callable[[Any], Array]] = dataclasses.field(default_factory=dict)
+    tracked: tuple[Tracked, ...] = ()
+
+    def seeds(self, seed: int) -> np.ndarray:
+        """Return what the sampler's noise is drawn from: sampling seed, clip number."""
+        return np.stack([np.full_like(self.numbers_B, seed), self.numbers_B], -1)
+
+    def imagine(
+        self,
+        methods: Methods,
+        method: str,
+        seed: int,
+        watch: Callable[[Any], Any] | None = None,
+    ) -> tuple[Any, Any, Frames]:
+        """Imagine the clips, see ``Methods.imagine``."""
+        seeds, camera = self.seeds(seed), self.targets.camera
+        return methods.imagine(method, self.context, self.control, camera, seeds, watch)
+
+    def whole(self, rgb_BTHWC: Any) -> Array:
+        """Return colours in [−1, 1] with the present frame before them, of padded clips too."""
+        parts = self.context.rgb_THWC[:, -1:], rgb_BTHWC
+        return jnp.concatenate([2 * unit_colours(part) - 1 for part in parts], 1)
+
+    def structure(self, frames: Frames, measure: Consistency) -> np.ndarray:
+        """Return SCS of the clips asked for and of their frames, see ``Scored.structure``."""
+        whole = unit_colours(self.whole(frames.rgb_THWC)[: self.real])
+        videos = np.rint(255 * np.asarray(whole)).astype(np.uint8)
+        pairs = zip(self.tracked, videos, strict=True)
+        return np.stack([tracked.score(measure, video) for tracked, video in pairs])
+
+    def sums(self, frames: Frames, lpips: Perceptual | None) -> np.ndarray:
+        """Return ``images.error_sums`` of the clips asked for, with LPIPS if it is given."""
+        sums = np.asarray(error_sums_batch(frames, self.targets, self.seen, self.unseen))
+        if lpips is not None:
+            known = lpips.net, lpips.sha256
+            if known not in self.described:
+                self.described[known] = lpips.towards(self.targets.rgb_THWC)
+            sums = with_lpips(sums, np.asarray(self.described[known](frames.rgb_THWC)))
+        return sums[: self.real]
+
+
+def load_batch(
+    config: Config,
+    episodes: Sequence[Episode],
+    choices: Sequence[ClipChoice],
+    first: int,
+    *,
+    cameras: bool,
+    track: bool = False,
+) -> Batch:
+    """Read clips, the first of them number ``first``, and find what was seen before.
+
+    Args:
+        config: the experiment.
+        episodes: held-out episodes.
+        choices: the clips.
+        first: number of the first of them.
+        cameras: see ``load_clip``.
+        track: whether to read the instance ids, for SCS.
+
+    Raises:
+        UserError: see ``load_clip``; or ids are asked for and an episode has none.
+    """
+    size = config.evaluate.batch
+    parts = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
+    context = stack([part[0] for part in parts], size)
+    targets = stack([part[1] for part in parts], size)
+    control = stack([part[2] for part in parts], size)
+    seen, unseen = seen_masks_batch(targets, context)
+    tracked = tuple(_tracked(episodes[one.episode], one) for one in choices) if track else ()
+    numbers, real = first + np.arange(size), len(choices)
+    return Batch(context, targets, control, numbers, seen, unseen, real=real, tracked=tracked)
+
+
+def _tracked(episode: Episode, choice: ClipChoice) -> Tracked:
+    frames = [choice.start, *choice.targets_N]
+    clip = episode.frames(frames)
+    visible_T = first_visible(np.asarray(clip.depth_THW), clip.camera)
+    return Tracked(episode.ids(frames), things_of(episode.info), visible_T)
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A piece of the table: one batch of clips, one method, one seed, and what is kept of them.
+
+    Attributes:
+        method: one of ``Methods.names``, or ``truth``.
+        seed: of the sampling noise.
+        first: number of the batch's first clip.
+        kept: ``sums`` of the errors, ``features`` for the distances of videos, or ``structure`` for
+            SCS.
+    """
+
+    method: str
+    seed: int
+    first: int
+    kept: str
+
+    def name(
+        self, methods: Methods, i3d: VideoDistance | None, structure: Consistency | None = None
+    ) -> str:
+        """Return the name of its file, which says what its content depends on beside the clips."""
+        who = "truth" if self.method == TRUTH else methods.piece(self.method)
+        kind = f"i3d-{i3d.sha256[:16]}" if i3d and self.kept == "features" else "table"
+        if structure and self.kept == "structure":
+            kind = "-".join(filter(None, ("scs", structure.encoder, structure.sha256[:16])))
+        return f"{kind}-{who}-seed{self.seed}-clip{self.first:04d}"
+
+
+def score_table(
+    config: Config,
+    episodes: Sequence[Episode],
+    methods: Methods,
+    partials: Partials,
+    say: Callable[[str], Any] = print_now,
+    lpips: Perceptual | None = None,
+    choices: list[ClipChoice] | None = None,
+    i3d: VideoDistance | None = None,
+    structure: Consistency | None = None,
+) -> Scored:
+    """Score ``evaluate.clips`` choices, chains of ``evaluate.chain`` clips, by method and seed.
+
+    Pieces that ``partials`` already holds are reused. Without ``lpips`` that is left out, without
+    ``i3d`` the features of whole clips, and without ``structure`` SCS. Without ``choices`` they are
+    those of ``choose``. Several processes share the work, and all return the whole table.
+
+    Raises:
+        UserError: no episode is long enough, the data is inconsistent or does not fit the model,
+            or the model's output is not finite.
+    """
+    if choices is None:
+        choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
+    size, starts = config.evaluate.batch, range(0, len(choices), config.evaluate.batch)
+    extras = [kept for kept, one in (("features", i3d), ("structure", structure)) if one]
+    tasks = _tasks(config, methods, starts, extras)
+    names = {task: task.name(methods, i3d, structure) for task in tasks}
+    known = {task: piece for task in tasks if (piece := partials.get(names[task])) is not None}
+    # What is kept of one imagination is one process's, so that nothing is imagined twice.
+    groups = list(dict.fromkeys((task.first, task.method, task.seed) for task in tasks))
+    own = set(share(groups, lambda group: group[1] not in SAMPLED))
+    todo = [t for t in tasks if t not in known and (t.first, t.method, t.seed) in own]
+    if known:
+        say(f"{len(known)} of {len(tasks)} pieces were scored before and are kept")
+    methods.prepare(task.method for task in todo)
+    frames_each = config.evaluate.chain * (config.model.clip.frames - 1)
+    total = sum(frames_each * min(size, len(choices) - task.first) for task in todo)
+    with Meter("scoring", total, "frames") as meter:
+        loaded: tuple[int, Batch] | None = None
+        made: tuple[tuple[Any, ...], Any] | None = None
+        for task in todo:
+            if loaded is None or loaded[0] != task.first:
+                chosen = choices[task.first : task.first + size]
+                cameras = methods.model.cameras
+                track = structure is not None
+                batch = load_batch(
+                    config, episodes, chosen, task.first, cameras=cameras, track=track
+                )
+                loaded, made = (task.first, batch), None
+            batch, group = loaded[1], (task.method, task.seed)
+            if task.method == TRUTH:
+                made = group, batch.targets
+            elif made is None or made[0] != group:
+                made = group, batch.imagine(methods, task.method, task.seed)[2]
+            kept = _kept(task, batch, made[1], lpips, i3d, structure)
+            known[task] = partials.put(names[task], **kept)
+            meter.advance(frames_each * batch.real)
+    if todo:
+        say(meter.summary())
+    found = gathered(partials, names, known, "table")
+
+    def joined(method: str, seed: int, kept: str) -> np.ndarray:
+        return np.concatenate([found[Task(method, seed, f, kept)][kept] for f in starts])
+
+    seeds = {method: methods.seeds(method, config.evaluate.seeds) for method in methods.names}
+    sums = {name: np.stack([joined(name, seed, "sums") for seed in seeds[name]]) for name in seeds}
+    firsts = {name: some[0] for name, some in seeds.items()} | {TRUTH: 0}
+    more = {
+        kept: {name: joined(name, seed, kept) for name, seed in firsts.items()} for kept in extras
+    }
+    return Scored(choices, sums, **more)
+
+
+def _tasks(
+    config: Config, methods: Methods, starts: Sequence[int], extras: Sequence[str]
+) -> list[Task]:
+    """Return all pieces, those of one batch and of one imagination beside each other."""
+    tasks = []
+    for first in starts:
+        for method in methods.names:
+            for place, seed in enumerate(methods.seeds(method, config.evaluate.seeds)):
+                tasks.append(Task(method, seed, first, "sums"))
+                if place == 0:
+                    tasks += [Task(method, seed, first, kept) for kept in extras]
+        tasks += [Task(TRUTH, 0, first, kept) for kept in extras]
+    return tasks
+
+
+def _kept(
+    task: Task,
+    batch: Batch,
+    frames: Frames,
+    lpips: Perceptual | None,
+    i3d: VideoDistance | None,
+    structure: Consistency | None,
+) -> dict[str, np.ndarray]:
+    if task.kept == "sums":
+        return {"sums": batch.sums(frames, lpips)}
+    if task.kept == "structure":
+        assert structure is not None
+        return {"structure": batch.structure(frames, structure)}
+    assert i3d is not None
+    return {"features": i3d.features(batch.whole(frames.rgb_THWC))[: batch.real]}

@@ -1,0 +1,404 @@
+"""Measure whether actions steer a world: imagine walks with the true actions, other ones and none.
+
+A world that follows its actions is nearest to the truth with the true ones. *Shuffled* actions are
+those of a clip in another house. *None* are embeddings of zero, which observed frames have: only a
+model whose control modulates can be asked for that. *Copy* is a baseline without a network, which
+repeats the observed frame.
+
+The measurement needs clips that can show a difference (``Walks``). In every clip at least half of
+the steps go forward, since a turn on the spot replaces the whole view after a few frames, whatever
+the actions are. The shuffled actions differ from the true ones in at least half of the steps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax import worlds
+from pewm_jax.config import ActionConfig, Config, UserError
+from pewm_jax.data.episodes import Episode
+from pewm_jax.data.progress import Meter
+from pewm_jax.eval import intervals
+from pewm_jax.eval.images import psnr, unit_colours
+from pewm_jax.eval.partial import Partials
+from pewm_jax.eval.protocol import ClipChoice, choice_of, load_clip, stack, way_back
+from pewm_jax.eval.shares import gathered, share
+from pewm_jax.geometry.actions import actions_between
+from pewm_jax.types import Array, Frames, Params
+
+TRUE, SHUFFLED, NONE, COPY = "true", "shuffled", "none", "copy"
+LEAST_FORWARD = 0.5
+"""Smallest share of a clip's steps that go forward."""
+LEAST_DIFFERENT = 0.5
+"""Smallest share of a clip's steps in which the shuffled actions differ from the true ones."""
+MOVED = 0.1
+"""Motion ahead, in steps of ``ActionConfig.step_m``, up to which the agent stands still."""
+APART = 0.5
+"""Difference between two motions, in units of a step or a turn, from which on they differ."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Walks:
+    """Clips that are walks, each with a clip of another house whose actions are other ones.
+
+    Attributes:
+        choices: the C clips to imagine.
+        others: (C,) clips whose actions are the shuffled ones.
+        forward_C: (C,) share of each clip's steps that go forward, at least ``LEAST_FORWARD``.
+        different_C: (C,) share of the steps in which the shuffled actions differ from the true
+            ones, at least ``LEAST_DIFFERENT``.
+
+    Raises:
+        ValueError: a share is below its limit, or both clips of a pair are of one house.
+    """
+
+    choices: list[ClipChoice]
+    others: list[ClipChoice]
+    forward_C: np.ndarray
+    different_C: np.ndarray
+
+    def __post_init__(self):
+        """Check the properties on which the measurement rests."""
+        pairs = zip(self.choices, self.others, strict=True)
+        if any(one.scene == other.scene for one, other in pairs):
+            raise ValueError("the actions of a clip are shuffled with those of its own house")
+        if np.any(self.forward_C < LEAST_FORWARD):
+            raise ValueError(f"a clip with {self.forward_C.min():.0%} forward steps is no walk")
+        if np.any(self.different_C < LEAST_DIFFERENT):
+            raise ValueError(
+                f"shuffled actions differ in {self.different_C.min():.0%} of the steps"
+            )
+
+    @property
+    def houses(self) -> np.ndarray:
+        """(C,) the number of each clip's house."""
+        return np.unique([choice.scene for choice in self.choices], return_inverse=True)[1]
+
+    @property
+    def about(self) -> str:
+        """What the clips are, in a sentence."""
+        return (
+            f"{len(self.choices)} walks in {len(set(self.houses))} houses: "
+            f"{100 * self.forward_C.mean():.1f} % of the steps go forward (in each clip at least "
+            f"{100 * self.forward_C.min():.0f} %); the other actions differ in "
+            f"{100 * self.different_C.mean():.1f} % of the steps (in each clip at least "
+            f"{100 * self.different_C.min():.0f} %)"
+        )
+
+
+def forward_steps(actions: ActionConfig, motion_N3: np.ndarray) -> np.ndarray:
+    """Return (...) bool: whether steps go forward.
+
+    A step goes forward if the agent moves ahead by more than it turns, in units of a forward step
+    and of a turn. So a discrete forward action does, and a discrete turn does not.
+
+    Args:
+        actions: the units.
+        motion_N3: (..., 3) dx, dy, dyaw; metres and radians.
+    """
+    motion = np.asarray(motion_N3)
+    ahead = motion[..., 0] / actions.step_m
+    turned = np.abs(motion[..., 2]) / math.radians(actions.turn_deg)
+    return ahead > np.maximum(turned, MOVED)
+
+
+def different_steps(actions: ActionConfig, one_N3: np.ndarray, two_N3: np.ndarray) -> np.ndarray:
+    """Return (...) bool: whether two motions differ, by half of a step or half of a turn.
+
+    Args:
+        actions: the units.
+        one_N3: (..., 3) dx, dy, dyaw; metres and radians.
+        two_N3: the same.
+    """
+    apart = np.abs(np.asarray(one_N3) - np.asarray(two_N3))
+    turned = np.minimum(apart[..., 2], 2 * math.pi - apart[..., 2]) / math.radians(actions.turn_deg)
+    return np.maximum(apart[..., :2].max(-1) / actions.step_m, turned) >= APART
+
+
+def choose_walks(
+    config: Config,
+    episodes: Sequence[Episode],
+    clips: int,
+    chain: int = 1,
+    among: Iterable[int] | None = None,
+) -> Walks:
+    """Choose clips that are walks, and the clips whose actions are the shuffled ones.
+
+    Starts are spread evenly over the walks on the way back of every episode, where reports take
+    their clips too. The shuffled actions are drawn, with a fixed seed, from all clips on the way
+    back in other houses that differ in ``LEAST_DIFFERENT`` of the steps; they need not be walks.
+
+    Args:
+        config: gives ``clip.frames``, ``actions``, ``data.context`` and ``evaluate.stride``.
+        episodes: held-out episodes.
+        clips: the most clips to choose.
+        chain: clips generated one after the other from each start.
+        among: indices of the episodes to choose from; by default all.
+
+    Returns:
+        The first walk of every episode, then the second ones, and so on.
+
+    Raises:
+        UserError: no episode is long enough, none has a walk, or no other house has other actions.
+    """
+    units, stride = config.model.actions, config.evaluate.stride
+    count = chain * (config.model.clip.frames - 1)
+    where = f"{config.data.path}/{config.evaluate.split}"
+    indices = sorted(set(range(len(episodes)) if among is None else among))
+    per_episode = -(-clips // max(len(indices), 1))
+    pool: list[ClipChoice] = []
+    motions: list[np.ndarray] = []
+    ranked: list[tuple[int, int]] = []
+    for index in indices:
+        episode = episodes[index]
+        last = episode.length - 1 - count * stride
+        if last < 0:
+            continue
+        starts = np.arange(min(way_back(episode), last), last + 1)
+        steps_SN = starts[:, None] + stride * np.arange(count)
+        motion_SN3 = _motion(episode.world_from_camera, stride)[steps_SN]
+        walking = np.flatnonzero(forward_steps(units, motion_SN3).mean(1) >= LEAST_FORWARD)
+        if walking.size:
+            spread = np.linspace(0, len(walking) - 1, per_episode)
+            for rank, at in enumerate(np.unique(np.round(spread).astype(int))):
+                ranked.append((rank, len(pool) + int(walking[at])))
+        pool += [choice_of(config, episode, index, int(start), count) for start in starts]
+        motions.append(motion_SN3)
+    if not pool:
+        raise UserError(
+            f"no episode of {where} is long enough for {count * stride + 1} frames: collect longer "
+            "ones."
+        )
+    if not ranked:
+        raise UserError(
+            f"no clip of {where} is a walk: in each of them fewer than half of the steps go "
+            "forward; collect walks with --test_policy follow, or score another split "
+            "(evaluate.split)."
+        )
+    motion_PN3 = np.concatenate(motions)
+    scenes = np.array([choice.scene for choice in pool])
+    chosen, others, different = [], [], []
+    for _, place in sorted(ranked):
+        share_P = different_steps(units, motion_PN3, motion_PN3[place]).mean(1)
+        able = np.flatnonzero((scenes != scenes[place]) & (share_P >= LEAST_DIFFERENT))
+        if able.size and len(chosen) < clips:
+            other = int(np.random.default_rng([0, place]).choice(able))
+            chosen.append(place)
+            others.append(other)
+            different.append(share_P[other])
+    if not chosen:
+        raise UserError(
+            f"no clip of {where} can be given other actions: they come from another house and "
+            "differ in at least half of the steps; score a split with several houses "
+            "(evaluate.split)."
+        )
+    return Walks(
+        [pool[place] for place in chosen],
+        [pool[other] for other in others],
+        forward_steps(units, motion_PN3[chosen]).mean(1),
+        np.array(different),
+    )
+
+
+def _motion(world_from_camera: np.ndarray, stride: int) -> np.ndarray:
+    """Return (T - stride, 3) the planar motion from each frame to the one ``stride`` later."""
+    pairs = np.stack([world_from_camera[:-stride], world_from_camera[stride:]], 1)
+    return np.asarray(jax.vmap(actions_between)(pairs))[:, 0]
+
+
+@dataclasses.dataclass(frozen=True)
+class Steered:
+    """What was measured.
+
+    Attributes:
+        errors: by kind of actions, (C, N) mean squared errors of each imagined frame's colours.
+        walks: the C clips.
+    """
+
+    errors: Mapping[str, np.ndarray]
+    walks: Walks
+
+    @property
+    def psnr(self) -> dict[str, np.ndarray]:
+        """PSNR of each clip, by kind of actions, dB."""
+        return {name: np.asarray(psnr(each.mean(1))) for name, each in self.errors.items()}
+
+    def table(self) -> dict[str, dict[str, Any]]:
+        """Return means over houses with intervals, and how much better the true actions are."""
+        return self._entries(self.psnr)
+
+    def per_frame(self) -> dict[str, dict[str, Any]]:
+        """Return the same with a list over imagined frames in the place of each number."""
+        return self._entries({name: np.asarray(psnr(x)) for name, x in self.errors.items()})
+
+    def facts(self) -> dict[str, Any]:
+        """Return the numbers for ``metrics.json``; ``docs/evaluation.md`` describes them."""
+        return {
+            "clips": len(self.walks.choices),
+            "forward": float(self.walks.forward_C.mean()),
+            "different": float(self.walks.different_C.mean()),
+            "all": self.table(),
+            "per_frame": self.per_frame(),
+        }
+
+    def _entries(self, values: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+        each = {name: intervals.entry(found, self.walks.houses) for name, found in values.items()}
+        more = {
+            f"{TRUE} - {name}": intervals.entry(values[TRUE] - found, self.walks.houses)
+            for name, found in values.items()
+            if name != TRUE
+        }
+        return {**each, **more}
+
+    def lines(self) -> list[str]:
+        """Return the table as text."""
+        out = [self.walks.about, "PSNR in dB, means over houses"]
+        for name, found in self.table().items():
+            low, high = found["low"], found["high"]
+            span = "" if low is None else f"  [{low:.2f}, {high:.2f}]"
+            out.append(f"  {name:<16} {found['mean']:6.2f}{span}")
+        return out
+
+
+def measure(
+    config: Config, params: Params, episodes: Sequence[Episode], clips: int, *, seed: int = 0
+) -> Steered:
+    """Imagine walks with true, shuffled and no actions, all with the same noise.
+
+    Args:
+        config: an experiment whose model is steered by actions.
+        params: its weights.
+        episodes: held-out episodes with actions.
+        clips: the most clips to imagine (``choose_walks``).
+        seed: of the sampling noise.
+
+    Raises:
+        UserError: the episodes are too short, have no walks, or are all of one house.
+    """
+    pieces = _Pieces(config, params, episodes, choose_walks(config, episodes, clips), seed)
+    with Meter("steering", len(pieces.keys) * pieces.size, "clips") as meter:
+        found = {}
+        for key in pieces.keys:
+            found[key] = pieces.errors(*key)
+            meter.advance(pieces.size)
+    return pieces.joined(found)
+
+
+def score(
+    config: Config,
+    params: Params,
+    episodes: Sequence[Episode],
+    choices: Sequence[ClipChoice],
+    partials: Partials,
+    say: Callable[[str], Any],
+) -> tuple[Steered | None, str | None]:
+    """Measure it for a report, shared among processes and kept with its partial results.
+
+    Args:
+        config: the experiment.
+        params: its weights.
+        episodes: held-out episodes.
+        choices: the report's clips: as many walks are chosen, in the same episodes.
+        partials: where finished pieces are kept.
+        say: shows a line.
+
+    Returns:
+        What was measured, and a sentence on the clips. The first is None, and the sentence says
+        why, where the episodes have no walks in two houses; both are None where the model is not
+        steered by actions.
+    """
+    if not config.model.control.MODULATES:
+        return None, None
+    among = {choice.episode for choice in choices}
+    try:
+        walks = choose_walks(config, episodes, len(choices), config.evaluate.chain, among)
+    except UserError as error:
+        return None, f"Whether the actions steer is not measured: {error}"
+    pieces = _Pieces(config, params, episodes, walks, config.evaluate.seeds[0])
+    names = {key: f"steering-walks-{key[0]}-clip{key[1]:04d}" for key in pieces.keys}
+    known = {key: piece for key in pieces.keys if (piece := partials.get(names[key])) is not None}
+    todo = [key for key in share(pieces.keys) if key not in known]
+    if todo:
+        say("imagining with true, shuffled and no actions …")
+    for key in todo:
+        known[key] = partials.put(names[key], errors=pieces.errors(*key))
+    found = gathered(partials, names, known, "steering")
+    return pieces.joined({key: piece["errors"] for key, piece in found.items()}), walks.about
+
+
+class _Pieces:
+    """The work in pieces: a kind of actions and a batch of clips, by its first one."""
+
+    def __init__(
+        self,
+        config: Config,
+        params: Params,
+        episodes: Sequence[Episode],
+        walks: Walks,
+        seed: int,
+    ):
+        self.config, self.params, self.seed = config, params, seed
+        self.episodes, self.walks = episodes, walks
+        self.size = min(config.evaluate.batch, len(walks.choices))
+        self._silent = _silenced(config, params)
+        self._imagine = jax.jit(_imagined, static_argnums=0)
+        kinds = (TRUE, SHUFFLED, *([NONE] if self._silent is not None else []), COPY)
+        starts = range(0, len(walks.choices), self.size)
+        self.keys = [(kind, first) for kind in kinds for first in starts]
+
+    def errors(self, kind: str, first: int) -> np.ndarray:
+        """Return (clips, N) squared errors of a batch."""
+        batch = slice(first, first + self.size)
+        parts = [self._load(choice) for choice in self.walks.choices[batch]]
+        context = stack([part[0] for part in parts], self.size)
+        truth = stack([part[1] for part in parts], self.size)
+        if kind == COPY:
+            rgb = context.rgb_THWC[:, -1:]
+        else:
+            actions = [np.asarray(part[2]) for part in parts]
+            if kind == SHUFFLED:
+                actions = [np.asarray(self._load(one)[2]) for one in self.walks.others[batch]]
+            weights = self._silent if kind == NONE else self.params
+            filled = np.arange(first, first + self.size)
+            given = stack(actions, self.size)
+            rgb = self._imagine(self.config, weights, context, given, self.seed, filled)
+        off = jnp.square(unit_colours(rgb) - unit_colours(truth.rgb_THWC))
+        return np.asarray(off.mean((2, 3, 4)))[: len(parts)]
+
+    def _load(self, choice: ClipChoice) -> Any:
+        return load_clip(self.config, self.episodes, choice)
+
+    def joined(self, found: Mapping[tuple[str, int], np.ndarray]) -> Steered:
+        """Put the errors of all pieces together."""
+        kinds = dict.fromkeys(kind for kind, _ in self.keys)
+        errors = {
+            k: np.concatenate([found[key] for key in self.keys if key[0] == k]) for k in kinds
+        }
+        return Steered(errors, self.walks)
+
+
+def _imagined(
+    config: Config, params: Params, context: Frames, actions: Array, seed: int, numbers_B: Array
+) -> Array:
+    """Return (B, N, H, W, 3) imagined colours."""
+
+    def one(context: Frames, moves: Array, number: Array) -> Array:
+        state = worlds.start(config, params, context)
+        key = jax.random.fold_in(jax.random.key(seed), number)
+        return worlds.imagine(config, params, state, moves, key)[1].rgb_THWC
+
+    return jax.vmap(one)(context, actions, numbers_B)
+
+
+def _silenced(config: Config, params: Params) -> Params | None:
+    """Return weights whose control embeds every action as zero, or None if it does not modulate."""
+    if not config.model.control.MODULATES or "control" not in params:
+        return None
+    return {**params, "control": jax.tree.map(jnp.zeros_like, params["control"])}

@@ -1,0 +1,1 @@
+"""Files: atomic writing, tensor files, weights that ship with the package."""

@@ -1,0 +1,253 @@
+"""CogVideoX's video autoencoder: frames ↔ latents, causal, in chunks of time.
+
+Four frames of 8 × 8 pixels become one latent; the first frame has a latent of its own. A clip is
+encoded in chunks of 8 frames (the first chunk also takes the remainder) and decoded in chunks of 2
+latents (3 in the first chunk if their number is odd). Every convolution passes its last two frames
+on to the next chunk, but the group norms see one chunk at a time. The chunks therefore affect the
+result, and they bound the memory. A latent depends on later frames only through the statistics of
+the norms, which cover its own chunk.
+
+Chunks of equal shape share one compiled body. Inside ``jit`` they are scanned. Outside, ``encode``
+and ``decode`` call a compiled function per chunk, so two compilations serve videos of any length.
+
+8N + 1 frames become 2N + 1 latents and 8N + 1 frames again. An *even* number of latents has no
+first-frame rule: 2 latents decode to 8 frames, not 5. See ``frames_of`` and ``latents_of``.
+
+Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``. Reference:
+``AutoencoderKLCogVideoX`` of diffusers.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+
+from pewm_jax.config import UserError, VAEConfig
+from pewm_jax.models.cogvideox import vae_layers as layers
+from pewm_jax.models.cogvideox.vae_shapes import init, layout
+from pewm_jax.models.cogvideox.vae_tiles import in_tiles
+from pewm_jax.types import Array, Params
+
+__all__ = ["decode", "encode", "frames_of", "init", "latents_of", "layout"]
+
+ENCODE_FRAMES = 8
+"""Frames per chunk in the encoder."""
+DECODE_LATENTS = 2
+"""Latents per chunk in the decoder."""
+LOGVAR_RANGE = (-30.0, 20.0)
+"""The logarithm of a latent's variance is clipped to this range."""
+
+_log = logging.getLogger(__name__)
+
+
+def frames_of(config: VAEConfig, latents: int) -> int:
+    """Return the number of frames that some latents decode to.
+
+    Odd: temporal·(latents − 1) + 1. Even: temporal·latents, without the first-frame rule.
+    """
+    return config.temporal * (latents - 1) + 1 if latents % 2 else config.temporal * latents
+
+
+def latents_of(config: VAEConfig, frames: int) -> int:
+    """Return the number of latents that some frames are encoded to.
+
+    Raises:
+        UserError: the number is neither temporal·k + 1 nor a multiple of 8; the reference would
+            fold such a video irregularly.
+    """
+    step = config.temporal
+    if frames >= 1 and ((frames - 1) % step == 0 or frames % ENCODE_FRAMES == 0):
+        return -(-frames // step)
+    raise UserError(
+        f"a video of {frames} frames cannot be encoded: use 8N + 1 frames (1, 9, 17, …, 49), "
+        f"another {step}k + 1, or a multiple of {ENCODE_FRAMES}."
+    )
+
+
+def encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
+    """Encode a video to the mean and variance of its latents.
+
+    To sample, compute mean + exp(logvar / 2)·noise.
+
+    Args:
+        config: the autoencoder.
+        params: its parameters.
+        video_BTHWC: (B, T, H, W, C) floats in [−1, 1]; their dtype is that of the computation.
+            T is 8N + 1, or another number that ``latents_of`` accepts. H and W are multiples
+            of ``config.spatial``; excess rows and columns are lost, as in the reference.
+
+    Returns:
+        Mean and logarithm of the variance, each (B, t, H/8, W/8, z), not scaled.
+
+    Raises:
+        UserError: frames that cannot be encoded.
+    """
+    _, frames, height, width, _ = _shape(video_BTHWC, config.in_channels, "video_BTHWC")
+    latents = latents_of(config, frames)
+    side = config.spatial
+    if min(height, width) < side:
+        raise UserError(
+            f"a video of {height}×{width} pixels is smaller than one latent, {side}×{side}: "
+            "enlarge it."
+        )
+    if height % side or width % side:
+        _log.warning(
+            "a video of %d×%d pixels is no multiple of %d: it will decode to %d×%d.",
+            *(height, width, side, height // side * side, width // side * side),
+        )
+    if frames_of(config, latents) != frames:
+        _log.warning(
+            "%d frames become %d latents, an even number, which decode to %d frames: "
+            "use 8N + 1 frames (1, 9, 17, …, 49).",
+            *(frames, latents, frames_of(config, latents)),
+        )
+    return _encode(config, params, video_BTHWC)
+
+
+def decode(
+    config: VAEConfig, params: Params, latents_BthwC: Array, *, frames: int | None = None
+) -> Array:
+    """Decode latents to a video.
+
+    Memory does not grow with the length of the clip, since two latents are decoded at a time. With
+    the published widths, 49 frames of 480 × 720 in float32 need 20.8 GiB besides parameters and
+    video, by XLA's memory analysis on a CPU (``python benchmarks/cogvideox_vae.py --memory``). It
+    is proportional to the pixels of a frame: with ``config.tiling``, tiles of 240 × 360 need about
+    a quarter.
+
+    Args:
+        config: the autoencoder.
+        params: its parameters.
+        latents_BthwC: (B, t, h, w, z) latents, divided by ``config.scaling_factor`` again; their
+            dtype is that of the computation.
+        frames: the number of frames expected; if not given, an even number of latents warns.
+
+    Returns:
+        (B, T, 8h, 8w, C) video in about [−1, 1]; T = ``frames_of(config, t)``.
+
+    Raises:
+        UserError: the latents decode to another number of frames than expected.
+    """
+    _, count, *_ = _shape(latents_BthwC, config.latent_channels, "latents_BthwC")
+    out = frames_of(config, count)
+    advice = (
+        f"{count} latents decode to {out} frames: an odd number of latents, 2N + 1, decodes to "
+        f"{2 * config.temporal}N + 1 frames"
+    )
+    if frames is None and count % 2 == 0:
+        _log.warning("%s, an even number has no first frame of its own.", advice)
+    elif frames not in {None, out}:
+        raise UserError(f"{advice}, {frames} frames were expected.")
+    return _decode(config, params, latents_BthwC)
+
+
+def _encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
+    def whole(video: Array) -> Array:
+        step = partial(_encode_chunk, config, params["encoder"])
+        return _in_chunks(step, video, ENCODE_FRAMES)
+
+    moments = in_tiles(whole, video_BTHWC, config, shrink=True)
+    mean, logvar = jnp.split(moments, 2, -1)
+    return mean, jnp.clip(logvar, *LOGVAR_RANGE)
+
+
+def _decode(config: VAEConfig, params: Params, latents_BthwC: Array) -> Array:
+    def whole(latents: Array) -> Array:
+        step = partial(_decode_chunk, config, params["decoder"])
+        return _in_chunks(step, latents, DECODE_LATENTS)
+
+    return in_tiles(whole, latents_BthwC, config, shrink=False)
+
+
+def _in_chunks(
+    step: Callable[[Array, Params], tuple[Array, Params]], x_BTHWC: Array, size: int
+) -> Array:
+    """Run ``step(chunk, past) → (out, past)`` over chunks of time and join the outputs."""
+    batch, frames = x_BTHWC.shape[:2]
+    more = max(frames // size, 1) - 1
+    split = frames - more * size
+    first, past = step(x_BTHWC[:, :split], {})
+    if not isinstance(x_BTHWC, Tracer):
+        outs = [first]
+        for start in range(split, frames, size):
+            out, past = step(x_BTHWC[:, start : start + size], past)
+            outs.append(out)
+        return jnp.concatenate(outs, 1)
+    if not more:
+        return first
+    rest = x_BTHWC[:, split:].reshape(batch, more, size, *x_BTHWC.shape[2:])
+
+    def body(past: Params, chunk: Array) -> tuple[Params, Array]:
+        out, past = step(chunk, past)
+        return past, out
+
+    _, outs = jax.lax.scan(body, past, jnp.moveaxis(rest, 1, 0))
+    outs = jnp.moveaxis(outs, 0, 1).reshape(batch, -1, *first.shape[2:])
+    return jnp.concatenate([first, outs], 1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _encode_chunk(
+    config: VAEConfig, params: Params, x_BTHWC: Array, past: Params
+) -> tuple[Array, Params]:
+    new: dict[str, Any] = {}
+    x, new["conv_in"] = layers.causal_conv(config, params["conv_in"], x_BTHWC, past.get("conv_in"))
+    halvings = config.temporal.bit_length() - 1
+    for level in range(len(config.widths)):
+        name = f"down_{level}"
+        x, new[name] = _resnets(config, params[name], x, None, past.get(name, {}))
+        if "resample" in params[name]:
+            x = layers.downsample(params[name]["resample"], x, in_time=level < halvings)
+    x, new["mid"] = _resnets(config, params["mid"], x, None, past.get("mid", {}))
+    x = layers.norm(params["norm_out"], x, None, config.groups, layers.EPS)
+    x, new["conv_out"] = layers.causal_conv(config, params["conv_out"], x, past.get("conv_out"))
+    return x, new
+
+
+@partial(jax.jit, static_argnums=0)
+def _decode_chunk(
+    config: VAEConfig, params: Params, latents_BthwC: Array, past: Params
+) -> tuple[Array, Params]:
+    new: dict[str, Any] = {}
+    x, new["conv_in"] = layers.causal_conv(
+        config, params["conv_in"], latents_BthwC, past.get("conv_in")
+    )
+    x, new["mid"] = _resnets(config, params["mid"], x, latents_BthwC, past.get("mid", {}))
+    halvings = config.temporal.bit_length() - 1
+    for level in range(len(config.widths)):
+        name = f"up_{level}"
+        x, new[name] = _resnets(config, params[name], x, latents_BthwC, past.get(name, {}))
+        if "resample" in params[name]:
+            x = layers.upsample(params[name]["resample"], x, in_time=level < halvings)
+    x = layers.norm(params["norm_out"], x, latents_BthwC, config.groups, layers.EPS)
+    x, new["conv_out"] = layers.causal_conv(config, params["conv_out"], x, past.get("conv_out"))
+    return x, new
+
+
+def _resnets(
+    config: VAEConfig, params: Params, x_BTHWC: Array, latents_BthwC: Array | None, past: Params
+) -> tuple[Array, Params]:
+    new: dict[str, Any] = {}
+    for k in range(sum(name.startswith("resnet") for name in params)):
+        name = f"resnet_{k}"
+        x_BTHWC, new[name] = layers.resnet(
+            config, params[name], x_BTHWC, latents_BthwC, past.get(name, {})
+        )
+    return x_BTHWC, new
+
+
+def _shape(x: Array, channels: int, name: str) -> tuple[int, ...]:
+    if x.ndim != 5 or x.shape[-1] != channels:
+        raise UserError(
+            f"{name} has shape {tuple(x.shape)}: five axes are needed, batch, time, height, width "
+            f"and {channels} channels last."
+        )
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        raise UserError(f"{name} holds {x.dtype}: convert it to floats first.")
+    return tuple(x.shape)

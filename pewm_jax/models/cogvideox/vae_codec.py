@@ -1,0 +1,93 @@
+"""CogVideoX's video autoencoder as a codec: the mean of its latents, scaled to unit variance."""
+
+from __future__ import annotations
+
+import math
+
+from jax.sharding import PartitionSpec as P
+
+from pewm_jax.config import ModelConfig, VAEConfig
+from pewm_jax.models.cogvideox import vae
+from pewm_jax.models.cogvideox.vae_shapes import layout
+from pewm_jax.nn.costs import Costs, Product, Share
+from pewm_jax.types import Array, Params
+
+SHARDING = (
+    (r"codec/.*/kernel", P(None, "fsdp")),
+    (r"codec/.*/(scale|bias)", P()),
+)
+"""Weights are stored sharded and gathered for use; each device encodes its own clips."""
+
+PASSES = 70
+"""How often encoding a clip reads or writes as many values as its widest array has."""
+HELD = 4.4
+"""Peak memory of encoding a chunk, in copies of its widest array."""
+
+init = vae.init
+
+
+def encode(
+    config: VAEConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
+) -> Array:
+    """Encode a video to the scaled mean of its latents; see ``codecs.interface.encode``."""
+    mean, _ = vae.encode(config, params, video_BTHWC)
+    return mean * _scale(config, condition=condition)
+
+
+def decode(config: VAEConfig, params: Params, latents_BthwC: Array) -> Array:
+    """Decode scaled latents to q·(t − 1) + 1 frames.
+
+    Raises:
+        UserError: the VAE decodes this many latents to another number of frames.
+    """
+    frames = config.temporal * (latents_BthwC.shape[1] - 1) + 1
+    return vae.decode(config, params, latents_BthwC / config.scaling_factor, frames=frames)
+
+
+def _scale(config: VAEConfig, *, condition: bool) -> float:
+    factor = config.scaling_factor
+    return 1 / factor if condition and config.invert_scale_latents else factor
+
+
+def costs(model: ModelConfig, share: Share) -> Costs:
+    """Return the costs of encoding colour and depth, of the clip and of its first frame."""
+    config, clip = model.codec, model.clip
+    assert isinstance(config, VAEConfig)
+    macs = sum(_encode_macs(config, model, frames) for frames in (clip.frames, 1))
+    pixels = 2 * (clip.frames + 1) * clip.height * clip.width
+    at_once = vae.ENCODE_FRAMES + clip.frames % vae.ENCODE_FRAMES  # frames of the first chunk
+    chunk = clip.height * clip.width * min(at_once, clip.frames)
+    return Costs(
+        products=(Product("codec", "convolution", 2 * macs),),
+        streamed=PASSES * share.clips * pixels * config.widths[0] * share.activation_bytes,
+        held=HELD
+        * 2
+        * chunk
+        * config.widths[0]
+        * share.activation_bytes,  # colour and depth, of one clip
+    )
+
+
+def _encode_macs(config: VAEConfig, model: ModelConfig, frames: int) -> float:
+    """Return the multiply-adds of encoding one video."""
+    clip = model.clip
+    halvings = config.temporal.bit_length() - 1
+    total = 0.0
+    for path, shape in layout(config).items():
+        if not (path.startswith("encoder/") and path.endswith("kernel")):
+            continue
+        level = _level(path, len(config.widths))
+        spatial, temporal = level, min(level, halvings)
+        if "resample" in path:
+            spatial, temporal = level + 1, min(level + 1, halvings)
+        cells = (clip.height >> spatial) * (clip.width >> spatial)
+        total += -(-frames // 2**temporal) * cells * math.prod(shape)
+    return total
+
+
+def _level(path: str, levels: int) -> int:
+    """Return how often the frame has been halved before a layer of the encoder."""
+    name = path.split("/")[1]
+    if name == "conv_in":
+        return 0
+    return int(name.removeprefix("down_")) if name.startswith("down_") else levels - 1

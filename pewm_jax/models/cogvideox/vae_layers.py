@@ -1,0 +1,170 @@
+"""The layers of the video autoencoder, channels last.
+
+A causal layer sees no later frames. The first chunk of a video is padded by repeating its first
+frame; a later chunk by the last frames of the chunk before. These are passed on as ``past``: one
+array per convolution, nested like the parameters. Reference: ``autoencoder_kl_cogvideox.py`` of
+diffusers.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import VAEConfig
+from pewm_jax.models.cogvideox.vae_convolution import convolve, convolve_2d, convolve_doubled
+from pewm_jax.types import Array, Params
+
+EPS = 1e-6
+"""Added to the variance where the reference uses a constant instead of its setting."""
+
+
+def causal_conv(
+    config: VAEConfig, params: Params, x_BTHWC: Array, past: Array | None
+) -> tuple[Array, Array]:
+    """3×3×3 convolution over this frame and the two before, zeros around the frame.
+
+    Args:
+        config: the autoencoder (which form of the convolution).
+        params: ``kernel`` (3, 3, 3, C, D) and ``bias``.
+        x_BTHWC: (B, T, H, W, C).
+        past: (B, 2, H, W, C), the two frames before; None repeats the first frame.
+
+    Returns:
+        (B, T, H, W, D), and the next chunk's past.
+    """
+    if past is None:
+        past = jnp.repeat(x_BTHWC[:, :1], 2, axis=1)
+    padded = jnp.concatenate([past, x_BTHWC], 1)
+    return convolve(config, params, padded), padded[:, -2:]
+
+
+def pointwise(params: Params, x: Array) -> Array:
+    """1×1×1 convolution over the last axis."""
+    kernel = params["kernel"].astype(x.dtype)
+    return x @ kernel.reshape(kernel.shape[-2:]) + params["bias"].astype(x.dtype)
+
+
+def group_norm(params: Params, x_BTHWC: Array, groups: int, eps: float) -> tuple[Array, Array]:
+    """Return the (B, C) factor and offset that normalise each group over time, space and channels.
+
+    In float32; ``x·factor + offset`` is the affine group norm.
+    """
+    batch, *_, channels = x_BTHWC.shape
+    x = x_BTHWC.astype(jnp.float32)
+    # Subtracting some pixel first keeps the variance exact when the mean is far from zero.
+    origin = jax.lax.stop_gradient(x[:, :1, :1, :1])
+    near = x - origin
+    count = x[0, ..., 0].size
+    first = jnp.sum(near, (1, 2, 3)) / count
+    second = jnp.sum(near * near, (1, 2, 3)) / count
+    mean = first + origin[:, 0, 0, 0]
+    spread = second - first * first
+
+    def pool(value_BC: Array) -> Array:
+        return value_BC.reshape(batch, groups, -1).mean(-1, keepdims=True)
+
+    mean_g = pool(mean)
+    between = jnp.square(mean.reshape(batch, groups, -1) - mean_g).mean(-1, keepdims=True)
+    scale = jax.lax.rsqrt(pool(spread) + between + eps)
+    scale = jnp.broadcast_to(scale, (batch, groups, channels // groups)).reshape(batch, channels)
+    mean = jnp.broadcast_to(mean_g, (batch, groups, channels // groups)).reshape(batch, channels)
+    factor = scale * params["scale"]
+    return factor, params["bias"] - mean * factor
+
+
+def norm(
+    params: Params, x_BTHWC: Array, latents_BthwC: Array | None, groups: int, eps: float
+) -> Array:
+    """Group norm and swish; with latents, they scale and shift the normalised values.
+
+    The reference upsamples the latents to x's size (nearest) and then maps their channels. Mapping
+    them first gives the same result with far less work.
+
+    Args:
+        params: ``scale`` and ``bias``; with latents also ``scale_by`` and ``shift_by``.
+        x_BTHWC: (B, T, H, W, C).
+        latents_BthwC: (B, t, h, w, z) this chunk's latents, or None.
+        groups: groups of channels.
+        eps: added to the variance.
+
+    Returns:
+        (B, T, H, W, C).
+    """
+    factor, offset = (v[:, None, None, None] for v in group_norm(params, x_BTHWC, groups, eps))
+    if latents_BthwC is not None:
+        latents = latents_BthwC.astype(jnp.float32)
+        by = pointwise(params["scale_by"], latents)
+        factor, offset = by * factor, by * offset + pointwise(params["shift_by"], latents)
+        factor, offset = (stretch(v, x_BTHWC.shape) for v in (factor, offset))
+    return jax.nn.silu(x_BTHWC.astype(jnp.float32) * factor + offset).astype(x_BTHWC.dtype)
+
+
+def stretch(x_BthwC: Array, shape: tuple[int, ...]) -> Array:
+    """Upsample (nearest) to (B, T, H, W, C); if T is odd, the first frame is not repeated."""
+    _, frames, height, width, _ = shape
+    t, h, w = x_BthwC.shape[1:4]
+    if frames > 1 and frames % 2:
+        first, rest = x_BthwC[:, :1], x_BthwC[:, 1:]
+        rest = jnp.repeat(rest, (frames - 1) // (t - 1), axis=1)
+        x_BthwC = jnp.concatenate([first, rest], 1)
+    else:
+        x_BthwC = jnp.repeat(x_BthwC, frames // t, axis=1)
+    return jnp.repeat(jnp.repeat(x_BthwC, height // h, axis=2), width // w, axis=3)
+
+
+def resnet(
+    config: VAEConfig,
+    params: Params,
+    x_BTHWC: Array,
+    latents_BthwC: Array | None,
+    past: Params,
+) -> tuple[Array, Params]:
+    """Residual block: norm, swish, convolution, twice.
+
+    Args:
+        config: the autoencoder.
+        params: ``norm1, conv1, norm2, conv2`` and, where the width changes, ``shortcut``.
+        x_BTHWC: (B, T, H, W, C).
+        latents_BthwC: what the decoder's norms are conditioned on; None in the encoder.
+        past: the convolutions' past; empty in the first chunk.
+
+    Returns:
+        (B, T, H, W, D), and the next chunk's past.
+    """
+    eps = config.eps if latents_BthwC is None else EPS
+    h, new = x_BTHWC, {}
+    for k in "12":
+        h = norm(params[f"norm{k}"], h, latents_BthwC, config.groups, eps)
+        name = f"conv{k}"
+        h, new[name] = causal_conv(config, params[name], h, past.get(name))
+    if "shortcut" in params:
+        x_BTHWC = pointwise(params["shortcut"], x_BTHWC)
+    return x_BTHWC + h, new
+
+
+def downsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
+    """Average pairs of frames, then halve height and width by a strided convolution.
+
+    If the number of frames is odd, the first one is not averaged.
+    """
+    if in_time:
+        odd = x_BTHWC.shape[1] % 2
+        rest = x_BTHWC[:, odd:].astype(jnp.float32)
+        rest = ((rest[:, ::2] + rest[:, 1::2]) / 2).astype(x_BTHWC.dtype)
+        x_BTHWC = jnp.concatenate([x_BTHWC[:, :odd], rest], 1)
+    return convolve_2d(params, x_BTHWC, stride=2, padding=((0, 1), (0, 1)))
+
+
+def upsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
+    """Double height and width (nearest) and convolve each frame; then repeat frames.
+
+    If the number of frames is odd, the first one is not repeated. (Repeating frames after a
+    convolution of single frames gives the same as before it, with less work.)
+    """
+    x = convolve_doubled(params, x_BTHWC)
+    frames = x.shape[1]
+    if not in_time or frames == 1:
+        return x
+    odd = frames % 2
+    return jnp.concatenate([x[:, :odd], jnp.repeat(x[:, odd:], 2, axis=1)], 1)

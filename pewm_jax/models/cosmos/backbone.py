@@ -1,0 +1,170 @@
+"""Cosmos' transformer as a backbone: its functions, sharding rules and costs.
+
+Observed frames are held, as in the reference's pipeline: the network gets their clean latents in
+the place of noisy ones, a time of almost no noise for them, and a channel that marks them; what is
+sampled there is what was given. Frames per second stretch the positions in time. A control that
+modulates adds to the time embedding of each latent frame (arXiv 2601.15284, Eq. 5). A memory is
+read after every block.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import CosmosConfig, ModelConfig, UserError
+from pewm_jax.models import interface as backbones
+from pewm_jax.models.cosmos import model as cosmos
+from pewm_jax.models.interface import Conditioning, Observed, Readers
+from pewm_jax.nn import attention as blocked_attention
+from pewm_jax.nn.costs import FLOAT, SPLIT, Costs, Product, Share, video_tokens
+from pewm_jax.types import Array, Params
+
+SHARDING = cosmos.SHARDING
+
+GIVEN_SIGMA = 1e-4
+"""The noise σ that the network is told of observed frames; of the reference's pipeline."""
+STREAMS = (24, 60)
+"""How often element-wise work reads or writes a block's tokens: forward, backward."""
+
+
+def init(config: CosmosConfig, key: Array, in_channels: int, out_channels: int) -> Params:
+    """Return random parameters; see ``cosmos.init``."""
+    sized = dataclasses.replace(config, in_channels=in_channels, out_channels=out_channels)
+    return cosmos.init(sized, key)
+
+
+def observed(model: ModelConfig, params: Params, seen: Observed) -> Conditioning:
+    """Hold the observed frames at their latents, and mark them; see ``backbones.observed``."""
+    del params
+    config, first = model.backbone, seen.latents_BthwC
+    assert isinstance(config, CosmosConfig)
+    frames, height, width = model.latent_shape
+    batch, held = first.shape[:2]
+    is_known = np.arange(frames) < held
+    rest = ((0, 0), (0, frames - held), (0, 0), (0, 0), (0, 0))
+    marks = jnp.asarray(is_known, first.dtype)[:, None, None, None]
+    return Conditioning(
+        joined_BthwC=jnp.broadcast_to(marks, (batch, frames, height, width, 1)),
+        known_BthwC=jnp.pad(first, rest),
+        known_Bt=jnp.broadcast_to(is_known, (batch, frames)),
+        fps=jnp.float32(config.fps),
+    )
+
+
+def apply(
+    config: CosmosConfig,
+    params: Params,
+    x_BthwC: Array,
+    time_B: Array,
+    conditioning: Conditioning,
+    readers: Readers,
+) -> Array:
+    """Predict from noisy latents; see ``backbones.apply``. For known frames it means nothing.
+
+    Raises:
+        UserError: it is not said which frames are known.
+    """
+    if conditioning.known_Bt is None:
+        raise UserError(
+            "this backbone (cosmos) needs to know which frames are given: make its conditioning by "
+            "models.world_model.condition."
+        )
+    dtype = x_BthwC.dtype
+    known_Bt = conditioning.known_Bt
+    times_Bt = time_B if time_B.ndim == 2 else time_B[:, None]
+    latents = backbones.held(conditioning, x_BthwC).astype(dtype)
+    cells = config.patch_t * config.patch**2
+    sized = dataclasses.replace(
+        config,
+        in_channels=params["patch_embed"]["kernel"].shape[-2] // cells - config.padding_mask,
+        out_channels=params["proj_out"]["kernel"].shape[-1] // cells,
+    )
+    text = conditioning.tokens_BLC
+    if text is None:
+        text = jnp.zeros((len(latents), *config.text_shape))
+    return cosmos.apply(
+        sized,
+        params,
+        latents,
+        jnp.where(known_Bt, GIVEN_SIGMA / (1 + GIVEN_SIGMA), times_Bt),
+        text,
+        conditioning.joined_BthwC,
+        fps=conditioning.fps,
+        modulation_BtE=conditioning.modulation_BtE,
+        expert=readers.block,
+        expert_params=readers.params,
+        added_BND=readers.added_BND,
+    )
+
+
+def costs(model: ModelConfig, share: Share, *, trained: bool) -> Costs:
+    """Return the transformer's costs, trained or frozen; see ``dit_backbone.costs``.
+
+    Every latent frame has a time embedding of its own. Tokens here are those of the video; keys and
+    values of the text are counted once a clip.
+    """
+    config = model.backbone
+    assert isinstance(config, CosmosConfig)
+    frames, patches = video_tokens(model)
+    tokens, depth, width = frames * patches, config.layers, config.width
+    whole = share.clips * tokens * width * share.activation_bytes / share.context
+    part = whole / share.tensor
+    hidden = part * config.mlp_ratio
+    logits = _logits(config, tokens, share)
+    kept = depth * whole if config.remat else depth * (9 * whole + 9 * part + 2 * hidden)
+    block = 18 * whole + 18 * part + (5 if config.remat else 1) * hidden
+    forward, backward = STREAMS
+    again = float(config.remat)
+    passes = 2 + config.remat
+    return Costs(
+        products=_products(config, model, trained=trained),
+        kept=kept,
+        block=block + 4 * FLOAT * logits + 2 * part * (share.context - 1),
+        streamed=depth * whole * (forward * (1 + again) + backward),
+        summed=3 * depth * passes * whole,
+        gathered=(1 + again) * depth * 2 * whole / share.tensor,
+        scattered=depth * 2 * whole / share.tensor,
+    )
+
+
+def _logits(config: CosmosConfig, tokens: int, share: Share) -> float:
+    """Return the number of logits of self-attention that exist at once."""
+    if share.flash:
+        return 0.0
+    logits = share.clips * config.heads / share.tensor * tokens**2 / share.context
+    on_cpu = share.activation_bytes == FLOAT
+    if on_cpu and logits > blocked_attention.LOGITS:  # blocks of one head
+        return min(share.clips * tokens**2 / share.context, blocked_attention.LOGITS)
+    return logits
+
+
+def _products(config: CosmosConfig, model: ModelConfig, *, trained: bool) -> tuple[Product, ...]:
+    depth, width, lora = config.layers, config.width, config.lora_dim
+    frames, patches = video_tokens(model)
+    tokens, (length, raw) = frames * patches, config.text_shape
+    cell = config.patch_t * config.patch**2
+    again, weights = float(config.remat), float(trained)
+    backward = 1.0 + weights
+    per_token = (6 * width + 2 * config.hidden) * width
+    text = length * 2 * config.text_dim * width
+    attention = 2 * tokens * (tokens + length) * width
+    modulation = frames * 3 * 4 * lora * width
+    inputs = model.in_channels + config.padding_mask
+    out = tokens * cell * model.codec.channels * width
+    linear = ("backbone", "linear")
+    of_times = 2 * weights if trained else 0.0
+    raw_text = length * raw * config.text_dim if config.raw_text_dim else 0.0
+    return (
+        Product(*linear, depth * tokens * per_token, backward, again, SPLIT),
+        Product(*linear, depth * text, backward if raw_text else weights, again, ("tensor",)),
+        Product("backbone", "attention", depth * attention, 2.0, again + 0.5, SPLIT),
+        Product(*linear, depth * modulation, of_times, again, ("tensor",)),
+        Product(*linear, frames * 3 * lora * width, of_times, 0.0, ("tensor",)),
+        Product(*linear, tokens * cell * inputs * width + raw_text, weights, 0.0, ("context",)),
+        Product(*linear, frames * width * width, weights),
+        Product(*linear, frames * 3 * width * width, 2 * weights),
+        Product(*linear, out, backward, 0.0, ("context",)),
+    )

@@ -1,0 +1,284 @@
+"""Cosmos' diffusion transformer, equal to ``CosmosTransformer3DModel`` of diffusers.
+
+Video tokens attend to each other and to the text. The noise level modulates every block, and may
+differ from one latent frame to the next: frames that are given have nearly none. A further
+embedding per latent frame can be added to the time embedding wherever that one modulates the
+network. This is how actions steer it (arXiv 2601.15284, Eq. 5).
+
+The blocks are scanned, so compile time does not grow with depth. Parameters: ``patch_embed,
+time_embed, blocks (stacked over layers), modulate_out, proj_out``, and ``text_embed`` or
+``positions`` where a variant has them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec as P
+
+from pewm_jax.config import CosmosConfig, UserError
+from pewm_jax.models.cogvideox.vae_shapes import draw
+from pewm_jax.models.cosmos import block as cosmos_block
+from pewm_jax.models.cosmos.block import Leaf, Time
+from pewm_jax.models.svd.layers import linear
+from pewm_jax.nn import layers, placement
+from pewm_jax.nn.patches import patchify
+from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.types import Array, Params
+
+SHARDING = (
+    # Matrices to and from heads and hidden channels.
+    (r"backbone/blocks/(attn[12]/to_[qkv]|ff/up|modulate[123]/up)/kernel", P("fsdp", "tensor")),
+    (r"backbone/blocks/(attn[12]/to_out|ff/down)/kernel", P("tensor", "fsdp")),
+    (r"backbone/blocks/modulate[123]/down/kernel", P("fsdp", None)),
+    (r"backbone/blocks/attn[12]/norm_[qk]/scale", P()),
+    (r"backbone/(patch_embed|text_embed)/kernel", P(None, "fsdp")),
+    (r"backbone/time_embed/linear_[12]/kernel", P(None, "fsdp")),
+    (r"backbone/(modulate_out/down|proj_out)/kernel", P("fsdp", None)),
+    (r"backbone/modulate_out/up/kernel", P("fsdp", "tensor")),
+    (r"backbone/positions/(time|rows|columns)", P(None, "fsdp")),
+    (r"backbone/(time_embed/norm/scale|text_embed/bias)", P()),
+)
+"""Rules over the paths of the parameters as a backbone; see ``models.backbones``."""
+
+Expert = Callable[[Any, Array, Array], Array]
+"""``expert(layer_params, video_BND, time_BE or time_BtE) -> video_BND``, run after a block."""
+
+
+def layout(config: CosmosConfig) -> dict[str, tuple[int, ...]]:
+    """Return ``{path: shape}`` of the parameters."""
+    blocks = {f"blocks/{path}": (config.layers, *s) for path, s in cosmos_block.shapes(config)}
+    return {**dict(_ends(config)), **blocks}
+
+
+def _ends(config: CosmosConfig) -> Iterator[Leaf]:
+    width, cells = config.width, config.patch_t * config.patch**2
+    yield "patch_embed/kernel", (cells * (config.in_channels + config.padding_mask), width)
+    yield "time_embed/linear_1/kernel", (width, width)
+    yield "time_embed/linear_2/kernel", (width, 3 * width)
+    yield "time_embed/norm/scale", (width,)
+    if config.raw_text_dim:
+        yield "text_embed/kernel", (config.raw_text_dim, config.text_dim)
+        yield "text_embed/bias", (config.text_dim,)
+    if config.learned_positions:
+        for name, size in zip(("time", "rows", "columns"), config.max_grid, strict=True):
+            yield f"positions/{name}", (size, width)
+    yield from cosmos_block.modulation("modulate_out", width, config.lora_dim, 2)
+    yield "proj_out/kernel", (width, cells * config.out_channels)
+
+
+def init(config: CosmosConfig, key: Array) -> Params:
+    """Return random parameters, float32; the tree is ``layout``'s."""
+    ends_key, blocks_key = jax.random.split(key)
+    blocks = jax.vmap(lambda k: draw(dict(cosmos_block.shapes(config)), k))(
+        jax.random.split(blocks_key, config.layers)
+    )
+    return {**draw(dict(_ends(config)), ends_key), "blocks": blocks}
+
+
+def apply(
+    config: CosmosConfig,
+    params: Params,
+    latents_BthwC: Array,
+    timesteps_Bt: Array,
+    text_BLD: Array,
+    condition_BthwC: Array | None = None,
+    padding_BHWC: Array | None = None,
+    fps: Array | float | None = None,
+    *,
+    modulation_BtE: Array | None = None,
+    expert: Expert | None = None,
+    expert_params: Any = None,
+    added_BND: Array | None = None,
+) -> Array:
+    """Predict from noisy latents.
+
+    Args:
+        config: the transformer.
+        params: its parameters.
+        latents_BthwC: (B, t, h, w, C) noisy latents, scaled; h and w are multiples of the patch, t
+            of ``patch_t``. Their dtype is the dtype of the computation.
+        timesteps_Bt: (B,) noise level in the network's units, σ / (1 + σ); or (B, t'), one for
+            each of the t' = t / ``patch_t`` tokens in time.
+        text_BLD: (B, L, D) text tokens.
+        condition_BthwC: (B, t, h, w, 1) joined to the channels of the latents: 1 where a frame is
+            given, else 0. With the latents it has ``in_channels`` channels.
+        padding_BHWC: (B or 1, H, W, 1) 1 where a pixel is padding, of any size; None for none.
+        fps: frames per second, one number; None for an image, and to count frames.
+        modulation_BtE: (B, t', width) added to the time embedding of each token in time, from
+            which every block and the output layer make their modulation; None for nothing.
+        expert: a function of the video tokens that runs after every block (the memory block);
+            tokens are in the order of ``layout_of``.
+        expert_params: the experts' parameters, stacked over layers.
+        added_BND: (B, N, D) added to the embedded tokens, in the order of ``layout_of``.
+
+    Returns:
+        (B, t, h, w, out_channels) prediction in the latents' dtype.
+
+    Raises:
+        UserError: an argument of another shape, or a size beyond the positions.
+    """
+    latents = _joined(config, latents_BthwC, condition_BthwC, padding_BHWC)
+    grid = _grid(config, latents.shape)
+    batch, dtype = len(latents), latents.dtype
+    wanted = {
+        "timesteps_Bt": (timesteps_Bt, ((batch,), (batch, grid[0]))),
+        "text_BLD": (text_BLD, ((batch, "L", config.raw_text_dim or config.text_dim),)),
+        "modulation_BtE": (modulation_BtE, ((batch, grid[0], config.time_dim),)),
+        "added_BND": (added_BND, ((batch, math.prod(grid), config.width),)),
+        "fps": (None if fps is None else jnp.asarray(fps), ((),)),
+    }
+    for name, (value, forms) in wanted.items():
+        _require_shape(name, value, forms)
+    params = {
+        name: leaf if name == "blocks" else jax.tree.map(placement.constrain, leaf)
+        for name, leaf in params.items()
+    }
+    order = layout_of(config, latents.shape)
+
+    def arranged(x_BNC: Array) -> Array:
+        return placement.constrain(order.spread(x_BNC), "batch", "tokens")
+
+    time = _time(config, params, dtype, timesteps_Bt, modulation_BtE)
+    text = text_BLD.astype(dtype)
+    if config.raw_text_dim:
+        text = jax.nn.gelu(linear(params["text_embed"], text), approximate=False)
+    patches = placement.constrain(patchify(latents, config.patch, config.patch_t), "batch")
+    x = arranged(linear(params["patch_embed"], patches))
+    if added_BND is not None:
+        x = x + added_BND.astype(dtype)
+    angles = order.spread(cosmos_block.angles(config, grid, fps)[None])[0]
+    positions = None
+    if config.learned_positions:
+        table = cosmos_block.learned_positions(params["positions"], grid).astype(dtype)
+        positions = order.spread(table[None])
+    seen = time.embedding_BTE[:, 0] if time.embedding_BTE.shape[1] == 1 else time.embedding_BTE
+
+    def body(x: Array, layer: tuple[Params, Any]) -> tuple[Array, None]:
+        if positions is not None:
+            x = x + positions
+        x = cosmos_block.run(config, layer[0], x, time, text, angles, order)
+        if expert is not None:
+            x = expert(layer[1], x, seen)
+        return placement.constrain(x, "batch", "tokens"), None
+
+    body = jax.checkpoint(body) if config.remat else body
+    x, _ = jax.lax.scan(body, x, (params["blocks"], expert_params))
+    x, _ = cosmos_block.modulate(params["modulate_out"], x, time, order)
+    return _unpatched(config, order.gather(linear(params["proj_out"], x)), grid)
+
+
+def layout_of(config: CosmosConfig, shape: tuple[int, ...]) -> TokenLayout:
+    """Return the token order for latents of shape (B, t, h, w, C)."""
+    frames, height, width = shape[1:4]
+    return TokenLayout.for_mesh(
+        0, frames // config.patch_t, (height // config.patch) * (width // config.patch)
+    )
+
+
+def _time(
+    config: CosmosConfig,
+    params: Params,
+    dtype: jnp.dtype,
+    timesteps: Array,
+    modulation: Array | None,
+) -> Time:
+    """Embed the noise levels: (B, 1, ·), or (B, t, ·) where frames differ."""
+    inside = params["time_embed"]
+    times = jnp.asarray(timesteps)
+    wave = layers.sinusoid(times if times.ndim == 2 else times[:, None], config.width).astype(dtype)
+    wave = placement.constrain(wave, "batch")
+    shared = linear(inside["linear_2"], jax.nn.silu(linear(inside["linear_1"], wave)))
+    embedding = cosmos_block.rms_norm(inside["norm"], wave)
+    if modulation is not None:
+        embedding = embedding + modulation.astype(dtype)
+        shared = jnp.broadcast_to(shared, (*embedding.shape[:2], shared.shape[-1]))
+    return Time(embedding, shared)
+
+
+def _unpatched(config: CosmosConfig, tokens_BNC: Array, grid: tuple[int, int, int]) -> Array:
+    """(B, N, p·p·p_t·C) → (B, t, h, w, C); the reference orders cells otherwise than going in."""
+    patch, patch_t = config.patch, config.patch_t
+    x = tokens_BNC.reshape(len(tokens_BNC), *grid, patch, patch, patch_t, -1)
+    x = x.transpose(0, 1, 6, 2, 4, 3, 5, 7)
+    frames, rows, columns = grid
+    return x.reshape(len(x), frames * patch_t, rows * patch, columns * patch, -1)
+
+
+def _joined(
+    config: CosmosConfig, latents: Array, condition: Array | None, padding: Array | None
+) -> Array:
+    """Join latents, condition and padding mask along the channels."""
+    if latents.ndim != 5:
+        raise UserError(
+            f"latents_BthwC has shape {latents.shape}: five axes are needed, batch, time, height, "
+            "width and channels last."
+        )
+    batch, frames, height, width, channels = latents.shape
+    parts = [latents]
+    if condition is not None:
+        _require_shape("condition_BthwC", condition, ((batch, frames, height, width, "C"),))
+        parts.append(condition.astype(latents.dtype))
+        channels += condition.shape[-1]
+    if channels != config.in_channels:
+        raise UserError(
+            f"latents_BthwC and condition_BthwC have {channels} channels together: the network "
+            f"takes {config.in_channels} (Cosmos-Predict2 for video: 16 of latents and 1 that "
+            "marks given frames)."
+        )
+    if padding is not None and not config.padding_mask:
+        raise UserError("padding_BHWC was given to a network without a padding mask.")
+    if config.padding_mask:
+        mask = jnp.zeros((1, height, width, 1)) if padding is None else padding
+        _require_shape("padding_BHWC", mask, ((1, "H", "W", 1), (batch, "H", "W", 1)))
+        rows, columns = (
+            np.arange(new) * old // new
+            for old, new in zip(mask.shape[1:3], (height, width), strict=True)
+        )
+        mask = mask[:, rows[:, None], columns].astype(latents.dtype)
+        parts.append(jnp.broadcast_to(mask[:, None], (*latents.shape[:4], 1)))
+    return jnp.concatenate(parts, -1)
+
+
+def _grid(config: CosmosConfig, shape: tuple[int, ...]) -> tuple[int, int, int]:
+    """Return tokens along time, height and width.
+
+    Raises:
+        UserError: a size that is no multiple of the patch, or beyond the positions.
+    """
+    _, frames, height, width, _ = shape
+    patch, patch_t = config.patch, config.patch_t
+    if frames % patch_t or height % patch or width % patch:
+        raise UserError(
+            f"latents of {frames}×{height}×{width} cannot be cut into patches: height and width "
+            f"must be multiples of {patch}, time of {patch_t}."
+        )
+    grid = frames // patch_t, height // patch, width // patch
+    most = config.max_grid if config.learned_positions else (max(config.max_grid),) * 3
+    if any(size > end for size, end in zip(grid, most, strict=True)):
+        raise UserError(
+            f"latents of {frames}×{height}×{width} are {grid} tokens along time, height and "
+            f"width: the network's positions reach {most}."
+        )
+    return grid
+
+
+def _require_shape(
+    name: str, value: Array | None, forms: tuple[tuple[int | str, ...], ...]
+) -> None:
+    """Refuse an array of none of these shapes; a letter stands for any size."""
+    if value is None:
+        return
+    for form in forms:
+        if len(form) == value.ndim and all(
+            isinstance(side, str) or side == size
+            for side, size in zip(form, value.shape, strict=True)
+        ):
+            return
+    texts = " or ".join(f"({', '.join(map(str, form))})" for form in forms)
+    raise UserError(f"{name} has shape {tuple(value.shape)}: it must be {texts}.")

@@ -1,0 +1,155 @@
+"""DreamSim (Fu et al. 2023, arXiv 2306.09344): how alike people find two pictures.
+
+Three vision transformers (DINO, CLIP and OpenCLIP, ViT-B/16 each), adapted to people's judgements,
+see both pictures; the distance is one minus the cosine between their joined, centred features. The
+reference is ``dreamsim`` 0.2, kind ``ensemble``: of DINO the class token of the last block, before
+the last norm; of both CLIPs the embedding. Its weights come with no package: see
+``models.dreamsim_weights``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.models.dinov2.model import MEAN_3, STD_3, patchify
+from pewm_jax.types import Array, Params
+
+Encoder = Literal["dino_vitb16", "clip_vitb16", "open_clip_vitb16"]
+ENCODERS: tuple[Encoder, ...] = ("dino_vitb16", "clip_vitb16", "open_clip_vitb16")
+"""In the order in which their features are joined."""
+HEAD = 64
+"""Channels of an attention head."""
+CLIP_MEAN_3 = (0.48145466, 0.4578275, 0.40821073)
+"""The mean colour in [0, 1] that CLIP subtracts."""
+CLIP_STD_3 = (0.26862954, 0.26130258, 0.27577711)
+"""The standard deviation of colours by which CLIP divides."""
+QUICK = 1.702
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """How an encoder differs from the others.
+
+    Attributes:
+        mean_3: colour that is subtracted.
+        std_3: by which colours are divided.
+        epsilon: of layer norms.
+        quick: whether GELU is x · sigmoid(1.702 x).
+        embeds: whether tokens are normed before the first block, and the class token is normed and
+            projected after the last one.
+    """
+
+    mean_3: tuple[float, float, float]
+    std_3: tuple[float, float, float]
+    epsilon: float
+    quick: bool
+    embeds: bool
+
+
+KINDS: Mapping[Encoder, Kind] = {
+    "dino_vitb16": Kind(MEAN_3, STD_3, 1e-6, quick=False, embeds=False),
+    "clip_vitb16": Kind(CLIP_MEAN_3, CLIP_STD_3, 1e-5, quick=True, embeds=True),
+    "open_clip_vitb16": Kind(CLIP_MEAN_3, CLIP_STD_3, 1e-5, quick=False, embeds=True),
+}
+
+
+def distance(params: Params, a_BHWC: Array, b_BHWC: Array) -> Array:
+    """Return DreamSim's distances, (B,) float32; 0 for equal pictures, lower is better.
+
+    Args:
+        params: from ``dreamsim_weights.read``: a vision transformer for each encoder.
+        a_BHWC: (B, H, W, 3) colours in [0, 1]; resized as ``resized`` says.
+        b_BHWC: the same shape.
+    """
+    a, b = embed(params, a_BHWC), embed(params, b_BHWC)
+    return 1 - (a * b).sum(-1)
+
+
+def embed(params: Params, rgb_BHWC: Array) -> Array:
+    """Return the joined features of pictures, (B, F) float32, centred and of length 1.
+
+    Args:
+        params: see ``distance``.
+        rgb_BHWC: (B, H, W, 3) colours in [0, 1].
+    """
+    parts = []
+    for name in ENCODERS:
+        images = resized(rgb_BHWC, side(params[name]))
+        parts.append(encode(name, params[name], images))
+    joined = jnp.concatenate(parts, -1)
+    centred = joined - joined.mean(-1, keepdims=True)
+    return centred / jnp.linalg.norm(centred, axis=-1, keepdims=True)
+
+
+def resized(rgb_BHWC: Array, pixels: int) -> Array:
+    """Return square pictures, bicubic with antialiasing, as the reference resizes; in [0, 1]."""
+    rgb = jnp.asarray(rgb_BHWC, jnp.float32)
+    shape = (len(rgb), pixels, pixels, 3)
+    return jnp.clip(jax.image.resize(rgb, shape, "cubic", antialias=True), 0, 1)
+
+
+def side(params: Params) -> int:
+    """Return the pixels, height and width, of the pictures that an encoder takes."""
+    places = params["position_embed"].shape[0] - 1
+    patch = round((params["patch_embed"]["kernel"].shape[0] / 3) ** 0.5)
+    return round(places**0.5) * patch
+
+
+def encode(name: Encoder, params: Params, images_BHWC: Array) -> Array:
+    """Return what one encoder makes of pictures, (B, F) float32.
+
+    Args:
+        name: of the encoder.
+        params: its parameters: ``patch_embed``, ``cls_token`` (D,), ``position_embed`` (1 + N, D),
+            ``blocks`` (stacked over layers), and of the CLIPs ``norm_before``, ``norm`` and
+            ``projection`` (D, F).
+        images_BHWC: (B, S, S, 3) colours in [0, 1], of the ``side`` that it takes.
+    """
+    kind = KINDS[name]
+    images = (images_BHWC - jnp.array(kind.mean_3)) / jnp.array(kind.std_3)
+    width = params["cls_token"].shape[0]
+    patch = round((params["patch_embed"]["kernel"].shape[0] / 3) ** 0.5)
+    tokens = _dense(params["patch_embed"], patchify(images, patch))
+    first = jnp.broadcast_to(params["cls_token"], (len(tokens), 1, width))
+    tokens = jnp.concatenate([first, tokens], 1) + params["position_embed"]
+    if kind.embeds:
+        tokens = _norm(kind, params["norm_before"], tokens)
+
+    def block(x_BND: Array, layer: Params) -> tuple[Array, None]:
+        x_BND = x_BND + _attend(layer, _norm(kind, layer["norm1"], x_BND))
+        hidden = _dense(layer["up"], _norm(kind, layer["norm2"], x_BND))
+        hidden = hidden * jax.nn.sigmoid(QUICK * hidden) if kind.quick else _gelu(hidden)
+        return x_BND + _dense(layer["down"], hidden), None
+
+    token = jax.lax.scan(block, tokens, params["blocks"])[0][:, 0]
+    if not kind.embeds:
+        return token
+    return _norm(kind, params["norm"], token) @ params["projection"]
+
+
+def _attend(layer: Params, x_BND: Array) -> Array:
+    width = x_BND.shape[-1]
+    qkv = _dense(layer["qkv"], x_BND)
+    q, k, v = qkv.reshape(*x_BND.shape[:2], 3, width // HEAD, HEAD).transpose(2, 0, 3, 1, 4)
+    weights = jax.nn.softmax(q @ k.swapaxes(-1, -2) * HEAD**-0.5, -1)
+    mixed = (weights @ v).swapaxes(1, 2).reshape(x_BND.shape)
+    return _dense(layer["to_out"], mixed)
+
+
+def _dense(params: Params, x: Array) -> Array:
+    return x @ params["kernel"] + params["bias"]
+
+
+def _gelu(x: Array) -> Array:
+    return jax.nn.gelu(x, approximate=False)
+
+
+def _norm(kind: Kind, params: Params, x: Array) -> Array:
+    mean = x.mean(-1, keepdims=True)
+    variance = ((x - mean) ** 2).mean(-1, keepdims=True)
+    return (x - mean) * jax.lax.rsqrt(variance + kind.epsilon) * params["scale"] + params["bias"]

@@ -1,0 +1,131 @@
+"""The camera model of PERSIST: where an action leads, given the voxels around the agent.
+
+A frame is one token: the classes of the innermost voxels and the camera before the action. The
+action modulates the blocks, which look back over time. What comes out is the step to the next
+camera (``geometry.camera_steps``); it learns by mean squared error (arXiv 2603.03482).
+
+Parameters: ``classes, voxels, camera, action, blocks (stacked over layers), modulate_out,
+proj_out``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from pewm_jax.config import CameraModelConfig, UserError
+from pewm_jax.geometry.camera_steps import NUMBERS, STEPS
+from pewm_jax.models.persist import blocks as frame_blocks
+from pewm_jax.models.persist import costs as frame_costs
+from pewm_jax.models.persist.blocks import FrameCache
+from pewm_jax.nn.costs import Costs, Share
+from pewm_jax.types import Array, Params
+
+PARTS = ("time",)
+SHARDING = frame_blocks.rules("camera_model")
+"""Rules over the paths of its parameters under ``camera_model``."""
+
+
+def ends(config: CameraModelConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the parameters around the blocks by path."""
+    width = config.blocks.width
+    last = frame_blocks.end_shapes(width, STEPS)
+    return {
+        "classes/kernel": (config.classes, config.embed),
+        **frame_blocks.mlp_shapes("voxels", config.inner**3 * config.embed, width),
+        **frame_blocks.mlp_shapes("camera", NUMBERS, width),
+        **frame_blocks.mlp_shapes("action", config.actions, width),
+        **{path: shape for path, shape in last.items() if not path.startswith("time_embed")},
+    }
+
+
+def init(config: CameraModelConfig, key: Array) -> Params:
+    """Return random parameters, float32; the camera stays where it is at first."""
+    params = frame_blocks.init(config.blocks, PARTS, ends(config), key)
+    params["classes"]["kernel"] *= config.classes**0.5  # a row is looked up, not all of them
+    return params
+
+
+def no_frames(config: CameraModelConfig, batch: int, dtype: Any = jnp.float32) -> FrameCache:
+    """Return the cache before the first frame."""
+    return frame_blocks.no_frames(config.blocks, batch, 1, dtype)
+
+
+def innermost(config: CameraModelConfig, classes_XYZ: Array) -> Array:
+    """Return the voxels around the middle of grids (..., X, Y, Z).
+
+    Raises:
+        UserError: a grid is smaller than that.
+    """
+    cut, whole = config.inner, classes_XYZ.shape[-3:]
+    if min(whole) < cut:
+        raise UserError(
+            f"The voxels have shape {classes_XYZ.shape}: the camera model sees the innermost "
+            f"{cut} along each axis (camera_model.inner)."
+        )
+    x, y, z = ((size - cut) // 2 for size in whole)
+    return classes_XYZ[..., x : x + cut, y : y + cut, z : z + cut]
+
+
+def apply(
+    config: CameraModelConfig,
+    params: Params,
+    classes_BTXYZ: Array,
+    camera_BTN: Array,
+    actions_BTA: Array,
+    *,
+    dtype: Any = jnp.float32,
+    cache: FrameCache | None = None,
+) -> tuple[Array, FrameCache | None]:
+    """Predict the step to each frame's camera.
+
+    Args:
+        config: the network.
+        params: its parameters.
+        classes_BTXYZ: (B, T, X, Y, Z) class ids of the frame that the action leads to; the grid or
+            its innermost part.
+        camera_BTN: (B, T, 10) numbers of the camera before the action; see ``camera_steps``.
+        actions_BTA: (B, T, A) the action that leads to each frame.
+        dtype: of the computation.
+        cache: the frames before these; see ``frame_blocks``.
+
+    Returns:
+        ``(steps_BT6, cache)``: metres and radians, float32; the cache with these frames, or None.
+
+    Raises:
+        UserError: an argument of another shape.
+    """
+    front = classes_BTXYZ.shape[:2]
+    for name, value, size in (
+        ("cameras", camera_BTN, NUMBERS),
+        ("actions", actions_BTA, config.actions),
+    ):
+        if value.shape != (*front, size):
+            raise UserError(f"The {name} have shape {value.shape}: give {(*front, size)}.")
+    inner = innermost(config, jnp.asarray(classes_BTXYZ))
+    seen = params["classes"]["kernel"].astype(dtype)[inner].reshape(*front, -1)
+    x = frame_blocks.mlp(params["voxels"], seen)
+    x = x + frame_blocks.mlp(params["camera"], camera_BTN.astype(dtype))
+    condition = frame_blocks.mlp(params["action"], actions_BTA.astype(dtype))
+    x, cache = frame_blocks.run(
+        config.blocks, PARTS, params["blocks"], x[:, :, None], condition, cache=cache
+    )
+    out = frame_blocks.project(params, x, condition)[:, :, 0].astype(jnp.float32)
+    return out * jnp.asarray(config.units), cache
+
+
+def costs(config: CameraModelConfig, share: Share, frames: int, *, trained: bool) -> Costs:
+    """Return the costs of T frames."""
+    inward = config.inner**3 * config.embed + NUMBERS + config.actions + 3 * config.blocks.width
+    ends_in = (inward + STEPS) * config.blocks.width
+    return frame_costs.costs(
+        config.blocks,
+        PARTS,
+        share,
+        "camera_model",
+        frames,
+        1,
+        ends=ends_in,
+        trained=trained,
+    )

@@ -1,0 +1,199 @@
+"""The world-frame transformer of PERSIST: how a voxel frame comes out of those before it.
+
+A frame is a cube of latents of ``voxel_vae``. Each of its tokens attends to the others of the
+frame, to its own place in earlier frames, and to patches of a picture's latents. Each frame has a
+time of its own (diffusion forcing), an action, and perhaps the camera of its picture; together they
+modulate the frame's tokens (arXiv 2603.03482).
+
+The grid lies along the world's axes and goes where the agent goes, so a place in the grid is not a
+place in the world: the network has to move what it remembers.
+
+Parameters: ``patch_embed, pixel_embed, no_pixels, time_embed, action, camera, blocks (stacked over
+layers), modulate_out, proj_out``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from pewm_jax.config import UserError, VoxelDiTConfig
+from pewm_jax.models.persist import blocks as frame_blocks
+from pewm_jax.models.persist import costs as frame_costs
+from pewm_jax.models.persist.blocks import FrameCache
+from pewm_jax.nn.costs import Costs, Share
+from pewm_jax.nn.patches import patchify, unpatchify
+from pewm_jax.nn.plain_layers import linear
+from pewm_jax.types import Array, Params
+
+PARTS = ("space", "time", "cross")
+SHARDING = frame_blocks.rules("voxel_dit")
+"""Rules over the paths of its parameters under ``voxel_dit``."""
+
+
+def ends(config: VoxelDiTConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the parameters around the blocks by path."""
+    width, cells = config.blocks.width, config.latent_channels * config.patch**3
+    pixels = config.pixel_channels * config.pixel_patch**2
+    made: dict[str, tuple[int, ...]] = {
+        "patch_embed/kernel": (cells, width),
+        "patch_embed/bias": (width,),
+        "pixel_embed/kernel": (pixels, width),
+        "pixel_embed/bias": (width,),
+        "no_pixels/bias": (width,),
+        **frame_blocks.mlp_shapes("action", config.actions, width),
+        **frame_blocks.end_shapes(width, cells),
+    }
+    if config.camera_numbers:
+        made |= frame_blocks.mlp_shapes("camera", config.camera_numbers, width)
+    return made
+
+
+def init(config: VoxelDiTConfig, key: Array) -> Params:
+    """Return random parameters, float32; the prediction is 0 at first."""
+    return frame_blocks.init(config.blocks, PARTS, ends(config), key)
+
+
+def no_frames(config: VoxelDiTConfig, batch: int, dtype: Any = jnp.float32) -> FrameCache:
+    """Return the cache before the first frame."""
+    return frame_blocks.no_frames(config.blocks, batch, config.tokens, dtype)
+
+
+def apply(
+    config: VoxelDiTConfig,
+    params: Params,
+    latents_BTxyzC: Array,
+    times_BT: Array,
+    actions_BTA: Array,
+    pixels_BThwC: Array,
+    *,
+    camera_BTN: Array | None = None,
+    shown_BT: Array | None = None,
+    known_BTxyz: Array | None = None,
+    cache: FrameCache | None = None,
+) -> tuple[Array, FrameCache | None]:
+    """Predict from noisy frames what the noise asks for.
+
+    Args:
+        config: the network.
+        params: its parameters.
+        latents_BTxyzC: (B, T, side, side, side, C) noisy latents of T frames; their dtype is the
+            dtype of the computation.
+        times_BT: each frame's time, in the network's units.
+        actions_BTA: the action that leads *to* each frame; zeros for the first of a walk.
+        pixels_BThwC: latents of the picture that each frame is shown: the one before it, or for
+            the first frame of a walk its own. Channels may hold more, such as rays.
+        camera_BTN: numbers of that picture's camera; see ``geometry.camera_steps.numbers``.
+        shown_BT: bool, whether a frame is shown its picture; None means all are.
+        known_BTxyz: bool, which latents are known; tokens of others are not read by later frames.
+            None means all are.
+        cache: the frames before these; see ``frame_blocks``.
+
+    Returns:
+        ``(prediction, cache)``: the prediction in the shape of the latents, and the cache with
+        these frames, or None. While a frame is denoised the cache from before it is used again and
+        again; the one to go on with is made from the frame as it came out.
+
+    Raises:
+        UserError: an argument of another shape, or cameras where the network takes none.
+    """
+    _require(config, latents_BTxyzC, actions_BTA, pixels_BThwC, camera_BTN)
+    (batch, frames), dtype = latents_BTxyzC.shape[:2], latents_BTxyzC.dtype
+    width, side = config.blocks.width, config.latent_side // config.patch
+    cube = latents_BTxyzC.reshape(batch * frames, *latents_BTxyzC.shape[2:])
+    patches = patchify(cube, config.patch, config.patch).reshape(batch, frames, config.tokens, -1)
+    x = linear(params["patch_embed"], patches)
+    x = x + jnp.asarray(frame_blocks.positions((side,) * 3, width), dtype)
+
+    given = linear(params["pixel_embed"], patchify(pixels_BThwC.astype(dtype), config.pixel_patch))
+    rows, columns = (n // config.pixel_patch for n in pixels_BThwC.shape[2:4])
+    given = given.reshape(batch, frames, rows * columns, width)
+    given = given + jnp.asarray(frame_blocks.positions((rows, columns), width), dtype)
+    if shown_BT is not None:
+        nothing = params["no_pixels"]["bias"].astype(dtype)
+        given = jnp.where(jnp.asarray(shown_BT)[..., None, None], given, nothing)
+
+    condition = frame_blocks.embed_times(params, times_BT, dtype)
+    condition = condition + frame_blocks.mlp(params["action"], actions_BTA.astype(dtype))
+    if camera_BTN is not None:
+        seen = frame_blocks.mlp(params["camera"], camera_BTN.astype(dtype))
+        if shown_BT is not None:
+            seen = jnp.where(jnp.asarray(shown_BT)[..., None], seen, 0)
+        condition = condition + seen
+    if known_BTxyz is not None:
+        cube = known_BTxyz.reshape(batch * frames, *known_BTxyz.shape[2:], 1)
+        known_BTxyz = patchify(cube, config.patch, config.patch).all(-1).reshape(x.shape[:3])
+    x, cache = frame_blocks.run(
+        config.blocks,
+        PARTS,
+        params["blocks"],
+        x,
+        condition,
+        given_BTMD=given,
+        known_BTN=known_BTxyz,
+        cache=cache,
+    )
+    out = frame_blocks.project(params, x, condition).reshape(batch * frames, config.tokens, -1)
+    out = _cube(config, out)
+    return out.reshape(latents_BTxyzC.shape), cache
+
+
+def costs(
+    config: VoxelDiTConfig, share: Share, frames: int, pixels: int, *, trained: bool
+) -> Costs:
+    """Return the costs of T frames, each of which is shown ``pixels`` latents of a picture."""
+    given = pixels // config.pixel_patch**2
+    ends_in = config.tokens * 2 * config.latent_channels * config.patch**3
+    ends_in += given * config.pixel_channels * config.pixel_patch**2
+    return frame_costs.costs(
+        config.blocks,
+        PARTS,
+        share,
+        "voxel_dit",
+        frames,
+        config.tokens,
+        given=given,
+        ends=ends_in * config.blocks.width,
+        trained=trained,
+    )
+
+
+def _cube(config: VoxelDiTConfig, tokens_BNC: Array) -> Array:
+    side, patch = config.latent_side, config.patch
+    return unpatchify(tokens_BNC, side, side, side, patch, patch)
+
+
+def _require(
+    config: VoxelDiTConfig, latents: Array, actions: Array, pixels: Array, camera: Array | None
+) -> None:
+    """Refuse arrays of other shapes."""
+    wanted = (*(config.latent_side,) * 3, config.latent_channels)
+    if latents.ndim != 6 or latents.shape[2:] != wanted:
+        raise UserError(
+            f"The voxel frames' latents have shape {latents.shape}: this network takes (batch, "
+            f"frames, {', '.join(map(str, wanted))})."
+        )
+    front, patch = latents.shape[:2], config.pixel_patch
+    if actions.shape != (*front, config.actions):
+        raise UserError(
+            f"The actions have shape {actions.shape}: give one of {config.actions} numbers for "
+            f"each frame, {(*front, config.actions)}, the one that leads to it."
+        )
+    sizes = pixels.shape[2:4]
+    if (
+        pixels.ndim != 5
+        or pixels.shape[:2] != front
+        or pixels.shape[4] != config.pixel_channels
+        or any(size % patch for size in sizes)
+    ):
+        raise UserError(
+            f"The pictures' latents have shape {pixels.shape}: give {front} of them with "
+            f"{config.pixel_channels} channels, rows and columns multiples of {patch}."
+        )
+    numbers = (*front, config.camera_numbers)
+    if camera is not None and (not config.camera_numbers or camera.shape != numbers):
+        raise UserError(
+            f"The cameras have shape {camera.shape}: this network takes {numbers}, and none where "
+            "the last is 0 (voxel_dit.camera_numbers)."
+        )

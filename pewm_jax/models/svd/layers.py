@@ -1,0 +1,233 @@
+"""Layers of Stable Video Diffusion, channels last: residual blocks and attention, space and time.
+
+Each layer works on single frames first and then on each pixel's frames; a learned number mixes the
+two results. The U-Net and the decoder of the autoencoder share the residual blocks. Norms and
+softmax are computed in float32, the rest in the dtype of the activations. References:
+``SpatioTemporalResBlock`` and ``TransformerSpatioTemporalModel`` of diffusers.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.models.cogvideox.vae_convolution import SAME, convolve_2d, convolve_doubled
+from pewm_jax.models.cogvideox.vae_layers import group_norm, pointwise
+from pewm_jax.nn import attention as blocked_attention
+from pewm_jax.nn import layers
+from pewm_jax.types import Array, Params
+
+GROUPS = 32
+"""Groups of every group norm in the reference."""
+EPS = 1e-6
+"""Added to the variance in the group norms before attention."""
+
+
+def linear(params: Params, x: Array) -> Array:
+    """Apply ``kernel`` (C, D) and ``bias``, if there is one, to the last axis."""
+    y = x @ params["kernel"].astype(x.dtype)
+    return y + params["bias"].astype(x.dtype) if "bias" in params else y
+
+
+def embed(params: Params, x: Array) -> Array:
+    """Apply a linear layer, SiLU, and another linear layer."""
+    return linear(params["linear_2"], jax.nn.silu(linear(params["linear_1"], x)))
+
+
+def norm(params: Params, x_BTHWC: Array, eps: float, *, over_time: bool = False) -> Array:
+    """Group norm of each frame, or of all frames of a clip together.
+
+    Args:
+        params: ``scale`` and ``bias``.
+        x_BTHWC: (B, T, H, W, C).
+        eps: added to the variance.
+        over_time: whether statistics are shared by the frames.
+
+    Returns:
+        (B, T, H, W, C), float32.
+    """
+    batch, frames, *rest = x_BTHWC.shape
+    x = x_BTHWC if over_time else x_BTHWC.reshape(batch * frames, 1, *rest)
+    factor, offset = (v[:, None, None, None] for v in group_norm(params, x, GROUPS, eps))
+    return (x.astype(jnp.float32) * factor + offset).reshape(x_BTHWC.shape)
+
+
+def active(params: Params, x_BTHWC: Array, eps: float, *, over_time: bool = False) -> Array:
+    """Group norm and SiLU, in x's dtype."""
+    return jax.nn.silu(norm(params, x_BTHWC, eps, over_time=over_time)).astype(x_BTHWC.dtype)
+
+
+def convolve_time(params: Params, x_BTHWC: Array) -> Array:
+    """Convolve each pixel over three frames, with zeros before the first and after the last.
+
+    Every frame is multiplied with the three taps at once; the products are then added to the
+    frames they belong to. Few large matrix products are what a CPU is fastest at.
+
+    Args:
+        params: ``kernel`` (3, C, D) and ``bias``.
+        x_BTHWC: (B, T, H, W, C).
+    """
+    kernel = params["kernel"].astype(x_BTHWC.dtype)
+    frames = x_BTHWC.shape[1]
+    before, here, after = (x_BTHWC @ tap for tap in kernel)
+    edge = ((0, 0), (1, 1), (0, 0), (0, 0), (0, 0))
+    before, after = (jnp.pad(x, edge) for x in (before, after))
+    bias = params["bias"].astype(x_BTHWC.dtype)
+    return before[:, :frames] + here + after[:, 2:] + bias
+
+
+def resnet_2d(params: Params, x_BTHWC: Array, time_BTE: Array | None, eps: float) -> Array:
+    """Residual block of single frames: norm, SiLU, 3×3 convolution, twice.
+
+    Args:
+        params: ``norm1, conv1, norm2, conv2``, with a time embedding ``time``, and ``shortcut``
+            where the width changes.
+        x_BTHWC: (B, T, H, W, C).
+        time_BTE: (B, T or 1, E) SiLU of the time embedding, or None.
+        eps: added to the variances.
+    """
+    h = convolve_2d(params["conv1"], active(params["norm1"], x_BTHWC, eps), 1, SAME)
+    if time_BTE is not None:
+        h = h + linear(params["time"], time_BTE)[:, :, None, None]
+    h = convolve_2d(params["conv2"], active(params["norm2"], h, eps), 1, SAME)
+    if "shortcut" in params:
+        x_BTHWC = pointwise(params["shortcut"], x_BTHWC)
+    return x_BTHWC + h
+
+
+def resnet(
+    params: Params,
+    x_BTHWC: Array,
+    time_BTE: Array | None,
+    eps: float,
+    temporal_eps: float | None = None,
+    *,
+    switched: bool = False,
+) -> Array:
+    """Residual block over space, then one over time, mixed.
+
+    Args:
+        params: ``spatial``, ``temporal`` and ``mix``.
+        x_BTHWC: (B, T, H, W, C).
+        time_BTE: (B, T or 1, E) SiLU of the time embedding, or None.
+        eps: added to the variances.
+        temporal_eps: the same over time, if it differs.
+        switched: whether ``mix`` speaks of the temporal branch, as in the autoencoder.
+    """
+    x = resnet_2d(params["spatial"], x_BTHWC, time_BTE, eps)
+    inside = params["temporal"]
+    eps = temporal_eps or eps
+    h = convolve_time(inside["conv1"], active(inside["norm1"], x, eps, over_time=True))
+    if time_BTE is not None:
+        h = h + linear(inside["time"], time_BTE)[:, :, None, None]
+    h = convolve_time(inside["conv2"], active(inside["norm2"], h, eps, over_time=True))
+    # A mixture of x and x + h is x and a share of h.
+    return x + _share(params, x.dtype, of_time=switched) * h
+
+
+def _share(params: Params, dtype: jnp.dtype, *, of_time: bool) -> Array:
+    """Return the share of the temporal branch."""
+    logit = params["mix"].astype(jnp.float32)
+    return jax.nn.sigmoid(logit if of_time else -logit).astype(dtype)
+
+
+def downsample(params: Params, x_BTHWC: Array, padding: tuple = SAME) -> Array:
+    """Halve height and width by a strided convolution."""
+    return convolve_2d(params, x_BTHWC, 2, padding)
+
+
+def upsample(params: Params, x_BTHWC: Array, height: int, width: int) -> Array:
+    """Repeat rows and columns up to a size, twice its own or one less, and convolve."""
+    if (height, width) == tuple(2 * side for side in x_BTHWC.shape[2:4]):
+        return convolve_doubled(params, x_BTHWC)
+    x = jnp.repeat(jnp.repeat(x_BTHWC, 2, 2), 2, 3)[:, :, :height, :width]
+    return convolve_2d(params, x, 1, SAME)
+
+
+def attend(params: Params, x_BTHWC: Array, image_BMD: Array, heads: int, layers_: int) -> Array:
+    """Attention over the pixels of a frame, then over the frames of a pixel, mixed; residual.
+
+    Args:
+        params: ``norm, proj_in, frame_embed, spatial_0, temporal_0, …, mix, proj_out``.
+        x_BTHWC: (B, T, H, W, C).
+        image_BMD: (B, M, D) embedding of the image, which both attend to as well.
+        heads: attention heads.
+        layers_: pairs of a spatial and a temporal layer.
+    """
+    batch, frames, height, width, channels = x_BTHWC.shape
+    pixels, dtype = height * width, x_BTHWC.dtype
+    x = norm(params["norm"], x_BTHWC, EPS).astype(dtype)
+    x = linear(params["proj_in"], x.reshape(batch, frames, pixels, channels))
+    number = layers.sinusoid(jnp.arange(frames), channels).astype(dtype)
+    number = embed(params["frame_embed"], number)[None, :, None]
+    for k in range(layers_):
+        flat = x.reshape(batch * frames, pixels, channels)
+        context = jnp.repeat(image_BMD, frames, 0) if image_BMD.shape[1] > 1 else image_BMD
+        x = _spatial(params[f"spatial_{k}"], flat, context, heads, frames)
+        x = x.reshape(batch, frames, pixels, channels)
+        moved = _temporal(params[f"temporal_{k}"], x + number, image_BMD, heads)
+        x = x + _share(params, dtype, of_time=False) * (moved - x)
+    x = linear(params["proj_out"], x).reshape(x_BTHWC.shape)
+    return x + x_BTHWC
+
+
+def _spatial(params: Params, x_NPC: Array, context: Array, heads: int, frames: int) -> Array:
+    """Run a layer on the pixels of every frame: self-attention, the image, feed-forward."""
+    normed = layer_norm(params["norm1"], x_NPC)
+    x = x_NPC + attention(params["attn1"], normed, normed, heads)
+    x = x + _look(params, x, context, heads, frames)
+    return x + _feed_forward(params["ff"], layer_norm(params["norm3"], x))
+
+
+def _temporal(params: Params, x_BTPC: Array, image_BMD: Array, heads: int) -> Array:
+    """Run a layer on the frames of every pixel; also a feed-forward layer at its start."""
+    batch, frames, pixels, channels = x_BTPC.shape
+    x = x_BTPC + _feed_forward(params["ff_in"], layer_norm(params["norm_in"], x_BTPC))
+    normed = layer_norm(params["norm1"], x)
+    x = x + _over_frames(params["attn1"], normed, heads)
+    flat = x.reshape(batch, frames * pixels, channels)
+    x = (flat + _look(params, flat, image_BMD, heads, 1)).reshape(x.shape)
+    return x + _feed_forward(params["ff"], layer_norm(params["norm3"], x))
+
+
+def _look(params: Params, x_NPC: Array, context: Array, heads: int, repeats: int) -> Array:
+    """Attend to the image's embedding.
+
+    All weight goes to a single token whatever the query is, so queries and keys are not computed.
+    """
+    inside = params["attn2"]
+    context = context.astype(x_NPC.dtype)
+    if context.shape[1] > 1:
+        return attention(inside, layer_norm(params["norm2"], x_NPC), context, heads)
+    return jnp.repeat(linear(inside["to_out"], linear(inside["to_v"], context)), repeats, 0)
+
+
+def attention(params: Params, x_NPC: Array, context_NMD: Array, heads: int) -> Array:
+    """Multi-head attention with its linear layers."""
+    q = layers.split_heads(linear(params["to_q"], x_NPC), heads)
+    k, v = (layers.split_heads(linear(params[n], context_NMD), heads) for n in ("to_k", "to_v"))
+    mixed = layers.merge_heads(blocked_attention.attention(q, k, v))
+    return linear(params["to_out"], mixed)
+
+
+def _over_frames(params: Params, x_BTPC: Array, heads: int) -> Array:
+    """Self-attention among the frames of every pixel."""
+    batch, frames, pixels, channels = x_BTPC.shape
+    x = x_BTPC.swapaxes(1, 2).reshape(batch * pixels, frames, channels)
+    out = attention(params, x, x, heads)
+    return out.reshape(batch, pixels, frames, channels).swapaxes(1, 2)
+
+
+def layer_norm(params: Params, x: Array, eps: float = 1e-5) -> Array:
+    """Layer norm in float32, returned in x's dtype."""
+    value = x.astype(jnp.float32)
+    mean = value.mean(-1, keepdims=True)
+    near = value - mean
+    scale = jax.lax.rsqrt(jnp.square(near).mean(-1, keepdims=True) + eps)
+    return (near * scale * params["scale"] + params["bias"]).astype(x.dtype)
+
+
+def _feed_forward(params: Params, x: Array) -> Array:
+    """Gated feed-forward: half of the hidden channels, times GELU of the other half."""
+    value, gate = jnp.split(linear(params["up"], x), 2, -1)
+    return linear(params["down"], value * jax.nn.gelu(gate, approximate=False))

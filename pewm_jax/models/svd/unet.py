@@ -1,0 +1,164 @@
+"""Stable Video Diffusion's U-Net, equal to ``UNetSpatioTemporalConditionModel`` of diffusers.
+
+It predicts from noisy latents, to which the latents of the conditioning image are joined, the
+embedding of that image, and three scalars. A further embedding per frame can be added to the time
+embedding wherever that one modulates the network, in space and in time alike. This is how actions
+steer it (arXiv 2601.15284, Eq. 5).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import SVDUNetConfig, UserError
+from pewm_jax.models.cogvideox.vae_convolution import SAME, convolve_2d
+from pewm_jax.models.cogvideox.vae_shapes import draw
+from pewm_jax.models.svd import layers as svd_layers
+from pewm_jax.models.svd import shapes as svd_shapes
+from pewm_jax.nn import layers, placement
+from pewm_jax.types import Array, Params
+
+EPS, EPS_COARSE = 1e-6, 1e-5
+"""Added to the variances of residual blocks: on the way up and in levels with attention; and in
+the bottom, on the way down without attention, and in the last norm."""
+
+
+def init(config: SVDUNetConfig, key: Array) -> Params:
+    """Return random parameters, float32; the tree is listed in ``svd_shapes``."""
+    return draw(svd_shapes.unet(config), key)
+
+
+def apply(
+    config: SVDUNetConfig,
+    params: Params,
+    latents_BThwC: Array,
+    timesteps_B: Array,
+    image_BMD: Array,
+    added_BK: Array,
+    modulation_BTE: Array | None = None,
+) -> Array:
+    """Predict from noisy latents.
+
+    Args:
+        config: the network.
+        params: its parameters.
+        latents_BThwC: (B, T, h, w, in_channels) scaled noisy latents and, joined to their channels,
+            the latents of the image. Their dtype is the dtype of the computation. Any size will
+            do.
+        timesteps_B: (B,) noise level in the network's units: log σ / 4.
+        image_BMD: (B, M, image_dim) embedding of the image; M is 1 in the published model.
+        added_BK: (B, added) scalars: frames per second less 1, motion bucket, deviation of the
+            noise that the image got.
+        modulation_BTE: (B, T, time_dim) added to the time embedding of each frame; None for
+            nothing.
+
+    Returns:
+        (B, T, h, w, out_channels) prediction.
+
+    Raises:
+        UserError: an argument of another shape.
+    """
+    _check(config, latents_BThwC, timesteps_B, image_BMD, added_BK, modulation_BTE)
+    time = _time(config, params, latents_BThwC.dtype, timesteps_B, added_BK, modulation_BTE)
+    levels, last = range(len(config.widths)), len(config.widths) - 1
+    params = jax.tree.map(placement.constrain, params)
+
+    def resnet(place: Params, x: Array, eps: float) -> Array:
+        return _run(config, functools.partial(svd_layers.resnet, eps=eps), place, x, time)
+
+    def attend(place: Params, k: int, x: Array, level: int) -> Array:
+        if f"attend_{k}" not in place:
+            return x
+        run = functools.partial(
+            svd_layers.attend, heads=config.heads[level], layers_=config.layers[level]
+        )
+        return _run(config, run, place[f"attend_{k}"], x, image_BMD)
+
+    x = convolve_2d(params["conv_in"], latents_BThwC, 1, SAME)
+    skips = [x]
+    for level in levels:
+        place = params[f"down_{level}"]
+        eps = EPS if config.attends[level] else EPS_COARSE
+        for k in range(config.resnets[level]):
+            x = resnet(place[f"resnet_{k}"], x, eps)
+            x = attend(place, k, x, level)
+            skips.append(x)
+        if level < last:
+            x = svd_layers.downsample(place["resample"], x)
+            skips.append(x)
+
+    place = params["mid"]
+    x = resnet(place["resnet_0"], x, EPS_COARSE)
+    x = attend(place, 0, x, last)
+    x = resnet(place["resnet_1"], x, EPS_COARSE)
+
+    for step, level in enumerate(reversed(levels)):
+        place = params[f"up_{step}"]
+        for k in range(config.resnets[level] + 1):
+            x = jnp.concatenate([x, skips.pop()], -1)
+            x = resnet(place[f"resnet_{k}"], x, EPS)
+            x = attend(place, k, x, level)
+        if level:
+            x = svd_layers.upsample(place["resample"], x, *skips[-1].shape[2:4])
+    return convolve_2d(
+        params["conv_out"], svd_layers.active(params["norm_out"], x, EPS_COARSE), 1, SAME
+    )
+
+
+def _run(config: SVDUNetConfig, layer: Callable[..., Array], *arguments: Array | Params) -> Array:
+    """Run a layer, again in the backward pass if the settings say so; each device its own clips."""
+    layer = jax.checkpoint(layer) if config.remat else layer
+    return placement.constrain(layer(*arguments), "batch")
+
+
+def _time(
+    config: SVDUNetConfig,
+    params: Params,
+    dtype: jnp.dtype,
+    timesteps_B: Array,
+    added_BK: Array,
+    modulation_BTE: Array | None,
+) -> Array:
+    """Return SiLU of the (B, T or 1, time_dim) embedding of level, scalars and modulation."""
+    wave = layers.sinusoid(timesteps_B, config.widths[0]).astype(dtype)
+    waves = layers.sinusoid(added_BK, config.added_dim).astype(dtype)
+    time = svd_layers.embed(params["time_embed"], wave) + svd_layers.embed(
+        params["added_embed"], waves.reshape(len(waves), -1)
+    )
+    time = time[:, None]
+    return jax.nn.silu(time if modulation_BTE is None else time + modulation_BTE.astype(dtype))
+
+
+def _check(
+    config: SVDUNetConfig,
+    latents: Array,
+    timesteps: Array,
+    image: Array,
+    added: Array,
+    modulation: Array | None,
+) -> None:
+    """Refuse arguments that do not fit the network or each other."""
+    if latents.ndim != 5 or latents.shape[-1] != config.in_channels:
+        raise UserError(
+            f"latents_BThwC has shape {latents.shape}: five axes are needed, batch, time, height, "
+            f"width and {config.in_channels} channels last."
+        )
+    batch, frames = latents.shape[:2]
+    wanted: dict[str, tuple[Array, tuple[int | str, ...]]] = {
+        "timesteps_B": (timesteps, (batch,)),
+        "image_BMD": (image, (batch, "M", config.image_dim)),
+        "added_BK": (added, (batch, config.added)),
+    }
+    if modulation is not None:
+        wanted["modulation_BTE"] = (modulation, (batch, frames, config.time_dim))
+    for name, (value, shape) in wanted.items():
+        fits = len(value.shape) == len(shape) and all(
+            side in ("M", size) for side, size in zip(shape, value.shape, strict=True)
+        )
+        if not fits:
+            sides = ", ".join(map(str, shape))
+            raise UserError(f"{name} has shape {tuple(value.shape)}: it must be ({sides}).")

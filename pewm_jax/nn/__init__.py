@@ -1,0 +1,1 @@
+"""Functional layers that the networks share: linear maps, attention, convolutions, positions."""

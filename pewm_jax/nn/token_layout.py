@@ -1,0 +1,136 @@
+"""The order of a clip's tokens: text, then video; split over devices, a share of both per device.
+
+Attention does not depend on the order of tokens. If the mesh splits tokens into X parts, each part
+gets 1/X of the text and 1/X of *every* latent frame:
+
+    one part     text                          frame 0          frame 1 …
+    X parts      text[0] frame 0[0] frame 1[0] … | text[1] frame 0[1] frame 1[1] … | …
+
+So text and video, and single frames, can be taken apart without moving a token between devices. If
+X does not divide a count, it is padded with zero tokens. They are masked in attention (``real``)
+and dropped at the end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.nn import placement
+from pewm_jax.types import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class TokenLayout:
+    """How L text tokens and t·n video tokens are ordered; static.
+
+    Attributes:
+        parts: X, number of parts that the tokens are split into.
+        text: L, number of text tokens.
+        frames: t, number of latent frames, counted in tokens.
+        patches: n, video tokens per frame.
+    """
+
+    parts: int
+    text: int
+    frames: int
+    patches: int
+
+    @classmethod
+    def for_mesh(cls, text: int, frames: int, patches: int) -> TokenLayout:
+        """Return the layout for the current mesh."""
+        return cls(placement.parts("tokens"), text, frames, patches)
+
+    @property
+    def text_per_part(self) -> int:
+        """Return the text tokens of a part, with padding."""
+        return -(-self.text // self.parts)
+
+    @property
+    def patches_per_part(self) -> int:
+        """Return the video tokens of one frame in a part, with padding."""
+        return -(-self.patches // self.parts)
+
+    def spread(self, video_BNC: Array) -> Array:
+        """(B, t·n, C) → (B, X·t·n', C): each part's share of every frame, part by part."""
+        if self.parts == 1:
+            return video_BNC
+        batch, channels = video_BNC.shape[0], video_BNC.shape[-1]
+        grid = video_BNC.reshape(batch, self.frames, self.patches, channels)
+        more = self.parts * self.patches_per_part - self.patches
+        grid = jnp.pad(grid, ((0, 0), (0, 0), (0, more), (0, 0)))
+        grid = grid.reshape(batch, self.frames, self.parts, self.patches_per_part, channels)
+        spread = grid.swapaxes(1, 2).reshape(batch, -1, channels)
+        return placement.constrain(spread, "batch", "tokens")
+
+    def gather(self, video_BNC: Array) -> Array:
+        """Invert ``spread``."""
+        if self.parts == 1:
+            return video_BNC
+        batch, channels = video_BNC.shape[0], video_BNC.shape[-1]
+        grid = video_BNC.reshape(batch, self.parts, self.frames, self.patches_per_part, channels)
+        grid = grid.swapaxes(1, 2).reshape(batch, self.frames, -1, channels)
+        return grid[:, :, : self.patches].reshape(batch, -1, channels)
+
+    def arrange(self, tokens_BNC: Array) -> Array:
+        """(B, L + t·n, C) text then video tokens → the same tokens in the order of this layout."""
+        if self.parts == 1:
+            return tokens_BNC
+        text, video = jnp.split(tokens_BNC, [self.text], 1)
+        more = self.parts * self.text_per_part - self.text
+        return self.join(jnp.pad(text, ((0, 0), (0, more), (0, 0))), self.spread(video))
+
+    def join(self, text_BLC: Array, video_BNC: Array) -> Array:
+        """Invert ``split``."""
+        if self.parts == 1:
+            return jnp.concatenate([text_BLC, video_BNC], 1)
+        batch, channels = video_BNC.shape[0], video_BNC.shape[-1]
+        both = [x.reshape(batch, self.parts, -1, channels) for x in (text_BLC, video_BNC)]
+        joined = jnp.concatenate(both, 2).reshape(batch, -1, channels)
+        return placement.constrain(joined, "batch", "tokens")
+
+    def split(self, tokens_BNC: Array) -> tuple[Array, Array]:
+        """Return the text and the video tokens of every part, each part by part."""
+        batch, channels = tokens_BNC.shape[0], tokens_BNC.shape[-1]
+        if self.parts == 1:
+            text, video = jnp.split(tokens_BNC, [self.text], 1)
+            return text, video
+        grid = tokens_BNC.reshape(batch, self.parts, -1, channels)
+        text, video = (
+            placement.constrain(x.reshape(batch, -1, channels), "batch", "tokens")
+            for x in jnp.split(grid, [self.text_per_part], 2)
+        )
+        return text, video
+
+    def per_token(self, frames_BtC: Array) -> Array:
+        """(B, t, C), one vector per token in time → (B, N, C), one per video token."""
+        return self.spread(jnp.repeat(frames_BtC, self.patches, 1))
+
+    @property
+    def is_text(self) -> np.ndarray:
+        """Return (N', 1) bool: True for text tokens."""
+        part = (
+            np.arange(self.text_per_part + self.frames * self.patches_per_part) < self.text_per_part
+        )
+        return np.tile(part, self.parts)[:, None]
+
+    @property
+    def real(self) -> np.ndarray | None:
+        """Return the indices of the tokens that are not padding; None if there is no padding."""
+        ones = np.ones((1, self.text + self.frames * self.patches, 1), np.int8)
+        marks = _on_host(self, ones)[0, :, 0]
+        return None if marks.all() else np.flatnonzero(marks)
+
+
+def _on_host(layout: TokenLayout, tokens: np.ndarray) -> np.ndarray:
+    """Compute ``arrange`` with NumPy."""
+    text, video = np.split(tokens, [layout.text], 1)
+    more = layout.parts * layout.text_per_part - layout.text
+    text = np.pad(text, ((0, 0), (0, more), (0, 0))).reshape(1, layout.parts, -1, 1)
+    video = video.reshape(1, layout.frames, layout.patches, 1)
+    more = layout.parts * layout.patches_per_part - layout.patches
+    video = np.pad(video, ((0, 0), (0, 0), (0, more), (0, 0)))
+    video = video.reshape(1, layout.frames, layout.parts, layout.patches_per_part, 1).swapaxes(1, 2)
+    return np.concatenate([text, video.reshape(1, layout.parts, -1, 1)], 2).reshape(1, -1, 1)

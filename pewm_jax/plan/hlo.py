@@ -1,0 +1,226 @@
+"""FLOPs and communication of a compiled program, counted from its HLO text.
+
+XLA's own ``cost_analysis`` counts the body of a loop once; here it counts as often as it runs. Only
+matrix products and convolutions are counted, with 2 FLOPs per multiply-add. All figures are for one
+device.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import re
+from collections.abc import Callable, Iterator
+
+from pewm_jax.plan import hlo_text
+from pewm_jax.plan.hlo_text import Line
+
+KINDS = ("all-gather", "reduce-scatter", "all-reduce", "all-to-all", "collective-permute")
+"""The kinds of collective communication."""
+THROUGH = ("bitcast", "copy", "convert", "transpose", "reshape")
+"""Operations that pass an array on without using its values."""
+
+_CALLED = re.compile(r"\b(?:calls|to_apply|body)=%?([\w.$-]+)")
+_BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
+_EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
+_TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
+
+
+@dataclasses.dataclass(frozen=True)
+class Product:
+    """A matrix product or convolution.
+
+    Attributes:
+        label: JAX's name for its place in the program.
+        flops: FLOPs of all its runs.
+    """
+
+    label: str
+    flops: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Collective:
+    """A collective communication between devices.
+
+    Attributes:
+        kind: one of ``KINDS``.
+        label: JAX's name for its place in the program.
+        group: one of the groups of devices that communicate, by their index in the mesh.
+        sent: bytes that a device sends in all its runs, with ring algorithms.
+    """
+
+    kind: str
+    label: str
+    group: tuple[int, ...]
+    sent: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """What one device does when a program runs once.
+
+    Attributes:
+        products: its matrix products and convolutions.
+        collectives: its communication.
+        unknown: labels of loops with products or communication whose number of runs is not in the
+            text; they count as one run.
+    """
+
+    products: tuple[Product, ...]
+    collectives: tuple[Collective, ...]
+    unknown: tuple[str, ...]
+
+    @property
+    def flops(self) -> float:
+        """FLOPs of all products."""
+        return sum(product.flops for product in self.products)
+
+    def sent(self, kind: str) -> float:
+        """Return the bytes that a device sends in communication of one kind."""
+        return sum(item.sent for item in self.collectives if item.kind == kind)
+
+
+def read(text: str) -> Program:
+    """Count what a compiled program does.
+
+    Args:
+        text: ``compiled.as_text()``.
+    """
+    computations, entry = hlo_text.split(text)
+    users = {name: hlo_text.users(lines) for name, lines in computations.items()}
+    unknown: list[str] = []
+
+    def only_sliced(
+        computation: str, name: str, result_is_sliced: Callable[[], bool] = lambda: False
+    ) -> bool:
+        """Tell whether every use of an array is a slice of it.
+
+        If the array is the computation's result, ``result_is_sliced`` tells it for the caller.
+        """
+        if name == next(reversed(computations[computation])):  # the computation's result
+            return result_is_sliced()
+        return bool(users[computation].get(name)) and all(
+            _is_slice(line, name)
+            or (line.opcode in THROUGH and only_sliced(computation, user, result_is_sliced))
+            or any(
+                only_sliced(
+                    *parameter,
+                    functools.partial(only_sliced, computation, user, result_is_sliced),
+                )
+                for parameter in _parameters(line, name, computations)
+            )
+            for user, line in users[computation][name]
+        )
+
+    @functools.cache
+    def walk(name: str) -> tuple[tuple[Product, ...], tuple[Collective, ...]]:
+        products: list[Product] = []
+        collectives: list[Collective] = []
+        lines = computations.get(name, {})
+        for line in lines.values():
+            if (flops := _flops(line, lines)) > 0:
+                products.append(Product(line.label, flops))
+            elif line.opcode.removesuffix("-start") in KINDS:
+                collectives += _collectives(line, lines, functools.partial(only_sliced, name))
+            for (inner_products, inner_collectives), trips in _inside(line, walk):
+                if trips == 0 and (inner_products or inner_collectives):
+                    unknown.append(line.label)
+                times = max(trips, 1)
+                products += [Product(p.label, p.flops * times) for p in inner_products]
+                collectives += [
+                    dataclasses.replace(c, sent=c.sent * times) for c in inner_collectives
+                ]
+        return tuple(products), tuple(collectives)
+
+    return Program(*walk(entry), tuple(unknown))
+
+
+def _inside(line: Line, walk) -> Iterator[tuple]:
+    """Yield what an instruction calls, and how often: 0 if the text does not tell."""
+    if line.opcode == "while":
+        trips = _TRIPS.search(line.rest)
+        body = _CALLED.search(line.rest)
+        if body:
+            yield walk(body[1]), int(trips[1]) if trips else 0
+    elif line.opcode == "conditional":
+        branches = _BRANCHES.search(line.rest)
+        names = re.findall(r"[\w.$-]+", branches[1]) if branches else _EITHER.findall(line.rest)
+        costs = [walk(name) for name in names]
+        if costs:
+            yield max(costs, key=lambda cost: sum(product.flops for product in cost[0])), 1
+    elif line.opcode in ("fusion", "call", "async-start"):
+        called = _CALLED.search(line.rest)
+        if called:
+            yield walk(called[1]), 1
+
+
+def _flops(line: Line, lines: dict[str, Line]) -> float:
+    """Return the FLOPs of one instruction, without what it calls."""
+    matmul = line.opcode == "custom-call" and "matmul" in line.rest
+    if line.opcode not in ("dot", "convolution") and not matmul:
+        return 0.0
+    shapes = [hlo_text.dims(lines[name].shape) for name in line.operands[:2]]
+    out = math.prod(hlo_text.dims(line.shape))
+    if line.opcode == "dot":
+        axes = hlo_text.numbers(line, "lhs_contracting_dims")
+        summed = math.prod(shapes[0][axis] for axis in axes)
+    elif matmul:
+        summed = shapes[0][-1]
+    else:
+        labels = re.search(r"dim_labels=\w+_(\w+)->", line.rest)
+        kernel = labels[1] if labels else "io"
+        summed = math.prod(n for n, axis in zip(shapes[1], kernel, strict=True) if axis != "o")
+    return 2.0 * out * summed
+
+
+def _collectives(
+    line: Line, lines: dict[str, Line], only_sliced: Callable[[str], bool]
+) -> Iterator[Collective]:
+    """Yield a ``Collective`` for each operand of a communication instruction.
+
+    An all-reduce whose result is only sliced counts as a reduce-scatter.
+    """
+    kind, group = line.opcode.removesuffix("-start"), hlo_text.group(line)
+    ring = (len(group) - 1) / max(len(group), 1)
+    own = next((name for name, other in lines.items() if other is line), "")
+    for index, operand in enumerate(line.operands):
+        taken = hlo_text.size(lines[operand].shape) if operand in lines else 0.0
+        effective = kind
+        if kind == "all-reduce" and only_sliced(_element(own, index, lines)):
+            effective = "reduce-scatter"
+        sent = {
+            "all-gather": taken * (len(group) - 1),
+            "reduce-scatter": taken * ring,
+            "all-reduce": 2 * taken * ring,
+            "all-to-all": taken * ring,
+            "collective-permute": taken,
+        }[effective]
+        yield Collective(effective, line.label, group, sent)
+
+
+def _element(name: str, index: int, lines: dict[str, Line]) -> str:
+    """Return the name of one of an instruction's results, by its index in the tuple."""
+    for other, line in lines.items():
+        taken = line.opcode == "get-tuple-element" and line.operands == (name,)
+        if taken and re.search(rf"\bindex={index}\b", line.rest):
+            return other
+    return name
+
+
+def _is_slice(line: Line, name: str) -> bool:
+    return line.opcode == "dynamic-slice" and line.operands[0] == name
+
+
+def _parameters(
+    line: Line, name: str, computations: dict[str, dict[str, Line]]
+) -> Iterator[tuple[str, str]]:
+    """Yield the parameter of a fusion or call that an operand becomes: (computation, name)."""
+    called = _CALLED.search(line.rest) if line.opcode in ("fusion", "call") else None
+    if called is None:
+        return
+    places = {str(k) for k, operand in enumerate(line.operands) if operand == name}
+    for inner, other in computations.get(called[1], {}).items():
+        if other.opcode == "parameter" and other.operands[0] in places:
+            yield called[1], inner

@@ -1,0 +1,1 @@
+"""Memory readers: how the memory conditions the denoiser."""

@@ -1,0 +1,234 @@
+"""Rendering as a memory reader: each frame's tokens get what the memory looks like from there.
+
+The memory's pictures (``Sight.view``) are gathered into the cells of the latents by space-to-depth
+and are not encoded. Each video token gets the pixels that it stands for: colours or features, depth
+and a mask. Or, where ``picture`` is `latents`, it gets the latents that the codec makes of the
+pictures (``Sight.encoded``), 0 in cells of which nothing is seen, and the mask. Either is added to
+the embedded tokens through a layer that starts at zero, and given to a block without attention
+after every block of the backbone (``render_block``), by which a frozen backbone learns to use it. A
+fresh reader changes nothing, and one that sees nothing never does.
+
+Parameters, under ``render``: ``reduce`` (pictures of many channels), ``embed_1``, ``embed_2``,
+``added``, and the stacked ``blocks``.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
+
+from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs.pixel import fold
+from pewm_jax.config import ModelConfig, RenderConfig
+from pewm_jax.models.interface import Readers
+from pewm_jax.nn import layers
+from pewm_jax.nn.costs import SPLIT, Costs, Product, Share, text_tokens, video_times, video_tokens
+from pewm_jax.nn.patches import patchify
+from pewm_jax.nn.signals import signal_from_depth
+from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.readers.render_block import RenderBlock
+from pewm_jax.types import Array, Camera, Params, Sight, View
+
+REPLICATED = P()
+
+SHARDING = (
+    (r"memory/render/blocks/(linear|up)/kernel", P("fsdp", "tensor")),
+    (r"memory/render/blocks/(linear|up)/bias", P("tensor")),
+    (r"memory/render/blocks/down/kernel", P("tensor", "fsdp")),
+    (r"memory/render/blocks/(down/bias|norm/(scale|bias))", REPLICATED),
+    (r"memory/render/(embed_[12]|added)/kernel", P(None, "fsdp")),
+    (r"memory/render/(reduce/(kernel|bias)|(embed_[12]|added)/bias)", REPLICATED),
+)
+
+STREAMS = (10, 22)
+"""How often element-wise work reads or writes a block's tokens: forward, backward."""
+
+
+def _settings(model: ModelConfig) -> RenderConfig:
+    config = model.memory.reader
+    assert isinstance(config, RenderConfig)
+    return config
+
+
+def _reduces(model: ModelConfig) -> bool:
+    config = _settings(model)
+    return not config.READS_LATENTS and model.memory.rendered_channels > config.reduced
+
+
+def pixel_channels(model: ModelConfig) -> int:
+    """Return the channels of a pixel of the pictures: features, depth and mask."""
+    return min(model.memory.rendered_channels, _settings(model).reduced) + 2
+
+
+def cell_channels(model: ModelConfig) -> int:
+    """Return the channels of what is read at a cell of the latents; see ``cells``."""
+    codec = model.codec
+    pixels = codec.temporal * codec.spatial**2
+    latents = _settings(model).READS_LATENTS
+    return codec.channels + pixels if latents else pixel_channels(model) * pixels
+
+
+def token_channels(model: ModelConfig) -> int:
+    """Return the channels of the part of the pictures that one video token stands for."""
+    places = model.backbone.places
+    return cell_channels(model) * places.patch_t * places.patch**2
+
+
+def _embeddings(model: ModelConfig) -> dict[str, layers.nn.Dense]:
+    """Return the linear layers on the way from pictures to tokens, by name."""
+    config, dtype = _settings(model), jnp.dtype(model.dtype)
+    found = {"embed_1": config.picture_width, "embed_2": config.picture_width}
+    made = {name: layers.dense(width, dtype, name) for name, width in found.items()}
+    made["added"] = layers.dense(model.backbone.places.width, dtype, "added", zero=True)
+    if _reduces(model):
+        made["reduce"] = layers.dense(config.reduced, dtype, "reduce")
+    return made
+
+
+def init(model: ModelConfig, key: Array) -> Params:
+    """Return random parameters, under ``render``; gates and ``added`` are zero."""
+    config, places = _settings(model), model.backbone.places
+    widths = {
+        "embed_1": token_channels(model),
+        "embed_2": config.picture_width,
+        "added": config.picture_width,
+        "reduce": model.memory.rendered_channels,
+    }
+    params: Params = {}
+    for place, (name, layer) in enumerate(sorted(_embeddings(model).items())):
+        example = jnp.zeros((1, widths[name]))
+        params[name] = layer.init(jax.random.fold_in(key, place), example)["params"]
+    if config.blocks:
+        example = (
+            jnp.zeros((1, 1, places.width)),
+            jnp.zeros((1, places.time)),
+            jnp.zeros((1, 1, config.picture_width)),
+        )
+        block = RenderBlock(config.mlp_ratio, TokenLayout(1, 0, 1, 1))
+        params["blocks"] = jax.vmap(lambda k: block.init(k, *example)["params"])(
+            jax.random.split(jax.random.fold_in(key, len(widths)), places.count)
+        )
+    return {"render": params}
+
+
+def pictures(model: ModelConfig, params: Params, view: View) -> Array:
+    """Return (B, T, H, W, C) what is read of pictures: features where seen, depth, the mask.
+
+    Depth is also read where only the back of something is known, a wall of the room next door.
+
+    Args:
+        model: the model.
+        params: the reader's parameters under ``render``.
+        view: (B, T) pictures; features that they hold where nothing is seen are not read.
+    """
+    seen, dtype = view.seen_THW[..., None], jnp.dtype(model.dtype)
+    features: Array = jnp.where(seen, view.features_THWF, 0).astype(dtype)
+    if _reduces(model):
+        features = _apply(model, params, "reduce", features)
+    depth = signal_from_depth(model.clip, view.depth_THW)
+    depth = jnp.where(view.depth_THW > 0, depth, 0)[..., None]
+    return jnp.concatenate([x.astype(dtype) for x in (features, depth, seen)], -1)
+
+
+def cells(model: ModelConfig, params: Params, sight: Sight) -> tuple[Array, Array]:
+    """Return what is read at each cell of the latents, and which clips see anything.
+
+    Args:
+        model: the model.
+        params: the reader's parameters under ``render``.
+        sight: of a batch; what it holds where nothing is seen is not read.
+
+    Returns:
+        ``(cells_BthwC, seen_B)``: the pixels of each cell (see ``pictures``), or its latents and
+        the mask of its pixels.
+    """
+    fold_cells = functools.partial(fold, spatial=model.codec.spatial, temporal=model.codec.temporal)
+    if not _settings(model).READS_LATENTS:
+        view = sight.view
+        assert view is not None
+        return fold_cells(pictures(model, params, view)), view.seen_THW.any((1, 2, 3))
+    encoded, dtype = sight.encoded, jnp.dtype(model.dtype)
+    assert encoded is not None
+    seen = fold_cells(encoded.seen_THW[..., None])
+    latents = jnp.where(seen.any(-1, keepdims=True), encoded.latents_thwC, 0)
+    joined = jnp.concatenate([latents.astype(dtype), seen.astype(dtype)], -1)
+    return joined, encoded.seen_THW.any((1, 2, 3))
+
+
+def _apply(model: ModelConfig, params: Params, name: str, x: Array) -> Array:
+    """Apply one of the layers on the way from pictures to tokens."""
+    return _embeddings(model)[name].apply({"params": params[name]}, x)
+
+
+def prepare(
+    model: ModelConfig, params: Params, sight: Sight, camera: Camera, rays_BthwC: Array
+) -> Readers:
+    """Embed the memory's pictures; see ``readers``."""
+    del camera, rays_BthwC  # the pictures are what these cameras see
+    config, places, weights = _settings(model), model.backbone.places, params["render"]
+    embed = functools.partial(_apply, model, weights)
+    layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
+
+    read_BthwC, seen_B = cells(model, weights, sight)
+    missing = -read_BthwC.shape[1] % places.patch_t
+    read_BthwC = jnp.concatenate([read_BthwC[:, :1]] * missing + [read_BthwC], 1)
+    patches = patchify(read_BthwC, places.patch, places.patch_t)
+    picture: Array = embed("embed_2", jax.nn.silu(embed("embed_1", patches)))
+    # A clip whose cameras see nothing of the memory is left alone.
+    shown = (seen_B | (not model.memory.REMEMBERS))[:, None, None]
+    added = layout.spread(jnp.where(shown, embed("added", picture), 0))
+    if not config.blocks:
+        return Readers(added_BND=added)
+    picture = layout.spread(picture)
+    block = RenderBlock(config.mlp_ratio, layout)
+
+    def read(layer: Params, video: Array, time: Array) -> Array:
+        out: Array = block.apply({"params": layer}, video, time, picture)
+        return jnp.where(shown, out, video)
+
+    return Readers(read, weights["blocks"], added)
+
+
+def costs(model: ModelConfig, share: Share) -> Costs:
+    """Return the costs of embedding pictures and of the blocks, and roughly of rendering.
+
+    Of latents also those of making them.
+    """
+    config, places, clip = _settings(model), model.backbone.places, model.clip
+    frames, patches = video_tokens(model)
+    video, depth, width = frames * patches, places.count * config.blocks, places.width
+    remat, inner = bool(model.backbone.remat), config.picture_width
+    hidden = config.mlp_ratio * width
+    mlp = depth * video * hidden * (2 * width + inner)
+    modulation = video_times(model) * depth * places.time * 3 * width
+    pixels = clip.frames * clip.height * clip.width
+    reduced = model.memory.rendered_channels * config.reduced * pixels * _reduces(model)
+    again = float(remat)
+    products = (
+        Product("memory", "linear", mlp, 2.0, again, SPLIT),
+        Product("memory", "linear", modulation, 1.0, again, ("tensor",)),
+        Product("memory", "linear", video * token_channels(model) * inner, 1.0 + _reduces(model)),
+        Product("memory", "linear", video * inner * (inner + width), 2.0),
+        Product("memory", "linear", reduced, 1.0),
+    )
+    each = share.clips * video / share.context * share.activation_bytes
+    tokens, part = each * width, each * hidden / share.tensor
+    drawn = share.clips * pixels * (model.memory.rendered_channels + 2) * share.activation_bytes
+    made, stays = Costs(), drawn
+    if config.READS_LATENTS:
+        made = codecs.costs_of_images(model, share, 2 * clip.frames, "memory")
+        stays = each * token_channels(model)  # the pictures are gone when the denoiser starts
+    kept = 0.0 if remat else depth * (4 * tokens + 3 * part)
+    block = 3 * part + 2 * tokens if remat and config.blocks else 0.0
+    forward, backward = STREAMS
+    return Costs(
+        products=products + made.products,
+        kept=kept + stays,
+        block=block,
+        held=made.held,
+        streamed=depth * tokens * (forward * (1 + remat) + backward) + 8 * drawn + made.streamed,
+        summed=2 * depth * (2 + remat) * tokens,
+    )

@@ -1,0 +1,200 @@
+"""The report's images and videos, drawn from stored long rollouts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pewm_jax.config import Config
+from pewm_jax.data.episodes import Episode
+from pewm_jax.eval.long_rollouts import LongRollouts
+from pewm_jax.eval.protocol import ClipChoice, load_clip
+from pewm_jax.eval.seen import seen_masks
+from pewm_jax.geometry.actions import heading
+from pewm_jax.memory import memories
+from pewm_jax.report.pictures import as_bytes, dim, enlarge, farthest, from_above, grid, map_bounds
+from pewm_jax.report.video import encode_gif, encode_h264, side_by_side, small_frames
+from pewm_jax.types import Frames
+
+ABOVE_CAMERA_M = 0.4
+"""Map cells higher than this above the camera are left out of the view from above."""
+CAPTIONS = {
+    "memory": "with its map",
+    "empty": "empty map",
+    "model": "no memory",
+    "reproject": "reprojected",
+}
+"""The methods in images, in their order, and their names."""
+ROWS = "rows"
+"""Folder of a report with ``Gallery.rows``: ``00-truth.png``, ``00-memory.png`` and so on."""
+HOLD = 4
+"""Video frames for which the observed image is held."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gallery:
+    """The images and videos of a report.
+
+    Attributes:
+        videos: (caption, MP4) of each long rollout.
+        strip: frames of one rollout in rows: truth, with its map, empty map, reprojected; of a
+            model without a memory one row in the place of two.
+        strip_note: which rollout and which frames they are.
+        moving: all frames of that rollout side by side, a GIF.
+        masks: the same true frames with never-seen pixels greyed out.
+        above: the map from above, before and after that rollout; None without a memory.
+        rows: of each rollout shown the frames of ``truth`` and of each method in ``CAPTIONS`` at
+            the steps of ``strip``, side by side in one picture and as large as they are.
+    """
+
+    videos: list[tuple[str, bytes]]
+    strip: np.ndarray
+    strip_note: str
+    moving: bytes
+    masks: np.ndarray
+    above: np.ndarray | None
+    rows: list[dict[str, np.ndarray]]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rollout:
+    """A long rollout, with the true frames and its methods' (colours, depth)."""
+
+    choice: ClipChoice
+    context: Frames
+    truth: Frames
+    seen_THW: np.ndarray
+    imagined: dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+def picture_steps(frames: int) -> np.ndarray:
+    """Return the steps of a rollout that are shown as pictures; 0 is the present."""
+    return np.unique(np.round(np.linspace(0, frames, 8)).astype(int))
+
+
+def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts) -> Gallery:
+    """Draw the images and encode the videos.
+
+    The images show the rollout with the most pixels seen before. This choice depends on geometry
+    alone, never on how well a method did.
+    """
+    shown = [_gather(config, episodes, long, index) for index in range(long.shown)]
+    best = max(range(len(shown)), key=lambda index: float(shown[index].seen_THW.mean()))
+    rollout = shown[best]
+    count = len(rollout.truth.depth_THW)
+    steps = picture_steps(count)
+    names = ["observed" if step == 0 else f"step {step}" for step in steps]
+    truth = _with_present(rollout.context, as_bytes(rollout.truth.rgb_THWC))
+    rows = [("truth", [truth[step] for step in steps])]
+    for method, (rgb, _) in rollout.imagined.items():
+        rows.append(
+            (CAPTIONS[method], [_with_present(rollout.context, rgb)[step] for step in steps])
+        )
+    seen = np.concatenate([np.ones_like(rollout.seen_THW[:1]), rollout.seen_THW])
+    masked = [dim(enlarge(truth[step], 128), _enlarge_mask(seen[step], 128)) for step in steps]
+    return Gallery(
+        videos=[_video(config, long, item) for item in shown],
+        strip=grid(rows, names),
+        strip_note=(
+            f"Episode {rollout.choice.name} from frame {rollout.choice.start}; steps "
+            f"{', '.join(str(step) for step in steps[1:])} of {count}. Of the {long.shown} "
+            "rollouts shown above it is the one with the most pixels seen before."
+        ),
+        moving=_moving(rollout),
+        masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
+        above=_above(config, long, best, rollout) if "memory" in long.kept else None,
+        rows=[_rows(item, steps) for item in shown],
+    )
+
+
+def _rows(item: _Rollout, steps: np.ndarray) -> dict[str, np.ndarray]:
+    colours = {"truth": as_bytes(item.truth.rgb_THWC)}
+    colours |= {method: rgb for method, (rgb, _) in item.imagined.items()}
+    return {
+        name: np.concatenate(list(_with_present(item.context, rgb)[steps]), axis=1)
+        for name, rgb in colours.items()
+    }
+
+
+def _gather(
+    config: Config, episodes: Sequence[Episode], long: LongRollouts, index: int
+) -> _Rollout:
+    choice = long.scored.choices[index]
+    context, truth, _ = load_clip(config, episodes, choice, cameras=True)
+    seen, _ = seen_masks(truth, context)
+    imagined = {
+        method: (long.kept[method]["rgb"][index], long.kept[method]["depth"][index])
+        for method in CAPTIONS
+        if method in long.kept
+    }
+    return _Rollout(choice, context, truth, np.asarray(seen), imagined)
+
+
+def _with_present(context: Frames, rgb_THWC: np.ndarray) -> np.ndarray:
+    return np.concatenate([as_bytes(np.asarray(context.rgb_THWC[-1:])), rgb_THWC])
+
+
+def _enlarge_mask(mask_HW: np.ndarray, width: int) -> np.ndarray:
+    factor = max(1, width // mask_HW.shape[1])
+    big = np.repeat(np.repeat(mask_HW, factor, 0), factor, 1)
+    rows = np.linspace(0, big.shape[0] - 1, round(mask_HW.shape[0] * width / mask_HW.shape[1]))
+    columns = np.linspace(0, big.shape[1] - 1, width)
+    return big[np.round(rows).astype(int)][:, np.round(columns).astype(int)]
+
+
+def _video(config: Config, long: LongRollouts, item: _Rollout) -> tuple[str, bytes]:
+    depth0 = np.asarray(item.context.depth_THW[-1:])
+    columns = [("truth", as_bytes(item.truth.rgb_THWC), item.truth.depth_THW)]
+    columns += [(CAPTIONS[method], rgb, depth) for method, (rgb, depth) in item.imagined.items()]
+    columns = [
+        (name, _with_present(item.context, rgb), np.concatenate([depth0, depth]))
+        for name, rgb, depth in columns
+    ]
+    count = len(item.truth.depth_THW)
+    share = item.seen_THW.mean((1, 2))
+    footers = ["the present, observed by all"] + [
+        f"imagined frame {t + 1} of {count}: {100 * share[t]:.0f} % of it was seen before"
+        for t in range(count)
+    ]
+    pictures = side_by_side(columns, footers, far_m=farthest(item.truth))
+    per_clip = config.model.clip.frames - 1
+    caption = (
+        f"{item.choice.name}, from frame {item.choice.start}: {count} frames imagined in "
+        f"{long.chain} clips of {per_clip}, stride {config.evaluate.stride}, sampling seed "
+        f"{config.evaluate.seeds[0]}."
+    )
+    return caption, encode_h264([pictures[0]] * (HOLD - 1) + pictures)
+
+
+def _moving(item: _Rollout) -> bytes:
+    columns = [("truth", as_bytes(item.truth.rgb_THWC))]
+    columns += [(CAPTIONS[method], rgb) for method, (rgb, _) in item.imagined.items()]
+    frames = small_frames([(name, _with_present(item.context, rgb)) for name, rgb in columns])
+    return encode_gif([frames[0]] * (HOLD - 1) + frames)
+
+
+def _above(config: Config, long: LongRollouts, index: int, item: _Rollout) -> np.ndarray:
+    """Draw the map before and after a rollout side by side, to one scale."""
+    kept = long.kept["memory"]
+    poses = np.asarray(item.context.camera.world_from_camera)
+    later = np.asarray(item.truth.camera.world_from_camera)
+    ceiling = poses[-1, 2, 3] + ABOVE_CAMERA_M
+    clouds = []
+    for when in ("first", "last"):
+        valid = kept[f"{when}_valid"][index] & (kept[f"{when}_points"][index][:, 2] < ceiling)
+        points = kept[f"{when}_points"][index][valid]
+        shades = memories.colours(config.model, kept[f"{when}_features"][index][valid])
+        clouds.append((points, as_bytes(shades)))
+    bounds = map_bounds(*[points for points, _ in clouds], poses[:, :3, 3])
+    panels = []
+    tracks = [("what was observed", poses), ("and after imagining the way on", later)]
+    for (title, track), (points, shades) in zip(tracks, clouds, strict=True):
+        path = track if track is poses else np.concatenate([poses[-1:], track])
+        yaw = float(heading(track[-1]))
+        cell_m = config.model.memory.cell_m
+        panels.append(
+            from_above(points, shades, cell_m, path[:, :3, 3], yaw, title=title, bounds=bounds)
+        )
+    return np.concatenate(panels, 1)

@@ -1,0 +1,150 @@
+"""The report of long horizons: numbers as JSON, a page, a strip of pictures, a video."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.io import atomic
+from pewm_jax.report.page import STYLE
+from pewm_jax.report.pictures import grid, save_png
+from pewm_jax.report.video import encode_h264, small_frames
+
+SHOWN = 8
+"""Frames of a walk in the strip."""
+FRAMES_PER_SECOND = 12
+NAMES = {
+    "truth": "truth",
+    "bound": "its renderer, true voxels",
+    "known": "begun in a known grid",
+    "world": "the world itself",
+    "without": "without its voxels",
+}
+"""What methods are called; other worlds are called as their runs."""
+
+
+def write(
+    folder: Path, facts: Mapping[str, Any], videos: Mapping[str, np.ndarray], ends: Sequence[int]
+) -> Path:
+    """Write the report; returns the page's path.
+
+    Args:
+        folder: where.
+        facts: plain values: ``psnr`` and perhaps ``distances`` by method, ``edits``, ``protocol``.
+        videos: method → (B, T, H, W, 3) uint8 colours, ``truth`` first.
+        ends: of the stretches, frames.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic.replacing(folder / "horizon.json") as partial:
+        partial.write_text(json.dumps(facts, indent=1) + "\n")
+    count = next(iter(videos.values())).shape[1]
+    frames = np.linspace(0, count - 1, SHOWN).round().astype(int)
+    rows = [(_name(name), [video[0, t] for t in frames]) for name, video in videos.items()]
+    save_png(folder / "horizon.png", grid(rows, [str(t + 1) for t in frames], cell=112))
+    columns = [(_name(name), video[0]) for name, video in videos.items()]
+    pictures = [x[: x.shape[0] // 2 * 2, : x.shape[1] // 2 * 2] for x in small_frames(columns)]
+    with atomic.replacing(folder / "horizon.mp4") as partial:
+        partial.write_bytes(encode_h264(pictures, FRAMES_PER_SECOND))
+    page = folder / "horizon.html"
+    with atomic.replacing(page) as partial:
+        partial.write_text(_html(facts, ends))
+    return page
+
+
+def lines(facts: Mapping[str, Any], ends: Sequence[int]) -> list[str]:
+    """Return what is printed: a line for each method."""
+    said = [f"PSNR in dB of frames {', '.join(_spans(ends))}:"]
+    for name, values in facts["psnr"].items():
+        said.append(f"  {_name(name):<26}" + "  ".join(f"{value:6.2f}" for value in values))
+    for name, found in facts.get("distances", {}).items():
+        scores = ", ".join(
+            f"{end}: FVD {one['fvd']['value']:.0f}, KVD {one['kvd']['value']:.2f} "
+            f"({one['fvd']['clips']} clips)"
+            for end, one in found.items()
+        )
+        said.append(f"  {_name(name)}: {scores}")
+    return [*said, *sentences(facts)]
+
+
+def sentences(facts: Mapping[str, Any]) -> list[str]:
+    """Return what is said of a world of voxels: its autoencoder, and blocks placed in it."""
+    said = []
+    if "autoencoder" in facts:
+        back = facts["autoencoder"]
+        said.append(
+            f"The 3D VAE gives back {100 * back['occupied']:.1f} % of the occupied cells with "
+            f"their class ({100 * back['filled']:.1f} % as occupied) and {100 * back['empty']:.1f} "
+            f"% of the empty ones, of {back['grids']} recorded grids."
+        )
+    if "edits" in facts:
+        edits = facts["edits"]
+        said.append(
+            f"Blocks that were placed and stayed: {edits['stayed']} of {edits['trials']} "
+            f"({100 * edits['share_of_cells']:.0f} % of their cells; {edits['without_room']} more "
+            f"walks had no room); in {edits['frames_in_window']} of {edits['frames']} frames a "
+            "part was in the window that may change, where a known cell changes if another class "
+            f"is likelier by {edits['hold']:g} nats. Seen as changed in "
+            f"{edits['changed_in_sight']} of {edits['frames_in_sight']} frames in sight."
+        )
+    return said
+
+
+def _spans(ends: Sequence[int]) -> list[str]:
+    """Return what the stretches between ends are called, such as 1–200 and 201–400."""
+    return [f"{low + 1}–{high}" for low, high in zip((0, *ends[:-1]), ends, strict=True)]
+
+
+def _name(name: str) -> str:
+    return NAMES.get(name, name)
+
+
+def _html(facts: Mapping[str, Any], ends: Sequence[int]) -> str:
+    head = "".join(f"<th>{span}</th>" for span in _spans(ends))
+    body = "".join(
+        f"<tr><td>{escape(_name(name))}</td>"
+        + "".join(f"<td>{value:.2f}</td>" for value in values)
+        + "</tr>"
+        for name, values in facts["psnr"].items()
+    )
+    parts = [
+        "<h1>Long horizons</h1>",
+        (
+            "<p class=lead>Each walk begins with a few observed frames and goes on by its recorded "
+            "actions alone.</p>"
+        ),
+        (
+            f"<h2>PSNR in dB, by frames</h2><table><thead><tr><th></th>{head}</tr></thead>"
+            f"<tbody>{body}</tbody></table>"
+        ),
+        (
+            "<p class=quiet>The renderer that is given the true voxels and cameras bounds the "
+            "world.</p>"
+            if "bound" in facts["psnr"]
+            else ""
+        ),
+    ]
+    if facts.get("distances"):
+        rows = "".join(
+            f"<tr><td>{escape(_name(name))}</td><td>{end}</td><td>{one['fvd']['value']:.0f}</td>"
+            f"<td>{one['kvd']['value']:.2f}</td><td>{one['fvd']['clips']}</td></tr>"
+            for name, found in facts["distances"].items()
+            for end, one in found.items()
+        )
+        parts.append(
+            "<h2>Windows of 16 frames, as sets</h2><table><thead><tr><th></th><th>frames before"
+            f"</th><th>FVD</th><th>KVD</th><th>clips</th></tr></thead><tbody>{rows}</tbody></table>"
+        )
+    said = "".join(f"<p>{escape(line)}</p>" for line in sentences(facts))
+    parts.append(f"{said}<figure><img src='horizon.png' alt='Frames of a walk.'></figure>")
+    parts.append("<video src='horizon.mp4' controls muted loop></video>")
+    protocol = "".join(
+        f"<dt>{escape(str(name))}</dt><dd>{escape(str(value))}</dd>"
+        for name, value in facts["protocol"].items()
+    )
+    parts.append(f"<h2>How it was measured</h2><dl>{protocol}</dl>")
+    return f"<!doctype html><meta charset=utf-8><style>{STYLE}</style>{''.join(parts)}\n"

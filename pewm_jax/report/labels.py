@@ -1,0 +1,283 @@
+"""The report's words: names of methods, masks and metrics, numbers, and what is said of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pewm_jax.eval.statistics import ours
+
+METHOD_NAMES = {
+    "memory": "with its map",
+    "empty": "same weights, empty map",
+    "model": "the model, which has no memory",
+    "none": "trained as long without a memory",
+    "reproject": "reprojection, no network",
+    "copy": "copying the last frame",
+}
+"""Names of the methods, in the order of the tables."""
+RIVALS = {
+    "reproject": "reprojecting what was observed",
+    "none": "a model trained as long without a memory",
+    "empty": "an empty map",
+}
+"""What the model is compared with, in sentences."""
+OUR_NAMES = {"memory": "The model with its map", "model": "The model, which has no memory,"}
+"""The model itself in sentences, by its row."""
+NO_MEMORY = (
+    "This model was trained without a memory: there is no map, and no row with an empty one; what "
+    "a memory brings is seen beside a run that has one (`pewm-jax compare`, or --none of that run)."
+)
+MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
+"""Names of the masks."""
+METRIC_NAMES = {
+    "psnr": ("PSNR, dB ↑", 2),
+    "ssim": ("SSIM ↑", 3),
+    "depth_mae": ("depth error, m ↓", 3),
+    "depth_rel": ("relative depth error ↓", 3),
+    "lpips": ("LPIPS ↓", 3),
+}
+"""Heading and digits of each metric; LPIPS is of whole pictures, where it was measured, and has its
+network's name (``heading``)."""
+COVERAGE_NAMES = {
+    "held": "held by the map",
+    "looked_at": "looked at by the model's reader",
+    "rendered": "shown by the rendered map",
+    "chosen": "among the tokens chosen for attention",
+    "attended": "among those that the frame's own camera would attend to",
+}
+"""What becomes of the pixels seen before, each a share of them."""
+ACTIONS_NAMES = {
+    "true": "the true actions",
+    "shuffled": "another clip's actions",
+    "none": "no actions",
+    "copy": "the observed frame, repeated",
+    "true - shuffled": "true minus another clip's",
+    "true - none": "true minus none",
+    "true - copy": "true minus the observed frame",
+}
+"""Names of the kinds of actions by which a model was steered, and of their differences."""
+NONE_HOW = (
+    "A row for a model trained as long without a memory is missing: train one of the same clip, "
+    "codec and number of steps with all steps in stage 1 (--train.stage1.steps N "
+    "--train.stage2.steps 0) and name its folder by --none."
+)
+
+
+def heading(metric: str, protocol: Mapping[str, Any]) -> str:
+    """Return a metric's heading: LPIPS with the name of its network.
+
+    Args:
+        metric: key of ``METRIC_NAMES``.
+        protocol: of ``metrics.json``.
+    """
+    words, network = METRIC_NAMES[metric][0], protocol.get("lpips_name")
+    return words.replace("LPIPS", network) if network else words
+
+
+def number(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
+    """Format an entry as ``mean ± stderr``, or as a dash."""
+    if entry["mean"] is None:
+        return "–"
+    text = f"{entry['mean']:{'+' if sign else ''}.{digits}f}"
+    return text if entry["stderr"] is None else f"{text} ± {entry['stderr']:.{digits}f}"
+
+
+def spread(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
+    """Format an entry as ``mean [low, high]``, or as a dash."""
+    if entry["mean"] is None:
+        return "–"
+    plus = "+" if sign else ""
+    text = f"{entry['mean']:{plus}.{digits}f}"
+    if entry["low"] is None:
+        return text
+    return f"{text} [{entry['low']:{plus}.{digits}f}, {entry['high']:{plus}.{digits}f}]"
+
+
+def verdict(entry: Mapping[str, Any], where: str) -> str:
+    """Return a sentence on what the map changes (PSNR of memory minus empty)."""
+    mean, stderr = entry["mean"], entry["stderr"]
+    if mean is None:
+        return f"No clip has enough pixels {where} to compare."
+    if stderr is None:
+        return (
+            f"On pixels {where} the map changes PSNR by {mean:+.2f} dB; with clips of one place "
+            "only, how sure that is cannot be said."
+        )
+    amount = f"{abs(mean):.2f} ± {stderr:.2f} dB"
+    if mean > 2 * stderr:
+        ratio = f", {mean / stderr:.0f} times the standard error" if stderr > 0 else ""
+        return f"On pixels {where} the map brings the model {amount} closer to the truth{ratio}."
+    if mean < -2 * stderr:
+        return f"On pixels {where} the map makes the model worse, by {amount}."
+    return f"On pixels {where} the map makes no clear difference ({mean:+.2f} ± {stderr:.2f} dB)."
+
+
+def comparison(margin: Mapping[str, Any], rival: str, own: str = "memory") -> str:
+    """Return a sentence on whether the model beats another method, mask by mask.
+
+    Args:
+        margin: ``[mask]["psnr"]`` of the model minus the rival.
+        rival: key of ``RIVALS``.
+        own: key of ``OUR_NAMES``.
+    """
+    places = {
+        "seen": "over pixels seen before",
+        "unseen": "over those never seen",
+        "all": "over all",
+    }
+    said = [f"{where} {_outcome(margin[mask]['psnr'])}" for mask, where in places.items()]
+    return f"{OUR_NAMES[own]} against {RIVALS[rival]}: {'; '.join(said)}."
+
+
+def _outcome(entry: Mapping[str, Any]) -> str:
+    mean, stderr = entry["mean"], entry["stderr"]
+    if mean is None:
+        return "there is nothing to compare"
+    if stderr is None:
+        return f"{mean:+.2f} dB in one place, how sure cannot be said"
+    amount = f"{mean:+.2f} ± {stderr:.2f} dB"
+    if abs(mean) <= 2 * stderr:
+        return f"no clear difference ({amount})"
+    return f"it {'is better' if mean > 0 else 'is WORSE'} ({amount})"
+
+
+def drifted(drift: Mapping[str, Any]) -> str:
+    """Return a sentence on how long rollouts of the model change.
+
+    Args:
+        drift: ``statistics.drift`` of the model's own row.
+    """
+    if drift["difference"] is None:
+        return "Long rollouts have fewer than 32 frames: their drift is not measured."
+    first, last, change = (drift[name] for name in ("first16", "last16", "difference"))
+    return (
+        f"Along long rollouts PSNR over pixels seen before goes from {number(first, 2)} dB (first "
+        f"16 frames) to {number(last, 2)} dB (last 16): {number(change, 2, sign=True)} dB."
+    )
+
+
+def covered(shares: Mapping[str, float]) -> str:
+    """Return a sentence on what the map knows of the pixels seen before."""
+    said = (f"{100 * shares[key]:.1f} % {name}" for key, name in COVERAGE_NAMES.items())
+    return f"Of the pixels seen before: {', '.join(said)}."
+
+
+def perceived(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence on LPIPS, or on why it was left out."""
+    found = {method: masks["all"].get("lpips") for method, masks in metrics["results"].items()}
+    if not all(found.values()):
+        return metrics["protocol"]["lpips"]
+    said = (f"{label} {number(found[m], 3)}" for m, label in METHOD_NAMES.items() if m in found)
+    name = metrics["protocol"].get("lpips_name") or "LPIPS"
+    return f"{name} of whole pictures, lower is better: {'; '.join(said)}."
+
+
+def far_apart(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence on FVD and KVD, or on why they were left out."""
+    found = metrics["videos"]
+    if not found:
+        return metrics["protocol"]["fvd"]
+    said = []
+    for kind, name in found["names"].items():
+        values = (
+            f"{label} {found['results'][method][kind]['value']:.4g}"
+            for method, label in METHOD_NAMES.items()
+            if method in found["results"]
+        )
+        said.append(f"{name}, lower is better: {'; '.join(values)}")
+    return f"{'. '.join(said)}."
+
+
+def came_back(metrics: Mapping[str, Any]) -> str:
+    """Return a sentence on the mirror test, or on why it was left out."""
+    found = metrics["mirror"]
+    if not found:
+        return metrics["protocol"]["mirror"]
+    said = []
+    for method, pairs in found["by_distance"].items():
+        values = pairs["again"]["mean"]
+        known = [(value, at) for value, at in zip(values, found["distances"], strict=True) if value]
+        ends = " and ".join(f"{value:.2f} dB after {at}" for value, at in (known[0], known[-1]))
+        said.append(f"{METHOD_NAMES[method]} {ends}")
+    return (
+        "There and back, the second visit against the first, by frames between them: "
+        f"{'; '.join(said)}."
+    )
+
+
+def consistent(metrics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on SCS, if it was measured."""
+    found = metrics.get("scs")
+    if not found:
+        return []
+    values = "; ".join(
+        f"{label} {spread(found['results'][method], 1)}"
+        for method, label in METHOD_NAMES.items()
+        if method in found["results"]
+    )
+    ceiling = spread(found["ceiling"], 1)
+    return [f"{found['name']}, higher is better: {values}; the true clip {ceiling}."]
+
+
+def followed(metrics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on whether the model follows its actions, or on why that is not known.
+
+    There is none of a model that is not steered by actions.
+    """
+    found = metrics.get("steering")
+    if not found:
+        about = metrics["protocol"].get("steering")
+        return [about] if about else []
+    less = (
+        f"{ACTIONS_NAMES[name.removeprefix('true - ')]}: {spread(entry, 2, sign=True)} dB"
+        for name, entry in found["all"].items()
+        if name.startswith("true - ")
+    )
+    true = spread(found["all"]["true"], 2)
+    return [f"PSNR with the true actions is {true} dB; its lead over {'; over '.join(less)}."]
+
+
+def grew(metrics: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on how the map grows, if there is one."""
+    found = metrics["long"]["growth"]
+    if not found:
+        return []
+    held = found["occupied"]["mean"]
+    said = (
+        f"Along long rollouts the map grows from {held[0]:.0f} to {held[-1]:.0f} points in "
+        f"{found['frames'][-1]} imagined frames, of {found['capacity']} that it has room for."
+    )
+    return [said]
+
+
+def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Return the report's sentences, for the terminal: against the baselines, then the map alone.
+
+    Args:
+        metrics: the content of ``metrics.json``.
+    """
+    margins, own = metrics["margins"], ours(metrics["results"])
+    lines = [NO_MEMORY]
+    if own == "memory":
+        lines = [
+            verdict(margins["empty"]["seen"]["psnr"], "seen before"),
+            verdict(margins["empty"]["unseen"]["psnr"], "never seen"),
+        ]
+    rivals = [name for name in ("reproject", "none") if name in margins]
+    lines += [comparison(margins[name], name, own) for name in rivals]
+    lines += [NONE_HOW] if own == "memory" and "none" not in margins else []
+    lines += [perceived(metrics), far_apart(metrics)]
+    lines += [covered(metrics["coverage"])] if metrics["coverage"] else []
+    lines += [drifted(metrics["long"]["drift"][own]), *grew(metrics)]
+    return [*lines, *followed(metrics), *consistent(metrics), came_back(metrics)]
+
+
+def score_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Return the PSNR of every method under every mask as lines of a table, for the terminal."""
+    lines = [f"{'PSNR, dB':<34}" + "".join(f"{name:>16}" for name in MASK_NAMES.values())]
+    for method, label in METHOD_NAMES.items():
+        if method in metrics["results"]:
+            cells = (number(metrics["results"][method][mask]["psnr"], 2) for mask in MASK_NAMES)
+            lines.append(f"{label:<34}" + "".join(f"{cell:>16}" for cell in cells))
+    return lines

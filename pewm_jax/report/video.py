@@ -1,0 +1,143 @@
+"""Side-by-side videos: H.264, which every browser plays, and GIF, which every page shows."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import av
+import numpy as np
+from PIL import Image, ImageDraw
+
+from pewm_jax.report.pictures import PAPER, QUIET, as_bytes, depth_colours, enlarge, write
+
+
+def side_by_side(
+    columns: Sequence[tuple[str, np.ndarray, np.ndarray]],
+    footers: Sequence[str],
+    *,
+    far_m: float,
+    cell: int = 256,
+) -> list[np.ndarray]:
+    """Draw several versions of the same frames side by side, colour above depth.
+
+    Args:
+        columns: caption, colours (T, H, W, 3) and depth (T, H, W) of each version.
+        footers: T lines, one under each frame.
+        far_m: depth drawn darkest.
+        cell: width of a picture, pixels.
+
+    Returns:
+        T uint8 pictures of one size with even sides.
+    """
+    height, width = columns[0][1].shape[1:3]
+    tall = round(height * cell / width)
+    header, footer, gap = 34, 30, 8
+    size = (gap + len(columns) * (cell + gap), header + 2 * (tall + gap) + footer)
+    size = (size[0] + size[0] % 2, size[1] + size[1] % 2)
+    pictures = []
+    for t, line in enumerate(footers):
+        canvas = Image.new("RGB", size, PAPER)
+        draw = ImageDraw.Draw(canvas)
+        for j, (caption, rgb, depth) in enumerate(columns):
+            x = gap + j * (cell + gap)
+            write(draw, (x + cell / 2, header / 2), caption, size=17, anchor="mm")
+            canvas.paste(Image.fromarray(enlarge(as_bytes(rgb[t]), cell)), (x, header))
+            shade = depth_colours(depth[t], far_m)
+            canvas.paste(Image.fromarray(enlarge(shade, cell)), (x, header + tall + gap))
+        write(draw, (size[0] / 2, size[1] - footer / 2), line, colour=QUIET, anchor="mm")
+        pictures.append(np.asarray(canvas))
+    return pictures
+
+
+def small_frames(columns: Sequence[tuple[str, np.ndarray]], *, cell: int = 160) -> list[np.ndarray]:
+    """Draw the colours of several versions side by side, for a small video.
+
+    Args:
+        columns: caption and colours (T, H, W, 3) of each version.
+        cell: width of a picture, pixels.
+
+    Returns:
+        T uint8 pictures of one size.
+    """
+    height, width = columns[0][1].shape[1:3]
+    header, gap = 20, 4
+    size = (gap + len(columns) * (cell + gap), header + round(height * cell / width) + gap)
+    pictures = []
+    for t in range(len(columns[0][1])):
+        canvas = Image.new("RGB", size, PAPER)
+        draw = ImageDraw.Draw(canvas)
+        for j, (caption, rgb) in enumerate(columns):
+            x = gap + j * (cell + gap)
+            write(draw, (x + cell / 2, header / 2), caption, size=13, anchor="mm")
+            canvas.paste(Image.fromarray(enlarge(as_bytes(rgb[t]), cell)), (x, header))
+        pictures.append(np.asarray(canvas))
+    return pictures
+
+
+def encode_gif(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> bytes:
+    """Encode uint8 pictures (H, W, 3), all of one size, as a GIF that begins again at its end."""
+    buffer = io.BytesIO()
+    first, *others = [Image.fromarray(picture) for picture in pictures]
+    first.save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=others,
+        duration=round(1000 / frames_per_second),
+        loop=0,
+        optimize=True,
+    )
+    return buffer.getvalue()
+
+
+def encode_h264(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> bytes:
+    """Encode pictures as an MP4 with H.264, yuv420p; equal pictures give equal bytes.
+
+    Args:
+        pictures: uint8 (H, W, 3) with even sides, all of one size.
+        frames_per_second: playing speed.
+    """
+    buffer = io.BytesIO()
+    film = Film(buffer, pictures[0].shape[:2], frames_per_second)
+    for picture in pictures:
+        film.add(picture)
+    film.close()
+    return buffer.getvalue()
+
+
+class Film:
+    """An MP4 with H.264 that is written picture by picture, so that none has to be kept.
+
+    x264 is used without its macroblock tree, whose vectorised code reads memory that nobody wrote:
+    with it, a few bits differ from run to run.
+    """
+
+    def __init__(self, where: io.BytesIO | str, size: tuple[int, int], frames_per_second: int = 4):
+        """Begin.
+
+        Args:
+            where: a buffer, or the name of a file to write.
+            size: height and width, even.
+            frames_per_second: playing speed.
+        """
+        self._container = av.open(where, "w", format="mp4")
+        self._stream = self._container.add_stream("libx264", rate=frames_per_second)
+        self._stream.height, self._stream.width = size
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.options = {
+            "crf": "21",
+            "preset": "medium",
+            "threads": "1",
+            "x264-params": "mbtree=0",
+        }
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append a uint8 (H, W, 3) picture of the film's size."""
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        """Write what is left; the film can be played."""
+        self._container.mux(self._stream.encode())
+        self._container.close()

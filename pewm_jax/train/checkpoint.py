@@ -1,0 +1,330 @@
+"""Checkpoints by Orbax: written in the background, whole or not at all, and checked when read.
+
+One folder per stage. Each checkpoint has four items: ``weights``, the inference weights, which can
+be loaded alone; ``state``, what else training needs (the trained parameters and the optimizer's
+moments; frozen parameters are in ``weights``); ``data``, the position in the data; ``config``, the
+experiment. Arrays restore to any mesh, any number of devices and of processes.
+
+Orbax writes into a temporary folder; ``step_folders`` adds a manifest of checksums and renames it.
+A checkpoint that does not match its manifest is set aside, and the one before it is used.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import errno
+import os
+import time
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+from etils import epath
+
+from pewm_jax import config as configuration
+from pewm_jax.config import Config, UserError
+from pewm_jax.io import tree
+from pewm_jax.train import integrity, processes, runs, step_folders
+from pewm_jax.train.background import Quiet
+from pewm_jax.train.stages import Stage
+from pewm_jax.train.state import TrainState, inference_params
+from pewm_jax.types import Params
+
+WEIGHTS_ITEM = step_folders.WEIGHTS_ITEM
+STATE_ITEM, DATA_ITEM, CONFIG_ITEM = "state", "data", "config"
+
+_MOMENT_S, _SHARE = 2.0, 0.02
+"""How long ``settle`` waits: seconds, or if longer a share of the time between two saves."""
+
+
+class Checkpoints:
+    """The checkpoints of one stage of one run; a context manager that waits for writes.
+
+    On construction, damaged checkpoints newer than the newest good one are set aside. All processes
+    of a job construct this, and call its methods in the same order.
+
+    Args:
+        run: the run's folder.
+        config: the experiment, remembered in each checkpoint.
+        stage: the stage.
+        say: prints a line, for example about a damaged checkpoint.
+
+    Raises:
+        UserError: there were checkpoints, and all are damaged.
+    """
+
+    def __init__(self, run: Path, config: Config, stage: Stage, say: Callable[[str], None] = print):
+        self.run = run
+        self.folder = step_folders.of(run, stage.name).resolve()
+        self.config = config
+        self.stage = stage
+        self._writer = ocp.AsyncCheckpointer(ocp.CompositeCheckpointHandler())
+        self._pool = concurrent.futures.ThreadPoolExecutor(1, "checkpoint")
+        self._finishing: concurrent.futures.Future[None] | None = None
+        self._began, self._interval, self._settled = time.monotonic(), 0.0, True
+        self._latest: int | None = processes.first(lambda: _tidied(self.folder, say))
+        self._quiet, self._failed = Quiet(), False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: types.TracebackType | None,
+    ) -> None:
+        try:
+            with self._writing():
+                try:
+                    self.wait()
+                finally:
+                    self._pool.shutdown()
+                    self._writer.close()
+        except UserError:
+            if error is None:
+                raise
+        finally:
+            if processes.is_primary():
+                step_folders.clear(self.folder)  # of a write that failed
+            if not self._failed:  # otherwise some threads may still print
+                self._quiet.end()
+
+    def latest(self) -> int | None:
+        """Return the step of the newest whole checkpoint, if there is any."""
+        return self._latest
+
+    def save(self, state: TrainState) -> None:
+        """Copy the state off the devices and write it in the background.
+
+        Raises:
+            UserError: this checkpoint, or the one before in the background, cannot be written.
+        """
+        self.wait()
+        step = int(state.step)
+        if step == self._latest:
+            return
+        settings = self.stage.settings(self.config)
+        position = {
+            "stage": self.stage.number,
+            "step": step,
+            "seed": self.stage.data_seed(self.config),
+            "batch": settings.batch,
+            "clips": step * settings.batch,
+        }
+        items = {
+            WEIGHTS_ITEM: ocp.args.StandardSave(inference_params(self.stage, state)),
+            STATE_ITEM: ocp.args.StandardSave(_training_state(self.stage, state)),
+            DATA_ITEM: ocp.args.JsonSave(position),
+            CONFIG_ITEM: ocp.args.JsonSave(configuration.to_dict(self.config)),
+        }
+        with self._writing():
+            self._writer.save(
+                step_folders.writing(self.folder, step),
+                args=ocp.args.Composite(**items),
+                force=True,
+            )
+        self._finishing = self._pool.submit(self._finish, step)
+        now = time.monotonic()
+        self._interval, self._began, self._settled = now - self._began, now, False
+
+    def wait(self, seconds: float | None = None) -> None:
+        """Block until everything is on disk, or some seconds have passed.
+
+        Raises:
+            UserError: as ``save``.
+        """
+        if self._finishing is None:
+            return
+        concurrent.futures.wait([self._finishing], seconds)
+        if self._finishing.done():
+            finished, self._finishing = self._finishing, None
+            with self._writing():
+                finished.result()
+
+    def settle(self) -> None:
+        """Wait for a save in progress, within limits; called before each step is reported.
+
+        So no reported step lies more than one save interval beyond the newest complete checkpoint:
+        a killed training loses no more than that. Waiting ends after two seconds or a fiftieth of
+        the interval, whichever is longer.
+
+        Raises:
+            UserError: as ``save``.
+        """
+        reasonable = max(_MOMENT_S, _SHARE * self._interval)
+        self.wait(0 if self._settled else reasonable)
+        self._settled = True
+
+    def restore(self, like: TrainState) -> TrainState:
+        """Read the newest checkpoint.
+
+        Args:
+            like: the abstract state; arrays come back with its shardings.
+
+        Raises:
+            UserError: there is none, it is of another configuration, or it cannot be read.
+        """
+        items = {
+            WEIGHTS_ITEM: ocp.args.StandardRestore(inference_params(self.stage, like)),
+            STATE_ITEM: ocp.args.StandardRestore(_training_state(self.stage, like)),
+        }
+        read = self._read(items)
+        ema, frozen = tree.split(read[WEIGHTS_ITEM], self.stage.trained)
+        rest = read[STATE_ITEM]
+        return TrainState(
+            params=tree.merge(rest["trained"], frozen),
+            ema=ema,
+            opt_state=rest["opt_state"],
+            step=rest["step"],
+        )
+
+    def restore_weights(self, like: TrainState) -> Params:
+        """Read only the inference weights of the newest checkpoint; see ``restore``."""
+        wanted = ocp.args.StandardRestore(inference_params(self.stage, like))
+        return self._read({WEIGHTS_ITEM: wanted})[WEIGHTS_ITEM]
+
+    def publish(self, params: Params) -> None:
+        """Write the newest checkpoint's weights to the run's ``weights.safetensors``.
+
+        Args:
+            params: those weights. Used where there is one process; of several, the first reads them
+                from the checkpoint into host memory.
+
+        Raises:
+            UserError: as ``save``.
+        """
+        self.wait()
+        step, alone = self._require_step(), jax.process_count() == 1
+
+        def write() -> None:
+            if not runs.is_published(self.run, self.stage, step):
+                whole = params if alone else _read_arrays(self.folder / str(step), params)
+                runs.publish(self.run, self.stage, step, whole)
+
+        processes.first(write)
+
+    def _finish(self, step: int) -> None:
+        """Wait for Orbax, add the manifest, rename the checkpoint, and delete old ones."""
+        self._writer.wait_until_finished()
+        if processes.is_primary():
+            step_folders.put(self.folder, step)
+            step_folders.prune(self.folder, self.config.train.keep, self.config.train.keep_every)
+        self._latest = step
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Turn errors of writing into a sentence that says which checkpoint is kept."""
+        try:
+            yield
+        except (OSError, ValueError, RuntimeError) as error:
+            if isinstance(error, UserError):
+                raise
+            self._failed = True
+            whole = self._latest
+            kept = "none was written before" if whole is None else f"that of step {whole} is kept"
+            raise UserError(
+                f"A checkpoint in {self.folder} cannot be written ({_reason(error)}); {kept}: free "
+                "space or allow writing there, then run the same command again to go on."
+            ) from None
+
+    def _require_step(self) -> int:
+        if self._latest is None:
+            raise UserError(f"{self.folder} holds no whole checkpoint; train this stage first.")
+        return self._latest
+
+    def _read(self, items: dict[str, Any]) -> Any:
+        """Read items of the newest checkpoint, if it is of this experiment."""
+        self.wait()
+        folder = self.folder / str(self._require_step())
+        with _reading(folder):
+            there = configuration.from_dict(Config, _read_json(folder / CONFIG_ITEM))
+            wrong = runs.differences(runs.identity(there), runs.identity(self.config))
+            if wrong:
+                raise UserError(
+                    f"{folder} is a checkpoint of another configuration ({runs.phrase(wrong)}): "
+                    "give this one its own folder with --train.run, or put the settings back."
+                )
+            return self._writer.restore(folder, args=ocp.args.Composite(**items))
+
+
+def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[Config, Params]:
+    """Read only the inference weights of a checkpoint.
+
+    Args:
+        folder: the checkpoint, such as ``runs/demo/checkpoints/stage1/200``.
+        like: called with the experiment and the stage's number for the shapes of the weights.
+
+    Returns:
+        The experiment and the weights, as NumPy arrays.
+
+    Raises:
+        UserError: what is read is damaged.
+    """
+    found = integrity.flaws(folder, (WEIGHTS_ITEM, DATA_ITEM, CONFIG_ITEM))
+    if found:
+        raise UserError(
+            f"The checkpoint {folder} is damaged ({tree.listing(found, 2)}): copy it again, or "
+            "name another one."
+        )
+    with _reading(folder):
+        config = configuration.from_dict(Config, _read_json(folder / CONFIG_ITEM))
+        position = _read_json(folder / DATA_ITEM)
+    return config, _read_arrays(folder, like(config, position["stage"]))
+
+
+def _read_json(item: Path) -> dict[str, Any]:
+    return dict(ocp.JsonCheckpointHandler().restore(epath.Path(item)))
+
+
+def _read_arrays(folder: Path, like: Params) -> Params:
+    """Read the weights of a checkpoint into the memory of this process alone."""
+    how = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), like)
+    with _reading(folder):
+        return ocp.PyTreeCheckpointHandler().restore(
+            epath.Path((folder / WEIGHTS_ITEM).resolve()),
+            args=ocp.args.PyTreeRestore(like, restore_args=how),
+        )
+
+
+def _tidied(folder: Path, say: Callable[[str], None]) -> int | None:
+    """Clean up the folder of a stage; returns the step of its newest undamaged checkpoint."""
+    folder.mkdir(parents=True, exist_ok=True)
+    step_folders.clear(folder)
+    return step_folders.newest(folder, say)
+
+
+@contextlib.contextmanager
+def _reading(folder: Path) -> Iterator[None]:
+    """Turn errors of reading an undamaged checkpoint into a sentence."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(
+            f"{folder} cannot be read ({_reason(error)}): another version of the library may have "
+            "written it; go on with that one, or train in another --train.run."
+        ) from None
+
+
+def _reason(error: BaseException) -> str:
+    said = getattr(error, "strerror", None) or str(error)
+    full = os.strerror(errno.ENOSPC)
+    if full in said:  # at the end of a long message of Orbax
+        return full
+    return " ".join(said.split())[:160]
+
+
+def _training_state(stage: Stage, state: TrainState) -> dict[str, Any]:
+    """Return what training needs besides the inference weights."""
+    return {
+        "trained": tree.select(state.params, stage.trained),
+        "opt_state": state.opt_state,
+        "step": jax.tree.map(lambda leaf: leaf, state.step),
+    }

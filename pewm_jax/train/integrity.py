@@ -1,0 +1,171 @@
+"""A manifest of a folder's files, by size and SHA-256, to find damage.
+
+A checkpoint gets its manifest before it is renamed to its final name. So a folder of that name
+whose manifest is missing or does not match has been damaged since.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from pewm_jax.io import atomic
+
+MANIFEST = "manifest.json"
+
+LARGE = 2 * 10**9
+"""Bytes from which checking takes seconds, and progress is printed."""
+
+_EVERY_S = 10.0
+
+
+def seal(folder: Path) -> None:
+    """Write the manifest of a folder, and flush the folder to disk.
+
+    Args:
+        folder: a folder that is complete.
+
+    Raises:
+        OSError: the manifest cannot be written.
+    """
+    paths = _files(folder)
+    files = {
+        name: {"bytes": paths[name].stat().st_size, "sha256": digest}
+        for name, digest in _digests(paths)
+    }
+    with atomic.replacing(folder / MANIFEST) as partial, partial.open("w") as file:
+        json.dump({"files": files, "sha256": _digest_of(files)}, file, sort_keys=True)
+        file.flush()
+        os.fsync(file.fileno())
+    for inside in {folder, *(path.parent for path in paths.values())}:
+        sync(inside)
+
+
+def flaws(
+    folder: Path,
+    parts: Iterable[str] = (),
+    say: Callable[[str], None] = lambda _: None,
+) -> list[str]:
+    """Compare a folder with its manifest.
+
+    Args:
+        folder: a folder that ``seal`` was called on.
+        parts: look only at what lies inside these subfolders; by default at everything.
+        say: prints progress where checking takes seconds.
+
+    Returns:
+        What is wrong, such as ``state/d/3f is cut short (10 of 505 bytes)``; empty if nothing is.
+    """
+    inside = tuple(f"{part}/" for part in parts)
+    try:
+        listed = _read(folder / MANIFEST)
+        paths = {n: p for n, p in _files(folder).items() if not inside or n.startswith(inside)}
+    except ValueError as error:
+        return [str(error)]
+    except OSError as error:
+        return [f"{MANIFEST} cannot be read ({error.strerror})"]
+    listed = {n: entry for n, entry in listed.items() if not inside or n.startswith(inside)}
+    found = [f"{name} is missing" for name in listed.keys() - paths.keys()]
+    found += [f"{name} was not written with it" for name in paths.keys() - listed.keys()]
+    whole = {}
+    for name in listed.keys() & paths.keys():
+        have, want = paths[name].stat().st_size, listed[name]["bytes"]
+        if have == want:
+            whole[name] = paths[name]
+        else:
+            how = "is cut short" if have < want else "has grown"
+            found.append(f"{name} {how} ({have} of {want} bytes)")
+    if not found:
+        total = sum(listed[name]["bytes"] for name in whole)
+        progress = _progress(f"checking {folder}", total, say)
+        for name, digest in _digests(whole, _digest_if_readable):
+            if digest != listed[name]["sha256"]:
+                found.append(f"{name} holds other bytes than were written")
+            progress(listed[name]["bytes"])
+    return sorted(found)
+
+
+def sync(folder: Path) -> None:
+    """Flush a folder's list of entries to disk (fsync), so that it survives a power cut."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the files that a manifest lists; ValueError says what is wrong with it."""
+    try:
+        found = json.loads(path.read_bytes())
+        files, digest = found["files"], found["sha256"]
+    except FileNotFoundError:
+        raise ValueError(f"{MANIFEST} is missing") from None
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(f"{MANIFEST} is damaged") from None
+    if digest != _digest_of(files):
+        raise ValueError(f"{MANIFEST} is damaged")
+    return files
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    """Return the files below a folder by relative name, all but the manifest."""
+    found = {
+        path.relative_to(folder).as_posix(): path
+        for path in sorted(folder.rglob("*"))
+        if not path.is_dir()
+    }
+    return {name: path for name, path in found.items() if name != MANIFEST}
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _digest_if_readable(path: Path) -> str:
+    try:
+        return _digest(path)
+    except OSError:
+        return "unreadable"
+
+
+def _digests(
+    paths: dict[str, Path], digest: Callable[[Path], str] = _digest
+) -> Iterable[tuple[str, str]]:
+    """Hash files side by side: hashing leaves the other threads of Python running."""
+    threads = min(8, os.cpu_count() or 1)
+    with concurrent.futures.ThreadPoolExecutor(threads) as pool:
+        yield from zip(paths, pool.map(digest, paths.values()), strict=True)
+
+
+def _digest_of(files: Any) -> str:
+    return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()
+
+
+def _progress(label: str, total: int, say: Callable[[str], None]) -> Callable[[int], None]:
+    """Return a function that counts bytes, and prints progress every ``_EVERY_S`` seconds."""
+    began = printed = time.monotonic()
+    done = 0
+    if total >= LARGE:
+        say(f"{label}: {total / 1e9:.1f} GB …")
+
+    def advance(count: int) -> None:
+        nonlocal done, printed
+        done, now = done + count, time.monotonic()
+        if now - printed >= _EVERY_S:
+            printed = now
+            rate = done / (now - began)
+            left = (total - done) / max(rate, 1.0)
+            say(
+                f"{label}: {done / 1e9:.1f}/{total / 1e9:.1f} GB, {rate / 1e9:.2f} GB/s, "
+                f"{left:.0f} s left"
+            )
+
+    return advance

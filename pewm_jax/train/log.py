@@ -1,0 +1,233 @@
+"""The log of a training: a line of JSON and a TensorBoard event per logged step, and a live view.
+
+Where ``train.wandb`` names a project, Weights & Biases gets the same scalars (``wandb_log``).
+
+On a terminal the live view is a progress bar, elsewhere a line every ten seconds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+import time
+import types
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from pewm_jax.config import Config
+from pewm_jax.io import atomic
+from pewm_jax.train import processes
+from pewm_jax.train.stages import Stage
+from pewm_jax.train.wandb_log import WandbLog
+
+FLUSH_S = 10
+"""Seconds between writes of TensorBoard's events; lines of JSON are written at once."""
+LINE_EVERY_S = 10.0
+"""Seconds between lines of the live view where the output is not a terminal."""
+
+
+class MetricsLog:
+    """Appends scalars to ``metrics.jsonl`` and to TensorBoard; a context manager.
+
+    Lines logged after the step that the run is resumed from are dropped, so that every step has
+    one line. Of several processes only the first writes.
+
+    Args:
+        run: the run's folder.
+        stage: the stage about to be trained.
+        step: steps of it that are done.
+        config: the experiment, which may ask for Weights & Biases; without it there is none.
+
+    Raises:
+        UserError: Weights & Biases is asked for and cannot begin.
+    """
+
+    def __init__(self, run: Path, stage: Stage, step: int, config: Config | None = None):
+        self._stage = stage.number
+        self._writes = processes.is_primary()
+        if not self._writes:
+            return
+        # Imported here and not above: it takes a second, and loads torch where that is installed.
+        import tensorboardX  # noqa: PLC0415
+
+        self._wandb = None
+        if config is not None and config.train.wandb:
+            self._wandb = WandbLog(config, run, stage)
+        path = run / "metrics.jsonl"
+        drop_after(path, stage.number, step)
+        self._file = path.open("a")
+        self._events = tensorboardX.SummaryWriter(
+            str(run / "tensorboard" / stage.name),
+            purge_step=step + 1 if step else None,
+            flush_secs=FLUSH_S,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: types.TracebackType | None,
+    ) -> None:
+        if not self._writes:
+            return
+        # An error that is being raised matters more than a disk too full for the last lines.
+        with contextlib.nullcontext() if error is None else contextlib.suppress(OSError):
+            try:
+                self._file.close()
+            finally:
+                self._events.close()
+                if self._wandb is not None:
+                    self._wandb.close(failed=error is not None)
+
+    def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Log the scalars of one step; NaN and infinity, which JSON lacks, are written as null."""
+        if not self._writes:
+            return
+        finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
+        values = {name: finite.get(name) for name in metrics}
+        line = {"stage": self._stage, "step": step, **values, "time": round(time.time(), 3)}
+        self._file.write(json.dumps(line) + "\n")
+        self._file.flush()
+        for name, value in finite.items():
+            self._events.add_scalar(name, value, step)
+        if self._wandb is not None:
+            self._wandb.write(step, finite)
+
+
+def drop_after(path: Path, stage: int, step: int) -> None:
+    """Drop a log's lines after a step of a stage (its number), and a half-written last line."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        try:
+            entry = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        if (entry["stage"], entry["step"]) <= (stage, step):
+            kept.append(line + "\n")
+    atomic.write_text(path, "".join(kept))
+
+
+class Pace:
+    """Seconds per step, smoothed, without the time spent on other work.
+
+    The mean of the first ten steps, from then on a moving average of about as many.
+    """
+
+    def __init__(self, now: float):
+        self._last = now
+        self._ticks = 0
+        self._mean = 0.0
+
+    def pause(self, seconds: float) -> None:
+        """Leave out time in which no step was made."""
+        self._last += seconds
+
+    def tick(self, now: float) -> float:
+        """Note that a step is done; returns the smoothed seconds per step."""
+        seconds, self._last = max(now - self._last, 1e-9), now
+        self._ticks += 1
+        self._mean += (seconds - self._mean) / min(self._ticks, 10)
+        return self._mean
+
+
+class LiveView:
+    """Shows how far a stage is, how well it learns and how fast; a context manager.
+
+    Args:
+        label: name of the stage.
+        total: its steps.
+        done: steps done before.
+        console: where to print; standard output by default.
+    """
+
+    def __init__(self, label: str, total: int, done: int, console: Console | None = None):
+        self._console = console or Console(file=sys.stdout, soft_wrap=True, highlight=False)
+        self._label, self._total = label, total
+        self._printed = time.monotonic()
+        self._bar: Progress | None = None
+        if self._console.is_terminal:
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=20),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[text]}"),
+                console=self._console,
+                refresh_per_second=4,
+            )
+            self._task = self._bar.add_task(label, total=total, completed=done, text="")
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: types.TracebackType | None,
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        self._console.print(text, markup=False)
+        self._printed = time.monotonic()
+
+    def update(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Show a step that is done; the last one is always shown."""
+        text = describe(metrics, (self._total - step) * metrics["step_seconds"])
+        if self._bar is not None:
+            self._bar.update(self._task, completed=step, text=text)
+        elif step == self._total or time.monotonic() - self._printed >= LINE_EVERY_S:
+            self.say(f"{self._label} {step}/{self._total} {text}")
+
+
+def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
+    """Put the figures of a step into one line."""
+    return (
+        f"loss {metrics['loss']:.4f} · lr {metrics['learning_rate']:.2e} · "
+        f"grad {metrics['grad_norm']:.3g} · {duration(metrics['step_seconds'])}/step · "
+        f"{metrics['clips_per_second']:.1f} clips/s · {_work(metrics)} · "
+        f"{_counts(metrics)}{duration(seconds_left)} left"
+    )
+
+
+def _work(metrics: Mapping[str, float]) -> str:
+    """Write the FLOP/s of each device, and the share of its peak (MFU) where that is known."""
+    rate = metrics["tflops_per_second_per_device"]
+    text = f"{rate:.1f} TFLOP/s" if rate >= 1 else f"{rate * 1e3:.3g} GFLOP/s"
+    share = f" · MFU {metrics['mfu']:.1%}" if "mfu" in metrics else ""
+    return f"{text}/device{share}"
+
+
+def _counts(metrics: Mapping[str, float]) -> str:
+    """Write how many updates were skipped and records were bad, if any."""
+    names = {"skipped": "skipped", "bad_records": "bad records"}
+    return "".join(
+        f"{name} {metrics[key]:.0f} · " for key, name in names.items() if metrics.get(key)
+    )
+
+
+def duration(seconds: float) -> str:
+    """Write a duration as people do: ``85 ms``, ``12.3 s``, ``4 min 05 s``, ``2 h 10 min``."""
+    if seconds < 1:
+        return f"{seconds * 1000:.0f} ms"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"

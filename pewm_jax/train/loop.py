@@ -1,0 +1,341 @@
+"""The loop: stages one after the other, resumable at any step. Everything with a clock is here.
+
+The metrics of step k − 1 are read after step k is dispatched, batches are placed ahead, and
+checkpoints are written in the background, so the devices never wait for the host.
+"""
+
+from __future__ import annotations
+
+import errno
+import functools
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import NoReturn
+
+import jax
+from jax.sharding import Mesh
+
+from pewm_jax.config import Config, StageConfig, UserError
+from pewm_jax.data import loader
+from pewm_jax.data.bad_records import BadRecords
+from pewm_jax.memory import feature_cache
+from pewm_jax.train import prepared, processes, runs, sharding, stages, starting, wandb_log
+from pewm_jax.train.checkpoint import Checkpoints
+from pewm_jax.train.feed import Feed, rows_of
+from pewm_jax.train.log import LiveView, MetricsLog, Pace, duration
+from pewm_jax.train.profile import Profile
+from pewm_jax.train.samples import Preview, Samples
+from pewm_jax.train.signals import Stop
+from pewm_jax.train.stages import Stage
+from pewm_jax.train.state import TrainState, inference_params
+from pewm_jax.train.step import Metrics, abstract_state, compile_step, initial_state, noise_key
+from pewm_jax.train.watch import Watch
+from pewm_jax.types import Clip, Params
+
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+"""Errors of a disk that takes no more."""
+
+
+def train(
+    config: Config,
+    *,
+    preview: Preview | None = None,
+    profile: int = 0,
+    say: Callable[[str], None] = print,
+) -> Path:
+    """Train all planned stages, going on where an earlier start of the same run stopped.
+
+    Args:
+        config: the experiment; ``config.train.run`` is the folder that is written.
+        preview: makes sample pictures every ``config.train.preview_every`` steps and at the end
+            of a stage.
+        profile: steps to trace in each stage, for ``profile/`` in the run's folder.
+        say: prints a line.
+
+    Returns:
+        The run's folder, ready for ``pewm_jax.load``.
+
+    Raises:
+        UserError: the folder is of another configuration or in use, the data do not fit, or the
+            loss is not finite.
+        Interrupted: Ctrl-C or SIGTERM came; everything is saved. (Where saving takes longer than
+            ``train.grace_s``, and at a second signal, the process ends itself.)
+    """
+    config = runs.resumed(config, say if processes.is_primary() else _silent)
+    planned = stages.planned(config)
+    starting.require_weights(config)
+    if config.train.wandb:
+        wandb_log.load()  # refused now, and not after the data are prepared
+    mesh = sharding.make_mesh(arranged=config.train.mesh)
+    for stage in planned:
+        sharding.require_divisible(config, stage, mesh)
+    run = runs.check(config)
+    bad = BadRecords(config.data.bad_records)
+    alone, agreed = jax.process_count() == 1, processes.Votes().cast
+    with (
+        processes.entered_by_first(runs.alone(run)),
+        Stop(config.train.grace_s, agreed=agreed, alone=alone) as stop,
+    ):
+        processes.first(lambda: str(runs.prepare(config)))
+        if processes.first(lambda: runs.is_finished(run, config)):
+            say(f"{run} is already trained: nothing to do.")
+            return run
+        weights: Params | None = None
+        for stage in starting.remaining_stages(run, planned):
+            worker = _Worker(
+                config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, say=say
+            )
+            worker.start, weights = weights, None  # so they are freed once a state is made of them
+            weights = worker.train()
+            if stop.requested and stage is not planned[-1]:
+                raise stop.interrupted(stage.title, stage.settings(config).steps)
+    say(f"Trained: {run / runs.WEIGHTS}")
+    return run
+
+
+def _print_error(line: str) -> None:
+    """Print what only this process knows; standard output belongs to the first process."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def _silent(line: str) -> None:
+    del line
+
+
+class _Worker:
+    """Trains one stage.
+
+    Attributes:
+        start: weights of the stage before; None to begin with those in ``train.start``, if any.
+    """
+
+    start: Params | None = None
+
+    checkpoints: Checkpoints
+    view: LiveView
+    watch: Watch
+    samples: Samples
+
+    def __init__(
+        self,
+        config: Config,
+        stage: Stage,
+        mesh: Mesh,
+        run: Path,
+        stop: Stop,
+        *,
+        bad: BadRecords,
+        preview: Preview | None,
+        profile: int,
+        say: Callable[[str], None],
+    ):
+        self.config, self.stage, self.mesh, self.path = config, stage, mesh, run
+        self.like = abstract_state(config, stage, mesh)
+        self.stop, self.bad, self.preview, self.profile = stop, bad, preview, profile
+        self.say = say
+
+    @property
+    def settings(self) -> StageConfig:
+        return self.stage.settings(self.config)
+
+    def train(self) -> Params:
+        """Train the stage, or find it done; returns its inference weights."""
+        config, stage, run, steps = self.config, self.stage, self.path, self.settings.steps
+        with Checkpoints(run, config, stage, self.say) as self.checkpoints, self._writing():
+            self.stop.at_once, self.stop.kept = True, self._kept
+            done = self.checkpoints.latest() or 0
+            if done >= steps:
+                params = self.checkpoints.restore_weights(self.like)
+                self.checkpoints.publish(params)
+                return params
+            with (
+                LiveView(stage.title, steps, done) as self.view,
+                MetricsLog(run, stage, done, config) as log,
+            ):
+                self.bad.say = self.view.say if processes.is_primary() else _print_error
+                self.watch = Watch(
+                    config,
+                    stage,
+                    run,
+                    done,
+                    devices=self.mesh.size,
+                    view=self.view,
+                    log=log,
+                    bad=self.bad,
+                )
+                self.samples = Samples(
+                    config,
+                    stage,
+                    self.preview,
+                    say=self.view.say,
+                    unless_stopped=self.stop.unless_requested,
+                )
+                state = self.run(done)
+            params = inference_params(stage, state)
+            self.checkpoints.publish(params)
+            return params
+
+    def run(self, done: int) -> TrainState:
+        """Do the steps after ``done``, once the first batch is there; returns the last state."""
+        config, settings = self.config, self.settings
+        cache = starting.features(config, self.stage)
+        where = sharding.of_batch(self.mesh)
+        batches = loader.clips(
+            config,
+            "train",
+            seed=self.stage.data_seed(config),
+            batch=settings.batch,
+            start_step=done,
+            features=cache and functools.partial(feature_cache.features, cache),
+            bad=self.bad,
+            rows=rows_of(where, settings.batch),
+        )
+        make_key = functools.partial(noise_key, config, self.stage)
+        key = jax.jit(make_key, out_shardings=sharding.replicated(self.mesh))()
+        traced = Profile(
+            self.path,
+            self.stage,
+            steps=self.profile if processes.is_primary() else 0,
+            first=done + 1,
+            last=settings.steps,
+            say=self.view.say,
+        )
+        batches, state = iter(batches), None
+        if prepared.applies(config, self.stage):
+            state = self._make_state(done)
+            batches = self._prepare(done, state)
+        with Feed(batches, where, settings.batch) as feed, closing(traced):
+            clip = next(feed)
+            state, step_fn = self._compile(done, clip, state)
+            if cache is not None:
+                split = Path(config.data.path) / "train"
+                processes.first(
+                    lambda: feature_cache.require_fresh(
+                        cache, config.model.memory.encoder, starting.encoder(config), split
+                    )
+                )
+            self.watch.pace = Pace(time.monotonic())
+            pending: tuple[int, Metrics] | None = None
+            for step in range(done + 1, settings.steps + 1):
+                with traced.around(step):
+                    state, metrics = step_fn(state, clip, key)
+                self.stop.at_once = False
+                if pending is not None:
+                    self._report(*pending)
+                pending = (step, metrics)
+                self.watch.pace.pause(traced.after(step, metrics))
+                last, stop = step == settings.steps, self.stop.due()
+                save = last or stop or step % config.train.save_every == 0
+                show = self.samples.due(step) and not stop
+                if save or show:
+                    self._report(step, metrics, state if show else None)
+                    pending = None
+                if save:
+                    self._save(state)
+                if last:
+                    break
+                following = None if stop else self.stop.unless_requested(feed.__next__)
+                if following is None:
+                    self._leave(step, state, pending)
+                clip = following
+        return state
+
+    def _prepare(self, done: int, state: TrainState) -> Iterator[Clip]:
+        """Prepare clips, the same however often training stopped, and draw from them."""
+        seed = self.stage.data_seed(self.config)
+        batch = self.settings.batch
+
+        def read(first: int) -> Iterator[Clip]:
+            chosen = prepared.seed(self.config, self.stage)
+            return loader.clips(
+                self.config, "train", seed=chosen, batch=batch, bad=self.bad, start_step=first
+            )
+
+        digest = ""
+        if self.config.data.prepared_path:
+            digest = prepared.start_digest(self.path, self.stage, state.params, done)
+        clips = prepared.gather(
+            self.config, self.stage, state.params, read, self.stop.unless_requested, digest
+        )
+        if clips is None:
+            raise self.stop.interrupted(self.stage.title, done)
+        return prepared.draw(clips, batch, seed, done)
+
+    def _compile(self, done: int, clip: Clip, state: TrainState | None):
+        """Make the state, whose first weights are compiled too, and compile the step."""
+        self.view.say(f"{self.stage.title}: compiling the training step …")
+        began = time.monotonic()
+        state = self._make_state(done) if state is None else state
+        step_fn = compile_step(self.config, self.stage, self.mesh, clip)
+        took = duration(time.monotonic() - began)
+        self.view.say(f"{self.stage.title}: compiled the training step in {took}")
+        return state, step_fn
+
+    def _make_state(self, done: int) -> TrainState:
+        """Make the state of the stage's start, or read that after ``done`` steps."""
+        if done:
+            self.view.say(f"{self.stage.title}: going on after step {done}")
+            return self.checkpoints.restore(self.like)
+        start, self.start = self.start, None
+        if start is None:
+            start = starting.read_weights(self.config, self.stage, self.say)
+        return initial_state(self.config, self.stage, self.mesh, start)
+
+    def _report(self, step: int, metrics: Metrics, shown: TrainState | None = None) -> None:
+        """Read a step's metrics; check, show and log them, with samples of the state if given."""
+        with self._paused():
+            self.checkpoints.settle()
+        values = self.watch.read(step, metrics, self._kept_in_the_end)
+        samples: dict[str, float] = {}
+        if shown is not None:
+            with self._paused():
+                samples = self.samples.make(inference_params(self.stage, shown), step)
+        self.watch.write(step, values | samples, always=bool(samples))
+
+    def _save(self, state: TrainState) -> None:
+        with self._paused():
+            self.checkpoints.save(state)
+
+    def _leave(self, step: int, state: TrainState, pending: tuple[int, Metrics] | None) -> NoReturn:
+        """Save what is not saved yet, and leave."""
+        if pending is not None:
+            self._report(*pending)
+        self._save(state)
+        self.checkpoints.wait()
+        raise self.stop.interrupted(self.stage.title, step)
+
+    def _kept(self) -> str:
+        """Say what is safely on disk."""
+        step, title = self.checkpoints.latest(), self.stage.title
+        if step is not None:
+            return f"{title}'s checkpoint of step {step} is intact"
+        first = self.stage.number == 1
+        return "nothing was saved yet" if first else f"of {title} nothing is saved yet"
+
+    def _kept_in_the_end(self) -> str:
+        self.checkpoints.wait()
+        return self._kept()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Turn a disk that is full, or fails, into a sentence that says what is safe on it."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno not in _DISK_ERRORS:
+                raise
+            raise UserError(
+                f"{error.filename or self.path} cannot be written ({error.strerror}); "
+                f"{self._kept_in_the_end()}: free space there, then run the same command again to "
+                "go on."
+            ) from None
+
+    @contextmanager
+    def _paused(self) -> Iterator[None]:
+        """Do not count what is done inside as time of the steps."""
+        began = time.monotonic()
+        yield
+        self.watch.pace.pause(time.monotonic() - began)

@@ -1,0 +1,144 @@
+"""Adam or Muon with warm-up, clipping and decoupled weight decay, masked to what a stage trains.
+
+``optax.partition`` sends every leaf to one of two transformations by the stage's labels: to the
+optimizer, with the clipping inside, or to zero. So frozen leaves have no moments and their
+gradients do not enter the norm that is clipped. (``optax.masked`` alone would pass raw gradients
+through to them.)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+from optax.contrib import MuonDimensionNumbers, scale_by_muon
+
+from pewm_jax.config import Config, StageConfig
+from pewm_jax.io import tree
+from pewm_jax.train.stages import FREEZE, TRAIN, Stage
+from pewm_jax.types import Params
+
+DECAYED = (
+    (r"(.*/)?kernel", True),
+    (r".*", False),
+)
+"""Which leaves weight decay pulls to zero: matrices, and not biases, scales, gates, embeddings."""
+
+
+def schedule(settings: StageConfig) -> optax.Schedule:
+    """Return the learning rate as a function of the number of steps done (0 at the first).
+
+    Linear warm-up that is already above zero at the first step and reaches the peak after
+    ``warmup`` steps, then constant or a half cosine that would reach zero one step after the last.
+    """
+    warmup = optax.linear_schedule(
+        settings.learning_rate / (settings.warmup + 1), settings.learning_rate, settings.warmup
+    )
+    if settings.decay == "constant":
+        rest = optax.constant_schedule(settings.learning_rate)
+    else:
+        rest = optax.cosine_decay_schedule(
+            settings.learning_rate, max(settings.steps - settings.warmup, 1)
+        )
+    return optax.join_schedules([warmup, rest], [settings.warmup])
+
+
+def rate(settings: StageConfig, opt_state: optax.OptState) -> Array:
+    """Return the learning rate of the next update; skipped ones have not counted."""
+    counted = optax.tree_utils.tree_get(opt_state, "ScaleByScheduleState")
+    return jnp.asarray(schedule(settings)(counted.count))
+
+
+def make(config: Config, stage: Stage) -> optax.GradientTransformation:
+    """Build the optimizer of a stage.
+
+    ``init`` and ``update`` take all of the stage's parameters; the updates of frozen leaves are 0.
+    """
+
+    def decayed(trained: Params) -> Params:
+        return tree.assign(DECAYED, trained, "weight-decay mask")
+
+    settings = stage.settings(config)
+    chosen = settings.optimizer or config.train.optimizer
+    adam = optax.scale_by_adam(config.train.beta1, config.train.beta2, config.train.epsilon)
+    trains = optax.chain(
+        optax.clip_by_global_norm(config.train.clip_norm),
+        muon(adam) if chosen == "muon" else adam,
+        optax.add_decayed_weights(config.train.weight_decay, mask=decayed),
+        optax.scale_by_learning_rate(schedule(settings)),
+        *([_rates(stage)] if stage.rates else []),
+    )
+    return optax.partition({TRAIN: trains, FREEZE: optax.set_to_zero()}, stage.labels)
+
+
+MATRICES = (
+    (
+        r"(.*/)?(embed|patch_embed|text_embed|proj_out|modulate_out|into|out|direct)[^/]*/kernel",
+        False,
+    ),
+    (r"memory/(tokens|camera)/kernel", False),
+    (r"(.*/)?kernel", True),
+    (r".*", False),
+)
+"""Which leaves Muon changes: matrices between hidden layers, and not the first and the last."""
+STACKED = "blocks"
+"""Folder of parameters whose first axis counts layers."""
+MUON_RMS = 0.2
+"""Root mean square of Muon's updates, as Adam's are in practice, so that one learning rate does for
+both (Liu et al. 2025, "Muon is scalable for LLM training", Eq. 4)."""
+
+
+def muon(adam: optax.GradientTransformation) -> optax.GradientTransformation:
+    """Return Muon for the matrices of hidden layers, and ``adam`` for everything else.
+
+    Muon steps along the nearest orthogonal matrix to the momentum (Jordan 2024; ``optax.contrib``).
+    A convolution is a matrix from all its inputs to its outputs; layers that are stacked count one
+    by one.
+    """
+
+    def names(trained: Params) -> Params:
+        matrices = tree.assign(MATRICES, trained, "Muon's matrices")
+        return jax.tree.map(lambda is_matrix: "muon" if is_matrix else "adam", matrices)
+
+    def sized(updates: Any, params: Any = None) -> Any:
+        del params
+        return jax.tree_util.tree_map_with_path(_sized, updates)
+
+    hidden = optax.chain(scale_by_muon(weight_dimension_numbers=_axes), optax.stateless(sized))
+    return optax.partition({"muon": hidden, "adam": adam}, names)
+
+
+def _axes(updates: Any) -> Any:
+    """Return which axes of each matrix are inputs and which outputs."""
+
+    def of(path: Any, leaf: Array) -> MuonDimensionNumbers:
+        return MuonDimensionNumbers(tuple(range(_first(path), leaf.ndim - 1)), leaf.ndim - 1)
+
+    return jax.tree_util.tree_map_with_path(of, updates)
+
+
+def _sized(path: Any, update: Array) -> Array:
+    """Give an orthogonal update the size of Adam's."""
+    inputs = math.prod(update.shape[_first(path) : -1])
+    return MUON_RMS * math.sqrt(max(inputs, update.shape[-1])) * update
+
+
+def _first(path: Any) -> int:
+    """Return the first axis of a matrix that is at this path: 1 where layers are stacked."""
+    return int(any(getattr(key, "key", None) == STACKED for key in path))
+
+
+def _rates(stage: Stage) -> optax.GradientTransformation:
+    """Multiply updates by the stage's factors for their paths."""
+    rules = (*stage.rates, (r".*", 1.0))
+
+    def scaled(updates: Any, params: Any = None) -> Any:
+        del params
+        factors = tree.assign(rules, updates, f"learning rates of {stage.name}")
+        return jax.tree.map(lambda update, factor: update * factor, updates, factors)
+
+    return optax.stateless(scaled)

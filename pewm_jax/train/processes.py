@@ -1,0 +1,346 @@
+"""The processes of one job: joining, agreeing on values, and ending together.
+
+All of them run the same program in the same order. Only the first one writes files. Decisions that
+must be the same everywhere are made by ``agree`` and ``Votes``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from orbax.checkpoint import multihost
+
+from pewm_jax.config import Join, UserError
+from pewm_jax.config import command_line as cli
+
+HEARTBEAT_S = 20
+"""Seconds of silence after which a process counts as dead, and all others end."""
+GONE = (
+    "Another process of this job is gone, or cannot be reached: see what the others say, and start "
+    "all of them again to go on from what was kept (the last checkpoint)."
+)
+"""What a process says when it notices that another is gone."""
+_LEAVE_S = 60
+"""Seconds that a process which is done waits for the others to be done too."""
+_REPORT_S = 5
+"""Seconds that a process which has reported an error waits for the others to report theirs."""
+_COMMUNICATION = ("gloo", "nccl", "unavailable", "deadline", "connect", "coordination", "socket")
+"""Parts of the messages of errors that JAX raises when another process is gone."""
+
+MEET_S = 7 * 24 * 3600
+"""Seconds that processes wait for one another in ``meet``: one that is gone is noticed sooner."""
+
+T = TypeVar("T")
+
+
+@contextlib.contextmanager
+def joined(launch: Join) -> Iterator[None]:
+    """Join the processes of a job while this is entered, if the launch asks for it.
+
+    Inside, only the first process prints. An error ends this process, with one sentence and the
+    exit code of ``cli.run``, as soon as the others have reported one too, or after ``_REPORT_S``;
+    the others notice within ``HEARTBEAT_S``. JAX may write more to standard error, or end this
+    process itself (SIGABRT) when the first process is gone.
+
+    Raises:
+        UserError: there is nothing to join.
+    """
+    if not launch.distributed:
+        yield
+        return
+    start(launch)
+    with _quiet_but_first():
+        try:
+            yield
+            _finish()
+            jax.distributed.shutdown()
+        except BaseException as error:  # noqa: BLE001 - reported, whatever it is
+            code = _report(error)
+            sys.stderr.flush()
+            try:
+                if not is_lost(error):
+                    _let_others_report()
+            finally:
+                os._exit(code)  # a normal exit waits for processes that wait for this one
+
+
+def start(launch: Join) -> None:
+    """Join the other processes of the job, if the launch asks for it; before any device is used.
+
+    If the launch names no coordinator, JAX reads it from the environment (SLURM, Kubernetes, Cloud
+    TPU, Open MPI). If not all processes have joined within ``launch.patience`` seconds, this one
+    prints so and exits. Without ``--distributed`` nothing happens.
+
+    Raises:
+        UserError: there is nothing to join, or the coordinator's port is taken.
+    """
+    if not launch.distributed:
+        return
+    given: dict[str, Any] = {}
+    if launch.coordinator:
+        given = {
+            "coordinator_address": launch.coordinator,
+            "num_processes": launch.processes,
+            "process_id": launch.process,
+        }
+        if launch.process == 0:
+            _require_free(launch.coordinator)
+    # Training handles SIGTERM itself (``signals``), so JAX must not.
+    jax.config.update("jax_enable_preemption_service", False)
+    late = threading.Timer(launch.patience, _give_up, (launch,))
+    late.daemon = True
+    late.start()
+    try:
+        jax.distributed.initialize(
+            **given,
+            initialization_timeout=launch.patience + 60,  # ``late`` comes first
+            heartbeat_timeout_seconds=HEARTBEAT_S,
+            shutdown_timeout_seconds=_LEAVE_S,
+        )
+    except (ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise UserError(
+            f"--distributed found no processes to join ({reason}): name them with --coordinator, "
+            "--processes and --process, or leave out --distributed."
+        ) from None
+    finally:
+        late.cancel()
+
+
+def is_primary() -> bool:
+    """Tell whether this is the first process, which writes logs, pictures and unsharded files."""
+    return jax.process_index() == 0
+
+
+def wait(name: str) -> None:
+    """Wait until all processes have reached the barrier of this name."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(name)
+
+
+def meet(name: str, patience_s: float = MEET_S) -> None:
+    """Wait until all processes have reached the barrier of this name, however long one takes.
+
+    ``wait`` is for steps of one program: it uses devices, whose collectives give up after a while.
+    This one is for processes whose shares of some work take minutes or hours.
+    """
+    if jax.process_count() > 1:
+        multihost.get_barrier_sync_fn()(key=name, timeout_ms=int(1000 * patience_s))
+
+
+def agree(value: Any) -> Any:
+    """Return the first process's value in all processes.
+
+    Args:
+        value: anything that JSON can hold; the values of other processes are ignored.
+    """
+    if jax.process_count() == 1:
+        return value
+    text = json.dumps(value).encode() if is_primary() else b""
+    size = multihost_utils.broadcast_one_to_all(np.asarray(len(text), np.int32))
+    padded = np.frombuffer(text.ljust(int(size), b" "), np.uint8)
+    return json.loads(bytes(multihost_utils.broadcast_one_to_all(padded)))
+
+
+def first(work: Callable[[], Any]) -> Any:
+    """Call a function in the first process only, and return its result in all of them.
+
+    Args:
+        work: returns something that JSON can hold.
+
+    Raises:
+        UserError: in all processes, if the function raised it or ``OSError`` in the first.
+    """
+    outcome: dict[str, Any] = {}
+    if is_primary():
+        try:
+            outcome = {"result": work()}
+        except (UserError, OSError) as error:
+            if jax.process_count() == 1:
+                raise
+            outcome = {"refused": str(error)}
+    outcome = agree(outcome)
+    if "refused" in outcome:
+        raise UserError(outcome["refused"])
+    return outcome["result"]
+
+
+@contextlib.contextmanager
+def entered_by_first(context: contextlib.AbstractContextManager[Any]) -> Iterator[None]:
+    """Enter a context in the first process only; raises as ``first`` does."""
+    with contextlib.ExitStack() as held:
+
+        def enter() -> None:
+            held.enter_context(context)
+
+        first(enter)
+        yield
+
+
+def is_lost(error: BaseException) -> bool:
+    """Tell whether an error is about another process that is gone or cannot be reached."""
+    status, _, reason = str(error).partition(": ")
+    return (
+        jax.process_count() > 1
+        and isinstance(error, (RuntimeError, ValueError))  # JAX raises both
+        and re.fullmatch("[A-Z_]+", status) is not None
+        and any(word in f"{status} {reason}".lower() for word in _COMMUNICATION)
+    )
+
+
+def gather(tree: T) -> T:
+    """Gather arrays that are sharded over processes in the first one; called by all.
+
+    Leaf by leaf, so no device holds more than one gathered array.
+
+    Returns:
+        In the first process the same tree with NumPy arrays, in the others a tree of empty arrays.
+    """
+    if jax.process_count() == 1:
+        return tree
+
+    def whole(leaf: Any) -> Any:
+        if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable:
+            if leaf.is_fully_replicated:
+                leaf = leaf.addressable_data(0)
+            else:
+                leaf = multihost_utils.process_allgather(leaf, tiled=True)
+        return np.asarray(leaf) if is_primary() else np.zeros(0)
+
+    return jax.tree.map(whole, tree)
+
+
+class Votes:
+    """Agree on a stop signal that any process received, one step later and without waiting.
+
+    Every process votes once after every step. A vote is a small computation over all devices,
+    queued behind the step; its result is ready by the next vote. So all processes learn of a signal
+    after the same step.
+    """
+
+    def __init__(self) -> None:
+        self._last: jax.Array | None = None
+        if jax.process_count() == 1:
+            return
+        self._largest = _largest_of_all()
+
+    def cast(self, number: int | None) -> int | None:
+        """Vote, and return the result of the previous vote.
+
+        Args:
+            number: the signal that this process received, or None.
+
+        Returns:
+            The largest number that any process gave, or None. With one process, its own number at
+            once.
+        """
+        if jax.process_count() == 1:
+            return number
+        before, self._last = self._last, self._largest(number or 0)
+        return None if before is None else (int(before) or None)
+
+
+def _largest_of_all() -> Callable[[int], jax.Array]:
+    """Return a function that gives the largest of all processes' numbers, on every device."""
+    mesh = Mesh(np.asarray(jax.devices()), ("all",))
+    each = NamedSharding(mesh, P("all"))
+    largest = jax.jit(jnp.max, out_shardings=NamedSharding(mesh, P()))
+
+    def ask(number: int) -> jax.Array:
+        own = np.full(1, number, np.int32)
+        shape = (jax.device_count(),)
+        return largest(jax.make_array_from_callback(shape, each, lambda _index: own))
+
+    return ask
+
+
+def _finish() -> None:
+    """Wait until all processes are done, each with all of its devices.
+
+    ``wait`` waits for the first device of each. Another one that is still connecting when JAX's
+    coordinator leaves would wait for ever, and its process with it.
+    """
+    jax.block_until_ready(_largest_of_all()(0))
+
+
+def _require_free(coordinator: str) -> None:
+    """Refuse an address at which something else listens."""
+    port = int(coordinator.rpartition(":")[2])
+    try:
+        with socket.socket() as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind(("", port))
+            trial.listen()
+    except OSError as error:
+        raise UserError(
+            f"--coordinator {coordinator}: port {port} cannot be used here ({error.strerror}); "
+            "give all processes another one."
+        ) from None
+
+
+def _give_up(launch: Join) -> NoReturn:
+    """Print that the processes have not met, and exit; JAX would print a stack trace."""
+    where = f" at {launch.coordinator}" if launch.coordinator else ""
+    who = f"process {launch.process} of {launch.processes}" if launch.coordinator else "this one"
+    sys.stderr.write(
+        f"error: The processes of this training have not met{where} within {launch.patience} s of "
+        f"waiting by {who}: start all of them, make sure that they can reach the first one there, "
+        "or wait longer with --patience.\n"
+    )
+    sys.stderr.flush()
+    os._exit(2)
+
+
+@contextlib.contextmanager
+def _quiet_but_first() -> Iterator[None]:
+    """Let only the first process print to standard output, and not from C++, as Gloo does."""
+    sys.stdout.flush()
+    before, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 1)
+    with (
+        os.fdopen(nothing, "w") as silence,
+        os.fdopen(before, "w") as speech,
+        contextlib.redirect_stdout(speech if is_primary() else silence),
+    ):
+        try:
+            yield
+        finally:
+            speech.flush()
+            os.dup2(before, 1)
+
+
+def _let_others_report() -> None:
+    """Wait for the other processes to report the same error: JAX aborts them without the first."""
+    with contextlib.suppress(Exception):  # it is not theirs, or they are gone
+        multihost.get_barrier_sync_fn()(key="reported", timeout_ms=1000 * _REPORT_S)
+        if is_primary():
+            time.sleep(0.5)  # the others leave first
+
+
+def _report(error: BaseException) -> int:
+    """Print an error as the command line does; returns the exit code."""
+    if is_lost(error):
+        error = UserError(GONE)
+    if not isinstance(error, (UserError, OSError, KeyboardInterrupt)):
+        sys.excepthook(type(error), error, error.__traceback__)
+        return 1
+
+    def again(_: Any) -> None:
+        raise error
+
+    return cli.run(again, [])

@@ -1,0 +1,163 @@
+"""Checks, shows and logs the metrics of each step: loss and gradient finite, speed, MFU.
+
+Only the first process of a job writes and shows; all of them stop when a value is not finite.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import jax
+
+from pewm_jax.config import Config, UserError
+from pewm_jax.data import loader
+from pewm_jax.data.bad_records import BadRecords
+from pewm_jax.io import atomic
+from pewm_jax.train import chips, prepared, processes
+from pewm_jax.train.log import LiveView, MetricsLog, Pace, drop_after
+from pewm_jax.train.stages import Stage
+from pewm_jax.train.step import Metrics
+from pewm_jax.worlds import costs
+
+SKIPPED = "nonfinite.jsonl"
+"""In the run's folder: a line for every update that was skipped."""
+
+
+class Watch:
+    """Reads, checks, shows and logs the metrics of one stage.
+
+    Args:
+        config: the experiment.
+        stage: the stage.
+        run: the run's folder.
+        done: steps of the stage done before.
+        devices: how many train.
+        view: shows the metrics.
+        log: writes them to files.
+        bad: the records that do not decode.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        stage: Stage,
+        run: Path,
+        done: int,
+        *,
+        devices: int,
+        view: LiveView,
+        log: MetricsLog,
+        bad: BadRecords,
+    ):
+        self.config, self.stage, self.run = config, stage, run
+        self.settings = stage.settings(config)
+        self.view, self.log, self.bad = view, log, bad
+        self.pace = Pace(time.monotonic())
+        self._devices, self._chip = devices, chips.find(jax.devices()[0].device_kind)
+        self._flops = self.settings.batch * costs.flops_per_clip(config, stage)
+        self._skipped = self._skipped_before(done)
+
+    def read(self, step: int, metrics: Metrics, kept: Callable[[], str]) -> dict[str, float]:
+        """Wait for a step's metrics, check and show them.
+
+        Args:
+            step: its number.
+            metrics: what the step returned.
+            kept: returns a sentence part that says which checkpoint is on disk.
+
+        Raises:
+            UserError: loss or gradient is not finite, and that is not to be skipped.
+        """
+        values = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        skipped = bool(values.pop("skipped", 0.0))
+        if not (math.isfinite(values["loss"]) and math.isfinite(values["grad_norm"])):
+            self._not_finite(step, values, skipped, kept)
+        seconds = self.pace.tick(time.monotonic())
+        rate = self._flops / seconds / self._devices
+        values |= {
+            "step_seconds": seconds,
+            "clips_per_second": self.settings.batch / seconds,
+            "tflops_per_second_per_device": rate / 1e12,
+        }
+        if self._chip is not None:
+            values["mfu"] = rate / self._chip.flops
+        if self.config.train.on_nonfinite == "skip":
+            values["skipped"] = float(self._skipped)
+        if self.config.data.bad_records:
+            values["bad_records"] = float(len(self.bad))
+        self.view.update(step, values)
+        return values
+
+    def write(self, step: int, values: Mapping[str, float], always: bool = False) -> None:
+        """Log a step where it is time for that, or ``always``."""
+        if always or step in (1, self.settings.steps) or step % self.config.train.log_every == 0:
+            self.log.write(step, values)
+
+    def _not_finite(
+        self, step: int, values: Mapping[str, float], skipped: bool, kept: Callable[[], str]
+    ) -> None:
+        """Write down the records of the step's batch; stop, unless its update was skipped."""
+        what = f"loss {values['loss']} and gradient norm {values['grad_norm']}"
+        self._skipped += skipped
+        name = SKIPPED if skipped else f"nonfinite-{self.stage.name}-{step}.json"
+        path = self.run / name
+        if processes.is_primary():
+            entry = {
+                "stage": self.stage.number,
+                "step": step,
+                "loss": _number(values["loss"]),
+                "grad_norm": _number(values["grad_norm"]),
+                **self._records(step),
+                "time": round(time.time(), 3),
+            }
+            if skipped:
+                with path.open("a") as file:
+                    file.write(json.dumps(entry, ensure_ascii=False) + "\n")
+            else:
+                atomic.write_text(path, json.dumps(entry, ensure_ascii=False, indent=2) + "\n")
+        if skipped:
+            self.view.say(
+                f"{self.stage.title}: step {step} is skipped, {what} are not both finite; "
+                f"{path} names its records"
+            )
+            return
+        raise UserError(
+            f"{self.stage.title.capitalize()} stopped at step {step}: {what} are not both finite "
+            f"({kept()}); {path} names the batch's records: skip such steps with "
+            "--train.on_nonfinite skip, or train again in another --train.run with a lower "
+            f"--train.{self.stage.name}.learning_rate."
+        )
+
+    def _records(self, step: int) -> dict[str, object]:
+        """Return the names of the records in a step's batch, or why they cannot be found."""
+        once, batch = self.config.data.prepared > 0, self.settings.batch
+        seed = prepared.seed(self.config, self.stage) if once else self.stage.data_seed(self.config)
+
+        def read(number: int) -> list[str]:
+            return loader.records(self.config, "train", seed=seed, batch=batch, step=number)
+
+        try:
+            if once:
+                rows = prepared.rows(self.config, self.stage, step - 1)
+                names = [read(row // batch)[row % batch] for row in rows]
+            else:
+                names = read(step - 1)
+        except UserError as error:
+            return {"records": [], "why_not": str(error)}
+        return {"records": names}
+
+    def _skipped_before(self, done: int) -> int:
+        """Drop the updates skipped after the step resumed from; returns how many remain."""
+        path = self.run / SKIPPED
+        if processes.is_primary():
+            drop_after(path, self.stage.number, done)
+        return len(path.read_text().splitlines()) if path.exists() else 0
+
+
+def _number(value: float) -> float | str:
+    """Return a finite number as it is, others as text: JSON has no NaN and no infinity."""
+    return value if math.isfinite(value) else str(value)

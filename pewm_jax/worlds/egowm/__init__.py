@@ -1,0 +1,1 @@
+"""EgoWM: a video diffusion model steered by actions."""

@@ -1,0 +1,1 @@
+"""PERSIST: a world model whose state is a voxel grid."""

@@ -1,0 +1,253 @@
+"""The losses of PERSIST's networks, one for each stage (arXiv 2603.03482).
+
+``voxel_vae`` reconstructs grids; ``world_frames`` and ``renderer`` learn the velocity of latents at
+a time of each frame's own; ``camera`` learns the steps between cameras. All are functions of
+arrays, leading axis B. In ``actions_BTA`` row t is the action that leads to frame t, zeros for the
+first; ``led_to`` makes them from recorded ones, which lead away.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import (
+    CameraModelConfig,
+    FrameFlowConfig,
+    VoxelDiTConfig,
+    VoxelRendererConfig,
+    VoxelVAEConfig,
+)
+from pewm_jax.diffusion import noise as noises
+from pewm_jax.geometry import camera_steps
+from pewm_jax.geometry.march import Layers
+from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer
+from pewm_jax.models.persist import voxel_vae as voxel_vae_model
+from pewm_jax.types import Array, Camera, Params
+
+Measured = dict[str, Array]
+Compare = Callable[[Array, Array, Array], tuple[Array, Array]]
+"""``(x0_BTxyzC, weight_BTxyz, key) -> (error, right)``: another error of what is predicted, () and
+already weighted, and the share that is right; see ``persist_classes.compared``."""
+
+
+def led_to(actions_BTA: Array) -> Array:
+    """Turn (B, T − 1, A) actions that lead away from frames into (B, T, A) that lead to them."""
+    return jnp.pad(jnp.asarray(actions_BTA), ((0, 0), (1, 0), (0, 0)))
+
+
+def previous(frames: Any) -> Any:
+    """Return what each frame is shown of another kind: that of the frame before it.
+
+    The first frame has its own, from which a world can begin (w₀ from o₀).
+
+    Args:
+        frames: a tree of arrays (B, T, …).
+    """
+    return jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x[:, :-1]], 1), frames)
+
+
+def voxel_vae(
+    config: VoxelVAEConfig, params: Params, classes_BTXYZ: Array, key: Array, dtype: Any
+) -> tuple[Array, Measured]:
+    """Return the loss of all grids of a batch of clips; see ``models.voxel_vae.loss``."""
+    grids = jnp.asarray(classes_BTXYZ)
+    grids = grids.reshape(-1, *grids.shape[2:])
+    return voxel_vae_model.loss(config, params, grids, key, dtype)
+
+
+def world_frames(
+    config: VoxelDiTConfig,
+    noise: FrameFlowConfig,
+    params: Params,
+    latents_BTxyzC: Array,
+    actions_BTA: Array,
+    pixels_BThwC: Array,
+    key: Array,
+    *,
+    camera_BTN: Array | None = None,
+    blind: float = 0.0,
+    known_BTxyz: Array | None = None,
+    weight_BTxyz: Array | None = None,
+    compare: Compare | None = None,
+    dtype: Any = jnp.float32,
+) -> tuple[Array, Measured]:
+    """Return the squared error of the velocity of voxel frames.
+
+    What is not known of a frame is noise alone, whatever the frame's time; later frames do not
+    read it, and its error does not count.
+
+    Args:
+        config: the network.
+        noise: times and noise.
+        params: the network's parameters.
+        latents_BTxyzC: normalised latents of voxel frames.
+        actions_BTA: the action that leads to each frame.
+        pixels_BThwC: latents of the picture at each frame; see ``previous``.
+        key: randomness of times, noise and of what is hidden.
+        camera_BTN: numbers of the camera at each frame.
+        blind: share of frames after the first that are not shown a picture.
+        known_BTxyz: bool, which latents a world would know at that frame; None for all.
+        weight_BTxyz: what the error of each latent counts; None for 1.
+        compare: an error of the predicted x0 that is added; see ``Compare``.
+        dtype: of the computation.
+    """
+    velocity_key, shown_key = jax.random.split(key)
+    front = latents_BTxyzC.shape[:2]
+    shown = jax.random.uniform(shown_key, front) >= blind
+    predict = functools.partial(
+        voxel_dit.apply,
+        config,
+        params,
+        actions_BTA=actions_BTA,
+        pixels_BThwC=previous(pixels_BThwC),
+        camera_BTN=None if camera_BTN is None else previous(camera_BTN),
+        shown_BT=shown | (jnp.arange(front[1]) == 0) if blind else None,
+        known_BTxyz=known_BTxyz,
+    )
+    return _velocity(
+        noise,
+        lambda x, t: predict(x, t)[0],
+        latents_BTxyzC,
+        velocity_key,
+        dtype,
+        known=known_BTxyz,
+        counts=weight_BTxyz,
+        compare=compare,
+    )
+
+
+def camera(
+    config: CameraModelConfig,
+    params: Params,
+    classes_BTXYZ: Array,
+    middle_BT3: Array,
+    cameras: Camera,
+    actions_BTA: Array,
+    width: int,
+    *,
+    reckoned_BT6: Array | None = None,
+    dtype: Any = jnp.float32,
+) -> tuple[Array, Measured]:
+    """Return the mean squared error of the steps between cameras, in ``config.units``.
+
+    Where the grid of a frame lies says where the agent has gone. So a camera's position is counted
+    from the middle of its own frame's grid, and not of the grid that the step leads to.
+
+    Args:
+        config: the network.
+        params: its parameters.
+        classes_BTXYZ: class ids at each frame.
+        middle_BT3: the middle of each frame's grid, metres.
+        cameras: (B, T) cameras.
+        actions_BTA: the action that leads to each frame.
+        width: of the images that the cameras' intrinsics are for, pixels.
+        reckoned_BT6: steps to which the network adds what it says, each to its frame; None for
+            none.
+        dtype: of the computation.
+
+    Returns:
+        ``(loss, {"metres_off", "radians_off"})``: mean lengths of what is wrong.
+    """
+    before, after = (
+        jax.tree.map(lambda x, c=c: x[:, c], cameras) for c in (slice(-1), slice(1, None))
+    )
+    seen = camera_steps.numbers(before, width, middle_BT3[:, :-1])
+    made, _ = camera_model.apply(
+        config, params, classes_BTXYZ[:, 1:], seen, actions_BTA[:, 1:], dtype=dtype
+    )
+    if reckoned_BT6 is not None:
+        made = made + reckoned_BT6[:, 1:]
+    off = made - camera_steps.between(before, after, width)
+    measured = {
+        "metres_off": jnp.linalg.norm(off[..., :3], axis=-1).mean(),
+        "radians_off": jnp.linalg.norm(off[..., 3:5], axis=-1).mean(),
+    }
+    return jnp.square(off / jnp.asarray(config.units)).mean(), measured
+
+
+def renderer(
+    config: VoxelRendererConfig,
+    noise: FrameFlowConfig,
+    params: Params,
+    latents_BThwC: Array,
+    layers: Layers,
+    key: Array,
+    *,
+    actions_BTA: Array | None = None,
+    drawn_BThwC: Array | None = None,
+    dtype: Any = jnp.float32,
+) -> tuple[Array, Measured]:
+    """Return the squared error of the velocity of pictures' latents.
+
+    Args:
+        config: the network.
+        noise: times and noise.
+        params: the network's parameters; the folding of the layers learns with the rest.
+        latents_BThwC: latents of pictures.
+        layers: (B, T, h, w, L) what their rays meet, from ``voxel_renderer.look``.
+        key: randomness of times and noise.
+        actions_BTA: the action that leads to each frame, where the network takes one.
+        drawn_BThwC: latents of the drawn voxels, where the network takes them.
+        dtype: of the computation.
+    """
+    seen = voxel_renderer.features(config, params, layers, dtype, drawn_hwC=drawn_BThwC)
+    predict = functools.partial(
+        voxel_renderer.apply, config, params, features_BThwF=seen, actions_BTA=actions_BTA
+    )
+    return _velocity(noise, lambda x, t: predict(x, t)[0], latents_BThwC, key, dtype)
+
+
+def _velocity(
+    noise: FrameFlowConfig,
+    predict: Callable[[Array, Array], Array],
+    x0: Array,
+    key: Array,
+    dtype: Any,
+    *,
+    known: Array | None = None,
+    counts: Array | None = None,
+    compare: Compare | None = None,
+) -> tuple[Array, Measured]:
+    """Return the squared error at times drawn for each frame, and that of x0.
+
+    Args:
+        noise: times and noise.
+        predict: ``(x_t, times_BT) -> velocity``.
+        x0: (B, T, …) clean latents.
+        key: randomness.
+        dtype: of the computation.
+        known: bool, in the shape of x0 without its channels: elsewhere x_t is noise alone, and
+            the error does not count.
+        counts: in the same shape, what the error counts there; None for 1.
+        compare: an error of the predicted x0 that is added.
+    """
+    time_key, noise_key = jax.random.split(key)
+    times = noises.draw(noise, time_key, *x0.shape[:2])
+    times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], x0.shape[:2])
+    drawn = jax.random.normal(noise_key, x0.shape)
+    x_t = noises.corrupt(noise, x0, drawn, times)
+    if known is not None:
+        x_t = jnp.where(known[..., None], x_t, drawn)
+    inputs, network_times = noises.shown(noise, x_t, times)
+    made = predict(inputs.astype(dtype), network_times).astype(jnp.float32)
+    error = jnp.square(made - noises.target(noise, x0, drawn, times))
+    weight = noises.spread(noises.weight(noise, times), error.ndim)
+    made_x0 = noises.to_x0(noise, made, x_t, times)
+    x0_error = jnp.square(made_x0 - x0)
+
+    share = jnp.ones(x0.shape[:-1]) if known is None else known.astype(jnp.float32)
+
+    def mean(x: Array, share: Array) -> Array:
+        return (x * (share / jnp.maximum(share.mean(), 1e-6))[..., None]).mean()
+
+    counted = share if counts is None else share * counts
+    loss, measured = mean(error * weight, counted), {"x0_error": mean(x0_error, share)}
+    if compare is None:
+        return loss, measured
+    compared, right = compare(made_x0, counted, jax.random.fold_in(key, 2))
+    return loss + compared, measured | {"classes": compared, "classes_right": right}

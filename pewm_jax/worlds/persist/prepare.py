@@ -1,0 +1,219 @@
+"""What each stage of the world ``persist`` is given of a batch of clips.
+
+It is computed with frozen weights, once where ``data.prepared`` asks for it; ``Clip.prepared``
+holds it. The voxels of a clip are seen in windows, as in a rollout.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.codecs import interface as codecs
+from pewm_jax.config import PersistConfig, UserError
+from pewm_jax.geometry import camera_steps
+from pewm_jax.geometry.march import Layers
+from pewm_jax.models.persist import voxel_renderer, voxel_vae
+from pewm_jax.nn.signals import as_signal
+from pewm_jax.types import Array, Camera, Clip, Params
+from pewm_jax.worlds.persist import losses, windows
+from pewm_jax.worlds.persist.pictures import drawn
+
+
+def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
+    """Return where the recorded grids begin, and the windows of their frames, in whole cells.
+
+    Windows begin at whole tokens of a lattice. A rollout's lies where its first frame was, so each
+    clip has another, by the cell where it begins.
+
+    Returns:
+        ``(recorded_BT3, start_BT3)``: int32 cells, counted from a corner that a clip's frames have
+        in common.
+
+    Raises:
+        UserError: the data have no voxels, no actions, or grids of another size.
+    """
+    require_recorded(model, clip)
+    size = windows.cell_m(model)
+    origin = jnp.asarray(clip.origin_T3)
+    first = jnp.floor(origin[:, :1] / size + 1e-3).astype(jnp.int32)
+    recorded = first + jnp.round((origin - origin[:, :1]) / size).astype(jnp.int32)
+    place = jnp.asarray(clip.frames.camera.world_from_camera)[..., :3, 3]
+    agent = recorded + jnp.floor((place - origin) / size).astype(jnp.int32)
+    wide, token = windows.side(model), model.backbone.token_cells  # type: ignore[attr-defined]
+    shift = _mixed(agent[:, :1]) % token
+    recorded, agent = recorded + shift, agent + shift
+    start = windows.snapped(agent - wide // 2, token)
+    beside = (model.memory.recorded - wide) // 2  # type: ignore[attr-defined]
+    return recorded, start.at[..., 2].set(recorded[..., 2] + beside)
+
+
+def _mixed(cell_BT3: Array) -> Array:
+    """Return two numbers and 0 of a cell that tell nothing of it: a clip's own, without a key."""
+    x, y, _ = jnp.moveaxis(cell_BT3.astype(jnp.uint32), -1, 0)
+    mixed = (x * jnp.uint32(0x9E3779B1)) ^ (y * jnp.uint32(0x85EBCA6B))
+    mixed = (mixed ^ (mixed >> 15)) * jnp.uint32(0xC2B2AE35)
+    both = jnp.stack([mixed >> 8, mixed >> 20, jnp.zeros_like(mixed)], -1) & 0xFF
+    return both.astype(jnp.int32)
+
+
+def cut(model: PersistConfig, clip: Clip, start_BT3: Array, recorded_BT3: Array) -> Array:
+    """Return (B, T, X, Y, Z) int16 windows of the recorded grids, unknown where they reach out."""
+    classes = jnp.asarray(clip.classes_TXYZ).astype(jnp.int16)
+    one = functools.partial(windows.cut, count=windows.side(model))
+    return jax.vmap(jax.vmap(one))(classes, start_BT3 - recorded_BT3)
+
+
+def pictures(model: PersistConfig, params: Params, clip: Clip) -> tuple[Array, windows.Shown]:
+    """Return (B, T, h, w, C) latents of the frames, and the same as voxel frames are shown them."""
+    frames = as_signal(clip.frames)
+    latents = codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
+    latents = latents[..., : model.picture_channels]
+    camera = jax.tree.map(jnp.asarray, frames.camera)
+    return latents, windows.shown_of(latents, jnp.asarray(frames.depth_THW), camera)
+
+
+def grids(model: PersistConfig, params: Params, clip: Clip) -> Clip:
+    """Return the windows of the first and of the last frame, for the autoencoder."""
+    del params
+    recorded, start = lattice(model, clip)
+    ends = jnp.array([0, -1])
+    some = dataclasses.replace(clip, classes_TXYZ=jnp.asarray(clip.classes_TXYZ)[:, ends])
+    return _prepared(clip, jnp.maximum(cut(model, some, start[:, ends], recorded[:, ends]), 0))
+
+
+def frames(model: PersistConfig, params: Params, clip: Clip) -> Clip:
+    """Return latents of voxel frames, all in the window of the last one, and their conditions."""
+    recorded, start = lattice(model, clip)
+    last = jnp.broadcast_to(start[:, -1:], start.shape)
+    classes = cut(model, clip, last, recorded)
+    shape = classes.shape[:2]
+    flat = classes.reshape(-1, *classes.shape[2:])
+    config, weights = model.backbone.voxel_vae, params["voxel_vae"]  # type: ignore[attr-defined]
+    dtype = jnp.dtype(model.dtype)
+
+    def encode(grid: Array) -> Array:
+        return voxel_vae.encode(config, weights, jnp.maximum(grid, 0)[None].astype(int), dtype)[0]
+
+    latents = jax.lax.map(encode, flat)
+    latents = latents.reshape(*shape, *latents.shape[1:])
+    recorded_too = jax.vmap(jax.vmap(functools.partial(windows.known_latents, model)))(classes)
+    token, wide = model.backbone.token_cells, windows.side(model)  # type: ignore[attr-defined]
+    at = last[..., None] + jnp.arange(0, wide, token)  # (B, T, 3, tokens)
+    inside = (at >= start[..., None]) & (at < start[..., None] + wide)
+    x, y, z = jnp.moveaxis(inside, 2, 0)
+    own = x[..., :, None, None] & y[..., None, :, None] & z[..., None, None, :]
+    patch = model.backbone.world_frames.patch  # type: ignore[attr-defined]
+    known = windows.spread(own, patch) & recorded_too
+
+    corner = jnp.asarray(clip.origin_T3) - recorded * windows.cell_m(model)
+    middle = windows.middle(model, corner, last)
+    _, shown = pictures(model, params, clip)
+    told = windows.told(model, shown, middle)
+    camera = camera_steps.numbers(shown.camera, model.clip.width, middle)
+    made = {
+        "latents": latents.astype(jnp.float16),
+        "told": told.astype(jnp.float16),
+        "camera": camera,
+        "actions": losses.led_to(clip.actions_TA),
+        "known": known,
+        "occupied": occupied(model, classes),
+        "classes": classes,
+    }
+    return _prepared(clip, made)
+
+
+def occupied(model: PersistConfig, classes_BTXYZ: Array) -> Array:
+    """Return (B, T, x, y, z) bool: whether anything is known to be in the cells of a latent."""
+    *front, wide, _, _ = classes_BTXYZ.shape
+    factor = model.backbone.voxel_vae.factor  # type: ignore[attr-defined]
+    count = wide // factor
+    cells = (classes_BTXYZ > 0).reshape(*front, count, factor, count, factor, count, factor)
+    return cells.any((-5, -3, -1))
+
+
+def cameras(model: PersistConfig, params: Params, clip: Clip) -> Clip:
+    """Return the voxels around where the camera was before each frame, and the cameras."""
+    del params
+    recorded, _ = lattice(model, clip)
+    size, config = windows.cell_m(model), model.backbone.camera_model  # type: ignore[attr-defined]
+    camera = jax.tree.map(jnp.asarray, clip.frames.camera)
+    place, origin = camera.world_from_camera[..., :3, 3], jnp.asarray(clip.origin_T3)
+    cell = jnp.floor((place - origin) / size).astype(jnp.int32)
+    before = losses.previous(recorded + cell)
+    one = functools.partial(windows.cut, count=config.inner)
+    classes = jnp.asarray(clip.classes_TXYZ).astype(jnp.int16)
+    inner = jax.vmap(jax.vmap(one))(classes, before - config.inner // 2 - recorded)
+    made = {
+        "classes": jnp.maximum(inner, 0),
+        "middle": origin + cell * size,
+        "camera": camera,
+        "actions": losses.led_to(clip.actions_TA),
+    }
+    return _prepared(clip, made)
+
+
+def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
+    """Return latents of the pictures, and what their rays meet in the true voxels."""
+    recorded, start = lattice(model, clip)
+    classes = jnp.maximum(cut(model, clip, start, recorded), 0)
+    size = windows.cell_m(model)
+    corner = jnp.asarray(clip.origin_T3) + (start - recorded) * size
+    camera = jax.tree.map(jnp.asarray, clip.frames.camera)
+    pixels = (model.clip.height, model.clip.width)
+
+    def look(one: tuple[Array, Array, Camera]) -> Layers:
+        grid, low, seen = one
+        return voxel_renderer.look(model.backbone.renderer, grid, low, size, seen, pixels)  # type: ignore[attr-defined]
+
+    layers = jax.lax.map(look, (classes, corner, camera))
+    made = {
+        "latents": pictures(model, params, clip)[0].astype(jnp.float16),
+        "ids": layers.ids_L.astype(jnp.int16),
+        "distance": layers.distance_L.astype(jnp.float16),
+        "side": layers.side_L.astype(jnp.int8),
+        "actions": losses.led_to(clip.actions_TA),
+    }
+    if model.backbone.renderer.drawn:  # type: ignore[attr-defined]
+
+        def draw(one: tuple[Array, Array, Camera]) -> Array:
+            return jax.lax.map(lambda frame: drawn(model, params, *frame), one)
+
+        made["drawn"] = jax.lax.map(draw, (classes, corner, camera)).astype(jnp.float16)
+    return _prepared(clip, made)
+
+
+def require_recorded(model: PersistConfig, clip: Clip) -> None:
+    """Refuse data without what this world learns from.
+
+    Raises:
+        UserError: no voxels, no actions, or grids of another size.
+    """
+    memory, classes = model.memory, clip.classes_TXYZ
+    groups = f"--voxels.kinds {memory.kinds} --voxels.colours {memory.colours}"  # type: ignore[attr-defined]
+    command = (
+        f"pewm-jax data collect DATA --moving --voxels --voxels.cell {windows.cell_m(model):g} "
+        f"--voxels.side {memory.recorded} {groups} --voxels.pictures {memory.pictures}"  # type: ignore[attr-defined]
+    )
+    if classes is None or clip.actions_TA is None:
+        raise UserError(
+            f"the data have no voxels or no actions, from which this world learns: {command}."
+        )
+    if classes.shape[-1] != memory.recorded:  # type: ignore[attr-defined]
+        raise UserError(
+            f"the recorded grids have {classes.shape[-1]} cells along each axis, and memory."
+            f"recorded is {memory.recorded}: {command}."  # type: ignore[attr-defined]
+        )
+
+
+def _prepared(clip: Clip, made: Any) -> Clip:
+    """Return a clip of what was made of it alone; arrays that are not used any more are empty."""
+
+    def none(x: Any) -> Any:
+        return jax.tree.map(lambda leaf: leaf[:, :0], x)
+
+    return Clip(none(clip.frames), none(clip.context), clip.context_valid_S[:, :0], prepared=made)

@@ -1,0 +1,208 @@
+"""How the world ``persist`` learns: its stages and the loss of each.
+
+What a stage is given of a batch is prepared by ``persist_prepare``.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.codecs import interface as codecs
+from pewm_jax.config import Config, PersistConfig, PersistTrainConfig, TrainSettings
+from pewm_jax.config import functions as functions_of
+from pewm_jax.geometry.march import Layers
+from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
+from pewm_jax.models.persist import nets as persist_nets
+from pewm_jax.models.persist.voxel_vae_shapes import costs as vae_costs
+from pewm_jax.nn.costs import Costs, Share
+from pewm_jax.types import Array, Clip, Params
+from pewm_jax.worlds.persist import classes as persist_classes
+from pewm_jax.worlds.persist import losses
+from pewm_jax.worlds.persist import prepare as persist_prepare
+from pewm_jax.worlds.persist.pictures import reckoning
+from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
+
+Measured = dict[str, Array]
+GRIDS = 2
+"""Grids of a clip from which the autoencoder learns: of its first and of its last frame."""
+STATISTICS = r"voxel_vae/latent_(mean|scale)_C"
+SMALL = 1e-4
+"""The least scale of a latent."""
+
+
+def init(model: PersistConfig, key: Array, networks: int = len(persist_nets.NETWORKS)) -> Params:
+    """Return random parameters of the codec and of the first so many networks."""
+    codec_key, key = jax.random.split(key)
+    names = persist_nets.NETWORKS[:networks]
+    made = {"codec": functions_of(model.codec).init(model.codec, codec_key)}
+    return made | persist_nets.init(model.backbone, key, names)  # type: ignore[arg-type]
+
+
+def _of(
+    prepare: Callable[..., Clip], model: PersistConfig, params: Params, clip: Clip
+) -> dict[str, Any]:
+    """Return what a stage is given of a batch, prepared now if it was not before."""
+    if clip.prepared is not None:
+        return clip.prepared
+    made = prepare(model, jax.lax.stop_gradient(params), clip).prepared
+    assert made is not None
+    return made
+
+
+def autoencode(
+    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, Measured]:
+    """Return the loss of stage ``voxel_vae``."""
+    del train
+    grids: Any = _of(persist_prepare.grids, model, params, clip)
+    config = model.backbone.voxel_vae  # type: ignore[attr-defined]
+    dtype = jnp.dtype(model.dtype)
+    return losses.voxel_vae(config, params["voxel_vae"], grids.astype(jnp.int32), key, dtype)
+
+
+def distribute(
+    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, Measured]:
+    """Return the loss of stage ``voxel_statistics``: least at mean 0 and variance 1 of latents."""
+    del train, key
+    grids: Any = _of(persist_prepare.grids, model, params, clip)
+    config, weights = model.backbone.voxel_vae, params["voxel_vae"]  # type: ignore[attr-defined]
+    grids = grids.reshape(-1, *grids.shape[2:]).astype(jnp.int32)
+    mean, _ = voxel_vae.moments(config, weights, grids, jnp.dtype(model.dtype))
+    scale = jnp.abs(weights["latent_scale_C"]) + SMALL
+    latents = (jax.lax.stop_gradient(mean) - weights["latent_mean_C"]) / scale
+    places = tuple(range(latents.ndim - 1))
+    return (jnp.square(latents) / 2).mean() + jnp.log(scale).mean(), {
+        "latent_mean": jnp.abs(latents.mean(places)).max(),
+        "latent_variance": latents.var(places).mean(),
+    }
+
+
+def world_frames(
+    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, Measured]:
+    """Return the loss of stage ``world_frames``."""
+    assert isinstance(train, PersistTrainConfig)
+    made = _of(persist_prepare.frames, model, params, clip)
+    config = model.backbone.world_frames  # type: ignore[attr-defined]
+
+    def compare(x0: Array, weight: Array, key: Array) -> tuple[Array, Array]:
+        vae, cells = model.backbone.voxel_vae, made["classes"]  # type: ignore[attr-defined]
+        frozen = params["voxel_vae"]
+        error, right = persist_classes.compared(vae, frozen, x0, cells, weight, train.compared, key)
+        return train.classes * error, right
+
+    return losses.world_frames(
+        config,
+        model.voxel_noise,  # type: ignore[arg-type]
+        params["voxel_dit"],
+        made["latents"].astype(jnp.float32),
+        made["actions"],
+        made["told"].astype(jnp.float32),
+        key,
+        camera_BTN=made["camera"] if config.camera_numbers else None,
+        blind=train.blind,
+        known_BTxyz=made["known"],
+        weight_BTxyz=1 + (train.occupied - 1) * made["occupied"],
+        compare=compare if train.classes else None,
+        dtype=jnp.dtype(model.dtype),
+    )
+
+
+def camera(
+    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, Measured]:
+    """Return the loss of stage ``camera``."""
+    del train, key
+    made = _of(persist_prepare.cameras, model, params, clip)
+    return losses.camera(
+        model.backbone.camera_model,  # type: ignore[attr-defined]
+        params["camera_model"],
+        made["classes"].astype(jnp.int32),
+        made["middle"],
+        made["camera"],
+        made["actions"],
+        model.clip.width,
+        reckoned_BT6=reckoning(model, made["actions"]),
+        dtype=jnp.dtype(model.dtype),
+    )
+
+
+def renderer(
+    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, Measured]:
+    """Return the loss of stage ``renderer``."""
+    del train
+    made = _of(persist_prepare.layers, model, params, clip)
+    config = model.backbone.renderer  # type: ignore[attr-defined]
+    layers = Layers(
+        made["ids"].astype(jnp.int32),
+        made["distance"].astype(jnp.float32),
+        made["side"].astype(jnp.int32),
+    )
+    return losses.renderer(
+        config,
+        model.noise,  # type: ignore[arg-type]
+        params["renderer"],
+        made["latents"].astype(jnp.float32),
+        layers,
+        key,
+        actions_BTA=made["actions"] if config.actions else None,
+        drawn_BThwC=made["drawn"].astype(jnp.float32) if config.drawn else None,
+        dtype=jnp.dtype(model.dtype),
+    )
+
+
+def _stage(
+    number: int, name: str, trained: str, networks: int, loss: Any, prepare: Any, **more: Any
+) -> Stage:
+    """Return a stage that trains what a pattern names, all else frozen."""
+    return Stage(
+        name=name,
+        number=number,
+        rules=((trained, TRAIN), (r".*", FREEZE)),
+        init=functools.partial(init, networks=networks),
+        loss=loss,
+        prepare=prepare,
+        prepares_by=("backbone", "codec", "voxel_vae"),
+        **more,
+    )
+
+
+_WEIGHTS = r"voxel_vae/(encoder|decoder)/.*"
+STAGES = (
+    _stage(1, "voxel_vae", _WEIGHTS, 1, autoencode, persist_prepare.grids),
+    _stage(2, "voxel_statistics", STATISTICS, 1, distribute, persist_prepare.grids),
+    _stage(3, "world_frames", r"voxel_dit/.*", 2, world_frames, persist_prepare.frames),
+    _stage(4, "camera", r"camera_model/.*", 3, camera, persist_prepare.cameras),
+    _stage(5, "renderer", r"renderer/.*", 4, renderer, persist_prepare.layers),
+)
+"""The stages, in order. The codec of pictures is given (``train.start``): the world ``codec``
+trains it."""
+
+
+def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
+    """Return the costs of one device by network."""
+    model = config.model
+    nets, frames = model.backbone, model.clip.frames
+    if stage.number <= 2:
+        made = vae_costs(nets.voxel_vae, share, GRIDS, trained=stage.number == 1)
+        return {"voxel_vae": made}
+    if stage.name == "camera":
+        return {"camera_model": camera_model.costs(nets.camera_model, share, frames, trained=True)}
+    found = {"codec": functions_of(model.codec).costs(model, share)}
+    if stage.name == "renderer":
+        made = voxel_renderer.costs(nets.renderer, share, frames, trained=True)
+        if nets.renderer.drawn:  # the drawn voxels are encoded, too
+            found["drawn"] = codecs.costs_of_images(model, share, 2 * frames, "codec")
+        return found | {"renderer": made}
+    pixels = nets.renderer.height * nets.renderer.width
+    return found | {
+        "voxel_vae": vae_costs(nets.voxel_vae, share, frames, trained=False),
+        "voxel_dit": voxel_dit.costs(nets.world_frames, share, frames, pixels, trained=True),
+    }

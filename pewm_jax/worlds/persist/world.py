@@ -1,0 +1,314 @@
+"""The world of PERSIST: a grid of class ids that evolves, and pictures made of it.
+
+What is remembered is the state of the world itself. A diffusion transformer makes the next voxels,
+a camera model says where the agent goes, rays through the voxels say what it faces, and a second
+diffusion transformer makes the picture of that (arXiv 2603.03482). Decoded voxels are encoded anew
+at each step, so what is edited in the grid (``memory.class_edit``, ``memories.erase`` and ``move``,
+``edit`` here) is the world that goes on.
+
+Where actions steer, the camera model says where they lead; cameras that are given are kept.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.config import PersistConfig, UserError
+from pewm_jax.config import functions as functions_of
+from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.memory import class_edit, class_grid
+from pewm_jax.memory.class_grid import ClassGrid
+from pewm_jax.models.persist import nets as persist_nets
+from pewm_jax.nn.signals import as_signal
+from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
+from pewm_jax.worlds import checks
+from pewm_jax.worlds.control import control_of
+from pewm_jax.worlds.persist import stages as persist_stages
+from pewm_jax.worlds.persist import windows
+from pewm_jax.worlds.persist.past import Given, Past, encoded
+from pewm_jax.worlds.persist.step import begin, step
+from pewm_jax.worlds.pewm import world as pewm
+from pewm_jax.worlds.stages import Stage
+
+init = persist_stages.init
+costs = persist_stages.costs
+START = 0
+"""Seed of the noise from which the voxels of real frames are made."""
+
+
+def stages(model: PersistConfig) -> tuple[Stage, ...]:
+    """Return the stages."""
+    del model
+    return persist_stages.STAGES
+
+
+def sharding(model: PersistConfig) -> tuple[tuple[str, Any], ...]:
+    """Return the rules of the four networks and of the codec."""
+    return (*persist_nets.SHARDING, *functions_of(model.codec).SHARDING)
+
+
+def split_heads(model: PersistConfig, stage: Stage) -> dict[str, int]:
+    """Return the head counts that ``train.mesh.tensor`` must divide."""
+    nets: Any = model.backbone
+    heads = {
+        "world_frames": {"backbone.world_frames.blocks.heads": nets.world_frames.blocks.heads},
+        "camera": {"backbone.camera_model.blocks.heads": nets.camera_model.blocks.heads},
+        "renderer": {"backbone.renderer.blocks.heads": nets.renderer.blocks.heads},
+    }
+    return heads.get(stage.name, {})
+
+
+def start(model: PersistConfig, params: Params, frames: Frames) -> WorldState:
+    """Begin a world; see ``worlds.start``.
+
+    The voxels around the first frame are generated from its picture; each later frame carries them
+    on, seen as it really was.
+    """
+    pewm.require_frames(model, frames, "start")
+    return _from_nothing(model, params, frames)
+
+
+def start_in(
+    model: PersistConfig,
+    params: Params,
+    frames: Frames,
+    classes_XYZ: Array,
+    origin_3: Array,
+    *,
+    depth_scale: float | None = None,
+) -> WorldState:
+    """Begin a world from a known grid; what of the first window is not in it is generated.
+
+    Args:
+        model: the model.
+        params: all parameters.
+        frames: S ≥ 1 frames in it, as for ``worlds.start``.
+        classes_XYZ: (n, n, n) class ids around the first frame's camera, such as an episode has;
+            −1 where nothing is known.
+        origin_3: (3,) world position of its lowest corner, metres.
+        depth_scale: as for ``worlds.start``.
+
+    Raises:
+        UserError: as for ``worlds.start``, or no grid around the camera.
+    """
+    frames = checks.check_frames(frames, "start_in", depth_scale)
+    return _start_in(model, params, frames, classes_XYZ, origin_3, depth_scale)
+
+
+@functools.partial(jax.jit, static_argnums=0, inline=True)
+def _start_in(
+    model: PersistConfig,
+    params: Params,
+    frames: Frames,
+    classes_XYZ: Array,
+    origin_3: Array,
+    depth_scale: Array | None,
+) -> WorldState:
+    frames = checks.in_metres(frames, depth_scale)
+    pewm.require_frames(model, frames, "start_in")
+    if jnp.ndim(classes_XYZ) != 3 or jnp.shape(origin_3) != (3,):
+        raise UserError(
+            f"start_in() got cells of shape {jnp.shape(classes_XYZ)} from {jnp.shape(origin_3)}: "
+            "give (n, n, n) class ids and the (3,) lowest corner in metres."
+        )
+    params, frames = _arrays(params, as_signal(frames))
+    empty = class_grid.empty(model, frames.camera.world_from_camera[0, :3, 3])
+    size, origin = windows.cell_m(model), jnp.asarray(origin_3, jnp.float32)
+    # The world's cells are laid where the given ones are, and their heights where those are.
+    off = jnp.round((empty.low_3 - origin) / size)
+    low = origin + off * size
+    given = jnp.asarray(classes_XYZ).astype(jnp.int16)
+    cells = _pasted(empty.classes_XYZ, given, -off.astype(jnp.int32))
+    return _started(model, params, ClassGrid(cells, low), frames)
+
+
+def observe(model: PersistConfig, params: Params, state: WorldState, frames: Frames) -> WorldState:
+    """Take in real frames; see ``worlds.observe``."""
+    pewm.require_frames(model, frames, "observe")
+    params, frames = _arrays(params, as_signal(frames))
+    return _observed(model, params, past_of(model, params, state), frames)
+
+
+def imagine(
+    model: PersistConfig,
+    params: Params,
+    state: WorldState,
+    control: Any,
+    key: Array,
+    *,
+    remember: bool = True,
+    memory: bool = True,
+) -> tuple[WorldState, Frames]:
+    """Imagine frame after frame; see ``worlds.imagine``.
+
+    Without ``memory`` the voxels are generated anew from the present picture, and what is in the
+    state is left as it is.
+    """
+    params = _arrays(params)[0]
+    asked, steered = _asked(model, state.frame.camera, control)
+    begun = state if memory else _from_nothing(model, params, state.frame, real=False)
+    past = past_of(model, params, begun)
+
+    def one(past: Past, inputs: tuple[Array, Camera, Array]) -> tuple[Past, Frames]:
+        action, camera, frame_key = inputs
+        given = None if steered else Given(camera=camera)
+        return step(model, params, past, action, frame_key, given)
+
+    keys = jax.random.split(key, asked.camera.intrinsics_4.shape[0])
+    after, frames = jax.lax.scan(one, past, (asked.actions_TA, asked.camera, keys))
+    frames = jax.tree.map(lambda x: x[:, 0], frames)
+    last = jax.tree.map(lambda x: x[-1:], frames)
+    return WorldState(last, after.grid if remember and memory else state.map), frames
+
+
+def edit(state: WorldState, change: Callable[..., ClassGrid], *arguments: Any) -> WorldState:
+    """Change the voxels of a world; the next frames are imagined of the changed ones.
+
+    ::
+
+        state = edit(state, class_edit.place, model.memory, box_23, number)
+        state = edit(state, class_edit.erase, model.memory, box_23)
+        state = edit(state, class_edit.move, model.memory, box_23, transform)
+        piece = class_edit.copy(model.memory, state.map, box_23)
+        state = edit(state, class_edit.paste, model.memory, piece, transform)
+
+    Args:
+        state: the world.
+        change: one of the functions of ``memory.class_edit``.
+        arguments: the grid's settings, and what follows the grid among the function's arguments.
+    """
+    config, *rest = arguments
+    changed = change(config, state.map, *rest)
+    return WorldState(state.frame, dataclasses.replace(changed, history=state.map.history))
+
+
+@functools.partial(jax.jit, static_argnums=0, inline=True)
+def render_true(
+    model: PersistConfig,
+    params: Params,
+    state: WorldState,
+    control: Any,
+    classes_TXYZ: Array,
+    origin_T3: Array,
+    key: Array,
+) -> tuple[WorldState, Frames]:
+    """Imagine the pictures of voxels that are given: the bound of what the renderer can do.
+
+    Args:
+        model: the model.
+        params: all parameters.
+        state: from ``start_in``, whose cells lie as the recorded ones.
+        control: cameras of the n frames, or a ``Control`` with actions.
+        classes_TXYZ: (n, R, R, R) recorded grids around them.
+        origin_T3: (n, 3) their lowest corners, metres.
+        key: randomness.
+    """
+    params = _arrays(params)[0]
+    asked, _ = _asked(model, state.frame.camera, control)
+    past = past_of(model, params, state)
+    size, low = windows.cell_m(model), state.map.low_3
+
+    def one(past: Past, inputs: Any) -> tuple[Past, Frames]:
+        action, camera, classes, origin, frame_key = inputs
+        first = windows.first_cell(model, low, camera.world_from_camera[:3, 3])
+        recorded = jnp.round((origin - low) / size).astype(jnp.int32)
+        grid = windows.cut(classes.astype(jnp.int16), first - recorded, windows.side(model))
+        given = Given(camera=camera, classes_XYZ=grid, start_3=first)
+        return step(model, params, past, action, frame_key, given)
+
+    keys = jax.random.split(key, asked.camera.intrinsics_4.shape[0])
+    inputs = (asked.actions_TA, asked.camera, jnp.asarray(classes_TXYZ), origin_T3, keys)
+    after, frames = jax.lax.scan(one, past, inputs)
+    frames = jax.tree.map(lambda x: x[:, 0], frames)
+    return WorldState(jax.tree.map(lambda x: x[-1:], frames), after.grid), frames
+
+
+def past_of(model: PersistConfig, params: Params, state: WorldState) -> Past:
+    """Return what a step needs of a state."""
+    frame = state.frame
+    latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
+    camera = jax.tree.map(lambda x: x[0], frame.camera)
+    return Past(state.map, windows.shown_of(latents, frame.depth_THW[0], camera))
+
+
+def _arrays(*trees: Any) -> Any:
+    """Return trees of JAX arrays: weights as they are loaded are NumPy's, which are no tables."""
+    return jax.tree.map(jnp.asarray, trees)
+
+
+def _from_nothing(
+    model: PersistConfig, params: Params, frames: Frames, *, real: bool = True
+) -> WorldState:
+    """Return a world of which nothing but frames is known."""
+    params, frames = _arrays(params, as_signal(frames))
+    grid = class_grid.empty(model, frames.camera.world_from_camera[0, :3, 3])
+    return _started(model, params, grid, frames, real=real)
+
+
+def _started(
+    model: PersistConfig, params: Params, grid: ClassGrid, frames: Frames, *, real: bool = True
+) -> WorldState:
+    first, later = (jax.tree.map(lambda x, c=c: x[c], frames) for c in (slice(1), slice(1, None)))
+    key = jax.random.key(START)
+    past = begin(model, params, grid, first, key, real=real)
+    if not later.depth_THW.shape[0]:
+        return WorldState(first, past.grid)
+    return _observed(model, params, past, later)
+
+
+def _observed(model: PersistConfig, params: Params, past: Past, frames: Frames) -> WorldState:
+    """Carry the voxels on along real frames."""
+    count = frames.depth_THW.shape[0]
+    here = past.shown.camera.world_from_camera[None]
+    poses = jnp.concatenate([here, frames.camera.world_from_camera])
+    actions = _between(model, poses)
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(START), 1), count)
+
+    def one(past: Past, inputs: tuple[Frames, Array, Array]) -> tuple[Past, None]:
+        frame, action, key = inputs
+        given = Given(frame.camera, frame.rgb_THWC, frame.depth_THW)
+        return step(model, params, past, action, key, given)[0], None
+
+    past, _ = jax.lax.scan(one, past, (frames, actions, keys))
+    return WorldState(jax.tree.map(lambda x: x[-1:], frames), past.grid)
+
+
+def _between(model: PersistConfig, poses: Array) -> Array:
+    """Return the actions between cameras; where they are not planar nobody knows them: zeros."""
+    if model.control.actions == action_geometry.PLANAR:
+        return action_geometry.actions_between(poses)
+    return jnp.zeros((len(poses) - 1, model.control.actions))
+
+
+def _asked(model: PersistConfig, present: Camera, control: Any) -> tuple[Control, bool]:
+    """Return cameras and actions of the frames to imagine, and whether actions alone steer."""
+    planar = model.control.actions == action_geometry.PLANAR
+    if isinstance(control, Camera) and planar:
+        control = Control(control)
+    if isinstance(control, Control) and control.actions_TA is None and planar:
+        poses = jnp.asarray(control.camera.world_from_camera)
+        if poses.ndim == 3:
+            whole = jnp.concatenate([present.world_from_camera, poses])
+            actions = action_geometry.actions_between(whole)
+            control = dataclasses.replace(control, actions_TA=actions)
+    steered = not isinstance(control, (Camera, Control))
+    asked = control_of(model, present, control)
+    return asked, steered
+
+
+def _pasted(cells_XYZ: Array, given_XYZ: Array, at_3: Array) -> Array:
+    """Put known cells into a grid at a place, which may reach out of it."""
+    for axis in range(3):
+        index = jnp.arange(cells_XYZ.shape[axis]) - at_3[axis]
+        size = given_XYZ.shape[axis]
+        found = jnp.take(given_XYZ, jnp.clip(index, 0, size - 1), axis=axis)
+        inside = (index >= 0) & (index < size)
+        inside = inside.reshape([-1 if a == axis else 1 for a in range(3)])
+        given_XYZ = jnp.where(inside, found, class_edit.UNKNOWN)
+    return jnp.where(given_XYZ >= 0, given_XYZ, cells_XYZ)

@@ -1,0 +1,1 @@
+"""PEWM: a video diffusion model with a 3D memory."""

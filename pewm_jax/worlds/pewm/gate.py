@@ -1,0 +1,112 @@
+"""The gate's last lesson: what this model imagines, beside what its memory shows.
+
+The codec's gate learned on true latents with noise. What a model imagines is wrong in other ways:
+sharp, plausible and elsewhere. After its training the model imagines each clip once, from the
+clip's first frame and with the memory of its context, and the gate alone learns which of the two to
+believe where.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from pewm_jax.codecs import interface as codecs
+from pewm_jax.config import ModelConfig, TrainConfig, TrainSettings, UserError
+from pewm_jax.memory import memories
+from pewm_jax.models.lpips import model as lpips
+from pewm_jax.models.lpips import weights as lpips_weights
+from pewm_jax.nn.signals import as_signal, signal_from_depth
+from pewm_jax.types import Array, Clip, Control, Frames, Params
+from pewm_jax.worlds import codec_gate, objective, sampling, world_model
+
+
+def require_gate(model: ModelConfig) -> None:
+    """Refuse a model in which there is nothing to learn.
+
+    Raises:
+        UserError: its codec has no gate, or its memory shows no colours.
+    """
+    if not memories.gated(model):
+        raise UserError(
+            "train.gate.steps is above 0, but this model has no gate that mixes its memory's "
+            "colours in: give it a codec with a gate (codec.kind learned, codec.gate) and a memory "
+            "of colours, or set train.gate.steps 0."
+        )
+
+
+def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
+    """Imagine a batch of clips with their memories; ``latents_thwC`` are those imagined.
+
+    The noise depends on the clips alone.
+
+    Raises:
+        UserError: the model's codec has no gate, or its memory shows no colours.
+    """
+    require_gate(model)
+    sight = objective.clip_sight(model, params, clip, pictures=True)
+    frames = as_signal(clip.frames)
+    observed = jax.tree.map(lambda x: x[:, :1], frames)
+    control = Control(frames.camera, clip.actions_TA, clip.state_A)
+    conditioning = world_model.condition(model, params, observed, control)
+    key = jax.random.fold_in(jax.random.key(0), clip.frames.rgb_THWC.astype(jnp.uint32).sum())
+    shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
+    noise = jax.random.normal(key, shape)
+    latents = sampling.sample(model, params, conditioning, sight, noise, jax.random.fold_in(key, 1))
+    return dataclasses.replace(
+        clip,
+        context=jax.tree.map(lambda x: x[:, :0], clip.context),
+        context_valid_S=clip.context_valid_S[:, :0],
+        context_features_ShwF=None,
+        latents_thwC=latents,
+        sight=sight,
+    )
+
+
+def loss(
+    model: ModelConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, dict[str, Array]]:
+    """Return the loss of the gate on imagined frames; see ``codec_gate.score``."""
+    assert isinstance(train, TrainConfig)
+    del key
+    if clip.latents_thwC is None:
+        clip = jax.lax.stop_gradient(prepare(model, params, clip))
+    assert clip.sight is not None
+    assert clip.sight.view is not None
+    rgb, depth = codecs.decode_rgbd(model, params, clip.latents_thwC)
+    view = clip.sight.view
+    far = signal_from_depth(model.clip, view.depth_THW)[..., None]
+    shown = jnp.concatenate([view.features_THWF[..., :3], far], -1)
+    frames = as_signal(clip.frames)
+    truth = Frames(
+        frames.rgb_THWC[:, 1:],
+        frames.depth_THW[:, 1:],
+        jax.tree.map(lambda x: x[:, 1:], frames.camera),
+    )
+    return codec_gate.score(
+        model,
+        params["codec"]["gate"],
+        rgb[:, 1:],
+        depth[:, 1:],
+        shown[:, 1:],
+        view.seen_THW[:, 1:],
+        truth,
+        (train.gate_lpips, params["lpips"]) if train.gate_lpips else None,
+    )
+
+
+def perceptual(model: ModelConfig, train: TrainSettings) -> Params | None:
+    """Return the weights of LPIPS that ``loss`` needs, under ``lpips``, or None.
+
+    Raises:
+        UserError: they are asked for and not installed, or damaged, or frames are too small.
+    """
+    assert isinstance(train, TrainConfig)
+    if not train.gate_lpips:
+        return None
+    file = lpips_weights.find(codec_gate.LPIPS)
+    found = {"lpips": lpips_weights.read(file, codec_gate.LPIPS)[1]}
+    lpips.require_size(codec_gate.LPIPS, model.clip.height, model.clip.width)
+    return found

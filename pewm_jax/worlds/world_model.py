@@ -1,0 +1,217 @@
+"""The world model's network: the denoiser, conditioned on frame, control, text and memory.
+
+Input channels, in order: noisy colour and depth latents; what shows the observed frames, as the
+backbone wants it (by default their latents, zero for later frames); the channels of the control
+(Plücker rays). At the places that the backbone provides, a reader reads the memory.
+
+Parameters: ``backbone``, ``memory`` (the reader) and, if the settings need them, ``control``, the
+frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (with which the backbone sees images)
+and ``text`` (the prompt's embedding, and a negative one's where guidance is on text). Without the
+``memory`` entry, or without sight of a memory, it is the stage-1 model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.codecs import interface as codecs
+from pewm_jax.config import ModelConfig
+from pewm_jax.controls import camera as camera_control
+from pewm_jax.controls import interface as controls
+from pewm_jax.encoders import interface as encoders
+from pewm_jax.models import interface as backbones
+from pewm_jax.models.interface import NO_READERS, Conditioning, Observed
+from pewm_jax.readers import interface as readers
+from pewm_jax.types import Array, Camera, Control, Frames, Params, Sight
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ClipConditioning:
+    """Everything that conditions a batch of clips, except the memory.
+
+    Attributes:
+        given: the backbone's conditioning.
+        camera: (B, T) cameras of the clips' frames.
+        rays_BthwC: their Plücker rays at the latent rate, for readers.
+    """
+
+    given: Conditioning
+    camera: Camera
+    rays_BthwC: Array
+
+
+def condition(
+    model: ModelConfig,
+    params: Params,
+    observed: Frames,
+    control: Control,
+    *,
+    noise_B: Array | None = None,
+    clean_BTHWC: Array | None = None,
+) -> ClipConditioning:
+    """Build the conditioning of a batch of clips.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; codec, image, control and text are used.
+        observed: (B, 1) the first frames, colours float in [−1, 1], depth in metres; or more of
+            them, as many as fill latent frames.
+        control: (B, T) cameras of all frames, and (B, T − 1) actions if there are any.
+        noise_B: deviation of noise that was added to the observed colours; None for none.
+        clean_BTHWC: these colours before that; None where there is no noise.
+    """
+    batch, rgb = len(observed.depth_THW), observed.rgb_THWC
+    first = codecs.encode_rgbd(model, params, rgb, observed.depth_THW, condition=True)
+    seen = Observed(
+        _seen(model, first),
+        rgb if clean_BTHWC is None else clean_BTHWC,
+        jnp.zeros((batch,)) if noise_B is None else noise_B,
+    )
+    shown = backbones.observed(model, params, seen)
+    steering = controls.condition(model, params.get("control", {}), observed, control)
+    joined = [x for x in (shown.joined_BthwC, steering.joined_BthwC) if x is not None]
+    given = dataclasses.replace(
+        shown,
+        joined_BthwC=jnp.concatenate(joined, -1),
+        modulation_BtE=steering.modulation_BtE,
+        tokens_BLC=_text(model, params, batch, steering.tokens_BLC),
+    )
+    return ClipConditioning(given, control.camera, camera_control.rays(model, control.camera))
+
+
+def blind(
+    model: ModelConfig, params: Params, conditioning: ClipConditioning, hidden_B: Array
+) -> ClipConditioning:
+    """Hide from clips of a batch what guidance is on, in a world without a memory.
+
+    That is the observed image, or, of a backbone that is guided by text, the prompt: the negative
+    prompt stands in its place.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; ``text`` is used.
+        conditioning: of a batch of clips.
+        hidden_B: (B,) bool, the clips from which it is hidden.
+    """
+    tokens = conditioning.given.tokens_BLC
+    if not model.backbone.GUIDED_BY_TEXT:
+        return without_image(model, conditioning, hidden_B)
+    stored = params.get("text", {})
+    if tokens is None or "negative_LC" not in stored:
+        return conditioning
+    negative = jnp.asarray(stored["negative_LC"], tokens.dtype)
+    other = tokens.at[:, : len(negative)].set(negative)
+    chosen = jnp.where(hidden_B[:, None, None], other, tokens)
+    given = dataclasses.replace(conditioning.given, tokens_BLC=chosen)
+    return dataclasses.replace(conditioning, given=given)
+
+
+def without_image(
+    model: ModelConfig, conditioning: ClipConditioning, hidden_B: Array
+) -> ClipConditioning:
+    """Hide the observed image from clips of a batch; control, text and scalars stay.
+
+    Args:
+        model: the model.
+        conditioning: of a batch of clips.
+        hidden_B: (B,) bool, the clips that are not to see it.
+    """
+    given = conditioning.given
+
+    def hide(x: Array, channels: int) -> Array:
+        there = hidden_B.reshape(-1, *(1,) * (x.ndim - 1))
+        return jnp.where(there & (np.arange(x.shape[-1]) < channels), 0, x)
+
+    joined, image, known = given.joined_BthwC, given.image_BMD, given.known_Bt
+    shown = model.backbone.shown_channels(model)
+    hidden = dataclasses.replace(
+        given,
+        joined_BthwC=None if joined is None else hide(joined, shown),
+        image_BMD=None if image is None else hide(image, image.shape[-1]),
+        known_Bt=None if known is None else known & ~jnp.asarray(hidden_B)[:, None],
+    )
+    return dataclasses.replace(conditioning, given=hidden)
+
+
+def _text(model: ModelConfig, params: Params, batch: int, more: Array | None) -> Array | None:
+    """Return the prompt's tokens (zeros without a prompt), followed by the control's."""
+    shape = model.backbone.text_shape
+    if shape is None:
+        return more
+    prompt = jnp.zeros(shape)
+    prompt = jnp.asarray(params.get("text", {}).get("prompt_LC", prompt), jnp.float32)
+    text = jnp.broadcast_to(prompt, (batch, *prompt.shape))
+    return text if more is None else jnp.concatenate([text, more], 1)
+
+
+def init(model: ModelConfig, key: Array, *, memory: bool = True) -> Params:
+    """Return random parameters; with ``memory`` also the reader's, without effect at first.
+
+    A backbone that names no places has no reader.
+    """
+    backbone_key, memory_key = jax.random.split(key)
+    frozen_key = jax.random.fold_in(key, 2)
+    channels = model.in_channels, model.codec.channels
+    params: Params = {"backbone": backbones.init(model.backbone, backbone_key, *channels)}
+    if memory and model.backbone.places is not None:
+        params["memory"] = readers.init(model, memory_key)
+    parts = {
+        "codec": codecs.init(model.codec, frozen_key),
+        "encoder": encoders.init(model.memory.encoder, jax.random.fold_in(frozen_key, 1)),
+        "control": controls.init(model, jax.random.fold_in(key, 3)),
+        "image": backbones.init_image(model.backbone, jax.random.fold_in(key, 4)),
+    }
+    params |= {name: part for name, part in parts.items() if part}
+    if model.backbone.stores_prompt:
+        names = ("prompt_LC", "negative_LC")[: 1 + model.backbone.GUIDED_BY_TEXT]
+        params["text"] = {name: jnp.zeros(model.backbone.text_shape) for name in names}
+    return params
+
+
+def apply(
+    model: ModelConfig,
+    params: Params,
+    noisy_BthwC: Array,
+    conditioning: ClipConditioning,
+    time_B: Array,
+    sight: Sight | None = None,
+) -> Array:
+    """Predict the noise's target (x0, v, ε, velocity …) from noisy latents.
+
+    Args:
+        model: the model.
+        params: ``{"backbone": …, "memory": …}``.
+        noisy_BthwC: (B, t, h, w, C) noisy colour and depth latents.
+        conditioning: the observed frame, control and text.
+        time_B: (B,) noise level as the network sees it, or (B, t), one for each latent frame.
+        sight: what the memory shows each clip, leading axis B; None is the stage-1 model.
+
+    Returns:
+        (B, t, h, w, C) float32 prediction.
+    """
+    dtype, memory_readers = jnp.dtype(model.dtype), NO_READERS
+    if sight is not None and "memory" in params:
+        memory_readers = readers.prepare(
+            model, params["memory"], sight, conditioning.camera, conditioning.rays_BthwC
+        )
+    noisy = _seen(model, noisy_BthwC).astype(dtype)
+    out = backbones.apply(
+        model.backbone, params["backbone"], noisy, time_B, conditioning.given, memory_readers
+    )
+    return _seen(model, out.astype(jnp.float32))
+
+
+def _seen(model: ModelConfig, latents_C: Array) -> Array:
+    """Set the depth channels of latents to zero if the denoiser works without depth.
+
+    The channels remain, so that both variants have the same parameters.
+    """
+    if model.clip.depth:
+        return latents_C
+    colour = np.arange(latents_C.shape[-1]) < model.codec.rgb_channels
+    return jnp.where(colour, latents_C, 0)
