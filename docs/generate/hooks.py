@@ -1,4 +1,4 @@
-"""What MkDocs calls: adds the pages that are made, and moves links to the site."""
+"""Hooks of MkDocs: add generated pages, and rewrite links for the site."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ OUTSIDE = {page: origin for origin, page in links.HOMES.items() if origin != "RE
 
 
 def on_config(config: Any) -> Any:
-    """Add to the menu the chapters of the reference, and pages that it does not name."""
+    """Add the packages of the reference, and pages missing from the navigation, to the menu."""
     menu = {title: entries for part in config.nav for title, entries in part.items()}
     named = set(re.findall(r"[\w/]+\.md", str(menu)))
     pages_here = sorted(path.name for path in (code.ROOT / "docs").glob("*.md"))
-    menu["How to"] += [name for name in pages_here if name not in named]
-    chapters = [{name: f"reference/{name}.md"} for name, _ in links.chapters()]
-    config.nav.append({"Chapters": ["reference/index.md", *chapters]})
+    menu["How-to"] += [name for name in pages_here if name not in named]
+    packages = [{name: f"reference/{name}.md"} for name, _ in links.packages()]
+    menu["Reference"] += [{"Modules": ["reference/index.md", *packages]}]
     return config
 
 
 def on_files(files: Files, *, config: Any) -> Files:
-    """Add the pages that are made of code, results, cards and notebooks."""
+    """Add the pages generated from code, results, cards and notebooks."""
     made: dict[str, str | bytes] = {**pages.reference()}
     for page, origin in OUTSIDE.items():
         made[page] = (code.ROOT / origin).read_text("utf-8")
@@ -45,7 +45,7 @@ def on_files(files: Files, *, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Any) -> str:  # noqa: ARG001
-    """Show the code that a page names, and lead its links to pages of the site."""
+    """Insert the code that a page names, and rewrite its links for the site."""
     here = page.file.src_uri
     if here.startswith("reference/") or here in ("glossary.md", "numbers.md"):
         return markdown

@@ -1,12 +1,11 @@
-"""Links of Markdown files: reading them, following them, and moving them to the site.
+"""Links of Markdown files: find, check and rewrite them for the site.
 
-Files of the repository link to each other as a reader of the repository follows them. The site has
-most of them as pages, at other places; the rest loses its link and keeps its words.
+Files of the repository link to each other by their paths. The site has most of them as pages at
+other paths; links to other files are replaced by their text.
 """
 
 from __future__ import annotations
 
-import ast
 import posixpath
 import re
 from collections.abc import Iterator
@@ -84,7 +83,7 @@ def page_of(path: str, root: Path = code.ROOT) -> str | None:
     """Return where the site has a file of the repository, None if it has not.
 
     Args:
-        path: from the root of the repository; a folder is a chapter.
+        path: from the root of the repository; a folder is a package.
         root: the repository.
     """
     if path in HOMES:
@@ -97,10 +96,10 @@ def page_of(path: str, root: Path = code.ROOT) -> str | None:
     if parts[0] == "configs":
         return "reference/presets.md"
     if parts[0] == "pewm_jax" and len(parts) > 1:
-        chapter = Path(parts[1]).stem
-        if chapter in dict(chapters(root)):
+        package = Path(parts[1]).stem
+        if package in dict(packages(root)):
             anchor = f"#{code.module_of(path)}" if path.endswith(".py") else ""
-            return f"reference/{chapter}.md{anchor}"
+            return f"reference/{package}.md{anchor}"
     return None
 
 
@@ -137,18 +136,9 @@ def moved(origin: str, page: str, text: str, root: Path = code.ROOT) -> str:
     return re.sub(r"\x00(\d+)\x00", lambda found: kept[int(found[1])], text)
 
 
-def chapters(root: Path = code.ROOT) -> list[tuple[str, str]]:
-    """List the chapters and what they are about, in the reading order of the README."""
-    text = (root / "README.md").read_text("utf-8").split("## Reading order", 1)[1]
-    rows = re.findall(r"^\| (`.+?) \| (.+?) \|$", text.split("\n## ", 1)[0], re.MULTILINE)
-    found: dict[str, str] = {}
-    for names, question in rows:
-        named = [name.removesuffix(".py") for name in re.findall(r"`([a-z_0-9.]+?)/?`", names)]
-        for name in named:
-            chapter = "presets" if name == "configs" else name
-            path = root / "pewm_jax" / chapter
-            file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-            if file.is_file():
-                said = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or question
-                found[chapter] = question if len(named) == 1 else said.split("\n")[0]
-    return list(found.items())
+def packages(root: Path = code.ROOT) -> list[tuple[str, str]]:
+    """List the packages and their content, in the order of the table in docs/architecture.md."""
+    text = (root / "docs" / "architecture.md").read_text("utf-8").split("## Packages", 1)[1]
+    rows = re.findall(r"^\| `([a-z_0-9.]+?)/?` \| (.+?) \|$", text.split("\n## ", 1)[0], re.MULTILINE)
+    names = ((name.removesuffix(".py"), content) for name, content in rows)
+    return [("presets" if name == "configs" else name, content) for name, content in names]

@@ -11,15 +11,14 @@ from typing import Any
 
 from docs.generate import code, links
 
-NUMBERS = """# Numbers
+NUMBERS = """# Results
 
-Every number here was written by a command of the repository into a file of it, and this page is
-made from those files.
+All numbers on this page are read from files that commands of the repository wrote.
 """
 GLOSSARY = """# Letters
 
-Names of arrays end in letters, one for each axis: `tokens_BND` is batch × tokens × width. A number
-stands for an axis of that size: `points_world_M3`. Leading axes that may be anything are left out.
+Names of arrays end in one letter per axis: `tokens_BND` is batch × tokens × width. A digit is an axis
+of that size: `points_world_M3`. Arbitrary leading axes are omitted.
 
 | letter | axis | in the data types |
 |---|---|---|
@@ -27,7 +26,7 @@ stands for an axis of that size: `points_world_M3`. Leading axes that may be any
 OWN = """
 ## Letters of single files
 
-Some files need further letters; their docstrings say what they stand for.
+Some files use further letters; their docstrings define them.
 
 | letter | where |
 |---|---|
@@ -39,36 +38,36 @@ SUFFIX = re.compile(r"\b[a-z][a-z0-9_]*_([A-Ztwhnqk]*[A-Z][A-Ztwhnqk]*)[0-9]*\b"
 
 
 def reference(root: Path = code.ROOT) -> dict[str, str]:
-    """Return the pages of the reference: one for each chapter, from the docstrings."""
+    """Return the pages of the reference: one per package, from the docstrings."""
     pages, rows = {}, []
-    for chapter, question in links.chapters(root):
-        modules = list(modules_of(chapter, root))
+    for package, content in links.packages(root):
+        modules = list(modules_of(package, root))
         body = "".join(f"\n::: {name}\n" for name in modules)
-        pages[f"reference/{chapter}.md"] = (
-            f"# {chapter}\n\n{question[:1].upper()}{question[1:]}\n{body}"
+        pages[f"reference/{package}.md"] = (
+            f"# {package}\n\n{content[:1].upper()}{content[1:]}.\n{body}"
         )
-        rows.append(f"| [{chapter}]({chapter}.md) | {question} | {len(modules)} |")
-    head = "# Reference\n\nIn the reading order: a chapter imports only chapters above it.\n\n"
-    table = "| chapter | question | files |\n|---|---|---|\n"
+        rows.append(f"| [{package}]({package}.md) | {content} | {len(modules)} |")
+    head = "# Reference\n\nA package imports only packages above it in this table.\n\n"
+    table = "| package | content | files |\n|---|---|---|\n"
     pages["reference/index.md"] = head + table + "\n".join(rows) + "\n"
     return pages
 
 
-def modules_of(chapter: str, root: Path = code.ROOT) -> Iterator[str]:
-    """List the dotted names of a chapter's modules, its own first."""
-    folder = root / ("configs" if chapter == "presets" else f"pewm_jax/{chapter}")
+def modules_of(package: str, root: Path = code.ROOT) -> Iterator[str]:
+    """List the dotted names of a package's modules, its own first."""
+    folder = root / ("configs" if package == "presets" else f"pewm_jax/{package}")
     if not folder.is_dir():
-        yield f"pewm_jax.{chapter}"
+        yield f"pewm_jax.{package}"
         return
     for path in sorted(folder.rglob("*.py"), key=lambda p: (p.name != "__init__.py", p)):
         if path.name != "__main__.py":
             inside = path.relative_to(folder).with_suffix("").parts
             names = [name for name in inside if name != "__init__"]
-            yield ".".join(["pewm_jax", chapter, *names])
+            yield ".".join(["pewm_jax", package, *names])
 
 
 def letters(root: Path = code.ROOT) -> dict[str, str]:
-    """Return what each letter stands for, from the docstring of ``types``."""
+    """Return the meaning of each letter, from the docstring of ``types``."""
     text = (root / "pewm_jax" / "types.py").read_text("utf-8")
     (said,) = re.findall(r"^Letters: (.+?)\.$", text, re.MULTILINE | re.DOTALL)
     found: dict[str, str] = {}
@@ -113,19 +112,19 @@ def numbers(root: Path = code.ROOT) -> str:
         scores = section(card, "Scores")
         parts.append(f"## The model `{name}`\n\nFrom [its card](cards/{name}.md).\n\n{scores}")
     found = json.loads((root / "docs" / "table2" / "results.json").read_text("utf-8"))
-    parts.append("## Deciding by a world model\n\n" + table2(found))
+    parts.append("## Planning with a world model\n\n" + table2(found))
     recorded = (root / "benchmarks" / "RESULTS.md").read_text("utf-8").split("\n", 1)[1]
     recorded = re.sub(r"^<!--.*?-->\n", "", recorded, flags=re.MULTILINE)
     recorded = re.sub(r"^## ", "### ", recorded, flags=re.MULTILINE)
-    parts.append(f"## Speed, beside named peers\n{recorded}")
+    parts.append(f"## Speed against named baselines\n{recorded}")
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
 def table2(found: dict[str, Any]) -> str:
     """Return the scores of `results.json` as a table, means and 95 % intervals over houses."""
     lines = [
-        "From `docs/table2/results.json`, which `pewm-jax table2` writes; 95 % intervals over",
-        "houses. [What the rows are](planning.md#does-it-help-table-2).",
+        "From `docs/table2/results.json`, which `pewm-jax table2` writes; 95 % confidence intervals over",
+        "houses. [Definition of the rows](planning.md#table-2).",
         "",
         "| row | SIM, % | success, % | final position, m | final heading, ° |",
         "|---|---|---|---|---|",
@@ -170,5 +169,5 @@ def notebook(path: Path) -> tuple[str, dict[str, bytes]]:
         said = [o["text"] for o in cell["outputs"] if o["output_type"] == "stream"]
         if said:
             parts.append(f"```text\n{''.join(map(''.join, said)).rstrip()}\n```")
-    head = f"*[The notebook itself](../../notebooks/{path.name}) can be run.*"
+    head = f"*[Notebook](../../notebooks/{path.name})*"
     return "\n\n".join([parts[0], head, *parts[1:]]) + "\n", pictures
