@@ -12,11 +12,11 @@ import pewm_jax
 ROOT = Path(__file__).parents[1]
 CHAPTERS = [
     "errors",
-    "registry",
-    "config",
     "types",
+    "registry",
     "io",
     "shipped",
+    "config",
     "geometry",
     "houses",
     "data",

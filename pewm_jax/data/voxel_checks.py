@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from pewm_jax.config import ConfigError, GridConfig, UserError
-from pewm_jax.config.model import WorldSettings
+from pewm_jax.config.model import World
 from pewm_jax.data.voxel_classes import PALETTE, SIDE_LIMIT, VoxelsConfig
 from pewm_jax.data.voxel_frames import DTYPES, VoxelFrames, VoxelGrid
 from pewm_jax.types import Camera
@@ -26,7 +26,7 @@ LOOKS, STEP = 8, 3
 """Frames looked at, and of these every n-th row and column."""
 
 
-def require_same_cells(world: WorldSettings, episode: Episode) -> None:
+def require_same_cells(world: World, episode: Episode) -> None:
     """Refuse collected grids of other classes, or pictures of something else, than a world expects.
 
     Args:

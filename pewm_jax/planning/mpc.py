@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, UserError, WorldSettings
+from pewm_jax.config import Config, UserError, World
 from pewm_jax.data.progress import Meter
 from pewm_jax.planning.candidates import Imagination, Judged, Rollout
 from pewm_jax.planning.costs import FrameCost
@@ -49,7 +49,7 @@ class Mind:
 
 
 def imagining(
-    config: Config | WorldSettings,
+    config: Config | World,
     params: Params,
     *,
     batch: int = 6,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from pewm_jax.config import GridConfig, UserError
-from pewm_jax.config.model import WorldSettings
+from pewm_jax.config.model import World
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.importer import ImportConfig, import_recording
 from pewm_jax.data.navigation import NavGrid, is_free, sample_free
@@ -76,7 +76,7 @@ def open_place(start: Start, height: int, width: int) -> Place:
     return Place(name, simulator.frames(around), planar, simulator)
 
 
-def require_shown(model: WorldSettings, start: Start) -> None:
+def require_shown(model: World, start: Start) -> None:
     """Refuse to begin with pictures of something else than a world was trained on.
 
     Args:
