@@ -24,7 +24,7 @@ from jax.core import Tracer
 
 from pewm_jax.codecs.pixel import fold
 from pewm_jax.config import Codec, ModelConfig, functions
-from pewm_jax.geometry import holes
+from pewm_jax.geometry import depth_images
 from pewm_jax.nn import placement
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.nn.signals import depth_from_signal, signal_from_depth
@@ -102,7 +102,7 @@ def encode_rgbd(
             rgb_BTHWC,
         )
     depth = jnp.asarray(depth_BTHW)
-    whole = holes.fill_depth(depth.reshape(-1, *depth.shape[-2:]), model.clip.far_m)
+    whole = depth_images.fill_depth(depth.reshape(-1, *depth.shape[-2:]), model.clip.far_m)
     signal = signal_from_depth(model.clip, whole.reshape(depth.shape))[..., None]
     if not model.codec.DEPTH_AS_GREY:
         parts = [encode(model.codec, weights, x, condition=condition) for x in (rgb_BTHWC, signal)]

@@ -13,7 +13,7 @@ import numpy as np
 
 from pewm_jax.config import Memory
 from pewm_jax.geometry.cameras import project, unproject
-from pewm_jax.geometry.visibility import visible_first
+from pewm_jax.geometry.zbuffer import visible_first
 from pewm_jax.types import Array, Camera, Frames
 
 FAR_M = 1e4
@@ -91,7 +91,7 @@ def choose(
 ) -> Array:
     """Return (≤ ``memory.tokens``,) indices of the points that condition one clip.
 
-    By ``memory.choose``: those that the clip's cameras can see first (``geometry.visibility``), or
+    By ``memory.choose``: those that the clip's cameras can see first (``geometry.zbuffer``), or
     those in view by their distance (``in_view_first``).
 
     Args:

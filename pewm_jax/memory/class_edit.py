@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 
 from pewm_jax.config import Memory, UserError
-from pewm_jax.data.voxel_classes import VoxelsConfig
+from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.geometry.cameras import invert_rigid, transform_points
 from pewm_jax.memory import boxes
 from pewm_jax.types import Array
