@@ -9,9 +9,10 @@ import pytest
 from pewm_jax.config import ConfigError, GridConfig, ModelConfig, NomadWorldConfig, PersistConfig
 from pewm_jax.data import voxel_pictures
 from pewm_jax.data.episodes import read_episode
+from pewm_jax.data.loader import require_same_cells
 from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
 from pewm_jax.data.voxel_pictures import ahead
-from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig, require_same_cells
+from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig
 from pewm_jax.geometry import block_light
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera
