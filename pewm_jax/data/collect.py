@@ -14,7 +14,7 @@ from pewm_jax.config import UserError
 from pewm_jax.data import engines, resume, shading
 from pewm_jax.data.engines import Job
 from pewm_jax.data.make_episode import SPLITS, CollectConfig, settings_of
-from pewm_jax.data.progress import Meter
+from pewm_jax.io.progress import Meter
 
 
 def collect(config: CollectConfig, log: Callable[[str], None] = print) -> None:

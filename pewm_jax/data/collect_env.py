@@ -32,7 +32,7 @@ from pewm_jax.data.checks import check_episode
 from pewm_jax.data.dataset import describe_shard, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, read_episode, write_episode
 from pewm_jax.data.importer import planar_actions
-from pewm_jax.data.progress import Meter
+from pewm_jax.io.progress import Meter
 
 SPLITS = ("train", "validation", "test")
 """Folders written."""

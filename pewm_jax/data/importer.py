@@ -39,11 +39,11 @@ from pewm_jax.data.episodes import (
     read_episode,
     write_episode,
 )
-from pewm_jax.data.progress import Meter
 from pewm_jax.data.recordings import RecordedFrame, read_recording, read_voxels
 from pewm_jax.data.voxels import VoxelFrames, VoxelGrid, require_alike
 from pewm_jax.geometry.actions import actions_between
 from pewm_jax.geometry.cameras import resize_intrinsics
+from pewm_jax.io.progress import Meter
 
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 

@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pewm_jax.config import UserError
-from pewm_jax.data.progress import Meter
 from pewm_jax.data.voxels import SIDE_LIMIT, VoxelFrames
+from pewm_jax.io.progress import Meter
 
 COLOUR_FOLDERS = ("image", "color", "colour", "rgb")
 DEPTH_FOLDERS = ("depth",)

@@ -22,9 +22,9 @@ from pewm_jax.data.dataset import (
     splits,
 )
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.data.progress import Meter
 from pewm_jax.data.record_format import DamagedError
 from pewm_jax.data.voxels import VoxelGrid, require_alike
+from pewm_jax.io.progress import Meter
 
 SHOWN = 20
 """Most problems printed."""

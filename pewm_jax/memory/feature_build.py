@@ -16,9 +16,9 @@ from jax.sharding import PartitionSpec as P
 from pewm_jax.config import Encoder, UserError
 from pewm_jax.data.dataset import EpisodeSource, write_json
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.progress import Meter
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import tree, weights
+from pewm_jax.io.progress import Meter
 from pewm_jax.memory.feature_cache import (
     MANIFEST,
     TENSOR,

@@ -21,7 +21,7 @@ import numpy as np
 
 from pewm_jax import worlds
 from pewm_jax.config import Config, UserError, World
-from pewm_jax.data.progress import Meter
+from pewm_jax.io.progress import Meter
 from pewm_jax.planning.candidates import Imagination, Judged, Rollout
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.plan import Plan, plan
