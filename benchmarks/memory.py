@@ -40,7 +40,7 @@ from memory_peers import (
 )
 from record import machine, record, table
 
-from pewm_jax.config import MemorySettings
+from pewm_jax.config import Memory
 from pewm_jax.memory import voxel_map
 from pewm_jax.types import Frames
 
@@ -55,7 +55,7 @@ def seconds(run: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def inserter(config: MemorySettings, frames: Frames, features: jax.Array) -> Callable[[], object]:
+def inserter(config: Memory, frames: Frames, features: jax.Array) -> Callable[[], object]:
     """Return a compiled insertion of a clip into an empty map, waited for."""
     frames = jax.tree.map(jnp.asarray, frames)
     voxels = voxel_map.empty(config, np.zeros(3), features.shape[-1], features.dtype)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from pewm_jax.config import MemorySettings, VoxelConfig
+from pewm_jax.config import Memory, VoxelConfig
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, ray_directions
 from pewm_jax.memory import voxel_frames, voxel_map
 from pewm_jax.types import Camera, Frames
@@ -53,7 +53,7 @@ def room(noise_m: float, seed: int = 0) -> Frames:
     return Frames(np.zeros((T, 1, 1, 3), np.float32), depth.astype(np.float32), camera)
 
 
-def slots(config: MemorySettings, frames: Frames) -> np.ndarray:
+def slots(config: Memory, frames: Frames) -> np.ndarray:
     """Return (T, H, W) int64: the slot of every pixel; V − 1 is never occupied here."""
     voxels = voxel_map.empty(config, np.zeros(3), 1)
     frames = jax.tree.map(jnp.asarray, frames)

@@ -1,25 +1,28 @@
-"""The registry of kinds: which settings a section of a model may hold, and their functions.
+"""The registry of kinds: which classes a section of a model may hold, by name.
 
-A model consists of parts (a backbone, a codec, a control, a memory with its encoder and reader, a
-noise). Each part comes in several kinds. A kind is a frozen dataclass of settings and a module (or
-any object) with its functions. One call makes it known::
+A model consists of parts: a backbone, a codec, a control, a memory with its encoder and reader, a
+noise; a world puts them together. Each part comes in several kinds. A kind is one class: a frozen
+dataclass whose fields are its settings and whose methods are its functions. Its base class in
+``pewm_jax.config.parts`` documents the methods. A decorator registers it::
 
-    register("backbone", "mine", MyConfig, my_module)
+    @register("codec", "turn")
+    @dataclasses.dataclass(frozen=True)
+    class TurnCodec(Codec):
+        spatial: int = 4
 
-From then on its functions are found by the type of the settings:
-``functions(settings).apply(settings, …)``. In JSON, a section names its kind:
-``{"backbone": {"kind": "mine", "layers": 4}}``. The functions of each part are documented in
-``pewm_jax.models`` (``backbones``, ``codecs``, ``controls``, ``readers``, ``encoders``),
-``pewm_jax.memory.memories``, ``pewm_jax.diffusion.noise`` and ``pewm_jax.worlds``.
+        def encode(self, params, video_BTHWC, *, condition=False): ...
 
-When a name is not known, the modules of the entry-point group ``pewm_jax.kinds`` are imported, by
-which installed packages register kinds of theirs.
+In JSON, a section names its kind: ``{"codec": {"kind": "turn", "spatial": 8}}``. Built-in kinds
+stand in ``BUILT_IN`` and are imported when they are first used. When a name is not known, the
+modules of the entry-point group ``pewm_jax.kinds`` are imported, by which installed packages
+register kinds of their own.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+from collections.abc import Callable
 from importlib import metadata
 from typing import Any, ClassVar
 
@@ -53,47 +56,142 @@ class Kind:
     Attributes:
         section: the part, such as ``backbone``.
         name: its name in JSON and flags.
-        settings: its frozen dataclass, a subclass of the section's settings.
-        where: the name of the module with its functions, imported when first used, so that
-            reading settings loads no networks; or an object with the functions.
+        settings: its class, a frozen dataclass derived from the section's interface.
+        where: for a kind whose functions are not methods yet: the name of the module with its
+            functions, or an object with them; else None.
     """
 
     section: str
     name: str
     settings: type
-    where: Any
+    where: Any = None
 
 
 GROUP = "pewm_jax.kinds"
 """The entry points whose modules register kinds when they are imported."""
+
+BUILT_IN: dict[str, dict[str, str]] = {
+    "world": {
+        "pewm": "pewm_jax.config.model:ModelConfig",
+        "codec": "pewm_jax.config.codec_world:CodecWorldConfig",
+        "egowm": "pewm_jax.config.egowm:EgoWMConfig",
+        "persist": "pewm_jax.config.persist:PersistConfig",
+        "nomad": "pewm_jax.config.nomad:NomadWorldConfig",
+    },
+    "backbone": {
+        "dit": "pewm_jax.config.dit:DiTConfig",
+        "svd_unet": "pewm_jax.config.svd_unet:SVDUNetConfig",
+        "cosmos": "pewm_jax.config.cosmos:CosmosConfig",
+        "persist": "pewm_jax.config.persist:PersistNetsConfig",
+    },
+    "codec": {
+        "pixel": "pewm_jax.config.codec:PixelConfig",
+        "vae": "pewm_jax.config.vae:VAEConfig",
+        "svd_vae": "pewm_jax.config.svd_vae:SVDVAEConfig",
+        "wan_vae": "pewm_jax.config.wan_vae:WanVAEConfig",
+        "learned": "pewm_jax.config.learned_codec:LearnedCodecConfig",
+    },
+    "control": {
+        "camera": "pewm_jax.config.control:CameraConfig",
+        "actions": "pewm_jax.config.control:ModulationConfig",
+    },
+    "encoder": {
+        "patch_colours": "pewm_jax.config.encoder:PatchColoursConfig",
+        "latents": "pewm_jax.config.encoder:LatentsConfig",
+        "dinov2": "pewm_jax.config.encoder:DINOv2EncoderConfig",
+    },
+    "reader": {
+        "attend": "pewm_jax.config.reader:AttentionConfig",
+        "render": "pewm_jax.config.reader:RenderConfig",
+        "both": "pewm_jax.config.reader:BothConfig",
+    },
+    "memory": {
+        "voxel": "pewm_jax.config.memory:VoxelConfig",
+        "map2d": "pewm_jax.config.memory:Map2DConfig",
+        "points": "pewm_jax.config.memory:PointsConfig",
+        "surfels": "pewm_jax.config.memory:SurfelConfig",
+        "grid": "pewm_jax.config.persist:GridConfig",
+        "images": "pewm_jax.config.memory:ImagesConfig",
+        "none": "pewm_jax.config.memory:NoMemoryConfig",
+    },
+    "noise": {
+        "ddpm": "pewm_jax.config.noise:DDPMConfig",
+        "edm": "pewm_jax.config.noise:EDMConfig",
+        "flow": "pewm_jax.config.noise:FlowConfig",
+        "frame_flow": "pewm_jax.config.frame_flow:FrameFlowConfig",
+    },
+}
+"""Section → name → "module:class" of the kinds of this package, imported when first used."""
+
+MODULES: dict[str, str] = {
+    "world.pewm": "pewm_jax.worlds.pewm.world",
+    "world.codec": "pewm_jax.worlds.codec",
+    "world.egowm": "pewm_jax.worlds.egowm.world",
+    "world.persist": "pewm_jax.worlds.persist.world",
+    "world.nomad": "pewm_jax.worlds.nomad",
+    "backbone.dit": "pewm_jax.models.cogvideox.backbone",
+    "backbone.svd_unet": "pewm_jax.models.svd.backbone",
+    "backbone.cosmos": "pewm_jax.models.cosmos.backbone",
+    "backbone.persist": "pewm_jax.models.persist.nets",
+    "codec.pixel": "pewm_jax.codecs.pixel",
+    "codec.vae": "pewm_jax.models.cogvideox.vae_codec",
+    "codec.svd_vae": "pewm_jax.models.svd.vae_codec",
+    "codec.wan_vae": "pewm_jax.models.wan.codec",
+    "codec.learned": "pewm_jax.codecs.learned",
+    "control.camera": "pewm_jax.controls.camera",
+    "control.actions": "pewm_jax.controls.actions",
+    "encoder.patch_colours": "pewm_jax.encoders.patch_colours",
+    "encoder.latents": "pewm_jax.encoders.latents",
+    "encoder.dinov2": "pewm_jax.models.dinov2.encoder",
+    "reader.attend": "pewm_jax.readers.attention",
+    "reader.render": "pewm_jax.readers.render",
+    "reader.both": "pewm_jax.readers.both",
+    "memory.voxel": "pewm_jax.memory.voxel_memory",
+    "memory.map2d": "pewm_jax.memory.map2d",
+    "memory.points": "pewm_jax.memory.points",
+    "memory.surfels": "pewm_jax.memory.surfels",
+    "memory.grid": "pewm_jax.memory.class_grid",
+    "memory.images": "pewm_jax.memory.images",
+    "memory.none": "pewm_jax.memory.nothing",
+    "noise.ddpm": "pewm_jax.diffusion.ddpm",
+    "noise.edm": "pewm_jax.diffusion.edm",
+    "noise.flow": "pewm_jax.diffusion.flow",
+    "noise.frame_flow": "pewm_jax.diffusion.frame_flow",
+}
+"""The modules of the built-in kinds whose functions are not methods yet; see ``functions``."""
 
 _KINDS: dict[tuple[str, str], Kind] = {}
 _ENTERED: set[str] = set()
 """Modules of entry points that were imported, or are being imported."""
 
 
-def register(section: str, name: str, settings: type, where: Any) -> None:
-    """Make a kind known.
+def register(section: str, name: str, settings: type | None = None, where: Any = None) -> Any:
+    """Register a kind, by a call or as a decorator: ``@register("codec", "turn")``.
 
-    Registering the same settings again replaces them and their functions: the same class, or the
-    one that a notebook's cell or a reloaded module defines anew.
+    Registering the same class again replaces it: the same object, or the class that a notebook's
+    cell or a reloaded module defines again.
 
     Args:
         section: the part of a model, such as ``backbone``.
         name: the kind's name in JSON and flags.
-        settings: a frozen dataclass, subclass of the section's settings.
-        where: the name of the module with its functions, or a module or other object.
+        settings: a frozen dataclass, subclass of the section's interface; None makes a decorator.
+        where: a module, its name or another object with the functions, if they are not methods.
+
+    Returns:
+        The class, or the decorator.
 
     Raises:
-        ConfigError: the settings are no frozen dataclass or of another section, or the name is
-            taken by other settings.
+        ConfigError: the class is not a frozen dataclass or is of another section, or the name is
+            taken by another class.
     """
+    if settings is None:
+        return lambda decorated: register(section, name, decorated)
     if not (isinstance(settings, type) and issubclass(settings, Settings)) or (
         section != settings.SECTION
     ):
         raise ConfigError(
             f"{getattr(settings, '__name__', settings)} cannot be registered as a {section}: "
-            f"derive a class from the settings of that section, which say SECTION = {section!r}."
+            f"derive a class from the interface of that section, with SECTION = {section!r}."
         )
     parameters = vars(settings).get("__dataclass_params__")
     if parameters is None or not parameters.frozen:
@@ -101,27 +199,65 @@ def register(section: str, name: str, settings: type, where: Any) -> None:
             f"{settings.__name__} cannot be registered as a {section}: it is no frozen dataclass, "
             "so write @dataclasses.dataclass(frozen=True) above it."
         )
+    built_in = BUILT_IN.get(section, {}).get(name)
     taken = _KINDS.get((section, name))
     if taken is not None and not _same(taken.settings, settings):
-        raise ConfigError(
-            f"There is a {section} {name!r} already ({taken.settings.__name__}); choose another "
-            "name."
-        )
-    _KINDS[section, name] = Kind(section, name, settings, where)
+        found = taken.settings.__name__
+    elif built_in is not None and built_in != _address(settings):
+        found = built_in.partition(":")[2]
+    else:
+        _KINDS[section, name] = Kind(section, name, settings, where)
+        return settings
+    raise ConfigError(f"There is a {section} {name!r} already ({found}); choose another name.")
+
+
+def part(section: str, name: str, **settings: Any) -> Any:
+    """Return a dataclass field whose default is made when a value is needed.
+
+    ``codec: Codec = part("codec", "pixel")`` imports the pixel codec only when a model without
+    another codec is built.
+
+    Args:
+        section: the part of a model.
+        name: the kind of the default.
+        settings: of the default, where they differ from the kind's own.
+    """
+    return dataclasses.field(
+        default_factory=lambda: named(section, name).settings(**settings),
+        metadata={"section": section, "kind": name},
+    )
+
+
+def default_of(field: dataclasses.Field[Any]) -> Any:
+    """Return the default of a field; ``dataclasses.MISSING`` if it has none."""
+    if field.default_factory is dataclasses.MISSING:
+        return field.default
+    return field.default_factory()
+
+
+def usual(field: dataclasses.Field[Any]) -> type:
+    """Return the type of a field's default; for a field made by ``part``, its kind's class."""
+    if "section" in field.metadata:
+        return named(field.metadata["section"], field.metadata["kind"]).settings
+    return type(default_of(field))
+
+
+def _address(settings: type) -> str:
+    return f"{settings.__module__}:{settings.__qualname__}"
 
 
 def _same(one: type, other: type) -> bool:
     """Tell whether two classes are one, or the same definition run twice."""
-    return (one.__module__, one.__qualname__) == (other.__module__, other.__qualname__)
+    return _address(one) == _address(other)
 
 
 def names(section: str) -> list[str]:
     """Return the names of the kinds of a section."""
-    return sorted(name for part, name in _KINDS if part == section)
+    return sorted({name for known, name in _KINDS if known == section} | set(BUILT_IN[section]))
 
 
 def named(section: str, name: str) -> Kind:
-    """Return a kind by its name; installed packages are asked for one that is not known.
+    """Return a kind by its name; if it is not known, import the modules of entry points first.
 
     Raises:
         ConfigError: there is no such kind; the message lists the known ones, and the modules of
@@ -129,6 +265,10 @@ def named(section: str, name: str) -> Kind:
     """
     failed: list[str] = []
     if isinstance(name, str):  # a table read from JSON may hold anything
+        if (section, name) not in _KINDS and name in BUILT_IN.get(section, {}):
+            module, _, attribute = BUILT_IN[section][name].partition(":")
+            settings = getattr(imported(module, f"{section} of kind {name!r}"), attribute)
+            register(section, name, settings, MODULES.get(f"{section}.{name}"))
         if (section, name) not in _KINDS:
             failed = _import_entry_points()
         if (section, name) in _KINDS:
@@ -183,23 +323,31 @@ def of(settings: Any) -> Kind:
     Raises:
         ConfigError: their type is not registered.
     """
-    for same in (lambda one, other: one is other, _same):
-        for kind in _KINDS.values():
-            if same(kind.settings, type(settings)):
-                return kind
+    kind = type(settings)
+    same: tuple[Callable[[type, type], bool], ...] = (lambda one, other: one is other, _same)
+    for equal in same:
+        for known in _KINDS.values():
+            if equal(known.settings, kind):
+                return known
+    for section, table in BUILT_IN.items():
+        for name, address in table.items():
+            if address == _address(kind):
+                return named(section, name)
     raise ConfigError(
-        f"{type(settings).__name__} is not registered: call pewm_jax.config.register(section, "
-        "name, settings, functions) once, where it is defined."
+        f"{kind.__name__} is not registered: call pewm_jax.config.register(section, name, "
+        f"{kind.__name__}) once, where it is defined."
     )
 
 
 def functions(settings: Any) -> Any:
-    """Return the module or object with the functions for settings, chosen by their type.
+    """Return the object with the functions of settings: themselves, if they have methods.
 
     Raises:
         ConfigError: their type is not registered, or the module cannot be imported.
     """
     kind = of(settings)
+    if kind.where is None:
+        return settings
     if not isinstance(kind.where, str):
         return kind.where
     return imported(kind.where, f"{kind.section} of kind {kind.name!r}")
@@ -219,13 +367,13 @@ def require_section(value: Any, section: str, where: str) -> None:
     given = not isinstance(value, type) and dataclasses.is_dataclass(value)
     if not given or getattr(value, "SECTION", None) != section:
         found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
-        there = [kind.settings.__name__ for kind in _KINDS.values() if kind.section == section]
+        there = [address.partition(":")[2] for address in BUILT_IN[section].values()]
+        there += [kind.settings.__name__ for kind in _KINDS.values() if kind.section == section]
         raise ConfigError(
             f"{where} is {found}: give it settings of the section {section!r}, such as "
-            f"{' or '.join(there)}."
+            f"{' or '.join(dict.fromkeys(there))}."
         )
     for field in dataclasses.fields(value):
-        if isinstance(field.default, Settings):
-            require_section(
-                getattr(value, field.name), field.default.SECTION, f"{where}.{field.name}"
-            )
+        below = field.metadata.get("section", getattr(field.default, "SECTION", None))
+        if below is not None:
+            require_section(getattr(value, field.name), below, f"{where}.{field.name}")

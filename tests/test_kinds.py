@@ -22,10 +22,10 @@ from pewm_jax.config import (
     ConfigError,
     DDPMConfig,
     ModelConfig,
-    NoiseSettings,
+    Noise,
     PixelConfig,
     VoxelConfig,
-    WorldSettings,
+    World,
     flags,
     register,
 )
@@ -37,11 +37,11 @@ PART = """
     import dataclasses
     import sys
 
-    from pewm_jax.config import NoiseSettings, register
+    from pewm_jax.config import Noise, register
 
 
     @dataclasses.dataclass(frozen=True)
-    class MineConfig(NoiseSettings):
+    class MineConfig(Noise):
         sample_steps: int = 3
         strength: float = 1.0
 
@@ -199,7 +199,7 @@ def cell(module="__main__"):
     """What a notebook's cell defines each time it is run."""
 
     @dataclasses.dataclass(frozen=True)
-    class Cell(NoiseSettings):
+    class Cell(Noise):
         sample_steps: int = 3
 
     Cell.__module__ = module
@@ -229,7 +229,7 @@ def test_a_module_that_is_reloaded_registers_anew(tmp_path, monkeypatch):
     assert kinds.named("noise", "reloaded").settings is module.MineConfig is not first
 
 
-class Plain(NoiseSettings):
+class Plain(Noise):
     pass
 
 
@@ -238,7 +238,7 @@ class Undecorated(DDPMConfig):
 
 
 @dataclasses.dataclass
-class Thawed(NoiseSettings):
+class Thawed(Noise):
     extra: int = 3
 
 
@@ -311,17 +311,17 @@ def test_a_kind_is_chosen_together_with_what_it_needs(words, tmp_path):
 
 
 @dataclasses.dataclass(frozen=True)
-class Demanding(NoiseSettings):
+class Demanding(Noise):
     strength: float
     sample_steps: int = 3
 
 
 def test_settings_without_a_default_are_asked_for():
     register("noise", "demanding", Demanding, "json")
-    found = configuration.from_dict(NoiseSettings, {"kind": "demanding", "strength": 2})
+    found = configuration.from_dict(Noise, {"kind": "demanding", "strength": 2})
     assert found == Demanding(2.0)
     with pytest.raises(ConfigError, match="config lacks strength") as refusal:
-        configuration.from_dict(NoiseSettings, {"kind": "demanding"})
+        configuration.from_dict(Noise, {"kind": "demanding"})
     one_sentence(refusal)
     with pytest.raises(ConfigError, match="strength have no default") as refusal:
         flags.take_kinds(["--model.noise.kind", "demanding"], Config())
@@ -332,8 +332,8 @@ DDPM = DDPMConfig()
 
 
 @dataclasses.dataclass(frozen=True)
-class Other(WorldSettings):
-    noise: NoiseSettings = DDPM
+class Other(World):
+    noise: Noise = DDPM
     dtype: str = "float32"
 
 

@@ -19,7 +19,7 @@ from pewm_jax.config import (
 )
 from pewm_jax.diffusion import noise as noises
 from pewm_jax.geometry import actions as action_geometry
-from pewm_jax.geometry import camera_steps
+from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.memory import class_edit, class_grid, memories
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import voxel_dit, voxel_vae
@@ -190,7 +190,7 @@ def test_the_cache_of_a_rollout_is_that_of_its_frames_at_once(params, state):
     for move in (MOVES[0] * 0.01, MOVES[1] * 0.01):  # small steps, that leave the window
         grid = windows.window(MODEL, present.map.classes_XYZ, present.map.history.start_3)
         told = windows.told(MODEL, shown, middle)
-        camera = camera_steps.numbers(shown.camera, MODEL.clip.width, middle)
+        camera = camera_numbers(shown.camera, MODEL.clip.width, middle)
         latents = voxel_vae.encode(coder, params["voxel_vae"], grid[None].astype(int))[0]
         frames.append((latents, present.map.history.action_A, told, camera))
         shown = persist.past_of(MODEL, params, present).shown

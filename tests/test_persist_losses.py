@@ -13,7 +13,8 @@ from pewm_jax.config import (
     VoxelVAEConfig,
 )
 from pewm_jax.diffusion import frame_flow
-from pewm_jax.geometry import camera_steps, cameras
+from pewm_jax.geometry import cameras
+from pewm_jax.geometry.actions import camera_steps_between
 from pewm_jax.geometry.march import Layers
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.types import Camera
@@ -131,7 +132,7 @@ def test_the_camera_learns_steps_and_does_not_see_where_the_next_grid_lies():
     first, second = (
         jax.tree.map(lambda x, c=c: x[:, c], seen) for c in (slice(-1), slice(1, None))
     )
-    steps = camera_steps.between(first, second, 32)
+    steps = camera_steps_between(first, second, 32)
     np.testing.assert_allclose(loss, jnp.square(steps / np.array(units)).mean(), rtol=1e-5)
     away = np.linalg.norm(steps[..., :3], axis=-1).mean()
     np.testing.assert_allclose(measured["metres_off"], away, rtol=1e-5)

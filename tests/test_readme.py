@@ -187,7 +187,7 @@ def test_make_test_runs_the_suite():
             ".venv/installed-dev",
             "test",
             f"PY={sys.executable}",
-            "ARGS=tests/test_tree.py",
+            "ARGS=tests/io/test_tree.py",
         ],
         ROOT,
     )

@@ -111,7 +111,7 @@ def _measured(
 
     from pewm_jax.config import PersistConfig
     from pewm_jax.data.dataset import EpisodeSource
-    from pewm_jax.data.voxel_checks import require_same_cells
+    from pewm_jax.data.loader import require_same_cells
     from pewm_jax.eval import edit_trials, horizon, voxel_score
     from pewm_jax.eval.metrics.videos import read
     from pewm_jax.models.i3d import weights as i3d_weights

@@ -1,6 +1,6 @@
 """Pixels ↔ latents: every codec behind one interface, chosen by the type of its settings.
 
-A codec is a ``CodecSettings`` and a module (or object) with
+A codec is a ``Codec`` and a module (or object) with
 
     init(settings, key) -> params                                    {} if it has none
     encode(settings, params, video_BTHWC, *, condition=False) -> latents_BthwC
@@ -23,22 +23,20 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from pewm_jax.codecs.pixel import fold
-from pewm_jax.config import CodecSettings, ModelConfig, functions
-from pewm_jax.geometry import holes
+from pewm_jax.config import Codec, ModelConfig, functions
+from pewm_jax.geometry import depth_images
 from pewm_jax.nn import placement
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.nn.signals import depth_from_signal, signal_from_depth
 from pewm_jax.types import Array, Params, View
 
 
-def init(config: CodecSettings, key: Array) -> Params:
+def init(config: Codec, key: Array) -> Params:
     """Return random parameters of a codec; the pixel codec has none."""
     return functions(config).init(config, key)
 
 
-def encode(
-    config: CodecSettings, params: Params, video_BTHWC: Array, *, condition: bool = False
-) -> Array:
+def encode(config: Codec, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
     """Encode a video.
 
     Args:
@@ -57,7 +55,7 @@ def encode(
     return functions(config).encode(config, params, video_BTHWC, condition=condition)
 
 
-def decode(config: CodecSettings, params: Params, latents_BthwC: Array) -> Array:
+def decode(config: Codec, params: Params, latents_BthwC: Array) -> Array:
     """Decode latents, the inverse of ``encode``.
 
     Args:
@@ -104,7 +102,7 @@ def encode_rgbd(
             rgb_BTHWC,
         )
     depth = jnp.asarray(depth_BTHW)
-    whole = holes.fill_depth(depth.reshape(-1, *depth.shape[-2:]), model.clip.far_m)
+    whole = depth_images.fill_depth(depth.reshape(-1, *depth.shape[-2:]), model.clip.far_m)
     signal = signal_from_depth(model.clip, whole.reshape(depth.shape))[..., None]
     if not model.codec.DEPTH_AS_GREY:
         parts = [encode(model.codec, weights, x, condition=condition) for x in (rgb_BTHWC, signal)]

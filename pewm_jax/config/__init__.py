@@ -4,19 +4,20 @@ A field's docstring is its ``--help`` text. Values that cannot work are refused 
 is built, in a sentence that names the fix; other code does not check them again.
 """
 
-from pewm_jax.config.backbone import BackboneSettings, Places
+import warnings
+from typing import Any
+
 from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
 from pewm_jax.config.clip_vision import CLIPVisionConfig
-from pewm_jax.config.codec import CodecSettings, PixelConfig
+from pewm_jax.config.codec import PixelConfig
 from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
-from pewm_jax.config.control import CameraConfig, ControlSettings, ModulationConfig
+from pewm_jax.config.control import CameraConfig, ModulationConfig
 from pewm_jax.config.cosmos import COSMOS_2B, COSMOS_14B, CosmosConfig
 from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
 from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
 from pewm_jax.config.encoder import (
     DINOv2EncoderConfig,
-    EncoderSettings,
     LatentsConfig,
     PatchColoursConfig,
 )
@@ -28,7 +29,6 @@ from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.memory import (
     ImagesConfig,
     Map2DConfig,
-    MemorySettings,
     NoMemoryConfig,
     PointsConfig,
     SurfelConfig,
@@ -36,9 +36,20 @@ from pewm_jax.config.memory import (
 )
 from pewm_jax.config.mesh import AXES, MeshConfig
 from pewm_jax.config.migrations import upgrade
-from pewm_jax.config.model import ModelConfig, WorldSettings
-from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig, NoiseSettings
+from pewm_jax.config.model import ModelConfig
+from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig
 from pewm_jax.config.nomad import NomadConfig, NomadTrainConfig, NomadWorldConfig
+from pewm_jax.config.parts import (
+    Backbone,
+    Codec,
+    Conditioner,
+    Encoder,
+    InjectionPoints,
+    Memory,
+    Noise,
+    Reader,
+    World,
+)
 from pewm_jax.config.persist import (
     POINT_WAVES,
     GridConfig,
@@ -46,7 +57,7 @@ from pewm_jax.config.persist import (
     PersistNetsConfig,
     PersistTrainConfig,
 )
-from pewm_jax.config.reader import AttentionConfig, BothConfig, ReaderSettings, RenderConfig
+from pewm_jax.config.reader import AttentionConfig, BothConfig, RenderConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
 from pewm_jax.config.svd_unet import SVDUNetConfig
 from pewm_jax.config.svd_vae import SVDVAEConfig
@@ -57,40 +68,6 @@ from pewm_jax.config.voxel_vae import VoxelVAEConfig
 from pewm_jax.config.wan_vae import WanVAEConfig
 from pewm_jax.errors import ConfigError, UserError
 from pewm_jax.registry import Settings, functions, register
-
-register("world", "pewm", ModelConfig, "pewm_jax.worlds.pewm.world")
-register("world", "codec", CodecWorldConfig, "pewm_jax.worlds.codec")
-register("world", "egowm", EgoWMConfig, "pewm_jax.worlds.egowm.world")
-register("world", "persist", PersistConfig, "pewm_jax.worlds.persist.world")
-register("world", "nomad", NomadWorldConfig, "pewm_jax.worlds.nomad")
-register("backbone", "dit", DiTConfig, "pewm_jax.models.cogvideox.backbone")
-register("backbone", "svd_unet", SVDUNetConfig, "pewm_jax.models.svd.backbone")
-register("backbone", "cosmos", CosmosConfig, "pewm_jax.models.cosmos.backbone")
-register("backbone", "persist", PersistNetsConfig, "pewm_jax.models.persist.nets")
-register("codec", "pixel", PixelConfig, "pewm_jax.codecs.pixel")
-register("codec", "vae", VAEConfig, "pewm_jax.models.cogvideox.vae_codec")
-register("codec", "svd_vae", SVDVAEConfig, "pewm_jax.models.svd.vae_codec")
-register("codec", "wan_vae", WanVAEConfig, "pewm_jax.models.wan.codec")
-register("codec", "learned", LearnedCodecConfig, "pewm_jax.codecs.learned")
-register("control", "camera", CameraConfig, "pewm_jax.controls.camera")
-register("control", "actions", ModulationConfig, "pewm_jax.controls.actions")
-register("encoder", "patch_colours", PatchColoursConfig, "pewm_jax.encoders.patch_colours")
-register("encoder", "latents", LatentsConfig, "pewm_jax.encoders.latents")
-register("encoder", "dinov2", DINOv2EncoderConfig, "pewm_jax.models.dinov2.encoder")
-register("reader", "attend", AttentionConfig, "pewm_jax.readers.attention")
-register("reader", "render", RenderConfig, "pewm_jax.readers.render")
-register("reader", "both", BothConfig, "pewm_jax.readers.both")
-register("memory", "voxel", VoxelConfig, "pewm_jax.memory.voxel_memory")
-register("memory", "map2d", Map2DConfig, "pewm_jax.memory.map2d")
-register("memory", "points", PointsConfig, "pewm_jax.memory.points")
-register("memory", "surfels", SurfelConfig, "pewm_jax.memory.surfels")
-register("memory", "grid", GridConfig, "pewm_jax.memory.class_grid")
-register("memory", "images", ImagesConfig, "pewm_jax.memory.images")
-register("memory", "none", NoMemoryConfig, "pewm_jax.memory.nothing")
-register("noise", "ddpm", DDPMConfig, "pewm_jax.diffusion.ddpm")
-register("noise", "edm", EDMConfig, "pewm_jax.diffusion.edm")
-register("noise", "flow", FlowConfig, "pewm_jax.diffusion.flow")
-register("noise", "frame_flow", FrameFlowConfig, "pewm_jax.diffusion.frame_flow")
 
 __all__ = [
     "AXES",
@@ -104,19 +81,19 @@ __all__ = [
     "VERSION",
     "ActionConfig",
     "AttentionConfig",
-    "BackboneSettings",
+    "Backbone",
     "BlocksConfig",
     "BothConfig",
     "CLIPVisionConfig",
     "CameraConfig",
     "CameraModelConfig",
     "ClipConfig",
-    "CodecSettings",
+    "Codec",
     "CodecTrainConfig",
     "CodecWorldConfig",
+    "Conditioner",
     "Config",
     "ConfigError",
-    "ControlSettings",
     "CosmosConfig",
     "DDPMConfig",
     "DINOv2Config",
@@ -126,23 +103,24 @@ __all__ = [
     "EDMConfig",
     "EgoWMConfig",
     "EgoWMTrainConfig",
-    "EncoderSettings",
+    "Encoder",
     "EvalConfig",
     "FlowConfig",
     "FrameFlowConfig",
     "GridConfig",
     "ImagesConfig",
+    "InjectionPoints",
     "Join",
     "LatentsConfig",
     "Launch",
     "LearnedCodecConfig",
     "Map2DConfig",
-    "MemorySettings",
+    "Memory",
     "MeshConfig",
     "ModelConfig",
     "ModulationConfig",
     "NoMemoryConfig",
-    "NoiseSettings",
+    "Noise",
     "NomadConfig",
     "NomadTrainConfig",
     "NomadWorldConfig",
@@ -151,9 +129,8 @@ __all__ = [
     "PersistNetsConfig",
     "PersistTrainConfig",
     "PixelConfig",
-    "Places",
     "PointsConfig",
-    "ReaderSettings",
+    "Reader",
     "RenderConfig",
     "SVDUNetConfig",
     "SVDVAEConfig",
@@ -169,7 +146,7 @@ __all__ = [
     "VoxelRendererConfig",
     "VoxelVAEConfig",
     "WanVAEConfig",
-    "WorldSettings",
+    "World",
     "from_dict",
     "functions",
     "load",
@@ -179,3 +156,30 @@ __all__ = [
     "to_dict",
     "upgrade",
 ]
+
+_RENAMED = {
+    "BackboneSettings": "Backbone",
+    "CodecSettings": "Codec",
+    "ControlSettings": "Conditioner",
+    "EncoderSettings": "Encoder",
+    "MemorySettings": "Memory",
+    "NoiseSettings": "Noise",
+    "Places": "InjectionPoints",
+    "ReaderSettings": "Reader",
+    "WorldSettings": "World",
+}
+"""Names of version 0.1 → their names now."""
+
+
+def __getattr__(name: str) -> Any:
+    """Return a class by the name that version 0.1 had for it, with a warning."""
+    if name not in _RENAMED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    now = _RENAMED[name]
+    warnings.warn(
+        f"pewm_jax.config.{name} is now pewm_jax.config.{now}; the old name will go in the next "
+        "version.",
+        DeprecationWarning,
+        stacklevel=2,
+    )
+    return globals()[now]

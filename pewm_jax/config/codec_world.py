@@ -6,10 +6,9 @@ import dataclasses
 from typing import ClassVar, Literal
 
 from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.codec import CodecSettings
 from pewm_jax.config.learned_codec import LearnedCodecConfig
-from pewm_jax.config.memory import MemorySettings, SurfelConfig
-from pewm_jax.config.model import WorldSettings
+from pewm_jax.config.memory import SurfelConfig
+from pewm_jax.config.parts import Codec, Memory, World
 from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.errors import require
 
@@ -63,7 +62,7 @@ class CodecTrainConfig(TrainSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class CodecWorldConfig(WorldSettings):
+class CodecWorldConfig(World):
     """A codec by itself, to be trained; it imagines nothing."""
 
     TRAIN: ClassVar[type[TrainSettings]] = CodecTrainConfig
@@ -71,9 +70,9 @@ class CodecWorldConfig(WorldSettings):
 
     clip: ClipConfig = ClipConfig(frames=2)
     """What the loader reads: every frame of a clip is learned from by itself."""
-    codec: CodecSettings = LearnedCodecConfig()
+    codec: Codec = LearnedCodecConfig()
     """The codec that is trained."""
-    memory: MemorySettings = SurfelConfig()
+    memory: Memory = SurfelConfig()
     """The memory that the gate sees rendered; it must show colours."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute precision; master weights of what trains stay float32."""

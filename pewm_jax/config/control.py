@@ -6,38 +6,12 @@ import dataclasses
 import math
 from typing import Any, ClassVar, Literal
 
+from pewm_jax.config.parts import Conditioner
 from pewm_jax.errors import require, require_positive
-from pewm_jax.registry import Settings
-
-
-class ControlSettings(Settings):
-    """Settings that every control has; see ``pewm_jax.controls.interface`` for its functions.
-
-    Attributes:
-        MODULATES: whether it adds to the time embedding of each latent frame.
-        actions: A, the numbers of an action that it needs; 0 where cameras are enough.
-        state: numbers of the agent's state at the first frame that it needs; 0 for none.
-        rate: factor of the learning rate of its parameters.
-    """
-
-    SECTION: ClassVar[str] = "control"
-    MODULATES: ClassVar[bool] = False
-    actions: Any = 0
-    state: Any = 0
-    rate: Any = 1.0
-
-    def channels(self, model: Any) -> int:
-        """Return the number of channels, at the latent rate, that it adds to the denoiser's input.
-
-        Args:
-            model: the ``ModelConfig`` that these settings are part of.
-        """
-        del model
-        return 0
 
 
 @dataclasses.dataclass(frozen=True)
-class CameraConfig(ControlSettings):
+class CameraConfig(Conditioner):
     """Control by cameras (the paper): their Plücker rays are concatenated to the input."""
 
     def channels(self, model: Any) -> int:
@@ -46,7 +20,7 @@ class CameraConfig(ControlSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class ModulationConfig(ControlSettings):
+class ModulationConfig(Conditioner):
     """Control by actions that are added to the time embedding of each latent frame (EgoWM).
 
     The defaults are the paper's for three numbers: metres forward and left in units of the data's

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.backbone import BackboneSettings, Places
 from pewm_jax.config.noise import EDMConfig, FlowConfig
+from pewm_jax.config.parts import Backbone, InjectionPoints
 from pewm_jax.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)
-class CosmosConfig(BackboneSettings):
+class CosmosConfig(Backbone):
     """A diffusion transformer in Cosmos' form (arXiv 2501.03575); defaults: Predict2-2B for video.
 
     ``COSMOS_2B`` and ``COSMOS_14B`` are the published video models. As a backbone it holds observed
@@ -66,9 +66,9 @@ class CosmosConfig(BackboneSettings):
     """Recompute activations in the backward pass: less memory, about a third more time."""
 
     @property
-    def places(self) -> Places:
+    def places(self) -> InjectionPoints:
         """Where a memory reader runs: after every block."""
-        return Places(self.layers, self.width, self.width, self.patch, self.patch_t)
+        return InjectionPoints(self.layers, self.width, self.width, self.patch, self.patch_t)
 
     @property
     def text_shape(self) -> tuple[int, int]:

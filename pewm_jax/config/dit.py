@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
-from pewm_jax.config.backbone import BackboneSettings, Places
+from pewm_jax.config.parts import Backbone, InjectionPoints
 from pewm_jax.errors import ConfigError, require, require_positive
 
 Positions = Literal["rope_integer", "rope_crop", "rope_learned", "sincos"]
@@ -15,7 +15,7 @@ Learned = Literal["exact", "interpolate", "drop", "reference"]
 
 
 @dataclasses.dataclass(frozen=True)
-class DiTConfig(BackboneSettings):
+class DiTConfig(Backbone):
     """A diffusion transformer in CogVideoX's form; see ``published`` for CogVideoX's settings."""
 
     layers: int = 4
@@ -75,9 +75,9 @@ class DiTConfig(BackboneSettings):
     """Recompute activations in the backward pass: less memory, about a third more time."""
 
     @property
-    def places(self) -> Places:
+    def places(self) -> InjectionPoints:
         """Where a memory reader runs: after every block."""
-        return Places(self.layers, self.width, self.time_dim, self.patch, self.patch_t)
+        return InjectionPoints(self.layers, self.width, self.time_dim, self.patch, self.patch_t)
 
     @property
     def text_shape(self) -> tuple[int, int]:

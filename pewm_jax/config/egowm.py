@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from pewm_jax.config.control import ControlSettings, ModulationConfig
-from pewm_jax.config.memory import MemorySettings, NoMemoryConfig
+from pewm_jax.config.control import ModulationConfig
+from pewm_jax.config.memory import NoMemoryConfig
 from pewm_jax.config.model import ModelConfig
+from pewm_jax.config.parts import Conditioner, Memory
 from pewm_jax.config.reader import RenderConfig
 from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.errors import require
@@ -47,9 +48,9 @@ class EgoWMConfig(ModelConfig):
 
     TRAIN: ClassVar[type[TrainSettings]] = EgoWMTrainConfig
 
-    control: ControlSettings = ModulationConfig()
+    control: Conditioner = ModulationConfig()
     """Control: what steers a clip."""
-    memory: MemorySettings = NoMemoryConfig(reader=RenderConfig())
+    memory: Memory = NoMemoryConfig(reader=RenderConfig())
     """There is none: leave it at `none`."""
     history: int = 1
     """Frames that every clip begins with and that are observed, or were imagined before: 1 in

@@ -6,31 +6,12 @@ import dataclasses
 from typing import Any, ClassVar
 
 from pewm_jax.config.dinov2 import DINOv2Config
+from pewm_jax.config.parts import Encoder
 from pewm_jax.errors import require, require_positive
-from pewm_jax.registry import Settings
-
-
-class EncoderSettings(Settings):
-    """Settings that every image encoder has; see ``pewm_jax.encoders.interface`` for its functions.
-
-    Attributes:
-        channels: F, number of features of a patch.
-        CONVERTED: whether the weights are frozen and come from ``train.start``.
-        WEIGHTS: the part of the model whose parameters it takes: its own, or the ``codec``'s.
-    """
-
-    SECTION: ClassVar[str] = "encoder"
-    CONVERTED: ClassVar[bool] = False
-    WEIGHTS: ClassVar[str] = "encoder"
-    channels: Any
-
-    def grid(self, clip: Any) -> tuple[int, int]:
-        """Return the rows and columns of patches that a frame of a ``ClipConfig`` has."""
-        raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True)
-class PatchColoursConfig(EncoderSettings):
+class PatchColoursConfig(Encoder):
     """The mean colour of each patch and its negative: six features, no weights."""
 
     patch: int = 2
@@ -57,7 +38,7 @@ class PatchColoursConfig(EncoderSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class LatentsConfig(EncoderSettings):
+class LatentsConfig(Encoder):
     """The colours' latents of each frame, as the model's own codec makes them; no other weights."""
 
     WEIGHTS: ClassVar[str] = "codec"
@@ -93,7 +74,7 @@ class LatentsConfig(EncoderSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class DINOv2EncoderConfig(EncoderSettings):
+class DINOv2EncoderConfig(Encoder):
     """Patch tokens of a frozen DINOv2 (the paper); the weights come from a converted checkpoint."""
 
     CONVERTED: ClassVar[bool] = True

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from pewm_jax.config.model import ModelConfig, WorldSettings
+from pewm_jax.config.model import ModelConfig
+from pewm_jax.config.parts import World
 from pewm_jax.config.training import DataConfig, EvalConfig, TrainConfig, TrainSettings
 from pewm_jax.errors import require
 from pewm_jax.registry import require_section
@@ -20,7 +21,7 @@ class Config:
 
     version: int = VERSION
     """Version of the format; set by the library."""
-    model: Any = dataclasses.field(default=ModelConfig(), metadata={"kinds": WorldSettings})
+    model: Any = dataclasses.field(default=ModelConfig(), metadata={"kinds": World})
     """The world model: all settings that inference needs."""
     data: DataConfig = DataConfig()
     """What training reads."""

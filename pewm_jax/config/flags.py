@@ -110,7 +110,7 @@ def of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
     if isinstance(instance, Settings) and prefix != "--":
         yield f"{prefix}kind", None
     for field in dataclasses.fields(settings):
-        value = field.default if instance is None else getattr(instance, field.name)
+        value = kinds.default_of(field) if instance is None else getattr(instance, field.name)
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             yield from of(value, f"{prefix}{field.name}.")
         else:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from pewm_jax.config.codec import CodecSettings
+from pewm_jax.config.parts import Codec
 from pewm_jax.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)
-class LearnedCodecConfig(CodecSettings):
+class LearnedCodecConfig(Codec):
     """8 × 8 pixels of one frame to a few channels; trained by the world `codec`.
 
     Depth is seen as a grey picture by the same weights. A model that has this codec starts from

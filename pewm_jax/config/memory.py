@@ -3,133 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.encoder import EncoderSettings, PatchColoursConfig
-from pewm_jax.config.reader import AttentionConfig, ReaderSettings
+from pewm_jax.config.parts import Memory
 from pewm_jax.errors import require, require_positive
-from pewm_jax.registry import Settings
 
 
 @dataclasses.dataclass(frozen=True)
-class MemorySettings(Settings):
-    """Settings that every memory has; see ``pewm_jax.memory.memories`` for its functions.
-
-    Attributes:
-        KEEPS_FEATURES: whether it keeps features of the image encoder.
-        READ_BY_BLOCKS: whether memory blocks read it, which are trained for that; else it is the
-            state of its world.
-    """
-
-    SECTION: ClassVar[str] = "memory"
-    KEEPS_FEATURES: ClassVar[bool] = True
-    """Whether it keeps the encoder's features; else the first three of a point are its colour."""
-    REMEMBERS: ClassVar[bool] = True
-    """Whether it ever holds anything."""
-    READ_BY_BLOCKS: ClassVar[bool] = True
-    TELLS_IMAGINED: ClassVar[bool] = False
-    """Whether its ``remember`` asks, by ``observed``, if frames were observed or imagined."""
-
-    cell_m: tuple[float, float, float] = (0.25, 0.25, 1.0)
-    """Size of a map cell along x, y, z (z is up), metres; the default is the paper's."""
-    cells: tuple[int, int, int] = (128, 128, 16)
-    """Cells of the grid along x, y, z; the extent in metres is cells × cell size. A larger extent
-    needs no more memory."""
-    capacity: int = 4096
-    """Occupied cells that a map can hold; cells that do not fit are dropped and counted."""
-    tokens: int = 512
-    """Map tokens that condition one clip."""
-    choose: Literal["visible", "nearest"] = "visible"
-    """Which tokens come first: those that the clip's cameras can see, each frame and each part of
-    its image in turn, hidden ones later; or the nearest in view, hidden or not."""
-    imagined_far: float = 0.95
-    """Imagined surfaces beyond this share of `clip.far_m` are not remembered."""
-    imagined_edge: float = 0.2
-    """Imagined pixels whose depth differs by more than this share from that of a pixel beside them
-    are not remembered: they lie on the edge of something. 0 remembers them."""
-    encoder: EncoderSettings = PatchColoursConfig()
-    """The image features that are kept."""
-    reader: ReaderSettings = AttentionConfig()
-    """How the denoiser reads them."""
-
-    @property
-    def extent_m(self) -> float:
-        """The longest side of the grid in metres."""
-        return max(size * count for size, count in zip(self.cell_m, self.cells, strict=True))
-
-    @property
-    def room(self) -> int:
-        """How many points it can hold."""
-        return self.capacity
-
-    @property
-    def rendered_channels(self) -> int:
-        """Channels of the memory's pictures: the colour, or the features that are kept."""
-        return self.encoder.channels if self.KEEPS_FEATURES else 3
-
-    def check(self, model: Any) -> None:
-        """Refuse a model that the encoder or the reader does not fit."""
-        if model.backbone.places is None:
-            require(
-                not self.REMEMBERS,
-                "this backbone has no place where a memory could be read: use memory.kind none, or "
-                "another backbone.",
-            )
-            return
-        self.encoder.check(model)
-        self.reader.check(model)
-
-    def __post_init__(self):
-        """Validate."""
-        require(all(size > 0 for size in self.cell_m), "memory.cell_m must be positive.")
-        require(all(count > 0 for count in self.cells), "memory.cells must be positive.")
-        require(
-            math.prod(self.cells) < 2**31,
-            f"memory.cells {self.cells} make {math.prod(self.cells)} cells, more than the 2³¹ that "
-            "can be numbered; take fewer or larger cells.",
-        )
-        require_positive(self, "memory", "capacity", "tokens")
-        require(
-            self.choose in ("visible", "nearest"),
-            f"memory.choose is {self.choose!r}; choose visible or nearest.",
-        )
-        require(
-            self.imagined_far > 0,
-            f"memory.imagined_far is {self.imagined_far}: nothing imagined would be remembered; "
-            "use a share of clip.far_m above 0, such as 0.95.",
-        )
-        require(
-            self.imagined_edge >= 0,
-            f"memory.imagined_edge is {self.imagined_edge}: use a share such as 0.2, or 0 to "
-            "remember edges.",
-        )
-        require(
-            self.tokens <= self.capacity,
-            f"memory.tokens {self.tokens} exceeds memory.capacity {self.capacity}: a clip cannot "
-            "attend to more cells than the map holds; raise capacity or lower tokens.",
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class VoxelConfig(MemorySettings):
+class VoxelConfig(Memory):
     """The 3D feature map: the maximum of the features per cell (the paper)."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Map2DConfig(MemorySettings):
+class Map2DConfig(Memory):
     """The feature map seen from above: a cell reaches from the floor to the ceiling."""
 
 
 @dataclasses.dataclass(frozen=True)
-class PointsConfig(MemorySettings):
+class PointsConfig(Memory):
     """Coloured points, one per cell, without features."""
 
     KEEPS_FEATURES: ClassVar[bool] = False
 
 
 @dataclasses.dataclass(frozen=True)
-class SurfelConfig(MemorySettings):
+class SurfelConfig(Memory):
     """Small coloured surfaces at the sensor's resolution; cells, tokens and capacity as elsewhere.
 
     They alone know what was observed and what was imagined: see ``protect``.
@@ -186,7 +84,7 @@ class SurfelConfig(MemorySettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class ImagesConfig(MemorySettings):
+class ImagesConfig(Memory):
     """A few snapshots that together cover what was seen."""
 
     snapshots: int = 8
@@ -204,7 +102,7 @@ class ImagesConfig(MemorySettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class NoMemoryConfig(MemorySettings):
+class NoMemoryConfig(Memory):
     """No memory; the reader exists with its parameters, but has nothing to read."""
 
     KEEPS_FEATURES: ClassVar[bool] = False

@@ -5,36 +5,20 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.backbone import BackboneSettings
 from pewm_jax.config.clip import ActionConfig, ClipConfig
-from pewm_jax.config.codec import CodecSettings, PixelConfig
-from pewm_jax.config.control import CameraConfig, ControlSettings
+from pewm_jax.config.codec import PixelConfig
+from pewm_jax.config.control import CameraConfig
 from pewm_jax.config.dit import DiTConfig
-from pewm_jax.config.memory import MemorySettings, VoxelConfig
-from pewm_jax.config.noise import DDPMConfig, NoiseSettings
+from pewm_jax.config.memory import VoxelConfig
+from pewm_jax.config.noise import DDPMConfig
+from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise, World
 from pewm_jax.config.training import TrainConfig, TrainSettings
 from pewm_jax.errors import require
-from pewm_jax.registry import Settings, require_section
-
-
-class WorldSettings(Settings):
-    """Settings that every world has; see ``pewm_jax.worlds`` for its functions.
-
-    Attributes:
-        TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
-            for each of the world's stages, named as the stage.
-        TRAINS: parts that other worlds take from ``train.start`` and this one trains itself.
-        dtype: precision of computation and of frozen weights.
-    """
-
-    SECTION: ClassVar[str] = "world"
-    TRAIN: ClassVar[type[TrainSettings]] = TrainSettings
-    TRAINS: ClassVar[tuple[str, ...]] = ()
-    dtype: Any = "float32"
+from pewm_jax.registry import require_section
 
 
 @dataclasses.dataclass(frozen=True)
-class ModelConfig(WorldSettings):
+class ModelConfig(World):
     """A video diffusion model with a memory (PEWM)."""
 
     TRAIN: ClassVar[type[TrainSettings]] = TrainConfig
@@ -43,15 +27,15 @@ class ModelConfig(WorldSettings):
     """Shape of a clip."""
     actions: ActionConfig = ActionConfig()
     """Effect of an action."""
-    codec: CodecSettings = PixelConfig()
+    codec: Codec = PixelConfig()
     """Codec: pixels to latents and back."""
-    backbone: BackboneSettings = DiTConfig()
+    backbone: Backbone = DiTConfig()
     """Backbone: the denoiser."""
-    control: ControlSettings = CameraConfig()
+    control: Conditioner = CameraConfig()
     """Control: what steers a clip."""
-    memory: MemorySettings = VoxelConfig()
+    memory: Memory = VoxelConfig()
     """Memory: what is remembered, as which features, and how it is read."""
-    noise: NoiseSettings = DDPMConfig()
+    noise: Noise = DDPMConfig()
     """Noise, prediction target, sampler."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Precision of computation and of frozen weights; weights in training stay float32."""

@@ -3,28 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
+from pewm_jax.config.parts import Noise
 from pewm_jax.errors import require, require_positive
-from pewm_jax.registry import Settings
-
-
-class NoiseSettings(Settings):
-    """Settings that every noise has; see ``pewm_jax.diffusion.noise`` for its functions.
-
-    Attributes:
-        guidance: classifier-free guidance on the memory, or in a world without one on the observed
-            image, or on the text where the backbone says so; 1 is off.
-        per_frame: whether training draws a time for every latent frame.
-    """
-
-    SECTION: ClassVar[str] = "noise"
-    guidance: Any = 1.0
-    per_frame: Any = False
 
 
 @dataclasses.dataclass(frozen=True)
-class DDPMConfig(NoiseSettings):
+class DDPMConfig(Noise):
     """Discrete noise levels ᾱ, as in CogVideoX: schedule, prediction target and sampler."""
 
     train_steps: int = 1000
@@ -97,7 +83,7 @@ class DDPMConfig(NoiseSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class EDMConfig(NoiseSettings):
+class EDMConfig(Noise):
     """Continuous noise σ with preconditioning (Karras et al. 2022, arXiv 2206.00364)."""
 
     sigma_data: float = 0.5
@@ -152,7 +138,7 @@ class EDMConfig(NoiseSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class FlowConfig(NoiseSettings):
+class FlowConfig(Noise):
     """Flow matching on straight paths: x_t = (1 − t) x0 + t ε, velocity ε − x0 (arXiv 2210.02747).
 
     Each latent frame may have its own time (diffusion forcing, arXiv 2407.01392).

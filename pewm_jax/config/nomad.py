@@ -6,7 +6,7 @@ import dataclasses
 from typing import ClassVar, Literal
 
 from pewm_jax.config.clip import ActionConfig, ClipConfig
-from pewm_jax.config.model import WorldSettings
+from pewm_jax.config.parts import World
 from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.errors import require, require_positive
 
@@ -130,7 +130,7 @@ class NomadTrainConfig(TrainSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class NomadWorldConfig(WorldSettings):
+class NomadWorldConfig(World):
     """A policy by itself, to be trained on walks; it imagines nothing."""
 
     TRAIN: ClassVar[type[TrainSettings]] = NomadTrainConfig

@@ -9,14 +9,13 @@ import dataclasses
 from typing import Literal
 
 from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.codec import CodecSettings
 from pewm_jax.config.dit import DiTConfig
-from pewm_jax.config.encoder import EncoderSettings, PatchColoursConfig
+from pewm_jax.config.encoder import PatchColoursConfig
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.memory import VoxelConfig
 from pewm_jax.config.mesh import MeshConfig
 from pewm_jax.config.model import ModelConfig
-from pewm_jax.config.noise import NoiseSettings
+from pewm_jax.config.parts import Codec, Encoder, Noise
 from pewm_jax.config.reader import AttentionConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
 
@@ -32,12 +31,12 @@ them evenly."""
 
 def experiment(
     backbone: DiTConfig,
-    codec: CodecSettings,
-    noise: NoiseSettings,
+    codec: Codec,
+    noise: Noise,
     *,
     run: str,
     clip: ClipConfig = CLIP,
-    encoder: EncoderSettings | None = None,
+    encoder: Encoder | None = None,
     dtype: Literal["float32", "bfloat16"] = "bfloat16",
 ) -> Config:
     """Return the settings with which a video model becomes the paper's world model.

@@ -6,16 +6,13 @@ import dataclasses
 import math
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.backbone import BackboneSettings
 from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.codec import CodecSettings
-from pewm_jax.config.control import ControlSettings, ModulationConfig
+from pewm_jax.config.control import ModulationConfig
 from pewm_jax.config.frame_flow import PERSIST_PIXELS, PERSIST_VOXELS
 from pewm_jax.config.learned_codec import LearnedCodecConfig
-from pewm_jax.config.memory import MemorySettings
 from pewm_jax.config.model import ModelConfig
-from pewm_jax.config.noise import NoiseSettings
-from pewm_jax.config.reader import ReaderSettings, RenderConfig
+from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise, Reader
+from pewm_jax.config.reader import RenderConfig
 from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
 from pewm_jax.config.voxel_vae import VoxelVAEConfig
@@ -26,7 +23,7 @@ POINT_WAVES = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class PersistNetsConfig(BackboneSettings):
+class PersistNetsConfig(Backbone):
     """The four networks of PERSIST; by default as published."""
 
     voxel_vae: VoxelVAEConfig = VoxelVAEConfig()
@@ -105,7 +102,7 @@ class PersistNetsConfig(BackboneSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class GridConfig(MemorySettings):
+class GridConfig(Memory):
     """The state of the world: class ids of all cells that were ever near the agent.
 
     A frame's voxels are a window of it around the agent; what leaves the window is kept.
@@ -130,7 +127,7 @@ class GridConfig(MemorySettings):
     eye_m: float = 1.25
     """Height of the camera above the floor, metres: where a world begins without a known grid, the
     floor is a border between cells."""
-    reader: ReaderSettings = RenderConfig()
+    reader: Reader = RenderConfig()
     """Nothing reads it but the networks of the world."""
 
     @property
@@ -247,17 +244,17 @@ class PersistConfig(ModelConfig):
 
     clip: ClipConfig = PUBLISHED_CLIP
     """What one clip is."""
-    codec: CodecSettings = LearnedCodecConfig()
+    codec: Codec = LearnedCodecConfig()
     """Codec: pictures to latents and back."""
-    backbone: BackboneSettings = PersistNetsConfig()
+    backbone: Backbone = PersistNetsConfig()
     """The four networks."""
-    control: ControlSettings = PUBLISHED_ACTIONS
+    control: Conditioner = PUBLISHED_ACTIONS
     """The numbers of an action; nothing else of it is used."""
-    memory: MemorySettings = GridConfig()
+    memory: Memory = GridConfig()
     """The state of the world."""
-    noise: NoiseSettings = PERSIST_PIXELS
+    noise: Noise = PERSIST_PIXELS
     """Noise of pictures, sampler."""
-    voxel_noise: NoiseSettings = PERSIST_VOXELS
+    voxel_noise: Noise = PERSIST_VOXELS
     """Noise of voxel frames, sampler."""
     hold: float = 0.0
     """By how many nats another class must be likelier than the one that a cell has had, for it to

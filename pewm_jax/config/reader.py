@@ -5,29 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, Literal
 
+from pewm_jax.config.parts import Reader
 from pewm_jax.errors import require, require_positive
-from pewm_jax.registry import Settings
-
-
-class ReaderSettings(Settings):
-    """Settings that every reader has; see ``pewm_jax.readers.interface`` for its functions.
-
-    Attributes:
-        READS_TOKENS: whether it takes the points that a clip's cameras see (``Sight.tokens``).
-        READS_VIEW: whether it takes what the memory looks like from them (``Sight.view``).
-        READS_LATENTS: whether it takes that as the codec encodes it (``Sight.encoded``) instead.
-        split_heads: a number that ``train.mesh.tensor`` must divide.
-    """
-
-    SECTION: ClassVar[str] = "reader"
-    READS_TOKENS: ClassVar[bool] = True
-    READS_VIEW: ClassVar[bool] = False
-    READS_LATENTS: ClassVar[bool] = False
-    split_heads: Any = 1
 
 
 @dataclasses.dataclass(frozen=True)
-class AttentionConfig(ReaderSettings):
+class AttentionConfig(Reader):
     """Cross-attention from video tokens to map tokens, after every block of the backbone."""
 
     positions: Literal["projective", "sinusoid"] = "projective"
@@ -75,7 +58,7 @@ class AttentionConfig(ReaderSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class RenderConfig(ReaderSettings):
+class RenderConfig(Reader):
     """What the memory looks like from each frame's camera, given to the video tokens there."""
 
     READS_TOKENS: ClassVar[bool] = False

@@ -59,7 +59,7 @@ def from_dict(kind: type[T], values: dict[str, Any], where: str = "config") -> T
     built: dict[str, Any] = {}
     for name, value in values.items():
         hint = fields[name].metadata.get("kinds", hints[name])
-        usual = type(fields[name].default)
+        usual = kinds.usual(fields[name])
         if isinstance(value, dict) and "kind" not in value and _has_kinds(usual):
             hint = usual  # a section without a kind is of the default one
         built[name] = _coerce(hint, value, f"{where}.{name}")

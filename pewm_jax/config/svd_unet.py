@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from pewm_jax.config.backbone import BackboneSettings
 from pewm_jax.config.clip_vision import CLIPVisionConfig
+from pewm_jax.config.parts import Backbone
 from pewm_jax.errors import require, require_positive
 
 GROUPS = 32
@@ -14,7 +14,7 @@ GROUPS = 32
 
 
 @dataclasses.dataclass(frozen=True)
-class SVDUNetConfig(BackboneSettings):
+class SVDUNetConfig(Backbone):
     """A U-Net over space and time in the form of Stable Video Diffusion (arXiv 2311.15127).
 
     As a backbone it takes any number of channels: those that codec and control have. It has no

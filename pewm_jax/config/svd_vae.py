@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from pewm_jax.config.codec import CodecSettings
+from pewm_jax.config.parts import Codec
 from pewm_jax.config.svd_unet import GROUPS
 from pewm_jax.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)
-class SVDVAEConfig(CodecSettings):
+class SVDVAEConfig(Codec):
     """An image encoder and a decoder over space and time (arXiv 2311.15127, appendix D)."""
 
     DEPTH_AS_GREY: ClassVar[bool] = True

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.codec import CodecSettings
+from pewm_jax.config.parts import Codec
 from pewm_jax.errors import ConfigError, require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)
-class VAEConfig(CodecSettings):
+class VAEConfig(Codec):
     """The video autoencoder in CogVideoX's form: causal 3D convolutions, encoded in chunks.
 
     The defaults are the published sizes; ``VAEConfig.published`` returns the variants. Weights come

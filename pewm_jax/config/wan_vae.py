@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.codec import CodecSettings
+from pewm_jax.config.parts import Codec
 from pewm_jax.errors import require, require_positive
 
 MEAN_16 = (
@@ -19,7 +19,7 @@ STD_16 = (
 
 
 @dataclasses.dataclass(frozen=True)
-class WanVAEConfig(CodecSettings):
+class WanVAEConfig(Codec):
     """Wan 2.1's video autoencoder (arXiv 2503.20314): causal, four frames to a latent."""
 
     DEPTH_AS_GREY: ClassVar[bool] = True

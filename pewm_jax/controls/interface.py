@@ -1,6 +1,6 @@
 """Controls, which steer a clip: one interface, chosen by the type of the settings.
 
-A control is a ``ControlSettings`` and a module (or object) with
+A control is a ``Conditioner`` and a module (or object) with
 
     init(model, key) -> params                       {} if it has none
     condition(model, params, observed, control) -> Conditioning

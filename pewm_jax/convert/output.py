@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pewm_jax.config import UserError
-from pewm_jax.data.progress import Meter
 from pewm_jax.io import atomic
+from pewm_jax.io.progress import Meter
 
 _MEGABYTE = 1 << 20
 

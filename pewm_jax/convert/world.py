@@ -20,7 +20,7 @@ from pewm_jax.config import (
     Config,
     DDPMConfig,
     DiTConfig,
-    EncoderSettings,
+    Encoder,
     UserError,
     VAEConfig,
     paper,
@@ -41,7 +41,7 @@ def config_of(
     dtype: str | None,
     *,
     run: str = "world",
-    encoder: EncoderSettings | None = None,
+    encoder: Encoder | None = None,
 ) -> Config:
     """Return the settings of the world model around a video model.
 

@@ -1,8 +1,8 @@
-"""Collect a dataset with many workers; an interrupted collection goes on where it stopped.
+"""Collect a dataset of houses or meshes with many workers; an interrupted collection is resumed.
 
-The unit of work is a shard. A shard is written under another name and then renamed;
-``dataset.json`` is written when all shards of a split exist. A collection that was killed goes on
-with the missing shards. The files depend neither on interruptions nor on the engine (``engines``).
+The unit of work is a shard. A shard is written under a temporary name and then renamed;
+``dataset.json`` is written when all shards of a split exist. The files depend neither on
+interruptions nor on the engine (``engines``).
 """
 
 from __future__ import annotations
@@ -11,80 +11,59 @@ import contextlib
 from collections.abc import Callable
 
 from pewm_jax.config import UserError
-from pewm_jax.data import engines, lighting, unfinished
+from pewm_jax.data import engines, resume, shading
 from pewm_jax.data.engines import Job
 from pewm_jax.data.make_episode import SPLITS, CollectConfig, settings_of
-from pewm_jax.data.progress import Meter
+from pewm_jax.io.progress import Meter
 
 
-def collect(config: CollectConfig, say: Callable[[str], None] = print) -> None:
+def collect(config: CollectConfig, log: Callable[[str], None] = print) -> None:
     """Make a dataset, or its missing shards.
 
     Args:
         config: what to make and where.
-        say: receives the lines to show.
+        log: receives the lines to print.
 
     Raises:
-        UserError: a mesh that cannot be walked in, a dataset of other settings in the way, no
-            renderer, a worker process that died, or a cluster that cannot be reached.
+        UserError: a mesh has no floor to walk on, a dataset of other settings is in the way, there
+            is no renderer, a worker process died, or a cluster cannot be reached.
     """
     for path in config.scene:
         if not path.is_file():
             raise UserError(f"{path} does not exist; give --scene the path of a mesh file.")
-    if config.out.exists() and not config.out.is_dir():
-        raise UserError(f"{config.out} is a file; give a folder to write the dataset to.")
-    wanted = [split for split in SPLITS if config.episodes(split)]
-    settings = {split: settings_of(config, split) for split in wanted}
-    states: dict[str, unfinished.State] = {
-        split: unfinished.examine(config.out / split, settings[split], overwrite=config.overwrite)
-        for split in wanted
-    }
-    todo = [split for split in wanted if states[split] != "complete"]
-    if not todo:
-        say(f"{config.out} is complete with these settings: nothing to do.")
+    counts = {split: config.episodes(split) for split in SPLITS}
+    splits = resume.unfinished_splits(
+        config.out,
+        counts,
+        lambda split: settings_of(config, split),
+        config.shard_episodes,
+        overwrite=config.overwrite,
+    )
+    if not splits:
+        log(f"{config.out} is complete with these settings: nothing to do.")
         return
-    if config.scene and len(config.scene) < len(wanted):
-        say(f"fewer meshes ({len(config.scene)}) than splits: the splits share their scenes.")
-    lighting.require_embree()
+    if config.scene and len(config.scene) < sum(map(bool, counts.values())):
+        log(f"fewer meshes ({len(config.scene)}) than splits: the splits share their scenes.")
+    shading.require_embree()
     engines.require(config)
-    jobs: dict[str, list[Job]] = {split: _jobs(config, split) for split in todo}
-    done = {
-        split: unfinished.prepare(
-            config.out / split,
-            settings[split],
-            states[split],
-            {job.path: len(job.indices) for job in jobs[split]},
-        )
-        for split in todo
-    }
-    missing = [job for split in todo for job in jobs[split] if job.path.name not in done[split]]
-    if any(done.values()):
-        there = sum(len(shards) for shards in done.values())
-        say(f"resuming: {there} files are there, {len(missing)} are missing.")
-    frames = sum(len(job.indices) for job in missing) * config.frames
+    for split in splits:
+        split.prepare()
+    jobs = [
+        Job(config, split.folder.name, path, indices)
+        for split in splits
+        for path, indices in split.missing().items()
+    ]
+    if existing := sum(len(split.done) for split in splits):
+        log(f"resuming: {existing} files exist, {len(jobs)} are missing.")
+    frames = sum(len(job.indices) for job in jobs) * config.frames
+    done = {split.folder.name: split.done for split in splits}
     with (
         Meter(f"collecting {config.out}", frames, "frames") as meter,
-        contextlib.closing(engines.run(missing, config, say)) as made,
+        contextlib.closing(engines.run(jobs, config, log)) as made,
     ):
         for job, shard in made:
             done[job.split][shard.file] = shard
             meter.advance(len(job.indices) * config.frames)
-    for split in todo:
-        shards = [done[split][job.path.name] for job in jobs[split]]
-        total = config.episodes(split) * config.frames
-        unfinished.publish(config.out / split, settings[split], shards, total)
-    say(meter.summary())
-
-
-def _jobs(config: CollectConfig, split: str) -> list[Job]:
-    episodes, per = config.episodes(split), config.shard_episodes
-    count = -(-episodes // per)
-    return [
-        Job(
-            config,
-            split,
-            config.out / split / f"shard-{i:05d}-of-{count:05d}.array_record",
-            range(i * per, min(episodes, (i + 1) * per)),
-        )
-        for i in range(count)
-    ]
+    for split in splits:
+        split.publish(counts[split.folder.name] * config.frames)
+    log(meter.summary())

@@ -1,93 +1,388 @@
-"""Collect episodes from an environment of one's own: ``pewm-jax data collect OUT --env …``.
+"""One episode of an environment of one's own.
 
-An interrupted collection goes on with the files that are missing, as every episode's seed follows
-from the settings and its number. What an environment has to show is said in ``env_episode``.
+The environment follows Gymnasium's API and shows, in its observation (a dictionary) or in ``info``,
+
+    rgb         (H, W, 3) uint8
+    depth       (H, W) float, metres along the camera's z axis, 0 = no measurement
+    pose        (4, 4) world_from_camera, OpenCV axes, metres, the world's z up
+    intrinsics  (4,) fx, fy, cx, cy in pixels, centres at +0.5; or the attribute ``intrinsics_4``
+                of the environment
+
+Every episode begins with a ``reset`` whose seed follows from the settings and its number. Planar
+actions are found from the poses: they say what the agent did, and not what it wanted to. Each
+episode is validated before it is written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
 
-from pewm_jax.config import UserError
-from pewm_jax.data import env_episode, unfinished
+import numpy as np
+import tyro
+
+from pewm_jax import registry as kinds
+from pewm_jax.config import ConfigError, UserError
+from pewm_jax.data import resume
+from pewm_jax.data.checks import check_episode
 from pewm_jax.data.dataset import describe_shard, write_shard
-from pewm_jax.data.env_episode import SPLITS, CollectEnvConfig
-from pewm_jax.data.progress import Meter
+from pewm_jax.data.episodes import EpisodeArrays, read_episode, write_episode
+from pewm_jax.data.importer import planar_actions
+from pewm_jax.io.progress import Meter
+
+SPLITS = ("train", "validation", "test")
+"""Folders written."""
+TRIES = 20
+"""Episodes in a row that may be too short."""
+FORM = (
+    "rgb (H, W, 3) uint8, depth (H, W) in metres along z, pose (4, 4) world_from_camera (OpenCV "
+    "axes, z up), and intrinsics (4,) fx, fy, cx, cy, which may also be the environment's "
+    "attribute intrinsics_4"
+)
+"""What an environment has to provide, for refusals."""
 
 
-def collect_env(config: CollectEnvConfig, say: Callable[[str], None] = print) -> None:
-    """Make a dataset from an environment, or its missing shards.
+@dataclasses.dataclass(frozen=True)
+class CollectEnvConfig:
+    """Walk an agent through an environment of your own and write what it sees as episodes."""
 
-    Args:
-        config: what to make and where.
-        say: receives the lines to show.
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder to write; gets train/, validation/ and test/."""
+    env: str
+    """MODULE:NAME of a function or class that gives a gymnasium.Env, or the name of a registered
+    one, after the module that registers it: pewm_jax.planning:pewm_jax/House-v0."""
+    env_args: str = "{}"
+    """Arguments of the function, as a JSON table: '{"task": "image"}'."""
+    policy: str = ""
+    """MODULE:FUNCTION, from observation to action; empty: random actions that persist."""
+    persistence: float = 0.7
+    """Without a policy: probability of doing once more what was done last, if it had an effect."""
+    train: int = 320
+    """Episodes to train on."""
+    validation: int = 8
+    """Episodes to watch training with."""
+    test: int = 24
+    """Episodes to score."""
+    frames: int = 96
+    """Frames of an episode."""
+    min_frames: int = 9
+    """Episodes that the environment ends before --frames are kept from this length on; shorter
+    ones are made anew."""
+    seed: int = 0
+    """Seed of the environment and of random actions."""
+    shard_episodes: int = 8
+    """Episodes per file."""
+    overwrite: bool = False
+    """Replace a dataset that was made with other settings."""
 
-    Raises:
-        UserError: the environment or the policy cannot be had, it does not show what is needed,
-            its episodes are too short or do not pass validation, or a dataset of other settings
-            is in the way.
-    """
-    if config.out.exists() and not config.out.is_dir():
-        raise UserError(f"{config.out} is a file; give a folder to write the dataset to.")
-    wanted = [split for split in SPLITS if config.episodes(split)]
-    states: dict[str, unfinished.State] = {
-        split: unfinished.examine(
-            config.out / split, config.settings(split), overwrite=config.overwrite
-        )
-        for split in wanted
-    }
-    todo = [split for split in wanted if states[split] != "complete"]
-    if not todo:
-        say(f"{config.out} is complete with these settings: nothing to do.")
-        return
-    env, policy = env_episode.open_env(config), env_episode.open_policy(config)
-    try:
-        # One episode, before anything is written: it is refused here if it lacks something.
-        env_episode.make(env, policy, config, todo[0], 0)
-        total = sum(config.episodes(split) for split in todo)
-        with Meter(f"collecting {config.out}", total, "episodes") as meter:
-            for split in todo:
-                _split(env, policy, config, split, states[split], meter)
-        say(meter.summary())
-    finally:
-        env.close()
+    def __post_init__(self):
+        """Validate."""
+        for name in ("train", "validation", "test", "seed"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"--{name} is {getattr(self, name)}: use 0 or more.")
+        if self.train + self.validation + self.test == 0:
+            raise ConfigError("--train, --validation and --test are all 0: nothing to collect.")
+        if self.shard_episodes < 1:
+            raise ConfigError(f"--shard-episodes is {self.shard_episodes}: use 1 or more.")
+        if not 2 <= self.min_frames <= self.frames:
+            raise ConfigError(
+                f"--min-frames is {self.min_frames} and --frames {self.frames}: use 2 or more, and "
+                "no more than --frames."
+            )
+        if not 0 <= self.persistence <= 1:
+            raise ConfigError(f"--persistence is {self.persistence}: use a probability, 0 to 1.")
+        self._check_names()
+
+    def _check_names(self) -> None:
+        for flag, value in (("--env", self.env), ("--policy", self.policy or "a:b")):
+            module, colon, name = value.partition(":")
+            if not (colon and name and all(part.isidentifier() for part in module.split("."))):
+                raise ConfigError(
+                    f"{flag} is {value!r}: give MODULE:NAME, such as my_robot:make for make() in "
+                    "my_robot.py."
+                )
+        try:
+            table = json.loads(self.env_args)
+        except ValueError:
+            table = None
+        if not isinstance(table, dict):
+            raise ConfigError(f"--env-args is {self.env_args!r}: give a JSON table.")
+
+    def episodes(self, split: str) -> int:
+        """Episodes of a split."""
+        return getattr(self, split)
+
+    def settings(self, split: str) -> dict[str, Any]:
+        """Return what determines the bytes of a split, as plain values."""
+        settings = dataclasses.asdict(self)
+        for name in ("out", "overwrite", *SPLITS):
+            del settings[name]
+        return {"made_by": "collect --env", "episodes": self.episodes(split), **settings}
 
 
-def _split(
+def make(
     env: Any,
     policy: Callable[[Any], Any] | None,
     config: CollectEnvConfig,
     split: str,
-    state: unfinished.State,
-    meter: Meter,
-) -> None:
-    """Make the missing shards of a split, and finish it."""
-    folder, per = config.out / split, config.shard_episodes
-    count = -(-config.episodes(split) // per)
-    jobs = {
-        folder / f"shard-{i:05d}-of-{count:05d}.array_record": range(
-            i * per, min(config.episodes(split), (i + 1) * per)
-        )
-        for i in range(count)
-    }
-    settings = config.settings(split)
-    done = unfinished.prepare(
-        folder, settings, state, {path: len(indices) for path, indices in jobs.items()}
+    index: int,
+) -> bytes:
+    """Walk one episode and return its record.
+
+    Args:
+        env: from ``open_env``.
+        policy: from ``open_policy``.
+        config: the settings.
+        split: the episode's split.
+        index: its number there.
+
+    Raises:
+        UserError: the environment does not show what is needed, or ends its episodes too soon, or
+            the episode does not pass validation.
+    """
+    longest = 0
+    for attempt in range(TRIES):
+        draw = np.random.default_rng([config.seed, SPLITS.index(split), index, attempt])
+        act = policy or _Persistent(env.action_space, config.persistence, draw)
+        seen, intrinsics, scene = _walk(env, act, config, int(draw.integers(2**31)))
+        longest = max(longest, len(seen))
+        if len(seen) >= config.min_frames:
+            return _record(seen, intrinsics, config, f"{split}-{index:06d}", scene)
+    raise UserError(
+        f"--env {config.env} ended {TRIES} episodes in a row after at most {longest} frames: let "
+        f"its episodes last longer, or lower --min-frames ({config.min_frames})."
     )
 
-    def records(indices: range) -> Iterator[bytes]:
+
+def _walk(
+    env: Any, act: Callable[[Any], Any], config: CollectEnvConfig, seed: int
+) -> tuple[list[dict[str, np.ndarray]], np.ndarray, str]:
+    """Return the frames of an episode, the intrinsics, and the scene's name."""
+    observation, info = _called(config, "reset", env.reset, seed=seed)
+    first, intrinsics = _look(env, observation, info, config)
+    seen = [first]
+    while len(seen) < config.frames:
+        action = _called(config, "the policy", act, observation)
+        observation, _, terminated, truncated, info = _called(config, "step", env.step, action)
+        frame, same = _look(env, observation, info, config)
+        if not np.array_equal(same, intrinsics) or frame["rgb"].shape != first["rgb"].shape:
+            raise UserError(
+                f"--env {config.env} changed its intrinsics or image size within an episode: an "
+                "episode has one camera."
+            )
+        if isinstance(act, _Persistent) and np.array_equal(frame["pose"], seen[-1]["pose"]):
+            act.forget()  # what was done had no effect: it stands before a wall
+        seen.append(frame)
+        if terminated or truncated:
+            break
+    shown = info.get("scene") if isinstance(info, Mapping) else None
+    return seen, intrinsics, str(shown or config.env.partition(":")[2])
+
+
+def _called(config: CollectEnvConfig, what: str, function: Callable, *given: Any, **named: Any):
+    """Call what is a user's own, which may raise anything."""
+    try:
+        return function(*given, **named)
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(
+            f"--env {config.env}: {what} failed ({type(error).__name__}: "
+            f"{' '.join(str(error).split())}); mend it."
+        ) from error
+
+
+def _look(
+    env: Any, observation: Any, info: Any, config: CollectEnvConfig
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return the frame that an environment shows, and the intrinsics; refuse another form."""
+    places = [place for place in (observation, info) if isinstance(place, Mapping)]
+
+    def find(name: str) -> Any:
+        return next((place[name] for place in places if name in place), None)
+
+    found = {name: find(name) for name in ("rgb", "depth", "pose", "intrinsics")}
+    if found["intrinsics"] is None:
+        found["intrinsics"] = getattr(getattr(env, "unwrapped", env), "intrinsics_4", None)
+    absent = [name for name, value in found.items() if value is None]
+    if absent:
+        raise UserError(
+            f"--env {config.env} shows no {', '.join(absent)}: provide {FORM}, in the observation "
+            "(a dictionary) or in info."
+        )
+    frame = {name: np.asarray(value) for name, value in found.items()}
+    size = frame["depth"].shape
+    fits = {
+        "rgb": len(size) == 2
+        and frame["rgb"].shape == (*size, 3)
+        and frame["rgb"].dtype == np.uint8,
+        "depth": len(size) == 2 and frame["depth"].dtype.kind == "f",
+        "pose": frame["pose"].shape == (4, 4),
+        "intrinsics": frame["intrinsics"].shape == (4,),
+    }
+    wrong = [name for name, fit in fits.items() if not fit]
+    if wrong:
+        what = ", ".join(f"{name} {frame[name].shape} {frame[name].dtype}" for name in wrong)
+        raise UserError(f"--env {config.env} shows {what}: provide {FORM}.")
+    # Copied: an environment may use its buffers again.
+    kept = {name: frame[name].copy() for name in ("rgb", "depth", "pose")}
+    return kept, frame["intrinsics"]
+
+
+def _record(
+    seen: list[dict[str, np.ndarray]],
+    intrinsics: np.ndarray,
+    config: CollectEnvConfig,
+    name: str,
+    scene: str,
+) -> bytes:
+    """Encode an episode, after the checks that ``data validate`` makes."""
+    rgb, depth, pose = (np.stack([frame[key] for frame in seen]) for key in seen[0])
+    arrays = EpisodeArrays(rgb, depth, intrinsics, pose, planar_actions(pose))
+    record = write_episode(arrays, name, scene, {"policy": config.policy or "random-persistent"})
+    problems = check_episode(read_episode(record), f"--env {config.env}, episode {name}")
+    if problems:
+        raise UserError(str(problems[0]))
+    return record
+
+
+class _Persistent:
+    """A policy: random actions of a space, each repeated with a probability."""
+
+    def __init__(self, space: Any, persistence: float, rng: np.random.Generator):
+        self._space, self._persistence, self._rng = space, persistence, rng
+        self._last: Any = None
+        space.seed(int(rng.integers(2**31)))
+
+    def __call__(self, observation: Any) -> Any:
+        """Return an action; the observation does not count."""
+        del observation
+        if self._last is None or self._rng.random() >= self._persistence:
+            self._last = self._space.sample()
+        return self._last
+
+    def forget(self) -> None:
+        """Draw the next action anew."""
+        self._last = None
+
+
+def open_env(config: CollectEnvConfig) -> Any:
+    """Return the environment that ``--env`` names.
+
+    Raises:
+        UserError: there is none of the name, it cannot be made, or it is no environment.
+    """
+    arguments = json.loads(config.env_args)
+    module, _, name = config.env.partition(":")
+    made = getattr(_module(module, "--env"), name, None)
+    if made is None:
+        made = _registered(config, name)
+    try:
+        env = made(**arguments)
+    except UserError:
+        raise
+    except Exception as error:  # what is a user's own may raise anything
+        raise UserError(
+            f"--env {config.env} cannot be made ({type(error).__name__}: "
+            f"{' '.join(str(error).split())}): mend it, or its --env-args."
+        ) from error
+    for wanted in ("reset", "step", "close", "action_space"):
+        if not hasattr(env, wanted):
+            raise UserError(
+                f"--env {config.env} gives a {type(env).__name__} without {wanted}: give a "
+                "function or class that gives a gymnasium.Env."
+            )
+    return env
+
+
+def _registered(config: CollectEnvConfig, name: str) -> Callable[..., Any]:
+    """Return what makes a registered environment of Gymnasium."""
+    try:
+        import gymnasium  # noqa: PLC0415 - an extra: other environments do without
+    except ImportError:
+        gymnasium = None
+    if gymnasium is None or name not in gymnasium.registry:
+        raise UserError(
+            f"--env {config.env}: the module has no {name!r}, and Gymnasium (pip install "
+            "'pewm-jax[planning]') knows no such environment after importing it."
+        )
+    return lambda **arguments: gymnasium.make(name, **arguments)
+
+
+def open_policy(config: CollectEnvConfig) -> Callable[[Any], Any] | None:
+    """Return the policy that ``--policy`` names, or None.
+
+    Raises:
+        UserError: there is no such function.
+    """
+    if not config.policy:
+        return None
+    module, _, name = config.policy.partition(":")
+    found = getattr(_module(module, "--policy"), name, None)
+    if not callable(found):
+        raise UserError(
+            f"--policy {config.policy}: there is no function {name}: give MODULE:FUNCTION, from "
+            "observation to action."
+        )
+    return found
+
+
+def _module(name: str, flag: str) -> Any:
+    """Import a user's module, which may also lie in the current folder."""
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+    return kinds.imported(name, flag)
+
+
+def collect_env(config: CollectEnvConfig, log: Callable[[str], None] = print) -> None:
+    """Make a dataset from an environment, or its missing shards.
+
+    Args:
+        config: what to make and where.
+        log: receives the lines to print.
+
+    Raises:
+        UserError: the environment or the policy cannot be opened, the environment does not provide
+            what is needed, its episodes are too short or fail validation, or a dataset of other
+            settings is in the way.
+    """
+    splits = resume.unfinished_splits(
+        config.out,
+        {split: config.episodes(split) for split in SPLITS},
+        config.settings,
+        config.shard_episodes,
+        overwrite=config.overwrite,
+    )
+    if not splits:
+        log(f"{config.out} is complete with these settings: nothing to do.")
+        return
+    env, policy = open_env(config), open_policy(config)
+
+    def records(split: str, indices: range, meter: Meter) -> Iterator[bytes]:
         for index in indices:
-            yield env_episode.make(env, policy, config, split, index)
+            yield make(env, policy, config, split, index)
             meter.advance(1)
 
-    for path, indices in jobs.items():
-        if path.name in done:
-            meter.advance(len(indices))
-            continue
-        write_shard(path, records(indices))
-        done[path.name] = describe_shard(path)
-    shards = [done[path.name] for path in jobs]
-    unfinished.publish(
-        folder, settings, shards, sum(unfinished.frames_of(folder, one) for one in shards)
-    )
+    try:
+        # Make one episode before anything is written, so that a misfit is refused here.
+        make(env, policy, config, splits[0].folder.name, 0)
+        total = sum(config.episodes(split.folder.name) for split in splits)
+        with Meter(f"collecting {config.out}", total, "episodes") as meter:
+            for split in splits:
+                split.prepare()
+                missing = split.missing()
+                meter.advance(
+                    sum(map(len, split.wanted.values())) - sum(map(len, missing.values()))
+                )
+                for path, indices in missing.items():
+                    write_shard(path, records(split.folder.name, indices, meter))
+                    split.done[path.name] = describe_shard(path)
+                split.publish()
+        log(meter.summary())
+    finally:
+        env.close()

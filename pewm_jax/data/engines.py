@@ -23,6 +23,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import cv2
@@ -30,7 +31,6 @@ import jax
 
 from pewm_jax.config import UserError
 from pewm_jax.data.dataset import Shard, describe_shard, write_shard
-from pewm_jax.data.interrupts import sigint_ignored, sigint_postponed
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.io import atomic
 
@@ -48,7 +48,7 @@ DIED = (
 )
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 """Environment variables for Ray: no usage reports, no warning about unused GPUs."""
-CHAPTERS = ("config", "geometry", "houses", "data")
+PACKAGES = ("config", "geometry", "houses", "data", "io")
 """Folders of this library whose code can change the bytes of a shard."""
 LIBRARIES = (
     "numpy",
@@ -86,21 +86,21 @@ class Job:
 
 
 def run(
-    jobs: list[Job], config: CollectConfig, say: Callable[[str], None] = print
+    jobs: list[Job], config: CollectConfig, log: Callable[[str], None] = print
 ) -> Generator[tuple[Job, Shard]]:
     """Make shards with the engine of the settings; yield each when it is done.
 
     Args:
         jobs: the shards.
         config: ``engine``, ``address`` and ``workers`` count.
-        say: receives the lines to show.
+        log: receives the lines to print.
 
     Raises:
         UserError: a worker died, the cluster cannot be reached or cannot make the same shards,
             or an episode cannot be made.
     """
     if config.engine == "ray":
-        return on_cluster(jobs, config, say)
+        return on_cluster(jobs, config, log)
     return on_processes(jobs, config.workers or os.cpu_count() or 1)
 
 
@@ -147,7 +147,7 @@ def _start_worker() -> None:
 
 
 def on_cluster(
-    jobs: list[Job], config: CollectConfig, say: Callable[[str], None] = print
+    jobs: list[Job], config: CollectConfig, log: Callable[[str], None] = print
 ) -> Generator[tuple[Job, Shard]]:
     """Make shards on the machines of a Ray cluster; arguments and errors as for ``run``.
 
@@ -155,7 +155,7 @@ def on_cluster(
     than there are processors, so that an autoscaling cluster grows.
     """
     ray = _import_ray()
-    with cluster(ray, config, say):
+    with cluster(ray, config, log):
         make = ray.remote(num_cpus=1, max_retries=RETRIES)(make_bytes)
         software = software_here()
         waiting, running = list(reversed(jobs)), {}
@@ -218,8 +218,8 @@ def software_here() -> dict[str, str]:
     """Return the versions that a shard's bytes depend on; of this library, a hash of its code."""
     root = Path(__file__).parents[1]
     code = hashlib.sha256()
-    for chapter in CHAPTERS:
-        for path in sorted((root / chapter).glob("*.py")):
+    for package in PACKAGES:
+        for path in sorted((root / package).glob("*.py")):
             code.update(path.name.encode() + path.read_bytes())
     versions = {name: importlib.metadata.version(name) for name in LIBRARIES}
     return {"pewm_jax with hash": code.hexdigest()[:12], **versions}
@@ -264,13 +264,13 @@ def _no_cluster(config: CollectConfig, reason: str) -> str:
 
 
 @contextlib.contextmanager
-def cluster(ray: Any, config: CollectConfig, say: Callable[[str], None]) -> Iterator[None]:
+def cluster(ray: Any, config: CollectConfig, log: Callable[[str], None]) -> Iterator[None]:
     """Connect to a cluster, or start one on this machine; keep a connection that exists already.
 
     Args:
         ray: the module.
         config: ``address`` and ``workers`` count.
-        say: receives the line to show.
+        log: receives the lines to print.
 
     Raises:
         UserError: there is no cluster.
@@ -292,7 +292,7 @@ def cluster(ray: Any, config: CollectConfig, say: Callable[[str], None]) -> Iter
                 raise UserError(_no_cluster(config, reason[:160])) from None
         machines = sum(node["Alive"] for node in ray.nodes())
         processors = ray.cluster_resources().get("CPU", 0)
-        say(f"ray: {processors:.0f} processors of {machines} machine{'s'[: machines > 1]}.")
+        log(f"ray: {processors:.0f} processors of {machines} machine{'s'[: machines > 1]}.")
         yield
     finally:
         ray.shutdown()
@@ -313,3 +313,42 @@ def _write_received(path: Path, made: Shard, content: bytes) -> Shard:
         file.flush()
         os.fsync(file.fileno())
     return made
+
+
+@contextlib.contextmanager
+def sigint_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C inside the block; processes spawned in it ignore it for good."""
+    if threading.current_thread() is not threading.main_thread():  # others cannot set signals
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
+
+
+@contextlib.contextmanager
+def sigint_postponed() -> Iterator[None]:
+    """Raise the KeyboardInterrupt of a first Ctrl-C after the block, that of a second at once.
+
+    Ray that is interrupted while it starts leaves processes behind, or crashes at its end.
+    """
+    if threading.current_thread() is not threading.main_thread():  # others cannot set signals
+        yield
+        return
+    pressed = False
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal pressed
+        if pressed:
+            signal.default_int_handler(number, frame)
+        pressed = True
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
+    if pressed:
+        raise KeyboardInterrupt

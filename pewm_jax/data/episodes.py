@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.data import voxel_frames
+from pewm_jax.data import voxels as voxel_frames
 from pewm_jax.data.record_format import (
     CONVENTIONS,
     UNITS,
@@ -28,8 +28,7 @@ from pewm_jax.data.record_format import (
     shape_fits,
     shape_text,
 )
-from pewm_jax.data.voxel_checks import refuse_misfits
-from pewm_jax.data.voxel_frames import VoxelFrames, VoxelGrid
+from pewm_jax.data.voxels import VoxelFrames, VoxelGrid, refuse_misfits
 from pewm_jax.types import Camera, Frames
 
 MILLIMETRES = 1000.0

@@ -39,12 +39,11 @@ from pewm_jax.data.episodes import (
     read_episode,
     write_episode,
 )
-from pewm_jax.data.progress import Meter
-from pewm_jax.data.recording_folders import RecordedFrame, read_recording
-from pewm_jax.data.voxel_frames import VoxelFrames, VoxelGrid, require_alike
-from pewm_jax.data.voxel_import import read_voxels
+from pewm_jax.data.recordings import RecordedFrame, read_recording, read_voxels
+from pewm_jax.data.voxels import VoxelFrames, VoxelGrid, require_alike
 from pewm_jax.geometry.actions import actions_between
 from pewm_jax.geometry.cameras import resize_intrinsics
+from pewm_jax.io.progress import Meter
 
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 
@@ -127,14 +126,14 @@ class ImportConfig:
                 raise ConfigError(f"--{what} is {value!r}: use a plain name without slashes.")
 
 
-def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -> None:
+def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -> None:
     """Read, convert, check and add a recording to a dataset.
 
     A recording with something wrong is refused before anything is written.
 
     Args:
         config: what to read and how.
-        say: receives the lines to show.
+        log: receives the lines to print.
 
     Raises:
         UserError: files that are missing or do not fit, or an episode that does not pass
@@ -186,7 +185,7 @@ def import_recording(config: ImportConfig, say: Callable[[str], None] = print) -
     )
     moves = "planar actions" if acts else "poses only (moves in 6 degrees)"
     grids = "" if voxels is None else f", voxels of {voxels.grid.side}³ cells"
-    say(f"{folder}: added {name}, {len(frames)} frames of {width}×{height} pixels, {moves}{grids}.")
+    log(f"{folder}: added {name}, {len(frames)} frames of {width}×{height} pixels, {moves}{grids}.")
 
 
 def world_from_recording(up: str) -> np.ndarray:

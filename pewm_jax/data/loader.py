@@ -1,30 +1,78 @@
-"""Batches of clips by Grain: batch k is a function of (seed, k), so a position is one integer.
-
-Every epoch visits every episode once, in an order drawn from the seed, and draws one clip from
-each. An interrupted training goes on from k alone. An episode that does not decode is replaced by
-another, drawn from the same seed and position, so the replacement depends only on the files.
-"""
+"""Records that fail to decode: they are skipped up to a limit, and each is reported once."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import grain
 import numpy as np
 
-from pewm_jax.config import Config, ConfigError, UserError
-from pewm_jax.data.bad_records import BadRecords
+from pewm_jax.config import Config, ConfigError, GridConfig, UserError
+from pewm_jax.config.model import World
 from pewm_jax.data.clips import Choice, ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.record_format import DamagedError
-from pewm_jax.data.voxel_checks import require_same_cells
-from pewm_jax.data.voxel_frames import VoxelGrid, require_alike
+from pewm_jax.data.voxels import PALETTE, VoxelGrid, VoxelsConfig, require_alike
 from pewm_jax.geometry.actions import PLANAR
 from pewm_jax.types import Clip
+
+
+class BadRecords:
+    """The records that failed to decode; may be shared by threads and by several loaders.
+
+    Args:
+        budget: most distinct records that may be skipped, ``data.bad_records``; None = no limit.
+        log: called once per skipped record with a line that names it.
+    """
+
+    def __init__(self, budget: int | None = None, log: Callable[[str], Any] | None = None):
+        self.log = log
+        self._budget = budget
+        self._reasons: dict[str, str] = {}
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._reasons)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the records, in the order in which they were found."""
+        return tuple(self._reasons)
+
+    def add(self, record: str, reason: str) -> None:
+        """Count a record that does not decode.
+
+        Args:
+            record: its name.
+            reason: the sentence with which it was refused.
+
+        Raises:
+            UserError: the limit is exceeded; the message names all of them.
+        """
+        with self._lock:
+            known = record in self._reasons
+            self._reasons.setdefault(record, reason)
+            if self._budget is not None and len(self) > self._budget:
+                raise UserError(self._too_many(reason))
+            if not known and self.log is not None:
+                allowed = "" if self._budget is None else f" of {self._budget} allowed"
+                self.log(f"bad record {len(self)}{allowed}, skipped: {record}: {reason}")
+
+    def _too_many(self, reason: str) -> str:
+        count = len(self)
+        if count == 1:
+            return f"{reason.rstrip('.')}, or train without it by --data.bad_records 1."
+        return (
+            f"{count} records do not decode and data.bad_records allows {self._budget}: "
+            f"{'; '.join(self._reasons)}. `python -m pewm_jax.data validate` finds all there are; "
+            "make their shards again, or allow more by --data.bad_records."
+        )
+
 
 BATCHES_AHEAD = 2
 """Batches decoded before they are asked for; with the one in use, what the loader holds."""
@@ -294,3 +342,35 @@ def _check_actions(config: Config, episode: Episode) -> None:
                 f"episode {episode.name} was collected with {name} {made:g}, the configuration has "
                 f"actions.{name} {wanted:g}: set --actions.{name} {made:g}."
             )
+
+
+def require_same_cells(world: World, episode: Episode) -> None:
+    """Refuse collected grids of other classes, or pictures of something else, than a world expects.
+
+    Args:
+        world: its settings; worlds without a memory of kind ``grid`` ask for nothing.
+        episode: of the data. Tables of other makers are not compared.
+
+    Raises:
+        ConfigError: another table of classes, or pictures of surfaces where cells are expected.
+    """
+    memory = getattr(world, "memory", None)
+    if not isinstance(memory, GridConfig) or episode.voxel_grid is None:
+        return
+    for kinds in ("all", "groups"):
+        for colours in range(1, len(PALETTE) + 1):
+            same = (kinds, colours) == (memory.kinds, memory.colours)
+            if not same and VoxelsConfig(kinds=kinds, colours=colours).names == (
+                episode.voxel_grid.names
+            ):
+                raise ConfigError(
+                    f"episode {episode.name} was collected with --voxels.kinds {kinds} "
+                    f"--voxels.colours {colours}, and memory.kinds is {memory.kinds}, memory."
+                    f"colours {memory.colours}: use the same."
+                )
+    shown = episode.info.get("pictures", "surfaces")
+    if shown != memory.pictures:
+        raise ConfigError(
+            f"episode {episode.name} has pictures of {shown}, and memory.pictures is "
+            f"{memory.pictures}: use that, or collect with --voxels.pictures {memory.pictures}."
+        )

@@ -15,17 +15,17 @@ import tyro
 
 from pewm_jax.config import ActionConfig, ConfigError
 from pewm_jax.config.launch import is_address
-from pewm_jax.data import block_pictures
+from pewm_jax.data import voxel_pictures
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.moving import MovingHouse, moving_house, render_moving
 from pewm_jax.data.navigation import NavGrid, navigable
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import Scene, house, load_scene
 from pewm_jax.data.trajectories import Policy, make_trajectory
-from pewm_jax.data.voxel_classes import VoxelsConfig
-from pewm_jax.data.voxel_recording import record_voxels
+from pewm_jax.data.voxelise import record_voxels
+from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.geometry.cameras import intrinsics_from_fov
-from pewm_jax.houses.moving_pieces import ROBOT_HEIGHT_M
+from pewm_jax.houses.fixtures import ROBOT_HEIGHT_M
 from pewm_jax.types import Camera
 
 SPLITS = ("train", "validation", "revisit")
@@ -237,7 +237,7 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         floor_z = float(grid.floor_z) if config.scene else 0.0
         voxels = record_voxels(config.voxels, scene, floor_z, pose[:, :3, 3], moving, parts)
     if voxels is not None and config.voxels.pictures == "cells":
-        seen = block_pictures.pictures(voxels, camera, config.size, config.size)
+        seen = voxel_pictures.draw_blocks(voxels, camera, config.size, config.size)
     elif moving is not None and parts is not None:
         seen = render_moving(moving, parts, camera, config.size, config.size)
     else:

@@ -11,8 +11,8 @@ import dataclasses
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.data.materials import LEVELS, sample
 from pewm_jax.data.scenes import Scene
+from pewm_jax.data.shading import LEVELS, sample
 from pewm_jax.types import Camera
 
 CHUNK = 1 << 14

@@ -51,7 +51,7 @@ class ShowConfig:
             raise ConfigError(f"--out is {self.out}: give a file name that ends in .png.")
 
 
-def show(config: ShowConfig, say: Callable[[str], None] = print) -> None:
+def show(config: ShowConfig, log: Callable[[str], None] = print) -> None:
     """Draw an episode and write the picture.
 
     Raises:
@@ -73,7 +73,7 @@ def show(config: ShowConfig, say: Callable[[str], None] = print) -> None:
     assert done
     with atomic.replacing(config.out) as partial:
         partial.write_bytes(code.tobytes())
-    say(f"{config.out}: {episode.name} in {episode.scene}, {episode.length} frames.")
+    log(f"{config.out}: {episode.name} in {episode.scene}, {episode.length} frames.")
 
 
 def draw(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray:

@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 
 from pewm_jax.data.episodes import DEPTH_LIMIT_M
-from pewm_jax.data.lighting import require_embree
 from pewm_jax.data.make_episode import HEADROOM_M
 from pewm_jax.data.navigation import NavGrid, is_free, line_is_free, navigable
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import Scene, house, load_scene
+from pewm_jax.data.shading import require_embree
 from pewm_jax.data.trajectories import advance
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera, Frames

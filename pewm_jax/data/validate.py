@@ -22,9 +22,9 @@ from pewm_jax.data.dataset import (
     splits,
 )
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.data.progress import Meter
 from pewm_jax.data.record_format import DamagedError
-from pewm_jax.data.voxel_frames import VoxelGrid, require_alike
+from pewm_jax.data.voxels import VoxelGrid, require_alike
+from pewm_jax.io.progress import Meter
 
 SHOWN = 20
 """Most problems printed."""
@@ -53,12 +53,12 @@ class Verdict:
     problems: list[Problem]
 
 
-def validate(config: ValidateConfig, say: Callable[[str], None] = print) -> Verdict:
+def validate(config: ValidateConfig, log: Callable[[str], None] = print) -> Verdict:
     """Check everything under a path.
 
     Args:
         config: where to look.
-        say: receives the lines to show.
+        log: receives the lines to print.
 
     Raises:
         UserError: there is nothing to check at the path, or a split is unfinished or cut short.
@@ -78,11 +78,11 @@ def validate(config: ValidateConfig, say: Callable[[str], None] = print) -> Verd
                 episodes, frames, problems = episodes + 1, frames + length, problems + found
                 meter.advance(1)
     for problem in problems[:SHOWN]:
-        say(str(problem))
+        log(str(problem))
     if len(problems) > SHOWN:
-        say(f"… and {len(problems) - SHOWN} more.")
+        log(f"… and {len(problems) - SHOWN} more.")
     if not problems:
-        say(f"{path}: {episodes} episodes, {frames} frames, all well.")
+        log(f"{path}: {episodes} episodes, {frames} frames, all well.")
     return Verdict(episodes, frames, problems)
 
 

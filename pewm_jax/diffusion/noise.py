@@ -1,6 +1,6 @@
 """Noise: every kind behind one interface, chosen by the type of its settings.
 
-A noise is a ``NoiseSettings`` and a module (or object) with the functions below. They corrupt clean
+A noise is a ``Noise`` and a module (or object) with the functions below. They corrupt clean
 latents at a given time, prepare the network's inputs, define its target and the weight of its
 error, turn its prediction into x0, and sample.
 
@@ -23,51 +23,49 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pewm_jax.config import NoiseSettings, functions
+from pewm_jax.config import Noise, functions
 from pewm_jax.types import Array
 
 Denoiser: TypeAlias = Callable[[Array, Array, Array], Array]
 """``(x_t, time_B, weight) -> x0``; the last argument is the weight of guidance at this step."""
 
 
-def draw(config: NoiseSettings, key: Array, batch: int, frames: int) -> Array:
+def draw(config: Noise, key: Array, batch: int, frames: int) -> Array:
     """Draw times for training: (B,), or (B, t) for ``frames`` latent frames."""
     return functions(config).draw(config, key, batch, frames)
 
 
-def corrupt(config: NoiseSettings, x0: Array, noise: Array, time_B: Array) -> Array:
+def corrupt(config: Noise, x0: Array, noise: Array, time_B: Array) -> Array:
     """Return x_t, made from clean latents (B, t, …) and standard normal noise."""
     return functions(config).corrupt(config, x0, noise, time_B)
 
 
-def shown(config: NoiseSettings, x_t: Array, time_B: Array) -> tuple[Array, Array]:
+def shown(config: Noise, x_t: Array, time_B: Array) -> tuple[Array, Array]:
     """Return the network's inputs: x_t as it is preconditioned, and the time in its units."""
     return functions(config).shown(config, x_t, time_B)
 
 
-def target(config: NoiseSettings, x0: Array, noise: Array, time_B: Array) -> Array:
+def target(config: Noise, x0: Array, noise: Array, time_B: Array) -> Array:
     """Return the target of the network's prediction."""
     return functions(config).target(config, x0, noise, time_B)
 
 
-def weight(config: NoiseSettings, time_B: Array) -> Array:
+def weight(config: Noise, time_B: Array) -> Array:
     """Return the loss weight of the squared error, in the shape of the times."""
     return functions(config).weight(config, time_B)
 
 
-def to_x0(config: NoiseSettings, prediction: Array, x_t: Array, time_B: Array) -> Array:
+def to_x0(config: Noise, prediction: Array, x_t: Array, time_B: Array) -> Array:
     """Turn the network's prediction into clean latents."""
     return functions(config).to_x0(config, prediction, x_t, time_B)
 
 
-def levels(config: NoiseSettings) -> np.ndarray:
+def levels(config: Noise) -> np.ndarray:
     """Return (sample_steps,) the times that a sampler visits, from the most noise to the least."""
     return functions(config).levels(config)
 
 
-def sample(
-    config: NoiseSettings, denoise: Denoiser, noise: Array, key: Array | None = None
-) -> Array:
+def sample(config: Noise, denoise: Denoiser, noise: Array, key: Array | None = None) -> Array:
     """Draw a sample.
 
     Args:

@@ -1,6 +1,6 @@
 """Image encoders, whose features the memory keeps: one interface, chosen by the settings' type.
 
-An encoder is an ``EncoderSettings`` and a module (or object) with
+An encoder is an ``Encoder`` and a module (or object) with
 
     init(settings, key) -> params                       {} if it has none
     encode(settings, params, rgb_THWC) -> features_ThwF
@@ -20,16 +20,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from pewm_jax.config import EncoderSettings, ModelConfig, UserError, functions
+from pewm_jax.config import Encoder, ModelConfig, UserError, functions
 from pewm_jax.types import Array, Params
 
 
-def init(config: EncoderSettings, key: Array) -> Params:
+def init(config: Encoder, key: Array) -> Params:
     """Return random parameters."""
     return functions(config).init(config, key)
 
 
-def encode(config: EncoderSettings, params: Params, rgb_THWC: Array) -> Array:
+def encode(config: Encoder, params: Params, rgb_THWC: Array) -> Array:
     """Return patch features (T, h, w, F); the map upsamples them itself.
 
     Args:
@@ -64,7 +64,7 @@ def weights(model: ModelConfig, params: Params) -> Params:
     return {name: params[name]} if name in params else {}
 
 
-def require_own(config: EncoderSettings, what: str) -> None:
+def require_own(config: Encoder, what: str) -> None:
     """Refuse an encoder that takes another part's parameters.
 
     Raises:
@@ -77,7 +77,7 @@ def require_own(config: EncoderSettings, what: str) -> None:
         )
 
 
-def colours(config: EncoderSettings, features_VF: Array) -> np.ndarray:
+def colours(config: Encoder, features_VF: Array) -> np.ndarray:
     """Return (V, 3) colours in [−1, 1] in which features are drawn."""
     return functions(config).colours(np.asarray(features_VF, np.float32))
 

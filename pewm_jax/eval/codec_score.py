@@ -22,7 +22,7 @@ from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.eval.images import psnr, unit_colours
 from pewm_jax.eval.imagine import print_now
 from pewm_jax.eval.protocol import file_hash
-from pewm_jax.geometry import holes
+from pewm_jax.geometry import depth_images
 from pewm_jax.io import atomic
 from pewm_jax.nn.signals import depth_from_signal, signal_from_depth, signal_from_rgb
 from pewm_jax.train import runs
@@ -116,7 +116,7 @@ def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[st
     """
     rgb = signal_from_rgb(frames.rgb_THWC)
     depth = jnp.asarray(frames.depth_THW)
-    whole = holes.fill_depth(depth, model.clip.far_m)
+    whole = depth_images.fill_depth(depth, model.clip.far_m)
     grey = jnp.broadcast_to(signal_from_depth(model.clip, whole)[..., None], rgb.shape)
     both = jnp.stack([rgb, grey])
     latents = learned_codec.encode(model.codec, params, both)  # type: ignore[arg-type]

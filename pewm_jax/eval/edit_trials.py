@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import Config, PersistConfig, UserError
-from pewm_jax.data.progress import Meter
 from pewm_jax.eval.horizon import Walk
 from pewm_jax.geometry.actions import heading
+from pewm_jax.io.progress import Meter
 from pewm_jax.memory import class_edit, class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist import voxel_renderer

@@ -20,10 +20,10 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import Config, PersistConfig, UserError
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.progress import Meter
 from pewm_jax.eval.images import psnr, unit_colours
 from pewm_jax.eval.metrics.videos import DISTANCES, VideoDistance
 from pewm_jax.geometry.actions import PLANAR
+from pewm_jax.io.progress import Meter
 from pewm_jax.report.pictures import as_bytes
 from pewm_jax.types import Camera, Control, Params
 from pewm_jax.worlds.persist import world as persist

@@ -16,7 +16,6 @@ import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.progress import Meter
 from pewm_jax.eval.images import unit_colours
 from pewm_jax.eval.imagine import print_now
 from pewm_jax.eval.methods import SAMPLED, Methods
@@ -25,6 +24,7 @@ from pewm_jax.eval.partial import Partials
 from pewm_jax.eval.protocol import ClipChoice, long_choices
 from pewm_jax.eval.scoring import Batch, Scored, load_batch
 from pewm_jax.eval.shares import gathered, share
+from pewm_jax.io.progress import Meter
 from pewm_jax.memory import memories
 from pewm_jax.types import WorldState
 

@@ -21,7 +21,6 @@ import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.progress import Meter
 from pewm_jax.eval import intervals
 from pewm_jax.eval.images import psnr, unit_colours
 from pewm_jax.eval.imagine import print_now
@@ -34,6 +33,7 @@ from pewm_jax.eval.scoring import TRUTH, Batch, Scored
 from pewm_jax.eval.shares import gathered, share
 from pewm_jax.eval.statistics import ours
 from pewm_jax.geometry.actions import there_and_back
+from pewm_jax.io.progress import Meter
 from pewm_jax.types import Frames
 
 USUAL, LONG = 32, 64

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from pewm_jax.errors import require
 from pewm_jax.eval.images import unit_colours
 from pewm_jax.geometry.cameras import unproject
-from pewm_jax.geometry.normals import normals
+from pewm_jax.geometry.depth_images import normals
 from pewm_jax.memory import rendering, views
 from pewm_jax.types import Array, Camera, Frames, View
 

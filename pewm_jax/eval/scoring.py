@@ -15,7 +15,6 @@ import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.progress import Meter
 from pewm_jax.eval.images import error_sums_batch, unit_colours, with_lpips
 from pewm_jax.eval.imagine import print_now
 from pewm_jax.eval.methods import SAMPLED, Methods
@@ -31,6 +30,7 @@ from pewm_jax.eval.partial import Partials
 from pewm_jax.eval.protocol import ClipChoice, choose, load_clip, stack
 from pewm_jax.eval.seen import seen_masks_batch
 from pewm_jax.eval.shares import gathered, share
+from pewm_jax.io.progress import Meter
 from pewm_jax.types import Array, Frames
 
 TRUTH = "truth"

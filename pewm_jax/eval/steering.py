@@ -24,13 +24,13 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.progress import Meter
 from pewm_jax.eval import intervals
 from pewm_jax.eval.images import psnr, unit_colours
 from pewm_jax.eval.partial import Partials
 from pewm_jax.eval.protocol import ClipChoice, choice_of, load_clip, stack, way_back
 from pewm_jax.eval.shares import gathered, share
 from pewm_jax.geometry.actions import actions_between
+from pewm_jax.io.progress import Meter
 from pewm_jax.types import Array, Frames, Params
 
 TRUE, SHUFFLED, NONE, COPY = "true", "shuffled", "none", "copy"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
+from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -203,3 +205,86 @@ def _uses(rng: np.random.Generator, areas: list[float]) -> list[str]:
     for room, name in zip(order, names, strict=True):
         uses[room] = str(name)
     return uses
+
+
+def overlap(a: Rect, b: Rect) -> bool:
+    """Return whether two rectangles share area."""
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def against(room: Room, side: int, at: float, depth: float, width: float) -> Rect:
+    """Return the rectangle on the floor of a piece that stands against a wall."""
+    x0, y0, x1, y1 = room.rect
+    low, high = at - width / 2, at + width / 2
+    return (
+        (low, y0, high, y0 + depth),
+        (x1 - depth, low, x1, high),
+        (low, y1 - depth, high, y1),
+        (x0, low, x0 + depth, high),
+    )[side]
+
+
+def doorway_clearance(room: Room, side: int, low: float, high: float) -> Rect:
+    """Return the floor in front of a doorway that must stay free: 0.75 m deep."""
+    return against(room, side, (low + high) / 2, 0.75, high - low)
+
+
+def shift(x: float, y: float) -> np.ndarray:
+    """Return the (4, 4) translation by (x, y)."""
+    pose = np.eye(4)
+    pose[:2, 3] = x, y
+    return pose
+
+
+def turned(quarters: int, at_2: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return the (4, 4) pose at a point, rotated about z by multiples of 90 degrees."""
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
+    pose = shift(float(at_2[0]), float(at_2[1]))
+    pose[:2, :2] = [[c, -s], [s, c]]
+    return pose
+
+
+def wall_frame(room: Room, side: int, at: float) -> np.ndarray:
+    """Return the (4, 4) pose of a point on a wall: x along the wall, y into the room."""
+    x0, y0, x1, y1 = room.rect
+    return turned(side, ((at, y0), (x1, at), (at, y1), (x0, at))[side])
+
+
+CELL_M = 0.05
+"""Cell of the raster."""
+CLEAR_M = 0.33
+"""Distance kept from walls and furniture; an agent of 0.2 m and grid cells of 0.1 m."""
+
+
+def all_reachable(plan: Plan, footprints: list[Rect]) -> bool:
+    """Return whether free floor joins all doorways and covers part of every room.
+
+    Args:
+        plan: rooms and doorways.
+        footprints: rectangles on the ground that furniture takes.
+    """
+    rects = np.array([room.rect for room in plan.rooms])
+    origin = rects[:, :2].min(0) - 2 * CELL_M
+    columns, rows = np.ceil((rects[:, 2:].max(0) + 2 * CELL_M - origin) / CELL_M).astype(int)
+    floor = np.zeros((rows, columns), bool)
+    for rect in [*rects, *(rect for _, _, rect in plan.doorways)]:
+        floor[_cells(rect, origin)] = True
+    for rect in footprints:
+        floor[_cells(rect, origin)] = False
+    distance = np.asarray(ndimage.distance_transform_edt(floor)) * CELL_M
+    labels = np.zeros(floor.shape, np.int32)
+    ndimage.label(distance >= CLEAR_M, output=labels)
+    if not labels.any():
+        return False
+    largest = 1 + int(np.bincount(labels.ravel())[1:].argmax())
+    for _, _, (x0, y0, x1, y1) in plan.doorways:
+        column, row = ((np.array([x0 + x1, y0 + y1]) / 2 - origin) / CELL_M).astype(int)
+        if labels[row, column] != largest:
+            return False
+    return all((labels[_cells(rect, origin)] == largest).any() for rect in rects)
+
+
+def _cells(rect: Rect | np.ndarray, origin_2: np.ndarray) -> tuple[slice, slice]:
+    """Return the rows and columns of cells whose centres a rectangle covers."""
+    x0, y0, x1, y1 = (np.asarray(rect) - np.tile(origin_2, 2)) / CELL_M
+    return slice(round(y0), round(y1)), slice(round(x0), round(x1))

@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 
 from pewm_jax.houses import textures
-from pewm_jax.houses.furniture_parts import Palette, books, bright, legs, small_objects
-from pewm_jax.houses.shapes import Piece
+from pewm_jax.houses.shapes import Palette, Piece, books, bright, legs, small_objects
 from pewm_jax.houses.textures import hsv, shade
 
 

@@ -9,11 +9,9 @@ import numpy as np
 import trimesh
 
 from pewm_jax.houses import textures
-from pewm_jax.houses.connectivity import all_reachable
-from pewm_jax.houses.floorplan import DOOR_TOP_M, Room, draw_plan
+from pewm_jax.houses.floorplan import DOOR_TOP_M, Room, all_reachable, draw_plan
 from pewm_jax.houses.furnish import Furnisher, Placed
-from pewm_jax.houses.furniture_parts import Palette
-from pewm_jax.houses.shapes import Piece
+from pewm_jax.houses.shapes import Palette, Piece
 from pewm_jax.houses.shell import doorway_piece, level_mesh, trim_piece, wall_mesh, window_meshes
 from pewm_jax.houses.textures import hsv, shade
 

@@ -9,8 +9,7 @@ import trimesh
 
 from pewm_jax.houses import textures
 from pewm_jax.houses.floorplan import WALL_M, Opening, Rect, Room
-from pewm_jax.houses.furniture_parts import Palette
-from pewm_jax.houses.shapes import Piece, textured
+from pewm_jax.houses.shapes import Palette, Piece, textured
 from pewm_jax.houses.textures import shade
 
 GRID_M = 0.5

@@ -11,23 +11,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import MemorySettings
+from pewm_jax.config import Memory
 from pewm_jax.geometry.cameras import project, unproject
-from pewm_jax.geometry.visibility import visible_first
+from pewm_jax.geometry.zbuffer import visible_first
 from pewm_jax.types import Array, Camera, Frames
 
 FAR_M = 1e4
 """Added to the distance of points that no camera sees, so that they come after all others."""
 
 
-def origin(config: MemorySettings, centre_3: Array) -> Array:
+def origin(config: Memory, centre_3: Array) -> Array:
     """Return (3,) the lower corner of a grid around a world position, snapped to whole cells."""
     cell = np.asarray(config.cell_m, np.float32)
     half = np.asarray(config.cells, np.float32) * cell / 2
     return (jnp.round((jnp.asarray(centre_3) - half) / cell) * cell).astype(jnp.float32)
 
 
-def keys(config: MemorySettings, origin_3: Array, points_3: Array) -> Array:
+def keys(config: Memory, origin_3: Array, points_3: Array) -> Array:
     """Return (...,) int32: the cell number of each point (..., 3).
 
     Points outside the grid, and points with NaN, get the number of cells, which is no cell.
@@ -39,7 +39,7 @@ def keys(config: MemorySettings, origin_3: Array, points_3: Array) -> Array:
     return jnp.where(inside, (x * ny + y) * nz + z, math.prod(config.cells))
 
 
-def corners(config: MemorySettings, origin_3: Array, cell_P: Array) -> Array:
+def corners(config: Memory, origin_3: Array, cell_P: Array) -> Array:
     """Return (P, 3) the lower corners of cells by their numbers, metres."""
     _, ny, nz = config.cells
     place = jnp.stack([cell_P // (ny * nz), cell_P // nz % ny, cell_P % nz], -1)
@@ -82,7 +82,7 @@ def sample(
 
 
 def choose(
-    config: MemorySettings,
+    config: Memory,
     points_V3: Array,
     valid_V: Array,
     camera: Camera,
@@ -91,7 +91,7 @@ def choose(
 ) -> Array:
     """Return (≤ ``memory.tokens``,) indices of the points that condition one clip.
 
-    By ``memory.choose``: those that the clip's cameras can see first (``geometry.visibility``), or
+    By ``memory.choose``: those that the clip's cameras can see first (``geometry.zbuffer``), or
     those in view by their distance (``in_view_first``).
 
     Args:

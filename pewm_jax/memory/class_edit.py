@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from pewm_jax.config import MemorySettings, UserError
-from pewm_jax.data.voxel_classes import VoxelsConfig
+from pewm_jax.config import Memory, UserError
+from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.geometry.cameras import invert_rigid, transform_points
 from pewm_jax.memory import boxes
 from pewm_jax.types import Array
@@ -30,7 +30,7 @@ EMPTY = 0
 """The id of a cell in which nothing is."""
 
 
-def place(config: MemorySettings, grid: ClassGrid, box_23: Array, number: int | Array) -> ClassGrid:
+def place(config: Memory, grid: ClassGrid, box_23: Array, number: int | Array) -> ClassGrid:
     """Fill a box with a class.
 
     Args:
@@ -54,7 +54,7 @@ def place(config: MemorySettings, grid: ClassGrid, box_23: Array, number: int | 
     return _with(grid, jnp.where(inside, jnp.asarray(number, jnp.int16), grid.classes_XYZ))
 
 
-def erase(config: MemorySettings, grid: ClassGrid, box_23: Array) -> ClassGrid:
+def erase(config: Memory, grid: ClassGrid, box_23: Array) -> ClassGrid:
     """Leave nothing in a box.
 
     Args:
@@ -68,7 +68,7 @@ def erase(config: MemorySettings, grid: ClassGrid, box_23: Array) -> ClassGrid:
     return place(config, grid, box_23, EMPTY)
 
 
-def copy(config: MemorySettings, grid: ClassGrid, box_23: Array) -> ClassGrid:
+def copy(config: Memory, grid: ClassGrid, box_23: Array) -> ClassGrid:
     """Return a grid of what is in a box; elsewhere nothing is known.
 
     Args:
@@ -85,7 +85,7 @@ def copy(config: MemorySettings, grid: ClassGrid, box_23: Array) -> ClassGrid:
 
 
 def paste(
-    config: MemorySettings, grid: ClassGrid, piece: ClassGrid, transform: Array | None = None
+    config: Memory, grid: ClassGrid, piece: ClassGrid, transform: Array | None = None
 ) -> ClassGrid:
     """Put a piece into a grid; where it has something, that replaces what was there.
 
@@ -114,7 +114,7 @@ def paste(
 
 
 def move(
-    config: MemorySettings,
+    config: Memory,
     grid: ClassGrid,
     box_23: Array,
     transform: Array,
@@ -138,13 +138,13 @@ def move(
     return paste(config, rest, piece, transform)
 
 
-def centres(config: MemorySettings, grid: ClassGrid) -> Array:
+def centres(config: Memory, grid: ClassGrid) -> Array:
     """Return the (X, Y, Z, 3) centres of all cells, metres."""
     places = np.stack(np.meshgrid(*map(np.arange, grid.classes_XYZ.shape), indexing="ij"), -1)
     return grid.low_3 + (places.astype(np.float32) + 0.5) * config.cell_m[0]
 
 
-def _within(config: MemorySettings, grid: ClassGrid, box_23: Array) -> Array:
+def _within(config: Memory, grid: ClassGrid, box_23: Array) -> Array:
     points = centres(config, grid)
     return boxes.within(points, jnp.ones(points.shape[:3], bool), box_23)
 

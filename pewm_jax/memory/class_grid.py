@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import GridConfig, ModelConfig, UserError
-from pewm_jax.data.voxel_classes import VoxelsConfig, table_colours
+from pewm_jax.data.voxels import VoxelsConfig, table_colours
 from pewm_jax.geometry import march
 from pewm_jax.memory import class_edit
 from pewm_jax.types import Array, Camera, Frames, View

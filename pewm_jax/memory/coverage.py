@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import AttentionConfig, Map2DConfig, MemorySettings, ModelConfig, SurfelConfig
+from pewm_jax.config import AttentionConfig, Map2DConfig, Memory, ModelConfig, SurfelConfig
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.plucker import fold_frames
 from pewm_jax.memory import cells, map2d, memories, rendering
@@ -103,12 +103,12 @@ def coverage(
     return Coverage(*map(count, counted))
 
 
-def _grid(config: MemorySettings) -> MemorySettings:
+def _grid(config: Memory) -> Memory:
     """Return the settings whose cells the memory's points stand for."""
     return map2d.flattened(config) if isinstance(config, Map2DConfig) else config
 
 
-def _among(config: MemorySettings, cell: Array, cell_V: Array, valid_V: Array, reach: int) -> Array:
+def _among(config: Memory, cell: Array, cell_V: Array, valid_V: Array, reach: int) -> Array:
     """Return (...,) bool: whether cells, or those at most ``reach`` beside them, are in a list."""
     nowhere = math.prod(config.cells)
     listed = jnp.sort(jnp.where(valid_V, cell_V, nowhere))

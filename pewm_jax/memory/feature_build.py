@@ -13,12 +13,12 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import EncoderSettings, UserError
+from pewm_jax.config import Encoder, UserError
 from pewm_jax.data.dataset import EpisodeSource, write_json
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.progress import Meter
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import tree, weights
+from pewm_jax.io.progress import Meter
 from pewm_jax.memory.feature_cache import (
     MANIFEST,
     TENSOR,
@@ -36,7 +36,7 @@ from pewm_jax.types import Array, Params
 
 
 def build(
-    config: EncoderSettings,
+    config: Encoder,
     params: Params,
     data: Path,
     out: Path,
@@ -100,9 +100,7 @@ def build(
 class _Encoder:
     """The encoder compiled for batches of frames, spread over all devices."""
 
-    def __init__(
-        self, config: EncoderSettings, params: Params, batch: int, say: Callable[[str], None]
-    ):
+    def __init__(self, config: Encoder, params: Params, batch: int, say: Callable[[str], None]):
         devices = jax.devices()
         mesh = jax.make_mesh((len(devices),), ("frames",), (AxisType.Auto,), devices=devices)
         self._spread = NamedSharding(mesh, P("frames"))

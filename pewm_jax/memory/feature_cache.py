@@ -19,7 +19,7 @@ import numpy as np
 
 from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
-from pewm_jax.config import EncoderSettings, UserError
+from pewm_jax.config import Encoder, UserError
 from pewm_jax.data.dataset import Manifest, read_manifest
 from pewm_jax.data.episodes import Episode
 from pewm_jax.encoders import interface as encoders
@@ -49,7 +49,7 @@ class FeatureCache:
     files: Mapping[str, tuple[str, int]]
 
 
-def fingerprint(config: EncoderSettings, params: Params, data: Manifest) -> dict[str, Any]:
+def fingerprint(config: Encoder, params: Params, data: Manifest) -> dict[str, Any]:
     """Return what features depend on: encoder, weights, preprocessing, data.
 
     Weights are identified by a hash of their float32 values, whatever dtype they are stored in;
@@ -73,7 +73,7 @@ def fingerprint(config: EncoderSettings, params: Params, data: Manifest) -> dict
     }
 
 
-def open_cache(path: Path, config: EncoderSettings, params: Params, data: Path) -> FeatureCache:
+def open_cache(path: Path, config: Encoder, params: Params, data: Path) -> FeatureCache:
     """Open a finished cache, if it belongs to this encoder and this data.
 
     Args:
@@ -91,7 +91,7 @@ def open_cache(path: Path, config: EncoderSettings, params: Params, data: Path) 
     return cache
 
 
-def require_fresh(cache: FeatureCache, config: EncoderSettings, params: Params, data: Path) -> None:
+def require_fresh(cache: FeatureCache, config: Encoder, params: Params, data: Path) -> None:
     """Refuse a stale cache; see ``open_cache``.
 
     Raises:

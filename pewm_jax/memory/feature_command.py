@@ -10,7 +10,7 @@ import tyro
 
 from pewm_jax.config import (
     DINOv2EncoderConfig,
-    EncoderSettings,
+    Encoder,
     PatchColoursConfig,
     UserError,
 )
@@ -63,7 +63,7 @@ def cache(config: CacheConfig) -> None:
         feature_build.build(settings, params, data, out, dtype=config.dtype, batch=config.batch)
 
 
-def _encoder(config: CacheConfig) -> tuple[EncoderSettings, Params]:
+def _encoder(config: CacheConfig) -> tuple[Encoder, Params]:
     """Return the encoder's settings, as an experiment has them, and its parameters."""
     if not config.encoder:
         return PatchColoursConfig(patch=config.patch), {}

@@ -10,12 +10,12 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from pewm_jax.config import MemorySettings, ModelConfig
+from pewm_jax.config import Memory, ModelConfig
 from pewm_jax.memory import voxel_map
 from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 
 
-def flattened(config: MemorySettings) -> MemorySettings:
+def flattened(config: Memory) -> Memory:
     """Return the settings of the voxel map with one layer that implements the 2D map."""
     (x, y, z), (nx, ny, nz) = config.cell_m, config.cells
     return dataclasses.replace(config, cell_m=(x, y, z * nz), cells=(nx, ny, 1))

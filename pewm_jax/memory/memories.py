@@ -17,7 +17,7 @@ points       a coloured point per 3D cell, no features    point cloud (ablation 
 surfels      a coloured surfel per small cell             none: ours alone
 ============ ============================================ =====================================
 
-A memory is a ``MemorySettings`` and a module (or object) with the functions ``empty``,
+A memory is a ``Memory`` and a module (or object) with the functions ``empty``,
 ``remember``, ``tokens`` and ``to_points``, as they are called below, and optionally ``render``, if
 it can show more than its points, and ``erase`` and ``move``, if it can be edited. All memories are
 pytrees of static size. Their tokens have the same shapes, so a reader has the same parameters with

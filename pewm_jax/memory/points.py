@@ -13,7 +13,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import MemorySettings, ModelConfig
+from pewm_jax.config import Memory, ModelConfig
 from pewm_jax.memory import cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
@@ -60,7 +60,7 @@ def empty(model: ModelConfig, centre_3: Array) -> PointCloud:
 
 
 def insert(
-    config: MemorySettings, cloud: PointCloud, points_P3: Array, rgb_PC: Array, valid_P: Array
+    config: Memory, cloud: PointCloud, points_P3: Array, rgb_PC: Array, valid_P: Array
 ) -> PointCloud:
     """Insert coloured points; new cells that do not fit are dropped, highest numbers first.
 

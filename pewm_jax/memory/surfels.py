@@ -22,7 +22,7 @@ import numpy as np
 
 from pewm_jax.config import ModelConfig, SurfelConfig
 from pewm_jax.geometry.cameras import unproject
-from pewm_jax.geometry.normals import normals
+from pewm_jax.geometry.depth_images import normals
 from pewm_jax.memory import boxes, cells, rendering, surfel_edit, views, voxel_cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from pewm_jax.geometry import holes
+from pewm_jax.geometry import depth_images
 from pewm_jax.types import View
 
 
@@ -36,7 +36,7 @@ def fill_nearest(view: View) -> View:
         The view with features and depth everywhere; ``seen_THW`` still tells what was seen.
     """
     frames, height, width = view.seen_THW.shape
-    index, found = holes.nearest(view.seen_THW)
+    index, found = depth_images.nearest_known(view.seen_THW)
     features = jnp.asarray(view.features_THWF).reshape(frames, height * width, -1)
     features = jnp.take_along_axis(features, index[:, :, None], 1)
     depth = jnp.take_along_axis(jnp.asarray(view.depth_THW).reshape(frames, -1), index, 1)

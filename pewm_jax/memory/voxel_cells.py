@@ -13,11 +13,11 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import MemorySettings
+from pewm_jax.config import Memory
 from pewm_jax.types import Array
 
 
-def nowhere(config: MemorySettings) -> int:
+def nowhere(config: Memory) -> int:
     """Return the number that stands for no cell; it sorts after all cells."""
     return math.prod(config.cells)
 

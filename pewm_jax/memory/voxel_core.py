@@ -10,13 +10,13 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
 
-from pewm_jax.config import MemorySettings, UserError
+from pewm_jax.config import Memory, UserError
 from pewm_jax.memory import cells, voxel_cells, voxel_frames
 from pewm_jax.types import Array, Camera, Frames, MapTokens, VoxelMap
 
 
 def empty(
-    config: MemorySettings, centre_3: Array, channels: int, dtype: DTypeLike = jnp.float32
+    config: Memory, centre_3: Array, channels: int, dtype: DTypeLike = jnp.float32
 ) -> VoxelMap:
     """Return an empty map.
 
@@ -38,7 +38,7 @@ def empty(
     )
 
 
-def cell_centres(config: MemorySettings, origin_3: Array, cell_V: Array) -> Array:
+def cell_centres(config: Memory, origin_3: Array, cell_V: Array) -> Array:
     """Return (V, 3) world centres of cell numbers (see ``cells.keys``)."""
     _, ny, nz = config.cells
     grid = jnp.stack([cell_V // (ny * nz), cell_V // nz % ny, cell_V % nz], -1)
@@ -46,7 +46,7 @@ def cell_centres(config: MemorySettings, origin_3: Array, cell_V: Array) -> Arra
 
 
 def insert(
-    config: MemorySettings, voxels: VoxelMap, points_P3: Array, features_PF: Array, valid_P: Array
+    config: Memory, voxels: VoxelMap, points_P3: Array, features_PF: Array, valid_P: Array
 ) -> VoxelMap:
     """Insert points by scatter-max.
 
@@ -90,7 +90,7 @@ def insert(
 
 
 def insert_frames(
-    config: MemorySettings,
+    config: Memory,
     voxels: VoxelMap,
     frames: Frames,
     features_ThwF: Array,
@@ -133,7 +133,7 @@ def insert_frames(
     return renewed(config, voxels, cell_V, rows, dropped, beyond)
 
 
-def merge(config: MemorySettings, a: VoxelMap, b: VoxelMap) -> VoxelMap:
+def merge(config: Memory, a: VoxelMap, b: VoxelMap) -> VoxelMap:
     """Return the union of two maps of one world: the maximum where both have a cell.
 
     As long as everything fits, merging equals inserting the points of both into one map. Counts of
@@ -166,7 +166,7 @@ def count(voxels: VoxelMap) -> Array:
     return voxels.occupied
 
 
-def to_points(config: MemorySettings, voxels: VoxelMap) -> tuple[Array, Array, Array]:
+def to_points(config: Memory, voxels: VoxelMap) -> tuple[Array, Array, Array]:
     """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0."""
     valid = voxels.cell_of_slot_V < voxel_cells.nowhere(config)
     points = cell_centres(config, voxels.origin_3, jnp.where(valid, voxels.cell_of_slot_V, 0))
@@ -174,9 +174,7 @@ def to_points(config: MemorySettings, voxels: VoxelMap) -> tuple[Array, Array, A
     return jnp.where(valid[:, None], points, 0), features, valid
 
 
-def tokens(
-    config: MemorySettings, voxels: VoxelMap, camera: Camera, size: tuple[int, int]
-) -> MapTokens:
+def tokens(config: Memory, voxels: VoxelMap, camera: Camera, size: tuple[int, int]) -> MapTokens:
     """Choose the M = ``memory.tokens`` cells that condition one clip.
 
     Cells that the clip's cameras can see come first (``cells.choose``). Ties go to the lower cell
@@ -195,7 +193,7 @@ def tokens(
 
 
 def renewed(
-    config: MemorySettings,
+    config: Memory,
     voxels: VoxelMap,
     cell_V: Array,
     features_VF: Array,

@@ -17,13 +17,13 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import MemorySettings
+from pewm_jax.config import Memory
 from pewm_jax.geometry.cameras import invert_rigid, transform_points
 from pewm_jax.memory import boxes, cells, voxel_cells, voxel_core
 from pewm_jax.types import Array, VoxelMap
 
 
-def erase(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> VoxelMap:
+def erase(config: Memory, voxels: VoxelMap, box_23: Array) -> VoxelMap:
     """Forget the cells in a box, as if nothing had ever been seen there.
 
     Args:
@@ -37,7 +37,7 @@ def erase(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> VoxelMap:
     return _only(config, voxels, ~_within(config, voxels, box_23))
 
 
-def copy(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> VoxelMap:
+def copy(config: Memory, voxels: VoxelMap, box_23: Array) -> VoxelMap:
     """Return a map of only the cells in a box; its counts of dropped and outside are 0.
 
     Args:
@@ -54,7 +54,7 @@ def copy(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> VoxelMap:
 
 
 def paste(
-    config: MemorySettings, voxels: VoxelMap, piece: VoxelMap, transform: Array | None = None
+    config: Memory, voxels: VoxelMap, piece: VoxelMap, transform: Array | None = None
 ) -> VoxelMap:
     """Insert a piece into a map; where both have a cell, take the maximum.
 
@@ -106,7 +106,7 @@ def paste(
 
 
 def move(
-    config: MemorySettings,
+    config: Memory,
     voxels: VoxelMap,
     box_23: Array,
     transform: Array,
@@ -130,19 +130,19 @@ def move(
     return paste(config, rest, piece, transform)
 
 
-def _within(config: MemorySettings, voxels: VoxelMap, box_23: Array) -> Array:
+def _within(config: Memory, voxels: VoxelMap, box_23: Array) -> Array:
     points, _, valid = voxel_core.to_points(config, voxels)
     return boxes.within(points, valid, box_23)
 
 
-def _only(config: MemorySettings, voxels: VoxelMap, keep_V: Array) -> VoxelMap:
+def _only(config: Memory, voxels: VoxelMap, keep_V: Array) -> VoxelMap:
     no_cell = voxel_cells.nowhere(config)
     cell_V = jnp.sort(jnp.where(keep_V, voxels.cell_of_slot_V, no_cell))
     rows = voxel_cells.relocate(voxels.cell_of_slot_V, voxels.features_VF, cell_V, no_cell)
     return voxel_core.renewed(config, voxels, cell_V, rows)
 
 
-def _neighbours(config: MemorySettings) -> np.ndarray:
+def _neighbours(config: Memory) -> np.ndarray:
     """Return (O, 3) offsets, metres, to all cells whose centre a rotated cell can cover."""
     half_diagonal = math.dist(config.cell_m, (0, 0, 0)) / 2
     reach = [int(half_diagonal / size + 0.5) for size in config.cell_m]

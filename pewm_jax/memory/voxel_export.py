@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from pewm_jax.config import MemorySettings, UserError
+from pewm_jax.config import Memory, UserError
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import atomic
 from pewm_jax.memory import voxel_core
@@ -30,7 +30,7 @@ _TRIANGLES = np.asarray([t for a, b, c, d in _SIDES for t in ((a, b, c), (a, c, 
 
 
 def export(
-    config: MemorySettings,
+    config: Memory,
     voxels: VoxelMap,
     path: Path,
     *,

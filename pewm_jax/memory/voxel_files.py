@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import MemorySettings, UserError
+from pewm_jax.config import Memory, UserError
 from pewm_jax.io import weights
 from pewm_jax.memory import voxel_cells
 from pewm_jax.types import VoxelMap
@@ -17,7 +17,7 @@ NAMES = {"cells_NI": "int32", "counts_3": "int32", "features_NF": "", "origin_3"
 """The tensors in a file and their dtypes; features may be float32, bfloat16 or float16."""
 
 
-def save(config: MemorySettings, voxels: VoxelMap, path: Path) -> None:
+def save(config: Memory, voxels: VoxelMap, path: Path) -> None:
     """Write a map atomically; free slots take no space.
 
     Args:
@@ -43,7 +43,7 @@ def save(config: MemorySettings, voxels: VoxelMap, path: Path) -> None:
     weights.save(Path(path), tensors, metadata)
 
 
-def load(config: MemorySettings, path: Path) -> VoxelMap:
+def load(config: Memory, path: Path) -> VoxelMap:
     """Read a map written by ``save``.
 
     Args:
@@ -79,7 +79,7 @@ def load(config: MemorySettings, path: Path) -> VoxelMap:
     )
 
 
-def _check(config: MemorySettings, path: Path, metadata: dict, tensors: dict) -> None:
+def _check(config: Memory, path: Path, metadata: dict, tensors: dict) -> None:
     """Refuse a file that is not an intact map of this grid, or does not fit the capacity."""
     if metadata.get("format") != "voxel map 1" or tensors.keys() != NAMES.keys():
         raise UserError(f"{path} is not a voxel map; give a file that save() has written.")

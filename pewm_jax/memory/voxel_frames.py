@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import MemorySettings
+from pewm_jax.config import Memory
 from pewm_jax.memory import voxel_cells
 from pewm_jax.types import Array, Camera
 
@@ -25,7 +25,7 @@ WORTH_A_BRANCH = 8192
 """Number of corner pixels from which a separate branch, with a shorter sort, pays off."""
 
 
-def pixel_cells(config: MemorySettings, origin_3: Array, depth_THW: Array, camera: Camera) -> Array:
+def pixel_cells(config: Memory, origin_3: Array, depth_THW: Array, camera: Camera) -> Array:
     """Return (T, H, W) int32, the cell of each pixel's surface point (see ``cells.keys``).
 
     The result equals unprojecting to points first, but takes one pass and stores no points.
@@ -118,7 +118,7 @@ def _running_sum(mask_THW: Array) -> Array:
 
 
 def insert(
-    config: MemorySettings,
+    config: Memory,
     cell_V: Array,
     features_VF: Array,
     cell_THW: Array,

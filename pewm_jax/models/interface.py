@@ -1,6 +1,6 @@
 """Backbones: every denoiser behind one interface, chosen by the type of its settings.
 
-A backbone is a ``BackboneSettings`` and a module (or object) with
+A backbone is a ``Backbone`` and a module (or object) with
 
     init(settings, key, in_channels, out_channels) -> params
     apply(settings, params, x_BthwC, time_B, conditioning, readers) -> prediction_BthwC
@@ -26,7 +26,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import BackboneSettings, ModelConfig, functions
+from pewm_jax.config import Backbone, ModelConfig, functions
 from pewm_jax.types import Array, Params
 
 
@@ -94,13 +94,13 @@ NO_READERS = Readers()
 """No memory is read."""
 
 
-def init(config: BackboneSettings, key: Array, in_channels: int, out_channels: int) -> Params:
+def init(config: Backbone, key: Array, in_channels: int, out_channels: int) -> Params:
     """Return random parameters of a backbone with these input and output channels."""
     return functions(config).init(config, key, in_channels, out_channels)
 
 
 def apply(
-    config: BackboneSettings,
+    config: Backbone,
     params: Params,
     x_BthwC: Array,
     time_B: Array,
@@ -123,7 +123,7 @@ def apply(
     return functions(config).apply(config, params, x_BthwC, time_B, conditioning, readers)
 
 
-def init_image(config: BackboneSettings, key: Array) -> Params:
+def init_image(config: Backbone, key: Array) -> Params:
     """Return random parameters of what a backbone sees images with; {} if it has nothing."""
     own = getattr(functions(config), "init_image", None)
     return {} if own is None else own(config, key)

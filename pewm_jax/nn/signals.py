@@ -7,7 +7,7 @@ import math
 import jax.numpy as jnp
 
 from pewm_jax.config import ClipConfig
-from pewm_jax.geometry.arguments import require_array
+from pewm_jax.geometry.cameras import require_array
 from pewm_jax.types import Array, Frames
 
 

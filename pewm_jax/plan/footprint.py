@@ -16,7 +16,7 @@ import jax
 from jax.sharding import Mesh
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, WorldSettings
+from pewm_jax.config import Config, World
 from pewm_jax.io import tree
 from pewm_jax.nn.costs import FLOAT, Share
 from pewm_jax.train.stages import Stage
@@ -64,7 +64,7 @@ class Weights:
     split: tuple[tuple[tuple[str, ...], int], ...]
 
     @classmethod
-    def of(cls, model: WorldSettings, params: Params) -> Weights:
+    def of(cls, model: World, params: Params) -> Weights:
         """Count parameters, which may be abstract, by the model's sharding rules."""
         specs = tree.flatten(tree.assign(worlds.sharding(model), params, "sharding rules"))
         found: dict[tuple[str, ...], int] = {}

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, UserError, WorldSettings
+from pewm_jax.config import Config, UserError, World
 from pewm_jax.errors import require
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.types import Array, Frames, Params, WorldState
@@ -34,7 +34,7 @@ WORKERS = 2
 
 @functools.partial(jax.jit, static_argnums=0, static_argnames=("memory", "last"))
 def _imagined(
-    model: WorldSettings,
+    model: World,
     params: Params,
     state: WorldState,
     actions_KN: Array,
@@ -68,7 +68,7 @@ class Imagination:
         memory: False ignores what is remembered.
     """
 
-    config: Config | WorldSettings
+    config: Config | World
     params: Params = dataclasses.field(repr=False)
     state: WorldState = dataclasses.field(repr=False)
     key: Array

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import EncoderSettings, ModelConfig, UserError
+from pewm_jax.config import Encoder, ModelConfig, UserError
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.errors import require
 from pewm_jax.geometry.actions import heading
@@ -175,7 +175,7 @@ class Features(_OfPictures):
         params: the encoder's parameters, or the world model's.
     """
 
-    settings: EncoderSettings | ModelConfig
+    settings: Encoder | ModelConfig
     params: Params = dataclasses.field(repr=False)
 
     def pictures(self, frames: Frames, goal: Frames) -> Array:
@@ -188,7 +188,7 @@ class Features(_OfPictures):
 
 @functools.partial(jax.jit, static_argnums=0)
 def _features(
-    settings: EncoderSettings | ModelConfig, params: Params, rgb_PHWC: Array, goal_1HWC: Array
+    settings: Encoder | ModelConfig, params: Params, rgb_PHWC: Array, goal_1HWC: Array
 ) -> Array:
     made = encoders.features if isinstance(settings, ModelConfig) else encoders.encode
 

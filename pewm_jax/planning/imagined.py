@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, WorldSettings
+from pewm_jax.config import Config, World
 from pewm_jax.geometry.actions import heading
 from pewm_jax.nn.signals import rgb_from_signal
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
@@ -54,7 +54,7 @@ class ImaginedState:
 
 
 def reset(
-    model: Config | WorldSettings,
+    model: Config | World,
     params: Params,
     frames: Frames,
     key: Array,
@@ -79,7 +79,7 @@ def reset(
 
 
 def step(
-    model: Config | WorldSettings,
+    model: Config | World,
     params: Params,
     state: ImaginedState,
     action: Any,

@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, UserError, WorldSettings
+from pewm_jax.config import Config, UserError, World
 from pewm_jax.data.episodes import DEPTH_LIMIT_M
 from pewm_jax.nn.signals import rgb_from_signal
 from pewm_jax.planning import imagined, observations, scores
@@ -45,7 +45,7 @@ class WorldModelEnv(gymnasium.Env):
 
     def __init__(
         self,
-        model: Config | WorldSettings,
+        model: Config | World,
         params: Params,
         house: HouseConfig | None = None,
         *,

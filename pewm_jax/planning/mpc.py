@@ -20,8 +20,8 @@ import jax
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, UserError, WorldSettings
-from pewm_jax.data.progress import Meter
+from pewm_jax.config import Config, UserError, World
+from pewm_jax.io.progress import Meter
 from pewm_jax.planning.candidates import Imagination, Judged, Rollout
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.plan import Plan, plan
@@ -49,7 +49,7 @@ class Mind:
 
 
 def imagining(
-    config: Config | WorldSettings,
+    config: Config | World,
     params: Params,
     *,
     batch: int = 6,

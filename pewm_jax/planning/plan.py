@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.data.progress import Meter
+from pewm_jax.io.progress import Meter
 from pewm_jax.planning import planners, rounds_file
 from pewm_jax.planning.planners import Search
 from pewm_jax.planning.settings import PlanConfig, Planner

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax.config import Config, WorldSettings
+from pewm_jax.config import Config, World
 from pewm_jax.planning.candidates import Imagination, Rollout
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.plan import checked
@@ -34,7 +34,7 @@ class Ranking:
 
 
 def rank(
-    config: Config | WorldSettings,
+    config: Config | World,
     params: Params,
     state: WorldState,
     proposals_KN: Any,

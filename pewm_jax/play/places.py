@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 
 from pewm_jax.config import GridConfig, UserError
-from pewm_jax.config.model import WorldSettings
+from pewm_jax.config.model import World
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.importer import ImportConfig, import_recording
+from pewm_jax.data.loader import require_same_cells
 from pewm_jax.data.navigation import NavGrid, is_free, sample_free
-from pewm_jax.data.recording_folders import read_recording
+from pewm_jax.data.recordings import read_recording
 from pewm_jax.data.render import render
 from pewm_jax.data.simulator import Simulator, move, open_simulator
-from pewm_jax.data.voxel_checks import require_same_cells
 from pewm_jax.geometry.cameras import resize_intrinsics
 from pewm_jax.play.settings import Start
 from pewm_jax.types import Camera, Frames
@@ -76,7 +76,7 @@ def open_place(start: Start, height: int, width: int) -> Place:
     return Place(name, simulator.frames(around), planar, simulator)
 
 
-def require_shown(model: WorldSettings, start: Start) -> None:
+def require_shown(model: World, start: Start) -> None:
     """Refuse to begin with pictures of something else than a world was trained on.
 
     Args:
@@ -205,7 +205,7 @@ def _recording(start: Start, height: int, width: int) -> Place:
             stride=stride,
             up=start.recording_up,
         )
-        import_recording(config, say=lambda _: None)
+        import_recording(config, log=lambda _: None)
         place = _episode(Path(made) / config.split, 0, start.frames, height, width)
     return dataclasses.replace(place, name=folder.resolve().name)
 

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import AttentionConfig, ModelConfig
-from pewm_jax.geometry import visibility
+from pewm_jax.geometry import zbuffer
 from pewm_jax.geometry.cameras import invert_rigid, project, transform_points
 from pewm_jax.geometry.plucker import fold_frames
 from pewm_jax.nn import placement
@@ -107,7 +107,7 @@ def sightings(
     """Choose the map tokens that each camera attends to, and compute their positions.
 
     Each camera gets J = ``looks`` tokens in view: first those that it can see, every part of its
-    image in turn (``geometry.visibility``; not with ``memory.choose`` nearest), then the nearest.
+    image in turn (``geometry.zbuffer``; not with ``memory.choose`` nearest), then the nearest.
     Tokens hidden behind much nearer ones come last.
 
     Args:
@@ -147,7 +147,7 @@ def _look(
     rank = z + jnp.where(behind, 1e3, 0.0)
     if model.memory.choose == "visible":
         turn = jax.vmap(lambda *seen: _turns(model, *seen))(points_M3, valid_M, camera)
-        rank = jnp.where(turn < visibility.CLASS, turn - visibility.CLASS, rank)
+        rank = jnp.where(turn < zbuffer.CLASS, turn - zbuffer.CLASS, rank)
     rank = jnp.where(visible, rank, jnp.inf)
     _, index = jax.lax.top_k(-rank, looks)
 
@@ -162,10 +162,10 @@ def _look(
 
 
 def _turns(model: ModelConfig, points_M3: Array, valid_M: Array, camera: Camera) -> Array:
-    """Return (T, M) how early each camera names each token; see ``visibility.rank``."""
+    """Return (T, M) how early each camera names each token; see ``zbuffer.rank``."""
     cell_m, size = model.memory.cell_m, (model.clip.height, model.clip.width)
     wide, tall = jnp.float32(max(cell_m[:2])), jnp.float32(cell_m[2])
-    return visibility.rank(points_M3, wide, tall, valid_M, camera, size)
+    return zbuffer.rank(points_M3, wide, tall, valid_M, camera, size)
 
 
 def sinusoid_3d(

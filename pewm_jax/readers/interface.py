@@ -1,6 +1,6 @@
 """Memory readers: one interface, chosen by the type of the settings.
 
-A reader is a ``ReaderSettings`` and a module (or object) with
+A reader is a ``Reader`` and a module (or object) with
 
     init(model, key) -> params                          under ``memory/``; has no effect at first
     prepare(model, params, sight, camera, rays_BthwC) -> Readers

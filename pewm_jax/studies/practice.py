@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.data.progress import Meter
 from pewm_jax.eval import intervals
 from pewm_jax.eval.loaded_run import Opened, open_run, remembers
 from pewm_jax.io import atomic
+from pewm_jax.io.progress import Meter
 from pewm_jax.planning import practice
 from pewm_jax.planning.practice import Place, Walk
 from pewm_jax.studies import kept, policies, practice_page, practice_piece

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from pewm_jax.config import ActionConfig, Config
-from pewm_jax.data import unfinished
+from pewm_jax.data import resume
 from pewm_jax.data.dataset import EpisodeSource, describe_shard, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.navigation import line_is_free
@@ -202,11 +202,11 @@ def _collect(
 ) -> None:
     """Write the walks of a practice as a dataset, or find them written."""
     settings = {"made_by": "practice", "seed": seed, **dataclasses.asdict(errand.practice)}
-    state = unfinished.examine(folder, settings)
+    state = resume.examine(folder, settings)
     if state == "complete":
         return
     path = folder / "shard-00000-of-00001.array_record"
-    done = unfinished.prepare(folder, settings, state, {path: errand.practice.walks})
+    done = resume.prepare(folder, settings, state, {path: errand.practice.walks})
     table = discrete_table(begun.motion)
 
     def records() -> Iterator[bytes]:
@@ -217,7 +217,7 @@ def _collect(
     if path.name not in done:
         write_shard(path, records())
     shard = done.get(path.name) or describe_shard(path)
-    unfinished.publish(folder, settings, [shard], unfinished.frames_of(folder, shard))
+    resume.publish(folder, settings, [shard], resume.frames_of(folder, shard))
 
 
 def _record(walk: Walk, table_A3: np.ndarray, name: str, house: str) -> bytes:

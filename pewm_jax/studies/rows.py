@@ -23,10 +23,10 @@ from pewm_jax.config import (
     ImagesConfig,
     LatentsConfig,
     Map2DConfig,
-    MemorySettings,
+    Memory,
     NoMemoryConfig,
     PointsConfig,
-    ReaderSettings,
+    Reader,
     RenderConfig,
     SurfelConfig,
     UserError,
@@ -63,7 +63,7 @@ class Row:
     """
 
     name: str
-    memory: MemorySettings
+    memory: Memory
     depth: bool = True
     paper: str = ""
     times: float = 1.0
@@ -117,12 +117,10 @@ def main_rows(base: Config) -> tuple[Row, ...]:
     )
 
 
-def _as(
-    memory: MemorySettings, kind: type[MemorySettings], reader: ReaderSettings, **changes: Any
-) -> MemorySettings:
+def _as(memory: Memory, kind: type[Memory], reader: Reader, **changes: Any) -> Memory:
     """Return a memory of another kind with the settings that all kinds share."""
     given: dict[str, Any] = {
-        field.name: getattr(memory, field.name) for field in dataclasses.fields(MemorySettings)
+        field.name: getattr(memory, field.name) for field in dataclasses.fields(Memory)
     }
     given["reader"] = reader
     given.update(changes)
@@ -130,12 +128,12 @@ def _as(
 
 
 def _finer(
-    memory: MemorySettings,
-    kind: type[MemorySettings],
-    reader: ReaderSettings,
+    memory: Memory,
+    kind: type[Memory],
+    reader: Reader,
     scale: float,
     more: int,
-) -> MemorySettings:
+) -> Memory:
     """Return a memory of coloured points: cells are cubes, and the extent stays."""
     side = round(scale * min(memory.cell_m), 4)
     sizes = zip(memory.cell_m, memory.cells, strict=True)
@@ -157,11 +155,11 @@ def _attend(base: Config) -> AttentionConfig:
     return reader
 
 
-def _rendered(base: Config, memory: MemorySettings) -> MemorySettings:
+def _rendered(base: Config, memory: Memory) -> Memory:
     """Return the memory read by rendering, with about as many parameters as by attention."""
     width = base.model.backbone.width
 
-    def with_ratio(ratio: int) -> MemorySettings:
+    def with_ratio(ratio: int) -> Memory:
         reader = RenderConfig(picture_width=width, mlp_ratio=ratio)
         return dataclasses.replace(memory, reader=reader)
 
@@ -170,18 +168,18 @@ def _rendered(base: Config, memory: MemorySettings) -> MemorySettings:
     return with_ratio(max(1, 1 + round(missing)))
 
 
-def parameters(base: Config, memory: MemorySettings) -> int:
+def parameters(base: Config, memory: Memory) -> int:
     """Return how many parameters a memory's reader has; those that stage 2 trains."""
     model = base.with_model(memory=memory).model
     shapes = jax.eval_shape(functools.partial(world_model.init, model), jax.random.key(0))
     return sum(leaf.size for leaf in jax.tree.leaves(shapes.get("memory", {})))
 
 
-def _paper_form(base: Config) -> MemorySettings:
+def _paper_form(base: Config) -> Memory:
     return next(row.memory for row in main_rows(base) if row.name == PAPER_FORM)
 
 
-def _cell(base: Config, side: str) -> MemorySettings:
+def _cell(base: Config, side: str) -> Memory:
     """Another size of a cell on the ground; extent and height stay, smaller ones are more."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
     x, y, z = memory.cell_m
@@ -196,7 +194,7 @@ def _cell(base: Config, side: str) -> MemorySettings:
     return dataclasses.replace(memory, cell_m=(x * scale, y * scale, z), cells=cells, capacity=room)
 
 
-def _extent(base: Config, side: str) -> MemorySettings:
+def _extent(base: Config, side: str) -> Memory:
     """Another extent of the map on the ground, metres."""
     if not 0 < float(side) < math.inf:
         raise ValueError(side)
@@ -206,7 +204,7 @@ def _extent(base: Config, side: str) -> MemorySettings:
     return dataclasses.replace(memory, cells=cells)
 
 
-def _tokens(base: Config, count: str) -> MemorySettings:
+def _tokens(base: Config, count: str) -> Memory:
     """Another number of tokens that condition a clip."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
     if int(count) > MOST_CELLS:
@@ -218,7 +216,7 @@ def _tokens(base: Config, count: str) -> MemorySettings:
     return dataclasses.replace(memory, tokens=int(count), capacity=most)
 
 
-def _features(base: Config, kind: str) -> MemorySettings:
+def _features(base: Config, kind: str) -> Memory:
     """Other features: colours of patches, the codec's latents, a DINOv2's, or none (points)."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
     if kind.startswith(NETWORK):
@@ -248,7 +246,7 @@ class Ablation:
         about: what it is, with its unit.
     """
 
-    make: Callable[[Config, str], MemorySettings]
+    make: Callable[[Config, str], Memory]
     values: tuple[str, ...]
     about: str
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from pewm_jax.config import Config, to_dict
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.data.progress import Meter
 from pewm_jax.eval import protocol_file
 from pewm_jax.eval.fixed import Protocol, decide, lay
 from pewm_jax.eval.imagine import Imagination, copy_last
@@ -31,6 +30,7 @@ from pewm_jax.eval.reproject import reproject_batch
 from pewm_jax.eval.reproject_choice import ReprojectChoice, choose_settings
 from pewm_jax.eval.scoring import Batch, load_batch
 from pewm_jax.geometry.actions import there_and_back
+from pewm_jax.io.progress import Meter
 from pewm_jax.models.lpips.model import LEAST
 from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.types import Camera, Frames

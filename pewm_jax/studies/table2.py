@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.config import Config, UserError
-from pewm_jax.data.progress import Meter
 from pewm_jax.eval import intervals
 from pewm_jax.eval.loaded_run import Opened, open_run, remembers
 from pewm_jax.io import atomic
+from pewm_jax.io.progress import Meter
 from pewm_jax.planning import scores
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.settings import PlanConfig

@@ -20,7 +20,7 @@ from jax.sharding import Mesh
 
 from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
-from pewm_jax.data.bad_records import BadRecords
+from pewm_jax.data.loader import BadRecords
 from pewm_jax.memory import feature_cache
 from pewm_jax.train import prepared, processes, runs, sharding, stages, starting, wandb_log
 from pewm_jax.train.checkpoint import Checkpoints
@@ -155,7 +155,7 @@ class _Worker:
                 LiveView(stage.title, steps, done) as self.view,
                 MetricsLog(run, stage, done, config) as log,
             ):
-                self.bad.say = self.view.say if processes.is_primary() else _print_error
+                self.bad.log = self.view.say if processes.is_primary() else _print_error
                 self.watch = Watch(
                     config,
                     stage,

@@ -24,8 +24,8 @@ import numpy as np
 from pewm_jax import config as configuration
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import read_manifest
-from pewm_jax.data.progress import Meter
 from pewm_jax.io import atomic, tensor_files, tree
+from pewm_jax.io.progress import Meter
 from pewm_jax.train.stages import Stage
 from pewm_jax.types import Clip, Params
 

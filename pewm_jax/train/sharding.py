@@ -18,7 +18,7 @@ from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax import worlds
-from pewm_jax.config import AXES, Config, ConfigError, MeshConfig, WorldSettings, functions
+from pewm_jax.config import AXES, Config, ConfigError, MeshConfig, World, functions
 from pewm_jax.io import tree
 from pewm_jax.nn.placement import BATCH
 from pewm_jax.train.stages import Stage
@@ -30,7 +30,7 @@ ALL_DATA = MeshConfig()
 WHOLE = P()
 
 
-def rules(model: WorldSettings) -> tuple[tuple[str, P], ...]:
+def rules(model: World) -> tuple[tuple[str, P], ...]:
     """Return the rules of a ``TrainState``: average and moments lie with their parameter.
 
     A rule leads from the path of a parameter to the mesh axes of its *last* axes; those before them
@@ -56,7 +56,7 @@ def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_D
     return jax.make_mesh(arranged.shape(len(devices)), AXES, types, devices=devices)
 
 
-def of_state(model: WorldSettings, mesh: Mesh | AbstractMesh, state: Any) -> Any:
+def of_state(model: World, mesh: Mesh | AbstractMesh, state: Any) -> Any:
     """Return the shardings of a (possibly abstract) state, as a tree of its structure.
 
     An axis of the mesh that does not divide its axis of a leaf is left out for that leaf;
@@ -72,7 +72,7 @@ def of_state(model: WorldSettings, mesh: Mesh | AbstractMesh, state: Any) -> Any
     )
 
 
-def constrain(model: WorldSettings, params: Params) -> Params:
+def constrain(model: World, params: Params) -> Params:
     """Keep a tree of parameters, or of their gradients, where the table says; within a step."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty or mesh.size == 1:
@@ -85,9 +85,7 @@ def constrain(model: WorldSettings, params: Params) -> Params:
     )
 
 
-def left_out(
-    model: WorldSettings, mesh: Mesh | AbstractMesh, state: Any
-) -> dict[str, tuple[str, ...]]:
+def left_out(model: World, mesh: Mesh | AbstractMesh, state: Any) -> dict[str, tuple[str, ...]]:
     """Return the leaves that are not split as their rule says, and the mesh axes left out.
 
     Args:
@@ -100,7 +98,7 @@ def left_out(
     return {path: axes for path, axes in missed.items() if axes}
 
 
-def _specs(model: WorldSettings, state: Any) -> Any:
+def _specs(model: World, state: Any) -> Any:
     return tree.assign(rules(model), state, "sharding rules")
 
 

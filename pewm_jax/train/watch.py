@@ -15,7 +15,7 @@ import jax
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data import loader
-from pewm_jax.data.bad_records import BadRecords
+from pewm_jax.data.loader import BadRecords
 from pewm_jax.io import atomic
 from pewm_jax.train import chips, prepared, processes
 from pewm_jax.train.log import LiveView, MetricsLog, Pace, drop_after

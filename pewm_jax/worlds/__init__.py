@@ -19,7 +19,7 @@ not batched, neither on the way in nor on the way out::
 
 ``jax.vmap`` over *states* is for worlds that differ; it needs one memory for each.
 
-A world is a ``WorldSettings`` and a module (or object) with these three functions and
+A world is a ``World`` and a module (or object) with these three functions and
 
     init(model, key) -> params               all parameters
     stages(model) -> (Stage, …)              how it is trained, see ``worlds.stages``
@@ -40,19 +40,19 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import Config, UserError, WorldSettings, functions
+from pewm_jax.config import Config, UserError, World, functions
 from pewm_jax.types import Array, Frames, Params, WorldState
 from pewm_jax.worlds import checks
 from pewm_jax.worlds.stages import Stage
 
 
-def model_of(config: Config | WorldSettings) -> Any:
+def model_of(config: Config | World) -> Any:
     """Return the model's settings, from a whole experiment's if those are given."""
     return config.model if isinstance(config, Config) else config
 
 
 def start(
-    model: Config | WorldSettings,
+    model: Config | World,
     params: Params,
     frames: Frames,
     *,
@@ -86,7 +86,7 @@ def start(
 
 
 def observe(
-    model: Config | WorldSettings,
+    model: Config | World,
     params: Params,
     state: WorldState,
     frames: Frames,
@@ -117,7 +117,7 @@ def observe(
 
 
 def imagine(
-    model: Config | WorldSettings,
+    model: Config | World,
     params: Params,
     state: WorldState,
     control: Any,
@@ -168,7 +168,7 @@ def imagine(
 
 
 def imagine_many(
-    model: Config | WorldSettings,
+    model: Config | World,
     params: Params,
     state: WorldState,
     controls: Any,
@@ -238,7 +238,7 @@ def _require_state(state: Any, who: str) -> None:
 @functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
 def _start(
     act: Callable[..., WorldState],
-    model: WorldSettings,
+    model: World,
     params: Params,
     frames: Frames,
     depth_scale: Array | None,
@@ -250,7 +250,7 @@ def _start(
 @functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
 def _observe(
     act: Callable[..., WorldState],
-    model: WorldSettings,
+    model: World,
     params: Params,
     state: WorldState,
     frames: Frames,
@@ -267,7 +267,7 @@ def _observe(
 )
 def _imagine(
     act: Callable[..., tuple[WorldState, Frames]],
-    model: WorldSettings,
+    model: World,
     params: Params,
     state: WorldState,
     control: Any,
@@ -288,7 +288,7 @@ def _imagine(
 )
 def _imagine_many(
     act: Callable[..., tuple[WorldState, Frames]],
-    model: WorldSettings,
+    model: World,
     params: Params,
     state: WorldState,
     controls: Any,
@@ -316,7 +316,7 @@ def _imagine_many(
     return checks.poisoned(ok, after.frame), checks.poisoned(ok, frames)
 
 
-def to_compare(model: Config | WorldSettings, state: WorldState) -> WorldState:
+def to_compare(model: Config | World, state: WorldState) -> WorldState:
     """Return a state for ``imagine_many`` alone, whose memory may be smaller and looks the same.
 
     On the host, not under jit; a world that can do no such thing gives the state as it is.
@@ -326,9 +326,7 @@ def to_compare(model: Config | WorldSettings, state: WorldState) -> WorldState:
     return state if own is None else own(model, state)
 
 
-def views(
-    model: Config | WorldSettings, params: Params, state: WorldState
-) -> Callable[[Any], Any] | None:
+def views(model: Config | World, params: Params, state: WorldState) -> Callable[[Any], Any] | None:
     """Return what makes ``views`` for ``imagine_many``, and keeps what candidates have in common.
 
     On the host, not under jit; None where a world has nothing of the kind. The state is the one
@@ -339,19 +337,19 @@ def views(
     return None if own is None else own(model, params, state)
 
 
-def init(model: Config | WorldSettings, key: Array) -> Params:
+def init(model: Config | World, key: Array) -> Params:
     """Return random parameters for all networks of a world."""
     model = model_of(model)
     return functions(model).init(model, key)
 
 
-def stages(model: Config | WorldSettings) -> tuple[Stage, ...]:
+def stages(model: Config | World) -> tuple[Stage, ...]:
     """Return the stages of a world's training, in order."""
     model = model_of(model)
     return functions(model).stages(model)
 
 
-def sharding(model: Config | WorldSettings) -> tuple[tuple[str, Any], ...]:
+def sharding(model: Config | World) -> tuple[tuple[str, Any], ...]:
     """Return the rules from paths of parameters to the mesh axes of their last axes."""
     model = model_of(model)
     return functions(model).sharding(model)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings, UserError
-from pewm_jax.geometry import holes
+from pewm_jax.geometry import depth_images
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.nn.costs import Costs, Product, Share
@@ -55,7 +55,7 @@ def pictures(model: CodecWorldConfig, clip: Clip) -> tuple[Array, Array]:
     frames = as_signal(clip.frames)
     rgb = frames.rgb_THWC.reshape(-1, *frames.rgb_THWC.shape[-3:])
     depth = frames.depth_THW.reshape(-1, *frames.depth_THW.shape[-2:], 1)
-    whole = holes.fill_depth(depth[..., 0], model.clip.far_m)[..., None]
+    whole = depth_images.fill_depth(depth[..., 0], model.clip.far_m)[..., None]
     grey = jnp.broadcast_to(signal_from_depth(model.clip, whole), rgb.shape)
     measured = (depth > 0).astype(rgb.dtype)
     return jnp.stack([rgb, grey]), jnp.stack([jnp.ones_like(measured), measured])

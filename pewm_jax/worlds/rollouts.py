@@ -23,7 +23,7 @@ from jax.typing import ArrayLike
 
 from pewm_jax import config as configs
 from pewm_jax import shipped, worlds
-from pewm_jax.config import Config, WorldSettings
+from pewm_jax.config import Config, World
 from pewm_jax.io import tree, weights
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 
@@ -64,7 +64,7 @@ def _expected(config: Config, params: Params) -> Params:
 
 
 def rollout(
-    config: Config | WorldSettings,
+    config: Config | World,
     params: Params,
     state: WorldState,
     actions: ArrayLike | Sequence[Any] | Camera | Control,

@@ -11,7 +11,6 @@ from data_world import split
 
 from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, UserError
 from pewm_jax.data import loader
-from pewm_jax.data.bad_records import BadRecords
 from pewm_jax.data.dataset import (
     EpisodeSource,
     Manifest,
@@ -21,6 +20,7 @@ from pewm_jax.data.dataset import (
     write_shard,
 )
 from pewm_jax.data.episodes import read_episode
+from pewm_jax.data.loader import BadRecords
 
 SHARD = "shard-00000-of-00002.array_record"
 

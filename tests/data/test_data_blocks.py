@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import ConfigError, GridConfig, ModelConfig, NomadWorldConfig, PersistConfig
-from pewm_jax.data import block_pictures
+from pewm_jax.data import voxel_pictures
 from pewm_jax.data.episodes import read_episode
+from pewm_jax.data.loader import require_same_cells
 from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
-from pewm_jax.data.voxel_checks import require_same_cells
-from pewm_jax.data.voxel_classes import PALETTE, VoxelsConfig
-from pewm_jax.data.voxel_frames import VoxelFrames
 from pewm_jax.data.voxel_pictures import ahead
+from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig
 from pewm_jax.geometry import block_light
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera
@@ -36,7 +35,7 @@ def room():
 
 def test_a_room_of_blocks_is_lit_by_side_distance_and_corner():
     voxels, camera = room()
-    seen = block_pictures.pictures(voxels, camera, SIZE, SIZE)
+    seen = voxel_pictures.draw_blocks(voxels, camera, SIZE, SIZE)
     rgb, middle = seen.rgb_THWC[0].astype(float), SIZE // 2
     np.testing.assert_allclose(seen.depth_THW[0, middle, middle], 3 * CELL - 0.01, atol=1e-4)
     assert seen.ids_THW[0, middle, middle] == BROWN
@@ -53,8 +52,8 @@ def test_a_room_of_blocks_is_lit_by_side_distance_and_corner():
 def test_where_nothing_is_met_there_is_no_depth():
     voxels, camera = room()
     nothing = dataclasses.replace(voxels, classes_TXYZ=np.zeros_like(voxels.classes_TXYZ))
-    seen = block_pictures.pictures(nothing, camera, SIZE, SIZE)
-    assert (seen.rgb_THWC == block_pictures.AIR).all()
+    seen = voxel_pictures.draw_blocks(nothing, camera, SIZE, SIZE)
+    assert (seen.rgb_THWC == voxel_pictures.AIR).all()
     assert not seen.depth_THW.any()
     assert (seen.ids_THW == -1).all()
 
@@ -65,7 +64,7 @@ def test_an_episode_of_cells_shows_the_cells_it_records():
     config = dataclasses.replace(plain, voxels=voxels, moving=True)
     episode = read_episode(make_episode(config, "train", 0))
     frames, cells = episode.frames(range(3)), episode.voxels(range(3))
-    again = block_pictures.pictures(cells, frames.camera, 32, 32)
+    again = voxel_pictures.draw_blocks(cells, frames.camera, 32, 32)
     np.testing.assert_array_equal(again.rgb_THWC, frames.rgb_THWC)
     drawn = ahead(cells, 1, frames.camera, 32, 32)
     np.testing.assert_allclose(frames.depth_THW[1], drawn.depth_HW, atol=2e-3)

@@ -13,8 +13,8 @@ import pytest
 from data_world import split
 
 from pewm_jax.cli.data import COMMANDS, main
-from pewm_jax.data.progress import Meter
 from pewm_jax.data.validate import Verdict
+from pewm_jax.io.progress import Meter
 from pewm_jax.presets.demo import config as demo
 
 ROOT = Path(__file__).parents[2]
@@ -146,7 +146,7 @@ def test_an_interruption_says_so(capsys, monkeypatch, tmp_path):
 
 def test_progress_off_the_terminal_is_a_line_now_and_then(capsys, monkeypatch):
     clock = iter([0.0, 4.0, 11.0, 12.0, 20.0])
-    monkeypatch.setattr("pewm_jax.data.progress.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("pewm_jax.io.progress.time.monotonic", lambda: next(clock))
     with Meter("work", 100, "frames") as meter:
         meter.advance(10)
         meter.advance(12)

@@ -124,7 +124,7 @@ def test_a_resumed_collection_makes_only_what_is_missing(whole, tmp_path, mesh):
     made = kept.stat().st_mtime_ns
     said = []
     collect(config, said.append)
-    assert said[1] == "resuming: 1 files are there, 3 are missing."
+    assert said[1] == "resuming: 1 files exist, 3 are missing."
     assert fingerprints(out) == whole[1]
     assert kept.stat().st_mtime_ns == made
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pewm_jax.cli.data import main
-from pewm_jax.data.consistency import share_floating
+from pewm_jax.data.checks import share_floating
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry.cameras import unproject
 

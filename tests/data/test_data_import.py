@@ -22,7 +22,7 @@ from pewm_jax.data.importer import (
     planar_actions,
     world_from_recording,
 )
-from pewm_jax.data.recording_folders import RecordedFrame, natural_key, read_recording
+from pewm_jax.data.recordings import RecordedFrame, natural_key, read_recording
 from pewm_jax.geometry.cameras import unproject
 
 SIZE = 48

@@ -9,14 +9,13 @@ import math
 import numpy as np
 import pytest
 
-from pewm_jax.data.doors import FAR_M, NEAR_M, Leaf
-from pewm_jax.data.moving import Round, moving_house, parts_at, render_moving
+from pewm_jax.data.moving import FAR_M, NEAR_M, Leaf, Round, moving_house, parts_at, render_moving
 from pewm_jax.data.navigation import is_free
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
-from pewm_jax.data.voxel_classes import VoxelsConfig
 from pewm_jax.data.voxel_pictures import ahead
-from pewm_jax.data.voxel_recording import record_voxels
+from pewm_jax.data.voxelise import record_voxels
+from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera
 

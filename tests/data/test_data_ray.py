@@ -61,7 +61,7 @@ def test_a_cluster_makes_the_very_files_of_the_local_pool_and_only_those_that_mi
     made = kept.stat().st_mtime_ns
     said = []
     collect(there, said.append)
-    assert said[0] == "resuming: 2 files are there, 1 are missing."
+    assert said[0] == "resuming: 2 files exist, 1 are missing."
     assert fingerprints(there.out) == want
     assert kept.stat().st_mtime_ns == made
 
@@ -186,7 +186,7 @@ def test_the_code_that_is_compared_is_all_that_makes_episodes():
     modules = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, text=True)
     names = [name.split(".") for name in modules.split() if name.startswith("pewm_jax.")]
     chapters = {name[1] for name in names if (ROOT / "pewm_jax" / name[1]).is_dir()}
-    assert chapters == set(engines.CHAPTERS)
+    assert chapters == set(engines.PACKAGES)
 
 
 def test_an_engine_that_cannot_be_used_is_refused_before_anything_is_touched(

@@ -25,14 +25,13 @@ from pewm_jax.data.episodes import read_episode, write_episode
 from pewm_jax.data.importer import import_recording, world_from_recording
 from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
 from pewm_jax.data.record_format import DamagedError
+from pewm_jax.data.recordings import turned
 from pewm_jax.data.scenes import house
 from pewm_jax.data.show import draw_voxels
 from pewm_jax.data.validate import ValidateConfig, validate
-from pewm_jax.data.voxel_classes import PALETTE, VoxelsConfig, class_ids, table_colours
-from pewm_jax.data.voxel_frames import VoxelFrames
-from pewm_jax.data.voxel_import import turned
 from pewm_jax.data.voxel_pictures import ahead
 from pewm_jax.data.voxelise import around, cut, fill, lattice_of
+from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig, class_ids, table_colours
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.houses.kinds import GROUPS, KINDS, OTHER, kind_of
 from tests.helpers import tiny_config

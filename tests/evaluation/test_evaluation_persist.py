@@ -13,7 +13,7 @@ from pewm_jax import worlds
 from pewm_jax.config import Config, DataConfig, EvalConfig, PersistTrainConfig
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
-from pewm_jax.data.voxel_classes import VoxelsConfig
+from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.eval import report
 from pewm_jax.io import weights
 from tests.persist_world import MODEL

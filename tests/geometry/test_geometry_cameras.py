@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import pewm_jax
 from pewm_jax.config import ImagesConfig, Map2DConfig, PointsConfig, SurfelConfig, VoxelConfig
-from pewm_jax.geometry import actions, camera_steps, cameras, plucker
+from pewm_jax.geometry import actions, cameras, plucker
 from pewm_jax.memory import memories
 from pewm_jax.types import Camera, Frames
 from tests.helpers import random_camera, rigid, tiny_model
@@ -97,8 +97,8 @@ EXACT = {
     "integrate": lambda: actions.integrate(POSE, jnp.ones((2, 3))),
     "between": lambda: actions.actions_between(CAMERA.world_from_camera),
     "back": lambda: actions.there_and_back(jnp.ones((2, 3))),
-    "camera steps": lambda: camera_steps.between(CAMERA, CAMERA, 16),
-    "follow": lambda: camera_steps.follow(CAMERA, jnp.zeros((3, 6)), 16),
+    "camera steps": lambda: actions.camera_steps_between(CAMERA, CAMERA, 16),
+    "follow": lambda: actions.follow_camera_steps(CAMERA, jnp.zeros((3, 6)), 16),
 }
 """Functions that multiply positions and rotations, called with arrays of their own."""
 

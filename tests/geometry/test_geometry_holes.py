@@ -5,9 +5,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.geometry import holes
+from pewm_jax.geometry import depth_images
 
-fill = jax.jit(holes.fill_depth, static_argnums=1)
+fill = jax.jit(depth_images.fill_depth, static_argnums=1)
 
 
 @settings(max_examples=20, deadline=None)

@@ -6,7 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.geometry.cameras import unproject
-from pewm_jax.geometry.normals import normals
+from pewm_jax.geometry.depth_images import normals
 from tests.helpers import random_camera
 
 found = jax.jit(normals)

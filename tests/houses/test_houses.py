@@ -11,7 +11,8 @@ import pytest
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import from_trimesh, house
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
-from pewm_jax.houses import connectivity, floorplan
+from pewm_jax.houses import floorplan
+from pewm_jax.houses import floorplan as connectivity
 from pewm_jax.houses import generate as houses_module
 from pewm_jax.houses.generate import generate_house
 from pewm_jax.types import Camera

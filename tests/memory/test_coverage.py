@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import RenderConfig
-from pewm_jax.geometry import visibility
+from pewm_jax.geometry import zbuffer
 from pewm_jax.memory import coverage, memories
 from tests.helpers import random_camera
 from tests.memory.test_memory_rivals import ALL, KINDS, encoded, model_of, scene, seen
@@ -68,11 +68,11 @@ def test_what_hides_is_chosen_before_what_is_hidden():
     points = jnp.asarray(np.stack([far, aside, near, near]), jnp.float32)
     valid = jnp.array([True, True, True, False])
     size = jnp.float32(0.5)
-    order = visibility.visible_first(points, size, size, valid, camera, (16, 24), 4)
+    order = zbuffer.visible_first(points, size, size, valid, camera, (16, 24), 4)
     np.testing.assert_array_equal(order, [2, 0, 1, 3])
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (21, 32), (1, 5)])
 def test_each_pixel_has_one_turn(shape):
-    turns = visibility.turns(*shape)
+    turns = zbuffer.turns(*shape)
     np.testing.assert_array_equal(np.sort(turns), np.arange(np.prod(shape)))

@@ -11,7 +11,7 @@ from pewm_jax.codecs import interface as codecs
 from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.config import (
     ClipConfig,
-    CodecSettings,
+    Codec,
     CodecWorldConfig,
     ConfigError,
     DiTConfig,
@@ -87,7 +87,7 @@ def test_sizes_that_do_not_fit_are_refused_in_a_sentence(params, video, says):
 
 def test_settings_that_cannot_work_are_refused_in_a_sentence():
     with pytest.raises(ConfigError, match=r"codec has no setting temporal; it has coarse, "):
-        from_dict(CodecSettings, {"kind": "learned", "temporal": 4}, "codec")
+        from_dict(Codec, {"kind": "learned", "temporal": 4}, "codec")
     with pytest.raises(ConfigError, match=r"codec\.coarse is 0: use at least 1"):
         LearnedCodecConfig(coarse=0)
     with pytest.raises(ConfigError, match=r"multiples of codec\.spatial × backbone\.patch = 16"):

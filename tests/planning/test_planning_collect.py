@@ -10,10 +10,9 @@ import pytest
 
 from pewm_jax.cli import data
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data.collect_env import collect_env
+from pewm_jax.data.collect_env import CollectEnvConfig, collect_env, open_env
+from pewm_jax.data.collect_env import make as make_record
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.data.env_episode import CollectEnvConfig, open_env
-from pewm_jax.data.env_episode import make as make_record
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.validate import ValidateConfig, validate
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
@@ -115,8 +114,8 @@ def test_the_command_walks_a_registered_house(tmp_path, capsys):
 
 
 def test_an_environment_and_a_policy_of_ones_own(tmp_path):
-    collect_env(settings(tmp_path, policy=f"{__name__}:turn_a_little"), say=lambda _: None)
-    verdict = validate(ValidateConfig(tmp_path), say=lambda _: None)
+    collect_env(settings(tmp_path, policy=f"{__name__}:turn_a_little"), log=lambda _: None)
+    verdict = validate(ValidateConfig(tmp_path), log=lambda _: None)
     assert (verdict.episodes, verdict.frames, verdict.problems) == (4, 48, [])
     source = EpisodeSource(tmp_path / "train")
     np.testing.assert_allclose(source[1].actions, np.tile([0, 0, 0.25], (11, 1)), atol=1e-5)
@@ -131,7 +130,7 @@ def test_an_environment_and_a_policy_of_ones_own(tmp_path):
 def test_random_actions_persist_and_an_interrupted_collection_goes_on(tmp_path):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     for out in (whole, cut):
-        collect_env(settings(out, persistence=0.8, frames=40), say=lambda _: None)
+        collect_env(settings(out, persistence=0.8, frames=40), log=lambda _: None)
     assert hashes(whole) == hashes(cut)
     turns = np.concatenate([one.actions[:, 2] for one in EpisodeSource(whole / "train")[:]])
     assert 0.65 < (np.abs(np.diff(turns)) < 1e-4).mean() < 0.92
@@ -139,11 +138,11 @@ def test_random_actions_persist_and_an_interrupted_collection_goes_on(tmp_path):
     assert len(names) == 2
     (cut / "train" / names[0]).unlink()
     kept = (cut / "train" / names[1]).stat().st_mtime_ns
-    collect_env(settings(cut, persistence=0.8, frames=40), say=lambda _: None)
+    collect_env(settings(cut, persistence=0.8, frames=40), log=lambda _: None)
     assert hashes(whole) == hashes(cut)
     assert (cut / "train" / names[1]).stat().st_mtime_ns == kept
     with pytest.raises(ConfigError, match="made with other settings"):
-        collect_env(settings(cut, frames=30), say=lambda _: None)
+        collect_env(settings(cut, frames=30), log=lambda _: None)
 
 
 def test_random_actions_that_have_no_effect_are_not_repeated(tmp_path):
@@ -160,9 +159,9 @@ def test_random_actions_that_have_no_effect_are_not_repeated(tmp_path):
 def test_episodes_that_end_early_keep_their_length(tmp_path):
     collect_env(
         settings(tmp_path, env_args='{"length": 10}', frames=30, min_frames=5),
-        say=lambda _: None,
+        log=lambda _: None,
     )
-    verdict = validate(ValidateConfig(tmp_path), say=lambda _: None)
+    verdict = validate(ValidateConfig(tmp_path), log=lambda _: None)
     assert (verdict.episodes, verdict.frames, verdict.problems) == (4, 40, [])
     assert json.loads((tmp_path / "train/dataset.json").read_text())["frames"] == 30
 
@@ -188,7 +187,7 @@ def test_episodes_that_end_early_keep_their_length(tmp_path):
 )
 def test_what_is_no_source_of_episodes_is_refused_and_nothing_is_written(tmp_path, options, says):
     with pytest.raises(UserError, match=re.escape(says)) as caught:
-        collect_env(settings(tmp_path / "out", **options), say=lambda _: None)
+        collect_env(settings(tmp_path / "out", **options), log=lambda _: None)
     told = str(caught.value)
     assert told.endswith(".")
     assert "\n" not in told

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import BackboneSettings, Places, register
+from pewm_jax.config import Backbone, InjectionPoints, register
 from pewm_jax.models import interface as backbones
 from pewm_jax.nn import layers
 from pewm_jax.nn.costs import Costs, Product, video_tokens
@@ -19,11 +19,11 @@ SHARDING = (
 
 
 @dataclasses.dataclass(frozen=True)
-class PerceptronConfig(BackboneSettings):
+class PerceptronConfig(Backbone):
     depth: int = 2
     width: int = 32
 
-    places = property(lambda self: Places(self.depth, self.width, self.width))
+    places = property(lambda self: InjectionPoints(self.depth, self.width, self.width))
 
 
 def init(config, key, in_channels, out_channels):

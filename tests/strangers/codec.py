@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.codecs.pixel import fold
-from pewm_jax.config import CodecSettings, register
+from pewm_jax.config import Codec, register
 from pewm_jax.nn.costs import Costs, Product
 
 SHARDING = ((r"codec/(colour|depth)", P(None, "fsdp")),)
 
 
 @dataclasses.dataclass(frozen=True)
-class TurnConfig(CodecSettings):
+class TurnConfig(Codec):
     spatial: int = 4
     temporal: ClassVar[int] = 1
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import ControlSettings, register
+from pewm_jax.config import Conditioner, register
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.nn.costs import Costs, Product
 
@@ -16,7 +16,7 @@ SHARDING = ((r"control/project", P(None, "fsdp")),)
 
 
 @dataclasses.dataclass(frozen=True)
-class PushConfig(ControlSettings):
+class PushConfig(Conditioner):
     MODULATES: ClassVar[bool] = True
 
     width: int = 3

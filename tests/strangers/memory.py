@@ -6,7 +6,7 @@ import sys
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import MemorySettings, register
+from pewm_jax.config import Memory, register
 from pewm_jax.memory import cells
 from pewm_jax.types import MapTokens
 
@@ -14,7 +14,7 @@ SIDE = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class NewestConfig(MemorySettings):
+class NewestConfig(Memory):
     frames: int = 4
 
 

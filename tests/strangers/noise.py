@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import NoiseSettings, register
+from pewm_jax.config import Noise, register
 from pewm_jax.diffusion.noise import spread
 
 
 @dataclasses.dataclass(frozen=True)
-class CosineConfig(NoiseSettings):
+class CosineConfig(Noise):
     sample_steps: int = 3
 
 

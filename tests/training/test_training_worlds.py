@@ -15,7 +15,7 @@ from jax.sharding import PartitionSpec as P
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
-from pewm_jax.config import Config, ConfigError, StageConfig, TrainSettings, WorldSettings, register
+from pewm_jax.config import Config, ConfigError, StageConfig, TrainSettings, World, register
 from pewm_jax.data import loader
 from pewm_jax.io import tree
 from pewm_jax.nn.costs import Costs, Product
@@ -34,7 +34,7 @@ class ThreeStages(TrainSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class LineConfig(WorldSettings):
+class LineConfig(World):
     """A line through points: the world needs no clip, no codec and no memory."""
 
     TRAIN: ClassVar[type[TrainSettings]] = ThreeStages

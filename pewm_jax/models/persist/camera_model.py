@@ -2,7 +2,7 @@
 
 A frame is one token: the classes of the innermost voxels and the camera before the action. The
 action modulates the blocks, which look back over time. What comes out is the step to the next
-camera (``geometry.camera_steps``); it learns by mean squared error (arXiv 2603.03482).
+camera (``geometry.actions``); it learns by mean squared error (arXiv 2603.03482).
 
 Parameters: ``classes, voxels, camera, action, blocks (stacked over layers), modulate_out,
 proj_out``.
@@ -15,7 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from pewm_jax.config import CameraModelConfig, UserError
-from pewm_jax.geometry.camera_steps import NUMBERS, STEPS
+from pewm_jax.geometry.actions import CAMERA_NUMBERS, CAMERA_STEP_NUMBERS
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache
@@ -30,11 +30,11 @@ SHARDING = frame_blocks.rules("camera_model")
 def ends(config: CameraModelConfig) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the parameters around the blocks by path."""
     width = config.blocks.width
-    last = frame_blocks.end_shapes(width, STEPS)
+    last = frame_blocks.end_shapes(width, CAMERA_STEP_NUMBERS)
     return {
         "classes/kernel": (config.classes, config.embed),
         **frame_blocks.mlp_shapes("voxels", config.inner**3 * config.embed, width),
-        **frame_blocks.mlp_shapes("camera", NUMBERS, width),
+        **frame_blocks.mlp_shapes("camera", CAMERA_NUMBERS, width),
         **frame_blocks.mlp_shapes("action", config.actions, width),
         **{path: shape for path, shape in last.items() if not path.startswith("time_embed")},
     }
@@ -85,7 +85,7 @@ def apply(
         params: its parameters.
         classes_BTXYZ: (B, T, X, Y, Z) class ids of the frame that the action leads to; the grid or
             its innermost part.
-        camera_BTN: (B, T, 10) numbers of the camera before the action; see ``camera_steps``.
+        camera_BTN: (B, T, 10) numbers of the camera before the action; see ``camera_numbers``.
         actions_BTA: (B, T, A) the action that leads to each frame.
         dtype: of the computation.
         cache: the frames before these; see ``frame_blocks``.
@@ -98,7 +98,7 @@ def apply(
     """
     front = classes_BTXYZ.shape[:2]
     for name, value, size in (
-        ("cameras", camera_BTN, NUMBERS),
+        ("cameras", camera_BTN, CAMERA_NUMBERS),
         ("actions", actions_BTA, config.actions),
     ):
         if value.shape != (*front, size):
@@ -117,8 +117,10 @@ def apply(
 
 def costs(config: CameraModelConfig, share: Share, frames: int, *, trained: bool) -> Costs:
     """Return the costs of T frames."""
-    inward = config.inner**3 * config.embed + NUMBERS + config.actions + 3 * config.blocks.width
-    ends_in = (inward + STEPS) * config.blocks.width
+    inward = (
+        config.inner**3 * config.embed + CAMERA_NUMBERS + config.actions + 3 * config.blocks.width
+    )
+    ends_in = (inward + CAMERA_STEP_NUMBERS) * config.blocks.width
     return frame_costs.costs(
         config.blocks,
         PARTS,

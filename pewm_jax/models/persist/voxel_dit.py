@@ -84,7 +84,7 @@ def apply(
         actions_BTA: the action that leads *to* each frame; zeros for the first of a walk.
         pixels_BThwC: latents of the picture that each frame is shown: the one before it, or for
             the first frame of a walk its own. Channels may hold more, such as rays.
-        camera_BTN: numbers of that picture's camera; see ``geometry.camera_steps.numbers``.
+        camera_BTN: numbers of that picture's camera; see ``geometry.actions.camera_numbers``.
         shown_BT: bool, whether a frame is shown its picture; None means all are.
         known_BTxyz: bool, which latents are known; tokens of others are not read by later frames.
             None means all are.

@@ -23,7 +23,7 @@ from pewm_jax.config import (
     VoxelVAEConfig,
 )
 from pewm_jax.diffusion import noise as noises
-from pewm_jax.geometry import camera_steps
+from pewm_jax.geometry.actions import camera_numbers, camera_steps_between
 from pewm_jax.geometry.march import Layers
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer
 from pewm_jax.models.persist import voxel_vae as voxel_vae_model
@@ -156,13 +156,13 @@ def camera(
     before, after = (
         jax.tree.map(lambda x, c=c: x[:, c], cameras) for c in (slice(-1), slice(1, None))
     )
-    seen = camera_steps.numbers(before, width, middle_BT3[:, :-1])
+    seen = camera_numbers(before, width, middle_BT3[:, :-1])
     made, _ = camera_model.apply(
         config, params, classes_BTXYZ[:, 1:], seen, actions_BTA[:, 1:], dtype=dtype
     )
     if reckoned_BT6 is not None:
         made = made + reckoned_BT6[:, 1:]
-    off = made - camera_steps.between(before, after, width)
+    off = made - camera_steps_between(before, after, width)
     measured = {
         "metres_off": jnp.linalg.norm(off[..., :3], axis=-1).mean(),
         "radians_off": jnp.linalg.norm(off[..., 3:5], axis=-1).mean(),

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import interface as codecs
-from pewm_jax.config import NoiseSettings, PersistConfig
+from pewm_jax.config import Noise, PersistConfig
 from pewm_jax.diffusion import noise as noises
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist.blocks import FrameCache
@@ -89,7 +89,7 @@ def decoded(model: PersistConfig, params: Params, latents_hwC: Array) -> tuple[A
     return rgb[0, 0], depth[0, 0] if model.clip.depth else jnp.zeros_like(depth[0, 0])
 
 
-def context(noise: NoiseSettings, x0: Array, key: Array) -> tuple[Array, Array]:
+def context(noise: Noise, x0: Array, key: Array) -> tuple[Array, Array]:
     """Return frames (1, 1, …) with the noise that given ones have, and their times."""
     times = jnp.full(x0.shape[:2], getattr(noise, "context_noise", 0.0))
     drawn = jax.random.normal(key, x0.shape, x0.dtype)

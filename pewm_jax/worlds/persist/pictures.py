@@ -7,8 +7,12 @@ import jax.numpy as jnp
 
 from pewm_jax.config import PersistConfig
 from pewm_jax.diffusion import noise as noises
-from pewm_jax.geometry import camera_steps
-from pewm_jax.geometry.actions import step_pose
+from pewm_jax.geometry.actions import (
+    CAMERA_STEP_NUMBERS,
+    camera_numbers,
+    follow_camera_steps,
+    step_pose,
+)
 from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist import camera_model, voxel_renderer
@@ -28,7 +32,7 @@ def reckoned(model: PersistConfig, here: Camera, action_A: Array) -> Camera:
 def reckoning(model: PersistConfig, actions_A: Array) -> Array:
     """Return the steps (..., 6) to which the camera model adds what it says."""
     if not model.dead_reckoning:
-        return jnp.zeros((*actions_A.shape[:-1], camera_steps.STEPS))
+        return jnp.zeros((*actions_A.shape[:-1], CAMERA_STEP_NUMBERS))
     dx, dy, turn = jnp.moveaxis(actions_A, -1, 0)
     still = jnp.zeros_like(dx)
     return jnp.stack([dx, dy, still, still, turn, still], -1)
@@ -48,7 +52,7 @@ def next_camera(
     place, size = here.world_from_camera[:3, 3], windows.cell_m(model)
     cell = jnp.floor((place - low_3) / size).astype(jnp.int32)
     inner = windows.cut(classes_XYZ, cell - config.inner // 2, config.inner)
-    seen = camera_steps.numbers(here, model.clip.width, low_3 + cell * size)
+    seen = camera_numbers(here, model.clip.width, low_3 + cell * size)
     made, cache = camera_model.apply(
         config,
         params["camera_model"],
@@ -59,7 +63,7 @@ def next_camera(
         cache=cache,
     )  # type: ignore[assignment]
     change = made[0, 0] + reckoning(model, action_A)
-    return camera_steps.follow(here, change, model.clip.width), cache
+    return follow_camera_steps(here, change, model.clip.width), cache
 
 
 def features(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import PersistConfig, UserError
-from pewm_jax.geometry import camera_steps
+from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.march import Layers
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
 from pewm_jax.nn.signals import as_signal
@@ -114,7 +114,7 @@ def frames(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     middle = windows.middle(model, corner, last)
     _, shown = pictures(model, params, clip)
     told = windows.told(model, shown, middle)
-    camera = camera_steps.numbers(shown.camera, model.clip.width, middle)
+    camera = camera_numbers(shown.camera, model.clip.width, middle)
     made = {
         "latents": latents.astype(jnp.float16),
         "told": told.astype(jnp.float16),

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import PersistConfig
-from pewm_jax.data.voxel_classes import PALETTE
+from pewm_jax.data.voxels import PALETTE
 from pewm_jax.geometry import block_light
 from pewm_jax.geometry.cameras import invert_rigid, transform_points, unproject
 from pewm_jax.types import Array, Camera

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import PersistConfig
 from pewm_jax.diffusion import noise as noises
-from pewm_jax.geometry import camera_steps
+from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.memory.class_edit import EMPTY, UNKNOWN
 from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.models.persist.blocks import FrameCache
@@ -136,7 +136,7 @@ def _asked(model: PersistConfig, history: History, middle_3: Array) -> dict[str,
     """Return the transformer's condition of one voxel frame."""
     config, shown = model.backbone.world_frames, history.shown  # type: ignore[attr-defined]
     told = windows.told(model, shown, middle_3)
-    camera = camera_steps.numbers(shown.camera, model.clip.width, middle_3)
+    camera = camera_numbers(shown.camera, model.clip.width, middle_3)
     return {
         "actions_BTA": history.action_A[None, None],
         "pixels_BThwC": told[None, None],

@@ -11,7 +11,7 @@ from pewm_jax.io import heap
 THREADS = 6
 COUNT = f"""
 import ctypes, sys, threading
-from pewm_jax import heap
+from pewm_jax.io import heap
 if sys.argv[1] == "few":
     assert heap.keep_small()
 libc = ctypes.CDLL(None)
@@ -38,7 +38,7 @@ def arenas(how):
 
 FAULTS = """
 import ctypes, resource, sys
-from pewm_jax import heap
+from pewm_jax.io import heap
 if sys.argv[1] == "kept":
     assert heap.keep_large()
 libc, size = ctypes.CDLL(None), 64 << 20

@@ -1,0 +1,666 @@
+"""The interfaces of a model's parts: what a backbone, a codec, a memory … must provide.
+
+A part is a frozen dataclass derived from one of these classes. Its fields are its settings, its
+methods are its functions: ``model.codec.encode(params, video)``. All methods are pure functions of
+their arguments. ``params`` are the part's own parameters, plain nested dictionaries, unless a
+method's documentation says otherwise. ``SHARDING`` lists rules ``(pattern, PartitionSpec)`` over
+the paths of the parameters in the world model, such as ``codec/encoder/kernel``; every parameter
+needs a rule. Letters of array axes are those of ``pewm_jax.types``.
+
+A class is registered by ``pewm_jax.registry.register``. This module imports no network and not JAX,
+so that reading settings stays fast.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+
+from pewm_jax.config.training import TrainSettings
+from pewm_jax.errors import require, require_positive
+from pewm_jax.registry import Settings, part
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pewm_jax.types import Array, Camera, Control, Frames, MapTokens, Params, Sight, View
+
+Rules: TypeAlias = tuple[Any, ...]
+"""Sharding rules: pairs of a regular expression and a ``PartitionSpec``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class InjectionPoints:
+    """Where a memory reader runs in a backbone, and the sizes it needs to know.
+
+    Attributes:
+        count: how often it runs; its parameters are stacked along this axis.
+        width: D, channels of the hidden video tokens (B, N, D).
+        time: E, channels of the time embedding (B, E).
+        patch: latent cells per token, along height and along width.
+        patch_t: latent frames per token.
+    """
+
+    count: int
+    width: int
+    time: int
+    patch: int = 1
+    patch_t: int = 1
+
+
+class Backbone(Settings):
+    """A denoiser: predicts from noisy latents what the noise asks for.
+
+    Attributes:
+        places: where a memory reader runs; None where none can.
+        time_dim: E, channels of the time embedding, to which a control may add.
+        text_shape: (length, channels) of its text tokens; None if it takes none.
+        stores_prompt: whether a prompt's embedding is stored with the weights.
+        split_heads: a number that ``train.mesh.tensor`` must divide.
+        remat: whether the backward pass recomputes activations.
+        SHARDING: rules over ``backbone/…`` paths.
+        GUIDED_BY_TEXT: whether guidance of a world without a memory is on the text, against
+            another prompt, and not on the observed image.
+    """
+
+    SECTION: ClassVar[str] = "backbone"
+    SHARDING: ClassVar[Rules] = ()
+    GUIDED_BY_TEXT: ClassVar[bool] = False
+    places: Any = None
+    text_shape: Any = None
+    stores_prompt: Any = False
+    split_heads: Any = 1
+    remat: Any = False
+
+    @property
+    def time_dim(self) -> int:
+        """Channels of the time embedding: those that the injection points state."""
+        return self.places.time
+
+    def init(self, key: Array, in_channels: int, out_channels: int) -> Params:
+        """Return random parameters for these numbers of input and output channels."""
+        raise NotImplementedError
+
+    def apply(
+        self, params: Params, x_BthwC: Array, time_B: Array, conditioning: Any, readers: Any
+    ) -> Array:
+        """Predict from noisy latents what the noise asks for.
+
+        Args:
+            params: its parameters.
+            x_BthwC: (B, t, h, w, C) noisy latents; their dtype is the dtype of the computation.
+            time_B: (B,) noise level as the network sees it, or (B, t), one per latent frame.
+            conditioning: a ``models.interface.Conditioning``: further inputs.
+            readers: a ``models.interface.Readers``: how the memory is read.
+
+        Returns:
+            (B, t, h, w, C_out) prediction.
+        """
+        raise NotImplementedError
+
+    def init_image(self, key: Array) -> Params:
+        """Return random parameters of its image encoder, which is frozen; {} if it has none."""
+        del key
+        return {}
+
+    def observed(self, model: Any, params: Params, seen: Any) -> Any:
+        """Return the ``Conditioning`` that holds the observed frames, or None for the default.
+
+        By default the latents are joined to the input, zero for the frames to be imagined.
+
+        Args:
+            model: the model.
+            params: the world model's parameters; those under ``image`` are from ``init_image``.
+            seen: a ``models.interface.Observed``: the observed frames.
+        """
+        del model, params, seen
+
+    def shown_channels(self, model: Any) -> int:
+        """Return the number of input channels that show the observed frames: their latents'."""
+        return model.codec.channels
+
+    def costs(self, model: Any, share: Any, *, trained: bool) -> Any:
+        """Return its ``nn.costs.Costs`` in one step of training."""
+        raise NotImplementedError
+
+    def check(self, model: Any) -> None:
+        """Refuse latents that do not split into the backbone's patches.
+
+        A backbone that takes other sizes has a check of its own.
+        """
+        if self.places is None:
+            return
+        step = model.codec.spatial * self.places.patch
+        clip = model.clip
+        require(
+            clip.height % step == 0 and clip.width % step == 0,
+            f"clip {clip.height}×{clip.width}: height and width must be multiples of "
+            f"codec.spatial × backbone.patch = {step}; change the clip's size or the patch.",
+        )
+
+
+class Codec(Settings):
+    """Pixels to latents and back; q·k + 1 frames become k + 1 latent frames.
+
+    Colour and depth are encoded separately and their channels concatenated.
+
+    Attributes:
+        spatial: pixels per latent cell, along height and along width.
+        temporal: q, frames per latent frame after the first.
+        rgb_channels: latent channels of colour.
+        depth_channels: latent channels of depth; 0 where it encodes colour alone.
+        framewise: whether every latent frame is decoded by itself.
+        SHARDING: rules over ``codec/…`` paths.
+        DEPTH_AS_GREY: whether depth is encoded as a grey image of three channels, not as one.
+        PIXELWISE: whether each latent channel of depth is one pixel of one frame.
+        CONVERTED: whether the weights are frozen and come from ``train.start``.
+    """
+
+    SECTION: ClassVar[str] = "codec"
+    SHARDING: ClassVar[Rules] = ()
+    DEPTH_AS_GREY: ClassVar[bool] = False
+    PIXELWISE: ClassVar[bool] = False
+    CONVERTED: ClassVar[bool] = False
+    spatial: Any
+    temporal: Any
+    rgb_channels: Any
+    depth_channels: Any
+
+    @property
+    def channels(self) -> int:
+        """Latent channels of colour and depth together."""
+        return self.rgb_channels + self.depth_channels
+
+    @property
+    def framewise(self) -> bool:
+        """Whether every latent frame is one frame, decoded by itself."""
+        return self.temporal == 1
+
+    def frames(self, count: int) -> int:
+        """Return the number of latent frames for a number of frames."""
+        return (count - 1) // self.temporal + 1
+
+    def latent_shape(self, clip: Any) -> tuple[int, int, int]:
+        """Return (t, h, w) of the latents of a ``ClipConfig``'s clip."""
+        return self.frames(clip.frames), clip.height // self.spatial, clip.width // self.spatial
+
+    def init(self, key: Array) -> Params:
+        """Return random parameters; {} if it has none."""
+        del key
+        return {}
+
+    def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
+        """Encode a video.
+
+        Args:
+            params: its parameters.
+            video_BTHWC: (B, q·k + 1, H, W, C) float in [−1, 1]; C is 3 where depth is encoded as
+                grey.
+            condition: whether the latents are what the denoiser is conditioned on. CogVideoX-1.5's
+                image-to-video model divides such latents by the scaling factor; others multiply.
+
+        Returns:
+            (B, k + 1, H/s, W/s, C') latents.
+
+        Raises:
+            ValueError: the video's size cannot be encoded.
+        """
+        raise NotImplementedError
+
+    def decode(self, params: Params, latents_BthwC: Array) -> Array:
+        """Decode latents, the inverse of ``encode``.
+
+        Args:
+            params: its parameters.
+            latents_BthwC: (B, k + 1, h, w, C') latents.
+
+        Returns:
+            (B, q·k + 1, h·s, w·s, C) video.
+
+        Raises:
+            UserError: latents that are decoded to another number of frames.
+        """
+        raise NotImplementedError
+
+    def measured(self, depth_BTHW: Array) -> Array | None:
+        """Return the share of measured pixels per depth latent, or None for the default.
+
+        See ``codecs.interface.measured``.
+        """
+        del depth_BTHW
+        return None
+
+    def costs(self, model: Any, share: Any) -> Any:
+        """Return the ``nn.costs.Costs`` of encoding a clip and its first frame."""
+        raise NotImplementedError
+
+    def check(self, model: Any) -> None:
+        """Refuse clips that cannot be folded, and depth that is not encoded."""
+        clip, q, s = model.clip, self.temporal, self.spatial
+        require(
+            (clip.frames - 1) % q == 0,
+            f"clip.frames is {clip.frames}: the codec folds every {q} frames after the first into "
+            f"one (codec.temporal), so use {q}k + 1 frames ({q + 1}, {2 * q + 1}, …).",
+        )
+        require(
+            clip.height % s == 0 and clip.width % s == 0,
+            f"clip {clip.height}×{clip.width}: height and width must be multiples of "
+            f"codec.spatial = {s}.",
+        )
+        require(
+            self.depth_channels > 0 or not clip.depth,
+            "clip.depth is true, and this codec encodes colour alone: use clip.depth false, or a "
+            "codec that encodes depth too.",
+        )
+
+
+class Conditioner(Settings):
+    """Turns what steers a clip (cameras, actions) into inputs of the denoiser.
+
+    Attributes:
+        MODULATES: whether it adds to the time embedding of each latent frame.
+        SHARDING: rules over ``control/…`` paths.
+        actions: A, the numbers of an action that it needs; 0 where cameras are enough.
+        state: numbers of the agent's state at the first frame that it needs; 0 for none.
+        rate: factor of the learning rate of its parameters.
+    """
+
+    SECTION: ClassVar[str] = "control"
+    SHARDING: ClassVar[Rules] = ()
+    MODULATES: ClassVar[bool] = False
+    actions: Any = 0
+    state: Any = 0
+    rate: Any = 1.0
+
+    def channels(self, model: Any) -> int:
+        """Return the number of channels, at the latent rate, that it adds to the denoiser's input.
+
+        Args:
+            model: the ``ModelConfig`` that it is part of.
+        """
+        del model
+        return 0
+
+    def init(self, model: Any, key: Array) -> Params:
+        """Return random parameters; {} if it has none."""
+        del model, key
+        return {}
+
+    def condition(self, model: Any, params: Params, observed: Frames, control: Control) -> Any:
+        """Return the ``models.interface.Conditioning`` of a batch of clips.
+
+        Args:
+            model: the model.
+            params: its parameters.
+            observed: (B, 1) the observed first frames, colours in [−1, 1]; or more of them.
+            control: (B, T) cameras, (B, T − 1) actions and (B, A) states if there are any.
+
+        Returns:
+            Input channels, modulation per latent frame, tokens: what the control provides.
+        """
+        raise NotImplementedError
+
+    def costs(self, model: Any, share: Any, *, trained: bool) -> Any:
+        """Return its ``nn.costs.Costs`` in one step of training."""
+        raise NotImplementedError
+
+
+class Encoder(Settings):
+    """An image encoder, whose features a memory keeps.
+
+    Attributes:
+        channels: F, number of features of a patch.
+        SHARDING: rules over ``encoder/…`` paths.
+        CONVERTED: whether the weights are frozen and come from ``train.start``.
+        WEIGHTS: the part of the model whose parameters it takes: its own, or the ``codec``'s. One
+            that takes another part's parameters has ``features`` of its own and no ``encode``.
+    """
+
+    SECTION: ClassVar[str] = "encoder"
+    SHARDING: ClassVar[Rules] = ()
+    CONVERTED: ClassVar[bool] = False
+    WEIGHTS: ClassVar[str] = "encoder"
+    channels: Any
+
+    def grid(self, clip: Any) -> tuple[int, int]:
+        """Return the rows and columns of patches that a frame of a ``ClipConfig`` has."""
+        raise NotImplementedError
+
+    def init(self, key: Array) -> Params:
+        """Return random parameters; {} if it has none."""
+        del key
+        return {}
+
+    def encode(self, params: Params, rgb_THWC: Array) -> Array:
+        """Return patch features (T, h, w, F); the memory resizes them itself.
+
+        Args:
+            params: its parameters.
+            rgb_THWC: (T, H, W, 3) float in [−1, 1].
+        """
+        raise NotImplementedError
+
+    def features(self, model: Any, params: Params, rgb_THWC: Array) -> Array:
+        """Return the features (T, h, w, F) that a model's memory keeps of frames.
+
+        Args:
+            model: the model.
+            params: the world model's parameters.
+            rgb_THWC: (T, H, W, 3) float in [−1, 1].
+        """
+        del model
+        return self.encode(params.get("encoder", {}), rgb_THWC)
+
+    def preprocessing(self) -> dict[str, Any]:
+        """Return plain values that identify a cache of features, besides the weights."""
+        raise NotImplementedError
+
+    def colours(self, features_VF: np.ndarray) -> np.ndarray:
+        """Return (V, 3) colours in [−1, 1] in which features are drawn."""
+        raise NotImplementedError
+
+    def costs(self, model: Any, share: Any, frames: int) -> Any:
+        """Return the ``nn.costs.Costs`` of encoding this many context frames of a clip."""
+        raise NotImplementedError
+
+
+class Reader(Settings):
+    """How the denoiser reads the memory.
+
+    Attributes:
+        SHARDING: rules over ``memory/…`` paths.
+        READS_TOKENS: whether it takes the points that a clip's cameras see (``Sight.tokens``).
+        READS_VIEW: whether it takes what the memory looks like from them (``Sight.view``).
+        READS_LATENTS: whether it takes that as the codec encodes it (``Sight.encoded``) instead.
+        split_heads: a number that ``train.mesh.tensor`` must divide.
+    """
+
+    SECTION: ClassVar[str] = "reader"
+    SHARDING: ClassVar[Rules] = ()
+    READS_TOKENS: ClassVar[bool] = True
+    READS_VIEW: ClassVar[bool] = False
+    READS_LATENTS: ClassVar[bool] = False
+    split_heads: Any = 1
+
+    def init(self, model: Any, key: Array) -> Params:
+        """Return random parameters, initialized so that the reader has no effect yet."""
+        raise NotImplementedError
+
+    def prepare(
+        self, model: Any, params: Params, sight: Sight, camera: Camera, rays_BthwC: Array
+    ) -> Any:
+        """Prepare to read the memories of a batch of clips.
+
+        Args:
+            model: the model.
+            params: its parameters.
+            sight: what the memory shows each clip, leading axis B; it has what the class
+                attributes ask for.
+            camera: (B, T) cameras of the clips.
+            rays_BthwC: their Plücker rays at the latent rate (``controls.camera.rays``).
+
+        Returns:
+            The ``models.interface.Readers`` that the backbone calls.
+        """
+        raise NotImplementedError
+
+    def costs(self, model: Any, share: Any) -> Any:
+        """Return its ``nn.costs.Costs`` in a stage that trains it."""
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class Memory(Settings):
+    """What a world remembers, as which features, and how it is read.
+
+    A memory's state is a pytree of static size, of the type that ``empty`` returns. The methods are
+    pure and handle one world: jit and vmap them.
+
+    Attributes:
+        KEEPS_FEATURES: whether it keeps features of the image encoder.
+        REMEMBERS: whether it ever holds anything.
+        READ_BY_BLOCKS: whether memory blocks read it, which are trained for that; else it is the
+            state of its world.
+        TELLS_IMAGINED: whether it distinguishes observed frames from imagined ones.
+    """
+
+    SECTION: ClassVar[str] = "memory"
+    SHARDING: ClassVar[Rules] = ()
+    KEEPS_FEATURES: ClassVar[bool] = True
+    """Whether it keeps the encoder's features; else the first three of a point are its colour."""
+    REMEMBERS: ClassVar[bool] = True
+    """Whether it ever holds anything."""
+    READ_BY_BLOCKS: ClassVar[bool] = True
+    TELLS_IMAGINED: ClassVar[bool] = False
+    """Whether its ``remember`` asks, by ``observed``, if frames were observed or imagined."""
+
+    cell_m: tuple[float, float, float] = (0.25, 0.25, 1.0)
+    """Size of a map cell along x, y, z (z is up), metres; the default is the paper's."""
+    cells: tuple[int, int, int] = (128, 128, 16)
+    """Cells of the grid along x, y, z; the extent in metres is cells × cell size. A larger extent
+    needs no more memory."""
+    capacity: int = 4096
+    """Occupied cells that a map can hold; cells that do not fit are dropped and counted."""
+    tokens: int = 512
+    """Map tokens that condition one clip."""
+    choose: Literal["visible", "nearest"] = "visible"
+    """Which tokens come first: those that the clip's cameras can see, each frame and each part of
+    its image in turn, hidden ones later; or the nearest in view, hidden or not."""
+    imagined_far: float = 0.95
+    """Imagined surfaces beyond this share of `clip.far_m` are not remembered."""
+    imagined_edge: float = 0.2
+    """Imagined pixels whose depth differs by more than this share from that of a pixel beside them
+    are not remembered: they lie on the edge of something. 0 remembers them."""
+    encoder: Encoder = part("encoder", "patch_colours")
+    """The image features that are kept."""
+    reader: Reader = part("reader", "attend")
+    """How the denoiser reads them."""
+
+    @property
+    def extent_m(self) -> float:
+        """The longest side of the grid in metres."""
+        return max(size * count for size, count in zip(self.cell_m, self.cells, strict=True))
+
+    @property
+    def room(self) -> int:
+        """How many points it can hold."""
+        return self.capacity
+
+    @property
+    def rendered_channels(self) -> int:
+        """Channels of the memory's pictures: the colour, or the features that are kept."""
+        return self.encoder.channels if self.KEEPS_FEATURES else 3
+
+    def empty(self, model: Any, centre_3: Array) -> Any:
+        """Return an empty memory.
+
+        Args:
+            model: the model.
+            centre_3: (3,) world position that the memory is centred on, metres.
+        """
+        raise NotImplementedError
+
+    def insert(
+        self,
+        model: Any,
+        params: Params,
+        memory: Any,
+        frames: Frames,
+        features_ThwF: Array,
+        valid_T: Array | None = None,
+        *,
+        observed: bool = True,
+    ) -> Any:
+        """Return the memory after T more frames.
+
+        Args:
+            model: the model.
+            params: the world model's parameters, for a memory whose update is learned; others
+                ignore them.
+            memory: from ``empty`` or from an earlier call.
+            frames: T frames, colours float in [−1, 1]; pixels without depth are ignored.
+            features_ThwF: (T, h, w, F) their patch features (``Encoder.features``).
+            valid_T: (T,) bool; False frames are ignored.
+            observed: False where the frames were imagined.
+        """
+        raise NotImplementedError
+
+    def read(self, model: Any, memory: Any, camera: Camera) -> MapTokens:
+        """Return the M = ``tokens`` tokens that condition one clip.
+
+        Args:
+            model: the model.
+            memory: what is remembered.
+            camera: (T,) cameras of the clip.
+        """
+        raise NotImplementedError
+
+    def to_points(self, model: Any, memory: Any) -> tuple[Array, Array, Array]:
+        """Return the whole memory as ``(points_world_V3, features_VF, valid_V)``; V is static."""
+        raise NotImplementedError
+
+    def render(
+        self, model: Any, memory: Any, camera: Camera, height: int, width: int
+    ) -> View | None:
+        """Render the memory for (T,) cameras whose intrinsics are for height × width pixels.
+
+        None, the default, draws its points as wide as the cells of ``cell_m``.
+        """
+        del model, memory, camera, height, width
+        return None
+
+    def trimmed(self, memory: Any) -> Any:
+        """Return a memory to look at and not to add to: smaller if it can be; not under jit."""
+        return memory
+
+    def check(self, model: Any) -> None:
+        """Refuse a model that the encoder or the reader does not fit."""
+        if model.backbone.places is None:
+            require(
+                not self.REMEMBERS,
+                "this backbone has no place where a memory could be read: use memory.kind none, or "
+                "another backbone.",
+            )
+            return
+        self.encoder.check(model)
+        self.reader.check(model)
+
+    def __post_init__(self):
+        """Validate."""
+        require(all(size > 0 for size in self.cell_m), "memory.cell_m must be positive.")
+        require(all(count > 0 for count in self.cells), "memory.cells must be positive.")
+        require(
+            math.prod(self.cells) < 2**31,
+            f"memory.cells {self.cells} make {math.prod(self.cells)} cells, more than the 2³¹ that "
+            "can be numbered; take fewer or larger cells.",
+        )
+        require_positive(self, "memory", "capacity", "tokens")
+        require(
+            self.choose in ("visible", "nearest"),
+            f"memory.choose is {self.choose!r}; choose visible or nearest.",
+        )
+        require(
+            self.imagined_far > 0,
+            f"memory.imagined_far is {self.imagined_far}: nothing imagined would be remembered; "
+            "use a share of clip.far_m above 0, such as 0.95.",
+        )
+        require(
+            self.imagined_edge >= 0,
+            f"memory.imagined_edge is {self.imagined_edge}: use a share such as 0.2, or 0 to "
+            "remember edges.",
+        )
+        require(
+            self.tokens <= self.capacity,
+            f"memory.tokens {self.tokens} exceeds memory.capacity {self.capacity}: a clip cannot "
+            "attend to more cells than the map holds; raise capacity or lower tokens.",
+        )
+
+
+Denoiser: TypeAlias = Callable[..., Any]
+"""``(x_t, time_B, weight) -> x0``; the last argument is the weight of guidance at this step."""
+
+
+class Noise(Settings):
+    """How latents are corrupted, what the network predicts, how samples are drawn.
+
+    ========== ==================== ==================================== ==========================
+    kind       time                 x_t                                  target
+    ========== ==================== ==================================== ==========================
+    ddpm       level, 0 … N − 1     √ᾱ x0 + √(1 − ᾱ) ε                   x0, v or ε
+    edm        σ                    x0 + σ ε                             ±(x0 − c_skip x_t) / c_out
+    flow       t in [0, 1]          (1 − t) x0 + t ε                     ε − x0
+    frame_flow t in [0, 1]          (1 − t) x0 + (s + (1 − s) t) ε       (1 − s) ε − x0
+    ========== ==================== ==================================== ==========================
+
+    A time is one number per clip, (B,), or one per latent frame, (B, t), if the kind allows it.
+
+    Attributes:
+        guidance: classifier-free guidance on the memory, or in a world without one on the observed
+            image, or on the text where the backbone says so; 1 is off.
+        per_frame: whether training draws a time for every latent frame.
+    """
+
+    SECTION: ClassVar[str] = "noise"
+    guidance: Any = 1.0
+    per_frame: Any = False
+
+    @property
+    def velocity_in_unit_time(self) -> bool:
+        """Whether the network gets times from 0 to 1 and predicts the velocity ε − x0."""
+        return False
+
+    def draw(self, key: Array, batch: int, frames: int) -> Array:
+        """Draw times for training: (B,), or (B, t) for ``frames`` latent frames."""
+        raise NotImplementedError
+
+    def corrupt(self, x0: Array, noise: Array, time_B: Array) -> Array:
+        """Return x_t, made from clean latents (B, t, …) and standard normal noise."""
+        raise NotImplementedError
+
+    def precondition(self, x_t: Array, time_B: Array) -> tuple[Array, Array]:
+        """Return the network's inputs: the preconditioned x_t, and the time in its units."""
+        raise NotImplementedError
+
+    def prediction_target(self, x0: Array, noise: Array, time_B: Array) -> Array:
+        """Return the target of the network's prediction."""
+        raise NotImplementedError
+
+    def weight(self, time_B: Array) -> Array:
+        """Return the loss weight of the squared error, in the shape of the times."""
+        raise NotImplementedError
+
+    def to_x0(self, prediction: Array, x_t: Array, time_B: Array) -> Array:
+        """Turn the network's prediction into clean latents."""
+        raise NotImplementedError
+
+    def levels(self) -> np.ndarray:
+        """Return (sample_steps,) the times that a sampler visits, the noisiest first."""
+        raise NotImplementedError
+
+    def sample(self, denoise: Denoiser, noise: Array, key: Array | None = None) -> Array:
+        """Draw a sample.
+
+        Args:
+            denoise: ``(x_t, time_B, weight) -> x0``.
+            noise: (B, t, …) standard normal start.
+            key: randomness of the steps, if the sampler draws noise.
+        """
+        raise NotImplementedError
+
+
+class World(Settings):
+    """A world model: parts put together; see ``pewm_jax.worlds`` for its functions.
+
+    Attributes:
+        TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
+            for each of the world's stages, named as the stage.
+        TRAINS: parts that other worlds take from ``train.start`` and this one trains itself.
+        dtype: precision of computation and of frozen weights.
+    """
+
+    SECTION: ClassVar[str] = "world"
+    TRAIN: ClassVar[type[TrainSettings]] = TrainSettings
+    TRAINS: ClassVar[tuple[str, ...]] = ()
+    dtype: Any = "float32"

@@ -1,0 +1,399 @@
+"""Results that survive an interruption: one file per finished piece of work, written atomically.
+
+A long loop over independent pieces (clips to score, decisions of a study, episodes to encode) keeps
+the result of each piece in a ``ResultCache``. If it is interrupted, the same call resumes: it reads
+the finished pieces and computes only the others::
+
+    cache = ResultCache(folder)
+    results = map_resumable(clips, name_of_clip, score_clips, cache=cache)
+
+What a result depends on is either part of the piece's name (``inputs_hash``), or of the folder's
+(``ResultCache.for_weights``), or is written beside the results and compared with
+(``require_same_inputs``). A half-written file counts as absent. ``ProgressFile`` keeps the state of
+a loop whose rounds build on one another.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import shutil
+import struct
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from pewm_jax.errors import UserError
+from pewm_jax.io import atomic
+
+SETTINGS = "settings.json"
+"""The file in which ``require_same_inputs`` keeps the inputs of a folder's results."""
+PATIENCE_S = 60.0
+"""Seconds to wait for a file that another process has written to become visible."""
+DAMAGED = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    KeyError,
+    RuntimeError,  # zipfile: a damaged header names a method of compression that does not exist
+    ValueError,  # NumPy, JSON, UTF-8
+)
+"""What readers of NumPy and JSON files raise if a file is damaged or cut short."""
+
+Arrays = dict[str, np.ndarray]
+K = TypeVar("K", bound=Hashable)
+T = TypeVar("T")
+
+
+class _NotWholeError(ValueError):
+    """A file holds something else than a result."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """How a result is stored.
+
+    Attributes:
+        suffix: of the file.
+        write: writes a result to a path.
+        read: reads it; raises one of ``DAMAGED`` if the file is not whole.
+    """
+
+    suffix: str
+    write: Callable[[Path, Any], None]
+    read: Callable[[Path], Any]
+
+
+def _write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    with path.open("wb") as file:
+        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def _write_compressed(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def _read_arrays(path: Path) -> Arrays:
+    # From memory: in a damaged file, zipfile may look for a part before the file's beginning, which
+    # is an OSError in a file, as errors of the disk are.
+    found = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
+    if isinstance(found, np.ndarray):
+        raise _NotWholeError("it holds one array without a name")
+    with found as arrays:
+        return {key: arrays[key] for key in arrays.files}
+
+
+def _write_table(path: Path, table: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(table, allow_nan=False) + "\n", "utf-8")
+
+
+def _read_table(path: Path) -> dict[str, Any]:
+    found = json.loads(path.read_text("utf-8"))
+    if not isinstance(found, dict):
+        raise _NotWholeError("it holds no table")
+    return found
+
+
+ARRAYS = Format(".npz", _write_arrays, _read_arrays)
+"""Named NumPy arrays."""
+COMPRESSED = Format(".npz", _write_compressed, _read_arrays)
+"""Named NumPy arrays in files that a repository can hold."""
+TABLE = Format(".json", _write_table, _read_table)
+"""A table of plain values."""
+
+
+def inputs_hash(inputs: Any) -> str:
+    """Return a hash of what a result depends on.
+
+    Args:
+        inputs: plain values: anything that JSON can hold. The order of keys does not matter.
+    """
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+
+
+class ResultCache:
+    """Named results in a folder, one file each.
+
+    Args:
+        folder: the folder, which is made when the first result is written.
+        kind: how a result is stored.
+    """
+
+    def __init__(self, folder: Path, kind: Format = ARRAYS):
+        self.folder, self.format = folder, kind
+
+    @classmethod
+    def for_weights(
+        cls, folder: Path, weights: str, fingerprint: str, kind: Format = ARRAYS
+    ) -> ResultCache:
+        """Return the cache of results that depend on weights and on a protocol.
+
+        It lies in ``folder/WEIGHTS/FINGERPRINT``. Results of other weights are deleted. Results of
+        other protocols stay, so a quick evaluation with fewer clips does not discard the results of
+        the full one.
+
+        Args:
+            folder: the folder of all results of a report.
+            weights: hash of the weights.
+            fingerprint: hash of weights and protocol.
+            kind: how a result is stored.
+        """
+        cache = cls(folder / weights[:16] / fingerprint[:16], kind)
+        cache.folder.mkdir(parents=True, exist_ok=True)
+        for other in folder.iterdir():
+            if other != cache.folder.parent and other.is_dir():
+                shutil.rmtree(other)
+        return cache
+
+    def path(self, name: str) -> Path:
+        """Return the file of a result, whether it exists or not; ``name`` may contain slashes."""
+        return self.folder / f"{name}{self.format.suffix}"
+
+    def get(self, name: str) -> Any | None:
+        """Return a finished result, or None if there is none or its file is damaged."""
+        try:
+            return self.format.read(self.path(name))
+        except (FileNotFoundError, *DAMAGED):
+            return None
+
+    def put(self, name: str, result: T) -> T:
+        """Write a result atomically, and return it."""
+        path = self.path(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic.replacing(path) as partial:
+            self.format.write(partial, result)
+        return result
+
+    def compute(self, name: str, work: Callable[[], T]) -> T:
+        """Return a result from its file, or compute and write it."""
+        found = self.get(name)
+        return self.put(name, work()) if found is None else found
+
+    def wait_for(self, name: str, patience_s: float = PATIENCE_S) -> Any:
+        """Return a result that another process of this job has finished.
+
+        Raises:
+            UserError: the file does not appear: the processes share no folder.
+        """
+        until = time.monotonic() + patience_s
+        while (found := self.get(name)) is None:
+            if time.monotonic() > until:
+                raise UserError(
+                    f"{self.path(name)}, which another process of this job has written, is "
+                    "not there: all processes must see the same folders; put the run on a disk "
+                    "that they share."
+                )
+            time.sleep(min(0.5, patience_s))
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Workers:
+    """The processes that share the work of a loop; by default this one alone.
+
+    Attributes:
+        count: number of processes.
+        index: number of this process.
+        barrier: waits until all processes have called it with this name.
+    """
+
+    count: int = 1
+    index: int = 0
+    barrier: Callable[[str], None] = lambda _name: None
+
+    def assign_work(
+        self, keys: Sequence[K], is_light: Callable[[K], bool] | None = None
+    ) -> list[K]:
+        """Return this process's pieces: every P-th heavy one and every P-th light one.
+
+        The choice depends only on a piece's place in the list, so all processes agree on it without
+        communication, also when the job is resumed.
+
+        Args:
+            keys: all pieces, in the same order in all processes.
+            is_light: whether a piece costs little compared with the others.
+        """
+        light = {key: bool(is_light and is_light(key)) for key in keys}
+        chosen: set[K] = set()
+        for kind in (False, True):
+            chosen.update([key for key in light if light[key] == kind][self.index :: self.count])
+        return [key for key in keys if key in chosen]
+
+    def first_alone(self, work: Callable[[], T], what: str) -> T:
+        """Call a function in process 0 before all other processes call it; return its result.
+
+        Args:
+            work: stores its result in a file, and reads it there if it is called again.
+            what: name of the work, a different one for each call.
+        """
+        result = work() if self.index == 0 else None
+        self.barrier(what)
+        return work() if result is None else result
+
+
+ALONE = Workers()
+
+
+def map_resumable(
+    keys: Iterable[K],
+    key_of_inputs: Callable[[K], str],
+    work: Callable[[list[K]], Iterable[tuple[K, T]]],
+    *,
+    cache: ResultCache,
+    what: str = "pieces",
+    log: Callable[[str], Any] | None = None,
+    is_usable: Callable[[K, T], bool] = lambda _key, _result: True,
+    workers: Workers = ALONE,
+    group_of: Callable[[K], Hashable] | None = None,
+    is_light: Callable[[K], bool] | None = None,
+) -> dict[K, T]:
+    """Compute the results of all pieces of work that the cache does not hold.
+
+    Args:
+        keys: the pieces; with several workers in the same order in all of them.
+        key_of_inputs: the name of a piece's result. It contains all that the result depends on
+            beside the cache's folder, for instance by ``inputs_hash``.
+        work: called once with the pieces that this process must compute, in order, if there are
+            any. It yields each with its result, which is written before the next one is computed.
+        cache: where results are stored.
+        what: name of the work for messages, a different one for each call of a job.
+        log: shows a line that says how many results are reused.
+        is_usable: whether a stored result is enough, or must be computed again.
+        workers: the processes that share the work. All of them get all results.
+        group_of: pieces of one group are computed by one process, such as the measures of one
+            rollout. By default every piece is a group of its own.
+        is_light: whether a piece, and its group, costs little compared with the others.
+
+    Returns:
+        The result of every piece, in the order of ``keys``.
+
+    Raises:
+        UserError: the result of another process is not visible to this one.
+    """
+    keys = list(dict.fromkeys(keys))
+    names = {key: key_of_inputs(key) for key in keys}
+    known: dict[K, T] = {}
+    for key, name in names.items():
+        found = cache.get(name)
+        if found is not None and is_usable(key, found):
+            known[key] = found
+    if known and log is not None:
+        log(f"{len(known)} of {len(keys)} {what} were computed before and are reused")
+    first_of_group: dict[Hashable, K] = {}
+    group = {key: group_of(key) if group_of else key for key in keys}
+    for key in keys:
+        first_of_group.setdefault(group[key], key)
+    own = set(workers.assign_work(list(first_of_group.values()), is_light))
+    missing = [key for key in keys if key not in known and first_of_group[group[key]] in own]
+    if missing:
+        for key, result in work(missing):
+            known[key] = cache.put(names[key], result)
+    workers.barrier(what)
+    return {key: known[key] if key in known else cache.wait_for(names[key]) for key in keys}
+
+
+def require_same_inputs(
+    folder: Path,
+    inputs: Mapping[str, Any],
+    what: str,
+    ignored: Collection[str] = (),
+) -> None:
+    """Refuse a folder whose results have other inputs; otherwise write the inputs there.
+
+    Args:
+        folder: the folder of the results.
+        inputs: settings and hashes of weights by name, as plain values.
+        what: what the results are, for the message.
+        ignored: names that no stored result depends on.
+
+    Raises:
+        UserError: naming the inputs that differ.
+    """
+    cache = ResultCache(folder, TABLE)
+    file = folder / SETTINGS
+    now = json.dumps({n: value for n, value in inputs.items() if n not in ignored}, indent=1)
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder} is a file: name a folder by --out.")
+    if file.exists():
+        before = cache.get(file.stem)
+        if before is None:
+            raise UserError(f"{file} is damaged: delete it, if its settings are still these.")
+        wrong = [name for name, value in json.loads(now).items() if before.get(name) != value]
+        if wrong:
+            raise UserError(
+                f"{folder} holds {what} of other settings ({', '.join(wrong)}): name another "
+                "folder by --out, or put them back."
+            )
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(file, now + "\n")
+
+
+def make_once(mark: Path, inputs: Any, make: Callable[[], None]) -> None:
+    """Call a function, unless a mark file says that it was called with the same inputs.
+
+    Args:
+        mark: a JSON file, written when the function has returned.
+        inputs: what its result depends on, as plain values.
+        make: writes files.
+    """
+    try:
+        before = json.loads(mark.read_text("utf-8"))
+    except (FileNotFoundError, ValueError):
+        before = None
+    if before is None or before != json.loads(json.dumps(inputs)):
+        make()
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        atomic.write_text(mark, json.dumps(inputs) + "\n")
+
+
+class ProgressFile:
+    """The state of a loop whose rounds build on one another, such as a search, in one file.
+
+    Args:
+        path: the file, ``.npz``.
+        identity: hash of all that the state depends on.
+        what: what the state belongs to, for messages: "a search".
+    """
+
+    IDENTITY = "who"
+    """The array that holds the identity."""
+
+    def __init__(self, path: Path, identity: str, what: str):
+        self.path, self.identity, self.what = path, identity, what
+
+    def read(self) -> Arrays | None:
+        """Return the arrays of the last ``write``, or None if there is no file.
+
+        Raises:
+            UserError: the file is damaged, or belongs to another loop.
+        """
+        try:
+            arrays = _read_arrays(self.path)
+            found = str(arrays.pop(self.IDENTITY))
+        except FileNotFoundError:
+            return None
+        except (OSError, *DAMAGED) as error:
+            raise UserError(
+                f"{self.path} is no checkpoint of {self.what}, or damaged "
+                f"({type(error).__name__}): remove it to begin anew."
+            ) from None
+        if found != self.identity:
+            raise UserError(
+                f"{self.path} belongs to {self.what} with other inputs: name another file, or "
+                "remove it."
+            )
+        return arrays
+
+    def write(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Replace the state atomically."""
+        with atomic.replacing(self.path) as partial:
+            _write_arrays(partial, {**arrays, self.IDENTITY: np.array(self.identity)})
