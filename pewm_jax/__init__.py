@@ -16,7 +16,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pewm_jax.config import Config, ConfigError, ModelConfig, UserError
+    from pewm_jax.config import Config, ModelConfig
+    from pewm_jax.errors import ConfigError, UserError
     from pewm_jax.geometry.actions import integrate
     from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
     from pewm_jax.nn.signals import rgb_from_signal

@@ -139,6 +139,8 @@ def moved(origin: str, page: str, text: str, root: Path = code.ROOT) -> str:
 def packages(root: Path = code.ROOT) -> list[tuple[str, str]]:
     """List the packages and their content, in the order of the table in docs/architecture.md."""
     text = (root / "docs" / "architecture.md").read_text("utf-8").split("## Packages", 1)[1]
-    rows = re.findall(r"^\| `([a-z_0-9.]+?)/?` \| (.+?) \|$", text.split("\n## ", 1)[0], re.MULTILINE)
+    rows = re.findall(
+        r"^\| `([a-z_0-9.]+?)/?` \| (.+?) \|$", text.split("\n## ", 1)[0], re.MULTILINE
+    )
     names = ((name.removesuffix(".py"), content) for name, content in rows)
     return [("presets" if name == "configs" else name, content) for name, content in names]

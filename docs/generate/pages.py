@@ -17,8 +17,8 @@ All numbers on this page are read from files that commands of the repository wro
 """
 GLOSSARY = """# Letters
 
-Names of arrays end in one letter per axis: `tokens_BND` is batch × tokens × width. A digit is an axis
-of that size: `points_world_M3`. Arbitrary leading axes are omitted.
+Names of arrays end in one letter per axis: `tokens_BND` is batch × tokens × width. A digit is an
+axis of that size: `points_world_M3`. Arbitrary leading axes are omitted.
 
 | letter | axis | in the data types |
 |---|---|---|
@@ -123,8 +123,8 @@ def numbers(root: Path = code.ROOT) -> str:
 def table2(found: dict[str, Any]) -> str:
     """Return the scores of `results.json` as a table, means and 95 % intervals over houses."""
     lines = [
-        "From `docs/table2/results.json`, which `pewm-jax table2` writes; 95 % confidence intervals over",
-        "houses. [Definition of the rows](planning.md#table-2).",
+        "From `docs/table2/results.json`, which `pewm-jax table2` writes; 95 % confidence intervals",
+        "over houses. [Definition of the rows](planning.md#table-2).",
         "",
         "| row | SIM, % | success, % | final position, m | final heading, ° |",
         "|---|---|---|---|---|",
