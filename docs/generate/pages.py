@@ -123,8 +123,8 @@ def numbers(root: Path = code.ROOT) -> str:
 def table2(found: dict[str, Any]) -> str:
     """Return the scores of `results.json` as a table, means and 95 % intervals over houses."""
     lines = [
-        "From `docs/table2/results.json`, which `pewm-jax table2` writes; 95 % confidence intervals",
-        "over houses. [Definition of the rows](planning.md#table-2).",
+        "From `docs/table2/results.json`, which `pewm-jax table2` writes; 95 % confidence",
+        "intervals over houses. [Definition of the rows](planning.md#table-2).",
         "",
         "| row | SIM, % | success, % | final position, m | final heading, ° |",
         "|---|---|---|---|---|",
