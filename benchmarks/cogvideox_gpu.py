@@ -30,9 +30,9 @@ import numpy as np
 import optax
 import record
 
-from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig, published
+from pewm_jax.config import DiTConfig, UserError, VAEConfig, published
 from pewm_jax.config import command_line as cli
-from pewm_jax.diffusion import sampler, schedule
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import atomic
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import vae
@@ -186,9 +186,9 @@ def measure_clip(setting: Setting) -> dict[str, float]:
 
         def denoise(x: Any, times: Any) -> Any:
             out = dit.apply(setting.dit, params, x.astype(setting.dtype), text, times)
-            return schedule.to_x0(config, out.astype(jnp.float32), x, times)
+            return config.to_x0(out.astype(jnp.float32), x, times)
 
-        x0 = sampler.ddim(config, denoise, noise.astype(jnp.float32).at[:, :1].add(first))
+        x0 = config.ddim(denoise, noise.astype(jnp.float32).at[:, :1].add(first))
         return vae.decode(setting.vae, codec, x0.astype(setting.dtype))
 
     run = jax.jit(clip)

@@ -4,7 +4,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DDPMConfig,
     DiTConfig,
     EvalConfig,
     LearnedCodecConfig,
@@ -14,6 +13,7 @@ from pewm_jax.config import (
     SurfelConfig,
     TrainConfig,
 )
+from pewm_jax.diffusion.ddpm import DDPMConfig
 
 
 def config() -> Config:

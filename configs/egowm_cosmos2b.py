@@ -1,6 +1,7 @@
 """EgoWM on Cosmos-Predict2-2B: 17 frames of 480×640, steered by (dx, dy, dyaw)."""
 
-from pewm_jax.config import COSMOS_2B, Config, WanVAEConfig, egowm_paper
+from pewm_jax.config import COSMOS_2B, Config, WanVAEConfig
+from pewm_jax.worlds.egowm import paper as egowm_paper
 
 
 def config() -> Config:

@@ -1,6 +1,7 @@
 """EgoWM on Stable Video Diffusion: 9 frames of 512×512, steered by (dx, dy, dyaw)."""
 
-from pewm_jax.config import Config, SVDUNetConfig, SVDVAEConfig, egowm_paper
+from pewm_jax.config import Config, SVDUNetConfig, SVDVAEConfig
+from pewm_jax.worlds.egowm import paper as egowm_paper
 
 
 def config() -> Config:

@@ -5,7 +5,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DDPMConfig,
     DiTConfig,
     EgoWMConfig,
     EgoWMTrainConfig,
@@ -14,6 +13,7 @@ from pewm_jax.config import (
     ModulationConfig,
     StageConfig,
 )
+from pewm_jax.diffusion.ddpm import DDPMConfig
 
 
 def config() -> Config:

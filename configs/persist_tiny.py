@@ -9,7 +9,6 @@ from pewm_jax.config import (
     Config,
     DataConfig,
     EvalConfig,
-    FrameFlowConfig,
     GridConfig,
     LearnedCodecConfig,
     ModulationConfig,
@@ -21,6 +20,7 @@ from pewm_jax.config import (
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
+from pewm_jax.diffusion.flow import FrameFlowConfig
 
 CLASSES = 73
 """Nine groups of kinds in eight colours, and nothing."""

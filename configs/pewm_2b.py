@@ -2,7 +2,9 @@
 
 import dataclasses
 
-from pewm_jax.config import Config, DDPMConfig, DINOv2EncoderConfig, VAEConfig, paper, published
+from pewm_jax.config import Config, DINOv2EncoderConfig, VAEConfig, published
+from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.worlds.pewm import paper
 
 
 def config() -> Config:
@@ -13,13 +15,10 @@ def config() -> Config:
 def on(variant: str) -> Config:
     """Return the settings of the paper on a published CogVideoX.
 
-    They are those of ``pewm_jax.config.paper``, with DINOv2's features (ViT-S/14 at 518²). Training
-    needs ``train.start``: converted weights, widened to depth and cameras, with those of DINOv2
-    (``pewm-jax convert import cogvideox SRC DST --rgbd --camera --encoder DINOV2``; then
+    They are those of ``pewm_jax.worlds.pewm.paper``, with DINOv2's features (ViT-S/14 at 518²).
+    Training needs ``train.start``: converted weights, widened to depth and cameras, with those of
+    DINOv2 (``pewm-jax convert import cogvideox SRC DST --rgbd --camera --encoder DINOV2``; then
     ``pewm-jax train DST`` has these settings too). ``--plan`` needs nothing.
-
-    Args:
-        variant: one of ``pewm_jax.config.PUBLISHED``.
     """
     snr_shift = 3.0 if variant == "2b" else 1.0
     return paper.experiment(

@@ -5,13 +5,13 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DDPMConfig,
     DiTConfig,
     ModelConfig,
     StageConfig,
     TrainConfig,
     VoxelConfig,
 )
+from pewm_jax.diffusion.ddpm import DDPMConfig
 
 
 def config() -> Config:

@@ -5,7 +5,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DDPMConfig,
     DiTConfig,
     EvalConfig,
     ModelConfig,
@@ -13,6 +12,7 @@ from pewm_jax.config import (
     TrainConfig,
     VoxelConfig,
 )
+from pewm_jax.diffusion.ddpm import DDPMConfig
 
 
 def config() -> Config:

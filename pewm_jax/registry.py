@@ -115,10 +115,10 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "none": "pewm_jax.config.memory:NoMemoryConfig",
     },
     "noise": {
-        "ddpm": "pewm_jax.config.noise:DDPMConfig",
-        "edm": "pewm_jax.config.noise:EDMConfig",
-        "flow": "pewm_jax.config.noise:FlowConfig",
-        "frame_flow": "pewm_jax.config.frame_flow:FrameFlowConfig",
+        "ddpm": "pewm_jax.diffusion.ddpm:DDPMConfig",
+        "edm": "pewm_jax.diffusion.edm:EDMConfig",
+        "flow": "pewm_jax.diffusion.flow:FlowConfig",
+        "frame_flow": "pewm_jax.diffusion.flow:FrameFlowConfig",
     },
 }
 """Section → name → "module:class" of the kinds of this package, imported when first used."""
@@ -153,10 +153,6 @@ MODULES: dict[str, str] = {
     "memory.grid": "pewm_jax.memory.class_grid",
     "memory.images": "pewm_jax.memory.images",
     "memory.none": "pewm_jax.memory.nothing",
-    "noise.ddpm": "pewm_jax.diffusion.ddpm",
-    "noise.edm": "pewm_jax.diffusion.edm",
-    "noise.flow": "pewm_jax.diffusion.flow",
-    "noise.frame_flow": "pewm_jax.diffusion.frame_flow",
 }
 """The modules of the built-in kinds whose functions are not methods yet; see ``functions``."""
 

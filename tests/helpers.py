@@ -11,12 +11,12 @@ from pewm_jax.config import (
     AttentionConfig,
     ClipConfig,
     Config,
-    DDPMConfig,
     DiTConfig,
     ModelConfig,
     PixelConfig,
     VoxelConfig,
 )
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import cameras
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import world_model

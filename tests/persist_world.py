@@ -4,7 +4,6 @@ from pewm_jax.config import (
     BlocksConfig,
     CameraModelConfig,
     ClipConfig,
-    FrameFlowConfig,
     GridConfig,
     ModulationConfig,
     PersistConfig,
@@ -14,6 +13,7 @@ from pewm_jax.config import (
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
+from pewm_jax.diffusion.flow import FrameFlowConfig
 
 BLOCKS = BlocksConfig(layers=1, heads=1, head_dim=8, mlp_ratio=2, context=3)
 NOISE = FrameFlowConfig(per_frame=True, sample_steps=1)

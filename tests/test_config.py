@@ -22,12 +22,9 @@ from pewm_jax.config import (
     ConfigError,
     CosmosConfig,
     DataConfig,
-    DDPMConfig,
     DINOv2EncoderConfig,
     DiTConfig,
-    EDMConfig,
     EvalConfig,
-    FlowConfig,
     ImagesConfig,
     LatentsConfig,
     LearnedCodecConfig,
@@ -42,6 +39,9 @@ from pewm_jax.config import (
     VoxelConfig,
 )
 from pewm_jax.config import command_line as cli
+from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.diffusion.edm import EDMConfig
+from pewm_jax.diffusion.flow import FlowConfig
 
 VERSION_1 = Path(__file__).parent / "version_1"
 """Settings as they were written before there were versions."""

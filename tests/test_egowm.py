@@ -15,7 +15,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     ConfigError,
-    DDPMConfig,
     DiTConfig,
     EgoWMConfig,
     EgoWMTrainConfig,
@@ -23,6 +22,7 @@ from pewm_jax.config import (
     SurfelConfig,
     UserError,
 )
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Control

@@ -14,7 +14,6 @@ from pewm_jax.config import (
     AttentionConfig,
     ConfigError,
     DataConfig,
-    DDPMConfig,
     DINOv2Config,
     DINOv2EncoderConfig,
     DiTConfig,
@@ -25,6 +24,7 @@ from pewm_jax.config import (
     VoxelConfig,
 )
 from pewm_jax.data import loader
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import tree, weights
 from pewm_jax.nn import signals

@@ -20,7 +20,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     ConfigError,
-    DDPMConfig,
     ModelConfig,
     Noise,
     PixelConfig,
@@ -30,6 +29,7 @@ from pewm_jax.config import (
     register,
 )
 from pewm_jax.config import command_line as cli
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from tests.strangers import run as strangers
 
 TINY = presets.load("tiny")

@@ -17,7 +17,6 @@ from pewm_jax.config import (
     PixelConfig,
     UserError,
 )
-from pewm_jax.diffusion import noise as noises
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.memory import class_edit, class_grid, memories
@@ -198,7 +197,7 @@ def test_the_cache_of_a_rollout_is_that_of_its_frames_at_once(params, state):
     np.testing.assert_array_equal(present.map.history.start_3, state.map.history.start_3)
     latents, actions, told, camera = (jnp.stack(x)[None] for x in zip(*frames, strict=True))
     times = jnp.zeros((1, 2))
-    inputs, times = noises.shown(clean, latents, times)
+    inputs, times = clean.precondition(latents, times)
     _, cache = voxel_dit.apply(
         config, params["voxel_dit"], inputs, times, actions, told,
         camera_BTN=camera if config.camera_numbers else None, cache=voxel_dit.no_frames(config, 1),

@@ -5,14 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import (
-    PERSIST_VOXELS,
     BlocksConfig,
     CameraModelConfig,
     VoxelDiTConfig,
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
-from pewm_jax.diffusion import frame_flow
+from pewm_jax.diffusion.flow import PERSIST_VOXELS
 from pewm_jax.geometry import cameras
 from pewm_jax.geometry.actions import camera_steps_between
 from pewm_jax.geometry.march import Layers
@@ -49,7 +48,7 @@ def test_whoever_knows_the_answer_has_no_error():
 
     def predict(x_t, times):
         asked.append(times.shape)
-        return frame_flow.velocity(NOISE, x0, x_t, times / NOISE.scale)
+        return NOISE.velocity(x0, x_t, times / NOISE.scale)
 
     loss, measured = persist_losses._velocity(NOISE, predict, x0, jax.random.key(0), jnp.float32)
     assert loss < 1e-4

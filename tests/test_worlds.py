@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, DDPMConfig, UserError
+from pewm_jax.config import Config, UserError
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import memories

@@ -13,7 +13,8 @@ import pytest
 
 import pewm_jax
 from pewm_jax import worlds
-from pewm_jax.config import DDPMConfig, UserError
+from pewm_jax.config import UserError
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import cameras
 from pewm_jax.planning import imagined
 from pewm_jax.types import Camera, Control, WorldState

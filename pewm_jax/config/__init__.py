@@ -4,6 +4,7 @@ A field's docstring is its ``--help`` text. Values that cannot work are refused 
 is built, in a sentence that names the fix; other code does not check them again.
 """
 
+import importlib
 import warnings
 from typing import Any
 
@@ -23,7 +24,6 @@ from pewm_jax.config.encoder import (
 )
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.frame_blocks import BlocksConfig
-from pewm_jax.config.frame_flow import PERSIST_PIXELS, PERSIST_VOXELS, FrameFlowConfig
 from pewm_jax.config.launch import Join, Launch
 from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.memory import (
@@ -37,7 +37,6 @@ from pewm_jax.config.memory import (
 from pewm_jax.config.mesh import AXES, MeshConfig
 from pewm_jax.config.migrations import upgrade
 from pewm_jax.config.model import ModelConfig
-from pewm_jax.config.noise import DDPMConfig, EDMConfig, FlowConfig
 from pewm_jax.config.nomad import NomadConfig, NomadTrainConfig, NomadWorldConfig
 from pewm_jax.config.parts import (
     Backbone,
@@ -73,8 +72,6 @@ __all__ = [
     "AXES",
     "COSMOS_2B",
     "COSMOS_14B",
-    "PERSIST_PIXELS",
-    "PERSIST_VOXELS",
     "POINT_WAVES",
     "PUBLISHED",
     "SMALLEST",
@@ -95,18 +92,14 @@ __all__ = [
     "Config",
     "ConfigError",
     "CosmosConfig",
-    "DDPMConfig",
     "DINOv2Config",
     "DINOv2EncoderConfig",
     "DataConfig",
     "DiTConfig",
-    "EDMConfig",
     "EgoWMConfig",
     "EgoWMTrainConfig",
     "Encoder",
     "EvalConfig",
-    "FlowConfig",
-    "FrameFlowConfig",
     "GridConfig",
     "ImagesConfig",
     "InjectionPoints",
@@ -157,29 +150,34 @@ __all__ = [
     "upgrade",
 ]
 
-_RENAMED = {
-    "BackboneSettings": "Backbone",
-    "CodecSettings": "Codec",
-    "ControlSettings": "Conditioner",
-    "EncoderSettings": "Encoder",
-    "MemorySettings": "Memory",
-    "NoiseSettings": "Noise",
-    "Places": "InjectionPoints",
-    "ReaderSettings": "Reader",
-    "WorldSettings": "World",
+_MOVED = {
+    "DDPMConfig": "pewm_jax.diffusion.ddpm",
+    "EDMConfig": "pewm_jax.diffusion.edm",
+    "FlowConfig": "pewm_jax.diffusion.flow",
+    "FrameFlowConfig": "pewm_jax.diffusion.flow",
+    "PERSIST_PIXELS": "pewm_jax.diffusion.flow",
+    "PERSIST_VOXELS": "pewm_jax.diffusion.flow",
+    "BackboneSettings": "pewm_jax.config.parts:Backbone",
+    "CodecSettings": "pewm_jax.config.parts:Codec",
+    "ControlSettings": "pewm_jax.config.parts:Conditioner",
+    "EncoderSettings": "pewm_jax.config.parts:Encoder",
+    "MemorySettings": "pewm_jax.config.parts:Memory",
+    "NoiseSettings": "pewm_jax.config.parts:Noise",
+    "Places": "pewm_jax.config.parts:InjectionPoints",
+    "ReaderSettings": "pewm_jax.config.parts:Reader",
+    "WorldSettings": "pewm_jax.config.parts:World",
 }
-"""Names of version 0.1 → their names now."""
+"""Names that version 0.1 had here → the module that has them now, and the name if it is another."""
 
 
 def __getattr__(name: str) -> Any:
-    """Return a class by the name that version 0.1 had for it, with a warning."""
-    if name not in _RENAMED:
+    """Return a class that version 0.1 had here, with a warning."""
+    if name not in _MOVED:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    now = _RENAMED[name]
+    module, _, now = _MOVED[name].partition(":")
     warnings.warn(
-        f"pewm_jax.config.{name} is now pewm_jax.config.{now}; the old name will go in the next "
-        "version.",
+        f"pewm_jax.config.{name} is deprecated: import {now or name} from {module}.",
         DeprecationWarning,
         stacklevel=2,
     )
-    return globals()[now]
+    return getattr(importlib.import_module(module), now or name)

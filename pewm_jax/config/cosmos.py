@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar, Literal
 
-from pewm_jax.config.noise import EDMConfig, FlowConfig
 from pewm_jax.config.parts import Backbone, InjectionPoints
 from pewm_jax.errors import require, require_positive
 
@@ -109,10 +108,8 @@ class CosmosConfig(Backbone):
     def check(self, model: Any) -> None:
         """Refuse noise in other units than the network's, and frames that share a token."""
         super().check(model)
-        noise = model.noise
-        in_units = isinstance(noise, EDMConfig) and noise.target == "flow"
         require(
-            in_units or (isinstance(noise, FlowConfig) and noise.scale == 1),
+            model.noise.velocity_in_unit_time,
             "this backbone (cosmos) is told times from 0 to 1 and predicts velocities: use "
             "noise.kind edm with noise.target flow, or noise.kind flow with noise.scale 1.",
         )

@@ -10,11 +10,10 @@ from pewm_jax.config.codec import PixelConfig
 from pewm_jax.config.control import CameraConfig
 from pewm_jax.config.dit import DiTConfig
 from pewm_jax.config.memory import VoxelConfig
-from pewm_jax.config.noise import DDPMConfig
 from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise, World
 from pewm_jax.config.training import TrainConfig, TrainSettings
 from pewm_jax.errors import require
-from pewm_jax.registry import require_section
+from pewm_jax.registry import part, require_section
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +34,7 @@ class ModelConfig(World):
     """Control: what steers a clip."""
     memory: Memory = VoxelConfig()
     """Memory: what is remembered, as which features, and how it is read."""
-    noise: Noise = DDPMConfig()
+    noise: Noise = part("noise", "ddpm")
     """Noise, prediction target, sampler."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Precision of computation and of frozen weights; weights in training stay float32."""
@@ -61,5 +60,5 @@ class ModelConfig(World):
                 f"model.{name} is {type(found).__name__}: give it a {kind.__name__}.",
             )
         parts: tuple[Any, ...] = (self.backbone, self.codec, self.control, self.memory, self.noise)
-        for part in parts:
-            part.check(self)
+        for settings in parts:
+            settings.check(self)

@@ -611,6 +611,11 @@ class Noise(Settings):
         """Whether the network gets times from 0 to 1 and predicts the velocity ε − x0."""
         return False
 
+    @staticmethod
+    def expand(time_B: Array, ndim: int) -> Array:
+        """Give times (B,) or (B, t) trailing axes, so that they broadcast with (B, t, …)."""
+        return time_B.reshape(*time_B.shape, *(1,) * (ndim - time_B.ndim))
+
     def draw(self, key: Array, batch: int, frames: int) -> Array:
         """Draw times for training: (B,), or (B, t) for ``frames`` latent frames."""
         raise NotImplementedError

@@ -8,7 +8,6 @@ from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.control import ModulationConfig
-from pewm_jax.config.frame_flow import PERSIST_PIXELS, PERSIST_VOXELS
 from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise, Reader
@@ -17,6 +16,7 @@ from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
 from pewm_jax.config.voxel_vae import VoxelVAEConfig
 from pewm_jax.errors import require
+from pewm_jax.registry import part
 
 POINT_WAVES = 4
 """Wavelengths of the sinusoids of a place, with ``model.points``."""
@@ -252,9 +252,9 @@ class PersistConfig(ModelConfig):
     """The numbers of an action; nothing else of it is used."""
     memory: Memory = GridConfig()
     """The state of the world."""
-    noise: Noise = PERSIST_PIXELS
+    noise: Noise = part("noise", "frame_flow", per_frame=True, context_noise=0.1)
     """Noise of pictures, sampler."""
-    voxel_noise: Noise = PERSIST_VOXELS
+    voxel_noise: Noise = part("noise", "frame_flow", per_frame=True)
     """Noise of voxel frames, sampler."""
     hold: float = 0.0
     """By how many nats another class must be likelier than the one that a cell has had, for it to

@@ -22,9 +22,10 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax.config import DDPMConfig, DiTConfig, UserError, VAEConfig
+from pewm_jax.config import DiTConfig, UserError, VAEConfig
 from pewm_jax.convert import assemble, base, output, scheduler, sources, transformer, vae
 from pewm_jax.convert.mapping import Entry
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tensor_files, tree, weights
 from pewm_jax.models.cogvideox import model as dit_model
 from pewm_jax.models.cogvideox import vae as vae_model

@@ -8,14 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pewm_jax.config import (
-    Config,
-    DDPMConfig,
-    DINOv2EncoderConfig,
-    DiTConfig,
-    UserError,
-    VAEConfig,
-)
+from pewm_jax.config import Config, DINOv2EncoderConfig, DiTConfig, UserError, VAEConfig
 from pewm_jax.config import command_line as cli
 from pewm_jax.config.dit import Learned
 from pewm_jax.convert import (
@@ -41,6 +34,7 @@ from pewm_jax.convert.options import (
     ImportDINOv2,
     ImportSVD,
 )
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.models.dinov2 import model as dinov2_model
 from pewm_jax.types import Params
 

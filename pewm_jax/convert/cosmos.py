@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pewm_jax.config import CosmosConfig, EDMConfig, WanVAEConfig
+from pewm_jax.config import CosmosConfig, WanVAEConfig
 from pewm_jax.convert import (
     cogvideox,
     cosmos_scheduler,
@@ -19,6 +19,7 @@ from pewm_jax.convert import (
     wan_vae,
 )
 from pewm_jax.convert.cogvideox import Network
+from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.models.cosmos import model as transformer_model
 from pewm_jax.models.wan import vae as vae_model
 from pewm_jax.types import Params

@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pewm_jax.config import EDMConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.convert import settings
+from pewm_jax.diffusion.edm import EDMConfig
 
 CLASS = "FlowMatchEulerDiscreteScheduler"
 """The reference's class."""

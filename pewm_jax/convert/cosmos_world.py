@@ -12,9 +12,10 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from pewm_jax.config import Config, CosmosConfig, UserError, WanVAEConfig, egowm_paper
+from pewm_jax.config import Config, CosmosConfig, UserError, WanVAEConfig
 from pewm_jax.convert import cogvideox, cosmos, output, text, whole_world
 from pewm_jax.types import Params
+from pewm_jax.worlds.egowm import paper as egowm_paper
 
 
 def config_of(

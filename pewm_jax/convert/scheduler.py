@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from pewm_jax import config as configuration
-from pewm_jax.config import ConfigError, DDPMConfig, UserError
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.convert import settings
+from pewm_jax.diffusion.ddpm import DDPMConfig
 
 CLASSES = {"CogVideoXDDIMScheduler": "ddim", "CogVideoXDPMScheduler": "dpm"}
 """Their classes and our samplers."""

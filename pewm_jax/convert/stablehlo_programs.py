@@ -13,8 +13,9 @@ import numpy as np
 
 from pewm_jax import registry as kinds
 from pewm_jax import worlds
-from pewm_jax.config import Config, DDPMConfig, UserError
+from pewm_jax.config import Config, UserError
 from pewm_jax.data import abstract
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree
 from pewm_jax.memory import memories
 from pewm_jax.types import Array, Camera, Control, Params, Sight

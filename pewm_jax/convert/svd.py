@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import CLIPVisionConfig, EDMConfig, SVDUNetConfig, SVDVAEConfig
+from pewm_jax.config import CLIPVisionConfig, SVDUNetConfig, SVDVAEConfig
 from pewm_jax.convert import (
     assemble,
     clip_vision,
@@ -23,6 +23,7 @@ from pewm_jax.convert import (
     svd_vae,
 )
 from pewm_jax.convert.cogvideox import Network
+from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tensor_files
 from pewm_jax.models.clip import model as clip_model
 from pewm_jax.models.svd import unet as unet_model

@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from pewm_jax import config as configuration
-from pewm_jax.config import ConfigError, EDMConfig, UserError
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.convert import settings
+from pewm_jax.diffusion.edm import EDMConfig
 
 CLASS = "EulerDiscreteScheduler"
 """The reference's class."""

@@ -13,9 +13,10 @@ from typing import Literal
 
 import jax
 
-from pewm_jax.config import Config, egowm_paper
+from pewm_jax.config import Config
 from pewm_jax.convert import assemble, clip_vision, cogvideox, output, sources, svd, whole_world
 from pewm_jax.models.clip import model as clip_model
+from pewm_jax.worlds.egowm import paper as egowm_paper
 
 
 def config_of(src: Path, dst: Path, dtype: str | None, size: tuple[int, int]) -> Config:

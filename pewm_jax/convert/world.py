@@ -15,22 +15,15 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    DDPMConfig,
-    DiTConfig,
-    Encoder,
-    UserError,
-    VAEConfig,
-    paper,
-)
+from pewm_jax.config import ClipConfig, Config, DiTConfig, Encoder, UserError, VAEConfig
 from pewm_jax.convert import base, cogvideox, output, widen
 from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tensor_files, tree
 from pewm_jax.nn import positions
 from pewm_jax.readers import interface as readers
 from pewm_jax.types import Array, Params
+from pewm_jax.worlds.pewm import paper
 
 
 def config_of(

@@ -1,126 +1,116 @@
-"""Samplers under ``lax.scan``: DDIM and SDE-DPM-Solver++ (2M), as in CogVideoX's schedulers."""
+"""Sampling under ``lax.scan``: DDIM and SDE-DPM-Solver++ (2M) share one update rule.
+
+    x ← keep · x + add · ((1 + mix) · x0 − mix · x0 of the step before) + spread · fresh noise
+
+The four coefficients depend only on the noise levels. They are computed once, in float64, before
+tracing. Levels without signal or without noise, where log-SNR is infinite, therefore need no
+special case under ``lax.scan``. References: ``scheduling_ddim_cogvideox.py`` and
+``scheduling_dpm_cogvideox.py`` in ``diffusers/schedulers/``.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import DDPMConfig
-from pewm_jax.diffusion import solver
 from pewm_jax.types import Array
 
-Denoiser: TypeAlias = Callable[[Array, Array], Array]
-"""``(x_t, timesteps_B) -> x0``; ``schedule.to_x0`` converts predictions of v or ε."""
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Steps:
+    """The coefficients of every sampling step, or of one.
+
+    Attributes:
+        timestep: (steps,) int32 noise level given to the denoiser.
+        keep: (steps,) weight of the present sample.
+        add: (steps,) weight of the clean sample.
+        mix: (steps,) how far the clean sample is extrapolated from the step before.
+        spread: (steps,) weight of fresh noise.
+        guidance: (steps,) weight of guidance.
+    """
+
+    timestep: Array
+    keep: Array
+    add: Array
+    mix: Array
+    spread: Array
+    guidance: Array
 
 
-def ddim(config: DDPMConfig, denoise: Denoiser, noise: Array, *, every_step: bool = False) -> Array:
-    """Sample by DDIM (Song et al. 2021, η = 0; ``CogVideoXDDIMScheduler``).
+def steps(
+    kind: str,
+    levels: np.ndarray,
+    now: np.ndarray,
+    after: np.ndarray,
+    before: np.ndarray,
+    guidance: np.ndarray,
+) -> Steps:
+    """Return the coefficients of a sampler, float32, in the order of the steps.
 
     Args:
-        config: schedule and steps; its ``sampler`` is not looked at.
-        denoise: ``(x_t, timesteps_B) -> x0``.
-        noise: (B, …) standard normal start.
-        every_step: return what is held after every step, (sample_steps, B, …).
-
-    Returns:
-        (B, …) the sample.
+        kind: ``ddim`` or ``dpm``.
+        levels: (steps,) the visited noise levels.
+        now: (steps,) ᾱ of each visited level.
+        after: (steps,) ᾱ of the level that each step leads to.
+        before: (steps,) ᾱ of the level visited before; NaN where a step must be of first order.
+        guidance: (steps,) the weights of guidance.
     """
-    rows = solver.steps(dataclasses.replace(config, sampler="ddim"))
-    return _follow(rows, _plain(denoise), noise, every_step=every_step)
+    rows = {"ddim": _ddim, "dpm": _dpm}[kind](now, after, before)
+    return Steps(levels, *(np.asarray(row, np.float32) for row in (*rows, guidance)))
 
 
-def dpm(
-    config: DDPMConfig,
-    denoise: Denoiser,
-    noise: Array,
-    key: Array | None = None,
-    *,
-    step_noise: Array | None = None,
-    every_step: bool = False,
-) -> Array:
-    """Sample by SDE-DPM-Solver++ (2M) (Lu et al. 2022; ``CogVideoXDPMScheduler``).
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
-    Args:
-        config: schedule and steps; its ``sampler`` is not looked at.
-        denoise: ``(x_t, timesteps_B) -> x0``.
-        noise: (B, …) standard normal start.
-        key: randomness of the fresh noise; step k draws from ``fold_in(key, k)``.
-        step_noise: (sample_steps, B, …) the fresh noise itself, in place of a key.
-        every_step: return what is held after every step, (sample_steps, B, …).
 
-    Returns:
-        (B, …) the sample.
+def _ddim(now: np.ndarray, after: np.ndarray, _before: np.ndarray) -> Rows:
+    """DDIM with η = 0 (Song et al. 2021, Eq. 12)."""
+    keep = np.sqrt((1 - after) / np.maximum(1 - now, 1e-12))
+    add = np.sqrt(after) - np.sqrt(now) * keep
+    return keep, add, np.zeros_like(now), np.zeros_like(now)
 
-    Raises:
-        ValueError: both or neither of key and step_noise are given, or step_noise has a wrong
-            shape.
+
+def _dpm(now: np.ndarray, after: np.ndarray, before: np.ndarray) -> Rows:
+    """SDE-DPM-Solver++ (2M) (Lu et al. 2022, arXiv 2211.01095).
+
+    With h the increase of log-SNR/2, exp(−h) is written as a ratio that is finite for ᾱ = 0 and 1.
     """
-    if (key is None) == (step_noise is None):
-        raise ValueError("dpm() draws fresh noise at every step: give it a key, or step_noise.")
-    shape = (config.sample_steps, *noise.shape)
-    if step_noise is not None and step_noise.shape != shape:
-        raise ValueError(f"dpm() got step_noise of shape {step_noise.shape}; it needs {shape}.")
-    if step_noise is None:
-        fresh = _draw(key, noise)
-    else:
-        given = jnp.asarray(step_noise)
-        fresh = given.__getitem__
-    rows = solver.steps(dataclasses.replace(config, sampler="dpm"))
-    return _follow(rows, _plain(denoise), noise, fresh, every_step=every_step)
+    decay = np.sqrt(now * (1 - after) / (after * (1 - now)))
+    keep = np.sqrt((1 - after) / (1 - now)) * decay
+    fresh = 1 - decay**2
+    mix = np.zeros_like(now)
+    for i in np.flatnonzero(~np.isnan(before)):
+        if before[i] > 0:  # from pure noise the step is of first order: mix is 0
+            mix[i] = (_rise(now[i], after[i]) / _rise(before[i], now[i])) / 2
+    return keep, fresh * np.sqrt(after), mix, np.sqrt((1 - after) * fresh)
 
 
-def sample(
-    config: DDPMConfig,
-    denoise: Callable[[Array, Array, Array], Array],
-    noise: Array,
-    key: Array | None = None,
-) -> Array:
-    """Sample with the configured sampler.
-
-    Args:
-        config: schedule, sampler and steps.
-        denoise: ``(x_t, timesteps_B, weight) -> x0``; the last is the weight of guidance (see
-            ``schedule.guidance``).
-        noise: (B, …) standard normal start.
-        key: randomness of the steps; only the sampler dpm needs it.
-
-    Returns:
-        (B, …) the sample.
-
-    Raises:
-        ValueError: the sampler is dpm and there is no key.
-    """
-    if config.sampler == "ddim":
-        return _follow(solver.steps(config), denoise, noise)
-    if key is None:
-        raise ValueError("noise.sampler dpm draws fresh noise at every step: give it a key.")
-    return _follow(solver.steps(config), denoise, noise, _draw(key, noise))
+def _rise(low: float, high: float) -> float:
+    """Return the increase of log-SNR/2 between two levels."""
+    return 0.5 * (np.log(high / (1 - high)) - np.log(low / (1 - low)))
 
 
-def _plain(denoise: Denoiser) -> Callable[[Array, Array, Array], Array]:
-    """Make a denoiser accept, and ignore, the weight of guidance."""
-    return lambda x, timesteps, _weight: denoise(x, timesteps)
-
-
-def _draw(key: Array, like: Array) -> Callable[[Array], Array]:
-    """Return a function from a step's number to its standard normal noise."""
-    return lambda k: jax.random.normal(jax.random.fold_in(key, k), like.shape, like.dtype)
-
-
-def _follow(
-    rows: solver.Steps,
+def follow(
+    rows: Steps,
     denoise: Callable[[Array, Array, Array], Array],
     start: Array,
     fresh: Callable[[Array], Array] | None = None,
     *,
     every_step: bool = False,
 ) -> Array:
-    """Scan the update of ``solver`` over its rows; ``fresh(k)`` is the noise added at step k."""
+    """Scan the update over the steps.
+
+    Args:
+        rows: the coefficients of all steps.
+        denoise: ``(x_t, levels_B, weight) -> x0``.
+        start: (B, …) standard normal.
+        fresh: ``fresh(k)`` is the noise that step k adds; None for a sampler that adds none.
+        every_step: return the sample after every step, (steps, B, …), and not the last one alone.
+    """
 
     def step(carry, inputs):
         x, earlier = carry

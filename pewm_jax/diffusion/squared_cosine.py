@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.diffusion.noise import spread
+from pewm_jax.config.parts import Noise
 from pewm_jax.types import Array
 
 OFFSET = 0.008
@@ -41,7 +41,7 @@ def corrupt(levels: int, clean: Array, noise: Array, time_B: Array) -> Array:
     """
     alphas = alphas_cumprod(levels)
     kept, added = (jnp.asarray(np.sqrt(x), jnp.float32)[time_B] for x in (alphas, 1 - alphas))
-    return spread(kept, clean.ndim) * clean + spread(added, clean.ndim) * noise
+    return Noise.expand(kept, clean.ndim) * clean + Noise.expand(added, clean.ndim) * noise
 
 
 def back(levels: int, predicted: Array, noisy: Array, time: Array, noise: Array) -> Array:

@@ -25,7 +25,6 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ModelConfig, UserError
-from pewm_jax.diffusion import noise as noises
 from pewm_jax.memory import memories
 from pewm_jax.types import Array, Control, Frames, Params, Sight, View
 from pewm_jax.worlds import world_model
@@ -138,11 +137,11 @@ def _looking_back(
     observed = jax.tree.map(lambda x: x[:, :1], back)
     conditioning = world_model.condition(model, params, observed, Control(back.camera))
     time_key, noise_key = jax.random.split(key)
-    times = noises.draw(model.noise, time_key, *x0.shape[:2])
-    x_t = noises.corrupt(model.noise, x0, jax.random.normal(noise_key, x0.shape), times)
-    inputs, network_time = noises.shown(model.noise, x_t, times)
+    times = model.noise.draw(time_key, *x0.shape[:2])
+    x_t = model.noise.corrupt(x0, jax.random.normal(noise_key, x0.shape), times)
+    inputs, network_time = model.noise.precondition(x_t, times)
     out = world_model.apply(model, params, inputs, conditioning, network_time, sight)
-    latents = noises.to_x0(model.noise, out, x_t, times)
+    latents = model.noise.to_x0(out, x_t, times)
     last = latents[:, -1:] if model.codec.framewise else latents
     rgb, depth = (x[:, -1:] for x in codecs.decode_rgbd(model, params, last))
     if view is not None and memories.gated(model):

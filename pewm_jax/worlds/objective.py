@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ModelConfig, TrainSettings
-from pewm_jax.diffusion import noise as noises
+from pewm_jax.config.parts import Noise
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import memories
 from pewm_jax.nn import placement
@@ -121,9 +121,9 @@ def loss(
         x0 = codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
     batch = x0.shape[0]
     time_key, noise_key, level_key, image_key = jax.random.split(key, 4)
-    times = noises.draw(model.noise, time_key, batch, x0.shape[1])
+    times = model.noise.draw(time_key, batch, x0.shape[1])
     noise = jax.random.normal(noise_key, x0.shape)
-    x_t = noises.corrupt(model.noise, x0, noise, times)
+    x_t = model.noise.corrupt(x0, noise, times)
 
     level = jnp.exp(
         train.image_noise_mean
@@ -152,16 +152,16 @@ def loss(
     if blind:
         hidden = jax.random.bernoulli(jax.random.fold_in(key, 6), blind, (batch,))
         conditioning = world_model.blind(model, params, conditioning, hidden)
-    inputs, network_time = noises.shown(model.noise, x_t, times)
+    inputs, network_time = model.noise.precondition(x_t, times)
     prediction = world_model.apply(model, params, inputs, conditioning, network_time, sight)
 
-    error = (prediction - noises.target(model.noise, x0, noise, times)) ** 2
-    error = error * noises.spread(noises.weight(model.noise, times), error.ndim)
+    error = (prediction - model.noise.prediction_target(x0, noise, times)) ** 2
+    error = error * Noise.expand(model.noise.weight(times), error.ndim)
     split = model.codec.rgb_channels
     measured = jnp.broadcast_to(codecs.measured(model, frames.depth_THW), error[..., split:].shape)
     rgb = error[..., :split].mean()
     if conditioning.given.known_Bt is not None:
-        counted = noises.spread(1.0 - conditioning.given.known_Bt, error.ndim)
+        counted = Noise.expand(1.0 - conditioning.given.known_Bt, error.ndim)
         rgb = (error[..., :split] * counted).mean() / jnp.maximum(counted.mean(), 1e-6)
         measured = measured * counted
     depth = (error[..., split:] * measured).sum() / jnp.maximum(measured.sum(), 1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax
 
 from pewm_jax.config import ModelConfig
-from pewm_jax.diffusion import noise as noises
 from pewm_jax.models import interface as backbones
 from pewm_jax.types import Array, Params, Sight
 from pewm_jax.worlds import world_model
@@ -63,9 +62,9 @@ def sample(
     def x0(
         x: Array, times: Array, given: world_model.ClipConditioning, sight: Sight | None
     ) -> Array:
-        inputs, network_time = noises.shown(noise, x, times)
+        inputs, network_time = noise.precondition(x, times)
         out = world_model.apply(model, params, inputs, given, network_time, sight)
-        return noises.to_x0(noise, out, x, times)
+        return noise.to_x0(out, x, times)
 
     def denoise(x: Array, times: Array, weight: Array) -> Array:
         clean = x0(x, times, conditioning, sight)
@@ -74,4 +73,4 @@ def sample(
             clean = without + weight * (clean - without)
         return backbones.held(conditioning.given, clean)
 
-    return noises.sample(noise, denoise, noise_BthwC, key)
+    return noise.sample(denoise, noise_BthwC, key)

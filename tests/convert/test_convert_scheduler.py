@@ -1,7 +1,8 @@
 import pytest
 
-from pewm_jax.config import DDPMConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.convert import scheduler
+from pewm_jax.diffusion.ddpm import DDPMConfig
 
 PUBLISHED = {  # CogVideoX-2b's file
     "_class_name": "CogVideoXDDIMScheduler",

@@ -13,8 +13,9 @@ import pytest
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import worlds
-from pewm_jax.config import AttentionConfig, ClipConfig, DDPMConfig, UserError, VoxelConfig
+from pewm_jax.config import AttentionConfig, ClipConfig, UserError, VoxelConfig
 from pewm_jax.convert import stablehlo, stablehlo_programs
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree
 from pewm_jax.train import runs
 from pewm_jax.worlds import world_model

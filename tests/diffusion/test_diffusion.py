@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import ConfigError, DDPMConfig, TrainConfig
-from pewm_jax.diffusion import sampler, schedule
+from pewm_jax.config import ConfigError, TrainConfig
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import objective, world_model
@@ -15,11 +15,11 @@ from tests.helpers import TINY, init_world, random_frames, randomise, tiny_model
 
 
 def test_the_schedule_ends_in_pure_noise_and_falls():
-    alphas = schedule.alphas_cumprod(DDPMConfig())
+    alphas = DDPMConfig().alphas_cumprod()
     assert alphas[-1] == 0
     assert np.all(np.diff(alphas) < 0)
     assert 0.99 < alphas[0] < 1
-    shifted = schedule.alphas_cumprod(DDPMConfig(snr_shift=3.0))
+    shifted = DDPMConfig(snr_shift=3.0).alphas_cumprod()
     assert np.all(shifted[1:-1] < alphas[1:-1]), "a shift above 1 means more noise"
 
 
@@ -29,9 +29,9 @@ def test_every_target_leads_back_to_x0(kind):
     rng = np.random.default_rng(0)
     x0, noise = rng.normal(size=(2, 5, 3)).astype(np.float32)
     times = jnp.array([0, 3, 500, 900, 999])
-    x_t = schedule.add_noise(config, x0, noise, times)
-    asked = schedule.target(config, x0, noise, times)
-    np.testing.assert_allclose(schedule.to_x0(config, asked, x_t, times), x0, atol=2e-3)
+    x_t = config.corrupt(x0, noise, times)
+    asked = config.prediction_target(x0, noise, times)
+    np.testing.assert_allclose(config.to_x0(asked, x_t, times), x0, atol=2e-3)
 
 
 def test_weighted_x0_error_equals_v_error():
@@ -39,12 +39,12 @@ def test_weighted_x0_error_equals_v_error():
     rng = np.random.default_rng(0)
     x0, noise, guess = rng.normal(size=(3, 4, 6)).astype(np.float32)
     times = jnp.array([100, 400, 700, 999])
-    a = np.sqrt(schedule.alphas_cumprod(config))[np.asarray(times)][:, None]
-    x_t = np.asarray(schedule.add_noise(config, x0, noise, times))
+    a = np.sqrt(config.alphas_cumprod())[np.asarray(times)][:, None]
+    x_t = np.asarray(config.corrupt(x0, noise, times))
     v_guess = (a * x_t - guess) / np.sqrt(1 - a**2)
-    v = schedule.target(dataclasses.replace(config, target="v"), x0, noise, times)
+    v = dataclasses.replace(config, target="v").prediction_target(x0, noise, times)
     by_v = ((v_guess - v) ** 2).mean(-1)
-    by_x0 = schedule.x0_weight(config, times) * ((guess - x0) ** 2).mean(-1)
+    by_x0 = config.weight(times) * ((guess - x0) ** 2).mean(-1)
     np.testing.assert_allclose(by_x0, by_v, rtol=1e-3)
 
 
@@ -58,7 +58,7 @@ def test_ddim_with_a_perfect_denoiser_finds_the_truth(steps):
     config = DDPMConfig(sample_steps=steps)
     x0 = np.random.default_rng(0).normal(size=(2, 3)).astype(np.float32)
     noise = jax.random.normal(jax.random.key(0), (2, 3))
-    out = jax.jit(lambda n: sampler.ddim(config, lambda _x, _t: jnp.asarray(x0), n))(noise)
+    out = jax.jit(lambda n: config.ddim(lambda _x, _t: jnp.asarray(x0), n))(noise)
     np.testing.assert_allclose(out, x0, atol=1e-6)
 
 
@@ -73,21 +73,21 @@ def test_ddim_keeps_the_noise_of_its_path():
         jax.debug.callback(lambda a, b: seen.append((np.array(a), np.array(b))), x, times)
         return x0
 
-    jax.block_until_ready(sampler.ddim(config, denoise, noise))
+    jax.block_until_ready(config.ddim(denoise, noise))
     jax.effects_barrier()
     assert len(seen) == 10
     for x, times in seen:
-        np.testing.assert_allclose(x, schedule.add_noise(config, x0, noise, times), atol=1e-4)
+        np.testing.assert_allclose(x, config.corrupt(x0, noise, times), atol=1e-4)
 
 
 def test_steps_trail():
-    steps = schedule.timesteps(DDPMConfig(sample_steps=10))
+    steps = DDPMConfig(sample_steps=10).levels()
     np.testing.assert_array_equal(steps, np.arange(999, 0, -100))
 
 
 def test_every_number_of_steps_is_exactly_that_many_and_starts_at_pure_noise():
     for count in range(1, 1001):
-        steps = schedule.timesteps(DDPMConfig(sample_steps=count))
+        steps = DDPMConfig(sample_steps=count).levels()
         assert len(steps) == count
         assert steps[0] == 999
         assert steps[-1] >= 0
@@ -171,7 +171,7 @@ def test_guidance_interpolates_between_with_and_without_map():
     np.testing.assert_allclose(run(3.0, sight), without + 3 * (with_map - without), atol=1e-3)
     assert np.abs(with_map - without).max() > 1e-4
     settings = DDPMConfig(sample_steps=1, guidance=3.0, dynamic_guidance=True)
-    (weight,) = schedule.guidance(settings)
+    (weight,) = settings.guidance_weights()
     assert 1 <= weight <= 4
     swung = run(3.0, sight, dynamic_guidance=True)
     np.testing.assert_allclose(swung, without + weight * (with_map - without), atol=1e-3)
@@ -185,7 +185,7 @@ def test_the_sampler_finds_the_mean_of_a_gaussian_whatever_the_network_predicts(
         target=target, sampler=kind, sample_steps=200, zero_terminal_snr=target != "eps"
     )
     mean, spread = 0.7, 0.2
-    alphas = jnp.asarray(schedule.alphas_cumprod(config), jnp.float32)
+    alphas = jnp.asarray(config.alphas_cumprod(), jnp.float32)
 
     def denoise(x, times):
         a = alphas[times][:, None]
@@ -193,13 +193,10 @@ def test_the_sampler_finds_the_mean_of_a_gaussian_whatever_the_network_predicts(
         x0 = mean + gain * (x - jnp.sqrt(a) * mean)
         noise = (x - jnp.sqrt(a) * x0) / jnp.sqrt(1 - a)
         asked = {"x0": x0, "eps": noise, "v": jnp.sqrt(a) * noise - jnp.sqrt(1 - a) * x0}[target]
-        return schedule.to_x0(config, asked, x, times)
+        return config.to_x0(asked, x, times)
 
     start, key = jax.random.normal(jax.random.key(0), (1, 4000)), jax.random.key(1)
-    if kind == "ddim":
-        out = sampler.ddim(config, denoise, start)
-    else:
-        out = sampler.dpm(config, denoise, start, key)
+    out = config.ddim(denoise, start) if kind == "ddim" else config.dpm(denoise, start, key)
     assert abs(float(out.mean()) - mean) < 0.03
     assert abs(float(out.std()) - spread) < 0.03
 
@@ -212,11 +209,11 @@ def test_dpm_draws_its_noise_from_the_key_or_takes_it():
     def denoise(x, _times):
         return jnp.tanh(x)
 
-    by_key = sampler.dpm(config, denoise, start, key)
-    given = sampler.dpm(config, denoise, start, step_noise=steps)
+    by_key = config.dpm(denoise, start, key)
+    given = config.dpm(denoise, start, step_noise=steps)
     np.testing.assert_allclose(by_key, given, atol=1e-6)
-    assert np.abs(by_key - sampler.dpm(config, denoise, start, jax.random.key(2))).max() > 1e-3
-    path = sampler.dpm(config, denoise, start, key, every_step=True)
+    assert np.abs(by_key - config.dpm(denoise, start, jax.random.key(2))).max() > 1e-3
+    path = config.dpm(denoise, start, key, every_step=True)
     assert path.shape == (4, 2, 3)
     np.testing.assert_allclose(path[-1], by_key, atol=1e-6)
 
@@ -224,10 +221,9 @@ def test_dpm_draws_its_noise_from_the_key_or_takes_it():
 @pytest.mark.parametrize("more", [{}, {"key": jax.random.key(0), "step_noise": np.zeros((4, 2))}])
 def test_dpm_needs_a_key_or_noise(more):
     with pytest.raises(ValueError, match="give it a key"):
-        sampler.dpm(DDPMConfig(sample_steps=4), lambda x, _t: x, jnp.zeros((2,)), **more)
+        DDPMConfig(sample_steps=4).dpm(lambda x, _t: x, jnp.zeros((2,)), **more)
     with pytest.raises(ValueError, match=r"it needs \(4, 2\)"):
-        sampler.dpm(
-            DDPMConfig(sample_steps=4),
+        DDPMConfig(sample_steps=4).dpm(
             lambda x, _t: x,
             jnp.zeros((2,)),
             step_noise=np.zeros((3, 2)),
@@ -237,8 +233,8 @@ def test_dpm_needs_a_key_or_noise(more):
 def test_the_sample_has_the_precision_of_the_noise():
     config, start = DDPMConfig(sample_steps=4), jnp.ones((1, 2), jnp.bfloat16)
     for out in (
-        sampler.ddim(config, lambda x, _t: jnp.tanh(x), start),
-        sampler.dpm(config, lambda x, _t: jnp.tanh(x), start, jax.random.key(0)),
+        config.ddim(lambda x, _t: jnp.tanh(x), start),
+        config.dpm(lambda x, _t: jnp.tanh(x), start, jax.random.key(0)),
     ):
         assert out.dtype == jnp.bfloat16
 
@@ -246,7 +242,7 @@ def test_the_sample_has_the_precision_of_the_noise():
 def test_a_fixed_stride_differs_only_where_the_steps_do_not_divide():
     def path(steps, stride):
         config = DDPMConfig(sample_steps=steps, stride=stride)
-        return sampler.ddim(config, lambda x, _t: jnp.tanh(x), jnp.ones((1, 2)))
+        return config.ddim(lambda x, _t: jnp.tanh(x), jnp.ones((1, 2)))
 
     np.testing.assert_array_equal(path(10, "next"), path(10, "fixed"))
     assert np.abs(path(7, "next") - path(7, "fixed")).max() > 1e-4

@@ -7,14 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import (
-    PERSIST_PIXELS,
-    PERSIST_VOXELS,
-    ConfigError,
-    FlowConfig,
-    FrameFlowConfig,
-)
-from pewm_jax.diffusion import flow, frame_flow, noise
+from pewm_jax.config import ConfigError
+from pewm_jax.diffusion.flow import PERSIST_PIXELS, PERSIST_VOXELS, FlowConfig, FrameFlowConfig
 
 PLAIN = FrameFlowConfig(shift=1.0, smallest=0.0)
 
@@ -27,11 +21,11 @@ def test_without_noise_left_at_0_it_is_flow():
     x0, eps = draw(0, 2, 3, 4), draw(1, 2, 3, 4)
     times = np.random.default_rng(2).uniform(0.1, 1, (2, 3)).astype(np.float32)
     config = FlowConfig(per_frame=True)
-    x_t = noise.corrupt(config, x0, eps, times)
-    np.testing.assert_allclose(noise.corrupt(PLAIN, x0, eps, times), x_t, atol=1e-6)
-    wanted = noise.target(config, x0, eps, times)
-    np.testing.assert_allclose(noise.target(PLAIN, x0, eps, times), wanted, atol=1e-6)
-    for made in (noise.to_x0(PLAIN, wanted, x_t, times), noise.to_x0(config, wanted, x_t, times)):
+    x_t = config.corrupt(x0, eps, times)
+    np.testing.assert_allclose(PLAIN.corrupt(x0, eps, times), x_t, atol=1e-6)
+    wanted = config.prediction_target(x0, eps, times)
+    np.testing.assert_allclose(PLAIN.prediction_target(x0, eps, times), wanted, atol=1e-6)
+    for made in (PLAIN.to_x0(wanted, x_t, times), config.to_x0(wanted, x_t, times)):
         np.testing.assert_allclose(made, x0, atol=1e-6)
 
 
@@ -40,23 +34,23 @@ def test_the_target_is_the_slope_of_the_path_whatever_is_left_at_0():
     x0, eps = draw(0, 2, 3, 4), draw(1, 2, 3, 4)
 
     def at(time):
-        return frame_flow.corrupt(config, x0, eps, jnp.full((2, 3), time))
+        return config.corrupt(x0, eps, jnp.full((2, 3), time))
 
     x_t, slope = jax.jvp(at, (0.4,), (1.0,))
-    wanted = frame_flow.target(config, x0, eps, None)
+    wanted = config.prediction_target(x0, eps, None)
     np.testing.assert_allclose(slope, wanted, atol=1e-6)
     np.testing.assert_allclose(x_t, 0.6 * x0 + (0.3 + 0.7 * 0.4) * eps, atol=1e-6)
     times = jnp.full((2, 3), 0.4)
-    np.testing.assert_allclose(frame_flow.to_x0(config, wanted, x_t, times), x0, atol=1e-6)
-    np.testing.assert_allclose(frame_flow.velocity(config, x0, x_t, times), wanted, atol=1e-5)
+    np.testing.assert_allclose(config.to_x0(wanted, x_t, times), x0, atol=1e-6)
+    np.testing.assert_allclose(config.velocity(x0, x_t, times), wanted, atol=1e-5)
     np.testing.assert_allclose(at(0.0) - x0, 0.3 * eps, atol=1e-6)
 
 
 def test_where_x0_is_predicted_samples_follow_the_same_path():
     config = FrameFlowConfig(predicts="x0", sample_steps=3)
     x0, eps, times = draw(0, 2, 3, 4), draw(1, 2, 3, 4), np.full((2, 3), 0.4, np.float32)
-    np.testing.assert_array_equal(noise.target(config, x0, eps, times), x0)
-    np.testing.assert_array_equal(noise.to_x0(config, x0, eps, times), x0)
+    np.testing.assert_array_equal(config.prediction_target(x0, eps, times), x0)
+    np.testing.assert_array_equal(config.to_x0(x0, eps, times), x0)
     velocity = dataclasses.replace(config, predicts="velocity")
 
     def sample(config):
@@ -64,36 +58,32 @@ def test_where_x0_is_predicted_samples_follow_the_same_path():
             made = 0.5 * x + x0
             if config.predicts == "x0":
                 return made
-            return frame_flow.velocity(config, made, x, time)
+            return config.velocity(made, x, time)
 
-        return frame_flow.sample(
-            config, lambda x, t, w: frame_flow.to_x0(config, network(x, t), x, t), eps
-        )
+        return config.sample(lambda x, t, w: config.to_x0(network(x, t), x, t), eps)
 
     np.testing.assert_allclose(sample(config), sample(velocity), atol=1e-5)
 
 
 def test_times_are_drawn_per_frame_and_only_the_sampler_shifts_them():
     config = PERSIST_VOXELS
-    times = np.asarray(frame_flow.draw(config, jax.random.key(0), 400, 5))
+    times = np.asarray(config.draw(jax.random.key(0), 400, 5))
     assert times.shape == (400, 5)
     assert np.unique(times).size > 1990
     logit = np.log(times / (1 - times))
     assert abs(logit.mean()) < 0.1
     assert abs(logit.std() - 1) < 0.1
-    shifted = frame_flow.draw(
-        dataclasses.replace(config, shifted_times=True), jax.random.key(0), 400, 5
-    )
+    shifted = dataclasses.replace(config, shifted_times=True).draw(jax.random.key(0), 400, 5)
     np.testing.assert_allclose(shifted, 3 * times / (1 + 2 * times), rtol=1e-5)
     even = np.linspace(1, 0, 21)[:-1]
-    np.testing.assert_allclose(frame_flow.levels(config), 3 * even / (1 + 2 * even), rtol=1e-6)
-    assert frame_flow.levels is flow.levels
+    np.testing.assert_allclose(config.levels(), 3 * even / (1 + 2 * even), rtol=1e-6)
+    assert FrameFlowConfig.levels is FlowConfig.levels
 
 
 def test_given_frames_have_a_little_noise_and_say_so():
     config = PERSIST_PIXELS
     x0 = np.zeros((2, 3, 50, 40), np.float32)
-    x_t, times = frame_flow.given(config, x0, jax.random.key(0))
+    x_t, times = config.noisy_context(x0, jax.random.key(0))
     np.testing.assert_allclose(times, np.full((2, 3), 0.1), rtol=1e-6)
     np.testing.assert_allclose(np.asarray(x_t).std(), 0.1, rtol=0.05)
 
@@ -106,7 +96,7 @@ def test_settings_that_cannot_work_are_refused(wrong):
 
 def test_times_at_the_ends_are_those_that_one_step_meets():
     config = FrameFlowConfig(per_frame=True, times="ends", sample_steps=1, context_noise=0.1)
-    times = np.asarray(frame_flow.draw(config, jax.random.key(0), 500, 4))
+    times = np.asarray(config.draw(jax.random.key(0), 500, 4))
     assert times.shape == (500, 4)
     assert set(np.unique(times)) == {np.float32(0.1), np.float32(1)}
     np.testing.assert_allclose(times.mean(0), 0.55, atol=0.05)
@@ -116,7 +106,7 @@ def test_times_at_the_ends_are_those_that_one_step_meets():
         jax.debug.callback(lambda t: asked.append(float(t)), time_B[0])
         return 0 * x
 
-    noise.sample(config, denoise, jnp.ones((1, 1, 2)))
+    config.sample(denoise, jnp.ones((1, 1, 2)))
     jax.effects_barrier()
     assert set(asked) <= {1.0}
     for change in ({"sample_steps": 2}, {"per_frame": False}):

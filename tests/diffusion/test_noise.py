@@ -11,8 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax import registry as kinds
-from pewm_jax.config import DDPMConfig, EDMConfig, FlowConfig, FrameFlowConfig, TrainConfig
-from pewm_jax.diffusion import flow, noise
+from pewm_jax.config import TrainConfig
+from pewm_jax.config.parts import Noise
+from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.diffusion.edm import EDMConfig
+from pewm_jax.diffusion.flow import FlowConfig, FrameFlowConfig
 from pewm_jax.worlds import objective
 from tests.diffusion.test_diffusion import make_clip
 from tests.helpers import TINY, init_world, randomise, tiny_model
@@ -46,21 +49,21 @@ def test_every_registered_noise_is_tested():
 
 @every
 def test_the_target_leads_back_to_x0_at_every_level(config):
-    times = jnp.asarray(noise.levels(dataclasses.replace(config, sample_steps=25)))
+    times = jnp.asarray(dataclasses.replace(config, sample_steps=25).levels())
     if isinstance(config, DDPMConfig):
         times = jnp.arange(0, 1000, 37)
     x0, eps = draw(0, 2, len(times), 3, 4)
-    x_t = noise.corrupt(config, x0, eps, times)
-    asked = noise.target(config, x0, eps, times)
+    x_t = config.corrupt(x0, eps, times)
+    asked = config.prediction_target(x0, eps, times)
     scale = max(1.0, float(np.abs(x_t).max()))
-    found = noise.to_x0(config, asked, x_t, times)
+    found = config.to_x0(asked, x_t, times)
     # ε divides by √ᾱ, which is small where noise is heavy.
     np.testing.assert_allclose(found, x0, atol=scale * (2e-3 if "ddpm" in repr(config) else 2e-6))
 
 
 @every
 def test_levels_fall_and_begin_at_the_most_noise(config):
-    levels = np.asarray(noise.levels(dataclasses.replace(config, sample_steps=7)))
+    levels = np.asarray(dataclasses.replace(config, sample_steps=7).levels())
     assert levels.shape == (7,)
     assert (np.diff(levels) < 0).all()
     most = {"ddpm": 999, "edm": 80.0, "flow": 1.0, "frame_flow": 1.0}[kinds.of(config).name]
@@ -70,12 +73,12 @@ def test_levels_fall_and_begin_at_the_most_noise(config):
 def test_no_noise_leaves_latents_alone_and_most_noise_leaves_nothing_of_them():
     x0, eps = draw(0, 2, 3, 4)
     for config in (EDMConfig(), FlowConfig()):
-        np.testing.assert_array_equal(noise.corrupt(config, x0, eps, jnp.zeros(3)), x0)
-    least = noise.corrupt(DDPMConfig(), x0, eps, jnp.zeros(3, int))
+        np.testing.assert_array_equal(config.corrupt(x0, eps, jnp.zeros(3)), x0)
+    least = DDPMConfig().corrupt(x0, eps, jnp.zeros(3, int))
     np.testing.assert_allclose(least, x0, atol=0.15)
     for config, most in ((DDPMConfig(), jnp.full(3, 999)), (FlowConfig(), jnp.ones(3))):
-        np.testing.assert_array_equal(noise.corrupt(config, x0, eps, most), eps)
-    drowned = noise.corrupt(EDMConfig(), x0, eps, jnp.full(3, 80.0)) / 80
+        np.testing.assert_array_equal(config.corrupt(x0, eps, most), eps)
+    drowned = EDMConfig().corrupt(x0, eps, jnp.full(3, 80.0)) / 80
     np.testing.assert_allclose(drowned, eps, atol=0.05)
 
 
@@ -87,7 +90,7 @@ def test_a_perfect_denoiser_is_followed_to_the_truth(config, steps):
 
     @jax.jit
     def run(start):
-        return noise.sample(config, lambda *_: jnp.asarray(x0), start)
+        return config.sample(lambda *_: jnp.asarray(x0), start)
 
     # At σ = 80 a float32 keeps 80·2⁻²⁴.
     np.testing.assert_allclose(run(start), x0, atol=3e-5 if isinstance(config, EDMConfig) else 1e-6)
@@ -102,20 +105,20 @@ def test_the_sampler_goes_through_the_whole_interface(config):
 
     def denoise(x, times, weight):
         told.append((times.shape, jnp.shape(weight)))
-        shown, _ = noise.shown(config, x, times)
+        shown, _ = config.precondition(x, times)
         assert shown.shape == x.shape
-        now = noise.spread(times, x.ndim)
+        now = Noise.expand(times, x.ndim)
         if isinstance(config, EDMConfig):
             eps = (x - x0) / now
         elif isinstance(config, FlowConfig):
             eps = (x - (1 - now) * x0) / now
         else:
-            a = noise.to_x0(dataclasses.replace(config, target="v"), jnp.zeros_like(x), x, times)
+            a = dataclasses.replace(config, target="v").to_x0(jnp.zeros_like(x), x, times)
             a = (a / x).mean((1, 2), keepdims=True)
             eps = (x - a * x0) / jnp.sqrt(1 - a**2)
-        return noise.to_x0(config, noise.target(config, x0, eps, times), x, times)
+        return config.to_x0(config.prediction_target(x0, eps, times), x, times)
 
-    found = jax.jit(lambda start: noise.sample(config, denoise, start))(start)
+    found = jax.jit(lambda start: config.sample(denoise, start))(start)
     np.testing.assert_allclose(found, x0, atol=5e-3)
     assert set(told) == {((2,), ())}
 
@@ -124,9 +127,7 @@ def test_the_sampler_goes_through_the_whole_interface(config):
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
 def test_the_sample_has_the_precision_of_the_noise(config, dtype):
     start = jnp.ones((1, 2, 3), dtype)
-    out = noise.sample(
-        dataclasses.replace(config, sample_steps=2), lambda x, *_: jnp.tanh(x), start
-    )
+    out = dataclasses.replace(config, sample_steps=2).sample(lambda x, *_: jnp.tanh(x), start)
     assert out.dtype == dtype
 
 
@@ -139,9 +140,9 @@ def test_what_edm_shows_and_asks_for_has_unit_variance(config, sigma):
     x0, eps = draw(0, 2, 1, 40_000)
     x0 = config.sigma_data * x0
     times = jnp.full((1,), sigma)
-    shown, told = noise.shown(config, noise.corrupt(config, x0, eps, times), times)
+    shown, told = config.precondition(config.corrupt(x0, eps, times), times)
     assert abs(float(shown.var()) - 1) < 0.03
-    assert abs(float(noise.target(config, x0, eps, times).var()) - 1) < 0.03
+    assert abs(float(config.prediction_target(x0, eps, times).var()) - 1) < 0.03
     np.testing.assert_allclose(told, np.log(sigma) / 4, rtol=1e-5)
 
 
@@ -158,7 +159,7 @@ def test_edm_visits_the_levels_of_equation_5(steps, least, most, rho):
         (most ** (1 / rho) + i / (steps - 1) * (least ** (1 / rho) - most ** (1 / rho))) ** rho
         for i in range(steps)
     ]
-    np.testing.assert_allclose(noise.levels(config), wanted, rtol=1e-9)
+    np.testing.assert_allclose(config.levels(), wanted, rtol=1e-9)
 
 
 def test_edm_steps_by_algorithm_1():
@@ -166,7 +167,7 @@ def test_edm_steps_by_algorithm_1():
     start = draw(0, 1, 2, 3)
     for kind in ("euler", "heun"):
         config = EDMConfig(sampler=kind, sample_steps=6)
-        sigmas = np.append(noise.levels(config), 0)
+        sigmas = np.append(config.levels(), 0)
         x = start.astype(np.float64) * sigmas[0]
         for now, then in itertools.pairwise(sigmas):
             slope = (x - np.tanh(x)) / now
@@ -174,7 +175,7 @@ def test_edm_steps_by_algorithm_1():
             if kind == "heun" and then > 0:
                 ahead = x + (then - now) * (slope + (ahead - np.tanh(ahead)) / then) / 2
             x = ahead
-        found = noise.sample(config, lambda x, *_: jnp.tanh(x), start)
+        found = config.sample(lambda x, *_: jnp.tanh(x), start)
         np.testing.assert_allclose(found, x, rtol=1e-4, atol=1e-5)
 
 
@@ -190,7 +191,7 @@ def gaussian_denoiser(config, mean, spread):
     """The best denoiser where data are N(mean, spread²)."""
 
     def denoise(x, times, _weight):
-        now = noise.spread(times, x.ndim)
+        now = Noise.expand(times, x.ndim)
         signal = 1 - now if isinstance(config, FlowConfig) else 1.0
         gain = signal * spread**2 / (signal**2 * spread**2 + now**2)
         return mean + gain * (x - signal * mean)
@@ -202,7 +203,7 @@ def gaussian_denoiser(config, mean, spread):
 def test_samplers_end_in_the_distribution_of_the_data(config):
     start = jnp.asarray(draw(0, 1, 1, 4000))
     denoise = gaussian_denoiser(config, 0.7, 0.2)
-    out = jax.jit(lambda x: noise.sample(config, denoise, x))(start)
+    out = jax.jit(lambda x: config.sample(denoise, x))(start)
     assert abs(float(out.mean()) - 0.7) < 0.03
     assert abs(float(out.std()) - 0.2) < 0.03
 
@@ -214,7 +215,7 @@ def test_heun_is_nearer_to_the_exact_path_than_euler():
         far = []
         for steps in (24, 48):
             config = EDMConfig(sampler=kind, sample_steps=steps, sigma_max=20.0)
-            end = noise.sample(config, gaussian_denoiser(config, 0.7, 0.2), jnp.asarray(start))
+            end = config.sample(gaussian_denoiser(config, 0.7, 0.2), jnp.asarray(start))
             exact = 0.7 + (20 * start - 0.7) * 0.2 / np.hypot(0.2, 20)
             far.append(np.abs(np.asarray(end) - exact).max())
         order[kind] = np.log2(far[0] / far[1])
@@ -226,25 +227,25 @@ def test_flow_takes_a_time_for_every_frame():
     config = FlowConfig()
     x0, eps = draw(0, 2, 2, 3, 4, 5)
     times = jnp.asarray(np.random.default_rng(1).uniform(size=(2, 3)), jnp.float32)
-    x_t = noise.corrupt(config, x0, eps, times)
+    x_t = config.corrupt(x0, eps, times)
     for b in range(2):
         for k in range(3):
-            alone = noise.corrupt(config, x0[b : b + 1, k], eps[b : b + 1, k], times[b, k][None])
+            alone = config.corrupt(x0[b : b + 1, k], eps[b : b + 1, k], times[b, k][None])
             np.testing.assert_array_equal(x_t[b, k], alone[0])
-    asked = noise.target(config, x0, eps, times)
-    np.testing.assert_allclose(noise.to_x0(config, asked, x_t, times), x0, atol=1e-6)
-    _, told = noise.shown(config, x_t, times)
+    asked = config.prediction_target(x0, eps, times)
+    np.testing.assert_allclose(config.to_x0(asked, x_t, times), x0, atol=1e-6)
+    _, told = config.precondition(x_t, times)
     np.testing.assert_allclose(told, 1000 * times)
-    assert noise.weight(config, times).shape == (2, 3)
+    assert config.weight(times).shape == (2, 3)
     same = jnp.broadcast_to(times[:, :1], (2, 3))
     np.testing.assert_array_equal(
-        noise.corrupt(config, x0, eps, same), noise.corrupt(config, x0, eps, times[:, 0])
+        config.corrupt(x0, eps, same), config.corrupt(x0, eps, times[:, 0])
     )
 
 
 @every
 def test_training_draws_one_time_for_a_clip_from_the_whole_range(config):
-    times = np.asarray(noise.draw(config, jax.random.key(0), 4000, 3))
+    times = np.asarray(config.draw(jax.random.key(0), 4000, 3))
     assert times.shape == (4000,)
     if isinstance(config, EDMConfig):
         np.testing.assert_allclose(np.log(times).mean(), config.log_mean, atol=0.1)
@@ -259,7 +260,7 @@ def test_training_draws_one_time_for_a_clip_from_the_whole_range(config):
 def test_flow_draws_a_time_for_every_frame_if_asked():
     for times in ("uniform", "logit_normal"):
         config = FlowConfig(per_frame=True, times=times)
-        drawn = np.asarray(noise.draw(config, jax.random.key(0), 50, 3))
+        drawn = np.asarray(config.draw(jax.random.key(0), 50, 3))
         assert drawn.shape == (50, 3)
         assert np.abs(np.diff(drawn, axis=1)).min() > 0
 
@@ -277,9 +278,9 @@ def test_training_with_a_time_for_every_frame(monkeypatch):
     assert np.isfinite([apart, together]).all()
     assert apart != together
     fixed = jnp.asarray([0.3, 0.8])
-    monkeypatch.setattr(flow, "draw", lambda *_: fixed)
+    monkeypatch.setattr(FlowConfig, "draw", lambda *_: fixed)
     one = loss(FlowConfig())
-    monkeypatch.setattr(flow, "draw", lambda *_: jnp.broadcast_to(fixed[:, None], (2, 3)))
+    monkeypatch.setattr(FlowConfig, "draw", lambda *_: jnp.broadcast_to(fixed[:, None], (2, 3)))
     np.testing.assert_allclose(loss(FlowConfig()), one, rtol=1e-5)
 
 

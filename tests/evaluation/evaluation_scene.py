@@ -12,7 +12,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DDPMConfig,
     DiTConfig,
     EvalConfig,
     ModelConfig,
@@ -21,6 +20,7 @@ from pewm_jax.config import (
 )
 from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry.actions import discrete_table, integrate
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, ray_directions
 from pewm_jax.types import Camera, Frames

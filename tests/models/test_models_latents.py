@@ -19,7 +19,6 @@ from pewm_jax.config import (
     Config,
     ConfigError,
     DataConfig,
-    DDPMConfig,
     LatentsConfig,
     LearnedCodecConfig,
     PatchColoursConfig,
@@ -31,6 +30,7 @@ from pewm_jax.config import (
     VoxelConfig,
 )
 from pewm_jax.convert import stablehlo_programs
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import tree
 from pewm_jax.memory import feature_cache, memories

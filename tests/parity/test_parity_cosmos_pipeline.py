@@ -10,9 +10,10 @@ import pytest
 import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
 
-from pewm_jax.config import ConfigError, EDMConfig, UserError
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.convert import cosmos, cosmos_scheduler
 from pewm_jax.diffusion import noise
+from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.models.cosmos import model
 from pewm_jax.models.wan import vae as wan_vae
 from tests.parity.cosmos_references import channels_first, channels_last, scheduler, small_pipeline
@@ -76,14 +77,14 @@ def test_what_the_pipeline_samples_is_what_we_sample(pipeline, folder, monkeypat
     mask = is_given[:, None, None, None]
 
     def denoise(x, sigma_B, weight):
-        shown, told = noise.shown(settings, x, sigma_B)
-        _, told_given = noise.shown(settings, x, jnp.full_like(sigma_B, GIVEN_SIGMA))
+        shown, told = settings.precondition(x, sigma_B)
+        _, told_given = settings.precondition(x, jnp.full_like(sigma_B, GIVEN_SIGMA))
         shown = jnp.where(mask > 0, known, shown)
         times = jnp.where(is_given > 0, told_given[:, None], told[:, None])
         marks = jnp.broadcast_to(mask, (*x.shape[:4], 1))
         shown, times, marks = (jnp.repeat(value, 2, 0) for value in (shown, times, marks))
         predicted = model.apply(config, params, shown, times, texts[:, 0], marks, fps=FPS)
-        with_text, without = noise.to_x0(settings, predicted, x, sigma_B)
+        with_text, without = settings.to_x0(predicted, x, sigma_B)
         return jnp.where(mask > 0, known, without + weight * (with_text - without))
 
     got = jax.jit(functools.partial(noise.sample, settings, denoise))(start)
@@ -98,17 +99,17 @@ def test_every_step_of_the_scheduler_is_ours(folder):
     assert config.sample_steps == 35
     theirs.set_timesteps(sigmas=np.linspace(0, 1, 35))
     sigmas = theirs.sigmas.numpy()
-    np.testing.assert_allclose(noise.levels(config), sigmas[:-1], rtol=1e-5)
+    np.testing.assert_allclose(config.levels(), sigmas[:-1], rtol=1e-5)
     x = torch.tensor(draw(2, 3, 4)) * 80
     for i, t in enumerate(theirs.timesteps[:-1]):
         sigma = sigmas[i][None].repeat(2)
         now = torch.tensor(sigma[0] / (sigma[0] + 1))
-        shown, told = noise.shown(config, x.numpy(), sigma)
+        shown, told = config.precondition(x.numpy(), sigma)
         np.testing.assert_allclose(shown, (x * (1 - now)).numpy(), rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(told, now, rtol=1e-5)
         velocity = torch.tanh(0.7 * x * (1 - now)) + 0.3 * torch.cos(now)
         clean = (1 - now) * x - now * velocity
-        ours = noise.to_x0(config, velocity.numpy(), x.numpy(), sigma)
+        ours = config.to_x0(velocity.numpy(), x.numpy(), sigma)
         np.testing.assert_allclose(ours, clean.numpy(), rtol=1e-4, atol=1e-5)
         stepped = theirs.step((x - clean) / sigmas[i], t, x, return_dict=False)[0]
         factor = sigmas[i + 1] / sigmas[i]
@@ -119,11 +120,11 @@ def test_every_step_of_the_scheduler_is_ours(folder):
 def test_what_is_corrupted_has_the_velocity_as_its_target():
     config = EDMConfig(target="flow", sigma_data=1.0)
     x0, fresh, sigma = draw(2, 3, 4), draw(2, 3, 4, seed=1), np.float32([0.3, 7])
-    noisy = noise.corrupt(config, x0, fresh, sigma)
-    target = noise.target(config, x0, fresh, sigma)
+    noisy = config.corrupt(x0, fresh, sigma)
+    target = config.prediction_target(x0, fresh, sigma)
     np.testing.assert_allclose(target, fresh - x0, atol=1e-5)
-    np.testing.assert_allclose(noise.to_x0(config, target, noisy, sigma), x0, atol=1e-5)
-    shown, told = noise.shown(config, noisy, sigma)
+    np.testing.assert_allclose(config.to_x0(target, noisy, sigma), x0, atol=1e-5)
+    shown, told = config.precondition(noisy, sigma)
     mixed = (1 - told)[:, None, None] * x0 + told[:, None, None] * fresh
     np.testing.assert_allclose(shown, mixed, atol=1e-5)
 

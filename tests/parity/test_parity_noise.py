@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import EDMConfig, FlowConfig, UserError
+from pewm_jax.config import UserError
+from pewm_jax.config.parts import Noise
 from pewm_jax.convert import svd, svd_scheduler
-from pewm_jax.diffusion import noise
+from pewm_jax.diffusion.edm import EDMConfig
+from pewm_jax.diffusion.flow import FlowConfig
 
 torch = pytest.importorskip("torch")
 diffusers = pytest.importorskip("diffusers")
@@ -26,11 +28,11 @@ def our_path(config):
     """What the network is shown and told, and x0 of each step; and the sample."""
 
     def denoise(x, times, _weight):
-        shown, told = noise.shown(config, x, times)
-        told = noise.spread(told, x.ndim)
-        return noise.to_x0(config, network(shown, told, jnp), x, times)
+        shown, told = config.precondition(x, times)
+        told = Noise.expand(told, x.ndim)
+        return config.to_x0(network(shown, told, jnp), x, times)
 
-    return np.asarray(jax.jit(lambda x: noise.sample(config, denoise, x))(START))
+    return np.asarray(jax.jit(lambda x: config.sample(denoise, x))(START))
 
 
 @pytest.mark.parametrize("steps", [1, 2, 18])
@@ -42,11 +44,11 @@ def test_edm_equals_the_reference(steps, settings):
         sigma_min=least, sigma_max=most, sigma_data=data, rho=rho, sample_steps=steps
     )
     theirs.set_timesteps(steps)
-    np.testing.assert_allclose(noise.levels(config), theirs.sigmas[:-1].numpy(), rtol=1e-5)
+    np.testing.assert_allclose(config.levels(), theirs.sigmas[:-1].numpy(), rtol=1e-5)
     x = torch.from_numpy(START) * theirs.sigmas[0]
     for i, t in enumerate(theirs.timesteps):
         shown = theirs.scale_model_input(x, t)
-        ours, told = noise.shown(config, x.numpy(), theirs.sigmas[i].numpy()[None].repeat(2))
+        ours, told = config.precondition(x.numpy(), theirs.sigmas[i].numpy()[None].repeat(2))
         np.testing.assert_allclose(ours, shown.numpy(), rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(told, float(t), rtol=1e-5, atol=1e-6)
         x = theirs.step(network(shown, t, torch), t, x, return_dict=False)[0]
@@ -79,16 +81,16 @@ def test_edm_of_v_equals_stable_video_diffusion_s_scheduler(steps, settings, tmp
     assert config.sample_steps == 25
     config = dataclasses.replace(config, sample_steps=steps)
     theirs.set_timesteps(steps)
-    np.testing.assert_allclose(noise.levels(config), theirs.sigmas[:-1].numpy(), rtol=1e-5)
+    np.testing.assert_allclose(config.levels(), theirs.sigmas[:-1].numpy(), rtol=1e-5)
     x = torch.from_numpy(START) * theirs.init_noise_sigma
     for i, t in enumerate(theirs.timesteps):
         sigma = theirs.sigmas[i].numpy()[None].repeat(2)
         shown = theirs.scale_model_input(x, t)
-        ours, told = noise.shown(config, x.numpy(), sigma)
+        ours, told = config.precondition(x.numpy(), sigma)
         np.testing.assert_allclose(ours, shown.numpy(), rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(told, float(t), rtol=1e-5, atol=1e-6)
         v = network(shown, t, torch)
-        clean = noise.to_x0(config, v.numpy(), x.numpy(), sigma)
+        clean = config.to_x0(v.numpy(), x.numpy(), sigma)
         x, found = theirs.step(v, t, x, return_dict=False)
         np.testing.assert_allclose(clean, found.numpy(), rtol=1e-5, atol=1e-5)
     got = our_path(config)
@@ -125,8 +127,8 @@ def test_flow_equals_the_reference(steps, shift):
     # As the pipelines ask for their times; left alone, this scheduler shifts twice.
     theirs.set_timesteps(sigmas=np.linspace(1, 1 / steps, steps))
     config = FlowConfig(shift=shift, sample_steps=steps)
-    np.testing.assert_allclose(noise.levels(config), theirs.sigmas[:-1].numpy(), rtol=1e-5)
-    _, told = noise.shown(config, START, jnp.asarray(noise.levels(config)))
+    np.testing.assert_allclose(config.levels(), theirs.sigmas[:-1].numpy(), rtol=1e-5)
+    _, told = config.precondition(START, jnp.asarray(config.levels()))
     np.testing.assert_allclose(told, theirs.timesteps.numpy(), rtol=1e-5)
     x = torch.from_numpy(START)
     for t in theirs.timesteps:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pewm_jax.convert import scheduler as converter
-from pewm_jax.diffusion import sampler, schedule
 
 torch = pytest.importorskip("torch")
 diffusers = pytest.importorskip("diffusers")
@@ -80,13 +79,13 @@ def their_path(theirs, steps, start, step_noise, monkeypatch):
 def our_path(config, start, step_noise):
     def denoise(x, times):
         prediction = network(x, times.reshape(-1, 1, 1, 1), jnp)
-        return schedule.to_x0(config, prediction, x, times)
+        return config.to_x0(prediction, x, times)
 
     if config.sampler == "ddim":
-        return jax.jit(lambda x: sampler.ddim(config, denoise, x, every_step=True))(start)
+        return jax.jit(lambda x: config.ddim(denoise, x, every_step=True))(start)
 
     def run(x, noise):
-        return sampler.dpm(config, denoise, x, step_noise=noise, every_step=True)
+        return config.dpm(denoise, x, step_noise=noise, every_step=True)
 
     return jax.jit(run)(start, step_noise)
 
@@ -109,7 +108,7 @@ def test_every_step_equals_the_reference(kind, target, settings, monkeypatch):
     start, step_noise = draw(0, *SHAPE), draw(1, steps, *SHAPE)
     want = their_path(theirs, steps, start, step_noise, monkeypatch)
     got = np.asarray(our_path(config, start, step_noise))
-    np.testing.assert_array_equal(schedule.timesteps(config), theirs.timesteps.numpy())
+    np.testing.assert_array_equal(config.levels(), theirs.timesteps.numpy())
     assert np.isfinite(got).all()
     assert got.shape == want.shape
     for i in range(steps):
@@ -120,13 +119,13 @@ def test_every_step_equals_the_reference(kind, target, settings, monkeypatch):
 def test_levels_noising_and_velocity_equal_the_reference(settings):
     theirs = reference("ddim", "v_prediction", settings)
     config = ours(theirs, settings[2])
-    alphas = schedule.alphas_cumprod(config)
+    alphas = config.alphas_cumprod()
     np.testing.assert_allclose(alphas, theirs.alphas_cumprod.numpy(), rtol=1e-9, atol=1e-15)
     x0, noise = draw(2, 2, 7, 3, 4)
     times = np.array([0, 1, 250, 500, 750, 998, 999])
     given = [torch.from_numpy(x) for x in (x0, noise, times)]
-    noised = np.asarray(schedule.add_noise(config, x0, noise, times))
-    velocity = np.asarray(schedule.target(config, x0, noise, times))
+    noised = np.asarray(config.corrupt(x0, noise, times))
+    velocity = np.asarray(config.prediction_target(x0, noise, times))
     for got, want in [
         (noised, theirs.add_noise(*given).numpy()),
         (velocity, theirs.get_velocity(*given).numpy()),
@@ -140,7 +139,7 @@ def test_the_visited_levels_equal_the_reference_for_every_count(spacing):
     config = ours(theirs, 1)
     for count in [*range(1, 130), 200, 250, 333, 500, 1000]:
         theirs.set_timesteps(count)
-        got = schedule.timesteps(dataclasses.replace(config, sample_steps=count))
+        got = dataclasses.replace(config, sample_steps=count).levels()
         # for a few counts the reference has an element too many, a level of −1
         np.testing.assert_array_equal(got, theirs.timesteps.numpy()[:count], str(count))
 
@@ -190,7 +189,7 @@ def test_dynamic_guidance_is_what_the_pipeline_applies():
         callback_on_step_end_tensor_inputs=["latents"],
     )
     config = dataclasses.replace(ours(theirs, 10), guidance=6.0, dynamic_guidance=True)
-    np.testing.assert_allclose(schedule.guidance(config), seen, rtol=1e-9)
+    np.testing.assert_allclose(config.guidance_weights(), seen, rtol=1e-9)
     assert np.ptp(seen) > 1
 
 

@@ -18,7 +18,6 @@ from pewm_jax.config import (
     ConfigError,
     CosmosConfig,
     DataConfig,
-    EDMConfig,
     EgoWMConfig,
     EgoWMTrainConfig,
     MeshConfig,
@@ -28,6 +27,7 @@ from pewm_jax.config import (
     WanVAEConfig,
 )
 from pewm_jax.controls import interface as controls
+from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
 from pewm_jax.plan import hlo
 from pewm_jax.plan.plan import QUICK

@@ -15,8 +15,6 @@ from pewm_jax.config import (
     Config,
     ConfigError,
     DataConfig,
-    DDPMConfig,
-    EDMConfig,
     EgoWMConfig,
     EgoWMTrainConfig,
     MeshConfig,
@@ -27,6 +25,8 @@ from pewm_jax.config import (
     SVDVAEConfig,
     TrainConfig,
 )
+from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.interface import Conditioning

@@ -21,7 +21,6 @@ from pewm_jax import presets
 from pewm_jax.config import (
     AttentionConfig,
     ConfigError,
-    DDPMConfig,
     DINOv2Config,
     DINOv2EncoderConfig,
     ImagesConfig,
@@ -33,6 +32,7 @@ from pewm_jax.config import (
     VAEConfig,
     VoxelConfig,
 )
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree, weights
 from pewm_jax.train import integrity, loop, runs, sharding, step
 from pewm_jax.train.checkpoint import CONFIG_ITEM, Checkpoints

@@ -15,14 +15,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import (
-    CameraModelConfig,
-    FrameFlowConfig,
-    VoxelDiTConfig,
-    VoxelRendererConfig,
-    VoxelVAEConfig,
-)
-from pewm_jax.diffusion import noise as noises
+from pewm_jax.config import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig, VoxelVAEConfig
+from pewm_jax.config.parts import Noise
+from pewm_jax.diffusion.flow import FrameFlowConfig
 from pewm_jax.geometry.actions import camera_numbers, camera_steps_between
 from pewm_jax.geometry.march import Layers
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer
@@ -227,17 +222,17 @@ def _velocity(
         compare: an error of the predicted x0 that is added.
     """
     time_key, noise_key = jax.random.split(key)
-    times = noises.draw(noise, time_key, *x0.shape[:2])
+    times = noise.draw(time_key, *x0.shape[:2])
     times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], x0.shape[:2])
     drawn = jax.random.normal(noise_key, x0.shape)
-    x_t = noises.corrupt(noise, x0, drawn, times)
+    x_t = noise.corrupt(x0, drawn, times)
     if known is not None:
         x_t = jnp.where(known[..., None], x_t, drawn)
-    inputs, network_times = noises.shown(noise, x_t, times)
+    inputs, network_times = noise.precondition(x_t, times)
     made = predict(inputs.astype(dtype), network_times).astype(jnp.float32)
-    error = jnp.square(made - noises.target(noise, x0, drawn, times))
-    weight = noises.spread(noises.weight(noise, times), error.ndim)
-    made_x0 = noises.to_x0(noise, made, x_t, times)
+    error = jnp.square(made - noise.prediction_target(x0, drawn, times))
+    weight = Noise.expand(noise.weight(times), error.ndim)
+    made_x0 = noise.to_x0(made, x_t, times)
     x0_error = jnp.square(made_x0 - x0)
 
     share = jnp.ones(x0.shape[:-1]) if known is None else known.astype(jnp.float32)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import Noise, PersistConfig
-from pewm_jax.diffusion import noise as noises
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.types import Array, Camera, Params
@@ -93,4 +92,4 @@ def context(noise: Noise, x0: Array, key: Array) -> tuple[Array, Array]:
     """Return frames (1, 1, …) with the noise that given ones have, and their times."""
     times = jnp.full(x0.shape[:2], getattr(noise, "context_noise", 0.0))
     drawn = jax.random.normal(key, x0.shape, x0.dtype)
-    return noises.corrupt(noise, x0, drawn, times), times
+    return noise.corrupt(x0, drawn, times), times

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import PersistConfig
-from pewm_jax.diffusion import noise as noises
 from pewm_jax.geometry.actions import (
     CAMERA_STEP_NUMBERS,
     camera_numbers,
@@ -127,9 +126,9 @@ def sample(
         del weight
         times = time_B[:, None]
         made, _ = _render(model, params, x, times, features, action_A, cache)
-        return noises.to_x0(noise, made.astype(jnp.float32), x, times)
+        return noise.to_x0(made.astype(jnp.float32), x, times)
 
-    return noises.sample(noise, denoise, jax.random.normal(key, shape))[0, 0]
+    return noise.sample(denoise, jax.random.normal(key, shape))[0, 0]
 
 
 def remembered(
@@ -156,7 +155,7 @@ def _render(
     cache: FrameCache,
 ) -> tuple[Array, FrameCache]:
     config, noise = model.backbone.renderer, model.noise  # type: ignore[attr-defined]
-    inputs, network_times = noises.shown(noise, x, times_BT)
+    inputs, network_times = noise.precondition(x, times_BT)
     return voxel_renderer.apply(
         config,
         params["renderer"],

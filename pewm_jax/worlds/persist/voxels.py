@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import PersistConfig
-from pewm_jax.diffusion import noise as noises
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.memory.class_edit import EMPTY, UNKNOWN
 from pewm_jax.models.persist import voxel_dit, voxel_vae
@@ -54,14 +53,14 @@ def sample(
     def denoise(x: Array, time_B: Array, weight: Array) -> Array:
         del weight
         times = time_B[:, None]
-        inputs, network_times = noises.shown(noise, x, times)
+        inputs, network_times = noise.precondition(x, times)
         inputs = inputs.astype(jnp.dtype(model.dtype))
         made, _ = voxel_dit.apply(
             config, params["voxel_dit"], inputs, network_times, **asked, cache=cache
         )
-        return noises.to_x0(noise, made.astype(jnp.float32), x, times)
+        return noise.to_x0(made.astype(jnp.float32), x, times)
 
-    latents = noises.sample(noise, denoise, jax.random.normal(key, shape))[:, 0]
+    latents = noise.sample(denoise, jax.random.normal(key, shape))[:, 0]
     return held(model, params, latents, before_XYZ, sight)
 
 
@@ -119,7 +118,7 @@ def taken_in(
     noise_key, unknown_key = jax.random.split(key)
     x, times = context(noise, latents, noise_key)
     x = jnp.where(known[..., None], x, jax.random.normal(unknown_key, x.shape))
-    inputs, network_times = noises.shown(noise, x, times)
+    inputs, network_times = noise.precondition(x, times)
     _, cache = voxel_dit.apply(
         config,
         params["voxel_dit"],
