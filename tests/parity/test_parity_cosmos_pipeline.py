@@ -12,7 +12,6 @@ from diffusers import FlowMatchEulerDiscreteScheduler
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.convert import cosmos, cosmos_scheduler
-from pewm_jax.diffusion import noise
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.models.cosmos import model
 from pewm_jax.models.wan import vae as wan_vae
@@ -87,7 +86,7 @@ def test_what_the_pipeline_samples_is_what_we_sample(pipeline, folder, monkeypat
         with_text, without = settings.to_x0(predicted, x, sigma_B)
         return jnp.where(mask > 0, known, without + weight * (with_text - without))
 
-    got = jax.jit(functools.partial(noise.sample, settings, denoise))(start)
+    got = jax.jit(functools.partial(settings.sample, denoise))(start)
     assert len(seen) == STEPS
     assert distance(got, seen[-1]) < 1e-4
     assert distance(seen[-1], seen[-2]) == 0  # the reference's last step leads nowhere
