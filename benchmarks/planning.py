@@ -29,7 +29,7 @@ from pewm_jax.planning import costs
 from pewm_jax.planning.candidates import Imagination, Judged
 from pewm_jax.planning.plan import plan
 from pewm_jax.planning.settings import CEM, PlanConfig
-from pewm_jax.types import Control, Frames, Sight
+from pewm_jax.types import Control, Frames, MemoryReadout
 from pewm_jax.worlds import sampling, world_model
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.pewm import many as pewm_many
@@ -100,7 +100,7 @@ def parts(model, params, state, actions_KN, key) -> dict[str, Clock]:
 
     looking, conditioning, drawing, decoding = (jax.jit(f) for f in (look, condition, draw, decode))
     clocks: dict[str, Clock] = {}
-    sight: Sight = jax.block_until_ready(looking(params, state.map, actions_KN))
+    sight: MemoryReadout = jax.block_until_ready(looking(params, state.map, actions_KN))
     given = jax.block_until_ready(conditioning(params, state.frame, actions_KN))
     latents = jax.block_until_ready(drawing(params, given, sight, keys))
     for name, run in {

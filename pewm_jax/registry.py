@@ -195,6 +195,12 @@ def register(section: str, name: str, settings: type | None = None, where: Any =
             f"{settings.__name__} cannot be registered as a {section}: it is no frozen dataclass, "
             "so write @dataclasses.dataclass(frozen=True) above it."
         )
+    missing = where is None and _missing(settings)
+    if missing:
+        raise ConfigError(
+            f"{settings.__name__} cannot be registered as a {section}: it lacks the methods "
+            f"{', '.join(missing)}; see {settings.__mro__[1].__name__}."
+        )
     built_in = BUILT_IN.get(section, {}).get(name)
     taken = _KINDS.get((section, name))
     if taken is not None and not _same(taken.settings, settings):
@@ -205,6 +211,12 @@ def register(section: str, name: str, settings: type | None = None, where: Any =
         _KINDS[section, name] = Kind(section, name, settings, where)
         return settings
     raise ConfigError(f"There is a {section} {name!r} already ({found}); choose another name.")
+
+
+def _missing(settings: type) -> list[str]:
+    """Return the names of abstract methods that a class does not override."""
+    every = ((name, getattr(settings, name, None)) for name in dir(settings))
+    return [name for name, value in every if getattr(value, "__isabstractmethod__", False)]
 
 
 def part(section: str, name: str, **settings: Any) -> Any:

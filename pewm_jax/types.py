@@ -91,32 +91,31 @@ class Clip:
         frames: T frames; frame 0 is observed, the others are to be generated.
         context: S earlier frames of the same episode, from which the memory is built.
         context_valid_S: (..., S) bool, False for padding, if the episode has fewer earlier frames.
-        context_features_ShwF: (..., S, h, w, F) the image encoder's features of the context, if
-            they are cached (``pewm_jax.memory.feature_cache``), else None.
         actions_TA: (..., T − 1, A) float32, action k leads from frame k to frame k + 1 of the clip;
             None if none were recorded (hand-held cameras). A = 3 is a planar action.
-        classes_TXYZ: (..., T, n, n, n) integer class ids of the cells around the agent at each
-            frame, 0 where nothing is; None if none were recorded.
-        origin_T3: (..., T, 3) float32 world position of each grid's lowest corner, metres; None
-            where ``classes_TXYZ`` is.
-        latents_thwC: (..., t, h, w, C) latents of the frames, if they were encoded beforehand
-            (``worlds.objective.prepare``), else None.
-        sight: what the memory of the context shows, if that was looked at beforehand, else None.
-        state_A: (..., A) the agent's own state at frame 0, None if none was recorded.
-        prepared: what else a stage's preparation made of the clip, in a form of its world's own.
+        extras: further arrays by name. Recorded ones are those that the world's ``batch_spec``
+            names; a name is absent if the data do not have the array:
+
+            * ``classes_TXYZ`` (..., T, n, n, n) integer class ids of the cells around the agent at
+              each frame, 0 for an empty cell; with ``origin_T3`` (..., T, 3) float32 world position
+              of each grid's lowest corner, metres;
+            * ``context_features_ShwF`` (..., S, h, w, F) cached image features of the context;
+            * ``state_A`` (..., A) the agent's own state at frame 0.
+
+            A stage's ``prepare`` adds what it computes from frozen weights, under names of its
+            world (``worlds.objective.prepare``: ``latents_thwC`` and ``readout``).
     """
 
     frames: Frames
     context: Frames
     context_valid_S: Array
-    context_features_ShwF: Array | None = None
     actions_TA: Array | None = None
-    classes_TXYZ: Array | None = None
-    origin_T3: Array | None = None
-    latents_thwC: Array | None = None
-    sight: Sight | None = None
-    state_A: Array | None = None
-    prepared: Any = None
+    extras: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def with_extras(self, **arrays: Any) -> Clip:
+        """Return the clip with extras added or replaced; None removes one."""
+        extras = {k: v for k, v in (self.extras | arrays).items() if v is not None}
+        return dataclasses.replace(self, extras=extras)
 
 
 @_pytree
@@ -191,7 +190,7 @@ class EncodedView:
 
 @_pytree
 @dataclasses.dataclass(frozen=True)
-class Sight:
+class MemoryReadout:
     """What a memory shows one clip, or each clip of a batch; what is not asked for is None.
 
     Attributes:

@@ -338,9 +338,8 @@ def recorded(count=2):
     origin = (np.floor(place / 0.5) - 6) * 0.5
     classes = rng.integers(0, 13, (count, 3, 12, 12, 12)).astype(np.uint8)
     context = jax.tree.map(lambda x: x[:, :1], frames)
-    return Clip(
-        frames, context, np.ones((count, 1), bool), None, moves, classes, origin.astype(np.float32)
-    )
+    extras = {"classes_TXYZ": classes, "origin_T3": origin.astype(np.float32)}
+    return Clip(frames, context, np.ones((count, 1), bool), moves, extras)
 
 
 @pytest.mark.parametrize("stage", worlds.stages(MODEL), ids=lambda stage: stage.name)
@@ -367,7 +366,7 @@ def test_a_stage_learns_what_it_names_from_what_was_prepared(params, stage):
 def test_windows_of_recorded_grids_are_those_of_a_rollout():
     clip = recorded(1)
     places = np.arange(12**3).reshape(12, 12, 12)
-    clip = dataclasses.replace(clip, classes_TXYZ=np.broadcast_to(places, (1, 3, 12, 12, 12)))
+    clip = clip.with_extras(classes_TXYZ=np.broadcast_to(places, (1, 3, 12, 12, 12)))
     found, start = persist_prepare.lattice(MODEL, clip)
     grids = persist_prepare.cut(MODEL, clip, start, found)
     for frame in range(3):
@@ -375,11 +374,13 @@ def test_windows_of_recorded_grids_are_those_of_a_rollout():
         np.testing.assert_array_equal(
             grids[0, frame], places[x : x + 8, y : y + 8, z : z + 8].astype(np.int16)
         )
-    agent = np.floor((clip.frames.camera.world_from_camera[0, :, :3, 3] - clip.origin_T3[0]) / 0.5)
+    agent = np.floor(
+        (clip.frames.camera.world_from_camera[0, :, :3, 3] - clip.extras["origin_T3"][0]) / 0.5
+    )
     off = agent + np.asarray(found)[0] - np.asarray(start)[0]
     assert np.abs(off[:, :2] - 4).max() <= MODEL.backbone.token_cells
     with pytest.raises(UserError, match=re.escape("--voxels.side 12")):
-        persist_prepare.lattice(MODEL, dataclasses.replace(clip, classes_TXYZ=None))
+        persist_prepare.lattice(MODEL, clip.with_extras(classes_TXYZ=None))
 
 
 def test_a_latent_is_occupied_where_anything_is_known_in_its_cells():

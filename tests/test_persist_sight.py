@@ -117,7 +117,7 @@ def test_what_is_seen_decides_between_classes_and_nothing_else_changes():
     before = jnp.full((8, 8, 8), -1)
     air = jnp.zeros((8, 8, 8), bool).at[:2].set(True)
     colour = jnp.full((8, 8, 8), -1).at[2:4].set(2)
-    sight = persist_sight.Sight(air, colour)
+    sight = persist_sight.ObservedCells(air, colour)
     free = dataclasses.replace(ROOM, hold=0.0)
     made = np.asarray(persist_voxels.held(free, params, latents, before))
     looked = np.asarray(persist_voxels.held(free, params, latents, before, sight))

@@ -10,7 +10,7 @@ from pewm_jax import config as configuration
 from pewm_jax import presets, shipped
 from pewm_jax.cli import named
 from pewm_jax.cli import plugins as imports
-from pewm_jax.config import Config, ModelConfig
+from pewm_jax.config import Config, World
 from pewm_jax.config import command_line as cli
 
 ABOUT = (
@@ -76,9 +76,9 @@ def _settings_of(name: str) -> Config:
         config = configuration.load(file)
     else:
         config = presets.load(cli.choose(name, presets.names(), "preset or run"))
-    if not isinstance(config.model, ModelConfig):
+    if not isinstance(config.model, World):
         raise cli.ConfigError(
-            f"{name} trains a codec, which is scored on frames and has no protocol: leave it to "
+            f"{name} trains no world model, and protocols are of rollouts: leave it to "
             "`pewm-jax evaluate`."
         )
     return config

@@ -9,7 +9,7 @@ from pathlib import Path
 from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax.cli import plugins as imports
-from pewm_jax.config import Config, Launch, ModelConfig
+from pewm_jax.config import Config, Launch, World
 from pewm_jax.config import command_line as cli
 from pewm_jax.io import heap
 
@@ -72,7 +72,7 @@ def main(argv: Sequence[str], prog: str = "python train.py") -> int:
         from pewm_jax.eval import protocol_file
         from pewm_jax.train import loop
 
-        if isinstance(config.model, ModelConfig):
+        if isinstance(config.model, World):
             protocol_file.given(config, {})  # refused now, and not after the training
         run = loop.runs.check(config)
         cli.cache_compilation(run.parent)

@@ -47,7 +47,6 @@ from pewm_jax.config.parts import (
     Memory,
     Noise,
     Reader,
-    World,
 )
 from pewm_jax.config.persist import (
     POINT_WAVES,
@@ -65,6 +64,7 @@ from pewm_jax.config.vae import VAEConfig
 from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
 from pewm_jax.config.voxel_vae import VoxelVAEConfig
 from pewm_jax.config.wan_vae import WanVAEConfig
+from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities, Facts, Task, World
 from pewm_jax.errors import ConfigError, UserError
 from pewm_jax.registry import Settings, functions, register
 
@@ -77,13 +77,16 @@ __all__ = [
     "SMALLEST",
     "VERSION",
     "ActionConfig",
+    "ArraySpec",
     "AttentionConfig",
     "Backbone",
+    "BatchSpec",
     "BlocksConfig",
     "BothConfig",
     "CLIPVisionConfig",
     "CameraConfig",
     "CameraModelConfig",
+    "Capabilities",
     "ClipConfig",
     "Codec",
     "CodecTrainConfig",
@@ -100,6 +103,7 @@ __all__ = [
     "EgoWMTrainConfig",
     "Encoder",
     "EvalConfig",
+    "Facts",
     "GridConfig",
     "ImagesConfig",
     "InjectionPoints",
@@ -130,6 +134,7 @@ __all__ = [
     "Settings",
     "StageConfig",
     "SurfelConfig",
+    "Task",
     "TrainConfig",
     "TrainSettings",
     "UserError",

@@ -8,8 +8,9 @@ from typing import ClassVar, Literal
 from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.memory import SurfelConfig
-from pewm_jax.config.parts import Codec, Memory, World
+from pewm_jax.config.parts import Codec, Memory
 from pewm_jax.config.training import StageConfig, TrainSettings
+from pewm_jax.config.world import BatchSpec, Task
 from pewm_jax.errors import require
 
 
@@ -62,11 +63,24 @@ class CodecTrainConfig(TrainSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class CodecWorldConfig(World):
-    """A codec by itself, to be trained; it imagines nothing."""
+class CodecWorldConfig(Task):
+    """A codec by itself: a training task."""
 
     TRAIN: ClassVar[type[TrainSettings]] = CodecTrainConfig
     TRAINS: ClassVar[tuple[str, ...]] = ("codec",)
+    CARD: ClassVar[tuple[str, str]] = (
+        (
+            "A small image codec: 8 × 8 pixels of one RGB-D frame to latents and back, colour and "
+            "depth by the same weights."
+        ),
+        (
+            "A model whose `codec.kind` is `learned` starts from it, `train.start` {name}: see the "
+            "preset `demo`. In Python, `pewm_jax.codecs.interface` encodes and decodes."
+        ),
+    )
+    INSTEAD: ClassVar[str] = (
+        "it holds a codec: name its folder by train.start of a model whose codec.kind is learned"
+    )
 
     clip: ClipConfig = ClipConfig(frames=2)
     """What the loader reads: every frame of a clip is learned from by itself."""
@@ -76,6 +90,11 @@ class CodecWorldConfig(World):
     """The memory that the gate sees rendered; it must show colours."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute precision; master weights of what trains stay float32."""
+
+    @property
+    def batch_spec(self) -> BatchSpec:
+        """Context where a gate is trained, which sees it rendered."""
+        return BatchSpec(context=bool(getattr(self.codec, "gate", 0)))
 
     def __post_init__(self):
         """Validate."""

@@ -11,6 +11,7 @@ from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.parts import Conditioner, Memory
 from pewm_jax.config.reader import RenderConfig
 from pewm_jax.config.training import StageConfig, TrainSettings
+from pewm_jax.config.world import BatchSpec, Capabilities
 from pewm_jax.errors import require
 
 
@@ -59,6 +60,16 @@ class EgoWMConfig(ModelConfig):
     image_noise: float = 0.0
     """Deviation of the noise on these frames while imagining; the paper's is 0.1, with Stable Video
     Diffusion. In training it is drawn as `train` says."""
+
+    @property
+    def batch_spec(self) -> BatchSpec:
+        """The clip's frames and actions alone."""
+        return dataclasses.replace(super().batch_spec, context=False, features=None)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a world without a memory can do."""
+        return dataclasses.replace(super().capabilities, memory_parameters="")
 
     def __post_init__(self):
         """Validate."""

@@ -6,8 +6,8 @@ import dataclasses
 from typing import Any
 
 from pewm_jax.config.model import ModelConfig
-from pewm_jax.config.parts import World
 from pewm_jax.config.training import DataConfig, EvalConfig, TrainConfig, TrainSettings
+from pewm_jax.config.world import Task
 from pewm_jax.errors import require
 from pewm_jax.registry import require_section
 
@@ -21,7 +21,7 @@ class Config:
 
     version: int = VERSION
     """Version of the format; set by the library."""
-    model: Any = dataclasses.field(default=ModelConfig(), metadata={"kinds": World})
+    model: Any = dataclasses.field(default=ModelConfig(), metadata={"kinds": Task})
     """The world model: all settings that inference needs."""
     data: DataConfig = DataConfig()
     """What training reads."""

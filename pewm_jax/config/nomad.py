@@ -6,8 +6,8 @@ import dataclasses
 from typing import ClassVar, Literal
 
 from pewm_jax.config.clip import ActionConfig, ClipConfig
-from pewm_jax.config.parts import World
 from pewm_jax.config.training import StageConfig, TrainSettings
+from pewm_jax.config.world import BatchSpec, Task
 from pewm_jax.errors import require, require_positive
 
 PLANE = 2
@@ -130,10 +130,15 @@ class NomadTrainConfig(TrainSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class NomadWorldConfig(World):
-    """A policy by itself, to be trained on walks; it imagines nothing."""
+class NomadWorldConfig(Task):
+    """A policy by itself: a training task, by imitation of recorded walks."""
 
     TRAIN: ClassVar[type[TrainSettings]] = NomadTrainConfig
+    EXPORTED: ClassVar[bool] = False
+    INSTEAD: ClassVar[str] = (
+        "it holds a policy: have it propose ways by pewm_jax.planning.nomad_policy, and imagine "
+        "them with a world model"
+    )
 
     clip: ClipConfig = ClipConfig(frames=24)
     """What the loader reads: earlier pictures, the present one, and as many later ones as a goal
@@ -144,6 +149,11 @@ class NomadWorldConfig(World):
     """The policy that is trained."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute precision; master weights stay float32."""
+
+    @property
+    def batch_spec(self) -> BatchSpec:
+        """The clip's frames alone."""
+        return BatchSpec(context=False)
 
     @property
     def farthest(self) -> int:

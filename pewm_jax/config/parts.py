@@ -18,14 +18,22 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
-from pewm_jax.config.training import TrainSettings
 from pewm_jax.errors import require, require_positive
 from pewm_jax.registry import Settings, part
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from pewm_jax.types import Array, Camera, Control, Frames, MapTokens, Params, Sight, View
+    from pewm_jax.types import (
+        Array,
+        Camera,
+        Control,
+        Frames,
+        MapTokens,
+        MemoryReadout,
+        Params,
+        View,
+    )
 
 Rules: TypeAlias = tuple[Any, ...]
 """Sharding rules: pairs of a regular expression and a ``PartitionSpec``."""
@@ -371,9 +379,10 @@ class Reader(Settings):
 
     Attributes:
         SHARDING: rules over ``memory/…`` paths.
-        READS_TOKENS: whether it takes the points that a clip's cameras see (``Sight.tokens``).
-        READS_VIEW: whether it takes what the memory looks like from them (``Sight.view``).
-        READS_LATENTS: whether it takes that as the codec encodes it (``Sight.encoded``) instead.
+        READS_TOKENS: whether it takes the points that a clip's cameras see, ``tokens`` of a
+            ``MemoryReadout``.
+        READS_VIEW: whether it takes the memory rendered for them, its ``view``.
+        READS_LATENTS: whether it takes that encoded by the codec instead, its ``encoded``.
         split_heads: a number that ``train.mesh.tensor`` must divide.
     """
 
@@ -389,7 +398,7 @@ class Reader(Settings):
         raise NotImplementedError
 
     def prepare(
-        self, model: Any, params: Params, sight: Sight, camera: Camera, rays_BthwC: Array
+        self, model: Any, params: Params, sight: MemoryReadout, camera: Camera, rays_BthwC: Array
     ) -> Any:
         """Prepare to read the memories of a batch of clips.
 
@@ -653,19 +662,3 @@ class Noise(Settings):
             key: randomness of the steps, if the sampler draws noise.
         """
         raise NotImplementedError
-
-
-class World(Settings):
-    """A world model: parts put together; see ``pewm_jax.worlds`` for its functions.
-
-    Attributes:
-        TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
-            for each of the world's stages, named as the stage.
-        TRAINS: parts that other worlds take from ``train.start`` and this one trains itself.
-        dtype: precision of computation and of frozen weights.
-    """
-
-    SECTION: ClassVar[str] = "world"
-    TRAIN: ClassVar[type[TrainSettings]] = TrainSettings
-    TRAINS: ClassVar[tuple[str, ...]] = ()
-    dtype: Any = "float32"

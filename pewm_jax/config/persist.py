@@ -15,6 +15,7 @@ from pewm_jax.config.reader import RenderConfig
 from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
 from pewm_jax.config.voxel_vae import VoxelVAEConfig
+from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities
 from pewm_jax.errors import require
 from pewm_jax.registry import part
 
@@ -272,6 +273,21 @@ class PersistConfig(ModelConfig):
     dead_reckoning: bool = False
     """Whether the camera model says by what a step differs from the planar action, and not the step
     itself; not as published."""
+
+    @property
+    def batch_spec(self) -> BatchSpec:
+        """Actions, and the recorded voxels around the agent."""
+        side = self.memory.recorded  # type: ignore[attr-defined]
+        voxels = (
+            ("classes_TXYZ", ArraySpec((self.clip.frames, side, side, side), "uint16")),
+            ("origin_T3", ArraySpec((self.clip.frames, 3))),
+        )
+        return BatchSpec(context=False, actions=self.control.actions, extras=voxels)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a world of voxels can do; all its stages train with them."""
+        return dataclasses.replace(super().capabilities, stage_without_memory=False)
 
     @property
     def picture_channels(self) -> int:

@@ -10,9 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax import registry as kinds
 from pewm_jax import worlds
-from pewm_jax.config import CodecWorldConfig, Config, UserError
+from pewm_jax.config import Config, UserError, World
 from pewm_jax.data.dataset import read_manifest
 from pewm_jax.report.labels import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, heading, number
 from pewm_jax.types import Params
@@ -68,20 +67,24 @@ def _what(facts: Facts) -> str:
     }
     rows = [f"| {part} | {count / 1e6:.2f} |" for part, count in counts.items()]
     table = "\n".join(["| part | million parameters |", "|---|---:|", *rows])
-    if isinstance(config.model, CodecWorldConfig):
-        return (
-            "A small image codec: 8 × 8 pixels of one RGB-D frame to latents and back, colour and "
-            f"depth by the same weights. pewm_jax {facts.version}.\n\n{table}"
+    if not isinstance(config.model, World):
+        return f"{config.model.CARD[0]} pewm_jax {facts.version}.\n\n{table}".lstrip()
+    parts, can = config.model.facts, config.model.capabilities
+    memory = "no memory"
+    if can.memory:
+        memory = (
+            f"a memory of kind `{parts.memory}`" if parts.memory else "a memory of its own kind"
         )
-    memory = f"a memory of kind `{kinds.of(config.model.memory).name}`"
-    if "memory" not in facts.params:
+    if can.memory_parameters and can.memory_parameters not in facts.params:
         memory = "no memory (only its first stage is trained)"
+    made_of = [f"image features `{parts.encoder}`"] * bool(parts.encoder)
+    made_of += [f"codec `{parts.codec}`"] * bool(parts.codec)
+    made_of = ", ".join(["", " and ".join(made_of)]) if made_of else ""
     size = f"{clip.frames} frames of {clip.width} × {clip.height} pixels"
+    seen = "colour and depth" if can.depth else "in colour"
     return (
         "A persistent embodied world model: given posed RGB-D frames and an agent's actions, it "
-        f"imagines what the agent will see, colour and depth, in clips of {size}, with {memory}, "
-        f"image features `{kinds.of(config.model.memory.encoder).name}` and codec "
-        f"`{kinds.of(config.model.codec).name}`."
+        f"imagines what the agent will see, {seen}, in clips of {size}, with {memory}{made_of}."
         f"\n\n{table}\n\n"
         "Weights are the moving average of training where it trained and the unchanged base "
         f"elsewhere, rounded to 16 bits; they compute in {config.model.dtype}. Written by "
@@ -90,12 +93,9 @@ def _what(facts: Facts) -> str:
 
 
 def _use(facts: Facts) -> str:
-    if isinstance(facts.config.model, CodecWorldConfig):
-        return (
-            "## Use\n\nA model whose `codec.kind` is `learned` starts from it, `train.start` "
-            f"{facts.name}: see the preset `demo`. In Python, `pewm_jax.codecs.interface` encodes "
-            "and decodes."
-        )
+    model = facts.config.model
+    if not isinstance(model, World):
+        return f"## Use\n\n{model.CARD[1].format(name=facts.name)}"
     clip, actions = facts.config.model.clip, facts.config.model.actions
     length = clip.frames - 1
     return f"""## Use
@@ -110,14 +110,13 @@ state, imagined = pewm_jax.rollout(config, params, state, [0] * {length}, jax.ra
 ```
 
 Actions: 0 forward {actions.step_m:g} m, 1 left and 2 right {actions.turn_deg:g}°, or floats
-(dx, dy, dyaw); {length} a clip. Sampling: {_sampler(facts)}, \
-{facts.config.model.noise.sample_steps} steps."""
+(dx, dy, dyaw); {length} a clip.{_sampler(model)}"""
 
 
-def _sampler(facts: Facts) -> str:
-    """Return the sampler's name, with that of the noise."""
-    noise = facts.config.model.noise
-    return " ".join([kinds.of(noise).name, *([noise.sampler] if hasattr(noise, "sampler") else [])])
+def _sampler(model: World) -> str:
+    """Return a sentence on the sampler, with the noise; nothing of a world without one."""
+    names = " ".join(filter(None, (model.facts.noise, model.facts.sampler)))
+    return f" Sampling: {names}, {model.sample_steps} steps." if names else ""
 
 
 def _data(facts: Facts) -> str:
@@ -158,8 +157,8 @@ def _training(facts: Facts) -> str:
             done = str(stage.steps) if number_ < (facts.stage or "") else f"0 of {stage.steps}"
         rows.append(f"| {number_} | {done} | {stage.batch} | {stage.learning_rate:g} | {what} |")
     tail = f"\n\nMoving average {train.ema:g}, seed {train.seed}"
-    if not isinstance(facts.config.model, CodecWorldConfig):
-        tail += f", noise {kinds.of(facts.config.model.noise).name}"
+    if facts.config.model.facts.noise:
+        tail += f", noise {facts.config.model.facts.noise}"
     tail += f". It started from `{train.start}`." if train.start else "."
     return head + "\n".join(rows) + tail
 

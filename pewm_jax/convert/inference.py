@@ -26,7 +26,8 @@ import numpy as np
 
 from pewm_jax import __version__
 from pewm_jax import config as configuration
-from pewm_jax.config import Config, NomadWorldConfig, UserError
+from pewm_jax import registry as kinds
+from pewm_jax.config import Config, UserError
 from pewm_jax.convert import card, output, sources
 from pewm_jax.eval.protocol import file_hash
 from pewm_jax.eval.report import METRICS
@@ -64,10 +65,10 @@ def export(
     with output.new_folder(dst) as folder:
         say(f"reading {run} …")
         config, params = rollouts.load_finished(run)
-        if isinstance(config.model, NomadWorldConfig):
+        if not config.model.EXPORTED:
             raise UserError(
-                f"{run} holds a policy, of which no smaller form is written: its config.json and "
-                "weights.safetensors are what pewm_jax.load reads, copy those."
+                f"{run} holds a {kinds.of(config.model).name}, of which no smaller form is written:"
+                " its config.json and weights.safetensors are what pewm_jax.load reads, copy those."
             )
         origin = _base(run, config)
         metadata = weights.metadata(run / runs.WEIGHTS)

@@ -92,8 +92,9 @@ def export(
     with output.new_folder(dst) as folder:
         say(f"reading {run} …")
         config, params = rollouts.load_finished(run)
-        if isinstance(config.model.backbone, DiTConfig):
-            anywhere = dataclasses.replace(config.model.backbone, attention="xla")
+        backbone = getattr(config.model, "backbone", None)
+        if isinstance(backbone, DiTConfig):
+            anywhere = dataclasses.replace(backbone, attention="xla")
             config = config.with_model(backbone=anywhere)
         if what == "rollout":
             programs = rollout_programs(config, params, frames or config.data.context, clips)

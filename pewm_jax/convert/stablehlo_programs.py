@@ -18,7 +18,7 @@ from pewm_jax.data import abstract
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree
 from pewm_jax.memory import memories
-from pewm_jax.types import Array, Camera, Control, Params, Sight
+from pewm_jax.types import Array, Camera, Control, MemoryReadout, Params
 from pewm_jax.worlds import world_model
 
 Arrays: TypeAlias = dict[str, Array]
@@ -117,7 +117,7 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
     def denoise(weights: Arrays, inputs: Arrays) -> Arrays:
         given = dict(zip(parts, _pack(parts, inputs), strict=True))
         conditioning = given.pop("conditioning")
-        sight = Sight(**given) if given else None
+        sight = MemoryReadout(**given) if given else None
         noisy, times = inputs["noisy_BthwC"], inputs["timesteps_B"]
         world = tree.unflatten(weights)
         out = world_model.apply(model, world, noisy, conditioning, times, sight)

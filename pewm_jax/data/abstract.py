@@ -8,10 +8,8 @@ import jax
 import numpy as np
 
 from pewm_jax.config import Config
+from pewm_jax.config.world import PLANAR
 from pewm_jax.types import Camera, Clip, Frames
-
-ACTION = 3
-"""Numbers of a recorded action: metres forward, metres left, radians to the left."""
 
 
 def camera(*lead: int) -> Camera:
@@ -35,24 +33,22 @@ def clip(config: Config, batch: int, *, features: bool = False, actions: bool = 
         features: whether the context's features are in it, where ``data.features`` keeps them.
         actions: whether actions were recorded.
     """
-    size, context, kept = config.model.clip, config.data.context, None
-    if features and config.data.features:
-        encoder = config.model.memory.encoder
-        shape = (batch, context, *encoder.grid(size), encoder.channels)
-        kept = array(*shape, dtype=np.float16)
-    control = getattr(config.model, "control", None)  # a world that is not steered has none
-    width = getattr(control, "actions", 0) or ACTION
+    size, asked = config.model.clip, config.model.batch_spec
+    context = config.data.context if asked.context else 0
     pixels = {"height": size.height, "width": size.width}
-    side = getattr(getattr(config.model, "memory", None), "recorded", 0)  # cells of grids, if any
-    cells = (batch, size.frames, side, side, side)
+    extras = {
+        name: array(batch, *one.shape, dtype=np.dtype(one.dtype)) for name, one in asked.extras
+    }
+    kept = asked.features if features and config.data.features else None
+    if kept is not None:
+        shape = (batch, context, *kept.shape)
+        extras["context_features_ShwF"] = array(*shape, dtype=np.dtype(kept.dtype))
     return Clip(
         frames(batch, size.frames, **pixels),
         frames(batch, context, **pixels),
         array(batch, context, dtype=np.bool_),
-        kept,
-        array(batch, size.frames - 1, width) if actions else None,
-        array(*cells, dtype=np.uint16) if side else None,
-        array(batch, size.frames, 3) if side else None,
+        array(batch, size.frames - 1, asked.actions or PLANAR) if actions else None,
+        extras,
     )
 
 

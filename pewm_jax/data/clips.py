@@ -87,7 +87,14 @@ def choose_context(start: int, slots: int, rng: np.random.Generator | None = Non
     return np.append(earlier, start)
 
 
-def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | None = None) -> Clip:
+def cut(
+    episode: Episode,
+    choice: Choice,
+    slots: int,
+    features: ReadFeatures | None = None,
+    *,
+    voxels: bool = True,
+) -> Clip:
     """Decode the frames of a clip, each once, and join its actions.
 
     Args:
@@ -97,6 +104,7 @@ def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | N
             first frame, and are marked invalid.
         features: reads the context's features, if they are kept; slots without a frame have the
             features of the clip's first frame.
+        voxels: whether the grids around the agent are read, if the episode has them.
 
     Returns:
         A NumPy clip without batch axis: rgb uint8, depth float32 metres, and the actions and the
@@ -113,16 +121,18 @@ def cut(episode: Episode, choice: Choice, slots: int, features: ReadFeatures | N
     context = _take(frames, fill)
     context.rgb_THWC[~valid] = 0
     context.depth_THW[~valid] = 0
-    found = None if features is None else features(episode, wanted[fill])
-    voxels = None if episode.voxel_grid is None else episode.voxels(choice.frames_T)
+    extras = {}
+    if features is not None:
+        extras["context_features_ShwF"] = features(episode, wanted[fill])
+    if voxels and episode.voxel_grid is not None:
+        found = episode.voxels(choice.frames_T)
+        extras |= {"classes_TXYZ": found.classes_TXYZ, "origin_T3": found.origin_T3}
     return Clip(
         _take(frames, place[:count]),
         context,
         valid,
-        found,
         None if episode.actions is None else join_actions(episode.actions, choice.frames_T),
-        None if voxels is None else voxels.classes_TXYZ,
-        None if voxels is None else voxels.origin_T3,
+        extras,
     )
 
 
@@ -179,8 +189,7 @@ def stack(clips: Sequence[Clip]) -> Clip:
         UserError: some clips have actions or voxels and others have none, or of another size.
     """
 
-    def optional(field: str) -> np.ndarray | None:
-        parts = [getattr(clip, field) for clip in clips]
+    def optional(field: str, parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
         shapes = {None if part is None else np.shape(part) for part in parts}
         if len(shapes) > 1:
             sizes = " and ".join(sorted("none" if s is None else str(s) for s in shapes))
@@ -200,14 +209,14 @@ def stack(clips: Sequence[Clip]) -> Clip:
             ),
         )
 
+    names = dict.fromkeys(name for clip in clips for name in clip.extras)
+    found = {name: optional(name, [clip.extras.get(name) for clip in clips]) for name in names}
     return Clip(
         frames([clip.frames for clip in clips]),
         frames([clip.context for clip in clips]),
         np.stack([clip.context_valid_S for clip in clips]),
-        optional("context_features_ShwF"),
-        optional("actions_TA"),
-        optional("classes_TXYZ"),
-        optional("origin_T3"),
+        optional("actions_TA", [clip.actions_TA for clip in clips]),
+        {k: v for k, v in found.items() if v is not None},
     )
 
 

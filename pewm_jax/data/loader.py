@@ -80,6 +80,10 @@ EPOCHS = 2**31
 """Epochs of the dataset: practically endless, and its length still fits an integer."""
 
 
+RECORDED = ("classes_TXYZ", "origin_T3")
+"""The extras of a clip that episodes may record."""
+
+
 @dataclasses.dataclass(frozen=True)
 class _Drawn:
     """A clip with the number of its record, the name of its episode and its frames."""
@@ -98,8 +102,8 @@ class _DrawClip(grain.transforms.RandomMap):
         source: the episodes.
         features: as for ``clips``.
         bad: as for ``clips``.
-        left_out: optional fields of a clip that are not read, see ``_not_in_all``.
-        grid: what the voxels of all episodes must be like, if they are read.
+        actions: whether batches have actions: all episodes do.
+        grid: what the voxels of all episodes must be like, if all episodes have them.
     """
 
     def __init__(
@@ -108,11 +112,11 @@ class _DrawClip(grain.transforms.RandomMap):
         source: EpisodeSource,
         features: ReadFeatures | None,
         bad: BadRecords,
-        left_out: tuple[str, ...] = (),
+        actions: bool = True,
         grid: VoxelGrid | None = None,
     ):
         self.config, self.source, self.features, self.bad = config, source, features, bad
-        self.left_out, self.grid = left_out, grid
+        self.actions, self.grid = actions, grid
 
     def random_map(self, element: int, rng: np.random.Generator) -> Clip:
         return self.draw(element, rng).clip
@@ -132,8 +136,14 @@ class _DrawClip(grain.transforms.RandomMap):
                 if self.grid is not None and episode.voxel_grid is not None:
                     require_alike(self.grid, episode.voxel_grid, f"episode {episode.name}")
                 choice = choose(self.config, episode.length, rng, f"episode {episode.name}")
-                clip = cut(episode, choice, self.config.data.context, self.features)
-                clip = dataclasses.replace(clip, **dict.fromkeys(self.left_out))
+                asked = self.config.model.batch_spec
+                slots = self.config.data.context
+                if not asked.context:
+                    slots, choice = 0, dataclasses.replace(choice, context_S=choice.context_S[:0])
+                voxels = self.grid is not None and "classes_TXYZ" in asked.names
+                clip = cut(episode, choice, slots, self.features, voxels=voxels)
+                if not self.actions:
+                    clip = dataclasses.replace(clip, actions_TA=None)
             except DamagedError as error:
                 self.bad.add(_name(self.source, record), str(error))
                 refused.add(record)
@@ -169,8 +179,9 @@ def dataset(
 ) -> grain.MapDataset:
     """Return the endless dataset whose element k is batch k, or some rows of it.
 
-    All batches have the same fields: actions and voxels where all episodes have them (``import``
-    lists which have them; a split of another maker is judged by its first episode).
+    All batches have the same arrays: those that the model's ``batch_spec`` asks for and that all
+    episodes have (``import`` lists which have actions and voxels; a split of another maker is
+    judged by its first episode).
 
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit the
@@ -180,9 +191,10 @@ def dataset(
     source = EpisodeSource(Path(config.data.path) / split)
     bad = BadRecords(config.data.bad_records) if bad is None else bad
     first = _check_first(config, source, bad)
-    left_out = _not_in_all(source, first)
-    grid = None if "classes_TXYZ" in left_out else first.voxel_grid
-    draw = _DrawClip(config, source, features, bad, left_out, grid)
+    _require_known(config)
+    actions, voxels = _in_all(source, first)
+    grid = first.voxel_grid if voxels else None
+    draw = _DrawClip(config, source, features, bad, actions, grid)
     drawn = _order(source, seed).random_map(draw)
     wanted = range(batch)[rows or slice(None)]
 
@@ -246,8 +258,9 @@ def clips(
             reads its own. Each clip is the same whoever reads it.
 
     Returns:
-        NumPy clips with a leading B (the number of rows): rgb uint8, depth float32 in metres, and
-        actions and voxels where all episodes have them.
+        NumPy clips with a leading B (the number of rows): rgb uint8, depth float32 in metres,
+        actions where all episodes have them, and the extras that the model's ``batch_spec`` names
+        where all episodes have those.
 
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit, or (where
@@ -281,8 +294,22 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Epis
     raise UserError(f"{source.path}: none of its records can be read; make the split again.")
 
 
-def _not_in_all(source: EpisodeSource, first: Episode) -> tuple[str, ...]:
-    """Return the optional fields of a clip that not all episodes of a split have.
+def _require_known(config: Config) -> None:
+    """Refuse a world that asks for recorded arrays which no episode has.
+
+    Raises:
+        ConfigError: its ``batch_spec`` has an unknown name.
+    """
+    unknown = sorted(set(config.model.batch_spec.names) - set(RECORDED))
+    if unknown:
+        raise ConfigError(
+            f"{type(config.model).__name__}.batch_spec asks for {', '.join(unknown)}, which no "
+            f"episode records; it may ask for {', '.join(RECORDED)}."
+        )
+
+
+def _in_all(source: EpisodeSource, first: Episode) -> tuple[bool, bool]:
+    """Return whether all episodes of a split have actions, and whether all have voxels.
 
     Args:
         source: the split.
@@ -296,8 +323,7 @@ def _not_in_all(source: EpisodeSource, first: Episode) -> tuple[str, ...]:
             listed = {k: source[k].actions is not None for k in range(len(source))}
         actions = all(listed.values())
         voxels = voxels and all(settings.get("voxels", {None: False}).values())
-    has = {"actions_TA": actions, "classes_TXYZ": voxels, "origin_T3": voxels}
-    return tuple(field for field, there in has.items() if not there)
+    return actions, voxels
 
 
 def _name(source: EpisodeSource, record: int) -> str:

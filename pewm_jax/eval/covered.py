@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,16 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import Config, ModelConfig
+from pewm_jax import worlds
+from pewm_jax.config import Config, World
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.imagine import Imagination, print_now
 from pewm_jax.eval.partial import Partials
 from pewm_jax.eval.protocol import ClipChoice, choose
 from pewm_jax.eval.scoring import Batch, load_batch
 from pewm_jax.eval.shares import gathered, share
-from pewm_jax.memory import memories
-from pewm_jax.memory.coverage import Coverage, coverage
-from pewm_jax.types import Array, Frames
+from pewm_jax.types import Array, Frames, Params, WorldState
+
+NAMES = ("seen", "held", "chosen", "attended", "rendered", "looked_at")
+"""The numbers of ``World.coverage``, in the order in which they are kept."""
 
 
 def score_coverage(
@@ -56,31 +57,27 @@ def score_coverage(
         known[first] = partials.put(names[first], counts=_count(config.model, model, batch))
     found = gathered(partials, names, known, "coverage")
     counts = [found[first]["counts"].sum(0) for first in starts]
-    total = dict(zip(_names(), np.sum(counts, 0).astype(float), strict=True))
+    total = dict(zip(NAMES, np.sum(counts, 0).astype(float), strict=True))
     seen = total.pop("seen")
     return {name: count / seen for name, count in total.items()} if seen else None
 
 
-def _names() -> list[str]:
-    return [field.name for field in dataclasses.fields(Coverage)]
-
-
-def _count(config: ModelConfig, model: Imagination, batch: Batch) -> np.ndarray:
-    """Return (clips, 6) pixels, in the order of ``Coverage``'s fields."""
+def _count(config: World, model: Imagination, batch: Batch) -> np.ndarray:
+    """Return (clips, 6) pixels, in the order of ``NAMES``."""
     state, length = model.begin(batch.context), config.clip.frames - 1
     targets, seen = jax.tree.map(lambda x: x[:, :length], (batch.targets, batch.seen))
     present = jax.tree.map(lambda x: x[:, -1:], batch.context)
     frames = jax.tree.map(lambda a, b: np.concatenate([a, b], 1), present, targets)
     seen = np.concatenate([np.zeros_like(seen[:, :1]), seen], 1)  # the present is not imagined
-    counted = _coverage_of_clips(config, state.map, frames, seen)
-    return np.stack([getattr(counted, name) for name in _names()], -1)[: batch.real]
+    counted = _coverage_of_clips(config, model.params, state, frames, seen)
+    return np.stack([counted[name] for name in NAMES], -1)[: batch.real]
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _coverage_of_clips(config: ModelConfig, maps: Any, frames: Frames, seen: Array) -> Coverage:
-    def one(clip: tuple[Any, Frames, Array]) -> Coverage:
-        memory, frames, seen_THW = clip
-        tokens = memories.tokens(config, memory, frames.camera)
-        return coverage(config, memory, tokens, frames, seen_THW)
+def _coverage_of_clips(
+    model: World, params: Params, states: WorldState, frames: Frames, seen: Array
+) -> dict[str, Array]:
+    def one(clip: tuple[WorldState, Frames, Array]) -> dict[str, Array]:
+        return worlds.coverage(model, params, *clip)
 
-    return jax.lax.map(one, jax.tree.map(jnp.asarray, (maps, frames, seen)))
+    return jax.lax.map(one, jax.tree.map(jnp.asarray, (states, frames, seen)))

@@ -70,6 +70,8 @@ class Imagination:
         self._prepare_start()
         many = f" on {self.mesh.size} devices" if self.mesh else ""
         length = self.config.model.clip.frames - 1
+        steps = self.config.model.sample_steps
+        steps = f"{steps} steps, " if steps else ""
         control = abstract.array(self.batch, length, 3)
         if self.cameras:
             control = abstract.camera(self.batch, length)
@@ -77,7 +79,7 @@ class Imagination:
         for memory in memories:
             self._clip[memory] = _compile(
                 f"the sampler {'with its map' if memory else 'without a map'} "
-                f"({self.config.model.noise.sample_steps} steps, {self.batch} clips at once{many})",
+                f"({steps}{self.batch} clips at once{many})",
                 self._split(
                     jax.vmap(
                         functools.partial(rollout, self.config, memory=memory), (None, 0, 0, 0)

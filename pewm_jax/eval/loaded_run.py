@@ -6,13 +6,13 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from pewm_jax import registry as kinds
 from pewm_jax import shipped
-from pewm_jax.config import Config, ModelConfig, UserError
+from pewm_jax.config import Config, UserError
 from pewm_jax.eval.protocol import file_hash
 from pewm_jax.io import weights
 from pewm_jax.train import stages
 from pewm_jax.types import Params
+from pewm_jax.worlds import require_world
 from pewm_jax.worlds.rollouts import load_finished
 
 WEIGHTS = "weights.safetensors"
@@ -74,12 +74,7 @@ def open_run(run: str | Path) -> Opened:
     """
     folder, home = folders(run)
     config, params = load_finished(folder)
-    if not isinstance(config.model, ModelConfig):
-        raise UserError(
-            f"{run} holds a world of kind {kinds.of(config.model).name}, of which there is no "
-            "report: of a codec, pewm_jax.eval.codec_score.score gives the numbers; a policy "
-            "proposes ways by pewm_jax.planning.nomad_policy, which a world model ranks."
-        )
+    require_world(config.model, f"a report of {run}")
     return Opened(folder, home, config, params, file_hash(folder / WEIGHTS))
 
 
@@ -93,10 +88,11 @@ def remembers(opened: Opened) -> bool:
     """
     known = stages.all_stages(opened.config)
     asked = [stage for stage in known if stage.memory and stage.settings(opened.config).steps > 0]
-    if not opened.config.model.memory.READ_BY_BLOCKS:
+    can = opened.config.model.capabilities
+    if not can.memory_parameters:
         _require_all_steps(opened)
-        return opened.config.model.memory.REMEMBERS
-    if "memory" not in opened.params:
+        return can.memory
+    if can.memory_parameters not in opened.params:
         if asked:
             raise UserError(
                 f"{opened.folder / WEIGHTS} has no memory blocks yet, only stage 1 is trained; "
@@ -104,7 +100,7 @@ def remembers(opened: Opened) -> bool:
             )
         _require_all_steps(opened)
         return False
-    return opened.config.model.memory.REMEMBERS
+    return can.memory
 
 
 def _require_all_steps(opened: Opened) -> None:
@@ -150,7 +146,7 @@ def open_none(opened: Opened, config: Config) -> Opened | None:
         return None
     other = open_run(name)
     for part in ("clip", "codec"):
-        there, here = getattr(other.config.model, part), getattr(config.model, part)
+        there, here = (getattr(one.model, part, None) for one in (other.config, config))
         if there != here:
             raise UserError(
                 f"evaluate.none: {name} has another {part} than {opened.folder} "
@@ -164,11 +160,13 @@ def open_none(opened: Opened, config: Config) -> Opened | None:
             f"{opened.folder} for {needed} in all; train it longer (--train.stage1.steps {needed} "
             "--train.stage2.steps 0), or the comparison would favour the memory."
         )
-    noise = dataclasses.replace(
-        other.config.model.noise, sample_steps=config.model.noise.sample_steps
+    model = other.config.model
+    if config.model.sample_steps and model.sample_steps:
+        model = model.with_sample_steps(config.model.sample_steps)
+    laid = dataclasses.replace(
+        other.config, model=model, data=config.data, evaluate=config.evaluate
     )
-    laid = dataclasses.replace(other.config, data=config.data, evaluate=config.evaluate)
-    return dataclasses.replace(other, config=laid.with_model(noise=noise))
+    return dataclasses.replace(other, config=laid)
 
 
 def none_facts(none: Opened, opened: Opened) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from pewm_jax import worlds
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.images import unit_colours
@@ -25,7 +26,6 @@ from pewm_jax.eval.protocol import ClipChoice, long_choices
 from pewm_jax.eval.scoring import Batch, Scored, load_batch
 from pewm_jax.eval.shares import gathered, share
 from pewm_jax.io.progress import Meter
-from pewm_jax.memory import memories
 from pewm_jax.types import WorldState
 
 
@@ -135,7 +135,7 @@ def _roll(
     def count(state: WorldState) -> None:
         held.append(np.asarray(occupied(config, state.map))[: batch.real])
 
-    remembers = method == "memory"
+    remembers = method == "memory" and config.model.capabilities.points
     first, last, frames = batch.imagine(
         methods, method, config.evaluate.seeds[0], count if remembers else None
     )
@@ -160,13 +160,14 @@ def occupied(config: Config, maps: Any) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _occupied(config: Config, maps: Any) -> jax.Array:
-    return jax.vmap(lambda one: memories.to_points(config.model, one)[2].sum())(maps)
+    points = worlds.function(config.model, "memory_points")
+    return jax.vmap(lambda one: points(config.model, one)[2].sum())(maps)
 
 
 def _map_points(config: Config, maps: Any, shown: int, when: str) -> dict[str, np.ndarray]:
     maps = jax.tree.map(lambda leaf: leaf[:shown], maps)
-    to_points = functools.partial(memories.to_points, config.model)
-    points, features, valid = jax.vmap(to_points)(maps)
+    listed = functools.partial(worlds.function(config.model, "memory_points"), config.model)
+    points, features, valid, _ = jax.vmap(listed)(maps)
     return {
         f"{when}_points": np.asarray(points),
         f"{when}_features": np.asarray(features),

@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax import registry as kinds
 from pewm_jax.config import Config, to_dict
 from pewm_jax.eval import intervals, mirror, statistics
 from pewm_jax.eval.long_rollouts import LongRollouts
@@ -86,7 +85,7 @@ def growth(config: Config, long: LongRollouts) -> dict[str, Any] | None:
         "frames": [each * clip for clip in range(long.chain + 1)],
         "occupied": intervals.entry(held, clusters),
         "per_frame": intervals.entry((held[:, -1] - held[:, 0]) / (each * long.chain), clusters),
-        "capacity": config.model.memory.room,
+        "capacity": config.model.facts.room or None,
     }
 
 
@@ -148,10 +147,10 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "frames": clip.frames,
         "imagined_frames": config.evaluate.chain * (clip.frames - 1),
         "stride": config.evaluate.stride,
-        "noise": kinds.of(config.model.noise).name,
-        "sampler": getattr(config.model.noise, "sampler", "euler"),
-        "sampling_steps": config.model.noise.sample_steps,
-        "guidance": config.model.noise.guidance,
+        "noise": config.model.facts.noise or None,
+        "sampler": config.model.facts.sampler or ("euler" if config.model.facts.noise else None),
+        "sampling_steps": config.model.sample_steps,
+        "guidance": config.model.facts.guidance,
         "resolution": f"{clip.width} × {clip.height} pixels",
         "method": own,
         **_memory_of(config, remembers=remembers),
@@ -190,16 +189,15 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
 
 def _memory_of(config: Config, *, remembers: bool) -> dict[str, Any]:
     """Return what is said of the memory; nulls where the model has none."""
-    memory = config.model.memory
+    facts = config.model.facts
     if not remembers:
         return {"memory": "none"} | dict.fromkeys(("encoder", "reader", "positions", "map"))
-    read = f", {memory.tokens} read per clip" if memory.READ_BY_BLOCKS else ""
     return {
-        "memory": kinds.of(memory).name,
-        "encoder": kinds.of(memory.encoder).name,
-        "reader": kinds.of(memory.reader).name,
-        "positions": getattr(memory.reader, "positions", ""),
-        "map": f"{memory.room} cells of {memory.cell_m} m" + read,
+        "memory": facts.memory or "of its own kind",
+        "encoder": facts.encoder or None,
+        "reader": facts.reader or None,
+        "positions": facts.positions,
+        "map": facts.capacity or None,
     }
 
 

@@ -60,9 +60,12 @@ def override(config: Config, **changes: Any) -> Config:
         if name in changes:
             changes[name] = str(changes[name])
     if steps is not None:
-        config = config.with_model(
-            noise=dataclasses.replace(config.model.noise, sample_steps=steps)
-        )
+        if not config.model.sample_steps:
+            raise UserError(
+                f"--steps is {steps}, and this world has no sampler whose steps could be chosen: "
+                "leave it out."
+            )
+        config = dataclasses.replace(config, model=config.model.with_sample_steps(steps))
     if data is not None:
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
     return dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, **changes))
@@ -215,7 +218,7 @@ def _asked(
     """
     covered = steered = about = None
     # A memory that is the state of its world has no tokens that could be counted.
-    if runs.remembers(opened) and config.model.memory.READ_BY_BLOCKS:
+    if runs.remembers(opened) and config.model.capabilities.coverage:
         covered = score_coverage(config, episodes, model, partials, say, clips)
     if not model.cameras:
         steered, about = steering.score(config, opened.params, episodes, clips, partials, say)

@@ -314,7 +314,7 @@ def score(
         why, where the episodes have no walks in two houses; both are None where the model is not
         steered by actions.
     """
-    if not config.model.control.MODULATES:
+    if not config.model.capabilities.silent_actions:
         return None, None
     among = {choice.episode for choice in choices}
     try:
@@ -399,6 +399,6 @@ def _imagined(
 
 def _silenced(config: Config, params: Params) -> Params | None:
     """Return weights whose control embeds every action as zero, or None if it does not modulate."""
-    if not config.model.control.MODULATES or "control" not in params:
+    if not config.model.capabilities.silent_actions or "control" not in params:
         return None
     return {**params, "control": jax.tree.map(jnp.zeros_like, params["control"])}

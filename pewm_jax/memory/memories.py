@@ -38,7 +38,16 @@ from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ModelConfig, UserError, functions
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import rendering, views
-from pewm_jax.types import Array, Camera, EncodedView, Frames, MapTokens, Params, Sight, View
+from pewm_jax.types import (
+    Array,
+    Camera,
+    EncodedView,
+    Frames,
+    MapTokens,
+    MemoryReadout,
+    Params,
+    View,
+)
 
 Memory: TypeAlias = Any
 """A pytree, of the type that the memory's ``empty`` returns."""
@@ -243,7 +252,7 @@ def look(
     params: Params | None = None,
     pictures: bool = False,
     view: View | None = None,
-) -> Sight:
+) -> MemoryReadout:
     """Return what the memory shows one clip, as far as the reader asks for it.
 
     Args:
@@ -269,7 +278,7 @@ def look(
         if reader.READS_LATENTS:
             encoded = encode(model, params or {}, view)
             view = view if pictures else None
-    return Sight(seen, view, encoded)
+    return MemoryReadout(seen, view, encoded)
 
 
 def encode(model: ModelConfig, params: Params, view: View) -> EncodedView:

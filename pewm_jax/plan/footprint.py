@@ -13,10 +13,11 @@ import functools
 import math
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, World
+from pewm_jax.config import ArraySpec, Config, World
 from pewm_jax.io import tree
 from pewm_jax.nn.costs import FLOAT, Share
 from pewm_jax.train.stages import Stage
@@ -203,7 +204,7 @@ def footprint(
     parts = costs.of_stage(config, stage, share)
     # Encoders run clip by clip with gathered weights; their outputs are stored for all clips.
     pixels = clips * config.model.clip.frames * config.model.clip.height * config.model.clip.width
-    held = max(part.held for part in parts.values()) + 2 * pixels * 3 * FLOAT
+    held = max((part.held for part in parts.values()), default=0.0) + 2 * pixels * 3 * FLOAT
     return Footprint(
         trained=trained,
         frozen=frozen_bytes * (c.frozen.on(mesh) + c.encoders.on(mesh)),
@@ -232,10 +233,14 @@ def clip_bytes(config: Config, stage: Stage) -> float:
     That is 8-bit colours, 32-bit depth, cached features, 16-bit class ids of recorded grids.
     """
     clip, context = config.model.clip, config.data.context
-    pixels = (clip.frames + context) * clip.height * clip.width * (3 + FLOAT)
-    cells = getattr(getattr(config.model, "memory", None), "recorded", 0) ** 3
-    pixels += 2 * clip.frames * cells
-    if not (config.data.features and stage.memory):
-        return pixels
-    encoder = config.model.memory.encoder
-    return pixels + 2 * context * math.prod(encoder.grid(clip)) * encoder.channels
+    asked = config.model.batch_spec
+    context = context if asked.context else 0
+    total = (clip.frames + context) * clip.height * clip.width * (3 + FLOAT)
+    total += sum(_bytes(one) for _, one in asked.extras)
+    if asked.features is None or not (config.data.features and stage.memory):
+        return total
+    return total + context * _bytes(asked.features)
+
+
+def _bytes(array: ArraySpec) -> int:
+    return math.prod(array.shape) * np.dtype(array.dtype).itemsize

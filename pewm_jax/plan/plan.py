@@ -17,8 +17,7 @@ from typing import Any
 
 import jax
 
-from pewm_jax import registry as kinds
-from pewm_jax.config import Config, Launch, ModelConfig, UserError, VAEConfig, WanVAEConfig
+from pewm_jax.config import Config, Launch, UserError, VAEConfig, WanVAEConfig
 from pewm_jax.data import abstract
 from pewm_jax.io import tree
 from pewm_jax.plan import hlo, suggest
@@ -47,13 +46,8 @@ def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> 
 
     Raises:
         ConfigError: the chip is not known, or the devices cannot form the mesh or share the batch.
-        UserError: JAX already uses devices, and too few; or the world is not PEWM.
+        UserError: JAX already uses devices, and too few.
     """
-    if not isinstance(config.model, ModelConfig):
-        raise UserError(
-            f"A plan is made of worlds of kind pewm, and this is of kind "
-            f"{kinds.of(config.model).name}: train it where it is to be trained."
-        )
     chip = chips.named(launch.chip)
     sizes = MeshSizes(*config.train.mesh.shape(launch.devices))
     planned = stages.planned(config)

@@ -86,8 +86,13 @@ def predict(config: Config, stage: Stage, mesh: MeshSizes, chip: Chip) -> Predic
         hardware_flops=sum(work.values()),
         mfu=model / (step_s * chip.flops * mesh.devices),
         clips_per_s=clips / step_s,
-        tokens_per_s=clips * math.prod(video_tokens(config.model)) / step_s,
+        tokens_per_s=clips * _tokens(config) / step_s,
     )
+
+
+def _tokens(config: Config) -> int:
+    """Return the video tokens of a clip; 0 of a model without a transformer."""
+    return math.prod(video_tokens(config.model)) if hasattr(config.model, "backbone") else 0
 
 
 def traffic(config: Config, stage: Stage, mesh: MeshSizes) -> dict[tuple[str, str], float]:
@@ -101,7 +106,10 @@ def traffic(config: Config, stage: Stage, mesh: MeshSizes) -> dict[tuple[str, st
     Per block and pass: the outputs of its two (with memory, four) output projections are summed
     over ``tensor``. Keys and values are gathered over ``context``, and their gradients scattered.
     """
-    c, remat = counts(config, stage), bool(config.model.backbone.remat)
+    c, remat = (
+        counts(config, stage),
+        bool(getattr(getattr(config.model, "backbone", None), "remat", False)),
+    )
     activation_bytes = 2 if config.model.dtype == "bfloat16" else FLOAT
     parts = costs.of_stage(
         config, stage, share_of(config, stage, mesh, activation_bytes=activation_bytes)

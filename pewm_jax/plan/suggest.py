@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
-from pewm_jax.config import Config, functions
+from pewm_jax import worlds
+from pewm_jax.config import Config
 from pewm_jax.plan.footprint import Footprint, MeshSizes, footprint
 from pewm_jax.plan.predict import Prediction, predict
 from pewm_jax.train.chips import Chip
@@ -43,7 +44,7 @@ def has_flash(config: Config, chip: Chip) -> bool:
     return (
         gpu
         and config.model.dtype == "bfloat16"
-        and getattr(config.model.backbone, "attention", "xla") != "xla"
+        and getattr(getattr(config.model, "backbone", None), "attention", "xla") != "xla"
     )
 
 
@@ -63,7 +64,7 @@ def arrangements(config: Config, stage: Stage, devices: int) -> Iterator[MeshSiz
     ``tensor`` divides the numbers of heads, and ``context`` is at most 16.
     """
     batch = stage.settings(config).batch
-    heads = functions(config.model).split_heads(config.model, stage).values()
+    heads = worlds.split_heads(config.model, stage).values()
     for tensor in _divisors(devices):
         if any(count % tensor for count in heads):
             continue

@@ -181,7 +181,7 @@ class Features(_OfPictures):
     def pictures(self, frames: Frames, goal: Frames) -> Array:
         """See ``_OfPictures``."""
         params = self.params
-        if isinstance(self.settings, ModelConfig):
+        if not isinstance(self.settings, Encoder):
             params = encoders.weights(self.settings, params)
         return _features(self.settings, params, frames.rgb_THWC, goal.rgb_THWC)
 
@@ -190,7 +190,7 @@ class Features(_OfPictures):
 def _features(
     settings: Encoder | ModelConfig, params: Params, rgb_PHWC: Array, goal_1HWC: Array
 ) -> Array:
-    made = encoders.features if isinstance(settings, ModelConfig) else encoders.encode
+    made = encoders.encode if isinstance(settings, Encoder) else encoders.features
 
     def encoded(picture_HWC: Array) -> Array:
         return made(settings, params, picture_HWC[None])[0]  # type: ignore[arg-type]

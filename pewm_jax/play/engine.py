@@ -7,21 +7,19 @@ So there is one program to compile, whatever keys are pressed.
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, ModelConfig, UserError
+from pewm_jax.config import Config, UserError, World
 from pewm_jax.errors import require
-from pewm_jax.memory import memories, views
 from pewm_jax.types import Array, Frames, Params, WorldState
 
-_points = jax.jit(memories.to_points, static_argnums=0)
-_erase = jax.jit(memories.erase, static_argnums=0)
-_move = jax.jit(memories.move, static_argnums=0, static_argnames="leave")
+_points = jax.jit(worlds.memory_points, static_argnums=0)
+_erase = jax.jit(worlds.erase, static_argnums=0)
+_move = jax.jit(worlds.move, static_argnums=0, static_argnames="leave")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class Engine:
     params: Params
 
     @property
-    def model(self) -> ModelConfig:
+    def model(self) -> World:
         """The settings of the model."""
         return self.config.model
 
@@ -51,17 +49,22 @@ class Engine:
     @property
     def forgets(self) -> bool:
         """Whether there is a memory to go without."""
-        return self.model.memory.REMEMBERS
+        return self.model.capabilities.memory
 
     @property
     def editable(self) -> bool:
         """Whether boxes of the map can be erased and moved."""
-        return memories.editable(self.model)
+        return self.model.capabilities.edits
+
+    @property
+    def cell_m(self) -> float:
+        """The size at which points of the map are drawn, metres."""
+        return float(max(self.model.facts.cell_m[:2], default=0.1))
 
     @property
     def sampler_steps(self) -> int:
         """Steps of the sampler, 0 if it has none."""
-        return int(getattr(self.model.noise, "sample_steps", 0))
+        return self.model.sample_steps
 
     def with_sampler_steps(self, steps: int) -> Engine:
         """Return the same model with another number of the sampler's steps.
@@ -70,8 +73,7 @@ class Engine:
             ConfigError: the sampler cannot take so many.
         """
         require(self.sampler_steps > 0, f"{self.name} has no steps of a sampler to choose.")
-        noise = dataclasses.replace(self.model.noise, sample_steps=steps)  # type: ignore[call-arg]
-        model = dataclasses.replace(self.model, noise=noise)
+        model = self.model.with_sample_steps(steps)
         return dataclasses.replace(self, config=dataclasses.replace(self.config, model=model))
 
     def start(self, frames: Frames) -> WorldState:
@@ -95,18 +97,20 @@ class Engine:
 
         Where a memory does not tell, everything counts as observed.
         """
-        points, features, valid = (np.asarray(x) for x in _points(self.model, world.map))
-        colours = memories.colours(self.model, features[valid])
+        if not self.model.capabilities.points:
+            return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, bool)
+        points, features, valid, observed = _points(self.model, world)
+        points, features, valid = (np.asarray(x) for x in (points, features, valid))
+        colours = worlds.function(self.model, "point_colours")(self.model, features[valid])
+        colours = np.asarray(colours)
         shown = ((np.clip(colours, -1, 1) + 1) * 127.5).round().astype(np.uint8)
-        observed = getattr(world.map, "observed_V", None)
         told = np.ones(len(shown), bool) if observed is None else np.asarray(observed)[valid]
         return points[valid], shown, told
 
     def erase(self, world: WorldState, box_23: np.ndarray) -> WorldState:
         """Forget what is in a box, in the map and in the present picture."""
         _require_box(box_23)
-        changed = _erase(self.model, world.map, jnp.asarray(box_23, jnp.float32))
-        return _looked_at(self.model, world, changed)
+        return _erase(self.model, self.params, world, jnp.asarray(box_23, jnp.float32))
 
     def move(
         self, world: WorldState, box_23: np.ndarray, transform: np.ndarray, *, leave: bool
@@ -114,8 +118,7 @@ class Engine:
         """Move or copy what is in a box, in the map and in the present picture."""
         _require_box(box_23)
         box, motion = (jnp.asarray(x, jnp.float32) for x in (box_23, transform))
-        changed = _move(self.model, world.map, box, motion, leave=leave)
-        return _looked_at(self.model, world, changed)
+        return _move(self.model, self.params, world, box, motion, leave=leave)
 
 
 def open_engine(name: str, config: Config, params: Params) -> Engine:
@@ -124,39 +127,10 @@ def open_engine(name: str, config: Config, params: Params) -> Engine:
     Raises:
         UserError: these are no parameters of a world that can be driven.
     """
-    if not isinstance(config.model, ModelConfig):
-        raise UserError(
-            f"{name} is no world that imagines RGB-D frames and remembers them; drive a run of a "
-            "world model, such as small."
-        )
-    if not config.model.clip.depth:
-        raise UserError(
-            f"{name} imagines no depth (clip.depth), so there is no map to drive in; take a run "
-            "with depth."
-        )
+    world = worlds.require_world(config.model, f"the viewer of {name}")
+    if not world.capabilities.actions:
+        raise UserError(f"{name} is not steered by planar actions (dx, dy, dyaw), as a drive is.")
     return Engine(name, config, jax.tree.map(jnp.asarray, params))
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _looked_at(model: ModelConfig, world: WorldState, changed: memories.Memory) -> WorldState:
-    """Return a world with a changed map, whose present frame shows the change.
-
-    The next clip is imagined from the present frame, too: what was erased would be copied from it.
-    So its pixels are taken from the map where the map looks different now; holes are filled with
-    what is nearest to them. Memories that cannot be looked at in colours leave the frame as it is.
-    """
-    frame = world.frame
-    if not memories.shows_colours(model):
-        return WorldState(frame, changed)
-    size = (model.clip.height, model.clip.width)
-    before, after = (memories.render(model, m, frame.camera, *size) for m in (world.map, changed))
-    apart = jnp.abs(before.features_THWF - after.features_THWF).max(-1) > 1e-3
-    apart = apart | (before.seen_THW != after.seen_THW)
-    apart = apart | (jnp.abs(before.depth_THW - after.depth_THW) > 1e-3)
-    whole = views.fill_nearest(after)
-    rgb = jnp.where(apart[..., None], whole.features_THWF[..., :3], frame.rgb_THWC)
-    depth = jnp.where(apart, whole.depth_THW, frame.depth_THW)
-    return WorldState(Frames(rgb, depth, frame.camera), changed)
 
 
 def _require_box(box_23: np.ndarray) -> None:

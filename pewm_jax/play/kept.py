@@ -86,5 +86,5 @@ def load(engine: Engine, like: WorldState, folder: Path, name: str) -> WorldStat
 
 def _facts(engine: Engine) -> str:
     """Return what two models must share to share worlds."""
-    sections = (engine.model.clip, engine.model.memory)
+    sections = (engine.model.clip, getattr(engine.model, "memory", engine.model))
     return json.dumps([serialize.to_dict(section) for section in sections], sort_keys=True)

@@ -142,7 +142,7 @@ class MapView:
         self._points = points
         if len(points):
             self._cloud.points, self._cloud.colors = points, colours
-        self._cloud.point_size = float(max(self._engine.model.memory.cell_m[:2])) * WIDE
+        self._cloud.point_size = self._engine.cell_m * WIDE
         self._cloud.visible = bool(len(points))
 
     def _draw_agent(self, image: np.ndarray | None) -> None:

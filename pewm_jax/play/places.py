@@ -10,8 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pewm_jax.config import GridConfig, UserError
-from pewm_jax.config.model import World
+from pewm_jax.config import GridConfig, UserError, World
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.importer import ImportConfig, import_recording
 from pewm_jax.data.loader import require_same_cells

@@ -27,7 +27,7 @@ from pewm_jax.nn.patches import patchify
 from pewm_jax.nn.token_layout import TokenLayout
 from pewm_jax.readers.geometry import Sightings, patch_pixels, sightings, sinusoid_3d
 from pewm_jax.readers.memory_block import MemoryBlock
-from pewm_jax.types import Array, Camera, Params, Sight
+from pewm_jax.types import Array, Camera, MemoryReadout, Params
 
 REPLICATED = P()
 
@@ -122,7 +122,7 @@ def init(model: ModelConfig, key: Array) -> Params:
 
 
 def prepare(
-    model: ModelConfig, params: Params, sight: Sight, camera: Camera, rays_BthwC: Array
+    model: ModelConfig, params: Params, sight: MemoryReadout, camera: Camera, rays_BthwC: Array
 ) -> Readers:
     """Embed rays and map tokens, and choose the tokens each camera attends to; see ``readers``."""
     config, places, dtype = _settings(model), model.backbone.places, jnp.dtype(model.dtype)

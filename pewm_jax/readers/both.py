@@ -15,7 +15,7 @@ from pewm_jax.models.interface import Readers
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.readers import attention as attention_reader
 from pewm_jax.readers import render as render_reader
-from pewm_jax.types import Array, Camera, Params, Sight
+from pewm_jax.types import Array, Camera, MemoryReadout, Params
 
 SHARDING = (*attention_reader.SHARDING, *render_reader.SHARDING)
 
@@ -27,7 +27,7 @@ def init(model: ModelConfig, key: Array) -> Params:
 
 
 def prepare(
-    model: ModelConfig, params: Params, sight: Sight, camera: Camera, rays_BthwC: Array
+    model: ModelConfig, params: Params, sight: MemoryReadout, camera: Camera, rays_BthwC: Array
 ) -> Readers:
     """Prepare both; see ``readers``."""
     attend = attention_reader.prepare(model, params, sight, camera, rays_BthwC)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from pewm_jax.config import ModelConfig, functions
 from pewm_jax.models.interface import Readers
-from pewm_jax.types import Array, Camera, Params, Sight
+from pewm_jax.types import Array, Camera, MemoryReadout, Params
 
 
 def init(model: ModelConfig, key: Array) -> Params:
@@ -23,7 +23,7 @@ def init(model: ModelConfig, key: Array) -> Params:
 
 
 def prepare(
-    model: ModelConfig, params: Params, sight: Sight, camera: Camera, rays_BthwC: Array
+    model: ModelConfig, params: Params, sight: MemoryReadout, camera: Camera, rays_BthwC: Array
 ) -> Readers:
     """Prepare to read the memories of a batch of clips.
 

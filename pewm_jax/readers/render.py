@@ -1,12 +1,12 @@
 """Rendering as a memory reader: each frame's tokens get what the memory looks like from there.
 
-The memory's pictures (``Sight.view``) are gathered into the cells of the latents by space-to-depth
-and are not encoded. Each video token gets the pixels that it stands for: colours or features, depth
-and a mask. Or, where ``picture`` is `latents`, it gets the latents that the codec makes of the
-pictures (``Sight.encoded``), 0 in cells of which nothing is seen, and the mask. Either is added to
-the embedded tokens through a layer that starts at zero, and given to a block without attention
-after every block of the backbone (``render_block``), by which a frozen backbone learns to use it. A
-fresh reader changes nothing, and one that sees nothing never does.
+The memory's pictures (``view`` of a ``MemoryReadout``) are gathered into the cells of the latents
+by space-to-depth and are not encoded. Each video token gets the pixels that it stands for: colours
+or features, depth and a mask. Or, where ``picture`` is `latents`, it gets the latents that the
+codec makes of the pictures (``encoded``), 0 in cells of which nothing is seen, and the mask. Either
+is added to the embedded tokens through a layer that starts at zero, and given to a block without
+attention after every block of the backbone (``render_block``), by which a frozen backbone learns to
+use it. A fresh reader changes nothing, and one that sees nothing never does.
 
 Parameters, under ``render``: ``reduce`` (pictures of many channels), ``embed_1``, ``embed_2``,
 ``added``, and the stacked ``blocks``.
@@ -30,7 +30,7 @@ from pewm_jax.nn.patches import patchify
 from pewm_jax.nn.signals import signal_from_depth
 from pewm_jax.nn.token_layout import TokenLayout
 from pewm_jax.readers.render_block import RenderBlock
-from pewm_jax.types import Array, Camera, Params, Sight, View
+from pewm_jax.types import Array, Camera, MemoryReadout, Params, View
 
 REPLICATED = P()
 
@@ -133,7 +133,7 @@ def pictures(model: ModelConfig, params: Params, view: View) -> Array:
     return jnp.concatenate([x.astype(dtype) for x in (features, depth, seen)], -1)
 
 
-def cells(model: ModelConfig, params: Params, sight: Sight) -> tuple[Array, Array]:
+def cells(model: ModelConfig, params: Params, sight: MemoryReadout) -> tuple[Array, Array]:
     """Return what is read at each cell of the latents, and which clips see anything.
 
     Args:
@@ -164,7 +164,7 @@ def _apply(model: ModelConfig, params: Params, name: str, x: Array) -> Array:
 
 
 def prepare(
-    model: ModelConfig, params: Params, sight: Sight, camera: Camera, rays_BthwC: Array
+    model: ModelConfig, params: Params, sight: MemoryReadout, camera: Camera, rays_BthwC: Array
 ) -> Readers:
     """Embed the memory's pictures; see ``readers``."""
     del camera, rays_BthwC  # the pictures are what these cameras see

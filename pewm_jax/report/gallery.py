@@ -7,19 +7,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pewm_jax import worlds
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.long_rollouts import LongRollouts
 from pewm_jax.eval.protocol import ClipChoice, load_clip
 from pewm_jax.eval.seen import seen_masks
 from pewm_jax.geometry.actions import heading
-from pewm_jax.memory import memories
 from pewm_jax.report.pictures import as_bytes, dim, enlarge, farthest, from_above, grid, map_bounds
 from pewm_jax.report.video import encode_gif, encode_h264, side_by_side, small_frames
 from pewm_jax.types import Frames
 
 ABOVE_CAMERA_M = 0.4
 """Map cells higher than this above the camera are left out of the view from above."""
+DOT_M = 0.1
+"""Size at which points of a memory without cells are drawn, metres."""
 CAPTIONS = {
     "memory": "with its map",
     "empty": "empty map",
@@ -104,7 +106,9 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
         ),
         moving=_moving(rollout),
         masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
-        above=_above(config, long, best, rollout) if "memory" in long.kept else None,
+        above=_above(config, long, best, rollout)
+        if "first_points" in long.kept.get("memory", {})
+        else None,
         rows=[_rows(item, steps) for item in shown],
     )
 
@@ -181,11 +185,11 @@ def _above(config: Config, long: LongRollouts, index: int, item: _Rollout) -> np
     poses = np.asarray(item.context.camera.world_from_camera)
     later = np.asarray(item.truth.camera.world_from_camera)
     ceiling = poses[-1, 2, 3] + ABOVE_CAMERA_M
-    clouds = []
+    clouds, colours = [], worlds.function(config.model, "point_colours")
     for when in ("first", "last"):
         valid = kept[f"{when}_valid"][index] & (kept[f"{when}_points"][index][:, 2] < ceiling)
         points = kept[f"{when}_points"][index][valid]
-        shades = memories.colours(config.model, kept[f"{when}_features"][index][valid])
+        shades = np.asarray(colours(config.model, kept[f"{when}_features"][index][valid]))
         clouds.append((points, as_bytes(shades)))
     bounds = map_bounds(*[points for points, _ in clouds], poses[:, :3, 3])
     panels = []
@@ -193,7 +197,7 @@ def _above(config: Config, long: LongRollouts, index: int, item: _Rollout) -> np
     for (title, track), (points, shades) in zip(tracks, clouds, strict=True):
         path = track if track is poses else np.concatenate([poses[-1:], track])
         yaw = float(heading(track[-1]))
-        cell_m = config.model.memory.cell_m
+        cell_m = config.model.facts.cell_m or (DOT_M,) * 3
         panels.append(
             from_above(points, shades, cell_m, path[:, :3, 3], yaw, title=title, bounds=bounds)
         )

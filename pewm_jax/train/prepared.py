@@ -98,7 +98,7 @@ def gather(
                 return None
             clip = jax.device_get(make(params, batch))
             if folder is not None:
-                leaves = tree.flatten(clip)
+                leaves = _named(clip)
                 file = _file(folder, number)
                 tensor_files.write(file, leaves, leaves.items(), tensor_files.header({}))
                 clip = _mapped(file, like)
@@ -174,13 +174,23 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
     return Path(config.data.prepared_path) / name
 
 
+def _named(clip: Clip) -> dict[str, Any]:
+    """Return the arrays of a clip by their names in files, which are those of earlier versions."""
+    renamed = {"readout": "sight"}
+    found = {}
+    for path, leaf in tree.flatten(clip).items():
+        first, slash, rest = path.removeprefix("extras/").partition("/")
+        found[renamed.get(first, first) + slash + rest] = leaf
+    return found
+
+
 def _file(folder: Path, number: int) -> Path:
     return folder / f"{number:05}.safetensors"
 
 
 def _mapped(file: Path, like: Clip) -> Clip:
     """Map a file of prepared clips, and refuse one of other shapes."""
-    found, names = tensor_files.mapped(file), tree.flatten(like)
+    found, names = tensor_files.mapped(file), _named(like)
     for name, leaf in names.items():
         if name not in found or found[name].shape != leaf.shape or found[name].dtype != leaf.dtype:
             raise UserError(

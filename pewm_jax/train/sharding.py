@@ -18,7 +18,7 @@ from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax import worlds
-from pewm_jax.config import AXES, Config, ConfigError, MeshConfig, World, functions
+from pewm_jax.config import AXES, Config, ConfigError, MeshConfig, World
 from pewm_jax.io import tree
 from pewm_jax.nn.placement import BATCH
 from pewm_jax.train.stages import Stage
@@ -37,7 +37,7 @@ def rules(model: World) -> tuple[tuple[str, P], ...]:
     (stacked layers, taps of a convolution) are never split. The first match wins, and every
     parameter must be matched. Each network says its own (``SHARDING``, beside its functions).
     """
-    parameters = worlds.sharding(model)
+    parameters = [(path, P(*spec)) for path, spec in worlds.sharding(model)]
     return (
         *((rf"(params|ema|opt_state/.+)/{path}", spec) for path, spec in parameters),
         (r"opt_state/.*(count|ns_coeffs)", WHOLE),
@@ -185,7 +185,7 @@ def require_divisible(config: Config, stage: Stage, mesh: Mesh | AbstractMesh) -
             f"use a multiple of {devices}."
         )
     tensor = mesh.shape["tensor"]
-    heads: Mapping[str, int] = functions(config.model).split_heads(config.model, stage)
+    heads: Mapping[str, int] = worlds.split_heads(config.model, stage)
     for name, count in heads.items():
         if count % tensor:
             raise ConfigError(

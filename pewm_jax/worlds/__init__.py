@@ -1,4 +1,4 @@
-"""Chapter 6, worlds: what is imagined next.
+"""Worlds: start from frames, observe frames, imagine frames.
 
 Every world is driven by the same three functions, whatever networks it has. They are pure. Called
 eagerly, they check the values they are given and run a program that is compiled once for each model
@@ -19,17 +19,9 @@ not batched, neither on the way in nor on the way out::
 
 ``jax.vmap`` over *states* is for worlds that differ; it needs one memory for each.
 
-A world is a ``World`` and a module (or object) with these three functions and
-
-    init(model, key) -> params               all parameters
-    stages(model) -> (Stage, …)              how it is trained, see ``worlds.stages``
-    sharding(model) -> rules                 path of a parameter → the mesh axes of its last axes
-    split_heads(model, stage) -> {name: n}   numbers that ``train.mesh.tensor`` must divide
-    costs(config, stage, share) -> {part: Costs}   see ``models.costs``
-
-and, if it can share work among candidates, an ``imagine_many``, a ``to_compare`` and ``views`` of
-its own. The module of a policy or a codec, which imagines nothing, sets ``IMAGINES = False``, and
-these functions raise ``UserError``. ``worlds.pewm`` is an example.
+The methods that a world must and may have are those of ``pewm_jax.config.World``; a training task
+that imagines nothing (a codec, a policy) is a ``pewm_jax.config.Task``. ``examples/world.py`` is a
+whole world in one file, ``worlds.pewm`` the paper's.
 """
 
 from __future__ import annotations
@@ -40,19 +32,43 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import Config, UserError, World, functions
+from pewm_jax.config import Config, Task, UserError, World, functions
 from pewm_jax.types import Array, Frames, Params, WorldState
 from pewm_jax.worlds import checks
 from pewm_jax.worlds.stages import Stage
 
 
-def model_of(config: Config | World) -> Any:
+def model_of(config: Config | Task) -> Any:
     """Return the model's settings, from a whole experiment's if those are given."""
     return config.model if isinstance(config, Config) else config
 
 
+def function(model: Task, name: str) -> Callable[..., Any]:
+    """Return a world's own function, or the default of its base class."""
+    found = functions(model)
+    own = getattr(type(model) if found is model else found, name, None)
+    return own or getattr(type(model), name, None) or DEFAULTS[name]
+
+
+def require_world(model: Task, who: str) -> World:
+    """Return the settings of a world, or refuse those of a task that imagines nothing.
+
+    Args:
+        model: the settings.
+        who: what asks for a world, for the message: ``"start()"``.
+
+    Raises:
+        UserError: it is a training task alone.
+    """
+    if not isinstance(model, World):
+        raise UserError(
+            f"{who} needs a world model, and this run imagines nothing: {model.INSTEAD}."
+        )
+    return model
+
+
 def start(
-    model: Config | World,
+    model: Config | Task,
     params: Params,
     frames: Frames,
     *,
@@ -78,15 +94,13 @@ def start(
             unknown unit, poses that are not finite or not rigid, intrinsics of another image size.
             Values are not checked under jit, vmap and grad.
     """
-    model = model_of(model)
-    module = functions(model)
-    if _imagines(module):
-        frames = checks.check_frames(frames, "start", depth_scale)
-    return _start(module.start, model, params, frames, depth_scale)
+    model = require_world(model_of(model), "start()")
+    frames = checks.check_frames(frames, "start", depth_scale)
+    return _start(function(model, "start"), model, params, frames, depth_scale)
 
 
 def observe(
-    model: Config | World,
+    model: Config | Task,
     params: Params,
     state: WorldState,
     frames: Frames,
@@ -108,16 +122,14 @@ def observe(
     Raises:
         UserError: as for ``start``.
     """
-    model = model_of(model)
-    module = functions(model)
-    if _imagines(module):
-        _require_state(state, "observe")
-        frames = checks.check_frames(frames, "observe", depth_scale)
-    return _observe(module.observe, model, params, state, frames, depth_scale)
+    model = require_world(model_of(model), "observe()")
+    _require_state(state, "observe")
+    frames = checks.check_frames(frames, "observe", depth_scale)
+    return _observe(function(model, "observe"), model, params, state, frames, depth_scale)
 
 
 def imagine(
-    model: Config | World,
+    model: Config | Task,
     params: Params,
     state: WorldState,
     control: Any,
@@ -156,19 +168,18 @@ def imagine(
             grad, it has an unknown discrete action, a number that is not finite, or a camera that
             is not rigid.
     """
-    model = model_of(model)
-    module = functions(model)
-    if _imagines(module):
-        _require_state(state, "imagine")
-        control = checks.check_control(control, "imagine")
+    model = require_world(model_of(model), "imagine()")
+    _require_state(state, "imagine")
+    control = checks.check_control(control, "imagine")
+    act = function(model, "imagine")
     after, frames = _imagine(
-        module.imagine, model, params, state, control, key, remember=remember, memory=memory
+        act, model, params, state, control, key, remember=remember, memory=memory
     )
     return (after if remember else WorldState(after.frame, state.map)), frames
 
 
 def imagine_many(
-    model: Config | World,
+    model: Config | Task,
     params: Params,
     state: WorldState,
     controls: Any,
@@ -198,31 +209,14 @@ def imagine_many(
     Raises:
         UserError: as for ``imagine``.
     """
-    model = model_of(model)
-    module = functions(model)
-    if _imagines(module):
-        _require_state(state, "imagine_many")
-        controls = checks.check_control(controls, "imagine_many")
-    own = getattr(module, "imagine_many", None)
-    act = module.imagine if own is None else own
+    model = require_world(model_of(model), "imagine_many()")
+    _require_state(state, "imagine_many")
+    controls = checks.check_control(controls, "imagine_many")
+    act = function(model, "imagine_many")
     frame, frames = _imagine_many(
-        act,
-        model,
-        params,
-        state,
-        controls,
-        keys,
-        views,
-        many=own is not None,
-        memory=memory,
-        last=last,
+        act, model, params, state, controls, keys, views, memory=memory, last=last
     )
     return WorldState(frame, state.map), frames
-
-
-def _imagines(module: Any) -> bool:
-    """Return False for a policy or a codec, whose functions refuse by themselves."""
-    return getattr(module, "IMAGINES", True)
 
 
 def _require_state(state: Any, who: str) -> None:
@@ -238,26 +232,24 @@ def _require_state(state: Any, who: str) -> None:
 @functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
 def _start(
     act: Callable[..., WorldState],
-    model: World,
+    model: Task,
     params: Params,
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    given = checks.in_metres(frames, depth_scale) if _imagines(functions(model)) else frames
-    return act(model, params, given)
+    return act(model, params, checks.in_metres(frames, depth_scale))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
 def _observe(
     act: Callable[..., WorldState],
-    model: World,
+    model: Task,
     params: Params,
     state: WorldState,
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    given = checks.in_metres(frames, depth_scale) if _imagines(functions(model)) else frames
-    after = act(model, params, state, given)
+    after = act(model, params, state, checks.in_metres(frames, depth_scale))
     ok = checks.valid((), state.frame.camera)
     return WorldState(checks.poisoned(ok, after.frame), checks.kept(ok, after.map, state.map))
 
@@ -267,7 +259,7 @@ def _observe(
 )
 def _imagine(
     act: Callable[..., tuple[WorldState, Frames]],
-    model: World,
+    model: Task,
     params: Params,
     state: WorldState,
     control: Any,
@@ -283,73 +275,145 @@ def _imagine(
     return WorldState(checks.poisoned(ok, after.frame), kept), checks.poisoned(ok, frames)
 
 
-@functools.partial(
-    jax.jit, static_argnums=(0, 1), static_argnames=("many", "memory", "last"), inline=True
-)
+@functools.partial(jax.jit, static_argnums=(0, 1), static_argnames=("memory", "last"), inline=True)
 def _imagine_many(
     act: Callable[..., tuple[WorldState, Frames]],
-    model: World,
+    model: Task,
     params: Params,
     state: WorldState,
     controls: Any,
     keys: Array,
     views: Any,
     *,
-    many: bool,
     memory: bool,
     last: bool,
 ) -> tuple[Frames, Frames]:
-    """Return (K, 1) present frames, and (K, n) imagined ones or the last of them.
-
-    ``act`` is the world's own ``imagine_many`` if ``many``, else its ``imagine``.
-    """
-    if many:
-        given = {} if views is None else {"views": views}
-        after, frames = act(model, params, state, controls, keys, memory=memory, last=last, **given)
-    else:
-        candidate = functools.partial(act, model, remember=False, memory=memory)
-        shared = WorldState(0, None)  # type: ignore[arg-type]
-        each = jax.vmap(candidate, (None, None, 0, 0), (shared, 0))
-        after, frames = each(params, state, controls, keys)
-        frames = jax.tree.map(lambda x: x[:, -1:], frames) if last else frames
+    """Return (K, 1) present frames, and (K, n) imagined ones or the last of them."""
+    shown = {} if views is None else {"views": views}
+    after, frames = act(model, params, state, controls, keys, memory=memory, last=last, **shown)
     ok = checks.valid(controls, state.frame.camera, leading=1)
     return checks.poisoned(ok, after.frame), checks.poisoned(ok, frames)
 
 
-def to_compare(model: Config | World, state: WorldState) -> WorldState:
+def to_compare(model: Config | Task, state: WorldState) -> WorldState:
     """Return a state for ``imagine_many`` alone, whose memory may be smaller and looks the same.
 
     On the host, not under jit; a world that can do no such thing gives the state as it is.
     """
-    model = model_of(model)
-    own = getattr(functions(model), "to_compare", None)
-    return state if own is None else own(model, state)
+    model = require_world(model_of(model), "to_compare()")
+    return function(model, "to_compare")(model, state)
 
 
-def views(model: Config | World, params: Params, state: WorldState) -> Callable[[Any], Any] | None:
+def views(model: Config | Task, params: Params, state: WorldState) -> Callable[[Any], Any] | None:
     """Return what makes ``views`` for ``imagine_many``, and keeps what candidates have in common.
 
     On the host, not under jit; None where a world has nothing of the kind. The state is the one
     that candidates are compared from.
     """
-    model = model_of(model)
-    own = getattr(functions(model), "views", None)
-    return None if own is None else own(model, params, state)
+    model = require_world(model_of(model), "views()")
+    return function(model, "views")(model, params, state)
 
 
-def init(model: Config | World, key: Array) -> Params:
+def init(model: Config | Task, key: Array) -> Params:
     """Return random parameters for all networks of a world."""
     model = model_of(model)
-    return functions(model).init(model, key)
+    return function(model, "init")(model, key)
 
 
-def stages(model: Config | World) -> tuple[Stage, ...]:
+def stages(model: Config | Task) -> tuple[Stage, ...]:
     """Return the stages of a world's training, in order."""
     model = model_of(model)
-    return functions(model).stages(model)
+    return function(model, "stages")(model)
 
 
-def sharding(model: Config | World) -> tuple[tuple[str, Any], ...]:
+def sharding(model: Config | Task) -> tuple[tuple[str, Any], ...]:
     """Return the rules from paths of parameters to the mesh axes of their last axes."""
     model = model_of(model)
-    return functions(model).sharding(model)
+    return function(model, "sharding")(model)
+
+
+def split_heads(model: Config | Task, stage: Stage) -> dict[str, int]:
+    """Return the numbers that ``train.mesh.tensor`` must divide, by the setting's name."""
+    model = model_of(model)
+    return function(model, "split_heads")(model, stage)
+
+
+def _imagine_each(
+    model: World,
+    params: Params,
+    state: WorldState,
+    controls: Any,
+    keys: Array,
+    *,
+    memory: bool = True,
+    last: bool = False,
+) -> tuple[WorldState, Frames]:
+    """Imagine candidates by ``jax.vmap`` of ``imagine``: the default of ``imagine_many``."""
+    act = functools.partial(function(model, "imagine"), model, params, state)
+
+    def candidate(control: Any, key: Array) -> tuple[Frames, Frames]:
+        after, frames = act(control, key, remember=False, memory=memory)
+        return after.frame, frames
+
+    present, frames = jax.vmap(candidate)(controls, keys)
+    frames = jax.tree.map(lambda x: x[:, -1:], frames) if last else frames
+    return WorldState(present, state.map), frames
+
+
+def _same_state(model: World, state: WorldState) -> WorldState:
+    del model
+    return state
+
+
+def _no_views(model: World, params: Params, state: WorldState) -> None:
+    del model, params, state
+
+
+def _no_costs(config: Config, stage: Stage, share: Any) -> dict[str, Any]:
+    del config, stage, share
+    return {}
+
+
+DEFAULTS: dict[str, Callable[..., Any]] = {
+    "imagine_many": _imagine_each,
+    "to_compare": _same_state,
+    "views": _no_views,
+    "costs": _no_costs,
+}
+"""The optional functions of a world; see ``config.World``."""
+
+
+def memory_points(
+    model: Config | Task, state: WorldState
+) -> tuple[Array, Array, Array, Array | None]:
+    """Return the memory as points; see ``World.memory_points``."""
+    model = require_world(model_of(model), "memory_points()")
+    return function(model, "memory_points")(model, state.map)
+
+
+def erase(model: Config | Task, params: Params, state: WorldState, box_23: Array) -> WorldState:
+    """Return a world that forgot what is in a box; see ``World.erase``."""
+    model = require_world(model_of(model), "erase()")
+    return function(model, "erase")(model, params, state, box_23)
+
+
+def move(
+    model: Config | Task,
+    params: Params,
+    state: WorldState,
+    box_23: Array,
+    transform: Array,
+    *,
+    leave: bool = False,
+) -> WorldState:
+    """Return a world in which what is in a box was moved; see ``World.move``."""
+    model = require_world(model_of(model), "move()")
+    return function(model, "move")(model, params, state, box_23, transform, leave=leave)
+
+
+def coverage(
+    model: Config | Task, params: Params, state: WorldState, frames: Frames, seen_THW: Array
+) -> dict[str, Array]:
+    """Return how many pixels seen before the memory holds; see ``World.coverage``."""
+    model = require_world(model_of(model), "coverage()")
+    return function(model, "coverage")(model, params, state, frames, seen_THW)

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ModelConfig, UserError
 from pewm_jax.memory import memories
-from pewm_jax.types import Array, Control, Frames, Params, Sight, View
+from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, View
 from pewm_jax.worlds import world_model
 
 
@@ -36,7 +36,7 @@ def first_frames(
     params: Params,
     frames: Frames,
     latents_BthwC: Array,
-    sight: Sight | None,
+    sight: MemoryReadout | None,
     key: Array,
 ) -> tuple[Array, Array]:
     """Return the first frames of a batch of clips, a share of them as the model makes them.
@@ -93,7 +93,7 @@ def first_frames(
     return replaced(made[0], true[0]), replaced(made[1], true[1])
 
 
-def backwards(model: ModelConfig, sight: Sight) -> Sight:
+def backwards(model: ModelConfig, sight: MemoryReadout) -> MemoryReadout:
     """Return what the memory shows clips that are run backwards; leading axes B and T.
 
     Tokens have no order in time. All else is reversed along T; latents that stand for one frame
@@ -123,7 +123,7 @@ def _looking_back(
     params: Params,
     frames: Frames,
     latents_BthwC: Array,
-    sight: Sight | None,
+    sight: MemoryReadout | None,
     key: Array,
 ) -> tuple[Array, Array]:
     """Run clips backwards, and return what the model makes of the frames where they arrive."""

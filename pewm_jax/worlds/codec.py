@@ -1,4 +1,4 @@
-"""The world that trains the learned codec, frame by frame; it imagines nothing.
+"""The task that trains the learned codec, frame by frame.
 
 Stage ``codec`` has it give frames back through noise on its latents. Stage ``statistics`` then fits
 mean and scale of the averaged codec's latents, by which it normalises them. Where ``codec.gate``
@@ -9,13 +9,13 @@ another model can start from.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NoReturn
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import learned as learned_codec
-from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings, UserError
+from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings
 from pewm_jax.geometry import depth_images
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.models.lpips import weights as lpips_weights
@@ -29,9 +29,6 @@ SMALL = 1e-4
 """Added to variances."""
 PULL = 1e-2
 """Weight of what keeps each channel of the latents near mean 0 and variance 1."""
-
-IMAGINES = False
-"""Whether this is a world model; if not, its functions refuse."""
 
 
 def init(model: CodecWorldConfig, key: Array) -> Params:
@@ -188,12 +185,6 @@ def sharding(model: CodecWorldConfig) -> tuple[tuple[str, Any], ...]:
     return learned_codec.SHARDING
 
 
-def split_heads(model: CodecWorldConfig, stage: Stage) -> dict[str, int]:
-    """Return what ``train.mesh.tensor`` must divide: nothing."""
-    del model, stage
-    return {}
-
-
 def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     """Return the costs of one device: of one clip, the frames' colour and depth."""
     del share
@@ -216,33 +207,3 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     if stage is STAGES[2]:
         products.append(Product("codec", "convolution", model.clip.frames * macs(model), 2.0))
     return {"codec": Costs(tuple(products))}
-
-
-def start(model: CodecWorldConfig, params: Params, frames: Any) -> NoReturn:
-    """Refuse; see ``_refuse``."""
-    del model, params, frames
-    _refuse("start")
-
-
-def observe(model: CodecWorldConfig, params: Params, state: Any, frames: Any) -> NoReturn:
-    """Refuse; see ``_refuse``."""
-    del model, params, state, frames
-    _refuse("observe")
-
-
-def imagine(*arguments: Any, **options: Any) -> NoReturn:
-    """Refuse; see ``_refuse``."""
-    del arguments, options
-    _refuse("imagine")
-
-
-def _refuse(who: str) -> NoReturn:
-    """Say that a codec is no world model.
-
-    Raises:
-        UserError: always.
-    """
-    raise UserError(
-        f"{who}() got a run that trained a codec alone, which imagines nothing: name its folder by "
-        "train.start of a model whose codec.kind is learned."
-    )

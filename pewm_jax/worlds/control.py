@@ -6,13 +6,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from pewm_jax import registry as kinds
-from pewm_jax.config import ModelConfig, UserError
+from pewm_jax.config import UserError, World
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.types import Array, Camera, Control
 
 
-def control_of(model: ModelConfig, present: Camera, control: Any) -> Control:
+def control_of(model: World, present: Camera, control: Any) -> Control:
     """Return (n,) cameras of the frames to imagine, and the (n, A) actions that lead to them.
 
     Of a ``Control`` the present frame is not a part here, in contrast to those of training.
@@ -31,7 +30,7 @@ def control_of(model: ModelConfig, present: Camera, control: Any) -> Control:
     return found
 
 
-def require_actions(model: ModelConfig, actions_TA: Array | None, who: str) -> None:
+def require_actions(model: World, actions_TA: Array | None, who: str) -> None:
     """Refuse what lacks the actions that the model's control needs, or has others.
 
     Args:
@@ -42,23 +41,23 @@ def require_actions(model: ModelConfig, actions_TA: Array | None, who: str) -> N
     Raises:
         UserError: they are absent, or of another width.
     """
-    wanted = model.control.actions
+    wanted, kind = model.batch_spec.actions, model.facts.control
     if not wanted:
         return
     if actions_TA is None:
         raise UserError(
             f"{who} got cameras without actions, and this model's control "
-            f"({kinds.of(model.control).name}) is steered by actions of {wanted} numbers: give "
+            f"({kind}) is steered by actions of {wanted} numbers: give "
             "actions, or a Control with both."
         )
     if actions_TA.shape[-1] != wanted:
         raise UserError(
             f"{who} got actions of {actions_TA.shape[-1]} numbers, and this model's control "
-            f"({kinds.of(model.control).name}) takes {wanted}: give those it was trained with."
+            f"({kind}) takes {wanted}: give those it was trained with."
         )
 
 
-def _in_one_form(model: ModelConfig, present: Camera, control: Any) -> Control:
+def _in_one_form(model: World, present: Camera, control: Any) -> Control:
     """Return cameras, and actions where there are any; see ``control_of``."""
     if isinstance(control, Control):
         count = _require_cameras(control.camera)

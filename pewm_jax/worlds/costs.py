@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from pewm_jax.config import Config, functions
+from pewm_jax import worlds
+from pewm_jax.config import Config
 from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.worlds.stages import Stage
 
@@ -21,7 +22,7 @@ def of_stage(config: Config, stage: Stage, share: Share = WHOLE_CLIP) -> dict[st
         stage: the stage.
         share: the device's share of the step.
     """
-    return functions(config.model).costs(config, stage, share)
+    return worlds.function(config.model, "costs")(config, stage, share)
 
 
 def products(config: Config, stage: Stage) -> list[Product]:

@@ -1,4 +1,4 @@
-"""The world in which NoMaD is trained, by imitation of recorded walks; it imagines nothing.
+"""The task that trains the policy NoMaD, by imitation of recorded walks.
 
 A clip has the earlier pictures, the present one and those of as many later steps as a goal may be
 away. From it are taken the waypoints, the places after the next steps, and the goal: the picture
@@ -8,18 +8,14 @@ farthest away and whose way is not learned (Sridhar et al. 2023, as in ``visualn
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
-
 import jax
 import jax.numpy as jnp
-from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import (
     Config,
     NomadTrainConfig,
     NomadWorldConfig,
     TrainSettings,
-    UserError,
 )
 from pewm_jax.diffusion import squared_cosine
 from pewm_jax.geometry import actions, cameras
@@ -31,9 +27,6 @@ from pewm_jax.worlds.stages import TRAIN, Stage
 
 SMALL = 1e-2
 """Added to the shares by which losses are divided, as in the reference."""
-
-IMAGINES = False
-"""Whether this is a world model; if not, its functions refuse."""
 
 
 def init(model: NomadWorldConfig, key: Array) -> Params:
@@ -114,50 +107,8 @@ def stages(model: NomadWorldConfig) -> tuple[Stage, ...]:
     return STAGES
 
 
-def sharding(model: NomadWorldConfig) -> tuple[tuple[str, Any], ...]:
-    """Return the rule: every device has all weights, which are few."""
-    del model
-    return ((r"policy/.*", P()),)
-
-
-def split_heads(model: NomadWorldConfig, stage: Stage) -> dict[str, int]:
-    """Return what ``train.mesh.tensor`` must divide: nothing."""
-    del model, stage
-    return {}
-
-
 def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     """Return the costs of one device."""
     del stage, share
     work = nomad.macs(config.model.policy)
     return {"policy": Costs((Product("policy", "convolution", work, 2.0),))}
-
-
-def start(*arguments: Any) -> NoReturn:
-    """Refuse; see ``_refuse``."""
-    del arguments
-    _refuse("start")
-
-
-def observe(*arguments: Any) -> NoReturn:
-    """Refuse; see ``_refuse``."""
-    del arguments
-    _refuse("observe")
-
-
-def imagine(*arguments: Any, **options: Any) -> NoReturn:
-    """Refuse; see ``_refuse``."""
-    del arguments, options
-    _refuse("imagine")
-
-
-def _refuse(who: str) -> NoReturn:
-    """Say that a policy is no world model.
-
-    Raises:
-        UserError: always.
-    """
-    raise UserError(
-        f"{who}() got a run that trained a policy, which imagines nothing: have it propose ways by "
-        "pewm_jax.planning.nomad_policy, and imagine them with a world model."
-    )

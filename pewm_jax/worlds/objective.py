@@ -15,7 +15,7 @@ from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import memories
 from pewm_jax.nn import placement
 from pewm_jax.nn.signals import as_signal, signal_from_rgb
-from pewm_jax.types import Array, Camera, Clip, Control, Frames, Params, Sight
+from pewm_jax.types import Array, Camera, Clip, Control, Frames, MemoryReadout, Params
 from pewm_jax.worlds import chained, world_model
 from pewm_jax.worlds.control import require_actions
 
@@ -25,19 +25,23 @@ FINE = 0.3
 """The noise on depth that differs from pixel to pixel, as a share of the broad noise."""
 
 
-def clip_sight(model: ModelConfig, params: Params, clip: Clip, *, pictures: bool = False) -> Sight:
+def clip_readout(
+    model: ModelConfig, params: Params, clip: Clip, *, pictures: bool = False
+) -> MemoryReadout:
     """Build every clip's memory from its context and return what it shows, leading axis B.
 
     Pictures are rendered clip by clip: one by itself fits a processor's cache. They are made even
     if the reader needs none where ``pictures`` asks for them.
     """
 
-    def of_batch(weights: Params, clip: Clip) -> Sight:
-        def of_clip(context: Frames, valid_S: Array, features: Array, camera: Camera) -> Sight:
+    def of_batch(weights: Params, clip: Clip) -> MemoryReadout:
+        def of_clip(
+            context: Frames, valid_S: Array, features: Array, camera: Camera
+        ) -> MemoryReadout:
             memory = memories.from_context(model, weights, context, valid_S, features)
             return memories.look(model, memory, camera, params=weights, pictures=pictures)
 
-        features = clip.context_features_ShwF
+        features = clip.extras.get("context_features_ShwF")
         if features is None:
             features = _features(model, weights, clip.context.rgb_THWC)
         context = as_signal(clip.context)
@@ -72,16 +76,18 @@ def prepare(model: ModelConfig, params: Params, clip: Clip, *, memory: bool) -> 
         memory: whether the memory is read (in stage 2).
 
     Returns:
-        The batch with ``latents_thwC`` and, with a memory, ``sight``.
+        The batch with the extras ``latents_thwC`` and, with a memory, ``readout``.
     """
     frames = as_signal(clip.frames)
-    return dataclasses.replace(
+    emptied = dataclasses.replace(
         clip,
         context=jax.tree.map(lambda x: x[:, :0], clip.context),
         context_valid_S=clip.context_valid_S[:, :0],
+    )
+    return emptied.with_extras(
         context_features_ShwF=None,
         latents_thwC=codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW),
-        sight=clip_sight(model, params, clip) if memory else None,
+        readout=clip_readout(model, params, clip) if memory else None,
     )
 
 
@@ -116,7 +122,7 @@ def loss(
         (``Conditioning.known_Bt``) do not count.
     """
     frames = as_signal(clip.frames)
-    x0 = clip.latents_thwC
+    x0 = clip.extras.get("latents_thwC")
     if x0 is None:
         x0 = codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
     batch = x0.shape[0]
@@ -129,9 +135,9 @@ def loss(
         train.image_noise_mean
         + train.image_noise_std * jax.random.normal(level_key, (batch, 1, 1, 1, 1))
     )
-    sight = clip.sight if memory else None
+    sight = clip.extras.get("readout") if memory else None
     if memory and sight is None:
-        sight = clip_sight(model, params, clip)
+        sight = clip_readout(model, params, clip)
     if sight is not None and train.hidden:
         kept = jax.random.bernoulli(jax.random.fold_in(key, 4), 1 - train.hidden, (batch,))
         sight = shown(sight, kept)
@@ -145,7 +151,7 @@ def loss(
         depth = depth * wrong(jax.random.fold_in(image_key, 1), depth.shape, train.depth_noise)
     observed = Frames(first, depth, jax.tree.map(lambda x: x[:, :history], frames.camera))
     require_actions(model, clip.actions_TA, "the loss")
-    control = Control(frames.camera, clip.actions_TA, clip.state_A)
+    control = Control(frames.camera, clip.actions_TA, clip.extras.get("state_A"))
     conditioning = world_model.condition(
         model, params, observed, control, noise_B=level.reshape(batch), clean_BTHWC=clean
     )
@@ -172,7 +178,7 @@ def loss(
     return total, {"loss_rgb": rgb, "loss_depth": depth}
 
 
-def shown(sight: Sight, kept_B: Array) -> Sight:
+def shown(sight: MemoryReadout, kept_B: Array) -> MemoryReadout:
     """Hide what the memory shows from the clips of a batch that are not kept."""
     tokens, view, encoded = sight.tokens, sight.view, sight.encoded
     if tokens is not None:
@@ -183,7 +189,7 @@ def shown(sight: Sight, kept_B: Array) -> Sight:
     if encoded is not None:
         seen = encoded.seen_THW & kept_B[:, None, None, None]
         encoded = dataclasses.replace(encoded, seen_THW=seen)
-    return Sight(tokens, view, encoded)
+    return MemoryReadout(tokens, view, encoded)
 
 
 def wrong(key: Array, shape: tuple[int, ...], most: float) -> Array:

@@ -6,7 +6,7 @@ import jax
 
 from pewm_jax.config import ModelConfig
 from pewm_jax.models import interface as backbones
-from pewm_jax.types import Array, Params, Sight
+from pewm_jax.types import Array, MemoryReadout, Params
 from pewm_jax.worlds import world_model
 
 
@@ -14,7 +14,7 @@ def draw(
     model: ModelConfig,
     params: Params,
     conditioning: world_model.ClipConditioning,
-    sight: Sight | None,
+    sight: MemoryReadout | None,
     key: Array,
     *,
     blind: world_model.ClipConditioning | None = None,
@@ -29,7 +29,7 @@ def sample(
     model: ModelConfig,
     params: Params,
     conditioning: world_model.ClipConditioning,
-    sight: Sight | None,
+    sight: MemoryReadout | None,
     noise_BthwC: Array,
     key: Array | None = None,
     *,
@@ -60,7 +60,7 @@ def sample(
     noise = model.noise
 
     def x0(
-        x: Array, times: Array, given: world_model.ClipConditioning, sight: Sight | None
+        x: Array, times: Array, given: world_model.ClipConditioning, sight: MemoryReadout | None
     ) -> Array:
         inputs, network_time = noise.precondition(x, times)
         out = world_model.apply(model, params, inputs, given, network_time, sight)

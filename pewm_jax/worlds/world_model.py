@@ -26,7 +26,7 @@ from pewm_jax.encoders import interface as encoders
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.interface import NO_READERS, Conditioning, Observed
 from pewm_jax.readers import interface as readers
-from pewm_jax.types import Array, Camera, Control, Frames, Params, Sight
+from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params
 
 
 @jax.tree_util.register_dataclass
@@ -179,7 +179,7 @@ def apply(
     noisy_BthwC: Array,
     conditioning: ClipConditioning,
     time_B: Array,
-    sight: Sight | None = None,
+    sight: MemoryReadout | None = None,
 ) -> Array:
     """Predict the noise's target (x0, v, ε, velocity …) from noisy latents.
 

@@ -29,7 +29,7 @@ from pewm_jax.io import tensor_files, weights
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.readers import interface as readers
-from pewm_jax.types import Camera, MapTokens, Sight
+from pewm_jax.types import Camera, MapTokens, MemoryReadout
 from pewm_jax.worlds import world_model
 
 WORLD = ["--rgbd", "--camera", "--memory", "--frames", "9", "--height", "32", "--width", "32"]
@@ -225,7 +225,7 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     noisy, conditioning, tokens, video = inputs(config, plan)
     times = jnp.array([999, 40])
     apply = jax.jit(world_model.apply, static_argnums=0)
-    got = apply(config.model, wide, noisy, conditioning, times, Sight(tokens))[
+    got = apply(config.model, wide, noisy, conditioning, times, MemoryReadout(tokens))[
         ..., : old.out_channels
     ]
     want = jax.jit(dit.apply, static_argnums=0)(

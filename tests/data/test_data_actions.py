@@ -88,7 +88,7 @@ def test_one_frame_has_no_action():
 def test_what_was_not_recorded_leaves_no_trace():
     walk = dataclasses.replace(episode(), actions=None)
     clip = clips.clip_at(config(), walk, 3)
-    assert (clip.actions_TA, clip.classes_TXYZ, clip.origin_T3) == (None, None, None)
+    assert (clip.actions_TA, clip.extras) == (None, {})
     batch = clips.stack([clip, clip])
     assert len(jax.tree.leaves(batch)) == 9
     with pytest.raises(UserError, match=r"one batch have actions_TA .*\(4, 3\) and none"):

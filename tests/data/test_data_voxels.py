@@ -17,7 +17,7 @@ from test_data_import import config as import_config
 from test_data_import import record
 
 from pewm_jax.cli.data import main
-from pewm_jax.config import ConfigError, DataConfig, UserError
+from pewm_jax.config import ArraySpec, BatchSpec, ConfigError, DataConfig, ModelConfig, UserError
 from pewm_jax.data import clips, loader
 from pewm_jax.data.checks import check_episode
 from pewm_jax.data.dataset import EpisodeSource
@@ -254,15 +254,28 @@ def test_a_clip_has_the_grids_of_its_frames():
     episode = read_episode(write_episode(boxed(voxels, frames=30), "a", "box"))
     config = tiny_config(data=DataConfig(context=3))
     clip = clips.clip_at(config, episode, 3, stride=2)
-    np.testing.assert_array_equal(clip.classes_TXYZ, voxels.classes_TXYZ[3:20:2])
-    np.testing.assert_array_equal(clip.origin_T3, voxels.origin_T3[3:20:2])
+    np.testing.assert_array_equal(clip.extras["classes_TXYZ"], voxels.classes_TXYZ[3:20:2])
+    np.testing.assert_array_equal(clip.extras["origin_T3"], voxels.origin_T3[3:20:2])
     batch = clips.stack([clip, clip])
-    assert batch.classes_TXYZ.shape == (2, 9, 4, 4, 4)
-    assert batch.origin_T3.shape == (2, 9, 3)
+    assert batch.extras["classes_TXYZ"].shape == (2, 9, 4, 4, 4)
+    assert batch.extras["origin_T3"].shape == (2, 9, 3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Voxels(ModelConfig):
+    """A model whose loss needs the voxels around the agent."""
+
+    @property
+    def batch_spec(self):
+        shape = (self.clip.frames, 4, 4, 4)
+        voxels = ("classes_TXYZ", ArraySpec(shape, "uint16"))
+        return BatchSpec(extras=(voxels, ("origin_T3", ArraySpec((self.clip.frames, 3)))))
 
 
 def test_a_split_has_one_kind_of_grid(tmp_path):
     config = tiny_config(data=DataConfig(path=str(tmp_path), context=3))
+    plain, model = config, Voxels(**vars(config.model))
+    config = dataclasses.replace(config, model=model)
 
     def split(name, *voxels):
         made = [boxed(v, frames=24, size=16, width=24, seed=k) for k, v in enumerate(voxels)]
@@ -271,8 +284,9 @@ def test_a_split_has_one_kind_of_grid(tmp_path):
         return next(loader.clips(config, name, seed=0, batch=len(records)))
 
     batch = split("same", grids(24), grids(24, seed=1))
-    assert batch.classes_TXYZ.shape == (2, 9, 4, 4, 4)
-    assert batch.origin_T3.shape == (2, 9, 3)
+    assert batch.extras["classes_TXYZ"].shape == (2, 9, 4, 4, 4)
+    assert batch.extras["origin_T3"].shape == (2, 9, 3)
+    assert next(loader.clips(plain, "same", seed=0, batch=2)).extras == {}
     other = dataclasses.replace(grids(24), names=("empty", "sofa", "wall"))
     for name, second, says in (
         ("table", other, "another table of classes .* from class 1 on"),

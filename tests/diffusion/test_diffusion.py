@@ -146,11 +146,11 @@ def test_pixels_without_depth_do_not_train_depth():
 
 def test_invalid_context_frames_are_not_remembered():
     clip = make_clip()
-    tokens = objective.clip_sight(TINY, {}, clip).tokens
+    tokens = objective.clip_readout(TINY, {}, clip).tokens
     changed = np.array(clip.context.rgb_THWC)
     changed[:, 0] = 255 - changed[:, 0]
     context = dataclasses.replace(clip.context, rgb_THWC=changed)
-    again = objective.clip_sight(TINY, {}, dataclasses.replace(clip, context=context)).tokens
+    again = objective.clip_readout(TINY, {}, dataclasses.replace(clip, context=context)).tokens
     np.testing.assert_array_equal(tokens.features_MF, again.features_MF)
     assert tokens.valid_M.any()
 
@@ -159,7 +159,7 @@ def test_guidance_interpolates_between_with_and_without_map():
     clip, key = make_clip(), jax.random.key(0)
     params = randomise(init_world(TINY, key))
     conditioning = conditioning_of(TINY, params, clip)
-    sight = objective.clip_sight(TINY, params, clip)
+    sight = objective.clip_readout(TINY, params, clip)
     noise = jax.random.normal(key, (2, 3, 4, 6, 256))
 
     def run(guidance, sight, **more):

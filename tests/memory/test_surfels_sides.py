@@ -8,7 +8,7 @@ import pytest
 from pewm_jax.config import SurfelConfig
 from pewm_jax.geometry.cameras import pose_from_yaw
 from pewm_jax.memory import memories, rendering, surfels, views
-from pewm_jax.types import Camera, Frames, Sight, View
+from pewm_jax.types import Camera, Frames, MemoryReadout, View
 from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import random_camera, tiny_model
 
@@ -119,10 +119,15 @@ def test_what_the_memory_showed_is_not_remembered_again_as_imagined():
     two = jax.tree.map(lambda x: jnp.concatenate([x, x]), frames)
     seen = np.zeros((1, 3, *SIZE), bool)
     seen[0, 2, :, :5] = True
-    shown = Sight(view=View(np.zeros((1, 3, *SIZE, 3)), np.ones(seen.shape), seen))
+    shown = MemoryReadout(view=View(np.zeros((1, 3, *SIZE, 3)), np.ones(seen.shape), seen))
     model = tiny_model(memory=FINE)
     new = np.asarray(pewm.new_surfaces(model, two, shown).depth_THW)
     np.testing.assert_array_equal(new, np.where(seen[0, 1:], 0, 2).astype(np.float32))
     again = tiny_model(memory=SurfelConfig(**{**vars(FINE), "imagined_again": True}))
-    for whole, sight in ((model, None), (model, Sight()), (again, shown), (tiny_model(), shown)):
+    for whole, sight in (
+        (model, None),
+        (model, MemoryReadout()),
+        (again, shown),
+        (tiny_model(), shown),
+    ):
         assert pewm.new_surfaces(whole, two, sight) is two

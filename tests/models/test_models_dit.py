@@ -12,7 +12,7 @@ from pewm_jax.models.cogvideox import block as dit_block
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.nn import layers, patches, positions
 from pewm_jax.nn.token_layout import TokenLayout
-from pewm_jax.types import Sight
+from pewm_jax.types import MemoryReadout
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, randomise
 from tests.models.test_models_world_model import setup as world
@@ -140,7 +140,7 @@ def test_with_closed_memory_gates_stage_2_is_stage_1_and_feels_no_map():
         memory = {**params["memory"], "blocks": blocks}
         seen = dataclasses.replace(tokens, features_MF=features)
         both = {**stage1, "memory": memory}
-        return world_model.apply(model, both, noisy, conditioning, times, Sight(seen))
+        return world_model.apply(model, both, noisy, conditioning, times, MemoryReadout(seen))
 
     @jax.jit
     def compare(linear):

@@ -13,7 +13,7 @@ from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.interface import Conditioning, Readers
 from pewm_jax.nn.token_layout import TokenLayout
 from pewm_jax.readers.memory_block import MemoryBlock
-from pewm_jax.types import Sight
+from pewm_jax.types import MemoryReadout
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, randomise, with_reader
 from tests.models.test_models_dit import CONFIG, inputs, random_params
@@ -159,7 +159,7 @@ def test_a_world_with_memory_takes_a_time_for_each_latent_frame(positions, patch
 
     @jax.jit
     def run(times):
-        return world_model.apply(model, params, noisy, conditioning, times, Sight(tokens))
+        return world_model.apply(model, params, noisy, conditioning, times, MemoryReadout(tokens))
 
     one = run(times)
     each = jnp.tile(times[:, None], (1, FRAMES))

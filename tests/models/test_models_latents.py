@@ -36,7 +36,7 @@ from pewm_jax.io import tree
 from pewm_jax.memory import feature_cache, memories
 from pewm_jax.readers import interface as readers
 from pewm_jax.train import prepared
-from pewm_jax.types import Clip, Control, EncodedView, Frames, Sight, View
+from pewm_jax.types import Clip, Control, EncodedView, Frames, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
@@ -74,7 +74,7 @@ GRID = (5, 2, 3)
 """Latents of a clip: 5 frames of 16 × 24 pixels."""
 apply = jax.jit(world_model.apply, static_argnums=0)
 condition = jax.jit(world_model.condition, static_argnums=0)
-look = jax.jit(objective.clip_sight, static_argnums=0)
+look = jax.jit(objective.clip_readout, static_argnums=0)
 start = jax.jit(pewm.start, static_argnums=0)
 encode_rgbd = jax.jit(codecs.encode_rgbd, static_argnums=0)
 features = jax.jit(encoders.features, static_argnums=0)
@@ -129,10 +129,10 @@ def inputs():
 def sight_of(kind, encoded):
     """What a reader of pictures is shown, without a token."""
     if not model_of(kind).memory.reader.READS_TOKENS:
-        return Sight(encoded=encoded)
+        return MemoryReadout(encoded=encoded)
     sight = look(model_of(kind), weights(kind), batch())
     tokens = dataclasses.replace(sight.tokens, valid_M=jnp.zeros_like(sight.tokens.valid_M))
-    return Sight(tokens, encoded=encoded)
+    return MemoryReadout(tokens, encoded=encoded)
 
 
 def predict(kind, params, sight):
@@ -158,7 +158,9 @@ def test_a_rollout_looks_as_training_does(kind):
     model, params, clips = model_of(kind), weights(kind), batch()
     sight = look(model, params, clips)
     reader = model.memory.reader
-    given = {field.name for field in dataclasses.fields(Sight) if getattr(sight, field.name)}
+    given = {
+        field.name for field in dataclasses.fields(MemoryReadout) if getattr(sight, field.name)
+    }
     asked = {"tokens": reader.READS_TOKENS, "encoded": reader.READS_LATENTS}
     asked["view"] = reader.READS_VIEW and not reader.READS_LATENTS
     assert given == {name for name, wanted in asked.items() if wanted}
@@ -211,8 +213,8 @@ def test_latents_of_cells_of_which_nothing_is_seen_are_not_read():
     blind = ~encoded.seen_THW.reshape(2, 5, 2, 8, 3, 8).any((3, 5))
     assert blind[:, 2, 0, 1].all()
     junk = jnp.where(blind[..., None], jnp.nan, encoded.latents_thwC)
-    base = predict("picture", weights("picture"), Sight(encoded=encoded))
-    junk = Sight(encoded=EncodedView(junk, encoded.seen_THW))
+    base = predict("picture", weights("picture"), MemoryReadout(encoded=encoded))
+    junk = MemoryReadout(encoded=EncodedView(junk, encoded.seen_THW))
     np.testing.assert_array_equal(predict("picture", weights("picture"), junk), base)
 
 
@@ -222,7 +224,11 @@ def test_each_token_gets_the_latents_and_the_mask_of_its_cell():
     added = jax.jit(
         lambda encoded: (
             readers.prepare(
-                model, params, Sight(encoded=encoded), conditioning.camera, conditioning.rays_BthwC
+                model,
+                params,
+                MemoryReadout(encoded=encoded),
+                conditioning.camera,
+                conditioning.rays_BthwC,
             ).added_BND
         )
     )
@@ -262,7 +268,7 @@ def test_a_prepared_batch_has_the_same_loss(kind):
     stage, config = pewm.STAGES[1], Config(model=model)
     ready = jax.jit(lambda p, c: stage.prepare(model, p, c))(params, clips)
     assert ready.context.depth_THW.size == 0
-    assert ready.sight.view is None
+    assert ready.extras["readout"].view is None
     loss = jax.jit(lambda p, c: stage.loss(model, config.train, p, c, jax.random.key(1))[0])
     np.testing.assert_allclose(loss(params, ready), loss(params, clips), rtol=1e-4)
 
@@ -270,7 +276,7 @@ def test_a_prepared_batch_has_the_same_loss(kind):
 def test_any_codec_encodes_the_picture_and_pixels_are_as_before():
     memory = PointsConfig(capacity=512, tokens=32, reader=LATENTS)
     model = tiny_model(memory=memory)  # the pixel codec, which folds four frames
-    made = jax.eval_shape(functools.partial(objective.clip_sight, model, {}), nine())
+    made = jax.eval_shape(functools.partial(objective.clip_readout, model, {}), nine())
     assert made.encoded.latents_thwC.shape == (2, *model.latent_shape, model.codec.channels)
     params = jax.eval_shape(functools.partial(world_model.init, model), jax.random.key(0))
     per_cell = model.codec.channels + 4 * 4 * 4

@@ -17,7 +17,7 @@ from pewm_jax.nn.signals import as_signal
 from pewm_jax.nn.token_layout import TokenLayout
 from pewm_jax.readers.geometry import sightings, sinusoid_3d
 from pewm_jax.readers.memory_block import MemoryBlock, masked_attention
-from pewm_jax.types import Camera, Clip, Control, Frames, MapTokens, Sight
+from pewm_jax.types import Camera, Clip, Control, Frames, MapTokens, MemoryReadout
 from pewm_jax.worlds import objective, rollouts, world_model
 from tests.helpers import TINY, random_camera, random_frames, randomise, rigid, with_reader
 
@@ -67,7 +67,7 @@ def predict(positions, tokens, conditioning=None, **changes):
     first, _, noisy = inputs()
     model = model_of(positions=positions, **changes)
     conditioning = first if conditioning is None else conditioning
-    return apply(model, weights(positions), noisy, conditioning, TIMES, Sight(tokens))
+    return apply(model, weights(positions), noisy, conditioning, TIMES, MemoryReadout(tokens))
 
 
 def dense(p, x):
@@ -272,7 +272,7 @@ def test_a_denoiser_without_depth_neither_sees_nor_makes_any():
     np.testing.assert_array_equal(base[..., split:], 0)
     assert np.abs(base[..., :split]).max() > 0.1
     deeper = noisy.at[..., split:].add(1.0)
-    out = apply(model, weights("projective"), deeper, conditioning, TIMES, Sight(tokens))
+    out = apply(model, weights("projective"), deeper, conditioning, TIMES, MemoryReadout(tokens))
     np.testing.assert_array_equal(out, base)
     frames = jax.tree.map(jnp.asarray, random_frames(np.random.default_rng(0), 9))
     batch = jax.tree.map(lambda x: x[None], as_signal(frames))
@@ -299,5 +299,5 @@ def test_without_depth_training_weighs_colour_alone_and_rollouts_add_nothing_to_
     np.testing.assert_array_equal(made.depth_THW, 0)
     for a, b in zip(jax.tree.leaves(after.map), jax.tree.leaves(state.map), strict=True):
         np.testing.assert_array_equal(a, b)
-    sight = jax.jit(objective.clip_sight, static_argnums=0)(model, params, batch)
+    sight = jax.jit(objective.clip_readout, static_argnums=0)(model, params, batch)
     assert np.asarray(sight.tokens.valid_M).any()

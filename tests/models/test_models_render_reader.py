@@ -19,7 +19,7 @@ from pewm_jax.config import (
 from pewm_jax.memory import memories
 from pewm_jax.readers import interface as readers
 from pewm_jax.readers import render as render_reader
-from pewm_jax.types import Clip, Control, Frames, MapTokens, Sight, View
+from pewm_jax.types import Clip, Control, Frames, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
@@ -35,7 +35,7 @@ ALL = pytest.mark.parametrize("kind", READERS)
 TIMES = jnp.array([5, 700])
 apply = jax.jit(world_model.apply, static_argnums=0)
 condition = jax.jit(world_model.condition, static_argnums=0)
-look = jax.jit(objective.clip_sight, static_argnums=0)
+look = jax.jit(objective.clip_readout, static_argnums=0)
 
 
 def model_of(kind, memory=VoxelConfig, **sections):
@@ -57,7 +57,7 @@ def inputs():
     first = jax.tree.map(lambda x: x[:, :1], camera)
     observed = Frames(jnp.tanh(draw(2, 1, 16, 24, 3)), depth[:, :1], first)
     conditioning = condition(TINY, {}, observed, Control(camera))
-    sight = Sight(
+    sight = MemoryReadout(
         MapTokens(draw(2, 20, 6), draw(2, 20, 3), jnp.ones((2, 20), bool)),
         View(draw(2, 9, 16, 24, 6), depth, jnp.asarray(rng.uniform(size=(2, 9, 16, 24)) < 0.6)),
     )
@@ -73,7 +73,7 @@ def hidden(sight):
     """The same, but the memory shows nothing."""
     tokens, view = sight.tokens, sight.view
     tokens = dataclasses.replace(tokens, valid_M=jnp.zeros_like(tokens.valid_M))
-    return Sight(tokens, dataclasses.replace(view, seen_THW=jnp.zeros_like(view.seen_THW)))
+    return MemoryReadout(tokens, dataclasses.replace(view, seen_THW=jnp.zeros_like(view.seen_THW)))
 
 
 @ALL
@@ -108,7 +108,7 @@ def test_what_features_say_where_nothing_is_seen_is_not_read(kind):
         seen,
     )
     base = predict(model, params, sight)
-    np.testing.assert_array_equal(predict(model, params, Sight(sight.tokens, junk)), base)
+    np.testing.assert_array_equal(predict(model, params, MemoryReadout(sight.tokens, junk)), base)
 
 
 def test_each_token_gets_the_pixels_that_it_stands_for():
@@ -123,8 +123,8 @@ def test_each_token_gets_the_pixels_that_it_stands_for():
         seen = sight.view.seen_THW.at[:, frame, row, column].set(True)
         moved = dataclasses.replace(sight.view, features_THWF=features, seen_THW=seen)
         shown = dataclasses.replace(sight.view, seen_THW=seen)
-        other = added(sight=Sight(None, moved)).added_BND.reshape(base.shape)
-        same = added(sight=Sight(None, shown)).added_BND.reshape(base.shape)
+        other = added(sight=MemoryReadout(None, moved)).added_BND.reshape(base.shape)
+        same = added(sight=MemoryReadout(None, shown)).added_BND.reshape(base.shape)
         changed = np.argwhere(np.abs(other - same).max(-1) > 0).tolist()
         assert changed == [[1, (frame + 3) // 4, row // 8, column // 8]]
 
@@ -185,7 +185,7 @@ def test_a_rollout_looks_as_training_does(memory):
 def test_readers_get_what_they_ask_for():
     batch = batch_of(None)
     for kind, wanted in {"attend": "tokens", "render": "view", "both": "tokens view"}.items():
-        sight = jax.eval_shape(functools.partial(objective.clip_sight, model_of(kind), {}), batch)
+        sight = jax.eval_shape(functools.partial(objective.clip_readout, model_of(kind), {}), batch)
         given = {name for name in ("tokens", "view") if getattr(sight, name) is not None}
         assert given == set(wanted.split())
 

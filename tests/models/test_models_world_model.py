@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.types import Camera, Control, Frames, MapTokens, Sight
+from pewm_jax.types import Camera, Control, Frames, MapTokens, MemoryReadout
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, random_camera, randomise, rigid, with_reader
 
@@ -43,7 +43,7 @@ def test_fresh_memory_blocks_are_exactly_the_identity(positions):
     params = init_world(model)
     params["backbone"] = randomise(params["backbone"])
     stage1 = apply(model, params, noisy, conditioning, times)
-    stage2 = apply(model, params, noisy, conditioning, times, Sight(tokens))
+    stage2 = apply(model, params, noisy, conditioning, times, MemoryReadout(tokens))
     assert np.abs(stage1).max() > 0.1
     np.testing.assert_array_equal(stage1, stage2)
 
@@ -55,13 +55,13 @@ def test_an_empty_map_contributes_nothing_and_has_finite_gradients(positions):
     without = apply(model, params, noisy, conditioning, times)
     empty = dataclasses.replace(tokens, valid_M=jnp.zeros_like(tokens.valid_M))
     np.testing.assert_array_equal(
-        apply(model, params, noisy, conditioning, times, Sight(empty)), without
+        apply(model, params, noisy, conditioning, times, MemoryReadout(empty)), without
     )
-    full = apply(model, params, noisy, conditioning, times, Sight(tokens))
+    full = apply(model, params, noisy, conditioning, times, MemoryReadout(tokens))
     assert np.abs(full - without).max() > 1e-3
 
     def total(params, tokens):
-        return (apply(model, params, noisy, conditioning, times, Sight(tokens)) ** 2).sum()
+        return (apply(model, params, noisy, conditioning, times, MemoryReadout(tokens)) ** 2).sum()
 
     grads = jax.jit(jax.grad(total))(params, empty)
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(grads))
@@ -71,17 +71,17 @@ def test_an_empty_map_contributes_nothing_and_has_finite_gradients(positions):
 def test_masked_tokens_contribute_nothing(positions):
     model, conditioning, tokens, noisy, times = setup(positions)
     params = randomise(init_world(model, jax.random.key(0)))
-    base = apply(model, params, noisy, conditioning, times, Sight(tokens))
+    base = apply(model, params, noisy, conditioning, times, MemoryReadout(tokens))
     other = dataclasses.replace(
         tokens,
         features_MF=tokens.features_MF.at[:, 15:].set(50.0),
         points_world_M3=tokens.points_world_M3.at[:, 15:].add(0.5),
     )
     np.testing.assert_array_equal(
-        apply(model, params, noisy, conditioning, times, Sight(other)), base
+        apply(model, params, noisy, conditioning, times, MemoryReadout(other)), base
     )
     seen = dataclasses.replace(tokens, features_MF=tokens.features_MF.at[:, :15].add(1.0))
-    changed = apply(model, params, noisy, conditioning, times, Sight(seen))
+    changed = apply(model, params, noisy, conditioning, times, MemoryReadout(seen))
     assert np.abs(changed - base).max() > 1e-4
 
 
@@ -89,7 +89,7 @@ def test_masked_tokens_contribute_nothing(positions):
 def test_moving_cameras_and_map_together_changes_nothing(positions):
     model, conditioning, tokens, noisy, times = setup(positions)
     params = randomise(init_world(model, jax.random.key(0)))
-    base = apply(model, params, noisy, conditioning, times, Sight(tokens))
+    base = apply(model, params, noisy, conditioning, times, MemoryReadout(tokens))
     motion = rigid(np.random.default_rng(3))
     camera = conditioning.camera
     moved = dataclasses.replace(
@@ -97,9 +97,9 @@ def test_moving_cameras_and_map_together_changes_nothing(positions):
     )
     points = tokens.points_world_M3 @ motion[:3, :3].T + motion[:3, 3]
     moved_tokens = dataclasses.replace(tokens, points_world_M3=points)
-    again = apply(model, params, noisy, moved, times, Sight(moved_tokens))
+    again = apply(model, params, noisy, moved, times, MemoryReadout(moved_tokens))
     np.testing.assert_allclose(again, base, atol=5e-3 * float(np.abs(base).max()))
-    alone = apply(model, params, noisy, conditioning, times, Sight(moved_tokens))
+    alone = apply(model, params, noisy, conditioning, times, MemoryReadout(moved_tokens))
     assert np.abs(alone - base).max() > 1e-2 * np.abs(base).max()
 
 

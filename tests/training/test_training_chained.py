@@ -15,7 +15,7 @@ from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import BothConfig, ConfigError, PixelConfig, TrainConfig, UserError
 from pewm_jax.memory import memories
 from pewm_jax.nn.signals import as_signal
-from pewm_jax.types import EncodedView, MapTokens, Sight, View
+from pewm_jax.types import EncodedView, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import chained, objective, world_model
 from pewm_jax.worlds import costs as world_costs
 from tests.helpers import TINY, init_world, randomise, tiny_config
@@ -49,7 +49,9 @@ def shows(config, seed=0):
     features[..., :3] = number[..., None] / size.frames
     points = rng.normal(size=(BATCH, SLOTS, channels + 3)).astype(np.float32)
     tokens = MapTokens(points[..., 3:], points[..., :3], np.ones((BATCH, SLOTS), bool))
-    return Sight(tokens, View(features, 1 + number.astype(np.float32), np.ones(shape, bool)))
+    return MemoryReadout(
+        tokens, View(features, 1 + number.astype(np.float32), np.ones(shape, bool))
+    )
 
 
 def ready_batch(config):
@@ -57,9 +59,8 @@ def ready_batch(config):
     clip = jax.tree.map(jnp.asarray, a_batch(config, BATCH))
     frames = as_signal(clip.frames)
     encode = jax.jit(lambda f: codecs.encode_rgbd(config.model, {}, f.rgb_THWC, f.depth_THW))
-    return dataclasses.replace(
-        clip, frames=frames, latents_thwC=encode(frames), sight=shows(config)
-    )
+    clip = dataclasses.replace(clip, frames=frames)
+    return clip.with_extras(latents_thwC=encode(frames), readout=shows(config))
 
 
 @pytest.fixture(scope="module")
@@ -78,14 +79,14 @@ def loss(params, clip, **settings):
 
 def test_a_memory_hidden_from_all_clips_is_an_empty_one(world):
     params, ready = world
-    empty = jax.tree.map(np.zeros_like, ready.sight)
-    without = loss(params, dataclasses.replace(ready, sight=empty))
+    empty = jax.tree.map(np.zeros_like, ready.extras["readout"])
+    without = loss(params, ready.with_extras(readout=empty))
     assert abs(loss(params, ready) - without) > 1e-4
     assert loss(params, ready, hidden=1.0) == without
 
 
 def test_the_memory_is_hidden_clip_by_clip(world):
-    sight = world[1].sight
+    sight = world[1].extras["readout"]
     kept = jnp.array([True, False, True, False])
     partly = objective.shown(sight, kept)
     for row, whole in enumerate(kept):
@@ -104,8 +105,8 @@ def test_chained_clips_are_learnt_from_the_models_own_frame(world):
             1.0,
             params,
             ready.frames,
-            ready.latents_thwC,
-            ready.sight,
+            ready.extras["latents_thwC"],
+            ready.extras["readout"],
             jax.random.fold_in(KEY, 5),
         )
 
@@ -136,7 +137,7 @@ def looking_back(monkeypatch, config, share):
 
     @jax.jit
     def made():
-        sight, latents = ready.sight, ready.latents_thwC
+        sight, latents = ready.extras["readout"], ready.extras["latents_thwC"]
         out = chained.first_frames(model, share, {}, ready.frames, latents, sight, KEY)
         return out, dict(got)
 
@@ -157,9 +158,11 @@ def test_the_clip_before_leads_back_to_the_first_frame(monkeypatch):
     poses = frames.camera.world_from_camera[:, ::-1]
     np.testing.assert_array_equal(got["conditioning"].camera.world_from_camera, poses)
     observed = got["conditioning"].given.joined_BthwC[:, 0, ..., : model.codec.channels]
-    np.testing.assert_allclose(observed, ready.latents_thwC[:, -1], atol=1e-5)
+    np.testing.assert_allclose(observed, ready.extras["latents_thwC"][:, -1], atol=1e-5)
     np.testing.assert_array_equal(got["sight"].view.depth_THW[0, :, 0, 0], [5, 4, 3, 2, 1])
-    np.testing.assert_array_equal(got["sight"].tokens.features_MF, ready.sight.tokens.features_MF)
+    np.testing.assert_array_equal(
+        got["sight"].tokens.features_MF, ready.extras["readout"].tokens.features_MF
+    )
 
 
 def test_only_a_share_goes_through_the_model_and_frames_may_be_folded(monkeypatch):
@@ -212,7 +215,9 @@ def test_the_forward_pass_of_chained_clips_is_counted():
         assert all_of_it == pytest.approx(expected), part
 
 
-@pytest.mark.parametrize("field", [f.name for f in dataclasses.fields(Sight) if f.name != "tokens"])
+@pytest.mark.parametrize(
+    "field", [f.name for f in dataclasses.fields(MemoryReadout) if f.name != "tokens"]
+)
 def test_a_clip_that_is_run_backwards_is_shown_the_memory_backwards(field):
     """Every part of what the memory shows, also one that is added later."""
     sight = shows(CONFIG)
@@ -230,6 +235,6 @@ def test_encoded_pictures_of_folded_frames_cannot_be_run_backwards():
     folded = config_of(PixelConfig(spatial=4, temporal=4)).model
     sight = shows(CONFIG)
     seen = sight.view.seen_THW
-    sight = Sight(sight.tokens, None, EncodedView(np.zeros((BATCH, 2, 4, 4, 3)), seen))
+    sight = MemoryReadout(sight.tokens, None, EncodedView(np.zeros((BATCH, 2, 4, 4, 3)), seen))
     with pytest.raises(UserError, match="folds several frames into one latent: use a codec of"):
         chained.backwards(folded, sight)

@@ -41,13 +41,13 @@ def test_the_map_of_kept_features_is_the_map_of_computed_ones(config):
     cache = starting.features(config, pewm.STAGES[1])
     kept, plain = batch(config, cache), batch(config, None)
     assert not kept.context_valid_S.all(), "the test should see slots without a frame"
-    assert kept.context_features_ShwF.shape == (3, 6, 8, 12, 6)
-    assert plain.context_features_ShwF is None
-    sight = jax.jit(objective.clip_sight, static_argnums=0)
+    assert kept.extras["context_features_ShwF"].shape == (3, 6, 8, 12, 6)
+    assert "context_features_ShwF" not in plain.extras
+    sight = jax.jit(objective.clip_readout, static_argnums=0)
     got, want = (sight(config.model, {}, clip).tokens for clip in (kept, plain))
     assert np.asarray(want.valid_M).any(1).all()
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), got, want)
-    scaled = dataclasses.replace(kept, context_features_ShwF=2 * kept.context_features_ShwF)
+    scaled = kept.with_extras(context_features_ShwF=2 * kept.extras["context_features_ShwF"])
     features = sight(config.model, {}, scaled).tokens.features_MF
     np.testing.assert_allclose(features, 2 * np.asarray(want.features_MF), atol=1e-6)
 

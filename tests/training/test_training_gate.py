@@ -156,8 +156,8 @@ def test_the_gate_learns_alone_on_what_the_model_imagines(reader):
     params = randomise(init_world(config.model))
     clip = batch(config, 2)
     ready = jax.device_get(jax.jit(lambda p, c: LAST.prepare(config.model, p, c))(params, clip))
-    assert ready.latents_thwC.shape[:2] == (2, 9)
-    assert ready.sight.view.seen_THW.any()
+    assert ready.extras["latents_thwC"].shape[:2] == (2, 9)
+    assert ready.extras["readout"].view.seen_THW.any()
     trained = {
         path for path, label in tree.flatten(LAST.labels(params)).items() if label == "train"
     }

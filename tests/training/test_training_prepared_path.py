@@ -26,12 +26,12 @@ def prepare(model, params, clip):
     latents = clip.frames.rgb_THWC[:, :, :2, :2].astype(jnp.float32) / 255
     if "codec" in params:
         latents = latents * params["codec"]["kernel"].sum()
-    return dataclasses.replace(
+    emptied = dataclasses.replace(
         clip,
         context=jax.tree.map(lambda x: x[:, :0], clip.context),
         context_valid_S=clip.context_valid_S[:, :0],
-        latents_thwC=latents,
     )
+    return emptied.with_extras(latents_thwC=latents)
 
 
 STAGE = dataclasses.replace(fakes.STAGES[0], prepare=prepare)

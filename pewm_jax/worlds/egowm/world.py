@@ -28,6 +28,7 @@ from pewm_jax.worlds.pewm import costs as pewm_costs
 from pewm_jax.worlds.pewm import world as pewm
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
+memory_points, point_colours = pewm.memory_points, pewm.point_colours
 init = functools.partial(world_model.init, memory=False)
 sharding = pewm.sharding
 split_heads = pewm.split_heads

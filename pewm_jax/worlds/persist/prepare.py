@@ -1,12 +1,11 @@
 """What each stage of the world ``persist`` is given of a batch of clips.
 
-It is computed with frozen weights, once where ``data.prepared`` asks for it; ``Clip.prepared``
-holds it. The voxels of a clip are seen in windows, as in a rollout.
+It is computed with frozen weights, once where ``data.prepared`` asks for it; The clip's extra
+``prepared`` holds it. The voxels of a clip are seen in windows, as in a rollout.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from typing import Any
 
@@ -39,7 +38,7 @@ def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
     """
     require_recorded(model, clip)
     size = windows.cell_m(model)
-    origin = jnp.asarray(clip.origin_T3)
+    origin = jnp.asarray(clip.extras["origin_T3"])
     first = jnp.floor(origin[:, :1] / size + 1e-3).astype(jnp.int32)
     recorded = first + jnp.round((origin - origin[:, :1]) / size).astype(jnp.int32)
     place = jnp.asarray(clip.frames.camera.world_from_camera)[..., :3, 3]
@@ -63,7 +62,7 @@ def _mixed(cell_BT3: Array) -> Array:
 
 def cut(model: PersistConfig, clip: Clip, start_BT3: Array, recorded_BT3: Array) -> Array:
     """Return (B, T, X, Y, Z) int16 windows of the recorded grids, unknown where they reach out."""
-    classes = jnp.asarray(clip.classes_TXYZ).astype(jnp.int16)
+    classes = jnp.asarray(clip.extras["classes_TXYZ"]).astype(jnp.int16)
     one = functools.partial(windows.cut, count=windows.side(model))
     return jax.vmap(jax.vmap(one))(classes, start_BT3 - recorded_BT3)
 
@@ -82,7 +81,7 @@ def grids(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     del params
     recorded, start = lattice(model, clip)
     ends = jnp.array([0, -1])
-    some = dataclasses.replace(clip, classes_TXYZ=jnp.asarray(clip.classes_TXYZ)[:, ends])
+    some = clip.with_extras(classes_TXYZ=jnp.asarray(clip.extras["classes_TXYZ"])[:, ends])
     return _prepared(clip, jnp.maximum(cut(model, some, start[:, ends], recorded[:, ends]), 0))
 
 
@@ -110,7 +109,7 @@ def frames(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     patch = model.backbone.world_frames.patch  # type: ignore[attr-defined]
     known = windows.spread(own, patch) & recorded_too
 
-    corner = jnp.asarray(clip.origin_T3) - recorded * windows.cell_m(model)
+    corner = jnp.asarray(clip.extras["origin_T3"]) - recorded * windows.cell_m(model)
     middle = windows.middle(model, corner, last)
     _, shown = pictures(model, params, clip)
     told = windows.told(model, shown, middle)
@@ -142,11 +141,11 @@ def cameras(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     recorded, _ = lattice(model, clip)
     size, config = windows.cell_m(model), model.backbone.camera_model  # type: ignore[attr-defined]
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
-    place, origin = camera.world_from_camera[..., :3, 3], jnp.asarray(clip.origin_T3)
+    place, origin = camera.world_from_camera[..., :3, 3], jnp.asarray(clip.extras["origin_T3"])
     cell = jnp.floor((place - origin) / size).astype(jnp.int32)
     before = losses.previous(recorded + cell)
     one = functools.partial(windows.cut, count=config.inner)
-    classes = jnp.asarray(clip.classes_TXYZ).astype(jnp.int16)
+    classes = jnp.asarray(clip.extras["classes_TXYZ"]).astype(jnp.int16)
     inner = jax.vmap(jax.vmap(one))(classes, before - config.inner // 2 - recorded)
     made = {
         "classes": jnp.maximum(inner, 0),
@@ -162,7 +161,7 @@ def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     recorded, start = lattice(model, clip)
     classes = jnp.maximum(cut(model, clip, start, recorded), 0)
     size = windows.cell_m(model)
-    corner = jnp.asarray(clip.origin_T3) + (start - recorded) * size
+    corner = jnp.asarray(clip.extras["origin_T3"]) + (start - recorded) * size
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     pixels = (model.clip.height, model.clip.width)
 
@@ -193,7 +192,7 @@ def require_recorded(model: PersistConfig, clip: Clip) -> None:
     Raises:
         UserError: no voxels, no actions, or grids of another size.
     """
-    memory, classes = model.memory, clip.classes_TXYZ
+    memory, classes = model.memory, clip.extras.get("classes_TXYZ")
     groups = f"--voxels.kinds {memory.kinds} --voxels.colours {memory.colours}"  # type: ignore[attr-defined]
     command = (
         f"pewm-jax data collect DATA --moving --voxels --voxels.cell {windows.cell_m(model):g} "
@@ -216,4 +215,9 @@ def _prepared(clip: Clip, made: Any) -> Clip:
     def none(x: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[:, :0], x)
 
-    return Clip(none(clip.frames), none(clip.context), clip.context_valid_S[:, :0], prepared=made)
+    return Clip(
+        none(clip.frames),
+        none(clip.context),
+        clip.context_valid_S[:, :0],
+        extras={"prepared": made},
+    )

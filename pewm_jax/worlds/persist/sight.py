@@ -32,7 +32,7 @@ NEAREST_M = 0.05
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Sight:
+class ObservedCells:
     """What is seen of the cells of a window.
 
     Attributes:
@@ -44,7 +44,7 @@ class Sight:
     colour_XYZ: Array
 
 
-def advantage(model: PersistConfig, sight: Sight, classes: int) -> Array:
+def advantage(model: PersistConfig, sight: ObservedCells, classes: int) -> Array:
     """Return the nats (X, Y, Z, classes) that sight adds to the scores of classes."""
     number = jnp.arange(classes)
     colours = model.memory.colours  # type: ignore[attr-defined]
@@ -55,7 +55,7 @@ def advantage(model: PersistConfig, sight: Sight, classes: int) -> Array:
 
 def seen(
     model: PersistConfig, corner_3: Array, rgb_HWC: Array, depth_HW: Array, camera: Camera
-) -> Sight:
+) -> ObservedCells:
     """Return what a picture shows of a window's cells.
 
     Args:
@@ -87,7 +87,7 @@ def seen(
     votes = votes.at[cell, colour_HW.reshape(-1)].add(1)[:-1]
     colour = votes.argmax(-1).reshape((side,) * 3).astype(jnp.int32)
     air = _before(model, corner_3, depth_HW, camera) & ~surface
-    return Sight(air, jnp.where(surface, colour, -1))
+    return ObservedCells(air, jnp.where(surface, colour, -1))
 
 
 def _before(model: PersistConfig, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:

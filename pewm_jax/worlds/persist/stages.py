@@ -47,11 +47,9 @@ def _of(
     prepare: Callable[..., Clip], model: PersistConfig, params: Params, clip: Clip
 ) -> dict[str, Any]:
     """Return what a stage is given of a batch, prepared now if it was not before."""
-    if clip.prepared is not None:
-        return clip.prepared
-    made = prepare(model, jax.lax.stop_gradient(params), clip).prepared
-    assert made is not None
-    return made
+    if "prepared" not in clip.extras:
+        clip = prepare(model, jax.lax.stop_gradient(params), clip)
+    return clip.extras["prepared"]
 
 
 def autoencode(

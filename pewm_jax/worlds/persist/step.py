@@ -19,7 +19,7 @@ from pewm_jax.worlds.persist import sight as persist_sight
 from pewm_jax.worlds.persist import voxels as persist_voxels
 from pewm_jax.worlds.persist import windows
 from pewm_jax.worlds.persist.past import Given, History, Past, decoded, encoded
-from pewm_jax.worlds.persist.sight import Sight
+from pewm_jax.worlds.persist.sight import ObservedCells
 
 
 def begin(
@@ -148,7 +148,7 @@ def _sight(
     rgb_HWC: Array,
     depth_HW: Array,
     camera: Camera,
-) -> Sight | None:
+) -> ObservedCells | None:
     """Return what a real picture shows of the window's cells, where the model looks."""
     if not model.sight:
         return None

@@ -21,7 +21,7 @@ from pewm_jax.types import Array, Params
 from pewm_jax.worlds.persist import sight as persist_sight
 from pewm_jax.worlds.persist import windows
 from pewm_jax.worlds.persist.past import History, context
-from pewm_jax.worlds.persist.sight import Sight
+from pewm_jax.worlds.persist.sight import ObservedCells
 
 
 def sample(
@@ -32,7 +32,7 @@ def sample(
     middle_3: Array,
     before_XYZ: Array,
     key: Array,
-    sight: Sight | None = None,
+    sight: ObservedCells | None = None,
 ) -> Array:
     """Sample a voxel frame: (X, Y, Z) class ids.
 
@@ -69,7 +69,7 @@ def held(
     params: Params,
     latents_BxyzC: Array,
     before_XYZ: Array,
-    sight: Sight | None = None,
+    sight: ObservedCells | None = None,
 ) -> Array:
     """Return the class ids (X, Y, Z) that latents (1, …) decode to.
 
@@ -84,7 +84,7 @@ def held(
         return voxel_vae.decode(config, weights, latents_BxyzC, dtype)[0]
     features = voxel_vae.features(config, weights, latents_BxyzC, dtype)[0]
 
-    def likeliest(slab: tuple[Array, Array, Sight | None]) -> Array:
+    def likeliest(slab: tuple[Array, Array, ObservedCells | None]) -> Array:
         features, before, sight = slab
         scores = linear(weights["decoder"]["scores"], features).astype(jnp.float32)
         number, before = jnp.arange(config.classes), before[..., None]

@@ -36,6 +36,8 @@ from pewm_jax.worlds.persist.step import begin, step
 from pewm_jax.worlds.pewm import world as pewm
 from pewm_jax.worlds.stages import Stage
 
+memory_points, point_colours = pewm.memory_points, pewm.point_colours
+erase, move = pewm.erase, pewm.move
 init = persist_stages.init
 costs = persist_stages.costs
 START = 0

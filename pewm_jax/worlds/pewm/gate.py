@@ -46,23 +46,21 @@ def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
         UserError: the model's codec has no gate, or its memory shows no colours.
     """
     require_gate(model)
-    sight = objective.clip_sight(model, params, clip, pictures=True)
+    sight = objective.clip_readout(model, params, clip, pictures=True)
     frames = as_signal(clip.frames)
     observed = jax.tree.map(lambda x: x[:, :1], frames)
-    control = Control(frames.camera, clip.actions_TA, clip.state_A)
+    control = Control(frames.camera, clip.actions_TA, clip.extras.get("state_A"))
     conditioning = world_model.condition(model, params, observed, control)
     key = jax.random.fold_in(jax.random.key(0), clip.frames.rgb_THWC.astype(jnp.uint32).sum())
     shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
     noise = jax.random.normal(key, shape)
     latents = sampling.sample(model, params, conditioning, sight, noise, jax.random.fold_in(key, 1))
-    return dataclasses.replace(
+    emptied = dataclasses.replace(
         clip,
         context=jax.tree.map(lambda x: x[:, :0], clip.context),
         context_valid_S=clip.context_valid_S[:, :0],
-        context_features_ShwF=None,
-        latents_thwC=latents,
-        sight=sight,
     )
+    return emptied.with_extras(context_features_ShwF=None, latents_thwC=latents, readout=sight)
 
 
 def loss(
@@ -71,12 +69,11 @@ def loss(
     """Return the loss of the gate on imagined frames; see ``codec_gate.score``."""
     assert isinstance(train, TrainConfig)
     del key
-    if clip.latents_thwC is None:
+    if "latents_thwC" not in clip.extras:
         clip = jax.lax.stop_gradient(prepare(model, params, clip))
-    assert clip.sight is not None
-    assert clip.sight.view is not None
-    rgb, depth = codecs.decode_rgbd(model, params, clip.latents_thwC)
-    view = clip.sight.view
+    view = clip.extras["readout"].view
+    assert view is not None
+    rgb, depth = codecs.decode_rgbd(model, params, clip.extras["latents_thwC"])
     far = signal_from_depth(model.clip, view.depth_THW)[..., None]
     shown = jnp.concatenate([view.features_THWF[..., :3], far], -1)
     frames = as_signal(clip.frames)

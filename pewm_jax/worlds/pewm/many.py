@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ModelConfig
 from pewm_jax.memory import memories
-from pewm_jax.types import Array, Camera, Control, Frames, Params, Sight, View, WorldState
+from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params, View, WorldState
 from pewm_jax.worlds import sampling, world_model
 from pewm_jax.worlds.control import control_of
 
@@ -151,7 +151,7 @@ def _clip(
 
 def look(
     model: ModelConfig, remembered: Any, camera: Camera, params: Params, view: View | None = None
-) -> Sight:
+) -> MemoryReadout:
     """Return what a memory shows K clips, leading axis K; see ``memories.look``.
 
     Args:

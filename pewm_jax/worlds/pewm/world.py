@@ -18,9 +18,11 @@ from jax.sharding import PartitionSpec as P
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import ModelConfig, UserError, functions
 from pewm_jax.encoders import interface as encoders
+from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import memories
+from pewm_jax.memory import views as memory_views
 from pewm_jax.nn.signals import as_signal
-from pewm_jax.types import Array, Control, Frames, Params, Sight, WorldState
+from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, WorldState
 from pewm_jax.worlds import chunks, objective, sampling, world_model
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.pewm import costs as pewm_costs
@@ -212,7 +214,69 @@ def imagine_clip(
     return WorldState(chunks.last(frames, end), remembered), frames
 
 
-def new_surfaces(model: ModelConfig, frames: Frames, sight: Sight | None) -> Frames:
+def memory_points(model: ModelConfig, memory: Any) -> tuple[Array, Array, Array, Array | None]:
+    """Return the memory's points; see ``World.memory_points``."""
+    return *memories.to_points(model, memory), getattr(memory, "observed_V", None)
+
+
+def point_colours(model: ModelConfig, features_VF: Array) -> Array:
+    """Return the colours in which points are drawn; see ``World.point_colours``."""
+    return memories.colours(model, features_VF)
+
+
+def erase(model: ModelConfig, params: Params, state: WorldState, box_23: Array) -> WorldState:
+    """Forget what is in a box, in the memory and in the present frame; see ``World.erase``."""
+    del params
+    return _looked_at(model, state, memories.erase(model, state.map, box_23))
+
+
+def move(
+    model: ModelConfig,
+    params: Params,
+    state: WorldState,
+    box_23: Array,
+    transform: Array,
+    *,
+    leave: bool = False,
+) -> WorldState:
+    """Move what is in a box, in the memory and in the present frame; see ``World.move``."""
+    del params
+    changed = memories.move(model, state.map, box_23, transform, leave=leave)
+    return _looked_at(model, state, changed)
+
+
+def _looked_at(model: ModelConfig, state: WorldState, changed: memories.Memory) -> WorldState:
+    """Return a state with a changed memory, whose present frame shows the change.
+
+    The next clip is imagined from the present frame, too: what was erased would be copied from it.
+    So its pixels are taken from the memory where the memory looks different now; holes are filled
+    with what is nearest to them. Memories that cannot be rendered in colours leave the frame as it
+    is.
+    """
+    frame = state.frame
+    if not memories.shows_colours(model):
+        return WorldState(frame, changed)
+    size = (model.clip.height, model.clip.width)
+    before, after = (memories.render(model, m, frame.camera, *size) for m in (state.map, changed))
+    apart = jnp.abs(before.features_THWF - after.features_THWF).max(-1) > 1e-3
+    apart = apart | (before.seen_THW != after.seen_THW)
+    apart = apart | (jnp.abs(before.depth_THW - after.depth_THW) > 1e-3)
+    whole = memory_views.fill_nearest(after)
+    rgb = jnp.where(apart[..., None], whole.features_THWF[..., :3], frame.rgb_THWC)
+    depth = jnp.where(apart, whole.depth_THW, frame.depth_THW)
+    return WorldState(Frames(rgb, depth, frame.camera), changed)
+
+
+def coverage(
+    model: ModelConfig, params: Params, state: WorldState, frames: Frames, seen_THW: Array
+) -> dict[str, Array]:
+    """Count the pixels that the memory covers; see ``memory.coverage``."""
+    del params
+    tokens = memories.tokens(model, state.map, frames.camera)
+    return vars(memory_coverage.coverage(model, state.map, tokens, frames, seen_THW))
+
+
+def new_surfaces(model: ModelConfig, frames: Frames, sight: MemoryReadout | None) -> Frames:
     """Return imagined frames with a depth of 0 where the memory showed something already."""
     again = getattr(model.memory, "imagined_again", True)
     if again or sight is None or sight.view is None:
