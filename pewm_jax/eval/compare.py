@@ -99,8 +99,10 @@ def compare(
     content = content_of(*groups)
     folder = Path(out) if out else first.folder.parent / f"compare-{_short(groups[1][0])}"
     make_folder(folder)
-    pictures = compare_page.side_by_side(first.protocol, first.folder, groups[1][0].folder)
-    atomic.write_text(folder / PAGE, compare_page.render(content, pictures))
+    pictures = compare_page.side_by_side(
+        first.protocol.long_horizon, first.folder, groups[1][0].folder
+    )
+    atomic.write_text(folder / PAGE, compare_page.comparison_page(content, pictures))
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     atomic.write_text(folder / COMPARISON, text + "\n")
     for line in compare_page.sentences(content):

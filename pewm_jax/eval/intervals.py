@@ -18,7 +18,8 @@ import numpy as np
 from scipy import stats
 
 from pewm_jax.eval.images import MASKS
-from pewm_jax.eval.statistics import ours, scores
+from pewm_jax.eval.statistics import scores
+from pewm_jax.report.labels import own_method
 
 DRAWS, SEED, LEVEL = 10_000, 0, 0.95
 """Bootstrap samples, the seed that they are drawn from, and the share that an interval holds."""
@@ -184,7 +185,7 @@ def table(sums: Mapping[str, np.ndarray], houses_C: np.ndarray) -> dict[str, Any
 
 def _minus(by_method: Mapping[str, Any]) -> dict[str, Any]:
     """Subtract every other method's scores from the model's own; sampling seeds averaged."""
-    own = ours(by_method)
+    own = own_method(by_method)
     mine = by_method[own]
     return {
         method: {

@@ -17,6 +17,7 @@ from pewm_jax.eval.metrics.structure import Consistency
 from pewm_jax.eval.metrics.videos import DISTANCES
 from pewm_jax.eval.mirror import Mirror
 from pewm_jax.eval.scoring import TRUTH, Scored
+from pewm_jax.report.labels import own_method
 
 SCHEMA = 1
 """Version of the layout of ``metrics.json``, which ``docs/evaluation.md`` describes. Entries may be
@@ -96,7 +97,7 @@ def structure(config: Config, scored: Scored, consistency: Consistency) -> dict[
         return intervals.entry(values, scored.clusters)
 
     values = {method: scs for method, scs in scored.structure.items() if method != TRUTH}
-    truth, own = scored.structure[TRUTH], values[statistics.ours(values)]
+    truth, own = scored.structure[TRUTH], values[own_method(values)]
     return {
         "name": consistency.name,
         "seed": config.evaluate.seeds[0],
@@ -133,7 +134,7 @@ def videos(config: Config, scored: Scored, i3d: VideoDistance) -> dict[str, Any]
 
 def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str, Any]:
     """Describe the measurement completely enough to repeat it."""
-    clip, choices, own = config.model.clip, scored.choices, statistics.ours(scored.sums)
+    clip, choices, own = config.model.clip, scored.choices, own_method(scored.sums)
     remembers = own == "memory"
     scenes = sorted({choice.scene for choice in choices + long.scored.choices})
     return {

@@ -21,7 +21,7 @@ import numpy as np
 from pewm_jax.config import UserError
 from pewm_jax.eval.imagine import Imagination, copy_last
 from pewm_jax.eval.reproject import ReprojectSettings, reproject_batch
-from pewm_jax.eval.statistics import OURS
+from pewm_jax.report.labels import OWN_METHODS
 from pewm_jax.types import Array, Camera, Frames
 
 METHODS = ("memory", "empty", "model", "none", "reproject", "copy")
@@ -73,7 +73,7 @@ class Methods:
         """Compile what some methods need."""
         methods = set(methods)
         known = ("empty", "memory", "model")
-        self.model.prepare([name in OURS for name in known if name in methods])
+        self.model.prepare([name in OWN_METHODS for name in known if name in methods])
         if self.none is not None and "none" in methods:
             self.none.prepare([False])
 
@@ -109,7 +109,9 @@ class Methods:
             return None, None, reproject_batch(self.reproject, context, camera)
         given: dict[str, Any] = {} if watch is None else {"watch": watch}
         model = self.none if method == "none" and self.none is not None else self.model
-        first, last, frames = model.run(context, control, seeds_B2, memory=method in OURS, **given)
+        first, last, frames = model.run(
+            context, control, seeds_B2, memory=method in OWN_METHODS, **given
+        )
         if not all(np.isfinite(leaf).all() for leaf in (frames.rgb_THWC, frames.depth_THW)):
             raise UserError(
                 "the model imagines values that are not finite: its weights are damaged or its "

@@ -31,9 +31,9 @@ from pewm_jax.eval.partial import Partials
 from pewm_jax.eval.protocol import ClipChoice, load_clip, stack
 from pewm_jax.eval.scoring import TRUTH, Batch, Scored
 from pewm_jax.eval.shares import gathered, share
-from pewm_jax.eval.statistics import ours
 from pewm_jax.geometry.actions import there_and_back
 from pewm_jax.io.progress import Meter
+from pewm_jax.report.labels import own_method
 from pewm_jax.types import Frames
 
 USUAL, LONG = 32, 64
@@ -235,7 +235,7 @@ def _of_model(
 def facts(mirror: Mirror) -> dict[str, Any]:
     """Return the numbers for ``metrics.json``; ``docs/evaluation.md`` describes them."""
     houses = mirror.scored.clusters
-    own, truth = ours(mirror.pairs), mirror.values[TRUTH]
+    own, truth = own_method(mirror.pairs), mirror.values[TRUTH]
 
     def entries(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
         return {name: intervals.entry(values, houses) for name, values in arrays.items()}

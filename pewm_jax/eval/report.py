@@ -17,6 +17,7 @@ from pewm_jax.eval import loaded_run as runs
 from pewm_jax.eval import protocol_file, reproject_choice, samples, steering
 from pewm_jax.eval.covered import score_coverage
 from pewm_jax.eval.fixed import decide, shortened
+from pewm_jax.eval.gallery import make_gallery
 from pewm_jax.eval.imagine import Imagination, print_now
 from pewm_jax.eval.long_rollouts import LongRollouts, roll_long
 from pewm_jax.eval.measure import measure
@@ -28,15 +29,14 @@ from pewm_jax.eval.protocol import ClipChoice, file_hash, fingerprint
 from pewm_jax.eval.scoring import Scored, score_table
 from pewm_jax.eval.shares import first_alone
 from pewm_jax.io import atomic
-from pewm_jax.report.gallery import ROWS, Gallery, make_gallery
+from pewm_jax.report.evaluation_page import Gallery, evaluation_page
 from pewm_jax.report.labels import score_lines, summary_lines
-from pewm_jax.report.page import render
-from pewm_jax.report.pictures import save_png
+from pewm_jax.report.pictures import ROWS, save_png
 from pewm_jax.train import processes
 
 TRAINED_ON = "train"
 """The split that training reads."""
-REPORT_VERSION = 10
+REPORT_VERSION = 11
 """Increase it whenever the same scores would give another report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
@@ -238,7 +238,7 @@ def _write(
     facts = {name: metrics["protocol"][name] for name in names}
     samples.save(folder, samples.gather(scored, long, **facts))
     _save_pictures(folder, gallery)
-    page = render(metrics, gallery)
+    page = evaluation_page(metrics, gallery)
     atomic.write_text(folder / PAGE, page)
     metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()
     atomic.write_text(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")

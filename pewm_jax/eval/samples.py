@@ -21,8 +21,9 @@ from pewm_jax.config import UserError
 from pewm_jax.eval.long_rollouts import LongRollouts
 from pewm_jax.eval.protocol import ClipChoice
 from pewm_jax.eval.scoring import Scored
-from pewm_jax.eval.statistics import ours, scores
+from pewm_jax.eval.statistics import scores
 from pewm_jax.io import atomic
+from pewm_jax.report.labels import own_method
 
 SAMPLES, VERSION = "samples.npz", 1
 PARTS = ("clips", "frames", "rollouts")
@@ -47,7 +48,7 @@ class Samples:
     @property
     def own(self) -> str:
         """The method that is the model itself: ``memory``, or ``model`` if it has none."""
-        return ours(name.split("/")[1] for name in self.arrays)
+        return own_method(name.split("/")[1] for name in self.arrays)
 
     def table(self, part: str, method: str) -> dict[str, dict[str, np.ndarray]]:
         """Return ``[mask][metric]`` of one of ``PARTS``; empty where there is no such method."""

@@ -9,29 +9,21 @@ score more precise but say nothing about new places.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from pewm_jax.eval.images import MASKS, PSNR_CEILING, SUMS
+from pewm_jax.report.labels import own_method
 
 METRICS = ("psnr", "ssim", "depth_mae", "depth_rel")
 """dB; structural similarity; metres; share of the true depth. Under the mask ``all`` there is also
 ``lpips`` where it was measured."""
 ENDS = 16
 """Frames at the start and at the end of a long rollout that are compared to tell its drift."""
-OURS = ("memory", "model")
-"""The rows of the model itself: with its map, or of a model that has no memory; one report has one
-of them."""
 LEAST_SHARE = 0.01
 """The smallest share of pixels that a mask must cover for a clip or frame to get a score."""
-
-
-def ours(names: Iterable[str]) -> str:
-    """Return which of the methods is the model itself: ``memory``, or ``model`` if it has none."""
-    found = set(names)
-    return next(name for name in OURS if name in found)
 
 
 def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
@@ -146,8 +138,8 @@ def margin(better: np.ndarray, base: np.ndarray, clusters: np.ndarray) -> dict[s
 
 
 def margins(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
-    """Compare the model itself (``ours``) with every other method, as ``margin`` does."""
-    own = ours(sums)
+    """Compare the model itself (``own_method``) with every other method, as ``margin`` does."""
+    own = own_method(sums)
     return {
         method: margin(sums[own], other, clusters)
         for method, other in sums.items()

@@ -1,18 +1,18 @@
-"""The report of long horizons: numbers as JSON, a page, a strip of pictures, a video."""
+"""The report of long rollouts: numbers as JSON, a page, a strip of pictures and a video."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pewm_jax.io import atomic
-from pewm_jax.report.page import STYLE
+from pewm_jax.report.page import Facts, Figure, Section, TableBlock, Text, render
 from pewm_jax.report.pictures import grid, save_png
+from pewm_jax.report.table import Cell, Table
 from pewm_jax.report.video import encode_h264, small_frames
 
 SHOWN = 8
@@ -21,11 +21,11 @@ FRAMES_PER_SECOND = 12
 NAMES = {
     "truth": "truth",
     "bound": "its renderer, true voxels",
-    "known": "begun in a known grid",
+    "known": "started from a known grid",
     "world": "the world itself",
     "without": "without its voxels",
 }
-"""What methods are called; other worlds are called as their runs."""
+"""Names of the methods; other worlds have the names of their runs."""
 
 
 def write(
@@ -52,12 +52,12 @@ def write(
         partial.write_bytes(encode_h264(pictures, FRAMES_PER_SECOND))
     page = folder / "horizon.html"
     with atomic.replacing(page) as partial:
-        partial.write_text(_html(facts, ends))
+        partial.write_text(_page(facts, ends))
     return page
 
 
 def lines(facts: Mapping[str, Any], ends: Sequence[int]) -> list[str]:
-    """Return what is printed: a line for each method."""
+    """Return the lines for the terminal: one for each method."""
     said = [f"PSNR in dB of frames {', '.join(_spans(ends))}:"]
     for name, values in facts["psnr"].items():
         said.append(f"  {_name(name):<26}" + "  ".join(f"{value:6.2f}" for value in values))
@@ -72,12 +72,12 @@ def lines(facts: Mapping[str, Any], ends: Sequence[int]) -> list[str]:
 
 
 def sentences(facts: Mapping[str, Any]) -> list[str]:
-    """Return what is said of a world of voxels: its autoencoder, and blocks placed in it."""
+    """Return sentences about a world of voxels: its autoencoder, and blocks placed in it."""
     said = []
     if "autoencoder" in facts:
         back = facts["autoencoder"]
         said.append(
-            f"The 3D VAE gives back {100 * back['occupied']:.1f} % of the occupied cells with "
+            f"The 3D VAE reconstructs {100 * back['occupied']:.1f} % of the occupied cells with "
             f"their class ({100 * back['filled']:.1f} % as occupied) and {100 * back['empty']:.1f} "
             f"% of the empty ones, of {back['grids']} recorded grids."
         )
@@ -95,7 +95,7 @@ def sentences(facts: Mapping[str, Any]) -> list[str]:
 
 
 def _spans(ends: Sequence[int]) -> list[str]:
-    """Return what the stretches between ends are called, such as 1–200 and 201–400."""
+    """Return the names of the stretches between ends, such as 1–200 and 201–400."""
     return [f"{low + 1}–{high}" for low, high in zip((0, *ends[:-1]), ends, strict=True)]
 
 
@@ -103,48 +103,42 @@ def _name(name: str) -> str:
     return NAMES.get(name, name)
 
 
-def _html(facts: Mapping[str, Any], ends: Sequence[int]) -> str:
-    head = "".join(f"<th>{span}</th>" for span in _spans(ends))
-    body = "".join(
-        f"<tr><td>{escape(_name(name))}</td>"
-        + "".join(f"<td>{value:.2f}</td>" for value in values)
-        + "</tr>"
-        for name, values in facts["psnr"].items()
+def _page(facts: Mapping[str, Any], ends: Sequence[int]) -> str:
+    psnr = Table.of(
+        ["", *_spans(ends)],
+        [
+            [_name(name), *(Cell(value) for value in values)]
+            for name, values in facts["psnr"].items()
+        ],
     )
-    parts = [
-        "<h1>Long horizons</h1>",
-        (
-            "<p class=lead>Each walk begins with a few observed frames and goes on by its recorded "
-            "actions alone.</p>"
-        ),
-        (
-            f"<h2>PSNR in dB, by frames</h2><table><thead><tr><th></th>{head}</tr></thead>"
-            f"<tbody>{body}</tbody></table>"
-        ),
-        (
-            "<p class=quiet>The renderer that is given the true voxels and cameras bounds the "
-            "world.</p>"
-            if "bound" in facts["psnr"]
-            else ""
-        ),
-    ]
+    sections: list[Section] = [Section("PSNR in dB, by frames", [TableBlock(psnr)])]
+    if "bound" in facts["psnr"]:
+        note = "The renderer with the true voxels and cameras is an upper bound of the world."
+        sections.append(Section("", [Text(note, "quiet")]))
     if facts.get("distances"):
-        rows = "".join(
-            f"<tr><td>{escape(_name(name))}</td><td>{end}</td><td>{one['fvd']['value']:.0f}</td>"
-            f"<td>{one['kvd']['value']:.2f}</td><td>{one['fvd']['clips']}</td></tr>"
-            for name, found in facts["distances"].items()
-            for end, one in found.items()
+        distances = Table.of(
+            ["", "frames before", "FVD", "KVD", "clips"],
+            [
+                [
+                    _name(name),
+                    end,
+                    Cell(one["fvd"]["value"], 0),
+                    Cell(one["kvd"]["value"]),
+                    str(one["fvd"]["clips"]),
+                ]
+                for name, found in facts["distances"].items()
+                for end, one in found.items()
+            ],
         )
-        parts.append(
-            "<h2>Windows of 16 frames, as sets</h2><table><thead><tr><th></th><th>frames before"
-            f"</th><th>FVD</th><th>KVD</th><th>clips</th></tr></thead><tbody>{rows}</tbody></table>"
-        )
-    said = "".join(f"<p>{escape(line)}</p>" for line in sentences(facts))
-    parts.append(f"{said}<figure><img src='horizon.png' alt='Frames of a walk.'></figure>")
-    parts.append("<video src='horizon.mp4' controls muted loop></video>")
-    protocol = "".join(
-        f"<dt>{escape(str(name))}</dt><dd>{escape(str(value))}</dd>"
-        for name, value in facts["protocol"].items()
+        sections.append(Section("Windows of 16 frames, as sets", [TableBlock(distances)]))
+    figures = [
+        Figure("horizon.png", alt="Frames of a walk."),
+        Figure("horizon.mp4", media="video/mp4"),
+    ]
+    sections.append(Section("", [*(Text(line) for line in sentences(facts)), *figures]))
+    protocol = [(str(name), str(value)) for name, value in facts["protocol"].items()]
+    sections.append(Section("How it was measured", [Facts(protocol)]))
+    opening = (
+        "Each walk begins with a few observed frames and continues by its recorded actions alone."
     )
-    parts.append(f"<h2>How it was measured</h2><dl>{protocol}</dl>")
-    return f"<!doctype html><meta charset=utf-8><style>{STYLE}</style>{''.join(parts)}\n"
+    return render("Long horizons", [Text(opening, "lead")], sections)

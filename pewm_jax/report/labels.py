@@ -1,11 +1,11 @@
-"""The report's words: names of methods, masks and metrics, numbers, and what is said of them."""
+"""The text of reports: names of methods, masks and metrics, and sentences about their numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pewm_jax.eval.statistics import ours
+from pewm_jax.report.table import Table, with_error, with_interval
 
 METHOD_NAMES = {
     "memory": "with its map",
@@ -16,17 +16,21 @@ METHOD_NAMES = {
     "copy": "copying the last frame",
 }
 """Names of the methods, in the order of the tables."""
+OWN_METHODS = ("memory", "model")
+"""The rows of the evaluated model itself: with its map, or a model that has no memory. A report has
+one of them."""
 RIVALS = {
     "reproject": "reprojecting what was observed",
     "none": "a model trained as long without a memory",
     "empty": "an empty map",
 }
 """What the model is compared with, in sentences."""
-OUR_NAMES = {"memory": "The model with its map", "model": "The model, which has no memory,"}
+OWN_NAMES = {"memory": "The model with its map", "model": "The model, which has no memory,"}
 """The model itself in sentences, by its row."""
 NO_MEMORY = (
-    "This model was trained without a memory: there is no map, and no row with an empty one; what "
-    "a memory brings is seen beside a run that has one (`pewm-jax compare`, or --none of that run)."
+    "This model was trained without a memory, so there is no map and no row with an empty map. To "
+    "measure what a memory adds, compare it with a run that has one (`pewm-jax compare`, or --none "
+    "of that run)."
 )
 MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
 """Names of the masks."""
@@ -37,8 +41,8 @@ METRIC_NAMES = {
     "depth_rel": ("relative depth error ↓", 3),
     "lpips": ("LPIPS ↓", 3),
 }
-"""Heading and digits of each metric; LPIPS is of whole pictures, where it was measured, and has its
-network's name (``heading``)."""
+"""Heading and digits of each metric. LPIPS is of whole pictures; its heading names its network
+(``heading``)."""
 COVERAGE_NAMES = {
     "held": "held by the map",
     "looked_at": "looked at by the model's reader",
@@ -46,7 +50,7 @@ COVERAGE_NAMES = {
     "chosen": "among the tokens chosen for attention",
     "attended": "among those that the frame's own camera would attend to",
 }
-"""What becomes of the pixels seen before, each a share of them."""
+"""Shares of the pixels seen before."""
 ACTIONS_NAMES = {
     "true": "the true actions",
     "shuffled": "another clip's actions",
@@ -56,12 +60,18 @@ ACTIONS_NAMES = {
     "true - none": "true minus none",
     "true - copy": "true minus the observed frame",
 }
-"""Names of the kinds of actions by which a model was steered, and of their differences."""
+"""Names of the kinds of actions that a model was given, and of their differences."""
 NONE_HOW = (
     "A row for a model trained as long without a memory is missing: train one of the same clip, "
     "codec and number of steps with all steps in stage 1 (--train.stage1.steps N "
     "--train.stage2.steps 0) and name its folder by --none."
 )
+
+
+def own_method(names: Iterable[str]) -> str:
+    """Return which of the methods is the evaluated model: ``memory``, or ``model`` without one."""
+    found = set(names)
+    return next(name for name in OWN_METHODS if name in found)
 
 
 def heading(metric: str, protocol: Mapping[str, Any]) -> str:
@@ -71,30 +81,21 @@ def heading(metric: str, protocol: Mapping[str, Any]) -> str:
         metric: key of ``METRIC_NAMES``.
         protocol: of ``metrics.json``.
     """
-    words, network = METRIC_NAMES[metric][0], protocol.get("lpips_name")
-    return words.replace("LPIPS", network) if network else words
+    text, network = METRIC_NAMES[metric][0], protocol.get("lpips_name")
+    return text.replace("LPIPS", network) if network else text
 
 
 def number(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
     """Format an entry as ``mean ± stderr``, or as a dash."""
-    if entry["mean"] is None:
-        return "–"
-    text = f"{entry['mean']:{'+' if sign else ''}.{digits}f}"
-    return text if entry["stderr"] is None else f"{text} ± {entry['stderr']:.{digits}f}"
+    return str(with_error(entry, digits, sign=sign))
 
 
 def spread(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
     """Format an entry as ``mean [low, high]``, or as a dash."""
-    if entry["mean"] is None:
-        return "–"
-    plus = "+" if sign else ""
-    text = f"{entry['mean']:{plus}.{digits}f}"
-    if entry["low"] is None:
-        return text
-    return f"{text} [{entry['low']:{plus}.{digits}f}, {entry['high']:{plus}.{digits}f}]"
+    return str(with_interval(entry, digits, sign=sign))
 
 
-def verdict(entry: Mapping[str, Any], where: str) -> str:
+def format_verdict(entry: Mapping[str, Any], where: str) -> str:
     """Return a sentence on what the map changes (PSNR of memory minus empty)."""
     mean, stderr = entry["mean"], entry["stderr"]
     if mean is None:
@@ -113,21 +114,21 @@ def verdict(entry: Mapping[str, Any], where: str) -> str:
     return f"On pixels {where} the map makes no clear difference ({mean:+.2f} ± {stderr:.2f} dB)."
 
 
-def comparison(margin: Mapping[str, Any], rival: str, own: str = "memory") -> str:
+def format_comparison(margin: Mapping[str, Any], rival: str, own: str = "memory") -> str:
     """Return a sentence on whether the model beats another method, mask by mask.
 
     Args:
         margin: ``[mask]["psnr"]`` of the model minus the rival.
         rival: key of ``RIVALS``.
-        own: key of ``OUR_NAMES``.
+        own: key of ``OWN_NAMES``.
     """
-    places = {
+    masks = {
         "seen": "over pixels seen before",
         "unseen": "over those never seen",
         "all": "over all",
     }
-    said = [f"{where} {_outcome(margin[mask]['psnr'])}" for mask, where in places.items()]
-    return f"{OUR_NAMES[own]} against {RIVALS[rival]}: {'; '.join(said)}."
+    said = [f"{where} {_outcome(margin[mask]['psnr'])}" for mask, where in masks.items()]
+    return f"{OWN_NAMES[own]} against {RIVALS[rival]}: {'; '.join(said)}."
 
 
 def _outcome(entry: Mapping[str, Any]) -> str:
@@ -142,7 +143,7 @@ def _outcome(entry: Mapping[str, Any]) -> str:
     return f"it {'is better' if mean > 0 else 'is WORSE'} ({amount})"
 
 
-def drifted(drift: Mapping[str, Any]) -> str:
+def format_drift(drift: Mapping[str, Any]) -> str:
     """Return a sentence on how long rollouts of the model change.
 
     Args:
@@ -157,13 +158,13 @@ def drifted(drift: Mapping[str, Any]) -> str:
     )
 
 
-def covered(shares: Mapping[str, float]) -> str:
+def format_coverage(shares: Mapping[str, float]) -> str:
     """Return a sentence on what the map knows of the pixels seen before."""
     said = (f"{100 * shares[key]:.1f} % {name}" for key, name in COVERAGE_NAMES.items())
     return f"Of the pixels seen before: {', '.join(said)}."
 
 
-def perceived(metrics: Mapping[str, Any]) -> str:
+def format_lpips(metrics: Mapping[str, Any]) -> str:
     """Return a sentence on LPIPS, or on why it was left out."""
     found = {method: masks["all"].get("lpips") for method, masks in metrics["results"].items()}
     if not all(found.values()):
@@ -173,7 +174,7 @@ def perceived(metrics: Mapping[str, Any]) -> str:
     return f"{name} of whole pictures, lower is better: {'; '.join(said)}."
 
 
-def far_apart(metrics: Mapping[str, Any]) -> str:
+def format_fvd(metrics: Mapping[str, Any]) -> str:
     """Return a sentence on FVD and KVD, or on why they were left out."""
     found = metrics["videos"]
     if not found:
@@ -189,7 +190,7 @@ def far_apart(metrics: Mapping[str, Any]) -> str:
     return f"{'. '.join(said)}."
 
 
-def came_back(metrics: Mapping[str, Any]) -> str:
+def format_mirror(metrics: Mapping[str, Any]) -> str:
     """Return a sentence on the mirror test, or on why it was left out."""
     found = metrics["mirror"]
     if not found:
@@ -206,7 +207,7 @@ def came_back(metrics: Mapping[str, Any]) -> str:
     )
 
 
-def consistent(metrics: Mapping[str, Any]) -> list[str]:
+def format_scs(metrics: Mapping[str, Any]) -> list[str]:
     """Return a sentence on SCS, if it was measured."""
     found = metrics.get("scs")
     if not found:
@@ -220,7 +221,7 @@ def consistent(metrics: Mapping[str, Any]) -> list[str]:
     return [f"{found['name']}, higher is better: {values}; the true clip {ceiling}."]
 
 
-def followed(metrics: Mapping[str, Any]) -> list[str]:
+def format_steering(metrics: Mapping[str, Any]) -> list[str]:
     """Return a sentence on whether the model follows its actions, or on why that is not known.
 
     There is none of a model that is not steered by actions.
@@ -238,7 +239,7 @@ def followed(metrics: Mapping[str, Any]) -> list[str]:
     return [f"PSNR with the true actions is {true} dB; its lead over {'; over '.join(less)}."]
 
 
-def grew(metrics: Mapping[str, Any]) -> list[str]:
+def format_map_growth(metrics: Mapping[str, Any]) -> list[str]:
     """Return a sentence on how the map grows, if there is one."""
     found = metrics["long"]["growth"]
     if not found:
@@ -257,27 +258,28 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     Args:
         metrics: the content of ``metrics.json``.
     """
-    margins, own = metrics["margins"], ours(metrics["results"])
+    margins, own = metrics["margins"], own_method(metrics["results"])
     lines = [NO_MEMORY]
     if own == "memory":
         lines = [
-            verdict(margins["empty"]["seen"]["psnr"], "seen before"),
-            verdict(margins["empty"]["unseen"]["psnr"], "never seen"),
+            format_verdict(margins["empty"]["seen"]["psnr"], "seen before"),
+            format_verdict(margins["empty"]["unseen"]["psnr"], "never seen"),
         ]
     rivals = [name for name in ("reproject", "none") if name in margins]
-    lines += [comparison(margins[name], name, own) for name in rivals]
+    lines += [format_comparison(margins[name], name, own) for name in rivals]
     lines += [NONE_HOW] if own == "memory" and "none" not in margins else []
-    lines += [perceived(metrics), far_apart(metrics)]
-    lines += [covered(metrics["coverage"])] if metrics["coverage"] else []
-    lines += [drifted(metrics["long"]["drift"][own]), *grew(metrics)]
-    return [*lines, *followed(metrics), *consistent(metrics), came_back(metrics)]
+    lines += [format_lpips(metrics), format_fvd(metrics)]
+    lines += [format_coverage(metrics["coverage"])] if metrics["coverage"] else []
+    lines += [format_drift(metrics["long"]["drift"][own]), *format_map_growth(metrics)]
+    return [*lines, *format_steering(metrics), *format_scs(metrics), format_mirror(metrics)]
 
 
 def score_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Return the PSNR of every method under every mask as lines of a table, for the terminal."""
-    lines = [f"{'PSNR, dB':<34}" + "".join(f"{name:>16}" for name in MASK_NAMES.values())]
-    for method, label in METHOD_NAMES.items():
-        if method in metrics["results"]:
-            cells = (number(metrics["results"][method][mask]["psnr"], 2) for mask in MASK_NAMES)
-            lines.append(f"{label:<34}" + "".join(f"{cell:>16}" for cell in cells))
-    return lines
+    """Return the PSNR of every method under every mask as aligned lines for the terminal."""
+    results = metrics["results"]
+    rows = [
+        [label, *(with_error(results[method][mask]["psnr"], 2) for mask in MASK_NAMES)]
+        for method, label in METHOD_NAMES.items()
+        if method in results
+    ]
+    return Table.of(["PSNR, dB", *MASK_NAMES.values()], rows).text()

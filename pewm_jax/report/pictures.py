@@ -17,6 +17,14 @@ from pewm_jax.types import Frames
 
 INK, PAPER, QUIET = (28, 32, 40), (255, 255, 255), (112, 118, 130)
 """Text, background, secondary text."""
+ROWS = "rows"
+"""Folder of a report with the frames of each rollout shown: ``00-truth.png``, ``00-memory.png`` and
+so on."""
+
+
+def picture_steps(frames: int) -> np.ndarray:
+    """Return the steps of a rollout that are shown as pictures; 0 is the present."""
+    return np.unique(np.round(np.linspace(0, frames, 8)).astype(int))
 
 
 @functools.cache

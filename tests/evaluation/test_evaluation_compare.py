@@ -110,7 +110,8 @@ def test_the_difference_is_paired_and_the_page_needs_no_other_file(tmp_path, err
     assert "+1.00 [+1.00, +1.00] dB over 6 houses" in said[0]
     text = page.read_text()
     assert found["protocol_sha256"] in text
-    assert text.count("data:image/png") == 1  # the rollout that both show
+    assert len(re.findall("<figure><img", text)) == 1  # the rollout that both show
+    assert text.count("data:image/png") == 1 + 2 * 8  # and charts, in light and dark
     assert not re.search(r"https?://|url\(|@import|<script|<link", text)
     back = content(compare.compare(b, a, out=tmp_path / "out", say=said.append))
     assert back["differences"]["clips"]["all"]["psnr"]["mean"] == pytest.approx(-1)

@@ -15,7 +15,7 @@ from pewm_jax.eval.statistics import margins, per_frame, table
 from pewm_jax.io import weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.models.lpips import weights as lpips_weights
-from pewm_jax.report.labels import perceived
+from pewm_jax.report.labels import format_lpips
 
 HIGHER = ("psnr", "ssim")
 
@@ -209,7 +209,7 @@ def test_tables_have_lpips_of_whole_pictures_and_only_where_it_was_measured():
     assert "lpips" not in gain["unseen"]
     frames = per_frame(both, clusters)["empty"]["all"]["lpips"]["mean"]
     assert frames == pytest.approx([0.2, 0.3, 0.4, 0.5])
-    said = perceived({"results": results, "protocol": {"lpips_name": "LPIPS[alex]"}})
+    said = format_lpips({"results": results, "protocol": {"lpips_name": "LPIPS[alex]"}})
     assert said.startswith(
         "LPIPS[alex] of whole pictures, lower is better: with its map 0.250 ± 0.000"
     )

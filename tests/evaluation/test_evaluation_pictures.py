@@ -6,17 +6,15 @@ import io
 import os
 import subprocess
 import sys
-import xml.etree.ElementTree as ET
 
 import av
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
+from pewm_jax.report.charts import IntervalChart, IntervalRow, Line, LineChart
+from pewm_jax.report.page import Charts, Section, render
 from pewm_jax.report.pictures import as_bytes, depth_colours, dim, from_above, grid, png, save_png
-from pewm_jax.report.plots import Line, chart, ticks
 from pewm_jax.report.video import encode_h264, side_by_side
 
 
@@ -122,39 +120,43 @@ def test_png_round_trip(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["picture.png"]
 
 
-@given(st.floats(-100, 100), st.floats(0.001, 200))
-def test_ticks_enclose_the_data(low, span):
-    marks = ticks(low, low + span)
-    tolerance = 1e-6 * max(1, abs(low) + span)
-    assert marks[0] <= low + tolerance
-    assert marks[-1] >= low + span - tolerance
-    assert 2 <= len(marks) <= 12
-    np.testing.assert_allclose(np.diff(marks), marks[1] - marks[0], rtol=1e-6)
-
-
-def points_of(svg, kind):
-    root = ET.fromstring(svg)
-    return [
-        [tuple(map(float, pair.split(","))) for pair in element.attrib["points"].split()]
-        for element in root.iter()
-        if element.tag.endswith(kind)
-    ]
+def painted(content, colour):
+    """Return the (row, column) of the pixels of one colour, within a little."""
+    picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
+    return np.argwhere(np.abs(picture - colour).max(-1) < 30)
 
 
 def test_chart_draws_higher_values_higher_and_breaks_at_gaps():
     lines = [
-        Line("up", "red", [1.0, 2.0, 3.0], [0.1, 0.1, None]),
-        Line("gap", "blue", [1.0, None, 2.0], [0.1, None, 0.1]),
+        Line.with_errors("up", "#ff0000", [1.0, 2.0, 3.0], [0.1, 0.1, None]),
+        Line.with_errors("gap", "#0000ff", [1.0, None, 1.0], [0.1, None, 0.1]),
     ]
-    svg = chart("A < B", "frame", lines, unit="dB")
-    rising, left, right = points_of(svg, "polyline")
-    assert [x for x, _ in rising] == sorted(x for x, _ in rising)
-    assert rising[0][1] > rising[1][1] > rising[2][1]
-    assert rising[0][1] - rising[1][1] == pytest.approx(rising[1][1] - rising[2][1], abs=0.2)
-    assert len(left) == len(right) == 1
-    band = points_of(svg, "polygon")[0]
-    assert min(y for _, y in band[:2]) < rising[0][1]
+    chart = LineChart("A < B", "frame", lines, unit="dB")
+    red, blue = painted(chart.png(), [255, 0, 0]), painted(chart.png(), [0, 0, 255])
+    left, right = red[:, 1].min(), red[:, 1].max()
+    heights = [red[abs(red[:, 1] - x) < 8, 0].mean() for x in (left, (left + right) / 2, right)]
+    assert heights[0] > heights[1] > heights[2]
+    assert heights[0] - heights[1] == pytest.approx(heights[1] - heights[2], abs=8)
+    middle = abs(blue[:, 1] - (left + right) / 2) < (right - left) / 4
+    assert len(blue)
+    assert not middle.any()
+
+
+def test_charts_are_equal_for_equal_values_and_have_a_dark_form():
+    line = Line("a", "#ff0000", [1.0, 2.0], [0.5, None], [1.5, None])
+    interval = IntervalRow("row", 1.0, 0.5, 1.5, dots=(0.8, 1.2))
+    for chart in (
+        LineChart("PSNR", "frame", [line], x=[0, 4], label_lines=True),
+        IntervalChart("PSNR", "over houses", [interval, IntervalRow("one", 2.0, None, None)]),
+    ):
+        assert chart.png() == chart.png()
+        light, dark = (np.asarray(Image.open(io.BytesIO(chart.png(dark=d)))) for d in (False, True))
+        assert light[0, 0, :3].min() > 200
+        assert dark[0, 0, :3].max() < 60
 
 
 def test_chart_without_values_says_so():
-    assert "no clip" in chart("PSNR", "frame", [Line("a", "red", [None, None], [None, None])])
+    empty = LineChart("PSNR", "frame", [Line("a", "red", [None, None])])
+    assert empty.is_empty
+    page = render("title", [], [Section("", [Charts([empty])])])
+    assert "PSNR: no clip has enough such pixels." in page

@@ -32,8 +32,8 @@ from pewm_jax.eval.imagine import Imagination
 from pewm_jax.eval.methods import Methods
 from pewm_jax.io import tree, weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.report.labels import comparison, drifted, number, verdict
-from pewm_jax.report.page import introduction
+from pewm_jax.report.evaluation_page import introduction
+from pewm_jax.report.labels import format_comparison, format_drift, format_verdict, number
 from pewm_jax.types import Frames
 from pewm_jax.worlds import world_model
 from pewm_jax.worlds.pewm.world import STAGES
@@ -215,7 +215,7 @@ def test_the_protocol_of_a_report_scores_another_run_which_is_compared(run, copi
     assert [found[side]["clips"]["seen"]["psnr"] for side in "ab"] == both
     difference = found["differences"]["clips"]["seen"]["psnr"]["mean"]
     assert difference == pytest.approx(both[0]["mean"] - both[1]["mean"])
-    assert page.read_text().count("data:image/png") == 1
+    assert len(re.findall("<figure><img", page.read_text())) == 1
     report.evaluate(copied, say=lambda _: None, clips=3)
     with pytest.raises(UserError, match="3 and 4 clips"):
         compare.compare(copied, run)
@@ -258,14 +258,16 @@ class Sources(HTMLParser):
         self.found = []
 
     def handle_starttag(self, tag, attrs):
-        self.found += [(tag, v) for k, v in attrs if k in {"src", "href", "poster", "data"}]
+        self.found += [
+            (tag, v) for k, v in attrs if k in {"src", "srcset", "href", "poster", "data"}
+        ]
 
 
 def test_page_needs_no_other_file(run):
     page = (run / "report" / "index.html").read_text()
     sources = Sources()
     sources.feed(page)
-    assert len(sources.found) == 4  # one video, stills, masks, map
+    assert len(sources.found) == 14  # a video, stills, masks, map; 5 charts in light and dark
     assert all(source.startswith("data:") for _, source in sources.found)
     assert not re.search(r"https?://|url\(|@import|<script|<link", page)
 
@@ -441,7 +443,7 @@ def test_a_run_without_a_memory_is_scored_and_compared_under_its_own_name(run, t
     assert any("trained without a memory" in line for line in said)
     page = (own / "report" / "index.html").read_text()
     assert "trained without a memory" in page
-    assert not re.search("with its map|empty map<|seed by seed|from above", page)
+    assert not re.search("with its map|empty map<|for each seed|from above", page)
     assert (own / "report" / "rows" / "00-model.png").is_file()
 
     found = compare.compare(run, own, say=said.append)
@@ -670,11 +672,11 @@ def test_places_are_called_new_only_where_they_are(run, tmp_path):
 
 
 def test_verdicts_are_fair():
-    assert "3.00 ± 0.50 dB closer" in verdict({"mean": 3.0, "stderr": 0.5}, "seen before")
-    assert "worse" in verdict({"mean": -3.0, "stderr": 0.5}, "seen before")
-    assert "no clear difference" in verdict({"mean": 0.6, "stderr": 0.5}, "never seen")
-    assert "cannot be said" in verdict({"mean": 0.6, "stderr": None}, "never seen")
-    assert "No clip" in verdict({"mean": None, "stderr": None}, "never seen")
+    assert "3.00 ± 0.50 dB closer" in format_verdict({"mean": 3.0, "stderr": 0.5}, "seen before")
+    assert "worse" in format_verdict({"mean": -3.0, "stderr": 0.5}, "seen before")
+    assert "no clear difference" in format_verdict({"mean": 0.6, "stderr": 0.5}, "never seen")
+    assert "cannot be said" in format_verdict({"mean": 0.6, "stderr": None}, "never seen")
+    assert "No clip" in format_verdict({"mean": None, "stderr": None}, "never seen")
     assert number({"mean": 1.0, "stderr": 0.25}, 2, sign=True) == "+1.00 ± 0.25"
     assert number({"mean": None, "stderr": None}, 2) == "–"
 
@@ -683,16 +685,16 @@ def test_whether_a_baseline_is_beaten_is_said_plainly():
     def entry(mean, stderr):
         return {"psnr": {"mean": mean, "stderr": stderr}}
 
-    said = comparison(
+    said = format_comparison(
         {"seen": entry(-2.0, 0.5), "unseen": entry(3.0, 0.5), "all": entry(0.6, 0.5)}, "reproject"
     )
     assert "seen before it is WORSE (-2.00 ± 0.50 dB)" in said
     assert "never seen it is better (+3.00 ± 0.50 dB)" in said
     assert "over all no clear difference" in said
     unsure = {"seen": entry(1.0, None), "unseen": entry(None, None), "all": entry(1.0, None)}
-    assert "cannot be said" in comparison(unsure, "none")
-    assert "nothing to compare" in comparison(unsure, "none")
+    assert "cannot be said" in format_comparison(unsure, "none")
+    assert "nothing to compare" in format_comparison(unsure, "none")
     short = {"first16": None, "last16": None, "difference": None}
-    assert "fewer than 32" in drifted(short)
+    assert "fewer than 32" in format_drift(short)
     full = {name: {"mean": -1.5, "stderr": 0.1} for name in short}
-    assert drifted(full).endswith("-1.50 ± 0.10 dB.")
+    assert format_drift(full).endswith("-1.50 ± 0.10 dB.")

@@ -14,8 +14,9 @@ from pewm_jax.eval.protocol import choose
 from pewm_jax.eval.steering import Walks, choose_walks, different_steps, forward_steps
 from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT, discrete_table, integrate
 from pewm_jax.geometry.cameras import pose_from_yaw
-from pewm_jax.report import page_tables
-from pewm_jax.report.labels import ACTIONS_NAMES, followed
+from pewm_jax.report import evaluation_page
+from pewm_jax.report.labels import ACTIONS_NAMES, format_steering
+from pewm_jax.report.page import render
 from pewm_jax.types import Frames
 from tests.helpers import tiny_config
 
@@ -84,11 +85,11 @@ def test_a_report_keeps_its_pieces_and_says_what_came_out(obeying, monkeypatch, 
     np.testing.assert_array_equal(again.errors["none"], found.errors["none"])
     assert len(said) == 1
     metrics = {"steering": found.facts(), "protocol": {"steering": about}}
-    page = page_tables.steering(metrics)
+    page = render("", [], [evaluation_page.steering(metrics)])
     assert page.count("<tr") == 1 + len(ACTIONS_NAMES)
     assert f"{found.psnr['true'].mean():.2f} [" in page
     assert "75 % of their steps go forward" in page
-    (sentence,) = followed(metrics)
+    (sentence,) = format_steering(metrics)
     assert "its lead over another clip's actions: +" in sentence
 
 
@@ -102,10 +103,10 @@ def test_what_was_not_measured_is_said(obeying, monkeypatch, tmp_path):
     assert found is None
     assert said == []
     metrics = {"steering": None, "protocol": {"steering": about}}
-    assert page_tables.steering(metrics) == ""
-    assert followed(metrics) == [about]
+    assert evaluation_page.steering(metrics) is None
+    assert format_steering(metrics) == [about]
     assert about.startswith("Whether the actions steer is not measured: no episode of")
-    assert followed({"steering": None, "protocol": {"steering": None}}) == []
+    assert format_steering({"steering": None, "protocol": {"steering": None}}) == []
 
 
 def test_a_world_without_embeddings_of_actions_is_not_asked_for_none(obeying):

@@ -1,4 +1,4 @@
-"""The report's images and videos, drawn from stored long rollouts."""
+"""Draw the images and videos of a report from stored long rollouts."""
 
 from __future__ import annotations
 
@@ -12,9 +12,19 @@ from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.long_rollouts import LongRollouts
 from pewm_jax.eval.protocol import ClipChoice, load_clip
-from pewm_jax.eval.seen import seen_masks
+from pewm_jax.eval.seen import TOLERANCE_M, TOLERANCE_RELATIVE, seen_masks
 from pewm_jax.geometry.actions import heading
-from pewm_jax.report.pictures import as_bytes, dim, enlarge, farthest, from_above, grid, map_bounds
+from pewm_jax.report.evaluation_page import Gallery
+from pewm_jax.report.pictures import (
+    as_bytes,
+    dim,
+    enlarge,
+    farthest,
+    from_above,
+    grid,
+    map_bounds,
+    picture_steps,
+)
 from pewm_jax.report.video import encode_gif, encode_h264, side_by_side, small_frames
 from pewm_jax.types import Frames
 
@@ -29,35 +39,21 @@ CAPTIONS = {
     "reproject": "reprojected",
 }
 """The methods in images, in their order, and their names."""
-ROWS = "rows"
-"""Folder of a report with ``Gallery.rows``: ``00-truth.png``, ``00-memory.png`` and so on."""
 HOLD = 4
 """Video frames for which the observed image is held."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Gallery:
-    """The images and videos of a report.
-
-    Attributes:
-        videos: (caption, MP4) of each long rollout.
-        strip: frames of one rollout in rows: truth, with its map, empty map, reprojected; of a
-            model without a memory one row in the place of two.
-        strip_note: which rollout and which frames they are.
-        moving: all frames of that rollout side by side, a GIF.
-        masks: the same true frames with never-seen pixels greyed out.
-        above: the map from above, before and after that rollout; None without a memory.
-        rows: of each rollout shown the frames of ``truth`` and of each method in ``CAPTIONS`` at
-            the steps of ``strip``, side by side in one picture and as large as they are.
-    """
-
-    videos: list[tuple[str, bytes]]
-    strip: np.ndarray
-    strip_note: str
-    moving: bytes
-    masks: np.ndarray
-    above: np.ndarray | None
-    rows: list[dict[str, np.ndarray]]
+MASKS_NOTE = (
+    "Pixels that count as seen before are in colour, the others grey. A pixel counts as seen if "
+    "its true point in space projects into an observed frame whose true depth agrees within the "
+    f"larger of {100 * TOLERANCE_M:.0f} cm and {100 * TOLERANCE_RELATIVE:.0f} %. No network is "
+    "involved."
+)
+ABOVE_NOTE = (
+    "Each square is one cell of the model's 3D map in the colour it remembers, drawn from below to "
+    f"above. Cells more than {ABOVE_CAMERA_M:g} m above the camera (the ceiling) are left out. The "
+    "red line is the agent's path through the frames the map was built from, the arrow its view "
+    "direction. On the right, the same map after the rollout of the stills above added its "
+    "imagined frames."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,11 +65,6 @@ class _Rollout:
     truth: Frames
     seen_THW: np.ndarray
     imagined: dict[str, tuple[np.ndarray, np.ndarray]]
-
-
-def picture_steps(frames: int) -> np.ndarray:
-    """Return the steps of a rollout that are shown as pictures; 0 is the present."""
-    return np.unique(np.round(np.linspace(0, frames, 8)).astype(int))
 
 
 def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts) -> Gallery:
@@ -106,9 +97,11 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
         ),
         moving=_moving(rollout),
         masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
+        masks_note=MASKS_NOTE,
         above=_above(config, long, best, rollout)
         if "first_points" in long.kept.get("memory", {})
         else None,
+        above_note=ABOVE_NOTE,
         rows=[_rows(item, steps) for item in shown],
     )
 
@@ -193,7 +186,7 @@ def _above(config: Config, long: LongRollouts, index: int, item: _Rollout) -> np
         clouds.append((points, as_bytes(shades)))
     bounds = map_bounds(*[points for points, _ in clouds], poses[:, :3, 3])
     panels = []
-    tracks = [("what was observed", poses), ("and after imagining the way on", later)]
+    tracks = [("after the observed frames", poses), ("after the imagined frames", later)]
     for (title, track), (points, shades) in zip(tracks, clouds, strict=True):
         path = track if track is poses else np.concatenate([poses[-1:], track])
         yaw = float(heading(track[-1]))
