@@ -14,7 +14,7 @@ from pewm_jax.config import (
 from pewm_jax.diffusion.flow import PERSIST_VOXELS
 from pewm_jax.geometry import cameras
 from pewm_jax.geometry.actions import camera_steps_between
-from pewm_jax.geometry.march import Layers
+from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.types import Camera
 from pewm_jax.worlds.persist import losses as persist_losses
@@ -151,7 +151,9 @@ def test_the_renderer_learns_to_fold_layers():
     )  # fmt: skip
     params = weights(voxel_renderer, config)
     rng, shape = np.random.default_rng(0), (2, 3, 2, 4, 6)
-    layers = Layers(rng.integers(0, 5, shape), rng.uniform(0, 5, shape), rng.integers(-1, 3, shape))
+    layers = RayHits(
+        rng.integers(0, 5, shape), rng.uniform(0, 5, shape), rng.integers(-1, 3, shape)
+    )
     x0 = normal(1, 2, 3, 2, 4, 3)
 
     @jax.jit

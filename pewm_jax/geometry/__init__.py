@@ -1,1 +1,1 @@
-"""Chapter 1, where the camera is: cameras, actions → poses, Plücker rays, unprojection."""
+"""Cameras, actions and poses, Plücker rays, z-buffers, depth images, rays through voxel grids."""

@@ -1,8 +1,14 @@
-"""Planar actions: poses from actions, actions from poses, several actions as one.
+"""Actions and camera motion: poses from actions, actions from poses, cameras as numbers.
 
-An action is (dx, dy, dyaw) in the agent's body frame: metres forward, metres to the left,
+A planar action is (dx, dy, dyaw) in the agent's body frame: metres forward, metres to the left,
 radians counter-clockwise; the agent first moves, then turns. Discrete actions are rows of a
 table: 0 forward, 1 turn left, 2 turn right.
+
+PERSIST (arXiv 2603.03482) describes a camera by ten numbers: two columns of its rotation
+(arXiv 1812.07035), its position and its field of view. Its camera model predicts a camera step: the
+change of position, pitch, yaw and field of view. Positions are relative to the middle of the voxel
+grid and moves are relative to the heading before the step, so neither depends on where in the world
+the agent is.
 """
 
 from __future__ import annotations
@@ -19,12 +25,12 @@ from pewm_jax.types import Array, Camera
 
 FORWARD, TURN_LEFT, TURN_RIGHT = 0, 1, 2
 PLANAR = 3
-"""Numbers of a planar action; recorded actions of another width are another kind of control."""
+"""Width of a planar action; recorded actions of another width are another kind of control."""
 NAMES = ("forward", "turn left", "turn right")
 
 
 def discrete_table(config: ActionConfig) -> np.ndarray:
-    """Return the (3, 3) table: row a is what discrete action a does, (dx, dy, dyaw)."""
+    """Return the (3, 3) table whose row a is the motion (dx, dy, dyaw) of discrete action a."""
     turn = math.radians(config.turn_deg)
     return np.array([[config.step_m, 0, 0], [0, 0, turn], [0, 0, -turn]], np.float32)
 
@@ -61,7 +67,7 @@ def step_pose(world_from_camera: Array, action_3: Array) -> Array:
 
 
 def integrate(world_from_camera: Array, actions_T3: Array) -> Array:
-    """Follow actions from a pose.
+    """Return the poses reached by carrying out actions from a pose.
 
     Args:
         world_from_camera: (4, 4) pose of frame 0.
@@ -131,20 +137,20 @@ def there_and_back(actions_T3: Array) -> Array:
 
 
 CAMERA_NUMBERS = 10
-"""Numbers of a camera: rotation 6, position 3, field of view 1."""
+"""Numbers that describe a camera: rotation 6, position 3, field of view 1."""
 CAMERA_STEP_NUMBERS = 6
-"""Numbers of a step: forward, left and up in metres; pitch, yaw and field of view in radians."""
+"""Numbers of a camera step: forward, left, up in metres; pitch, yaw, field of view in radians."""
 STEEPEST_PITCH = 1.55
-"""Largest pitch, radians: straight up and down there is no heading."""
+"""Largest pitch, radians: a camera that looks straight up or down has no heading."""
 
 
 def camera_numbers(camera: Camera, width: int, middle_3: Array) -> Array:
-    """Return (..., 10) numbers of cameras.
+    """Return the (..., 10) numbers that describe cameras.
 
     Args:
         camera: cameras of any leading shape.
-        width: of the images that their intrinsics are for, pixels.
-        middle_3: (..., 3) the middle of each one's voxel grid, metres.
+        width: width of the images that the intrinsics belong to, pixels.
+        middle_3: (..., 3) the middle of each camera's voxel grid, metres.
     """
     pose = jnp.asarray(camera.world_from_camera)
     rotation = jnp.concatenate([pose[..., :3, 1], pose[..., :3, 2]], -1)
@@ -158,7 +164,7 @@ def field_of_view(camera: Camera, width: int) -> Array:
 
 
 def pitch(world_from_camera: Array) -> Array:
-    """Return by how much cameras (..., 4, 4) look up, radians."""
+    """Return the pitch of cameras (..., 4, 4), radians; positive looks up."""
     return jnp.arcsin(jnp.clip(world_from_camera[..., 2, 2], -1, 1))
 
 
@@ -168,7 +174,7 @@ def camera_steps_between(before: Camera, after: Camera, width: int) -> Array:
     Args:
         before: upright cameras.
         after: upright cameras.
-        width: of the images that their intrinsics are for, pixels.
+        width: width of the images that the intrinsics belong to, pixels.
     """
     here, there = (jnp.asarray(x.world_from_camera) for x in (before, after))
     yaw = heading(here)
@@ -181,16 +187,16 @@ def camera_steps_between(before: Camera, after: Camera, width: int) -> Array:
 
 
 def follow_camera_steps(before: Camera, step_6: Array, width: int) -> Camera:
-    """Return the upright cameras to which steps lead: the inverse of ``camera_steps_between``.
+    """Return the upright cameras after steps; the inverse of ``camera_steps_between``.
 
     Args:
-        before: cameras; a roll is not kept.
+        before: cameras; their roll is dropped.
         step_6: (..., 6) steps.
-        width: of the images that the intrinsics are for, pixels.
+        width: width of the images that the intrinsics belong to, pixels.
     """
     here, intrinsics = jnp.asarray(before.world_from_camera), jnp.asarray(before.intrinsics_4)
     moved = einsum("...ij,...j->...i", rotation_z(heading(here)), step_6[..., :3])
-    place = here[..., :3, 3] + moved
+    position = here[..., :3, 3] + moved
     up = jnp.clip(pitch(here) + step_6[..., 3], -STEEPEST_PITCH, STEEPEST_PITCH)
     yaw = heading(here) + step_6[..., 4]
     view = jnp.clip(field_of_view(before, width) + step_6[..., 5], 0.1, 3.0)
@@ -199,7 +205,7 @@ def follow_camera_steps(before: Camera, step_6: Array, width: int) -> Camera:
     flat, none = jnp.cos(up), jnp.zeros_like(up)
     ahead = jnp.stack([jnp.cos(yaw) * flat, jnp.sin(yaw) * flat, jnp.sin(up)], -1)
     right = jnp.stack([jnp.sin(yaw), -jnp.cos(yaw), none], -1)
-    columns = jnp.stack([right, jnp.cross(ahead, right), ahead, place], -1)
+    columns = jnp.stack([right, jnp.cross(ahead, right), ahead, position], -1)
     last = jnp.broadcast_to(jnp.array([0.0, 0, 0, 1]), (*columns.shape[:-2], 1, 4))
     pose = jnp.concatenate([columns, last], -2)
     return Camera(jnp.concatenate([zoomed, intrinsics[..., 2:]], -1), pose)

@@ -1,7 +1,6 @@
-"""How a world of blocks is lit: by the direction of a side, by distance, and darker in corners.
+"""Lighting of block worlds: it depends on the side of a block, on distance, and on nearby corners.
 
-One law for whoever draws such pictures (``data.block_pictures``) and for whoever reads colours out
-of them (``worlds.persist_sight``).
+``data.voxel_pictures`` renders with it; PERSIST's world inverts it to read the colours of blocks.
 """
 
 from __future__ import annotations
@@ -12,13 +11,13 @@ import numpy as np
 from pewm_jax.types import Array
 
 SIDES = (0.88, 0.74, 1.0, 0.5)
-"""Light on a side that is met across x, y, z, and on the cell in which a ray begins."""
+"""Light on sides perpendicular to x, y and z, and on the cell in which a ray begins."""
 BELOW = 0.62
 """Light on a side that is seen from below, such as a ceiling."""
 HALF_M = 7.0
-"""At this distance light has fallen to a half, metres."""
+"""Distance at which light falls to a half, metres."""
 CORNER, CORNER_M = 0.35, 0.2
-"""How much darker a corner is than what lies this far from it, metres."""
+"""Darkening in a corner, and the distance from the corner at which it ends, metres."""
 
 
 def light(
@@ -30,16 +29,16 @@ def light(
     far_HW: Array,
     side_HW: Array,
 ) -> Array:
-    """Return by what the colours of what rays meet are multiplied, (H, W).
+    """Return the (H, W) factors that multiply the colours of the cells that rays hit.
 
     Args:
-        occupied_XYZ: bool, the cells with something in them.
+        occupied_XYZ: bool, which cells are occupied.
         low_3: lowest corner of the grid, metres.
         cell_m: side of a cell, metres.
-        eye_3: where the rays begin, metres.
-        way_HW3: where they go.
-        far_HW: how far each goes until it meets a cell, in lengths of its direction.
-        side_HW: across which axis (0, 1, 2) it enters; −1 where it begins in the cell.
+        eye_3: origin of the rays, metres.
+        way_HW3: (H, W, 3) directions of the rays.
+        far_HW: distance from the origin to the hit cell, in lengths of the direction.
+        side_HW: axis (0, 1, 2) across which the ray enters the cell; −1 where it begins inside.
     """
     facing = jnp.asarray(SIDES, jnp.float32)[side_HW]
     facing = jnp.where((side_HW == 2) & (way_HW3[..., 2] > 0), BELOW, facing)
@@ -50,7 +49,7 @@ def light(
 
 
 def side_of(at_HW3: Array) -> Array:
-    """Return across which axis a point on a cell's side is entered, (H, W): the nearest border.
+    """Return the (H, W) axis of the cell border that is nearest to points on the sides of cells.
 
     Args:
         at_HW3: points, in cells from the grid's lowest corner.
@@ -61,10 +60,10 @@ def side_of(at_HW3: Array) -> Array:
 def _dark(
     occupied_XYZ: Array, cell_m: float | Array, at_HW3: Array, way_HW3: Array, side_HW: Array
 ) -> Array:
-    """Return how deep in a corner points are, (H, W): 1 in it, 0 from ``CORNER_M`` on."""
+    """Return (H, W) how close points are to a corner: 1 in it, 0 from ``CORNER_M`` on."""
     met = side_HW >= 0
     across = np.arange(3) == jnp.where(met, side_HW, 0)[..., None]
-    # The open cell before the side: the side's plane is a border, the ray comes from before it.
+    # The open cell in front of the side, from which the ray comes.
     before = jnp.where(across, jnp.round(at_HW3) - (way_HW3 > 0), jnp.floor(at_HW3))
     before, inside = before.astype(jnp.int32), at_HW3 - jnp.floor(at_HW3)
     shape, dark = np.array(occupied_XYZ.shape), jnp.zeros(side_HW.shape)

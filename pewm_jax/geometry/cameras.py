@@ -21,12 +21,12 @@ from pewm_jax.types import Array, Camera
 
 
 def matmul(a: Array, b: Array) -> Array:
-    """Return ``a @ b`` in full float32 precision on every platform."""
+    """Return ``a @ b`` in full float32 precision on all platforms."""
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
 
 def einsum(equation: str, *operands: Array) -> Array:
-    """Return ``jnp.einsum`` in full float32 precision on every platform."""
+    """Return ``jnp.einsum`` in full float32 precision on all platforms."""
     return jnp.einsum(equation, *operands, precision=jax.lax.Precision.HIGHEST)
 
 
@@ -39,10 +39,10 @@ def intrinsics_from_fov(height: int, width: int, horizontal_fov_deg: float) -> n
         horizontal_fov_deg: the horizontal field of view, degrees, between 0 and 180.
 
     Raises:
-        UserError: an argument is no number, or out of its range.
+        UserError: an argument is not a number, or is out of its range.
     """
-    given = {"height": height, "width": width, "horizontal_fov_deg": horizontal_fov_deg}
-    for name, value in given.items():
+    arguments = {"height": height, "width": width, "horizontal_fov_deg": horizontal_fov_deg}
+    for name, value in arguments.items():
         require_array("intrinsics_from_fov", name, value)
     if min(height, width) < 1 or not 0 < horizontal_fov_deg < 180:
         raise UserError(
@@ -67,7 +67,7 @@ def pose_from_yaw(position_3: np.ndarray, yaw: float, pitch: float = 0.0) -> np.
         pitch: radians, positive looks up.
 
     Raises:
-        UserError: an argument is no number, or the position has another shape than (3,).
+        UserError: an argument is not a number, or the position does not have shape (3,).
     """
     require_array("pose_from_yaw", "position_3", position_3, 3)
     for name, value in (("yaw", yaw), ("pitch", pitch)):
@@ -152,16 +152,16 @@ def project(points_world_P3: Array, camera: Camera) -> tuple[Array, Array]:
 
 
 def require_array(who: str, name: str, value: Any, *shape: Any) -> None:
-    """Refuse what is no array of finite numbers of a shape.
+    """Refuse an argument that is not an array of finite numbers of a shape.
 
-    Values are not looked at under jit, vmap and grad; types and shapes are.
+    Under jit, vmap and grad only types and shapes are checked, not values.
 
     Args:
-        who: the function, for the message.
-        name: the argument, for the message.
-        value: what was given.
-        shape: the sizes of its last axes, None for any size; more axes may come before them if the
-            first is Ellipsis.
+        who: name of the function, for the message.
+        name: name of the argument, for the message.
+        value: the argument.
+        shape: the sizes of its last axes, None for any size; if the first is Ellipsis, more axes
+            may come before them.
 
     Raises:
         UserError: it has another type or shape, or holds NaN or infinity.

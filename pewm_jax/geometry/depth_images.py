@@ -1,7 +1,8 @@
-"""Holes in images: the nearest pixel that has a value.
+"""Depth images: filling their holes, and the normals of the surfaces they show.
 
-By jump flooding (steps of …, 4, 2, 1 and once more 1 pixels): a static number of passes, and seldom
-a pixel that is a little farther than the nearest.
+Holes are filled from the nearest known pixel, which jump flooding finds (steps of …, 4, 2, 1 and
+once more 1 pixels): the number of passes is static, and in rare cases the pixel found is a little
+farther away than the nearest.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from pewm_jax.types import Array, Camera
 
 
 def nearest_known(known_THW: Array) -> tuple[Array, Array]:
-    """Find for each pixel the nearest pixel of its image that is known.
+    """Return the nearest known pixel of each pixel.
 
     Args:
         known_THW: (T, H, W) bool.
 
     Returns:
-        ``(index, found)``, both (T, H·W): the linear index of that pixel in its image, its own
-        where it is known, and False where an image has none.
+        ``(index, found)``, both (T, H·W): the linear index of the nearest known pixel in the same
+        image (a known pixel's own index), and False where an image has no known pixel.
     """
     frames, height, width = known_THW.shape
     place = np.arange(height * width, dtype=np.int32).reshape(height, width)
@@ -51,7 +52,7 @@ def nearest_known(known_THW: Array) -> tuple[Array, Array]:
         return found, None
 
     def one(known_HW: Array) -> Array:
-        # A scan, so that each pass is computed once and not anew by all that read it.
+        # A scan: unrolled passes would be fused and recomputed by each of their readers.
         return jax.lax.scan(flood, jnp.where(known_HW, place, -1), jnp.array(steps))[0]
 
     source = jax.vmap(one)(jnp.asarray(known_THW)).reshape(frames, -1)
@@ -59,11 +60,13 @@ def nearest_known(known_THW: Array) -> tuple[Array, Array]:
 
 
 def fill_depth(depth_THW: Array, otherwise: float) -> Array:
-    """Give pixels that were not measured the depth of the nearest that was; no work without holes.
+    """Return depths whose holes have the depth of the nearest measured pixel.
+
+    Images without holes are returned as they are, without any work.
 
     Args:
         depth_THW: (T, H, W) metres, 0 where not measured.
-        otherwise: depth of an image without any measurement, metres.
+        otherwise: depth for images without any measurement, metres.
     """
     depth = jnp.asarray(depth_THW)
 
@@ -76,17 +79,17 @@ def fill_depth(depth_THW: Array, otherwise: float) -> Array:
 
 
 def normals(depth_THW: Array, camera: Camera) -> Array:
-    """Return the unit normals of what is seen at pixels, turned towards the camera.
+    """Return the unit normals of the surfaces seen at pixels, turned towards the camera.
 
-    Across and down, a pixel's surface is taken to go on to that neighbour whose depth is closer, so
-    that edges do not bend it.
+    Along each image axis the difference is taken to the neighbour with the closer depth, so that
+    depth edges do not bend the normal.
 
     Args:
-        depth_THW: (T, H, W) metres along the axis of view, 0 where not measured.
+        depth_THW: (T, H, W) metres along z, 0 where not measured.
         camera: (T,) cameras.
 
     Returns:
-        (T, H, W, 3) in the world; 0 where a neighbour's depth was not measured, or there is none.
+        (T, H, W, 3) in the world; 0 where the depth of the neighbours is unknown.
     """
     depth = jnp.asarray(depth_THW)
     points = unproject(depth, camera)
@@ -102,7 +105,7 @@ def normals(depth_THW: Array, camera: Camera) -> Array:
 
 
 def _step(points_THW3: Array, depth_THW: Array, axis: int) -> tuple[Array, Array]:
-    """Return the way to the next point along an axis, and whether there is one."""
+    """Return the difference to the next point along an image axis, and whether it is known."""
     count = depth_THW.shape[axis]
     place = np.arange(count).reshape([-1 if a == axis else 1 for a in range(depth_THW.ndim)])
     ahead, behind = jnp.roll(points_THW3, -1, axis), jnp.roll(points_THW3, 1, axis)

@@ -1,8 +1,8 @@
-"""What rays meet on their way through a grid of class ids: all occupied cells, in order.
+"""Cast rays through a grid of class ids: the occupied cells along each ray, in order.
 
 A ray goes from cell to cell (Amanatides and Woo 1987, "A fast voxel traversal algorithm"). The next
-border is computed from the cell's number and not by adding up, so that rounding does not grow with
-the way. PERSIST's renderer (arXiv 2603.03482) takes such layers of faces for each pixel.
+border is computed from the cell's index and not by accumulation, so rounding errors do not grow
+along the ray. PERSIST's renderer (arXiv 2603.03482) uses such layers of faces for each pixel.
 """
 
 from __future__ import annotations
@@ -18,25 +18,26 @@ from pewm_jax.geometry.cameras import einsum
 from pewm_jax.types import Array, Camera
 
 SIDES, SHIFT, INSIDE = 4, 2, 3
-"""Ways into a cell, and their bits: by one of three axes, or by beginning there."""
+"""Number of sides of a cell (one per axis, or the ray begins inside), their bits, and INSIDE."""
 EMPTY = 0
-"""The class id of a cell with nothing in it."""
+"""The class id of an empty cell."""
 CHUNK = 4096
-"""Rays at a time: what is known of them stays in a processor's cache."""
+"""Rays processed at a time, so that their state fits in a processor's cache."""
 ROUND = 32
-"""Cells of a ray that are looked up at a time: the bits of a word."""
+"""Cells of a ray looked up at a time: the bits of a word."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Layers:
-    """What rays meet, any leading shape; slots behind the last occupied cell are empty.
+class RayHits:
+    """The occupied cells along rays, any leading shape; slots after the last one are empty.
 
     Attributes:
-        ids_L: (..., L) int32 class ids, ``EMPTY`` where there is nothing more.
-        distance_L: (..., L) where the ray enters the cell, in lengths of its direction; 0 there,
-            and where the ray begins inside of the cell.
-        side_L: (..., L) int32, by which axis (0, 1, 2) it enters; −1 there.
+        ids_L: (..., L) int32 class ids, ``EMPTY`` in empty slots.
+        distance_L: (..., L) distance at which the ray enters the cell, in lengths of its direction;
+            0 in empty slots and where the ray begins inside the cell.
+        side_L: (..., L) int32 axis (0, 1, 2) across which the ray enters; −1 where the distance is
+            0 for these reasons.
     """
 
     ids_L: Array
@@ -51,15 +52,15 @@ def march(
     origins_R3: Array,
     directions_R3: Array,
     layers: int,
-) -> Layers:
+) -> RayHits:
     """Return the occupied cells along rays, nearest first.
 
     Args:
         ids_XYZ: (X, Y, Z) integer class ids.
         low_3: the corner of the grid with the smallest coordinates, metres.
         cell_m: side of a cell, metres.
-        origins_R3: (R, 3) where rays begin, inside of the grid or not, metres.
-        directions_R3: (R, 3) where they go; not all zero, of any length.
+        origins_R3: (R, 3) origins of the rays, inside or outside the grid, metres.
+        directions_R3: (R, 3) directions of the rays, of any length above 0.
         layers: L; cells beyond the first L are left out.
 
     Returns:
@@ -83,32 +84,29 @@ def march(
 
 
 def _require_bits(shape: tuple[int, ...]) -> None:
-    """Refuse grids whose cells have no number of 32 bits."""
+    """Refuse grids whose cells cannot be packed into 32 bits."""
     if SHIFT + sum((count + 1).bit_length() for count in shape) > 32:
-        raise UserError(
-            f"The grid has {shape} cells: rays go through at most 1022 along each axis."
-        )
+        raise UserError(f"the grid has {shape} cells; rays can cross at most 1022 along each axis.")
 
 
 def _chunk(
     flat: Array, shape: tuple[int, int, int], start: Array, way: Array, layers: int
-) -> Layers:
-    """Return ``march`` of some rays: all cells on their ways first, then the occupied ones.
+) -> RayHits:
+    """Return ``march`` of a chunk of rays.
 
-    The loop over cells is run more often than anything else: it goes to the next one and writes
-    down its number, no more. What is there is looked up for many cells at once. Each round of cells
-    leaves a word per ray with a bit for each occupied one; layer by layer, the lowest bits of all
-    rays are then taken out. Nothing is written to scattered places.
+    The inner loop only steps to the next cell and stores its index. The class ids of ``ROUND``
+    cells are then looked up at once, which gives a word per ray with one bit per occupied cell.
+    Finally each layer takes the lowest set bit of every ray. There are no scattered writes.
 
     Args:
         flat: (X·Y·Z,) class ids.
         shape: X, Y, Z.
-        start: (3, R) where rays begin, in cells.
-        way: (3, R) where they go.
+        start: (3, R) origins of the rays, in cells.
+        way: (3, R) directions of the rays.
         layers: L.
     """
     rays, words = start.shape[1], -(-(sum(shape) + 1) // ROUND)
-    code = _Code(shape)
+    code = _PackedCells(shape)
     forward, still = way > 0, way == 0
     inverse = 1 / jnp.where(still, 1, way)
     turns = code.turns(jnp.where(forward, 1, -1))
@@ -125,7 +123,7 @@ def _chunk(
         return jnp.where(code.inside(at_R), code.without_side(at_R) + turn, at_R)
 
     def walk(held: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Go on by a round of cells, and look what is in them."""
+        """Step through a round of cells and look up which are occupied."""
         number, at_R, way_WNR, full_WR = held
 
         def one(k: Array, held: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -145,7 +143,7 @@ def _chunk(
         )
 
     def take(held: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Take the nearest occupied cell that is left out of all rays, as one layer."""
+        """Take the nearest remaining occupied cell of every ray as one layer."""
         layer, full_WR, made = held
         word_R, number_R = full_WR[0], jnp.zeros(rays, jnp.int32)
         for number in range(1, words):
@@ -185,17 +183,17 @@ def _chunk(
     *_, made = jax.lax.while_loop(
         lambda held: (held[0] < layers) & (held[1] != 0).any(), take, (0, full_WR, empty)
     )
-    return Layers(*made)
+    return RayHits(*made)
 
 
-class _Code:
-    """A cell and the way into it in one number: x, y and z, each from 1, and the side.
+class _PackedCells:
+    """Packs a cell and the side by which it is entered into one number: x, y, z from 1, then side.
 
-    A cell beside the grid has 0 or the count of cells plus 1 along an axis.
+    A cell just outside the grid has 0, or the count of cells plus 1, along an axis.
     """
 
     def __init__(self, shape: tuple[int, int, int]):
-        """Count bits.
+        """Compute the bits of each field.
 
         Args:
             shape: cells of the grid along each axis.
@@ -214,31 +212,31 @@ class _Code:
         return [field.astype(jnp.int32) - 1 for field in self.fields(at)]
 
     def inside(self, at: Array) -> Array:
-        """Return whether cells are in the grid."""
+        """Return whether cells lie in the grid."""
         x, y, z = (f - 1 < count for f, count in zip(self.fields(at), self.shape, strict=True))
         return x & y & z
 
     def place(self, at: Array) -> Array:
-        """Return the place of cells in the grid's flat array, int32."""
+        """Return the indices of cells in the grid's flat array, int32."""
         x, y, z = self.cells(at)
         return (x * self.shape[1] + y) * self.shape[2] + z
 
     def side(self, at: Array) -> Array:
-        """Return by which side cells are entered, int32."""
+        """Return the sides by which cells are entered, int32."""
         return (at & SIDES - 1).astype(jnp.int32)
 
     def without_side(self, at: Array) -> Array:
-        """Return cells alone."""
+        """Return the packed cells without their sides."""
         return at & ~jnp.uint32(SIDES - 1)
 
     def pack(self, cells: Array, side: Array) -> Array:
-        """Return the numbers of cells (3, ...) that are entered by sides."""
+        """Return packed cells from indices (3, ...) and sides."""
         pairs = zip(cells, self.shifts, strict=True)
         x, y, z = (cell.astype(jnp.uint32) + 1 << shift for cell, shift in pairs)
         return x | y | z | side.astype(jnp.uint32)
 
     def turns(self, ahead: Array) -> list[Array]:
-        """Return what a step of −1 or 1 along each axis adds to a cell without a side."""
+        """Return what a step of −1 or 1 along each axis adds to a packed cell without a side."""
         return [
             (step << shift).astype(jnp.uint32) + jnp.uint32(axis)
             for axis, (step, shift) in enumerate(zip(ahead, self.shifts, strict=True))
@@ -246,11 +244,11 @@ class _Code:
 
 
 def _enter(start: Array, way: Array, shape_31: Array) -> tuple[Array, Array, Array]:
-    """Return the first cells (3, R), the side by which rays come in, and if they do.
+    """Return the first cells (3, R) of rays, the sides by which they enter, and whether they do.
 
     Args:
-        start: (3, R) where rays begin, in cells.
-        way: (3, R) where they go.
+        start: (3, R) origins of the rays, in cells.
+        way: (3, R) directions of the rays.
         shape_31: cells of the grid.
     """
     still, forward, size = way == 0, way > 0, shape_31.astype(start.dtype)
@@ -263,7 +261,7 @@ def _enter(start: Array, way: Array, shape_31: Array) -> tuple[Array, Array, Arr
     first = jnp.maximum(enter.max(0), 0)
     side = jnp.where(enter.max(0) > 0, enter.argmax(0), INSIDE)
     cell = jnp.floor(start + jnp.where(jnp.isfinite(first), first, 0) * way).astype(jnp.int32)
-    edge = jnp.where(forward, 0, shape_31 - 1)  # of the axis by which a ray comes in, exactly
+    edge = jnp.where(forward, 0, shape_31 - 1)  # exact index along the axis of entry
     cell = jnp.where(jnp.arange(3)[:, None] == side, edge, jnp.clip(cell, 0, shape_31 - 1))
     return cell, side, first < leave.min(0)
 
@@ -276,16 +274,16 @@ def through_pixels(
     height: int,
     width: int,
     layers: int,
-) -> Layers:
-    """Return what the rays through the pixels of cameras meet; distances are depths along z.
+) -> RayHits:
+    """Return the cells that the rays through the pixels of cameras hit; distances are z-depths.
 
     Args:
         ids_XYZ: (X, Y, Z) integer class ids.
         low_3: as for ``march``.
         cell_m: as for ``march``.
-        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
-        height: of the images, pixels.
-        width: of the images, pixels.
+        camera: (T,) cameras, whose intrinsics belong to images of ``height`` × ``width``.
+        height: image height in pixels.
+        width: image width in pixels.
         layers: L.
 
     Returns:

@@ -1,6 +1,12 @@
-"""Z-buffers of points that have a size: which point is the nearest at each pixel of an image.
+"""Z-buffers of points that have a size: the nearest point at each pixel, and the visible points.
 
-Everything is of static shape and deterministic; of equally near points the first is seen.
+All shapes are static and all results deterministic: of equally near points the first wins.
+
+``visible_first`` chooses the points that condition a clip. Each camera draws the points into a
+small z-buffer, in their sizes; every pixel names the point it shows. Points named by most pixels
+come first, as they stand for the largest part of the frames to imagine. Ties are broken by
+``pixel_order``, which goes round all bins of the image so that no part of it is starved. Then come
+points on a surface that is seen, then those hidden in view, then all others.
 """
 
 from __future__ import annotations
@@ -17,46 +23,48 @@ from pewm_jax.geometry.cameras import invert_rigid
 from pewm_jax.types import Array, Camera
 
 NEAREST_M = 0.05
-"""Points nearer to the camera plane than this are not seen, metres."""
+"""Points nearer to the camera plane than this are not visible, metres."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Spots:
-    """Points as one camera sees them, axis by axis: vectors are what processors are fast with.
+class ProjectedPoints:
+    """Points projected into one camera, one array per coordinate (fastest on all processors).
 
     Attributes:
-        u_V: (V,) where they are across, pixels.
-        v_V: (V,) down, pixels.
+        u_V: (V,) horizontal position, pixels.
+        v_V: (V,) vertical position, pixels.
         z_V: (V,) depth, metres.
-        across_V: (V,) half their width, pixels.
-        down_V: (V,) half their height, pixels.
-        there_V: (V,) bool; others are not there, or behind the camera.
+        half_width_V: (V,) half their width, pixels.
+        half_height_V: (V,) half their height, pixels.
+        valid_V: (V,) bool; False for empty slots and points behind the camera.
     """
 
     u_V: Array
     v_V: Array
     z_V: Array
-    across_V: Array
-    down_V: Array
-    there_V: Array
+    half_width_V: Array
+    half_height_V: Array
+    valid_V: Array
 
 
-def look(points_V3: Array, wide_V: Array, tall_V: Array, valid_V: Array, camera: Camera) -> Spots:
-    """Return what one camera sees of points; see ``cameras.project``.
+def project_points(
+    points_V3: Array, wide_V: Array, tall_V: Array, valid_V: Array, camera: Camera
+) -> ProjectedPoints:
+    """Project points that have a size into one camera; see ``cameras.project``.
 
     Args:
         points_V3: (V, 3) in the world, metres.
-        wide_V: (V,) or () their width in the image, metres.
-        tall_V: (V,) or () their height in the image, metres.
-        valid_V: (V,) bool; others are not there.
+        wide_V: (V,) or () their widths parallel to the image, metres.
+        tall_V: (V,) or () their heights parallel to the image, metres.
+        valid_V: (V,) bool; others are empty slots.
         camera: one camera.
     """
     world, (fx, fy, cx, cy) = invert_rigid(camera.world_from_camera), camera.intrinsics_4
     x, y, z = (sum((row[i] * points_V3[:, i] for i in range(3)), start=row[3]) for row in world[:3])
     there = valid_V & (z > NEAREST_M)
     near = 1 / jnp.where(there, z, 1)
-    return Spots(
+    return ProjectedPoints(
         x * near * fx + cx,
         y * near * fy + cy,
         z,
@@ -66,16 +74,16 @@ def look(points_V3: Array, wide_V: Array, tall_V: Array, valid_V: Array, camera:
     )
 
 
-def window(place: Array, half: Array, most: int) -> tuple[Array, Array]:
-    """Return the pixels that points cover along one axis, as ``(begin, wide)``, int32.
+def pixel_window(place: Array, half: Array, most: int) -> tuple[Array, Array]:
+    """Return the pixels that points cover along one axis, as ``(begin, count)``, int32.
 
-    Those whose centres lie in [place − half, place + half), at least the pixel at the place, and at
-    most ``most``, then those in the middle.
+    These are the pixels whose centres lie in [place − half, place + half): at least the pixel at
+    the position, and at most ``most`` pixels around it.
 
     Args:
-        place: (…) where the points are, pixels.
-        half: (…) half their size, pixels.
-        most: pixels at most.
+        place: (…) positions of the points, pixels.
+        half: (…) half their sizes, pixels.
+        most: largest number of pixels.
     """
     half = jnp.minimum(half, most / 2)
     here = jnp.floor(place)
@@ -84,56 +92,61 @@ def window(place: Array, half: Array, most: int) -> tuple[Array, Array]:
     return begin.astype(jnp.int32), jnp.clip(wide, 1, most).astype(jnp.int32)
 
 
-def cover(spots: Spots, height: int, width: int, most: int) -> tuple[Array, Array]:
+def nearest_per_pixel(
+    projected: ProjectedPoints, height: int, width: int, most: int
+) -> tuple[Array, Array]:
     """Return (H·W,) depth and index of the nearest point covering each pixel; inf and ≥ V if none.
 
-    No window is drawn pixel by pixel. Windows of one size that begin at one pixel cover the same
-    pixels, so that only the nearest of them counts: a z-buffer per size. And a window is the union
-    of the two windows one pixel smaller that begin at the same and at the next pixel: each size is
-    spread into the next smaller one, down to single pixels.
+    Windows are not drawn pixel by pixel. Windows of one size that begin at the same pixel cover the
+    same pixels, so only the nearest of them counts: there is one z-buffer per size. A window is
+    also the union of the two windows, one pixel smaller, that begin at the same and at the next
+    pixel: the z-buffer of each size is spread into that of the next smaller size, down to single
+    pixels.
 
     Args:
-        spots: the points.
-        height: of the image, pixels.
-        width: of the image, pixels.
-        most: pixels that a point covers at most, across and down.
+        projected: the points.
+        height: image height in pixels.
+        width: image width in pixels.
+        most: largest number of pixels that a point covers along each axis.
     """
-    left, wide = window(spots.u_V, spots.across_V, most)
-    above, tall = window(spots.v_V, spots.down_V, most)
+    left, wide = pixel_window(projected.u_V, projected.half_width_V, most)
+    above, tall = pixel_window(projected.v_V, projected.half_height_V, most)
     # A window may begin up to most − 1 pixels before the image.
     left, above, shape = left + most - 1, above + most - 1, (height + most - 1, width + most - 1)
     inside = (left >= 0) & (left < shape[1]) & (above >= 0) & (above < shape[0])
     level = (tall - 1) * most + wide - 1
-    seat = (level * shape[0] + above) * shape[1] + left
-    found = nearest(seat, spots.z_V, spots.there_V & inside, most * most * shape[0] * shape[1])
+    bin_ = (level * shape[0] + above) * shape[1] + left
+    found = nearest_per_bin(
+        bin_, projected.z_V, projected.valid_V & inside, most * most * shape[0] * shape[1]
+    )
     depth, index = (x.reshape(most, most, *shape) for x in found)  # down, across, row, column
     depth, index = _spread(jnp.moveaxis(depth, 1, 0), jnp.moveaxis(index, 1, 0), axis=2)
     depth, index = _spread(depth, index, axis=0)
     return tuple(x[most - 1 :, most - 1 :].reshape(-1) for x in (depth, index))
 
 
-def nearest(seat_V: Array, z_V: Array, there_V: Array, seats: int) -> tuple[Array, Array]:
-    """Return the smallest depth at each seat and the lowest index that has it; inf and V if none.
+def nearest_per_bin(bin_V: Array, z_V: Array, valid_V: Array, bins: int) -> tuple[Array, Array]:
+    """Return the smallest depth in each bin and the lowest index that has it; inf and V if none.
 
     Args:
-        seat_V: (V,) int32, the seat of each point; not used where it is not there.
+        bin_V: (V,) int32, the bin of each point; ignored for invalid points.
         z_V: (V,) depths.
-        there_V: (V,) bool.
-        seats: how many seats there are.
+        valid_V: (V,) bool.
+        bins: number of bins.
     """
     count = len(z_V)
-    seat = jnp.where(there_V, seat_V, seats)
-    depth = jnp.full((seats,), jnp.inf).at[seat].min(z_V, mode="drop")
-    first = there_V & (z_V <= depth[jnp.clip(seat_V, 0, seats - 1)])
-    index = jnp.full((seats,), count, jnp.int32)
-    seat = jnp.where(first, seat_V, seats)
-    return depth, index.at[seat].min(jnp.arange(count, dtype=jnp.int32), mode="drop")
+    bin_ = jnp.where(valid_V, bin_V, bins)
+    depth = jnp.full((bins,), jnp.inf).at[bin_].min(z_V, mode="drop")
+    first = valid_V & (z_V <= depth[jnp.clip(bin_V, 0, bins - 1)])
+    index = jnp.full((bins,), count, jnp.int32)
+    bin_ = jnp.where(first, bin_V, bins)
+    return depth, index.at[bin_].min(jnp.arange(count, dtype=jnp.int32), mode="drop")
 
 
 def _spread(depth: Array, index: Array, axis: int) -> tuple[Array, Array]:
-    """Spread images (level, …) of windows of 1, 2, … pixels along an axis of each down to pixels.
+    """Spread z-buffers (level, …) of windows of 1, 2, … pixels along an axis down to single pixels.
 
-    Of several at one pixel the nearest counts, of equals the lowest index.
+    The nearest window wins; of equally near ones the lowest index.
     """
 
     def nearer(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -149,38 +162,38 @@ def _spread(depth: Array, index: Array, axis: int) -> tuple[Array, Array]:
         next_one = moved(best[0], jnp.inf), moved(best[1], np.iinfo(np.int32).max)
         return nearer(nearer(best, next_one), level), None
 
-    # A scan, so that each level is computed once and not anew by all that read it.
+    # A scan: unrolled levels would be fused and recomputed by each of their readers.
     smaller = depth[:-1], index[:-1]
     return jax.lax.scan(step, (depth[-1], index[-1]), smaller, reverse=True)[0]
 
 
 RASTER, BIN, MOST = 32, 4, 4
-"""Longest side of a z-buffer, side of a bin, and pixels that a point covers at most."""
+"""Longest side of the small z-buffer, side of a bin, and largest side of a point, pixels."""
 RELATIVE = 0.1
-"""Points on one surface lie within the larger of their width and this share of its depth."""
+"""Depth tolerance of points on one surface, relative to its depth (at least their width)."""
 CLASS = 2.0**15
-"""The rank of points by class: named, on a seen surface, hidden in view, others; metres are added
-within a class."""
+"""Distance between the ranks of two classes of points (named by a pixel, on a seen surface, hidden
+in view, others); metres are added within a class."""
 
 
 @functools.lru_cache(maxsize=64)
-def turns(rows: int, columns: int) -> np.ndarray:
-    """Return (rows · columns,) int32: each pixel's turn, from 0, in an order that goes round bins.
+def pixel_order(rows: int, columns: int) -> np.ndarray:
+    """Return (rows · columns,) int32: the position of each pixel in an order that goes round bins.
 
-    Within a bin, pixels far apart come first (their places, bit by bit backwards).
+    Within a bin, pixels that are far apart come first (their coordinates, bits reversed).
     """
     row, column = np.divmod(np.arange(rows * columns), columns)
     v, u = row % BIN, column % BIN
-    # The bits of u and v, lowest first: next turns are half a bin apart, then a quarter.
+    # The bits of u and v, lowest first: successive pixels are half a bin apart, then a quarter.
     within = np.zeros_like(row)
     for k in range(BIN.bit_length() - 1):
         within += (((u ^ v) >> k & 1) * 2 + (v >> k & 1)) << 2 * (BIN.bit_length() - 2 - k)
     bins = (row // BIN) * (-(-columns // BIN)) + column // BIN
     scattered = np.random.default_rng(0).permutation(bins.max() + 1)[bins]
-    order = np.lexsort((scattered, np.asarray(within)))
-    turn = np.empty(len(order), np.int32)
-    turn[order] = np.arange(len(order), dtype=np.int32)
-    return turn
+    pixels = np.lexsort((scattered, np.asarray(within)))
+    position = np.empty(len(pixels), np.int32)
+    position[pixels] = np.arange(len(pixels), dtype=np.int32)
+    return position
 
 
 def raster(size: tuple[int, int]) -> tuple[int, int]:
@@ -189,7 +202,7 @@ def raster(size: tuple[int, int]) -> tuple[int, int]:
     return tuple(max(round(side * most / max(size)), 1) for side in size)  # type: ignore[return-value]
 
 
-def rank(
+def visibility_rank(
     points_V3: Array,
     wide_V: Array,
     tall_V: Array,
@@ -197,10 +210,11 @@ def rank(
     camera: Camera,
     size: tuple[int, int],
 ) -> Array:
-    """Return (T, V) how early each camera would have each point; inf for points out of its view.
+    """Return the (T, V) rank of each point for each camera, low first; inf for points out of view.
 
-    Below ``CLASS`` are points that pixels name, those of most pixels first; then follow points on a
-    surface that is seen, and from 2 ``CLASS`` on hidden ones, both by depth.
+    Ranks below ``CLASS`` are those of points named by pixels, those of most pixels first. Ranks
+    from ``CLASS`` on are those of points on a seen surface, and from 2 ``CLASS`` on those of hidden
+    points, both by depth.
 
     Args:
         points_V3: (V, 3) in the world, metres.
@@ -212,22 +226,22 @@ def rank(
     """
     count, (rows, columns) = len(points_V3), raster(size)
     scale = np.array([columns / size[1], rows / size[0]] * 2, np.float32)
-    turn = jnp.asarray(turns(rows, columns))
+    order = jnp.asarray(pixel_order(rows, columns))
 
     def one(camera: Camera) -> Array:
         small = Camera(camera.intrinsics_4 * scale, camera.world_from_camera)
-        spots = look(points_V3, wide_V, tall_V, valid_V, small)
-        front, shown = cover(spots, rows, columns, MOST)
+        projected = project_points(points_V3, wide_V, tall_V, valid_V, small)
+        front, shown = nearest_per_pixel(projected, rows, columns, MOST)
         area = jnp.zeros((count,)).at[shown].add(1.0, mode="drop")
-        first = jnp.full((count,), jnp.inf).at[shown].min(turn / len(turn), mode="drop")
-        named = len(turn) - area + first
-        u, v = spots.u_V, spots.v_V
-        inside = spots.there_V & (u >= 0) & (u <= columns) & (v >= 0) & (v <= rows)
+        first = jnp.full((count,), jnp.inf).at[shown].min(order / len(order), mode="drop")
+        named = len(order) - area + first
+        u, v = projected.u_V, projected.v_V
+        inside = projected.valid_V & (u >= 0) & (u <= columns) & (v >= 0) & (v <= rows)
         column = jnp.clip(u, 0, columns - 1).astype(jnp.int32)
         row = jnp.clip(v, 0, rows - 1).astype(jnp.int32)
         before = front[row * columns + column]
-        hidden = spots.z_V > before + jnp.maximum(wide_V, RELATIVE * before)
-        behind = jnp.minimum(spots.z_V, CLASS / 2) + jnp.where(hidden, 2, 1) * CLASS
+        hidden = projected.z_V > before + jnp.maximum(wide_V, RELATIVE * before)
+        behind = jnp.minimum(projected.z_V, CLASS / 2) + jnp.where(hidden, 2, 1) * CLASS
         return jnp.minimum(named, jnp.where(inside, behind, jnp.inf))
 
     return jax.lax.map(one, jax.tree.map(jnp.asarray, camera))
@@ -244,10 +258,10 @@ def visible_first(
 ) -> Array:
     """Return (≤ count,) indices of the points that condition one clip, the most useful first.
 
-    Points that pixels of some camera show, those of most pixels first; then points on a
-    seen surface and then hidden points in view, nearest first (by the smallest depth at which a
-    camera has them); then others by distance to the nearest camera; invalid ones are last. Ties go
-    to the lower index.
+    Points that pixels of some camera show come first, those of most pixels first. Then come points
+    on a seen surface and then hidden points in view, by the smallest depth in any camera. Then come
+    the others by distance to the nearest camera, and invalid points last. Ties go to the lower
+    index.
 
     Args:
         points_V3: (V, 3) in the world, metres.
@@ -256,9 +270,9 @@ def visible_first(
         valid_V: (V,) bool.
         camera: (T,) cameras of the clip.
         size: image height and width in pixels.
-        count: the most indices to return; fewer if there are fewer points.
+        count: the largest number of indices to return.
     """
-    rank_TV = rank(points_V3, wide_V, tall_V, valid_V, camera, size)
+    rank_TV = visibility_rank(points_V3, wide_V, tall_V, valid_V, camera, size)
     centres = jnp.asarray(camera.world_from_camera)[:, :3, 3]
     squares = sum((points_V3[None, :, i] - centres[:, None, i]) ** 2 for i in range(3))
     far = 3 * CLASS + jnp.sqrt(jnp.min(jnp.asarray(squares), 0))

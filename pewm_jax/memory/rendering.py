@@ -16,7 +16,7 @@ import numpy as np
 
 from pewm_jax.geometry import zbuffer
 from pewm_jax.geometry.cameras import project
-from pewm_jax.geometry.zbuffer import NEAREST_M, Spots
+from pewm_jax.geometry.zbuffer import NEAREST_M, ProjectedPoints
 from pewm_jax.types import Array, Camera, View
 
 TOLERANCE_M, TOLERANCE_RELATIVE = 0.05, 0.1
@@ -125,20 +125,20 @@ def splat_surfels(
     few = int(blocks * SHARE)
 
     def one(camera: Camera) -> tuple[Array, Array, Array]:
-        spots = zbuffer.look(points_V3, size_V, size_V, valid_V, camera)
+        projected = zbuffer.project_points(points_V3, size_V, size_V, valid_V, camera)
         away_V = None
         if sides:
             away_V = ((points_V3 - camera.world_from_camera[:3, 3]) * sides[0]).sum(-1) > 0
 
         def drawn(
-            spots: Spots, features_VF: Array, away_V: Array | None
+            projected: ProjectedPoints, features_VF: Array, away_V: Array | None
         ) -> tuple[Array, Array, Array]:
-            return _draw(spots, features_VF, away_V, height, width, most, average)
+            return _draw(projected, features_VF, away_V, height, width, most, average)
 
-        everything = spots, features_VF, away_V
+        everything = projected, features_VF, away_V
         if few * BLOCK < WORTH_A_BRANCH:
             return drawn(*everything)
-        listed, count = _blocks_in_view(spots, height, width, most, few)
+        listed, count = _blocks_in_view(projected, height, width, most, few)
 
         def chosen(x: Array) -> Array:
             rows = x.reshape(blocks, BLOCK, *x.shape[1:])
@@ -213,14 +213,14 @@ def _whole_blocks(*arrays_V: Array) -> tuple[Array, ...]:
 
 
 def _blocks_in_view(
-    spots: Spots, height: int, width: int, most: int, few: int
+    projected: ProjectedPoints, height: int, width: int, most: int, few: int
 ) -> tuple[Array, Array]:
     """Return (few,) the blocks that reach into the image, padded with their number; how many do."""
     # A point reaches half of `most` beyond where it is, and its bilinear share one pixel.
     reach = most / 2 + 1
-    across = (spots.u_V > -reach) & (spots.u_V < width + reach)
-    down = (spots.v_V > -reach) & (spots.v_V < height + reach)
-    used = (across & down & spots.there_V).reshape(-1, BLOCK).any(-1)
+    across = (projected.u_V > -reach) & (projected.u_V < width + reach)
+    down = (projected.v_V > -reach) & (projected.v_V < height + reach)
+    used = (across & down & projected.valid_V).reshape(-1, BLOCK).any(-1)
     number = jnp.arange(len(used), dtype=jnp.int32)
     place = jnp.where(used, jnp.cumsum(used) - 1, few)
     listed = jnp.full((few,), len(used), jnp.int32).at[place].set(number, mode="drop")
@@ -228,7 +228,7 @@ def _blocks_in_view(
 
 
 def _draw(
-    spots: Spots,
+    projected: ProjectedPoints,
     features_VF: Array,
     away_V: Array | None,
     height: int,
@@ -242,18 +242,18 @@ def _draw(
     that does not lies as near.
     """
     count, pixels = len(features_VF), height * width
-    front_P, covering = zbuffer.cover(spots, height, width, most)
+    front_P, covering = zbuffer.nearest_per_pixel(projected, height, width, most)
 
     def visible(column: Array, row: Array) -> tuple[Array, Array]:
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         pixel = jnp.where(inside, row * width + column, 0)
         front = front_P[pixel]
-        shown = spots.there_V & inside & (spots.z_V <= front + tolerance(front))
+        shown = projected.valid_V & inside & (projected.z_V <= front + tolerance(front))
         return jnp.where(shown, pixel, pixels), shown
 
     behind = jnp.zeros(pixels, bool)
     if average:
-        total = _shares(spots, features_VF, away_V, visible, pixels)
+        total = _shares(projected, features_VF, away_V, visible, pixels)
         direct = total[:, -1] > LEAST
         mean = total / jnp.where(direct, total[:, -1], 1)[:, None]
         if away_V is not None:
@@ -261,9 +261,9 @@ def _draw(
             mean = jnp.concatenate([mean[:, :-2], mean[:, -1:]], -1)
         features, depth = mean[:, :-2], mean[:, -2]
     else:
-        column, row = (jnp.floor(x).astype(jnp.int32) for x in (spots.u_V, spots.v_V))
+        column, row = (jnp.floor(x).astype(jnp.int32) for x in (projected.u_V, projected.v_V))
         pixel, shown = visible(column, row)
-        depth, index = zbuffer.nearest(pixel, spots.z_V, shown, pixels)
+        depth, index = zbuffer.nearest_per_bin(pixel, projected.z_V, shown, pixels)
         direct = index < count
         features = features_VF[jnp.minimum(index, count - 1)]
         if away_V is not None:
@@ -280,7 +280,7 @@ def _draw(
 
 
 def _shares(
-    spots: Spots,
+    projected: ProjectedPoints,
     features_VF: Array,
     away_V: Array | None,
     visible: Callable[[Array, Array], tuple[Array, Array]],
@@ -293,11 +293,11 @@ def _shares(
     """
     # A place may be computed anew for each use, rounded to either side of the middle of a pixel,
     # where a point that is seen again lies: the border between two pixels is moved from there.
-    u, v = spots.u_V - 0.5, spots.v_V - 0.5
+    u, v = projected.u_V - 0.5, projected.v_V - 0.5
     column, row = (jnp.floor(x + MIDDLE).astype(jnp.int32) for x in (u, v))
     right, below = jnp.maximum(u - column, 0), jnp.maximum(v - row, 0)
     one_V1 = jnp.ones((len(features_VF), 1))
-    values_VC = jnp.concatenate([features_VF, spots.z_V[:, None], one_V1], -1)
+    values_VC = jnp.concatenate([features_VF, projected.z_V[:, None], one_V1], -1)
     if away_V is not None:
         values_VC = jnp.where(away_V[:, None], 0, values_VC)
         away_V1 = away_V[:, None].astype(values_VC.dtype)

@@ -162,10 +162,10 @@ def _look(
 
 
 def _turns(model: ModelConfig, points_M3: Array, valid_M: Array, camera: Camera) -> Array:
-    """Return (T, M) how early each camera names each token; see ``zbuffer.rank``."""
+    """Return (T, M) how early each camera names each token; see ``zbuffer.visibility_rank``."""
     cell_m, size = model.memory.cell_m, (model.clip.height, model.clip.width)
     wide, tall = jnp.float32(max(cell_m[:2])), jnp.float32(cell_m[2])
-    return zbuffer.rank(points_M3, wide, tall, valid_M, camera, size)
+    return zbuffer.visibility_rank(points_M3, wide, tall, valid_M, camera, size)
 
 
 def sinusoid_3d(

@@ -74,5 +74,5 @@ def test_what_hides_is_chosen_before_what_is_hidden():
 
 @pytest.mark.parametrize("shape", [(8, 8), (21, 32), (1, 5)])
 def test_each_pixel_has_one_turn(shape):
-    turns = zbuffer.turns(*shape)
+    turns = zbuffer.pixel_order(*shape)
     np.testing.assert_array_equal(np.sort(turns), np.arange(np.prod(shape)))

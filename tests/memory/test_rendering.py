@@ -163,7 +163,9 @@ def covered_by_loop(points, size, valid, camera, most):
     uv, z = (np.asarray(x) for x in cameras.project(points, camera))
     for p in np.flatnonzero(valid & (z > rendering.NEAREST_M)):
         half = size[p] / 2 * np.asarray(camera.intrinsics_4[:2]) / z[p]
-        first, wide = (np.asarray(x)[0] for x in zbuffer.window(uv[p][None], half[None], most))
+        first, wide = (
+            np.asarray(x)[0] for x in zbuffer.pixel_window(uv[p][None], half[None], most)
+        )
         for row in range(first[1], first[1] + wide[1]):
             for column in range(first[0], first[0] + wide[0]):
                 inside = 0 <= row < HEIGHT and 0 <= column < WIDTH
@@ -224,7 +226,7 @@ def test_points_with_a_size_are_drawn_as_by_a_loop(seed, most, average):
 def test_a_window_holds_the_pixel_of_its_point_and_has_the_size_of_its_point(seed, most):
     rng = np.random.default_rng(seed)
     uv, half = rng.uniform(-3, 9, (50, 2)), rng.uniform(0, 3, (50, 2))
-    begin, wide = (np.asarray(x) for x in zbuffer.window(uv, half, most))
+    begin, wide = (np.asarray(x) for x in zbuffer.pixel_window(uv, half, most))
     assert ((wide >= 1) & (wide <= most)).all()
     assert ((begin <= np.floor(uv)) & (np.floor(uv) < begin + wide)).all()
     assert (np.abs(wide - np.clip(2 * half, 1, most)) <= 1 + 1e-4).all()

@@ -10,7 +10,7 @@ import torch
 
 from pewm_jax.config import BlocksConfig, UserError, VoxelRendererConfig
 from pewm_jax.geometry import cameras
-from pewm_jax.geometry.march import Layers
+from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import voxel_renderer
 from pewm_jax.types import Camera
 from tests.persist_nets import weights
@@ -29,7 +29,7 @@ def test_layers_are_folded_as_by_torch():
     rng = np.random.default_rng(0)
     params = weights(voxel_renderer, CONFIG)
     depth = rng.uniform(0, 12, (2, 3, 14)).astype(np.float32)
-    seen = Layers(rng.integers(0, 9, (2, 3, 14)), depth, rng.integers(-1, 3, (2, 3, 14)))
+    seen = RayHits(rng.integers(0, 9, (2, 3, 14)), depth, rng.integers(-1, 3, (2, 3, 14)))
     run = jax.jit(voxel_renderer.features, static_argnums=0)
     made = run(CONFIG, params, seen)
 
@@ -58,7 +58,7 @@ def test_drawn_voxels_join_what_rays_meet_and_reach_the_picture():
     params = weights(voxel_renderer, config)
     rng = np.random.default_rng(1)
     shape = (1, 1, 6, 8, 14)
-    layers = Layers(rng.integers(0, 9, shape), rng.uniform(0, 5, shape), np.zeros(shape, int))
+    layers = RayHits(rng.integers(0, 9, shape), rng.uniform(0, 5, shape), np.zeros(shape, int))
     drawn = rng.normal(size=(1, 1, 6, 8, 3)).astype(np.float32)
     told = voxel_renderer.features(config, params, layers, drawn_hwC=drawn)
     assert told.shape[-1] == config.features == config.folded + 3

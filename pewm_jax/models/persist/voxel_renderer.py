@@ -21,7 +21,7 @@ import numpy as np
 from pewm_jax.config import UserError, VoxelRendererConfig
 from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import resize_intrinsics
-from pewm_jax.geometry.march import Layers
+from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache
@@ -76,7 +76,7 @@ def look(
     cell_m: float,
     camera: Camera,
     size: tuple[int, int],
-) -> Layers:
+) -> RayHits:
     """Return what the rays of T cameras meet in T grids, (T, h, w, L); distances are depths.
 
     With ``rays`` r above 1 the shape is (T, h·r, w·r, L).
@@ -93,7 +93,7 @@ def look(
     shrink = width / size[1], height / size[0]
     intrinsics = resize_intrinsics(camera.intrinsics_4, shrink[0], shrink[1])
 
-    def one(frame: tuple[Array, ...]) -> Layers:
+    def one(frame: tuple[Array, ...]) -> RayHits:
         ids, low, intrinsics_4, pose = frame
         seen = Camera(intrinsics_4[None], pose[None])
         found = march.through_pixels(ids, low, cell_m, seen, height, width, config.layers)
@@ -107,7 +107,7 @@ def look(
 def features(
     config: VoxelRendererConfig,
     params: Params,
-    layers: Layers,
+    layers: RayHits,
     dtype: Any = jnp.float32,
     *,
     drawn_hwC: Array | None = None,
@@ -139,7 +139,7 @@ def features(
     return jnp.concatenate([folded, drawn_hwC.astype(dtype)], -1)
 
 
-def _folded(config: VoxelRendererConfig, params: Params, layers: Layers, dtype: Any) -> Array:
+def _folded(config: VoxelRendererConfig, params: Params, layers: RayHits, dtype: Any) -> Array:
     x = params["classes"]["kernel"].astype(dtype)[layers.ids_L]
     if config.sides:
         x = x + params["faces"]["kernel"].astype(dtype)[layers.side_L]  # −1 is the last row

@@ -19,7 +19,7 @@ from pewm_jax.config import CameraModelConfig, VoxelDiTConfig, VoxelRendererConf
 from pewm_jax.config.parts import Noise
 from pewm_jax.diffusion.flow import FrameFlowConfig
 from pewm_jax.geometry.actions import camera_numbers, camera_steps_between
-from pewm_jax.geometry.march import Layers
+from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer
 from pewm_jax.models.persist import voxel_vae as voxel_vae_model
 from pewm_jax.types import Array, Camera, Params
@@ -170,7 +170,7 @@ def renderer(
     noise: FrameFlowConfig,
     params: Params,
     latents_BThwC: Array,
-    layers: Layers,
+    layers: RayHits,
     key: Array,
     *,
     actions_BTA: Array | None = None,

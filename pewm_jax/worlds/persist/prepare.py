@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import PersistConfig, UserError
 from pewm_jax.geometry.actions import camera_numbers
-from pewm_jax.geometry.march import Layers
+from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
 from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Array, Camera, Clip, Params
@@ -165,7 +165,7 @@ def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     pixels = (model.clip.height, model.clip.width)
 
-    def look(one: tuple[Array, Array, Camera]) -> Layers:
+    def look(one: tuple[Array, Array, Camera]) -> RayHits:
         grid, low, seen = one
         return voxel_renderer.look(model.backbone.renderer, grid, low, size, seen, pixels)  # type: ignore[attr-defined]
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.config import Config, PersistConfig, PersistTrainConfig, TrainSettings
 from pewm_jax.config import functions as functions_of
-from pewm_jax.geometry.march import Layers
+from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.models.persist import nets as persist_nets
 from pewm_jax.models.persist.voxel_vae_shapes import costs as vae_costs
@@ -138,7 +138,7 @@ def renderer(
     del train
     made = _of(persist_prepare.layers, model, params, clip)
     config = model.backbone.renderer  # type: ignore[attr-defined]
-    layers = Layers(
+    layers = RayHits(
         made["ids"].astype(jnp.int32),
         made["distance"].astype(jnp.float32),
         made["side"].astype(jnp.int32),
