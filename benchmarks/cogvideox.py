@@ -25,9 +25,10 @@ import record
 import torch
 
 from pewm_jax.config import DiTConfig, published
-from pewm_jax.convert import assemble, transformer
+from pewm_jax.convert import pipeline
 from pewm_jax.models.cogvideox import model as dit
-from pewm_jax.nn import positions
+from pewm_jax.models.cogvideox import positions
+from pewm_jax.models.cogvideox.convert import TRANSFORMER
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -57,9 +58,9 @@ def same_weights(config: DiTConfig) -> tuple[Any, CogVideoXTransformer3DModel]:
         return np.asarray(one + rng.normal(0, spread, leaf.shape), np.float32)
 
     params = jax.tree_util.tree_map_with_path(draw, like)
-    values = transformer.config_to_diffusers(config)
+    values = TRANSFORMER.write_config(config)
     network = CogVideoXTransformer3DModel(**{k: v for k, v in values.items() if k[0] != "_"})
-    tensors = assemble.write(transformer.entries(config), params)
+    tensors = pipeline.write_tensors(TRANSFORMER.entries(config), params)
     network.load_state_dict({name: torch.tensor(np.array(x)) for name, x in tensors})
     return jax.tree.map(jnp.asarray, params), network
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from diffusers import AutoencoderKLCogVideoX, CogVideoXDDIMScheduler, CogVideoXTransformer3DModel
 
-from pewm_jax.convert import transformer
+from pewm_jax.models.cogvideox.convert import TRANSFORMER
 
 
 def timed(job: Callable[[], Any], repeats: int) -> dict[str, float]:
@@ -34,7 +34,7 @@ def timed(job: Callable[[], Any], repeats: int) -> dict[str, float]:
 
 def network(setting: Any, dtype: torch.dtype) -> Any:
     """Return the reference transformer, random weights, on the GPU."""
-    values = transformer.config_to_diffusers(setting.dit)
+    values = TRANSFORMER.write_config(setting.dit)
     settings = {k: v for k, v in values.items() if not k.startswith("_")}
     with torch.device("cuda"):
         return CogVideoXTransformer3DModel(**settings).to(dtype)

@@ -25,9 +25,9 @@ import numpy as np
 from record import machine, record, table
 
 from pewm_jax.config import VAEConfig
-from pewm_jax.convert import vae as converter
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import vae
+from pewm_jax.models.cogvideox.convert import VAE
 
 NAME = "cogvideox_vae"
 GOAL = 0.8
@@ -53,13 +53,13 @@ def pair() -> tuple[Any, VAEConfig, dict[str, Any]]:
     torch.set_num_threads(2)
     torch.manual_seed(0)
     network = AutoencoderKLCogVideoX().eval().requires_grad_(requires_grad=False)
-    config = converter.config_from_diffusers(dict(network.config))
+    config = VAE.read_config(dict(network.config))
     tensors = network.state_dict()
     leaves = {
         entry.path: jnp.asarray(
-            np.ascontiguousarray(entry.turn.ours(tensors[entry.theirs].numpy()))
+            np.ascontiguousarray(entry.transform.read(tensors[entry.name].numpy()))
         )
-        for entry in converter.entries(config)
+        for entry in VAE.entries(config)
     }
     return network, config, tree.unflatten(leaves)
 

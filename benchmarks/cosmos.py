@@ -22,10 +22,11 @@ import torch
 from cogvideox_vae import compare
 from svd import HEADER, Row, same_weights
 
-from pewm_jax.convert import cosmos_transformer, wan_vae
 from pewm_jax.io import tree
 from pewm_jax.models.cosmos import model as transformer_model
+from pewm_jax.models.cosmos.convert import TRANSFORMER
 from pewm_jax.models.wan import vae as vae_model
+from pewm_jax.models.wan.convert import VAE
 from pewm_jax.types import Params
 
 with warnings.catch_warnings():
@@ -43,9 +44,9 @@ def stacked(network: torch.nn.Module, config: transformer_model.CosmosConfig) ->
         path: np.empty(shape, np.float32)
         for path, shape in transformer_model.layout(config).items()
     }
-    for entry in cosmos_transformer.entries(config):
+    for entry in TRANSFORMER.entries(config):
         place = leaves[entry.path] if entry.layer is None else leaves[entry.path][entry.layer]
-        place[...] = entry.turn.ours(tensors[entry.theirs].numpy())
+        place[...] = entry.transform.read(tensors[entry.name].numpy())
     return jax.tree.map(jnp.asarray, tree.unflatten(leaves))
 
 
@@ -70,7 +71,7 @@ def transformer_row(heads: int, blocks: int, shape: tuple[int, int, int], turns:
         concat_padding_mask=False,  # the reference needs torchvision for it
     )
     network = network.eval().requires_grad_(requires_grad=False)
-    config = cosmos_transformer.config_from_diffusers(dict(network.config))
+    config = TRANSFORMER.read_config(dict(network.config))
     params = stacked(network, config)
     frames, height, width = shape
     latents, mask = torch.randn(1, 16, *shape), torch.zeros(1, 1, *shape)
@@ -96,8 +97,8 @@ def vae_rows(base: int, frames: int, size: int, turns: int) -> list[Row]:
     """Compare encoding and decoding."""
     torch.manual_seed(0)
     network = AutoencoderKLWan(base_dim=base).eval().requires_grad_(requires_grad=False)
-    config = wan_vae.config_from_diffusers(dict(network.config))
-    params = same_weights(network, wan_vae.entries(config))
+    config = VAE.read_config(dict(network.config))
+    params = same_weights(network, VAE.entries(config))
     video = torch.rand(1, 3, frames, size, size) * 2 - 1
 
     def encoded() -> torch.Tensor:

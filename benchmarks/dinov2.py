@@ -21,9 +21,9 @@ import torch
 from transformers import Dinov2Config, Dinov2Model
 
 from pewm_jax.config.dinov2 import published
-from pewm_jax.convert import assemble
-from pewm_jax.convert.dinov2 import entries
+from pewm_jax.convert import pipeline
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.convert import entries
 
 SIZE = 518
 BATCHES = (1, 4)
@@ -51,7 +51,7 @@ def same_weights() -> tuple[dict, Dinov2Model]:
     known = network.state_dict().keys()
     tensors = {
         name if name in known else in_memory(name): torch.tensor(tensor)
-        for name, tensor in assemble.write(entries(CONFIG), params)
+        for name, tensor in pipeline.write_tensors(entries(CONFIG), params)
     }
     missing, unexpected = network.load_state_dict(tensors, strict=False)
     assert (missing, unexpected) == (["embeddings.mask_token"], [])

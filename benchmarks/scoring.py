@@ -38,9 +38,9 @@ from pewm_jax.eval.protocol import choose
 from pewm_jax.eval.reproject import ReprojectSettings
 from pewm_jax.eval.scoring import load_batch
 from pewm_jax.io import tree
+from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
-from pewm_jax.models.i3d import weights as i3d_weights
-from pewm_jax.models.lpips import weights as lpips_weights
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.types import Params
 
 SAMPLER, EMPTY = "sampler, with the map", "sampler, without"

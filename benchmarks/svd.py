@@ -22,11 +22,11 @@ import record
 import torch
 from cogvideox_vae import compare
 
-from pewm_jax.convert import svd_unet, svd_vae
-from pewm_jax.convert.mapping import Entry
 from pewm_jax.io import tree
+from pewm_jax.io.published import Entry
 from pewm_jax.models.svd import unet as unet_model
 from pewm_jax.models.svd import vae as vae_model
+from pewm_jax.models.svd.convert import BLOCK, UNET, VAE
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
@@ -51,7 +51,7 @@ def same_weights(network: torch.nn.Module, entries: Sequence[Entry]) -> Any:
     return tree.unflatten(
         {
             entry.path: jnp.asarray(
-                np.ascontiguousarray(entry.turn.ours(tensors[entry.theirs].numpy()))
+                np.ascontiguousarray(entry.transform.read(tensors[entry.name].numpy()))
             )
             for entry in entries
         }
@@ -74,8 +74,8 @@ def unet_row(
     torch.manual_seed(0)
     network = UNetSpatioTemporalConditionModel(block_out_channels=widths, num_attention_heads=heads)
     network = network.eval().requires_grad_(requires_grad=False)
-    config = svd_unet.config_from_diffusers(dict(network.config))
-    params = same_weights(network, svd_unet.entries(config))
+    config = UNET.read_config(dict(network.config))
+    params = same_weights(network, UNET.entries(config))
     frames, height, width = shape
     latents = torch.randn(1, frames, config.in_channels, height, width)
     rest = (torch.tensor([0.4]), torch.randn(1, 1, config.image_dim), torch.tensor([[6, 127, 0.1]]))
@@ -95,12 +95,12 @@ def vae_rows(widths: tuple[int, ...], frames: int, size: int, turns: int) -> lis
     torch.manual_seed(0)
     network = AutoencoderKLTemporalDecoder(
         block_out_channels=widths,
-        down_block_types=[svd_vae.BLOCK] * len(widths),
+        down_block_types=[BLOCK] * len(widths),
         layers_per_block=2,
     )
     network = network.eval().requires_grad_(requires_grad=False)
-    config = svd_vae.config_from_diffusers(dict(network.config))
-    params = same_weights(network, svd_vae.entries(config))
+    config = VAE.read_config(dict(network.config))
+    params = same_weights(network, VAE.entries(config))
     video = torch.rand(frames, 3, size, size) * 2 - 1
 
     def encoded() -> torch.Tensor:

@@ -16,11 +16,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pewm_jax.codecs.signals import rgb_from_signal
     from pewm_jax.config import Config, ModelConfig
     from pewm_jax.errors import ConfigError, UserError
     from pewm_jax.geometry.actions import integrate
     from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
-    from pewm_jax.nn.signals import rgb_from_signal
     from pewm_jax.train.loading import load
     from pewm_jax.types import Camera, Clip, Control, Frames, VoxelMap, WorldState
     from pewm_jax.worlds import imagine, imagine_many, observe, start
@@ -46,7 +46,7 @@ _HOME = {
     "load": "train.loading",
     "observe": "worlds",
     "pose_from_yaw": "geometry.cameras",
-    "rgb_from_signal": "nn.signals",
+    "rgb_from_signal": "codecs.signals",
     "rollout": "worlds.rollouts",
     "start": "worlds",
 }

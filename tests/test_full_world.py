@@ -10,6 +10,7 @@ import pytest
 from pewm_jax import config as configs
 from pewm_jax import worlds
 from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import signals
 from pewm_jax.config import (
     AttentionConfig,
     ConfigError,
@@ -27,7 +28,6 @@ from pewm_jax.data import loader
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import tree, weights
-from pewm_jax.nn import signals
 from pewm_jax.train import loop
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import rollouts, world_model

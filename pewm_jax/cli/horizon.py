@@ -114,7 +114,7 @@ def _measured(
     from pewm_jax.data.loader import require_same_cells
     from pewm_jax.eval import edit_trials, horizon, voxel_score
     from pewm_jax.eval.metrics.videos import read
-    from pewm_jax.models.i3d import weights as i3d_weights
+    from pewm_jax.models.i3d import convert as i3d_weights
 
     i3d = read(i3d_weights.find(None), "fvd") if settings.fvd == "on" else None
     episodes = EpisodeSource(settings.data / settings.split)

@@ -23,11 +23,11 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from pewm_jax.codecs.pixel import fold
+from pewm_jax.codecs.signals import depth_from_signal, signal_from_depth
 from pewm_jax.config import Codec, ModelConfig, functions
 from pewm_jax.geometry import depth_images
 from pewm_jax.nn import placement
 from pewm_jax.nn.costs import Costs, Share
-from pewm_jax.nn.signals import depth_from_signal, signal_from_depth
 from pewm_jax.types import Array, Params, View
 
 

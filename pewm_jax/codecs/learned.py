@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
+from pewm_jax.codecs import gates
 from pewm_jax.config import LearnedCodecConfig, ModelConfig, UserError
-from pewm_jax.nn import gates
 from pewm_jax.nn.convolution import convolve
 from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.types import Array, Params

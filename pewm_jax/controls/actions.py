@@ -22,8 +22,8 @@ from jax.sharding import PartitionSpec as P
 from pewm_jax.config import ModelConfig, ModulationConfig, UserError
 from pewm_jax.controls import camera as camera_control
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.models.svd.layers import linear
 from pewm_jax.nn.costs import Costs, Product, Share
+from pewm_jax.nn.layers import linear
 from pewm_jax.types import Array, Control, Frames, Params
 
 SHARDING = (

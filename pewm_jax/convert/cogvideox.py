@@ -1,4 +1,4 @@
-"""CogVideoX checkpoints in the layout of diffusers: read, import, and load what was imported.
+"""CogVideoX's folders: read a checkpoint, import it, load what was imported, export it again.
 
 A pipeline's folder has ``transformer/``, ``vae/`` and ``scheduler/``, each with its JSON settings
 and safetensors, one file or shards. An imported folder has the same parts in our layout::
@@ -8,107 +8,57 @@ and safetensors, one file or shards. An imported folder has the same parts in ou
         scheduler/config.json
         text/weights.safetensors  the prompts, encoded (where there is a text encoder)
         base.json                 the three original settings, licence, prompts
+
+``base.json`` holds what converted weights were made from, so that ``export`` can write them as
+diffusers' ``from_pretrained`` loads them. Three kinds of folder can be exported: an import, an
+import that was widened to a world model, and a training run that began from one. Of a world model
+the video model inside is written: the memory blocks and the channels of depth and camera are left
+out.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Sequence
+import re
+import shutil
+from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax.config import DiTConfig, UserError, VAEConfig
-from pewm_jax.convert import assemble, base, output, scheduler, sources, transformer, vae
-from pewm_jax.convert.mapping import Entry
+from pewm_jax.config import Config, DiTConfig, UserError, VAEConfig
+from pewm_jax.convert import output, pipeline, schedulers, widen
+from pewm_jax.convert.pipeline import CONFIG, WEIGHTS
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.io import tensor_files, tree, weights
-from pewm_jax.models.cogvideox import model as dit_model
-from pewm_jax.models.cogvideox import vae as vae_model
-from pewm_jax.types import Array, Params
+from pewm_jax.io import sources, tensor_files, tree, weights
+from pewm_jax.io.published import Network
+from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
+from pewm_jax.types import Params
 
 PIPELINES = (
     "CogVideoXPipeline",
     "CogVideoXImageToVideoPipeline",
     "CogVideoXVideoToVideoPipeline",
 )
-WEIGHTS = "weights.safetensors"
-CONFIG = "config.json"
-
-
-@dataclasses.dataclass(frozen=True)
-class Network:
-    """A network that can be converted.
-
-    Attributes:
-        folder: its folder in a pipeline, theirs and ours.
-        theirs: its class in diffusers.
-        ours: our configuration's class.
-        converter: ``config_from_diffusers``, ``config_to_diffusers`` and ``entries``.
-        init: ``(config, key) -> params``.
-    """
-
-    folder: str
-    theirs: str
-    ours: type
-    converter: ModuleType
-    init: Callable[[Any, Array], Params]
-
-    def entries(self, config: Any) -> Sequence[Entry]:
-        """Return the converter's table."""
-        return self.converter.entries(config)
-
-    def like(self, config: Any) -> Params:
-        """Return the abstract parameters, nothing allocated."""
-        return jax.eval_shape(lambda key: self.init(config, key), jax.random.key(0))
-
-    def config(self, values: dict[str, Any], where: str) -> Any:
-        """Read the settings of diffusers.
-
-        Raises:
-            UserError: a setting is unknown or unsupported.
-        """
-        try:
-            return self.converter.config_from_diffusers(values)
-        except UserError as error:
-            raise UserError(f"{where}: {error}") from None
-
-
-TRANSFORMER = Network(
-    "transformer", "CogVideoXTransformer3DModel", DiTConfig, transformer, dit_model.init
-)
-VAE = Network("vae", "AutoencoderKLCogVideoX", VAEConfig, vae, vae_model.init)
+BASE = "base.json"
+"""What converted weights were made from, beside ``config.json`` or the networks' folders."""
+PARTS = ("transformer", "vae", "scheduler")
+UNSTATED = "not stated in the folder it came from; ask where you got it before you pass it on"
+_CARD = re.compile(r"^(license|license_name|license_link):\s*(\S.*)$", re.MULTILINE)
+_TEXT = ("text_encoder", "tokenizer")
+"""Parts that are not converted, only copied."""
 
 
 def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[DiTConfig, Params]:
-    """Read the diffusion transformer of a CogVideoX checkpoint.
-
-    Args:
-        folder: a diffusers pipeline's folder, or the transformer's folder in it.
-        dtype: of the parameters, ``float32``, ``bfloat16`` or ``float16``; by default the
-            stored one.
-
-    Returns:
-        ``(config, params)`` for ``pewm_jax.models.cogvideox.model.apply``, NumPy arrays.
-
-    Raises:
-        UserError: a tensor that is missing, left over or of another shape, a damaged file, a
-            class or setting that is not known.
-    """
-    return read_network(TRANSFORMER, Path(folder), dtype)
+    """Read the transformer for ``pewm_jax.models.cogvideox.model.apply``; see ``pipeline.read``."""
+    return pipeline.read(TRANSFORMER, folder, dtype)
 
 
 def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[VAEConfig, Params]:
-    """Read the VAE of a CogVideoX checkpoint; see ``read_transformer``.
-
-    Returns:
-        ``(config, params)`` for ``pewm_jax.models.cogvideox.vae.encode`` and ``decode``.
-    """
-    return read_network(VAE, Path(folder), dtype)
+    """Read the VAE for ``pewm_jax.models.cogvideox.vae``; see ``pipeline.read``."""
+    return pipeline.read(VAE, folder, dtype)
 
 
 def read_scheduler(folder: str | Path) -> DDPMConfig:
@@ -120,7 +70,7 @@ def read_scheduler(folder: str | Path) -> DDPMConfig:
     Raises:
         UserError: a class or setting that is not known.
     """
-    return scheduler.config_from_diffusers(scheduler_settings(Path(folder)))
+    return schedulers.read(schedulers.COGVIDEOX, folder)
 
 
 def require_pipeline(src: Path) -> None:
@@ -141,42 +91,6 @@ def require_pipeline(src: Path) -> None:
             f"{src} holds weights that are of no use here: {tree.listing(unused)}; merge a LoRA "
             "into the transformer first, and move away the rest."
         )
-
-
-def settings(network: Network, folder: Path) -> dict[str, Any]:
-    """Read a network's settings as diffusers wrote them."""
-    return sources.read_config(sources.component(folder, network.folder) / CONFIG, [network.theirs])
-
-
-def scheduler_settings(folder: Path) -> dict[str, Any]:
-    """Read the scheduler's settings as diffusers wrote them."""
-    path = sources.component(folder, "scheduler") / "scheduler_config.json"
-    return sources.read_config(path, sorted(scheduler.CLASSES))
-
-
-def read_network(network: Network, folder: Path, dtype: str | None) -> tuple[Any, Params]:
-    """Read the settings and weights of a network from a pipeline's folder or its own.
-
-    Raises:
-        UserError: see ``read_transformer``.
-    """
-    inside = sources.component(folder, network.folder)
-    config = network.config(settings(network, folder), str(inside / CONFIG))
-    entries, source = network.entries(config), sources.open_folder(inside)
-    total = sum(place.size for _, place in source.places.values())
-    with output.megabytes(f"read {network.folder}", total) as progress:
-        return config, assemble.read(entries, source, network.like(config), dtype, progress)
-
-
-def stored_specs(
-    network: Network, folder: Path, dtype: str | None
-) -> dict[str, jax.ShapeDtypeStruct]:
-    """Return shape and dtype of every leaf that reading a network will give, by path."""
-    config = network.config(settings(network, folder), network.folder)
-    source = sources.open_folder(sources.component(folder, network.folder))
-    entries, like = network.entries(config), network.like(config)
-    assemble.require(entries, source, like)
-    return assemble.leaf_specs(entries, source, like, dtype)
 
 
 def load_transformer(folder: str | Path) -> tuple[DiTConfig, Params]:
@@ -200,7 +114,7 @@ def load_scheduler(folder: str | Path) -> DDPMConfig:
 
 def _load(network: Network, folder: Path) -> tuple[Any, Params]:
     inside = folder / network.folder
-    config = configuration.load(inside / CONFIG, network.ours)
+    config = configuration.load(inside / CONFIG, network.config_class)
     params = weights.load(inside / WEIGHTS)
     weights.check(params, network.like(config), str(inside / WEIGHTS))
     return config, params
@@ -213,32 +127,6 @@ def write_network(config: Any, params: Params, folder: Path) -> None:
     size = tensor_files.size(tree.flatten(params))
     with output.megabytes(f"write {folder.name}", size) as progress:
         weights.save(folder / WEIGHTS, params, progress=progress)
-
-
-def write_diffusers(
-    network: Network,
-    values: dict[str, Any],
-    params: Params,
-    folder: Path,
-    dtype: str | None = None,
-) -> None:
-    """Write one network as diffusers' ``from_pretrained`` reads it.
-
-    Args:
-        network: which.
-        values: its settings as diffusers names them.
-        params: our parameters.
-        folder: to make, or an empty one.
-        dtype: of the tensors; by default that of the parameters.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    output.write_json(folder / CONFIG, values)
-    entries = network.entries(network.config(values, "base.json"))
-    specs = assemble.specs(entries, params, dtype)
-    path = folder / "diffusion_pytorch_model.safetensors"
-    tensors = assemble.write(entries, params, dtype)
-    with output.megabytes(f"write {network.folder}", tensor_files.size(specs)) as progress:
-        tensor_files.write(path, specs, tensors, {"format": "pt"}, progress)
 
 
 def import_pipeline(
@@ -255,11 +143,170 @@ def import_pipeline(
     """
     with output.new_folder(dst) as folder:
         for network in (TRANSFORMER, VAE):
-            write_network(*read_network(network, src, dtype), folder / network.folder)
+            write_network(*pipeline.read(network, src, dtype), folder / network.folder)
         (folder / "scheduler").mkdir()
         configuration.save(read_scheduler(src), folder / "scheduler" / CONFIG)
         if prompts:
             stacked = np.stack(list(prompts.values()))
             kind = np.dtype(jax.numpy.dtype(dtype or "float32"))
             weights.save(folder / "text" / WEIGHTS, {"prompts_PLC": stacked.astype(kind)})
-        base.save(folder, record)
+        output.write_json(folder / BASE, record)
+
+
+def describe_base(
+    src: Path,
+    settings: dict[str, dict[str, Any]],
+    prompts: Sequence[str],
+    dtype: str | None,
+) -> dict[str, Any]:
+    """Return what ``base.json`` shall hold.
+
+    Args:
+        src: the pipeline's folder.
+        settings: the original settings of ``PARTS``.
+        prompts: the prompts that were encoded, in the order in which they are stored.
+        dtype: the dtype that was asked for, None for the stored one.
+    """
+    index = src / "model_index.json"
+    return {
+        **{part: settings[part] for part in PARTS},
+        "model_index": sources.read_json(index) if index.is_file() else None,
+        "name": src.resolve().name,
+        "licence": licence(src),
+        "prompts": list(prompts),
+        "dtype": dtype or "as stored",
+    }
+
+
+def licence(src: Path) -> str:
+    """Return what the folder's card or licence file says, in one line."""
+    card = src / "README.md"
+    if card.is_file():
+        head = card.read_text(encoding="utf-8", errors="replace").split("\n---", 1)[0]
+        stated = dict(_CARD.findall(head))
+        names = [stated[key].strip("'\" ") for key in ("license_name", "license") if key in stated]
+        link = stated.get("license_link")
+        if names:
+            return names[0] + (f" ({link})" if link else "")
+    for name in ("LICENSE", "LICENSE.txt", "LICENSE.md"):
+        if (src / name).is_file():
+            text = (src / name).read_text(encoding="utf-8", errors="replace")
+            lines = [line.strip(" #") for line in text.splitlines() if line.strip(" #")]
+            if lines:
+                return f"{lines[0]} (see the file {name} of the original)"
+    return UNSTATED
+
+
+def load_base(folder: Path) -> dict[str, Any]:
+    """Read ``base.json``.
+
+    Raises:
+        UserError: it is absent or lacks a part.
+    """
+    path = folder / BASE
+    if not path.is_file():
+        raise UserError(
+            f"{path} does not exist, so what these weights were made from is unknown; name the "
+            "imported folder with --base."
+        )
+    values = sources.read_json(path)
+    lacking = [part for part in PARTS if not isinstance(values.get(part), dict)]
+    if lacking:
+        raise UserError(f"{path} lacks {', '.join(lacking)}; copy it again from the import.")
+    return values
+
+
+def export(
+    src: Path,
+    dst: Path,
+    base_folder: Path | None = None,
+    dtype: str | None = None,
+    original: Path | None = None,
+) -> None:
+    """Write a diffusers folder: ``transformer/``, ``vae/``, ``scheduler/``, ``model_index.json``.
+
+    Args:
+        src: an imported folder, a widened one, or a training run.
+        dst: the folder to make.
+        base_folder: the folder with ``base.json``, by default ``src`` or, of a training run, the
+            folder it started from.
+        dtype: of the tensors; by default that of our weights.
+        original: the original pipeline's folder, to copy text encoder and tokenizer from.
+
+    Raises:
+        UserError: ``dst`` exists, ``base.json`` is absent, or the weights do not fit it.
+    """
+    if not src.is_dir():
+        raise UserError(f"{src} is not a folder; give an imported folder or a training run.")
+    output.refuse_existing(dst)
+    record = load_base(base_folder or _origin(src))
+    absent = [name for name in _TEXT if original and not (original / name).is_dir()]
+    if absent:
+        raise UserError(f"{original} has no folder {absent[0]}/; give the original pipeline's.")
+    imported = (src / "transformer").is_dir()
+    with output.new_folder(dst) as folder:
+        for network in (TRANSFORMER, VAE):
+            params = _imported(src, network) if imported else _run(src, network, record)
+            values = record[network.folder]
+            pipeline.write_published(network, values, params, folder / network.folder, dtype)
+            del params
+        (folder / "scheduler").mkdir()
+        output.write_json(folder / "scheduler" / "scheduler_config.json", record["scheduler"])
+        output.write_json(folder / "model_index.json", _index(record, text=original is not None))
+        if original:
+            for name in _TEXT:
+                shutil.copytree(original / name, folder / name)
+
+
+def _origin(src: Path) -> Path:
+    """Return the folder with ``base.json``: a training run names where it started from."""
+    seen: list[Path] = []
+    here = src
+    while not (here / BASE).is_file() and (here / CONFIG).is_file() and here not in seen:
+        seen.append(here)
+        start = configuration.load(here / CONFIG, Config).train.start
+        if not start:
+            return src
+        here = Path(start)
+    return here
+
+
+def _imported(src: Path, network: Network) -> Params:
+    load = load_transformer if network is TRANSFORMER else load_vae
+    return load(src)[1]
+
+
+def _run(src: Path, network: Network, record: dict[str, Any]) -> Params:
+    """Return the video model's part of a world model."""
+    config = configuration.load(src / CONFIG, Config)
+    path = src / WEIGHTS
+    if network is VAE:
+        params = weights.load(path, "codec")
+    else:
+        old = network.config(record[network.folder], BASE)
+        vae = VAE.config(record[VAE.folder], BASE)
+        plan = widen.plan(old, vae.latent_channels, config.model.control.channels(config.model))
+        backbone = weights.load(path, "backbone")
+        weights.check(backbone, network.like(plan.new), f"the backbone in {path}")
+        params = widen.narrow(plan, backbone)
+    like = network.like(network.config(record[network.folder], BASE))
+    weights.check(params, like, f"the {network.folder} in {path}")
+    return params
+
+
+def _index(record: dict[str, Any], *, text: bool) -> dict[str, Any]:
+    """Return ``model_index.json``, with or without text encoder and tokenizer."""
+    image = record["transformer"].get("in_channels", 16) != record["transformer"].get(
+        "out_channels", 16
+    )
+    given = record.get("model_index") or {
+        "_class_name": "CogVideoXImageToVideoPipeline" if image else "CogVideoXPipeline",
+        "_diffusers_version": record["transformer"].get("_diffusers_version", "0.36.0"),
+    }
+    return {
+        **{name: [None, None] for name in _TEXT},
+        **{name: value for name, value in given.items() if text or name not in _TEXT},
+        "scheduler": ["diffusers", record["scheduler"]["_class_name"]],
+        "transformer": ["diffusers", TRANSFORMER.class_name],
+        "vae": ["diffusers", VAE.class_name],
+    }

@@ -8,23 +8,28 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pewm_jax.config import Config, DINOv2EncoderConfig, DiTConfig, UserError, VAEConfig
+from pewm_jax.config import (
+    Config,
+    DINOv2EncoderConfig,
+    DiTConfig,
+    UserError,
+    VAEConfig,
+)
 from pewm_jax.config import command_line as cli
 from pewm_jax.config.dit import Learned
 from pewm_jax.convert import (
-    base,
     cogvideox,
-    cosmos_world,
-    diffusers_folder,
+    cogvideox_world,
+    cosmos,
     dinov2,
     inference,
     output,
+    pipeline,
+    schedulers,
     stablehlo,
-    svd_world,
+    svd,
     text,
-    world,
 )
-from pewm_jax.convert.cogvideox import TRANSFORMER, VAE
 from pewm_jax.convert.options import (
     ExportDiffusers,
     ExportInference,
@@ -35,6 +40,7 @@ from pewm_jax.convert.options import (
     ImportSVD,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
 from pewm_jax.models.dinov2 import model as dinov2_model
 from pewm_jax.types import Params
 
@@ -44,16 +50,16 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
     src, dst = options.src, options.dst
     output.refuse_existing(dst)
     cogvideox.require_pipeline(src)
-    settings = {part.folder: cogvideox.settings(part, src) for part in (TRANSFORMER, VAE)}
-    settings["scheduler"] = cogvideox.scheduler_settings(src)
+    settings = {part.folder: pipeline.published_config(part, src) for part in (TRANSFORMER, VAE)}
+    settings["scheduler"] = schedulers.published_config(schedulers.COGVIDEOX, src)
     dit = TRANSFORMER.config(settings["transformer"], str(src / "transformer/config.json"))
     vae = VAE.config(settings["vae"], str(src / "vae/config.json"))
     noise = cogvideox.read_scheduler(src)
     for network in (TRANSFORMER, VAE):  # damaged files are refused before hours of work
-        cogvideox.stored_specs(network, src, options.dtype)
+        pipeline.specs(network, src, options.dtype)
     config, encoder = _world(options, dit, vae, noise) if options.rgbd else (None, None)
     prompts = text.encode(src, options.prompt, dit.text_length, dit.text_dim)
-    record = base.describe(src, settings, list(prompts), options.dtype)
+    record = cogvideox.describe_base(src, settings, list(prompts), options.dtype)
     if config is None:
         cogvideox.import_pipeline(src, dst, options.dtype, prompts, record)
     else:
@@ -61,7 +67,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
         tokens: Literal["zeros", "stored"] = "zeros" if prompt is None else "stored"
         backbone = dataclasses.replace(config.model.backbone, prompt=tokens)
         config = config.with_model(backbone=backbone)
-        world.import_world(
+        cogvideox_world.import_world(
             src,
             dst,
             config,
@@ -85,7 +91,7 @@ def _world(
     """
     size = (options.frames, options.height, options.width)
     network, params = dinov2_model.load(options.encoder) if options.encoder else (None, None)
-    config = world.config_of(
+    config = cogvideox_world.config_of(
         _with_positions(dit, options.positions),
         vae,
         noise,
@@ -95,7 +101,7 @@ def _world(
         encoder=DINOv2EncoderConfig(network=network) if network else None,
     )
     config = cli.overlay(config, options.config) if options.config else config
-    world.require_size(config)
+    cogvideox_world.require_size(config)
     kept = config.model.memory.encoder
     if network and not (isinstance(kept, DINOv2EncoderConfig) and kept.network == network):
         raise UserError(
@@ -128,7 +134,7 @@ def _with_positions(dit: DiTConfig, learned: Learned | None) -> DiTConfig:
 
 def _stored_dtype(options: ImportCogVideoX) -> str:
     """Return the dtype that the transformer's weights will have."""
-    specs = cogvideox.stored_specs(TRANSFORMER, options.src, options.dtype)
+    specs = pipeline.specs(TRANSFORMER, options.src, options.dtype)
     return specs["proj_out/kernel"].dtype.name
 
 
@@ -149,23 +155,25 @@ def import_dinov2(options: ImportDINOv2) -> None:
 def import_svd(options: ImportSVD) -> None:
     """Run ``import svd``."""
     size = options.height, options.width
-    svd_world.import_world(options.src, options.dst, options.dtype, size)
-    print(f"{options.dst}: a world model; licence of the original: {base.licence(options.src)}")
+    svd.import_world(options.src, options.dst, options.dtype, size)
+    print(
+        f"{options.dst}: a world model; licence of the original: {cogvideox.licence(options.src)}"
+    )
 
 
 def import_cosmos2(options: ImportCosmos2) -> None:
     """Run ``import cosmos2``."""
     size = options.frames, options.height, options.width
     texts = options.prompt, options.negative
-    encoded = cosmos_world.import_world(options.src, options.dst, options.dtype, size, texts)
+    encoded = cosmos.import_world(options.src, options.dst, options.dtype, size, texts)
     told = "prompts encoded" if encoded else "no prompt (there is no text_encoder/)"
-    said = base.licence(options.src)
+    said = cogvideox.licence(options.src)
     print(f"{options.dst}: a world model, {told}; licence of the original: {said}")
 
 
 def export_diffusers(options: ExportDiffusers) -> None:
     """Run ``export diffusers``."""
-    diffusers_folder.export(options.src, options.dst, options.base, options.dtype, options.original)
+    cogvideox.export(options.src, options.dst, options.base, options.dtype, options.original)
     print(f"{options.dst}: transformer/, vae/, scheduler/ for diffusers' from_pretrained")
 
 

@@ -1,91 +1,57 @@
-"""Cosmos-Predict2 in the layout of diffusers: read its networks and write them back.
+"""Cosmos-Predict2: read its networks, write them back, and import it as a world model.
 
 A pipeline's folder has ``transformer/``, ``vae/`` and ``scheduler/``. Every tensor of a folder must
-be used. The text encoder (T5) is not read.
+be used. The text encoder (T5) is not read; it encodes two prompts once, where there is one: the
+prompt that videos are made with, and the one that guidance pushes away from. The world model has
+the settings of the preset ``egowm_cosmos2b`` around the checkpoint's networks, and fresh layers for
+the actions, which change nothing yet.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-from pewm_jax.config import CosmosConfig, WanVAEConfig
-from pewm_jax.convert import (
-    cogvideox,
-    cosmos_scheduler,
-    cosmos_transformer,
-    output,
-    sources,
-    wan_vae,
-)
-from pewm_jax.convert.cogvideox import Network
-from pewm_jax.diffusion.edm import EDMConfig
-from pewm_jax.models.cosmos import model as transformer_model
-from pewm_jax.models.wan import vae as vae_model
-from pewm_jax.types import Params
-
-TRANSFORMER = Network(
-    "transformer",
-    cosmos_transformer.CLASS,
+from pewm_jax.config import (
+    Config,
     CosmosConfig,
-    cosmos_transformer,
-    transformer_model.init,
+    UserError,
+    WanVAEConfig,
 )
-VAE = Network("vae", wan_vae.CLASS, WanVAEConfig, wan_vae, vae_model.init)
+from pewm_jax.convert import output, pipeline, schedulers, text
+from pewm_jax.diffusion.edm import EDMConfig
+from pewm_jax.models.cosmos.convert import TRANSFORMER
+from pewm_jax.models.wan.convert import VAE
+from pewm_jax.types import Params
+from pewm_jax.worlds.egowm import paper as egowm_paper
 
 
 def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[CosmosConfig, Params]:
-    """Read the diffusion transformer of a checkpoint.
-
-    Args:
-        folder: a diffusers pipeline's folder, or the transformer's folder in it.
-        dtype: of the parameters, ``float32``, ``bfloat16`` or ``float16``; by default the stored
-            one.
-
-    Returns:
-        ``(config, params)`` for ``pewm_jax.models.cosmos.model.apply``, NumPy arrays.
-
-    Raises:
-        UserError: a tensor that is missing, left over or of another shape, a damaged file, a
-            class or setting that is not known.
-    """
-    return cogvideox.read_network(TRANSFORMER, Path(folder), dtype)
+    """Read the transformer for ``pewm_jax.models.cosmos.model.apply``; see ``pipeline.read``."""
+    return pipeline.read(TRANSFORMER, folder, dtype)
 
 
 def write_transformer(
     config: CosmosConfig, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the transformer as diffusers' ``from_pretrained`` reads it.
+    """Write the transformer as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``.
 
-    The inverse of ``read_transformer``. How attention is computed and what is recomputed are not
-    part of it.
-
-    Args:
-        config: the network.
-        params: its parameters.
-        folder: to make.
-        dtype: of the tensors; by default that of the parameters.
-
-    Raises:
-        UserError: the folder exists.
+    How attention is computed and what is recomputed are not part of it.
     """
-    _write(TRANSFORMER, config, params, Path(folder), dtype)
+    pipeline.write(TRANSFORMER, config, params, folder, dtype)
 
 
 def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[WanVAEConfig, Params]:
-    """Read the autoencoder of a checkpoint; see ``read_transformer``.
-
-    Returns:
-        ``(config, params)`` for ``pewm_jax.models.wan.vae.encode`` and ``decode``.
-    """
-    return cogvideox.read_network(VAE, Path(folder), dtype)
+    """Read the autoencoder for ``pewm_jax.models.wan.vae``; see ``pipeline.read``."""
+    return pipeline.read(VAE, folder, dtype)
 
 
 def write_vae(
     config: WanVAEConfig, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the autoencoder as diffusers' ``from_pretrained`` reads it; the inverse of reading."""
-    _write(VAE, config, params, Path(folder), dtype)
+    """Write the autoencoder as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``."""
+    pipeline.write(VAE, config, params, folder, dtype)
 
 
 def read_scheduler(folder: str | Path) -> EDMConfig:
@@ -97,13 +63,89 @@ def read_scheduler(folder: str | Path) -> EDMConfig:
     Raises:
         UserError: a class or setting that is not known.
     """
-    path = sources.component(Path(folder), "scheduler") / "scheduler_config.json"
-    return cosmos_scheduler.config_from_diffusers(
-        sources.read_config(path, [cosmos_scheduler.CLASS])
+    return schedulers.read(schedulers.COSMOS, folder)
+
+
+def config_of(
+    src: Path, dst: Path, dtype: str | None, clip: tuple[int, int, int], *, prompt: bool
+) -> Config:
+    """Return the settings of the world model around a pipeline's networks.
+
+    Args:
+        src: the pipeline's folder.
+        dst: the folder to be made, whose name the runs have.
+        dtype: of the weights; 16 bits are computed in bfloat16.
+        clip: frames, height and width.
+        prompt: whether prompts' embeddings are stored.
+
+    Raises:
+        UserError: a network of another class, settings that are not known, or a transformer that is
+            not for video.
+        ConfigError: the networks do not fit each other or the clip.
+    """
+    transformer, vae = (pipeline.read_config(network, src) for network in (TRANSFORMER, VAE))
+    assert isinstance(transformer, CosmosConfig)
+    assert isinstance(vae, WanVAEConfig)
+    latents = vae.latent_channels
+    found = transformer.in_channels, transformer.out_channels
+    if found != (latents + 1, latents):
+        raise UserError(
+            f"The transformer takes {found[0]} channels and gives {found[1]}; one for video takes "
+            f"the {latents} of the autoencoder's latents and 1 that marks given frames: import a "
+            "Video2World checkpoint."
+        )
+    precision: Literal["float32", "bfloat16"] = "float32" if dtype == "float32" else "bfloat16"
+    return egowm_paper.cosmos_experiment(
+        dataclasses.replace(transformer, prompt="stored" if prompt else "zeros"),
+        vae,
+        read_scheduler(src),
+        run=dst.name,
+        clip=clip,
+        dtype=precision,
     )
 
 
-def _write(network: Network, config: Any, params: Params, dst: Path, dtype: str | None) -> None:
-    values = network.converter.config_to_diffusers(config)
-    with output.new_folder(dst) as whole:
-        cogvideox.write_diffusers(network, values, params, whole, dtype)
+def import_world(
+    src: Path,
+    dst: Path,
+    dtype: str | None = None,
+    clip: tuple[int, int, int] = egowm_paper.COSMOS_CLIP,
+    prompts: tuple[str, str] = ("", ""),
+) -> bool:
+    """Write the folder: ``config.json`` and ``weights.safetensors``.
+
+    Args:
+        src: a pipeline's folder as diffusers writes it: transformer/, vae/, scheduler/ and, if
+            there is one, text_encoder/ with tokenizer/.
+        dst: the folder to make.
+        dtype: of the weights; by default the stored one, and float32 for the actions' layers and
+            the prompts.
+        clip: frames, height and width.
+        prompts: the prompt, and the one that guidance pushes away from.
+
+    Returns:
+        Whether prompts were encoded.
+
+    Raises:
+        UserError: ``dst`` exists, or ``src`` is incomplete, damaged or of another kind.
+        ConfigError: the networks do not fit each other or the clip.
+    """
+    output.refuse_existing(dst)
+    backbone, codec = (pipeline.part(network, src, dtype) for network in (TRANSFORMER, VAE))
+    stored = backbone[0]["proj_out/kernel"].dtype.name
+    config = config_of(src, dst, dtype or stored, clip, prompt=False)
+    length, width = config.model.backbone.text_shape
+    encoded = text.encode(src, prompts, length, width, masked=True)
+    parts: dict[str, pipeline.Part] = {
+        "backbone": backbone,
+        "codec": codec,
+        "control": pipeline.fresh_actions(config, dtype),
+    }
+    if encoded:
+        config = config_of(src, dst, dtype or stored, clip, prompt=True)
+        tokens: Params = dict(
+            zip(("prompt_LC", "negative_LC"), (encoded[prompt] for prompt in prompts), strict=True)
+        )
+        parts["text"] = (pipeline.cast_specs(tokens, dtype), lambda: tokens)
+    pipeline.write_world(dst, config, parts)
+    return bool(encoded)

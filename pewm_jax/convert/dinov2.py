@@ -1,19 +1,8 @@
-"""DINOv2's weights in: from ``transformers``, or from the original repository's state dict.
-
-A ``transformers`` folder has its settings in ``config.json``. For a state dict of the original
-repository (such as ``dinov2_vits14_pretrain.pth``, or the same tensors as safetensors) they follow
-from the tensors' shapes: every published model has heads of 64 channels. Both fill the same tree;
-the network follows ``transformers`` in how position embeddings are interpolated (see
-``pewm_jax.models.dinov2.model``).
-
-The mask token, which only pretraining uses, and an image classifier's last layer are left behind;
-every other tensor must be used.
-"""
+"""Read DINOv2 from a transformers folder or an original state dict, and write it in our layout."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,193 +11,19 @@ import numpy as np
 
 from pewm_jax import config as configuration
 from pewm_jax.config import DINOv2Config, UserError
-from pewm_jax.config.dinov2 import HEAD_DIM
-from pewm_jax.convert import assemble, output, sources
-from pewm_jax.convert.dinov2_source import open_source, with_transformers_names
-from pewm_jax.convert.mapping import LINEAR, SAME, Entry, Turn
-from pewm_jax.convert.sources import Source
-from pewm_jax.io import tree, weights
+from pewm_jax.convert import output, pipeline
+from pewm_jax.io import sources, tree, weights
+from pewm_jax.io.sources import Source
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.convert import (
+    config_from_shapes,
+    config_from_transformers,
+    entries,
+    with_transformers_names,
+)
 from pewm_jax.types import Params
 
-_FIXED = {"hidden_act": "gelu", "num_channels": 3, "qkv_bias": True}
-"""Settings of which only this value is implemented."""
-_NO_MATTER = frozenset(
-    [
-        "architectures",
-        "model_type",
-        "torch_dtype",
-        "dtype",
-        "transformers_version",
-        "_name_or_path",
-        "id2label",
-        "label2id",
-        "problem_type",
-        "num_labels",
-        "return_dict",
-        "output_hidden_states",
-        "output_attentions",
-        "is_encoder_decoder",
-        "chunk_size_feed_forward",
-        "torchscript",
-        "use_bfloat16",
-        "apply_layernorm",
-        "reshape_hidden_states",
-        "out_features",
-        "out_indices",
-        "stage_names",
-        "initializer_range",
-        "layerscale_value",
-        "attention_probs_dropout_prob",
-        "hidden_dropout_prob",
-        "drop_path_rate",
-        "use_mask_token",
-        "_attn_implementation_autoset",
-    ]
-)
-"""Settings that do not change what the network computes once it is trained."""
-_READ = frozenset(
-    [
-        "hidden_size",
-        "num_hidden_layers",
-        "num_attention_heads",
-        "mlp_ratio",
-        "layer_norm_eps",
-        "image_size",
-        "patch_size",
-        "use_swiglu_ffn",
-        "num_register_tokens",
-    ]
-)
-
-
-def entries(config: DINOv2Config) -> list[Entry]:
-    """List every tensor of ``transformers``' network and where it goes in our tree."""
-    p = config.patch
-    patch = Turn(
-        lambda x: np.moveaxis(x, (1, 0), (2, 3)).reshape(p * p * 3, -1),
-        lambda x: np.moveaxis(x.reshape(p, p, 3, -1), (2, 3), (1, 0)),
-    )
-    row = Turn(lambda x: x[0], lambda x: x[None])
-    token = Turn(lambda x: x[0, 0], lambda x: x[None, None])
-    found = [
-        Entry("embeddings.cls_token", "cls_token", token),
-        Entry("embeddings.position_embeddings", "position_embed", row),
-        Entry("embeddings.patch_embeddings.projection.weight", "patch_embed/kernel", patch),
-        Entry("embeddings.patch_embeddings.projection.bias", "patch_embed/bias"),
-        Entry("layernorm.weight", "norm/scale"),
-        Entry("layernorm.bias", "norm/bias"),
-    ]
-    if config.registers:
-        found.append(Entry("embeddings.register_tokens", "register_tokens", row))
-    up, down = ("weights_in", "weights_out") if config.swiglu else ("fc1", "fc2")
-    linear = {
-        "attention.attention.query": "to_q",
-        "attention.attention.key": "to_k",
-        "attention.attention.value": "to_v",
-        "attention.output.dense": "to_out",
-        f"mlp.{up}": "up",
-        f"mlp.{down}": "down",
-    }
-    inside = [("layer_scale1.lambda1", "scale1", SAME), ("layer_scale2.lambda1", "scale2", SAME)]
-    for theirs, ours in linear.items():
-        inside += [(f"{theirs}.weight", f"{ours}/kernel", LINEAR)]
-        inside += [(f"{theirs}.bias", f"{ours}/bias", SAME)]
-    for norm in ("norm1", "norm2"):
-        inside += [
-            (f"{norm}.weight", f"{norm}/scale", SAME),
-            (f"{norm}.bias", f"{norm}/bias", SAME),
-        ]
-    found += [
-        Entry(f"encoder.layer.{layer}.{theirs}", f"blocks/{ours}", turn, layer)
-        for layer in range(config.layers)
-        for theirs, ours, turn in inside
-    ]
-    return found
-
-
-def config_from_transformers(values: Mapping[str, Any], where: str = "config.json") -> DINOv2Config:
-    """Read the settings of ``Dinov2Config`` or ``Dinov2WithRegistersConfig``.
-
-    Args:
-        values: what ``config.json`` holds.
-        where: its name in messages.
-
-    Raises:
-        UserError: a setting that is unknown, or one that this network does not have.
-    """
-    kind = values.get("model_type")
-    if kind not in ("dinov2", "dinov2_with_registers"):
-        raise UserError(
-            f"{where} is of model_type {kind!r}; this can read dinov2 and dinov2_with_registers "
-            "only."
-        )
-    unknown = values.keys() - _READ - _NO_MATTER - _FIXED.keys()
-    if unknown:
-        raise UserError(
-            f"{where} has settings this library does not know: {tree.listing(unknown)}; remove "
-            "them if they change nothing."
-        )
-    for name, only in _FIXED.items():
-        if values.get(name, only) != only:
-            raise UserError(
-                f"{where} has {name} {values[name]!r}; only {only!r} is known of DINOv2."
-            )
-    registers = kind == "dinov2_with_registers"
-    if not registers and values.get("num_register_tokens"):
-        raise UserError(
-            f"{where} has num_register_tokens; that is model_type dinov2_with_registers."
-        )
-    return DINOv2Config(
-        layers=_number(values, "num_hidden_layers", 12, where),
-        heads=_number(values, "num_attention_heads", 12, where),
-        width=_number(values, "hidden_size", 768, where),
-        patch=_number(values, "patch_size", 16 if registers else 14, where),
-        pretrained_size=_number(values, "image_size", 224, where),
-        mlp_ratio=_number(values, "mlp_ratio", 4, where),
-        swiglu=bool(values.get("use_swiglu_ffn", False)),
-        registers=_number(values, "num_register_tokens", 4, where) if registers else 0,
-        antialias=registers,
-        epsilon=float(values.get("layer_norm_eps", 1e-6)),
-    )
-
-
-def config_from_shapes(source: Source) -> DINOv2Config:
-    """Work out the settings from the shapes of tensors with ``transformers``' names.
-
-    Raises:
-        UserError: the tensors are not DINOv2's.
-    """
-    names = set(source.names())
-    needed = ("position_embeddings", "patch_embeddings.projection.weight")
-    shapes = [source.shape(f"embeddings.{n}") for n in needed if f"embeddings.{n}" in names]
-    layers = {int(n.split(".")[2]) for n in names if re.match(r"encoder\.layer\.\d+\.", n)}
-    if [len(shape) for shape in shapes] != [3, 4] or not layers:
-        raise UserError(
-            f"{source.where} is not a DINOv2 state dict: it holds {tree.listing(names)}; give "
-            "dinov2_vit{s,b,l,g}14[_reg4]_pretrain.pth, or a transformers folder."
-        )
-    (_, places, width), (*_, patch) = shapes
-    if width % HEAD_DIM:
-        raise UserError(
-            f"{source.where} has a width of {width}, which is not a multiple of {HEAD_DIM}, "
-            "DINOv2's width of a head; give a transformers folder, whose config.json names the "
-            "heads."
-        )
-    side = round((places - 1) ** 0.5)
-    register = "embeddings.register_tokens"
-    registers = source.shape(register)[1] if register in names else 0
-    swiglu = any(".mlp.weights_in." in name for name in names)
-    return DINOv2Config(
-        layers=max(layers) + 1,
-        heads=width // HEAD_DIM,
-        width=width,
-        patch=patch,
-        pretrained_size=side * patch,
-        swiglu=swiglu,
-        registers=registers,
-        antialias=registers > 0,
-    )
+_PICKLED = (".pth", ".pt", ".bin")
 
 
 def read(src: Path | str, dtype: str | None = None) -> tuple[DINOv2Config, Params]:
@@ -234,7 +49,7 @@ def read(src: Path | str, dtype: str | None = None) -> tuple[DINOv2Config, Param
         config = config_from_transformers(sources.read_json(settings), str(settings))
     else:
         config = config_from_shapes(source)
-    return config, assemble.read(entries(config), source, _like(config), dtype)
+    return config, pipeline.read_tensors(entries(config), source, _like(config), dtype)
 
 
 def write(config: DINOv2Config, params: Params, dst: Path | str) -> None:
@@ -283,11 +98,48 @@ def _like(config: DINOv2Config) -> Params:
     return jax.eval_shape(lambda: dinov2.init(config, jax.random.key(0)))
 
 
-def _number(values: Mapping[str, Any], name: str, default: int, where: str) -> int:
-    """Return a whole number, of a pair of equal ones too."""
-    value = values.get(name, default)
-    if isinstance(value, list) and len(set(value)) == 1:
-        value = value[0]
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
-        raise UserError(f"{where} has {name} {value!r}; it should be a whole number.")
-    return int(value)
+def open_source(src: Path) -> Source:
+    """Open a file or a folder, whatever it holds."""
+    if src.is_dir():
+        if any(src.glob("*.safetensors")):
+            return sources.open_folder(src)
+        pickled = [path for path in sorted(src.iterdir()) if path.suffix in _PICKLED]
+        if len(pickled) != 1:
+            what = f"several: {tree.listing(p.name for p in pickled)}" if pickled else "none"
+            raise UserError(
+                f"{src} should hold one file of weights, .safetensors or .pth, but there are "
+                f"{what}; name the file itself."
+            )
+        src = pickled[0]
+    if not src.is_file():
+        raise UserError(f"{src} does not exist; give a transformers folder or a DINOv2 state dict.")
+    return _unpickled(src) if src.suffix in _PICKLED else sources.open_file(src)
+
+
+def _unpickled(path: Path) -> Source:
+    """Read a state dict that torch saved; nothing in it is executed."""
+    try:
+        import torch  # noqa: PLC0415 - an extra: only these files need it
+    except ImportError:
+        raise UserError(
+            f"{path} is a torch file, and torch is not installed: pip install 'pewm-jax[convert]'."
+        ) from None
+    try:
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(
+            f"{path} cannot be read as a state dict ({first}); download it again."
+        ) from error
+    if not isinstance(found, dict) or not all(
+        isinstance(name, str) and isinstance(value, torch.Tensor) for name, value in found.items()
+    ):
+        raise UserError(f"{path} is not a plain table of names and tensors, a state dict.")
+    return sources.Arrays({name: _to_numpy(torch, x) for name, x in found.items()}, str(path))
+
+
+def _to_numpy(torch: Any, tensor: Any) -> np.ndarray:
+    """Return a torch tensor's values, bfloat16 included."""
+    if tensor.dtype == torch.bfloat16:
+        return tensor.contiguous().view(torch.uint16).numpy().view(jax.numpy.bfloat16)
+    return tensor.numpy()

@@ -1,120 +1,66 @@
-"""Stable Video Diffusion in the layout of diffusers: read its networks and write them back.
+"""Stable Video Diffusion: read its networks, write them back, and import it as a world model.
 
 A pipeline's folder has ``unet/``, ``vae/``, ``image_encoder/`` and ``scheduler/``. Every tensor of
-a folder must be used.
+a folder must be used. The world model has the settings of the preset ``egowm_svd`` around the
+checkpoint's networks, and fresh layers for the actions, which change nothing yet.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-import jax
-
-from pewm_jax.config import CLIPVisionConfig, SVDUNetConfig, SVDVAEConfig
-from pewm_jax.convert import (
-    assemble,
-    clip_vision,
-    cogvideox,
-    output,
-    sources,
-    svd_scheduler,
-    svd_unet,
-    svd_vae,
+from pewm_jax.config import (
+    CLIPVisionConfig,
+    Config,
+    SVDUNetConfig,
+    SVDVAEConfig,
 )
-from pewm_jax.convert.cogvideox import Network
+from pewm_jax.convert import output, pipeline, schedulers
 from pewm_jax.diffusion.edm import EDMConfig
-from pewm_jax.io import tensor_files
-from pewm_jax.models.clip import model as clip_model
-from pewm_jax.models.svd import unet as unet_model
-from pewm_jax.models.svd import vae as vae_model
+from pewm_jax.models.clip.convert import IMAGE_ENCODER
+from pewm_jax.models.svd.convert import UNET, VAE
 from pewm_jax.types import Params
-
-UNET = Network("unet", svd_unet.CLASS, SVDUNetConfig, svd_unet, unet_model.init)
-VAE = Network("vae", svd_vae.CLASS, SVDVAEConfig, svd_vae, vae_model.init)
+from pewm_jax.worlds.egowm import paper as egowm_paper
 
 
 def read_unet(folder: str | Path, dtype: str | None = None) -> tuple[SVDUNetConfig, Params]:
-    """Read the U-Net of a checkpoint.
-
-    Args:
-        folder: a diffusers pipeline's folder, or the U-Net's folder in it.
-        dtype: of the parameters, ``float32``, ``bfloat16`` or ``float16``; by default the stored
-            one.
-
-    Returns:
-        ``(config, params)`` for ``pewm_jax.models.svd.unet.apply``, NumPy arrays.
-
-    Raises:
-        UserError: a tensor that is missing, left over or of another shape, a damaged file, a
-            class or setting that is not known.
-    """
-    return cogvideox.read_network(UNET, Path(folder), dtype)
+    """Read the U-Net for ``pewm_jax.models.svd.unet.apply``; see ``pipeline.read``."""
+    return pipeline.read(UNET, folder, dtype)
 
 
 def write_unet(
     config: SVDUNetConfig, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the U-Net as diffusers' ``from_pretrained`` reads it; the inverse of ``read_unet``.
-
-    Args:
-        config: the network.
-        params: its parameters.
-        folder: to make.
-        dtype: of the tensors; by default that of the parameters.
-
-    Raises:
-        UserError: the folder exists.
-    """
-    _write(UNET, config, params, Path(folder), dtype)
+    """Write the U-Net as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``."""
+    pipeline.write(UNET, config, params, folder, dtype)
 
 
 def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[SVDVAEConfig, Params]:
-    """Read the autoencoder of a checkpoint; see ``read_unet``.
-
-    Returns:
-        ``(config, params)`` for ``pewm_jax.models.svd.vae.encode`` and ``decode``.
-    """
-    return cogvideox.read_network(VAE, Path(folder), dtype)
+    """Read the autoencoder for ``pewm_jax.models.svd.vae``; see ``pipeline.read``."""
+    return pipeline.read(VAE, folder, dtype)
 
 
 def write_vae(
     config: SVDVAEConfig, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the autoencoder as diffusers' ``from_pretrained`` reads it; see ``write_unet``."""
-    _write(VAE, config, params, Path(folder), dtype)
+    """Write the autoencoder as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``."""
+    pipeline.write(VAE, config, params, folder, dtype)
 
 
 def read_image_encoder(
     folder: str | Path, dtype: str | None = None
 ) -> tuple[CLIPVisionConfig, Params]:
-    """Read the image encoder of a checkpoint, in the layout of transformers; see ``read_unet``.
-
-    Returns:
-        ``(config, params)`` for ``pewm_jax.models.clip.model.apply``.
-    """
-    inside = sources.component(Path(folder), "image_encoder")
-    path = inside / "config.json"
-    config = clip_vision.config_from_transformers(sources.read_json(path), str(path))
-    source = sources.open_folder(inside)
-    total = sum(place.size for _, place in source.places.values())
-    like = jax.eval_shape(lambda: clip_model.init(config, jax.random.key(0)))
-    with output.megabytes("read image_encoder", total) as progress:
-        kept = clip_vision.without_positions(source)
-        return config, assemble.read(clip_vision.entries(config), kept, like, dtype, progress)
+    """Read the image encoder for ``pewm_jax.models.clip.model.apply``; see ``pipeline.read``."""
+    return pipeline.read(IMAGE_ENCODER, folder, dtype)
 
 
 def write_image_encoder(
     config: CLIPVisionConfig, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the image encoder as transformers' ``from_pretrained`` reads it; see ``write_unet``."""
-    entries = clip_vision.entries(config)
-    specs = assemble.specs(entries, params, dtype)
-    with output.new_folder(Path(folder)) as whole:
-        output.write_json(whole / "config.json", clip_vision.config_to_transformers(config))
-        path, tensors = whole / "model.safetensors", assemble.write(entries, params, dtype)
-        with output.megabytes("write image_encoder", tensor_files.size(specs)) as progress:
-            tensor_files.write(path, specs, tensors, {"format": "pt"}, progress)
+    """Write the image encoder as transformers' ``from_pretrained`` reads it."""
+    pipeline.write(IMAGE_ENCODER, config, params, folder, dtype)
 
 
 def read_scheduler(folder: str | Path) -> EDMConfig:
@@ -126,11 +72,57 @@ def read_scheduler(folder: str | Path) -> EDMConfig:
     Raises:
         UserError: a class or setting that is not known.
     """
-    path = sources.component(Path(folder), "scheduler") / "scheduler_config.json"
-    return svd_scheduler.config_from_diffusers(sources.read_config(path, [svd_scheduler.CLASS]))
+    return schedulers.read(schedulers.SVD, folder)
 
 
-def _write(network: Network, config: Any, params: Params, dst: Path, dtype: str | None) -> None:
-    values = network.converter.config_to_diffusers(config)
-    with output.new_folder(dst) as whole:
-        cogvideox.write_diffusers(network, values, params, whole, dtype)
+def config_of(src: Path, dst: Path, dtype: str | None, size: tuple[int, int]) -> Config:
+    """Return the settings of the world model around a pipeline's networks.
+
+    Args:
+        src: the pipeline's folder.
+        dst: the folder to be made, whose name the runs have.
+        dtype: of the weights; 16 bits are computed in bfloat16.
+        size: height and width of a frame.
+
+    Raises:
+        UserError: a network of another class, or settings that are not known.
+        ConfigError: the networks do not fit each other or the size.
+    """
+    unet, vae, encoder = (
+        pipeline.read_config(network, src) for network in (UNET, VAE, IMAGE_ENCODER)
+    )
+    precision: Literal["float32", "bfloat16"] = "float32" if dtype == "float32" else "bfloat16"
+    return egowm_paper.experiment(
+        dataclasses.replace(unet, image=encoder),
+        vae,
+        read_scheduler(src),
+        run=dst.name,
+        size=size,
+        dtype=precision,
+    )
+
+
+def import_world(
+    src: Path, dst: Path, dtype: str | None = None, size: tuple[int, int] = (512, 512)
+) -> None:
+    """Write the folder: ``config.json`` and ``weights.safetensors``.
+
+    Args:
+        src: a pipeline's folder as diffusers writes it: unet/, vae/, image_encoder/, scheduler/.
+        dst: the folder to make.
+        dtype: of the weights; by default the stored one, and float32 for the actions' layers.
+        size: height and width of a frame.
+
+    Raises:
+        UserError: ``dst`` exists, or ``src`` is incomplete, damaged or of another kind.
+        ConfigError: the networks do not fit each other or the size.
+    """
+    output.refuse_existing(dst)
+    stored = dtype or pipeline.specs(UNET, src)["conv_out/kernel"].dtype.name
+    config = config_of(src, dst, stored, size)
+    parts: dict[str, pipeline.Part] = {
+        name: pipeline.part(network, src, dtype)
+        for name, network in (("backbone", UNET), ("codec", VAE), ("image", IMAGE_ENCODER))
+    }
+    parts["control"] = pipeline.fresh_actions(config, dtype)
+    pipeline.write_world(dst, config, parts)

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.convert import output, sources
-from pewm_jax.io import tree
+from pewm_jax.convert import output
+from pewm_jax.io import sources, tree
 
 
 def encode(

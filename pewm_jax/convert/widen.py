@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pewm_jax.config import DiTConfig, UserError
-from pewm_jax.nn import patches
+from pewm_jax.nn import tokens
 from pewm_jax.types import Array, Params
 
 
@@ -103,10 +103,10 @@ def _rows(config: DiTConfig, wide: int, narrow: int, channels: tuple[int, ...]) 
 
 
 def _places(config: DiTConfig, channels: int) -> Mapping[tuple[int, int], int]:
-    """Return (cell of a patch, channel) → place in the row of ``patches.patchify``."""
+    """Return (cell of a patch, channel) → place in the row of ``tokens.patchify``."""
     p, p_t = config.patch, config.patch_t
     ids = np.arange(p_t * p * p * channels).reshape(1, p_t, p, p, channels)
-    order = np.asarray(patches.patchify(ids, p, p_t))[0, 0]
+    order = np.asarray(tokens.patchify(ids, p, p_t))[0, 0]
     return {(int(i) // channels, int(i) % channels): place for place, i in enumerate(order)}
 
 

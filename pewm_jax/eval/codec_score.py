@@ -17,6 +17,7 @@ import numpy as np
 
 from pewm_jax import shipped
 from pewm_jax.codecs import learned as learned_codec
+from pewm_jax.codecs.signals import depth_from_signal, signal_from_depth, signal_from_rgb
 from pewm_jax.config import CodecWorldConfig, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.eval.images import psnr, unit_colours
@@ -24,7 +25,6 @@ from pewm_jax.eval.imagine import print_now
 from pewm_jax.eval.protocol import file_hash
 from pewm_jax.geometry import depth_images
 from pewm_jax.io import atomic
-from pewm_jax.nn.signals import depth_from_signal, signal_from_depth, signal_from_rgb
 from pewm_jax.train import runs
 from pewm_jax.types import Array, Frames, Params
 from pewm_jax.worlds.rollouts import load_finished

@@ -13,6 +13,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from pewm_jax.codecs.signals import signal_from_rgb
 from pewm_jax.config import Encoder, UserError
 from pewm_jax.data.dataset import EpisodeSource, write_json
 from pewm_jax.data.episodes import Episode
@@ -31,7 +32,6 @@ from pewm_jax.memory.feature_cache import (
     read_json,
     refuse_stale,
 )
-from pewm_jax.nn.signals import signal_from_rgb
 from pewm_jax.types import Array, Params
 
 

@@ -79,7 +79,7 @@ class Readers:
 
     Attributes:
         block: ``(params of one place, video_BND, time_BE) -> video_BND``, run at each of the
-            backbone's places on the video tokens, in the order of ``token_layout``; or None.
+            backbone's places on the video tokens, in the order of ``nn.tokens``; or None.
             ``time_BE`` may be (B, t, E), one embedding for each token in time.
         params: the parameters of ``block``, stacked over places.
         added_BND: added to the embedded video tokens before the first block.

@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.nn import layers, placement
-from pewm_jax.types import Array
+from pewm_jax.nn import placement
+from pewm_jax.nn.layers import linear, merge_heads, split_heads
+from pewm_jax.types import Array, Params
 
 LOGITS = 2**20
 """Logits held at once on a CPU: 4 MB in float32."""
@@ -77,8 +78,22 @@ def _alone(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implemen
         return flash(q, k, v, "cudnn").swapaxes(1, 2)
     logits = batch * queries * k_BKMD.shape[2]
     if heads * logits <= LOGITS:
-        return layers.attention(q_BKND, k_BKMD, v_BKMD)
+        return plain_attention(q_BKND, k_BKMD, v_BKMD)
     return _attention(q_BKND, k_BKMD, v_BKMD, min(math.ceil(logits / LOGITS), queries))
+
+
+def multi_head_attention(params: Params, x_BND: Array, context_BME: Array, heads: int) -> Array:
+    """Multi-head attention with its linear layers: ``to_q``, ``to_k``, ``to_v``, ``to_out``."""
+    q = split_heads(linear(params["to_q"], x_BND), heads)
+    k, v = (split_heads(linear(params[n], context_BME), heads) for n in ("to_k", "to_v"))
+    return linear(params["to_out"], merge_heads(attention(q, k, v)))
+
+
+def plain_attention(q_BKND: Array, k_BKMD: Array, v_BKMD: Array) -> Array:
+    """Compute attention (B, K, N, d) with all logits at once and the softmax in float32."""
+    logits = jnp.einsum("bknd,bkmd->bknm", q_BKND, k_BKMD, preferred_element_type=jnp.float32)
+    weights = jax.nn.softmax(logits / math.sqrt(q_BKND.shape[-1]), -1)
+    return jnp.einsum("bknm,bkmd->bknd", weights.astype(v_BKMD.dtype), v_BKMD)
 
 
 def flash(q_BNKD: Array, k_BMKD: Array, v_BMKD: Array, implementation: Any) -> Array:

@@ -1,36 +1,92 @@
-"""Layers shared by the diffusion transformer and the memory blocks.
+"""Layers as functions of their parameters and activations, for every network.
 
-Flax linen modules. Parameters are float32, computation is in the dtype of the activations, norms
-and softmax are in float32.
+Parameters are ``{"kernel", "bias"}`` or ``{"scale", "bias"}``. Computation is in the dtype of the
+activations; norms are in float32. ``nn.modules`` has the same in the form of flax modules,
+``nn.parameters`` draws parameters.
 """
 
 from __future__ import annotations
 
 import math
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.nn import placement
-from pewm_jax.types import Array
+from pewm_jax.types import Array, Params
 
-zeros = nn.initializers.zeros_init()
-
-
-def dense(features: int, dtype: jnp.dtype, name: str, *, zero: bool = False) -> nn.Dense:
-    """Return a linear layer with bias; ``zero`` initialises its kernel to zero."""
-    kernel = zeros if zero else nn.initializers.lecun_normal()
-    return nn.Dense(features, dtype=dtype, kernel_init=kernel, name=name)
+EPSILON = 1e-5
+"""Added to variances, as torch does by default."""
 
 
-def layer_norm(x: Array, name: str, epsilon: float = 1e-5) -> Array:
-    """Affine layer norm over the last axis, computed in float32, returned in x's dtype.
+def linear(params: Params, x: Array) -> Array:
+    """Multiply the last axis by ``kernel`` (in, out) and add ``bias``, if there is one."""
+    y = x @ params["kernel"].astype(x.dtype)
+    return y + params["bias"].astype(x.dtype) if "bias" in params else y
 
-    Call inside a compact module.
+
+def mlp(params: Params, x: Array) -> Array:
+    """Apply a linear layer, SiLU, and another linear layer: ``linear_1`` and ``linear_2``."""
+    return linear(params["linear_2"], jax.nn.silu(linear(params["linear_1"], x)))
+
+
+def standardise(x: Array, epsilon: float = EPSILON) -> Array:
+    """Bring the last axis to mean 0 and variance 1, float32: a layer norm without parameters."""
+    wide = x.astype(jnp.float32)
+    centred = wide - wide.mean(-1, keepdims=True)
+    return centred * jax.lax.rsqrt(jnp.square(centred).mean(-1, keepdims=True) + epsilon)
+
+
+def layer_norm(params: Params, x: Array, epsilon: float = EPSILON) -> Array:
+    """Normalise over the last axis, with ``scale`` and ``bias``; returned in x's dtype."""
+    return (standardise(x, epsilon) * params["scale"] + params["bias"]).astype(x.dtype)
+
+
+def rms_norm(params: Params, x: Array, epsilon: float = 1e-6) -> Array:
+    """Divide by the root mean square of the last axis, in float32; returned in x's dtype."""
+    value = x.astype(jnp.float32)
+    scale = jax.lax.rsqrt(jnp.square(value).mean(-1, keepdims=True) + epsilon)
+    return (value * scale * params["scale"]).astype(x.dtype)
+
+
+def group_norm(params: Params, x: Array, groups: int) -> Array:
+    """Normalise (B, …, C) over positions and each group of channels; returned in x's dtype."""
+    grouped = x.astype(jnp.float32).reshape(len(x), -1, groups, x.shape[-1] // groups)
+    mean = grouped.mean((1, 3), keepdims=True)
+    variance = jnp.square(grouped - mean).mean((1, 3), keepdims=True)
+    normed = ((grouped - mean) * jax.lax.rsqrt(variance + EPSILON)).reshape(x.shape)
+    return (normed * params["scale"] + params["bias"]).astype(x.dtype)
+
+
+def group_norm_affine(
+    params: Params, x_BTHWC: Array, groups: int, eps: float
+) -> tuple[Array, Array]:
+    """Return the (B, C) factor and offset that normalise each group over time, space and channels.
+
+    In float32; ``x·factor + offset`` is the affine group norm. In this form a video is read once,
+    and later layers can change the factor and the offset before they are applied.
     """
-    return nn.LayerNorm(epsilon=epsilon, dtype=jnp.float32, name=name)(x).astype(x.dtype)
+    batch, *_, channels = x_BTHWC.shape
+    x = x_BTHWC.astype(jnp.float32)
+    # Subtracting some pixel first keeps the variance exact when the mean is far from zero.
+    origin = jax.lax.stop_gradient(x[:, :1, :1, :1])
+    near = x - origin
+    count = x[0, ..., 0].size
+    first = jnp.sum(near, (1, 2, 3)) / count
+    second = jnp.sum(near * near, (1, 2, 3)) / count
+    mean = first + origin[:, 0, 0, 0]
+    spread = second - first * first
+
+    def pool(value_BC: Array) -> Array:
+        return value_BC.reshape(batch, groups, -1).mean(-1, keepdims=True)
+
+    mean_g = pool(mean)
+    between = jnp.square(mean.reshape(batch, groups, -1) - mean_g).mean(-1, keepdims=True)
+    scale = jax.lax.rsqrt(pool(spread) + between + eps)
+    scale = jnp.broadcast_to(scale, (batch, groups, channels // groups)).reshape(batch, channels)
+    mean = jnp.broadcast_to(mean_g, (batch, groups, channels // groups)).reshape(batch, channels)
+    factor = scale * params["scale"]
+    return factor, params["bias"] - mean * factor
 
 
 def sinusoid(values: Array, channels: int, max_period: float = 1e4) -> Array:
@@ -79,13 +135,6 @@ def rotate_halves(x: Array, angles: Array) -> Array:
     return jnp.concatenate([a * cos - b * sin, b * cos + a * sin], -1).astype(x.dtype)
 
 
-def attention(q_BKND: Array, k_BKMD: Array, v_BKMD: Array) -> Array:
-    """Scaled dot-product attention with the softmax in float32: (B, K, N, d)."""
-    logits = jnp.einsum("bknd,bkmd->bknm", q_BKND, k_BKMD, preferred_element_type=jnp.float32)
-    weights = jax.nn.softmax(logits / math.sqrt(q_BKND.shape[-1]), -1)
-    return jnp.einsum("bknm,bkmd->bknd", weights.astype(v_BKMD.dtype), v_BKMD)
-
-
 def split_heads(x_BND: Array, heads: int) -> Array:
     """(B, N, K·d) → (B, K, N, d)."""
     batch, tokens, width = x_BND.shape
@@ -96,35 +145,3 @@ def merge_heads(x_BKND: Array) -> Array:
     """(B, K, N, d) → (B, N, K·d)."""
     batch, heads, tokens, channels = x_BKND.shape
     return x_BKND.transpose(0, 2, 1, 3).reshape(batch, tokens, heads * channels)
-
-
-class FeedForward(nn.Module):
-    """Linear, tanh-gelu, linear."""
-
-    ratio: int
-
-    @nn.compact
-    def __call__(self, x_BND: Array) -> Array:
-        """(B, N, D) → (B, N, D)."""
-        width = x_BND.shape[-1]
-        hidden = dense(self.ratio * width, x_BND.dtype, "up")(x_BND)
-        hidden = placement.constrain(hidden, "batch", "tokens", "hidden")
-        return dense(width, x_BND.dtype, "down")(nn.gelu(hidden, approximate=True))
-
-
-class TimeEmbedding(nn.Module):
-    """Sinusoid of the diffusion time → linear, SiLU, linear."""
-
-    width: int
-    """Channels of the sinusoid: the model width in CogVideoX."""
-    time_dim: int
-    """Channels of the embedding."""
-    dtype: jnp.dtype
-
-    @nn.compact
-    def __call__(self, timesteps_B: Array) -> Array:
-        """(B,) → (B, time_dim)."""
-        wave = sinusoid(timesteps_B, self.width).astype(self.dtype)
-        hidden = dense(self.time_dim, self.dtype, "linear_1")(placement.constrain(wave, "batch"))
-        hidden = nn.silu(placement.constrain(hidden, "batch"))
-        return placement.constrain(dense(self.time_dim, self.dtype, "linear_2")(hidden), "batch")

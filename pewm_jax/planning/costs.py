@@ -23,14 +23,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import Encoder, ModelConfig, UserError
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.errors import require
 from pewm_jax.geometry.actions import heading
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.models.lpips.model import Net
-from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Array, Frames, Params
 
 FrameCost: TypeAlias = Callable[[Frames, Frames], Any]

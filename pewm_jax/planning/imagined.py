@@ -27,9 +27,9 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax import worlds
+from pewm_jax.codecs.signals import rgb_from_signal
 from pewm_jax.config import Config, World
 from pewm_jax.geometry.actions import heading
-from pewm_jax.nn.signals import rgb_from_signal
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds.checks import as_array
 

@@ -23,9 +23,9 @@ import jax
 import numpy as np
 
 from pewm_jax import worlds
+from pewm_jax.codecs.signals import rgb_from_signal
 from pewm_jax.config import Config, UserError, World
 from pewm_jax.data.episodes import DEPTH_LIMIT_M
-from pewm_jax.nn.signals import rgb_from_signal
 from pewm_jax.planning import imagined, observations, scores
 from pewm_jax.planning.extra import gymnasium
 from pewm_jax.planning.house import HouseEnv

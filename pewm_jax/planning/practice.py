@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from pewm_jax import worlds
+from pewm_jax.codecs.signals import rgb_from_signal
 from pewm_jax.config import ActionConfig, Config, NomadConfig, UserError
 from pewm_jax.data.simulator import Simulator, move
 from pewm_jax.data.trajectories import advance
@@ -32,7 +33,6 @@ from pewm_jax.geometry.actions import (
     discrete_table,
     heading,
 )
-from pewm_jax.nn.signals import rgb_from_signal
 from pewm_jax.planning import nomad_policy
 from pewm_jax.planning.floor_map import FloorMap
 from pewm_jax.types import Frames, Params

@@ -12,7 +12,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import AttentionConfig, CameraConfig, ModelConfig
 from pewm_jax.models.interface import Readers
-from pewm_jax.nn import layers
+from pewm_jax.nn import layers, modules
 from pewm_jax.nn.costs import (
     FLOAT,
     SPLIT,
@@ -23,8 +23,7 @@ from pewm_jax.nn.costs import (
     video_times,
     video_tokens,
 )
-from pewm_jax.nn.patches import patchify
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.nn.tokens import TokenLayout, patchify
 from pewm_jax.readers.geometry import Sightings, patch_pixels, sightings, sinusoid_3d
 from pewm_jax.readers.memory_block import MemoryBlock
 from pewm_jax.types import Array, Camera, MemoryReadout, Params
@@ -71,7 +70,7 @@ def _ray_channels(model: ModelConfig) -> int:
 def _embeddings(model: ModelConfig) -> tuple[layers.nn.Dense, layers.nn.Dense]:
     """Return the linear layers that embed rays (one vector per video token) and map tokens."""
     dtype = jnp.dtype(model.dtype)
-    camera = layers.dense(model.backbone.places.width // 2, dtype, "camera")
+    camera = modules.dense(model.backbone.places.width // 2, dtype, "camera")
     # A layer norm follows, which would discard the magnitude of the features. A random bias of
     # unit variance keeps it visible.
     constant = layers.nn.initializers.normal(1.0)

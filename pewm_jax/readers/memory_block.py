@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import AttentionConfig
-from pewm_jax.nn import layers, placement
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.nn import layers, modules, placement
+from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.readers.geometry import Sightings, frequencies
 from pewm_jax.types import Array
 
@@ -68,11 +68,11 @@ class SinusoidAttention(nn.Module):
     def __call__(self, video_BND: Array, memory_BMD: Array, valid_BM: Array) -> Array:
         """Return (B, N, K·d)."""
         dtype, width = video_BND.dtype, self.heads * self.head_dim
-        q = layers.split_heads(layers.dense(width, dtype, "to_q")(video_BND), self.heads)
-        k = layers.split_heads(layers.dense(width, dtype, "to_k")(memory_BMD), self.heads)
-        v = layers.split_heads(layers.dense(width, dtype, "to_v")(memory_BMD), self.heads)
-        q, k = (layers.layer_norm(x, f"norm_{n}", 1e-6) for x, n in ((q, "q"), (k, "k")))
-        sink = self.param("sink", layers.zeros, (self.heads,))
+        q = layers.split_heads(modules.dense(width, dtype, "to_q")(video_BND), self.heads)
+        k = layers.split_heads(modules.dense(width, dtype, "to_k")(memory_BMD), self.heads)
+        v = layers.split_heads(modules.dense(width, dtype, "to_v")(memory_BMD), self.heads)
+        q, k = (modules.layer_norm(x, f"norm_{n}", 1e-6) for x, n in ((q, "q"), (k, "k")))
+        sink = self.param("sink", modules.zeros, (self.heads,))
         read = placement.local(_read_all, (QUERIES, KEYS, KEYS, ("batch",), ("heads",)), MIXED)
         return read(q, k, v, valid_BM, sink)
 
@@ -107,9 +107,9 @@ class ProjectiveAttention(nn.Module):
         width = heads * head_dim
         camera_of_head = np.arange(heads) % seen.angles_tqJR.shape[2]
 
-        q = layers.split_heads(layers.dense(width, dtype, "to_q")(video_BND), heads)
-        k = layers.split_heads(layers.dense(width, dtype, "to_k")(memory_BMD), heads)
-        v = layers.split_heads(layers.dense(width, dtype, "to_v")(memory_BMD), heads)
+        q = layers.split_heads(modules.dense(width, dtype, "to_q")(video_BND), heads)
+        k = layers.split_heads(modules.dense(width, dtype, "to_k")(memory_BMD), heads)
+        v = layers.split_heads(modules.dense(width, dtype, "to_v")(memory_BMD), heads)
         gain = nn.initializers.constant(0.3)
 
         def norm(x: Array, name: str) -> Array:
@@ -121,9 +121,9 @@ class ProjectiveAttention(nn.Module):
         size = math.sqrt(PEAK / math.sqrt(head_dim))
         q_constant = self.param("q_constant", self._constant, (heads, head_dim))
         k_constant = self.param("k_constant", nn.initializers.constant(size), (heads, head_dim))
-        k_depth = self.param("k_depth", layers.zeros, (heads, head_dim))
+        k_depth = self.param("k_depth", modules.zeros, (heads, head_dim))
         nearer = self.param("nearer", nn.initializers.constant(2.0), (heads,))
-        sink = self.param("sink", layers.zeros, (heads,))
+        sink = self.param("sink", modules.zeros, (heads,))
 
         q, k = norm(q, "norm_q"), norm(k, "norm_k")
         views = (seen.index_tqJ, seen.angles_tqJR, seen.place_tqJ3, seen.visible_tqJ)
@@ -220,7 +220,7 @@ class MemoryBlock(nn.Module):
         config, dtype = self.config, video_BND.dtype
         width, memory_width = video_BND.shape[-1], memory_BMD.shape[-1]
         sizes = [width, width, memory_width, memory_width, width]
-        modulation = layers.dense(sum(sizes) + width, dtype, "linear", zero=True)(nn.silu(time_BE))
+        modulation = modules.dense(sum(sizes) + width, dtype, "linear", zero=True)(nn.silu(time_BE))
         modulation = placement.constrain(modulation, "batch")
         parts = jnp.split(modulation, np.cumsum(sizes).tolist(), -1)
         if time_BE.ndim == 3:
@@ -228,13 +228,13 @@ class MemoryBlock(nn.Module):
             apart = (spread, spread, mean, mean, spread, spread)
             parts = [turn(part) for turn, part in zip(apart, parts, strict=True)]
         shift, scale, m_shift, m_scale, m_gate, gate = parts
-        query = layers.dense(width, dtype, "with_camera")(
+        query = modules.dense(width, dtype, "with_camera")(
             jnp.concatenate([video_BND, camera_BNC], -1)
         )
         query = placement.constrain(query, "batch", "tokens")
-        query = layers.modulate(layers.layer_norm(query, "norm_video"), shift, scale)
+        query = layers.modulate(modules.layer_norm(query, "norm_video"), shift, scale)
         query = placement.constrain(query, "batch", "tokens")
-        keys = layers.modulate(layers.layer_norm(memory_BMD, "norm_memory"), m_shift, m_scale)
+        keys = layers.modulate(modules.layer_norm(memory_BMD, "norm_memory"), m_shift, m_scale)
 
         if seen is None:
             attend = SinusoidAttention(config.heads, config.head_dim, name="attention")
@@ -242,10 +242,10 @@ class MemoryBlock(nn.Module):
         else:
             attend = ProjectiveAttention(config.heads, config.head_dim, self.grid, name="attention")
             mixed = attend(query, keys, seen)
-        mixed = layers.dense(width, dtype, "to_out")(mixed)
+        mixed = modules.dense(width, dtype, "to_out")(mixed)
 
         out = placement.constrain(video_BND + layers.to_tokens(m_gate) * mixed, "batch", "tokens")
-        forward = layers.FeedForward(config.mlp_ratio, name="ff")(layers.layer_norm(out, "norm2"))
+        forward = modules.FeedForward(config.mlp_ratio, name="ff")(modules.layer_norm(out, "norm2"))
         out = out + layers.to_tokens(gate) * forward
         if self.always:
             return out

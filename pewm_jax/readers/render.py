@@ -22,13 +22,12 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.codecs import interface as codecs
 from pewm_jax.codecs.pixel import fold
+from pewm_jax.codecs.signals import signal_from_depth
 from pewm_jax.config import ModelConfig, RenderConfig
 from pewm_jax.models.interface import Readers
-from pewm_jax.nn import layers
+from pewm_jax.nn import layers, modules
 from pewm_jax.nn.costs import SPLIT, Costs, Product, Share, text_tokens, video_times, video_tokens
-from pewm_jax.nn.patches import patchify
-from pewm_jax.nn.signals import signal_from_depth
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.nn.tokens import TokenLayout, patchify
 from pewm_jax.readers.render_block import RenderBlock
 from pewm_jax.types import Array, Camera, MemoryReadout, Params, View
 
@@ -81,10 +80,10 @@ def _embeddings(model: ModelConfig) -> dict[str, layers.nn.Dense]:
     """Return the linear layers on the way from pictures to tokens, by name."""
     config, dtype = _settings(model), jnp.dtype(model.dtype)
     found = {"embed_1": config.picture_width, "embed_2": config.picture_width}
-    made = {name: layers.dense(width, dtype, name) for name, width in found.items()}
-    made["added"] = layers.dense(model.backbone.places.width, dtype, "added", zero=True)
+    made = {name: modules.dense(width, dtype, name) for name, width in found.items()}
+    made["added"] = modules.dense(model.backbone.places.width, dtype, "added", zero=True)
     if _reduces(model):
-        made["reduce"] = layers.dense(config.reduced, dtype, "reduce")
+        made["reduce"] = modules.dense(config.reduced, dtype, "reduce")
     return made
 
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 import flax.linen as nn
 import jax.numpy as jnp
 
-from pewm_jax.nn import layers, placement
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.nn import layers, modules, placement
+from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.types import Array
 
 
@@ -36,14 +36,14 @@ class RenderBlock(nn.Module):
             picture_BNW: (B, N, W) the embedded part of the picture at each token.
         """
         dtype, width = video_BND.dtype, video_BND.shape[-1]
-        modulation = layers.dense(3 * width, dtype, "linear", zero=True)(nn.silu(time_BE))
+        modulation = modules.dense(3 * width, dtype, "linear", zero=True)(nn.silu(time_BE))
         modulation = placement.constrain(modulation, "batch")
         if time_BE.ndim == 3:
             modulation = self.layout.per_token(modulation)
         shift, scale, gate = jnp.split(modulation, 3, -1)
-        normed = layers.modulate(layers.layer_norm(video_BND, "norm"), shift, scale)
+        normed = layers.modulate(modules.layer_norm(video_BND, "norm"), shift, scale)
         joined = placement.constrain(jnp.concatenate([normed, picture_BNW], -1), "batch", "tokens")
-        hidden = layers.dense(self.mlp_ratio * width, dtype, "up")(joined)
+        hidden = modules.dense(self.mlp_ratio * width, dtype, "up")(joined)
         hidden = nn.gelu(placement.constrain(hidden, "batch", "tokens", "hidden"), approximate=True)
-        mixed = layers.dense(width, dtype, "down")(hidden)
+        mixed = modules.dense(width, dtype, "down")(hidden)
         return placement.constrain(video_BND + layers.to_tokens(gate) * mixed, "batch", "tokens")

@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import learned as learned_codec
+from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings
 from pewm_jax.geometry import depth_images
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.nn.costs import Costs, Product, Share
-from pewm_jax.nn.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.codec_gate import macs, mix
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage

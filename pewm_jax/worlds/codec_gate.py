@@ -7,12 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pewm_jax.codecs import gates
 from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, TrainSettings
 from pewm_jax.memory import memories
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.nn import gates
-from pewm_jax.nn.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.types import Array, Camera, Clip, Frames, Params
 
 ABSOLUTE = 0.1

@@ -11,6 +11,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import (
     Config,
     NomadTrainConfig,
@@ -21,7 +22,6 @@ from pewm_jax.diffusion import squared_cosine
 from pewm_jax.geometry import actions, cameras
 from pewm_jax.models.nomad import model as nomad
 from pewm_jax.nn.costs import Costs, Product, Share
-from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.stages import TRAIN, Stage
 

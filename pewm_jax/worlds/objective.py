@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs.signals import as_signal, signal_from_rgb
 from pewm_jax.config import ModelConfig, TrainSettings
 from pewm_jax.config.parts import Noise
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import memories
 from pewm_jax.nn import placement
-from pewm_jax.nn.signals import as_signal, signal_from_rgb
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, MemoryReadout, Params
 from pewm_jax.worlds import chained, world_model
 from pewm_jax.worlds.control import require_actions

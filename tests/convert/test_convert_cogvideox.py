@@ -24,8 +24,9 @@ from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax.cli.convert import main
 from pewm_jax.config import published
-from pewm_jax.convert import assemble, base, cogvideox, mapping, sources, widen, world
-from pewm_jax.io import tensor_files, weights
+from pewm_jax.convert import cogvideox, cogvideox_world, pipeline, widen
+from pewm_jax.io import sources, tensor_files, weights
+from pewm_jax.io.published import LINEAR, Entry
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.readers import interface as readers
@@ -141,7 +142,7 @@ def test_of_several_precisions_the_plain_one_is_read(images, tmp_path):
 
 
 def test_the_record_says_where_it_came_from(imported, images):
-    record = base.load(imported)
+    record = cogvideox.load_base(imported)
     assert record["licence"] == "tiny"
     assert record["prompts"] == ["a room", ""]
     for part in ("transformer", "vae"):
@@ -204,11 +205,11 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     network = cogvideox.TRANSFORMER
     source = {k: v.numpy() for k, v in pipelines.dit(variant).state_dict().items()}
     old = network.config(dict(pipelines.dit(variant).config), variant)
-    params = assemble.read(
+    params = pipeline.read_tensors(
         network.entries(old), sources.Arrays(source, variant), network.like(old), "float32"
     )
     vae = cogvideox.VAE.config(dict(pipelines.vae().config), "vae")
-    config = world.config_of(
+    config = cogvideox_world.config_of(
         old, vae, cogvideox.scheduler.config_from_diffusers(
             {"_class_name": "CogVideoXDDIMScheduler", **pipelines.SCHEDULER}
         ), (9, 32, 32), "float32",
@@ -291,7 +292,7 @@ def test_an_imported_checkpoint_starts_from_the_preset_of_its_size(variant, bill
     preset = presets.load(f"pewm_{variant}")
     noise = preset.model.noise
     backbone, codec = published(variant), preset.model.codec
-    made = world.config_of(backbone, codec, noise, (None, None, None), "bfloat16")
+    made = cogvideox_world.config_of(backbone, codec, noise, (None, None, None), "bfloat16")
     assert without(made.train, "run") == without(preset.train, "run")
     assert (made.data, made.evaluate) == (preset.data, preset.evaluate)
     assert without(made.model, "memory", "backbone") == without(preset.model, "memory", "backbone")
@@ -299,7 +300,9 @@ def test_an_imported_checkpoint_starts_from_the_preset_of_its_size(variant, bill
     assert without(made.model.memory, "encoder") == without(preset.model.memory, "encoder")
     assert configuration.kinds.of(made.model.memory.encoder).name == "patch_colours"
     encoder = preset.model.memory.encoder
-    made = world.config_of(backbone, codec, noise, (None,) * 3, "bfloat16", encoder=encoder)
+    made = cogvideox_world.config_of(
+        backbone, codec, noise, (None,) * 3, "bfloat16", encoder=encoder
+    )
     assert made.model.memory == preset.model.memory
     blocks = jax.eval_shape(lambda: readers.init(made.model, jax.random.key(0)))
     count = sum(leaf.size for leaf in jax.tree.leaves(blocks))
@@ -343,7 +346,7 @@ def test_learned_positions_are_for_other_clips_by_choice(images, tmp_path, learn
 def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
     """Measured on 24 layers of 1 MiB in 24 shards; a second copy would be 24 MiB more."""
     layer, layers = (512, 512), 24
-    entries = [mapping.Entry(f"l.{i}", "w", mapping.LINEAR, i) for i in range(layers)]
+    entries = [Entry(f"l.{i}", "w", LINEAR, i) for i in range(layers)]
     spec = {f"l.{i}": jax.ShapeDtypeStruct(layer, np.float32) for i in range(layers)}
     for i, name in enumerate(spec):
         one = {name: spec[name]}
@@ -354,10 +357,10 @@ def test_no_more_than_the_network_and_one_tensor_is_in_memory(tmp_path):
     like = {"w": jax.ShapeDtypeStruct((layers, *layer), np.float32)}
     for dtype, each in (("float32", 1 << 20), ("bfloat16", 1 << 19)):
         tracemalloc.start()
-        params = assemble.read(entries, sources.open_folder(tmp_path), like, dtype)
+        params = pipeline.read_tensors(entries, sources.open_folder(tmp_path), like, dtype)
         weights.save(tmp_path / "out" / "w.safetensors", params)
-        specs = assemble.specs(entries, params)
-        tensor_files.write(tmp_path / "back", specs, assemble.write(entries, params), {})
+        specs = pipeline.published_specs(entries, params)
+        tensor_files.write(tmp_path / "back", specs, pipeline.write_tensors(entries, params), {})
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert layers * each < peak < layers * each + 2.5 * (1 << 20)

@@ -9,7 +9,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from pewm_jax.config import DINOv2Config, UserError
-from pewm_jax.convert import assemble, dinov2
+from pewm_jax.convert import dinov2, pipeline
 from pewm_jax.models.dinov2 import model
 
 CONFIG = DINOv2Config(layers=2, heads=1, width=64, pretrained_size=28, registers=2, antialias=True)
@@ -34,7 +34,7 @@ def params():
 @pytest.fixture
 def folder(params, tmp_path):
     """A transformers folder, its tensors written by our own table."""
-    return write(tmp_path / "theirs", dict(assemble.write(dinov2.entries(CONFIG), params)))
+    return write(tmp_path / "theirs", dict(pipeline.write_tensors(dinov2.entries(CONFIG), params)))
 
 
 def write(folder, tensors, settings=SETTINGS):
@@ -51,7 +51,7 @@ def test_entries_read_what_they_wrote(folder, params):
 
 
 def test_shards_are_read_like_one_file(folder, params):
-    tensors = dict(assemble.write(dinov2.entries(CONFIG), params))
+    tensors = dict(pipeline.write_tensors(dinov2.entries(CONFIG), params))
     (folder / "model.safetensors").unlink()
     table = {}
     for number, name in enumerate(tensors):
@@ -95,7 +95,7 @@ def test_settings_that_do_not_fit_are_refused(folder, change, words):
 
 
 def test_tensors_that_do_not_fit_are_refused(folder, params, tmp_path):
-    tensors = dict(assemble.write(dinov2.entries(CONFIG), params))
+    tensors = dict(pipeline.write_tensors(dinov2.entries(CONFIG), params))
     del tensors["layernorm.bias"]
     with pytest.raises(UserError, match=r"lacks 1 tensors \(layernorm.bias\)"):
         dinov2.read(write(folder, tensors))

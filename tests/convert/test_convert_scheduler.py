@@ -1,7 +1,7 @@
 import pytest
 
 from pewm_jax.config import UserError
-from pewm_jax.convert import scheduler
+from pewm_jax.convert import schedulers
 from pewm_jax.diffusion.ddpm import DDPMConfig
 
 PUBLISHED = {  # CogVideoX-2b's file
@@ -25,7 +25,7 @@ PUBLISHED = {  # CogVideoX-2b's file
 
 
 def test_the_published_settings_become_ours():
-    assert scheduler.config_from_diffusers(PUBLISHED) == DDPMConfig(
+    assert schedulers.cogvideox_from_diffusers(PUBLISHED) == DDPMConfig(
         snr_shift=3.0, target="v", sample_steps=50, stride="fixed"
     )
 
@@ -52,5 +52,5 @@ def test_the_published_settings_become_ours():
 )
 def test_what_is_not_supported_is_refused_in_a_sentence(change, sentence):
     with pytest.raises(UserError, match=sentence) as told:
-        scheduler.config_from_diffusers({**PUBLISHED, **change})
+        schedulers.cogvideox_from_diffusers({**PUBLISHED, **change})
     assert "\n" not in str(told.value)

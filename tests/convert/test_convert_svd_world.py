@@ -15,17 +15,18 @@ from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 import pewm_jax
 from pewm_jax import worlds
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.convert import commands, svd, svd_unet, svd_vae
+from pewm_jax.convert import commands, svd
 from pewm_jax.convert.options import ImportSVD
 from pewm_jax.io import tree
+from pewm_jax.models.svd.convert import BLOCK, DOWN, UP
 from pewm_jax.train import starting
 from tests.helpers import random_frames
 
 UNET = {
     "block_out_channels": (32, 64),
     "num_attention_heads": (2, 4),
-    "down_block_types": [svd_unet.DOWN[True], svd_unet.DOWN[False]],
-    "up_block_types": [svd_unet.UP[False], svd_unet.UP[True]],
+    "down_block_types": [DOWN[True], DOWN[False]],
+    "up_block_types": [UP[False], UP[True]],
     "layers_per_block": 1,
     "cross_attention_dim": 24,
     "addition_time_embed_dim": 16,
@@ -45,7 +46,7 @@ CLIP = {
 def pipeline(folder, projection=24):
     UNetSpatioTemporalConditionModel(**UNET).save_pretrained(folder / "unet")
     vae = AutoencoderKLTemporalDecoder(
-        block_out_channels=(32, 32), down_block_types=[svd_vae.BLOCK] * 2, layers_per_block=2
+        block_out_channels=(32, 32), down_block_types=[BLOCK] * 2, layers_per_block=2
     )
     vae.save_pretrained(folder / "vae")
     encoder = CLIPVisionModelWithProjection(CLIPVisionConfig(projection_dim=projection, **CLIP))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pewm_jax.config import DiTConfig, UserError
 from pewm_jax.convert import widen
-from pewm_jax.nn import patches
+from pewm_jax.nn import tokens
 
 
 def build(patch, patch_t, latents, *, image):
@@ -48,14 +48,14 @@ def test_old_channels_keep_their_weights_wherever_they_go(
         known = np.concatenate([known, seen[..., 2 * latents : 3 * latents]], -1)
 
     def embed(latents_BthwC, kernel):
-        return patches.patchify(latents_BthwC, patch, patch_t) @ kernel
+        return tokens.patchify(latents_BthwC, patch, patch_t) @ kernel
 
     token = embed(known, params["patch_embed"]["kernel"])
     np.testing.assert_allclose(embed(seen, wide["patch_embed"]["kernel"]), token, atol=1e-12)
 
     def project(layer):
         rows = token @ layer["kernel"] + layer["bias"]
-        return patches.unpatchify(rows, *size[1:], patch, patch_t)
+        return tokens.unpatchify(rows, *size[1:], patch, patch_t)
 
     made = project(wide["proj_out"])
     np.testing.assert_allclose(made[..., :latents], project(params["proj_out"]), atol=1e-12)

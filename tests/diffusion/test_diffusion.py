@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import ConfigError, TrainConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.pewm import world as pewm

@@ -10,8 +10,8 @@ from pewm_jax.eval import metrics
 from pewm_jax.eval.metrics import videos
 from pewm_jax.eval.metrics.distributions import against, floor, frechet, kernel
 from pewm_jax.io import tree, weights
+from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
-from pewm_jax.models.i3d import weights as i3d_weights
 
 
 def draw(count, width=6, seed=0, shift=0.0):

@@ -13,8 +13,8 @@ from pewm_jax.eval.images import MASKS, SUMS, with_lpips
 from pewm_jax.eval.metrics import perceptual
 from pewm_jax.eval.statistics import margins, per_frame, table
 from pewm_jax.io import weights
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.report.labels import format_lpips
 
 HIGHER = ("psnr", "ssim")

@@ -21,7 +21,7 @@ from pewm_jax.eval.protocol import long_choices
 from pewm_jax.eval.reproject import ReprojectSettings
 from pewm_jax.eval.scoring import Scored, score_table
 from pewm_jax.geometry.actions import integrate
-from pewm_jax.models.i3d import weights as i3d_weights
+from pewm_jax.models.i3d import convert as i3d_weights
 
 SAMPLED = {"memory", "empty"}
 

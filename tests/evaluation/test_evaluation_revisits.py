@@ -11,9 +11,9 @@ from pewm_jax.eval import metrics
 from pewm_jax.eval.metrics import revisits, similarity
 from pewm_jax.io import tree, weights
 from pewm_jax.models.dinov2 import model as dinov2
-from pewm_jax.models.i3d import weights as i3d_weights
+from pewm_jax.models.i3d import convert as i3d_weights
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
 
 
 def walks(count=3, places=2, size=(40, 36)):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pewm_jax.cli import memory as command
+from pewm_jax.codecs import signals
 from pewm_jax.config import (
     DINOv2Config,
     DINOv2EncoderConfig,
@@ -19,7 +20,6 @@ from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import weights
 from pewm_jax.memory import feature_build, feature_cache
 from pewm_jax.models.dinov2 import model as dinov2
-from pewm_jax.nn import signals
 from tests.data import data_world
 
 NETWORK = DINOv2Config(layers=1, heads=1, width=8, pretrained_size=28)

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import ConfigError, PatchColoursConfig, SurfelConfig, VoxelConfig
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.eval.seen import seen_masks
 from pewm_jax.memory import memories, rendering, surfels, views
-from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Frames
 from tests.helpers import TINY, random_camera, tiny_model
 from tests.memory.test_memory_rivals import encoded, scene

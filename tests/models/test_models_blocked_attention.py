@@ -10,7 +10,6 @@ import pytest
 
 from pewm_jax.config import UserError
 from pewm_jax.nn import attention as blocked_attention
-from pewm_jax.nn import layers
 
 
 def inputs(batch=2, heads=3, queries=13, keys=11, channels=8):
@@ -22,7 +21,7 @@ def inputs(batch=2, heads=3, queries=13, keys=11, channels=8):
 @pytest.mark.parametrize("blocks", [1, 2, 5, 13])
 def test_pieces_make_the_whole(blocks):
     q, k, v = inputs()
-    want = layers.attention(q, k, v)
+    want = blocked_attention.plain_attention(q, k, v)
     got = blocked_attention.in_pieces(q, k, v, blocks)
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
 
@@ -30,7 +29,9 @@ def test_pieces_make_the_whole(blocks):
 def test_large_logits_do_not_overflow():
     q, k, v = inputs()
     got = blocked_attention.in_pieces(q * 1e3, k * 1e3, v, 2)
-    np.testing.assert_allclose(got, layers.attention(q * 1e3, k * 1e3, v), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        got, blocked_attention.plain_attention(q * 1e3, k * 1e3, v), rtol=1e-3, atol=1e-3
+    )
     assert np.isfinite(got).all()
 
 
@@ -44,7 +45,7 @@ def test_what_does_not_fit_is_cut_on_a_cpu_and_only_there(monkeypatch):
 
     assert loops("cpu") == 2
     assert loops("cuda") == 0
-    want = layers.attention(q, k, v)
+    want = blocked_attention.plain_attention(q, k, v)
     np.testing.assert_allclose(
         jax.jit(functools.partial(blocked_attention.attention))(q, k, v), want, rtol=1e-5, atol=1e-6
     )
@@ -67,7 +68,7 @@ def test_gradients_are_those_of_the_whole(monkeypatch, logits):
         return jax.jit(jax.grad(lambda *x: (attend(*x) * weight).sum(), (0, 1, 2)))(q, k, v)
 
     for got, want in zip(
-        slopes(blocked_attention.attention), slopes(layers.attention), strict=True
+        slopes(blocked_attention.attention), slopes(blocked_attention.plain_attention), strict=True
     ):
         np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
 
@@ -141,6 +142,8 @@ def test_padding_for_odd_lengths_changes_neither_results_nor_gradients(queries, 
     def slopes(attend):
         return jax.grad(lambda *x: (attend(*x) * weight).sum(), (0, 1, 2))(q, k, v)
 
-    np.testing.assert_allclose(padded(q, k, v), layers.attention(q, k, v), rtol=1e-5, atol=1e-5)
-    for got, want in zip(slopes(padded), slopes(layers.attention), strict=True):
+    np.testing.assert_allclose(
+        padded(q, k, v), blocked_attention.plain_attention(q, k, v), rtol=1e-5, atol=1e-5
+    )
+    for got, want in zip(slopes(padded), slopes(blocked_attention.plain_attention), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)

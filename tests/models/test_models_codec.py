@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import signals
 from pewm_jax.config import ClipConfig, PixelConfig
-from pewm_jax.nn import signals
 from tests.helpers import TINY
 
 encode = jax.jit(codecs.encode, static_argnums=0)

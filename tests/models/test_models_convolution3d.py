@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.nn import convolution3d
+from pewm_jax.nn import convolution
 
-FORMS = {"whole": convolution3d.convolve, "halved": convolution3d.halved}
+FORMS = {"whole": convolution.convolve_grid, "halved": convolution.halve_grid}
 
 
 def draw(seed, *shape):
@@ -33,5 +33,5 @@ def test_both_forms_and_both_gradients_agree(name):
 
 def test_a_kernel_of_one_place_is_a_linear_layer():
     x, kernel = draw(0, 2, 3, 3, 3, 4), draw(1, 1, 1, 1, 4, 5)
-    made = convolution3d.convolve(x, kernel)
-    np.testing.assert_allclose(made, convolution3d.by_xla(x, kernel), atol=1e-5)
+    made = convolution.convolve_grid(x, kernel)
+    np.testing.assert_allclose(made, convolution.by_xla(x, kernel), atol=1e-5)

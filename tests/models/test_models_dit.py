@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.config import PUBLISHED, ConfigError, DiTConfig, UserError, published
-from pewm_jax.models.cogvideox import block as dit_block
 from pewm_jax.models.cogvideox import model as dit
-from pewm_jax.nn import layers, patches, positions
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.models.cogvideox import model as dit_block
+from pewm_jax.models.cogvideox import positions
+from pewm_jax.nn import layers
+from pewm_jax.nn.tokens import TokenLayout, patchify, unpatchify
 from pewm_jax.types import MemoryReadout
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, randomise
@@ -46,11 +47,9 @@ run = jax.jit(dit.apply, static_argnums=0, static_argnames="expert")
 )
 def test_unpatchify_inverts_patchify(t, h, w, p, p_t, c):
     latents = np.random.default_rng(0).normal(size=(2, t * p_t, h * p, w * p, c))
-    tokens = patches.patchify(latents, p, p_t)
+    tokens = patchify(latents, p, p_t)
     assert tokens.shape == (2, t * h * w, c * p_t * p * p)
-    np.testing.assert_array_equal(
-        patches.unpatchify(tokens, t * p_t, h * p, w * p, p, p_t), latents
-    )
+    np.testing.assert_array_equal(unpatchify(tokens, t * p_t, h * p, w * p, p, p_t), latents)
 
 
 def test_a_fresh_network_predicts_zero():
@@ -86,7 +85,7 @@ def plain_loop(params, latents, text, times):
     """The same network without scan."""
     ends = dit.Ends(CONFIG, 7, jnp.dtype("float32"))
     rest = {"params": {k: v for k, v in params.items() if k != "blocks"}}
-    tokens = patches.patchify(latents, 2)
+    tokens = patchify(latents, 2)
     tokens, time = ends.apply(rest, tokens, text, times, times, method="embed")
     length = CONFIG.text_length
     angles = positions.joint_angles(CONFIG, (3, 2, 3), length)
@@ -95,7 +94,7 @@ def plain_loop(params, latents, text, times):
         layer = jax.tree.map(lambda x, i=i: x[i], params["blocks"])
         tokens = dit_block.Block(CONFIG).apply({"params": layer}, tokens, time, angles, layout)
     out = ends.apply(rest, tokens[:, length:], time, method="project")
-    return patches.unpatchify(out, 3, 4, 6, 2)
+    return unpatchify(out, 3, 4, 6, 2)
 
 
 def test_scan_and_remat_equal_a_plain_loop():

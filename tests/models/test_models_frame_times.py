@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pewm_jax.models import interface as backbones
-from pewm_jax.models.cogvideox import block as dit_block
 from pewm_jax.models.cogvideox import model as dit
+from pewm_jax.models.cogvideox import model as dit_block
 from pewm_jax.models.interface import Conditioning, Readers
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.readers.memory_block import MemoryBlock
 from pewm_jax.types import MemoryReadout
 from pewm_jax.worlds import world_model

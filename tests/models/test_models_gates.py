@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.nn import gates
+from pewm_jax.codecs import gates
 from tests.helpers import randomise
 
 

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax import worlds
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import NoMemoryConfig, TrainConfig, VoxelConfig
 from pewm_jax.geometry.cameras import project
-from pewm_jax.nn.signals import as_signal
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.readers.geometry import sightings, sinusoid_3d
 from pewm_jax.readers.memory_block import MemoryBlock, masked_attention
 from pewm_jax.types import Camera, Clip, Control, Frames, MapTokens, MemoryReadout

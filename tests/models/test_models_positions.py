@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pewm_jax import presets
 from pewm_jax.config import ConfigError, DiTConfig, UserError, published
 from pewm_jax.models.cogvideox import model as dit
-from pewm_jax.nn import positions
+from pewm_jax.models.cogvideox import positions
 from pewm_jax.worlds import world_model
 from tests.helpers import randomise
 

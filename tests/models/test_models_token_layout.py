@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.nn.tokens import TokenLayout
 
 layouts = pytest.mark.parametrize(
     "layout",

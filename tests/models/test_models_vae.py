@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import ConfigError, UserError, VAEConfig
-from pewm_jax.convert import vae as converter
-from pewm_jax.models.cogvideox import vae, vae_convolution, vae_layers, vae_tiles
+from pewm_jax.models.cogvideox import vae, vae_layers
+from pewm_jax.models.cogvideox.convert import VAE
+from pewm_jax.nn import layers, video_convolution
 from tests.helpers import randomise
 
 TINY = VAEConfig(
@@ -41,12 +42,12 @@ def reach(params, frames, latents):
 
 
 def test_with_statistics_held_fixed_a_latent_depends_on_no_later_frame(params, monkeypatch):
-    statistics = vae_layers.group_norm
+    statistics = vae_layers.group_norm_affine
 
     def fixed(p, x, *settings):
         return jax.lax.stop_gradient(statistics(p, x, *settings))
 
-    monkeypatch.setattr(vae_layers, "group_norm", fixed)
+    monkeypatch.setattr(vae_layers, "group_norm_affine", fixed)
     jax.clear_caches()
     seen = reach(params, 9, 3)
     jax.clear_caches()
@@ -100,7 +101,7 @@ def test_tiles_that_do_not_join_are_told(caplog):
     for height, told in ((24, True), (12, False)):
         caplog.clear()
         x = jnp.zeros((1, 1, height, 8, 3))
-        vae_tiles.in_tiles(lambda x: x[:, :, ::4, ::4], x, config, shrink=True)
+        vae.in_tiles(lambda x: x[:, :, ::4, ::4], x, config, shrink=True)
         assert ("do not join" in caplog.text) == told
 
 
@@ -128,7 +129,7 @@ def test_the_log_variance_is_clipped(params):
 
 @given(frames=st.integers(1, 64))
 def test_tiles_of_time_cover_every_frame_and_save_a_third(frames):
-    cut = vae_convolution._split(frames)
+    cut = video_convolution._split(frames)
     assert sum(size * count for size, count in cut) == frames
     convolutions = sum((size + 2) * count for size, count in cut)
     assert convolutions == min(
@@ -143,7 +144,7 @@ def test_tiles_of_time_cover_every_frame_and_save_a_third(frames):
 def test_the_minimal_filter_is_a_filter(size, seed):
     rng = np.random.default_rng(seed)
     taps, inputs = rng.normal(size=3), rng.normal(size=size + 2)
-    out_of, weigh, into = vae_convolution.minimal_filter(size)
+    out_of, weigh, into = video_convolution.minimal_filter(size)
     out = out_of @ ((weigh @ taps) * (into @ inputs))
     np.testing.assert_allclose(out, np.correlate(inputs, taps), atol=1e-12)
 
@@ -157,7 +158,7 @@ def test_every_form_of_a_convolution_agrees(frames):
         "bias": jnp.asarray(rng.normal(size=2), jnp.float32),
     }
     volume, *others = (
-        vae_convolution.convolve(dataclasses.replace(TINY, convolution=form), kernel, x)
+        video_convolution.convolve(dataclasses.replace(TINY, convolution=form), kernel, x)
         for form in ("volume", "taps", "winograd")
     )
     for other in others:
@@ -172,9 +173,9 @@ def test_a_doubled_frame_is_convolved_without_being_made():
         "bias": jnp.asarray(rng.normal(size=4), jnp.float32),
     }
     doubled = jnp.repeat(jnp.repeat(x, 2, axis=2), 2, axis=3)
-    wanted = vae_convolution.convolve_2d(kernel, doubled, 1, vae_convolution.SAME)
+    wanted = video_convolution.convolve_frames(kernel, doubled, 1, video_convolution.SAME)
     np.testing.assert_allclose(
-        vae_convolution.convolve_doubled(kernel, x), wanted, rtol=1e-4, atol=1e-4
+        video_convolution.convolve_upsampled(kernel, x), wanted, rtol=1e-4, atol=1e-4
     )
 
 
@@ -182,7 +183,7 @@ def test_group_norm_keeps_its_digits_far_from_zero():
     x = np.random.default_rng(0).normal(size=(1, 3, 4, 4, 4))
     p = {"scale": jnp.ones(4), "bias": jnp.zeros(4)}
     far = jnp.asarray(x + 1000, jnp.float32)
-    factor, offset = vae_layers.group_norm(p, far, 2, 1e-6)
+    factor, offset = layers.group_norm_affine(p, far, 2, 1e-6)
     grouped = x.reshape(1, -1, 2, 2)
     wanted = 1 / grouped.std((1, 3))
     np.testing.assert_allclose(factor[0, ::2], wanted[0], rtol=1e-3)
@@ -230,13 +231,13 @@ def test_only_published_names_are_known():
     ],
 )
 def test_settings_of_a_checkpoint_are_read_strictly(change, sentence):
-    values = converter.config_to_diffusers(VAEConfig())
+    values = VAE.write_config(VAEConfig())
     with pytest.raises(UserError, match=sentence):
-        converter.config_from_diffusers({**values, **change})
+        VAE.read_config({**values, **change})
 
 
 def test_settings_come_back_from_a_checkpoints_json():
     config = dataclasses.replace(TINY, invert_scale_latents=True, scaling_factor=0.7)
-    values = {**converter.config_to_diffusers(config), "_diffusers_version": "0.30.0"}
-    assert converter.config_from_diffusers(values) == config
-    assert converter.config_from_diffusers({}) == VAEConfig()
+    values = {**VAE.write_config(config), "_diffusers_version": "0.30.0"}
+    assert VAE.read_config(values) == config
+    assert VAE.read_config({}) == VAEConfig()

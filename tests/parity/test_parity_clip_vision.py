@@ -6,13 +6,16 @@ import jax
 import numpy as np
 import pytest
 import torch
-from diffusers.pipelines.stable_video_diffusion import pipeline_stable_video_diffusion as pipeline
+from diffusers.pipelines.stable_video_diffusion import (
+    pipeline_stable_video_diffusion as reference_pipeline,
+)
 from safetensors.numpy import load_file, save_file
 from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
 
 from pewm_jax import config as configuration
 from pewm_jax.config import UserError
-from pewm_jax.convert import assemble, clip_vision, svd
+from pewm_jax.convert import pipeline, svd
+from pewm_jax.models.clip import convert as clip_convert
 from pewm_jax.models.clip import model
 from tests.parity.svd_references import distance, draw, randomise
 
@@ -62,7 +65,7 @@ def test_counted_positions_are_left_behind_and_nothing_else(pair, tmp_path):
     _, folder, (_, params) = pair
     tensors = load_file(folder / "model.safetensors")
     (tmp_path / "config.json").write_text((folder / "config.json").read_text())
-    counted = {clip_vision.LEFT_BEHIND[0]: np.arange(5)[None]}
+    counted = {clip_convert.UNUSED[0]: np.arange(5)[None]}
     save_file(tensors | counted, tmp_path / "model.safetensors")
     jax.tree.map(np.testing.assert_array_equal, svd.read_image_encoder(tmp_path)[1], params)
     save_file(tensors | {"more": np.ones(1)}, tmp_path / "model.safetensors")
@@ -74,16 +77,18 @@ def test_the_published_size_has_the_reference_s_tensors():
     config = configuration.CLIPVisionConfig()
     with torch.device("meta"):
         network = reference("gelu", 32, 16, 1280, 5120, 224, 1024)
-    assert clip_vision.config_from_transformers(network.config.to_dict(), "it") == config
+    assert clip_convert.config_from_transformers(network.config.to_dict(), "it") == config
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     want = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    assert assemble.expected(clip_vision.entries(config), like) == want
+    assert pipeline.expected(clip_convert.entries(config), like) == want
 
 
 @pytest.mark.parametrize("size", [(90, 61), (224, 40), (30, 224), (7, 20)], ids=str)
 def test_images_are_prepared_as_by_the_pipeline(size):
     rgb = np.random.default_rng(0).uniform(-1, 1, (2, *size, 3)).astype(np.float32)
-    resized = pipeline._resize_with_antialiasing(torch.tensor(rgb).permute(0, 3, 1, 2), (28, 28))
+    resized = reference_pipeline._resize_with_antialiasing(
+        torch.tensor(rgb).permute(0, 3, 1, 2), (28, 28)
+    )
     processor = CLIPImageProcessor()
     want = processor(
         images=(resized + 1) / 2,
@@ -111,7 +116,7 @@ def test_settings_that_are_not_supported_are_refused(pair, setting, value, words
     _, folder, _ = pair
     values = json.loads((folder / "config.json").read_text()) | {setting: value}
     with pytest.raises(UserError, match=words):
-        clip_vision.config_from_transformers(values, "it")
+        clip_convert.config_from_transformers(values, "it")
 
 
 def test_images_of_another_shape_are_refused(pair):

@@ -18,9 +18,10 @@ from diffusers.models.transformers.transformer_cosmos import (
 from safetensors.numpy import load_file, save_file
 
 from pewm_jax.config import COSMOS_2B, COSMOS_14B, CosmosConfig, UserError
-from pewm_jax.convert import assemble, cosmos, cosmos_transformer
+from pewm_jax.convert import cosmos, pipeline
 from pewm_jax.io import tree
 from pewm_jax.models.cosmos import model
+from pewm_jax.models.cosmos.convert import TRANSFORMER
 from tests.parity.cosmos_references import channels_first, channels_last, transformer
 from tests.parity.svd_references import distance, draw
 
@@ -30,13 +31,13 @@ FILE = "diffusion_pytorch_model.safetensors"
 
 def ours(network):
     """Return a reference's settings and weights as ours."""
-    config = cosmos_transformer.config_from_diffusers(dict(network.config))
+    config = TRANSFORMER.read_config(dict(network.config))
     tensors = network.state_dict()
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     leaves = {path: np.empty(x.shape, np.float32) for path, x in tree.flatten(like).items()}
-    for entry in cosmos_transformer.entries(config):
+    for entry in TRANSFORMER.entries(config):
         place = leaves[entry.path] if entry.layer is None else leaves[entry.path][entry.layer]
-        place[...] = entry.turn.ours(tensors[entry.theirs].numpy())
+        place[...] = entry.transform.read(tensors[entry.name].numpy())
     return config, tree.unflatten(leaves)
 
 
@@ -123,9 +124,9 @@ def test_every_variant_predicts_as_the_reference(variant):
     assert distance(got, reference(network, *arguments, 10)) < TOLERANCE
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     want = {name: tuple(x.shape) for name, x in network.state_dict().items()}
-    assert assemble.expected(cosmos_transformer.entries(config), like) == want
-    written = cosmos_transformer.config_to_diffusers(config)
-    assert cosmos_transformer.config_from_diffusers(written) == config
+    assert pipeline.expected(TRANSFORMER.entries(config), like) == want
+    written = TRANSFORMER.write_config(config)
+    assert TRANSFORMER.read_config(written) == config
 
 
 @pytest.mark.parametrize("per_frame", [True, False])
@@ -201,7 +202,7 @@ def test_what_is_written_back_is_what_was_read(pair, tmp_path):
     for key, tensor in before.items():
         np.testing.assert_array_equal(after[key], tensor)
     again = CosmosTransformer3DModel.from_pretrained(tmp_path / "back")
-    assert cosmos_transformer.config_from_diffusers(dict(again.config)) == config
+    assert TRANSFORMER.read_config(dict(again.config)) == config
 
 
 PUBLISHED = {
@@ -222,9 +223,9 @@ def test_the_published_sizes_have_the_reference_s_tensors(name):
     config, settings = PUBLISHED[name]
     with torch.device("meta"):
         network = CosmosTransformer3DModel(in_channels=17, extra_pos_embed_type=None, **settings)
-    assert cosmos_transformer.config_from_diffusers(dict(network.config)) == config
+    assert TRANSFORMER.read_config(dict(network.config)) == config
     want = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    assert assemble.expected(cosmos_transformer.entries(config), abstract(config)) == want
+    assert pipeline.expected(TRANSFORMER.entries(config), abstract(config)) == want
 
 
 @pytest.mark.parametrize("settings", [{}, {"learned_positions": True, "raw_text_dim": 8}], ids=str)
@@ -265,13 +266,13 @@ def test_every_tensor_must_be_used_and_there(pair, tmp_path):
 def test_settings_that_are_not_supported_are_refused(pair, setting, value, words):
     values = json.loads((pair[1] / "config.json").read_text()) | {setting: value}
     with pytest.raises(UserError, match=words):
-        cosmos_transformer.config_from_diffusers(values)
+        TRANSFORMER.read_config(values)
 
 
 def test_a_projection_of_the_text_that_does_not_fit_is_refused():
     values = VARIANTS["Predict2.5"] | {"text_embed_dim": 32}
     with pytest.raises(UserError, match="is not its text_embed_dim 32"):
-        cosmos_transformer.config_from_diffusers(values)
+        TRANSFORMER.read_config(values)
 
 
 @pytest.mark.parametrize("which", range(5))

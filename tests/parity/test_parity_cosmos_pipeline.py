@@ -11,7 +11,7 @@ import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
 
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.convert import cosmos, cosmos_scheduler
+from pewm_jax.convert import cosmos, schedulers
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.models.cosmos import model
 from pewm_jax.models.wan import vae as wan_vae
@@ -134,18 +134,18 @@ def public(settings):
 
 def test_the_scheduler_is_written_back(pipeline, folder):
     config = cosmos.read_scheduler(folder)
-    values = cosmos_scheduler.config_to_diffusers(config)
-    assert cosmos_scheduler.config_from_diffusers(values) == config
+    values = schedulers.cosmos_to_diffusers(config)
+    assert schedulers.cosmos_from_diffusers(values) == config
     again = FlowMatchEulerDiscreteScheduler.from_config(values)
     assert public(again.config).items() <= public(pipeline.scheduler.config).items()
-    assert cosmos_scheduler.config_from_diffusers(dict(scheduler().config)) == config
+    assert schedulers.cosmos_from_diffusers(dict(scheduler().config)) == config
     for key, value in (("use_karras_sigmas", False), ("sigma_max", 200), ("shift_terminal", 0.1)):
         with pytest.raises(UserError, match=f"{key} is {value}; only"):
-            cosmos_scheduler.config_from_diffusers(values | {key: value})
+            schedulers.cosmos_from_diffusers(values | {key: value})
     with pytest.raises(UserError, match="not known: rho"):
-        cosmos_scheduler.config_from_diffusers(values | {"rho": 7})
+        schedulers.cosmos_from_diffusers(values | {"rho": 7})
     with pytest.raises(UserError, match=r"target is 'edm'; Cosmos-Predict2 has 'flow'"):
-        cosmos_scheduler.config_to_diffusers(EDMConfig())
+        schedulers.cosmos_to_diffusers(EDMConfig())
 
 
 def test_settings_of_the_noise_that_cannot_work_are_refused():

@@ -16,8 +16,7 @@ from transformers import (
 )
 
 from pewm_jax.config.dinov2 import published
-from pewm_jax.convert import assemble, dinov2
-from pewm_jax.convert.dinov2_source import with_transformers_names
+from pewm_jax.convert import dinov2
 from pewm_jax.models.dinov2 import model
 
 SHRUNKEN = {"small": (64, 1), "base": (128, 2), "large": (192, 3), "giant": (192, 3)}
@@ -186,7 +185,7 @@ def test_published_sizes_have_the_reference_s_tensors(size, registers):
             image=config.pretrained_size,
         )
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
-    assembled = assemble.expected(dinov2.entries(config), like)
+    assembled = pipeline.expected(dinov2.entries(config), like)
     source = with_transformers_names(_Shapes(original_words(network)))
     assert assembled == {name: source.shape(name) for name in source.names()}
     assert sum(np.prod(shape) for shape in assembled.values()) + config.width == sum(

@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.config import PUBLISHED, UserError, published
-from pewm_jax.convert import transformer
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import model as dit
-from pewm_jax.nn import positions
+from pewm_jax.models.cogvideox import positions
+from pewm_jax.models.cogvideox.convert import TRANSFORMER
 
 LENGTH = 7
 OLDER = {"sample_height": 8, "sample_width": 12, "sample_frames": 9}
@@ -47,7 +47,7 @@ def shrunken(name):
 
 
 def build(config):
-    values = transformer.config_to_diffusers(config)
+    values = TRANSFORMER.write_config(config)
     return CogVideoXTransformer3DModel(**{k: v for k, v in values.items() if k[0] != "_"}).eval()
 
 
@@ -71,8 +71,8 @@ def converted(name):
     """The reference's tensors as our parameters."""
     config, state = shrunken(name), reference(name).state_dict()
     leaves = {}
-    for entry in transformer.entries(config):
-        tensor = entry.turn.ours(state[entry.theirs].numpy())
+    for entry in TRANSFORMER.entries(config):
+        tensor = entry.transform.read(state[entry.name].numpy())
         leaves.setdefault(entry.path, {})[entry.layer] = tensor
     stacked = {
         path: parts[None] if None in parts else np.stack([parts[i] for i in range(config.layers)])
@@ -174,12 +174,12 @@ def test_gradients_are_equal():
 
     ours = tree.flatten(jax.jit(jax.grad(gradient))(converted(name)))
     wanted = {path: parameter.grad.numpy() for path, parameter in network.named_parameters()}
-    for entry in transformer.entries(config):
+    for entry in TRANSFORMER.entries(config):
         got = ours[entry.path] if entry.layer is None else ours[entry.path][entry.layer]
         # The keys' common part moves no softmax, so the gradient of its bias is rounding alone.
-        scale = max(np.abs(wanted[entry.theirs]).max(), 1e-3)
-        off = np.abs(got - entry.turn.ours(wanted[entry.theirs])).max() / scale
-        assert off < 1e-4, (entry.theirs, off)
+        scale = max(np.abs(wanted[entry.name]).max(), 1e-3)
+        off = np.abs(got - entry.transform.read(wanted[entry.name])).max() / scale
+        assert off < 1e-4, (entry.name, off)
 
 
 @settings(max_examples=30, deadline=None)
@@ -216,16 +216,16 @@ def test_at_full_size_names_and_shapes_are_the_references(name):
         network = build(config)
     there = network.state_dict()
     assert {tensor.device.type for tensor in there.values()} == {"meta"}
-    listed = transformer.entries(config)
-    assert sorted(entry.theirs for entry in listed) == sorted(there)
+    listed = TRANSFORMER.entries(config)
+    assert sorted(entry.name for entry in listed) == sorted(there)
 
     abstract = jax.eval_shape(lambda: dit.init(config, jax.random.key(0)))
     ours = tree.flatten(abstract)
     filled = {path: set() for path in ours}
     for entry in listed:
-        shape = tuple(there[entry.theirs].shape)
-        turned = np.shape(entry.turn.ours(np.broadcast_to(np.float32(0), shape)))
-        back = np.shape(entry.turn.theirs(np.broadcast_to(np.float32(0), turned)))
+        shape = tuple(there[entry.name].shape)
+        turned = np.shape(entry.transform.read(np.broadcast_to(np.float32(0), shape)))
+        back = np.shape(entry.transform.write(np.broadcast_to(np.float32(0), turned)))
         leaf = ours[entry.path].shape
         assert (turned, back) == (leaf if entry.layer is None else leaf[1:], shape), entry
         assert entry.layer not in filled[entry.path], "two tensors for one place"
@@ -237,9 +237,9 @@ def test_at_full_size_names_and_shapes_are_the_references(name):
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_settings_survive_the_journey(name):
     for config in (published(name), shrunken(name)):
-        values = transformer.config_to_diffusers(config)
+        values = TRANSFORMER.write_config(config)
         stated = dataclasses.replace(config, learned="exact")  # diffusers has no name for it
-        assert transformer.config_from_diffusers(values) == stated
+        assert TRANSFORMER.read_config(values) == stated
         known = set(inspect.signature(CogVideoXTransformer3DModel.__init__).parameters)
         assert {k for k in values if k[0] != "_"} == known - {"self"}
 
@@ -260,8 +260,8 @@ def test_settings_survive_the_journey(name):
 )
 def test_settings_that_are_not_known_are_refused_by_name(changes, says):
     with pytest.raises(UserError, match=says):
-        transformer.config_from_diffusers(changes)
+        TRANSFORMER.read_config(changes)
 
 
 def test_absent_settings_are_the_references_defaults():
-    assert transformer.config_from_diffusers({}) == published("2b")
+    assert TRANSFORMER.read_config({}) == published("2b")

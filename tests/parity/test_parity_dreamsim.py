@@ -11,8 +11,8 @@ from torch import nn
 
 from pewm_jax.config import UserError
 from pewm_jax.eval import metrics
+from pewm_jax.models.dreamsim import convert as dreamsim_weights
 from pewm_jax.models.dreamsim import model as dreamsim
-from pewm_jax.models.dreamsim import weights as dreamsim_weights
 
 WIDTH, DEPTH, PATCH, GRID, RANK, ALPHA = 128, 2, 4, 3, 3, 0.5
 

@@ -9,8 +9,8 @@ from torch.nn import functional
 
 from pewm_jax.config import UserError
 from pewm_jax.io import tree, weights
+from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
-from pewm_jax.models.i3d import weights as i3d_weights
 
 nn = torch.nn
 

@@ -9,8 +9,8 @@ from safetensors.numpy import save_file
 
 from pewm_jax.config import UserError
 from pewm_jax.io import tree, weights
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
 
 CUTS = {"alex": (2, 5, 8, 10, 12), "vgg": (4, 9, 16, 23, 30)}
 """Where torchvision's ``features`` are cut into slices (lpips/pretrained_networks.py)."""

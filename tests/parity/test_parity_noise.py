@@ -9,7 +9,7 @@ import pytest
 
 from pewm_jax.config import UserError
 from pewm_jax.config.parts import Noise
-from pewm_jax.convert import svd, svd_scheduler
+from pewm_jax.convert import schedulers, svd
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
 
@@ -106,18 +106,18 @@ def public(settings):
 def test_stable_video_diffusion_s_scheduler_is_written_back(tmp_path):
     theirs = diffusers.EulerDiscreteScheduler(**SVD)
     theirs.save_pretrained(tmp_path)
-    values = svd_scheduler.config_to_diffusers(svd.read_scheduler(tmp_path))
+    values = schedulers.svd_to_diffusers(svd.read_scheduler(tmp_path))
     again = diffusers.EulerDiscreteScheduler.from_config(values)
     assert public(again.config) == public(theirs.config)
     for key, value in (("prediction_type", "epsilon"), ("timestep_spacing", "trailing")):
         with pytest.raises(UserError, match=f"{key} is '{value}'; only"):
-            svd_scheduler.config_from_diffusers(values | {key: value})
+            schedulers.svd_from_diffusers(values | {key: value})
     with pytest.raises(UserError, match="sigma_max is None"):
-        svd_scheduler.config_from_diffusers(values | {"sigma_max": None})
+        schedulers.svd_from_diffusers(values | {"sigma_max": None})
     with pytest.raises(UserError, match="not known: rho"):
-        svd_scheduler.config_from_diffusers(values | {"rho": 7})
+        schedulers.svd_from_diffusers(values | {"rho": 7})
     with pytest.raises(UserError, match=r"sigma_data is 0\.5"):
-        svd_scheduler.config_to_diffusers(EDMConfig(target="v"))
+        schedulers.svd_to_diffusers(EDMConfig(target="v"))
 
 
 @pytest.mark.parametrize("steps", [1, 4, 20])

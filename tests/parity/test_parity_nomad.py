@@ -12,8 +12,8 @@ import torch
 from torch.nn import functional
 
 from pewm_jax.config import NomadConfig, UserError
-from pewm_jax.convert import nomad as converter
 from pewm_jax.diffusion import squared_cosine
+from pewm_jax.models.nomad import convert as converter
 from pewm_jax.models.nomad import efficientnet
 from pewm_jax.models.nomad import model as nomad
 
@@ -327,7 +327,7 @@ def test_the_published_sizes_have_the_published_names_and_shapes():
         published.vision_encoder = VisionEncoder(NomadConfig())
         published.noise_pred_net, published.dist_pred_net = Unet(NomadConfig()), Distance(256)
     state = published.state_dict()
-    listed = {entry.theirs: entry for entry in converter.entries(NomadConfig())}
+    listed = {entry.name: entry for entry in converter.entries(NomadConfig())}
     left = state.keys() - listed.keys()
     assert not listed.keys() - state.keys()
     assert {name.split(".")[1] for name in left} == {
@@ -339,7 +339,7 @@ def test_the_published_sizes_have_the_published_names_and_shapes():
     shapes = nomad.shapes(NomadConfig())
     assert {entry.path for entry in listed.values()} == shapes.keys()
     for name, entry in listed.items():
-        turned = entry.turn.ours(np.broadcast_to(np.zeros(()), tuple(state[name].shape)))
+        turned = entry.transform.read(np.broadcast_to(np.zeros(()), tuple(state[name].shape)))
         assert turned.shape == shapes[entry.path]
 
 

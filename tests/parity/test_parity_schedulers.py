@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.convert import scheduler as converter
+from pewm_jax.convert import schedulers
 
 torch = pytest.importorskip("torch")
 diffusers = pytest.importorskip("diffusers")
@@ -44,7 +44,7 @@ def reference(kind, target, settings):
 
 def ours(theirs, steps):
     values = {**theirs.config, "_class_name": type(theirs).__name__}
-    return dataclasses.replace(converter.config_from_diffusers(values), sample_steps=steps)
+    return dataclasses.replace(schedulers.cogvideox_from_diffusers(values), sample_steps=steps)
 
 
 def network(x, t, xp):
@@ -197,8 +197,8 @@ def test_dynamic_guidance_is_what_the_pipeline_applies():
 def test_settings_survive_the_way_there_and_back(kind):
     for settings in SETTINGS[:5]:
         theirs = reference(kind, "v_prediction", settings)
-        written = converter.config_to_diffusers(ours(theirs, 50))
-        assert converter.config_from_diffusers(written) == ours(theirs, 50)
+        written = schedulers.cogvideox_to_diffusers(ours(theirs, 50))
+        assert schedulers.cogvideox_from_diffusers(written) == ours(theirs, 50)
         again = type(theirs).from_config(written).config
         for name, value in theirs.config.items():
             if name not in {"clip_sample", "_use_default_values"}:  # no step reads the former

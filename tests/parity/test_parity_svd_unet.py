@@ -12,15 +12,16 @@ from diffusers.models.resnet import SpatioTemporalResBlock
 from safetensors.numpy import load_file, save_file
 
 from pewm_jax.config import SVDUNetConfig, UserError
-from pewm_jax.convert import assemble, svd, svd_unet
+from pewm_jax.convert import pipeline, svd
 from pewm_jax.models.svd import unet as model
+from pewm_jax.models.svd.convert import DOWN, UNET, UP
 from tests.parity.svd_references import distance, draw, first, randomise
 
 SHRUNKEN = {
     "block_out_channels": (32, 64),
     "num_attention_heads": (2, 4),
-    "down_block_types": [svd_unet.DOWN[True], svd_unet.DOWN[False]],
-    "up_block_types": [svd_unet.UP[False], svd_unet.UP[True]],
+    "down_block_types": [DOWN[True], DOWN[False]],
+    "up_block_types": [UP[False], UP[True]],
     "layers_per_block": (1, 2),
     "transformer_layers_per_block": (1, 2),
     "cross_attention_dim": 24,
@@ -103,17 +104,17 @@ def test_what_is_written_back_is_what_was_read(pair, tmp_path):
     for key, tensor in before.items():
         np.testing.assert_array_equal(after[key], tensor)
     again = UNetSpatioTemporalConditionModel.from_pretrained(tmp_path / "back")
-    assert svd_unet.config_from_diffusers(dict(again.config)) == config
+    assert UNET.read_config(dict(again.config)) == config
 
 
 def test_the_published_size_has_the_reference_s_tensors():
     with torch.device("meta"):
         network = UNetSpatioTemporalConditionModel()
-    config = svd_unet.config_from_diffusers(dict(network.config))
+    config = UNET.read_config(dict(network.config))
     assert config == SVDUNetConfig()
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     want = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    assert assemble.expected(svd_unet.entries(config), like) == want
+    assert pipeline.expected(UNET.entries(config), like) == want
 
 
 def test_every_tensor_must_be_used_and_there(pair, tmp_path):
@@ -131,7 +132,7 @@ def test_every_tensor_must_be_used_and_there(pair, tmp_path):
     ("setting", "value", "words"),
     [
         ("dropout", 0.1, "not known: dropout"),
-        ("up_block_types", [svd_unet.UP[True]] * 2, "mirror image"),
+        ("up_block_types", [UP[True]] * 2, "mirror image"),
         ("cross_attention_dim", [24, 32], "only one number"),
         ("layers_per_block", 1.5, "whole number"),
     ],
@@ -140,7 +141,7 @@ def test_settings_that_are_not_supported_are_refused(pair, setting, value, words
     _, folder, _ = pair
     values = json.loads((folder / "config.json").read_text()) | {setting: value}
     with pytest.raises(UserError, match=words):
-        svd_unet.config_from_diffusers(values)
+        UNET.read_config(values)
 
 
 @pytest.mark.parametrize("which", range(4))

@@ -10,8 +10,9 @@ from diffusers import AutoencoderKLTemporalDecoder
 from safetensors.numpy import load_file
 
 from pewm_jax.config import SVDVAEConfig, UserError
-from pewm_jax.convert import assemble, svd, svd_vae
+from pewm_jax.convert import pipeline, svd
 from pewm_jax.models.svd import vae as model
+from pewm_jax.models.svd.convert import BLOCK, VAE
 from tests.parity.svd_references import distance, draw, first, randomise
 
 WIDTHS = (32, 64)
@@ -19,7 +20,7 @@ TOLERANCE = 1e-4
 
 
 def reference(widths):
-    blocks = [svd_vae.BLOCK] * len(widths)
+    blocks = [BLOCK] * len(widths)
     return AutoencoderKLTemporalDecoder(
         block_out_channels=widths, down_block_types=blocks, layers_per_block=2
     )
@@ -70,17 +71,17 @@ def test_what_is_written_back_is_what_was_read(pair, tmp_path):
     for key, tensor in before.items():
         np.testing.assert_array_equal(after[key], tensor)
     again = AutoencoderKLTemporalDecoder.from_pretrained(tmp_path / "back")
-    assert svd_vae.config_from_diffusers(dict(again.config)) == config
+    assert VAE.read_config(dict(again.config)) == config
 
 
 def test_the_published_size_has_the_reference_s_tensors():
     config = SVDVAEConfig()
     with torch.device("meta"):
         network = reference(config.widths)
-    assert svd_vae.config_from_diffusers(dict(network.config)) == config
+    assert VAE.read_config(dict(network.config)) == config
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     want = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    assert assemble.expected(svd_vae.entries(config), like) == want
+    assert pipeline.expected(VAE.entries(config), like) == want
 
 
 @pytest.mark.parametrize(
@@ -97,7 +98,7 @@ def test_settings_that_are_not_supported_are_refused(pair, setting, value, words
     _, folder, _ = pair
     values = json.loads((folder / "config.json").read_text()) | {setting: value}
     with pytest.raises(UserError, match=words):
-        svd_vae.config_from_diffusers(values)
+        VAE.read_config(values)
 
 
 def test_videos_that_do_not_fit_are_refused(pair):

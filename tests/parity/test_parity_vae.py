@@ -10,9 +10,9 @@ import torch
 from diffusers import AutoencoderKLCogVideoX
 
 from pewm_jax.config import UserError, VAEConfig
-from pewm_jax.convert import vae as converter
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import vae
+from pewm_jax.models.cogvideox.convert import VAE
 
 SHRUNKEN = {
     "block_out_channels": (8, 12, 12, 16),
@@ -39,11 +39,11 @@ def reference():
 
 @pytest.fixture(scope="module")
 def ours(reference):
-    config = converter.config_from_diffusers(dict(reference.config))
+    config = VAE.read_config(dict(reference.config))
     tensors = {name: tensor.numpy() for name, tensor in reference.state_dict().items()}
     leaves = {
-        entry.path: jnp.asarray(entry.turn.ours(tensors.pop(entry.theirs)))
-        for entry in converter.entries(config)
+        entry.path: jnp.asarray(entry.transform.read(tensors.pop(entry.name)))
+        for entry in VAE.entries(config)
     }
     assert not tensors
     # The form that compiles fastest; the others are compared below.
@@ -153,15 +153,16 @@ def test_bfloat16_is_as_near_to_float32_as_the_references(reference, ours):
 def test_names_and_shapes_of_the_published_size_fit_without_a_weight(variant):
     config = VAEConfig.published(variant)
     with torch.device("meta"):
-        network = AutoencoderKLCogVideoX.from_config(converter.config_to_diffusers(config))
+        network = AutoencoderKLCogVideoX.from_config(VAE.write_config(config))
     wanted = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     like = tree.flatten(jax.eval_shape(lambda key: vae.init(config, key), jax.random.key(0)))
-    entries = converter.entries(config)
+    entries = VAE.entries(config)
     nothing = np.zeros((), np.float32)
     have = {
-        e.theirs: e.turn.theirs(np.broadcast_to(nothing, like[e.path].shape)).shape for e in entries
+        e.name: e.transform.write(np.broadcast_to(nothing, like[e.path].shape)).shape
+        for e in entries
     }
     assert have == wanted
     assert {e.path for e in entries} == like.keys()
     assert len(entries) == len(like)
-    assert converter.config_from_diffusers(dict(network.config)) == config
+    assert VAE.read_config(dict(network.config)) == config

@@ -10,8 +10,9 @@ from diffusers import AutoencoderKLWan
 from safetensors.numpy import load_file
 
 from pewm_jax.config import UserError, WanVAEConfig
-from pewm_jax.convert import assemble, cosmos, wan_vae
+from pewm_jax.convert import cosmos, pipeline
 from pewm_jax.models.wan import vae as model
+from pewm_jax.models.wan.convert import VAE
 from tests.parity.cosmos_references import channels_first, channels_last
 from tests.parity.svd_references import distance, draw, randomise
 
@@ -106,18 +107,18 @@ def test_what_is_written_back_is_what_was_read(pair, tmp_path):
     for key, tensor in before.items():
         np.testing.assert_array_equal(after[key], tensor)
     again = AutoencoderKLWan.from_pretrained(tmp_path / "back")
-    assert wan_vae.config_from_diffusers(dict(again.config)) == config
+    assert VAE.read_config(dict(again.config)) == config
 
 
 def test_the_published_size_has_the_reference_s_tensors():
     with torch.device("meta"):
         network = AutoencoderKLWan()
-    config = wan_vae.config_from_diffusers(dict(network.config))
+    config = VAE.read_config(dict(network.config))
     assert config == WanVAEConfig()
     assert (config.spatial, config.temporal) == (8, 4)
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     want = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    assert assemble.expected(wan_vae.entries(config), like) == want
+    assert pipeline.expected(VAE.entries(config), like) == want
 
 
 @pytest.mark.parametrize(
@@ -140,7 +141,7 @@ def test_the_published_size_has_the_reference_s_tensors():
 def test_settings_that_are_not_supported_are_refused(pair, setting, value, words):
     values = json.loads((pair[1] / "config.json").read_text()) | {setting: value}
     with pytest.raises(UserError, match=words):
-        wan_vae.config_from_diffusers(values)
+        VAE.read_config(values)
 
 
 def test_videos_that_do_not_fit_are_refused(pair):

@@ -21,8 +21,8 @@ from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
 from pewm_jax.geometry.actions import discrete_table, rotation_z
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.planning import candidates, costs
 from pewm_jax.planning.candidates import Imagination, Judged
 from pewm_jax.planning.mpc import imagining, knowing, mpc

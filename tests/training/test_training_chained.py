@@ -12,9 +12,9 @@ from test_training_prepared import a_batch
 
 from pewm_jax import worlds
 from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import BothConfig, ConfigError, PixelConfig, TrainConfig, UserError
 from pewm_jax.memory import memories
-from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import EncodedView, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import chained, objective, world_model
 from pewm_jax.worlds import costs as world_costs

@@ -30,8 +30,8 @@ from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, writ
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.eval import codec_score, report
 from pewm_jax.io import tree, weights
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.plan import plan
 from pewm_jax.train import loop, stages, starting, step
 from pewm_jax.worlds import codec as world

@@ -9,6 +9,7 @@ import pytest
 
 import pewm_jax
 from pewm_jax import shipped, worlds
+from pewm_jax.codecs import gates
 from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.config import (
     AttentionConfig,
@@ -26,9 +27,8 @@ from pewm_jax.config import (
 )
 from pewm_jax.data import abstract
 from pewm_jax.io import tree
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
-from pewm_jax.nn import gates
 from pewm_jax.train import loop, stages
 from pewm_jax.types import Frames
 from pewm_jax.worlds import codec_gate

@@ -43,8 +43,8 @@ from pewm_jax.eval.metrics.pictures import DEPTHS, PLAIN, Metric
 from pewm_jax.eval.metrics.revisits import Revisit, RevisitScore
 from pewm_jax.eval.metrics.similarity import Similarity
 from pewm_jax.eval.metrics.videos import SetScore, VideoDistance
-from pewm_jax.models.i3d import weights as i3d_weights
-from pewm_jax.models.lpips import weights as lpips_weights
+from pewm_jax.models.i3d import convert as i3d_weights
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips.model import Net
 
 __all__ = [

@@ -19,9 +19,9 @@ from pewm_jax.eval.metrics.similarity import read as read_encoder
 from pewm_jax.eval.metrics.structure import Consistency, follow_by_flow
 from pewm_jax.eval.metrics.videos import VideoDistance
 from pewm_jax.eval.protocol import file_hash
+from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
-from pewm_jax.models.i3d import weights as i3d_weights
-from pewm_jax.models.lpips import weights as lpips_weights
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips.model import LEAST
 
 FLOW = "flow"

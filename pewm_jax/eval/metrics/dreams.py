@@ -10,8 +10,8 @@ import jax
 
 from pewm_jax.config import UserError
 from pewm_jax.eval.metrics.pictures import colours
+from pewm_jax.models.dreamsim import convert as dreamsim_weights
 from pewm_jax.models.dreamsim import model as dreamsim
-from pewm_jax.models.dreamsim import weights as dreamsim_weights
 from pewm_jax.types import Array, Params
 
 PICTURES = 8

@@ -11,8 +11,8 @@ from pathlib import Path
 import jax
 
 from pewm_jax.eval.metrics.pictures import colours, marked
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.models.lpips.model import LEAST, NAMES, Net
 from pewm_jax.types import Array, Params
 

@@ -24,8 +24,8 @@ from pewm_jax.config import DINOv2Config, UserError
 from pewm_jax.config.dinov2 import size_name
 from pewm_jax.eval.metrics.pictures import colours, marked
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
 from pewm_jax.models.lpips.model import Net
 from pewm_jax.types import Array, Params
 

@@ -20,8 +20,8 @@ import numpy as np
 from pewm_jax.eval.metrics import distributions
 from pewm_jax.eval.metrics.distributions import Distance, Spread
 from pewm_jax.eval.metrics.pictures import colours, marked
+from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
-from pewm_jax.models.i3d import weights as i3d_weights
 from pewm_jax.types import Array, Params
 
 FRAMES = 32

@@ -13,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import CLIPVisionConfig, UserError
-from pewm_jax.models.cogvideox.vae_shapes import draw
-from pewm_jax.models.dinov2.model import patchify, resize_matrix
-from pewm_jax.models.svd.layers import attention, layer_norm, linear
-from pewm_jax.models.svd.shapes import Leaf, conv, norm
+from pewm_jax.models.dinov2.model import resize_matrix
+from pewm_jax.nn.attention import multi_head_attention
+from pewm_jax.nn.layers import layer_norm, linear
+from pewm_jax.nn.parameters import Leaf, draw, norm
+from pewm_jax.nn.parameters import linear as linear_leaves
+from pewm_jax.nn.tokens import patchify_images
 from pewm_jax.types import Array, Params
 
 MEAN_3 = (0.48145466, 0.4578275, 0.40821073)
@@ -34,14 +36,14 @@ def init(config: CLIPVisionConfig, key: Array) -> Params:
     """
     ends_key, blocks_key, *keys = jax.random.split(key, 4)
     shapes = {"cls_token": (config.width,), "position_embed": (config.tokens, config.width)}
-    blocks = jax.vmap(lambda k: draw(dict(_block(config)), k))(
+    blocks = jax.vmap(lambda k: draw(dict(_block(config)), k, key_per_leaf=True))(
         jax.random.split(blocks_key, config.layers)
     )
     tokens = {
         name: 0.02 * jax.random.normal(k, shape)
         for k, (name, shape) in zip(keys, shapes.items(), strict=True)
     }
-    return {**draw(dict(_ends(config)), ends_key), **tokens, "blocks": blocks}
+    return {**draw(dict(_ends(config)), ends_key, key_per_leaf=True), **tokens, "blocks": blocks}
 
 
 def apply(config: CLIPVisionConfig, params: Params, images_BHWC: Array) -> Array:
@@ -67,7 +69,7 @@ def apply(config: CLIPVisionConfig, params: Params, images_BHWC: Array) -> Array
             f"CLIP got images of shape {images.shape} and dtype {dtype}: give it floats of shape "
             f"(batch, {side}, {side}, 3), from clip_vision.preprocess."
         )
-    patches = linear(params["patch_embed"], patchify(images, config.patch))
+    patches = linear(params["patch_embed"], patchify_images(images, config.patch))
     first = jnp.broadcast_to(params["cls_token"].astype(dtype), (len(images), 1, config.width))
     x = jnp.concatenate([first, patches], 1) + params["position_embed"].astype(dtype)
     x = layer_norm(params["norm_in"], x, config.epsilon)
@@ -132,7 +134,7 @@ def _smooth_resize(old: int, new: int) -> np.ndarray:
 def _run(config: CLIPVisionConfig, params: Params, x_BND: Array) -> Array:
     """Pre-norm attention and feed-forward."""
     normed = layer_norm(params["norm1"], x_BND, config.epsilon)
-    x = x_BND + attention(params["attn"], normed, normed, config.heads)
+    x = x_BND + multi_head_attention(params["attn"], normed, normed, config.heads)
     hidden = linear(params["up"], layer_norm(params["norm2"], x, config.epsilon))
     if config.activation == "gelu":
         hidden = jax.nn.gelu(hidden, approximate=False)
@@ -150,8 +152,8 @@ def _ends(config: CLIPVisionConfig) -> Iterator[Leaf]:
 
 def _block(config: CLIPVisionConfig) -> Iterator[Leaf]:
     for name in ("to_q", "to_k", "to_v", "to_out"):
-        yield from conv(f"attn/{name}", (), config.width, config.width)
+        yield from linear_leaves(f"attn/{name}", config.width, config.width)
     yield from norm("norm1", config.width)
     yield from norm("norm2", config.width)
-    yield from conv("up", (), config.width, config.hidden)
-    yield from conv("down", (), config.hidden, config.width)
+    yield from linear_leaves("up", config.width, config.hidden)
+    yield from linear_leaves("down", config.hidden, config.width)

@@ -13,6 +13,10 @@ and ``decode`` call a compiled function per chunk, so two compilations serve vid
 8N + 1 frames become 2N + 1 latents and 8N + 1 frames again. An *even* number of latents has no
 first-frame rule: 2 latents decode to 8 frames, not 5. See ``frames_of`` and ``latents_of``.
 
+Large frames may be processed in overlapping spatial tiles, which are blended (``in_tiles``). Tiles
+need less memory than whole frames. The result differs slightly, since norms and borders see only a
+tile. Tiles of equal shape share one compiled body and run one after another.
+
 Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``. Reference:
 ``AutoencoderKLCogVideoX`` of diffusers.
 """
@@ -26,15 +30,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 
 from pewm_jax.config import UserError, VAEConfig
 from pewm_jax.models.cogvideox import vae_layers as layers
-from pewm_jax.models.cogvideox.vae_shapes import init, layout
-from pewm_jax.models.cogvideox.vae_tiles import in_tiles
+from pewm_jax.models.cogvideox.vae_layers import layout
+from pewm_jax.nn.parameters import draw
 from pewm_jax.types import Array, Params
-
-__all__ = ["decode", "encode", "frames_of", "init", "latents_of", "layout"]
 
 ENCODE_FRAMES = 8
 """Frames per chunk in the encoder."""
@@ -44,6 +47,19 @@ LOGVAR_RANGE = (-30.0, 20.0)
 """The logarithm of a latent's variance is clipped to this range."""
 
 _log = logging.getLogger(__name__)
+
+
+def init(config: VAEConfig, key: Array) -> Params:
+    """Return random parameters: float32, kernels of variance 1/inputs, scales 1, biases 0.
+
+    Args:
+        config: the autoencoder.
+        key: a random key.
+
+    Returns:
+        ``{"encoder": …, "decoder": …}``.
+    """
+    return draw(layout(config), key, key_per_leaf=True)
 
 
 def frames_of(config: VAEConfig, latents: int) -> int:
@@ -251,3 +267,93 @@ def _shape(x: Array, channels: int, name: str) -> tuple[int, ...]:
     if not jnp.issubdtype(x.dtype, jnp.floating):
         raise UserError(f"{name} holds {x.dtype}: convert it to floats first.")
     return tuple(x.shape)
+
+
+def in_tiles(
+    whole: Callable[[Array], Array], x_BTHWC: Array, config: VAEConfig, *, shrink: bool
+) -> Array:
+    """Apply ``whole`` to the tiles of a video and blend, or to a video no larger than a tile.
+
+    Args:
+        whole: (B, T, H, W, C) → (B, T', H', W', C').
+        x_BTHWC: the video, or the latents.
+        config: the autoencoder; without ``config.tiling`` the video is not split.
+        shrink: whether ``whole`` encodes (pixels in, latents out) or decodes.
+
+    Returns:
+        What ``whole`` would return, up to effects at tile borders. If tiles do not overlap by a
+        whole number of latents, the size differs, as in the reference, and a warning is logged.
+    """
+    pixels = config.tile_pixels
+    latents = tuple(size // config.spatial for size in pixels)
+    tile, out = (pixels, latents) if shrink else (latents, pixels)
+    size = x_BTHWC.shape[2:4]
+    if not config.tiling or (size[0] <= tile[0] and size[1] <= tile[1]):
+        return whole(x_BTHWC)
+    overlap = (config.tile_overlap_height, config.tile_overlap_width)
+    steps = [int(n * (1 - share)) for n, share in zip(tile, overlap, strict=True)]
+    blend = [int(n * share) for n, share in zip(out, overlap, strict=True)]
+    keep = [n - extent for n, extent in zip(out, blend, strict=True)]
+    starts = [list(range(0, n, step)) for n, step in zip(size, steps, strict=True)]
+
+    tiles = _run_tiles(whole, x_BTHWC, starts, tile)
+    rows = []
+    for i in range(len(starts[0])):
+        row = []
+        for j in range(len(starts[1])):
+            if i > 0:
+                tiles[i, j] = _fade(tiles[i - 1, j], tiles[i, j], blend[0], axis=2)
+            if j > 0:
+                tiles[i, j] = _fade(tiles[i, j - 1], tiles[i, j], blend[1], axis=3)
+            row.append(tiles[i, j][:, :, : keep[0], : keep[1]])
+        rows.append(jnp.concatenate(row, 3))
+    joined = jnp.concatenate(rows, 2)
+    side = config.spatial
+    wanted = tuple(n // side if shrink else n * side for n in size)
+    if joined.shape[2:4] != wanted:
+        _log.warning(
+            "tiles of %d×%d pixels that overlap by shares of %.3g and %.3g do not join on whole "
+            "latents: the result is %d×%d, not %d×%d; choose tiles whose overlap is a whole number "
+            "of %d pixels, as 240×360 with 1/6 and 1/5.",
+            *(*pixels, *overlap, *joined.shape[2:4], *wanted, side),
+        )
+    return joined
+
+
+def _run_tiles(
+    whole: Callable[[Array], Array],
+    x_BTHWC: Array,
+    starts: list[list[int]],
+    tile: tuple[int, ...],
+) -> dict[tuple[int, int], Array]:
+    """Apply ``whole`` to every tile, with one ``lax.map`` per shape of tile."""
+    height, width = x_BTHWC.shape[2:4]
+    shapes: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, top in enumerate(starts[0]):
+        for j, left in enumerate(starts[1]):
+            shape = (min(tile[0], height - top), min(tile[1], width - left))
+            shapes.setdefault(shape, []).append((i, j))
+    tiles = {}
+    for shape, places in shapes.items():
+        corners = np.array([(starts[0][i], starts[1][j]) for i, j in places])
+
+        def process(corner: Array, shape: tuple[int, int] = shape) -> Array:
+            cut = jax.lax.dynamic_slice_in_dim(x_BTHWC, corner[0], shape[0], 2)
+            return whole(jax.lax.dynamic_slice_in_dim(cut, corner[1], shape[1], 3))
+
+        tiles.update(zip(places, jax.lax.map(process, jnp.asarray(corners)), strict=True))
+    return tiles
+
+
+def _fade(before: Array, after: Array, extent: int, axis: int) -> Array:
+    """Blend the end of one tile linearly into the start of the next."""
+    extent = min(before.shape[axis], after.shape[axis], extent)
+    if extent == 0:
+        return after
+    shape = [1] * after.ndim
+    shape[axis] = extent
+    share = jnp.asarray(np.arange(extent).reshape(shape) / extent, after.dtype)
+    end = jax.lax.slice_in_dim(before, before.shape[axis] - extent, None, axis=axis)
+    start = jax.lax.slice_in_dim(after, 0, extent, axis=axis)
+    rest = jax.lax.slice_in_dim(after, extent, None, axis=axis)
+    return jnp.concatenate([end * (1 - share) + start * share, rest], axis)

@@ -8,7 +8,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import ModelConfig, VAEConfig
 from pewm_jax.models.cogvideox import vae
-from pewm_jax.models.cogvideox.vae_shapes import layout
+from pewm_jax.models.cogvideox.vae_layers import layout
 from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.types import Array, Params
 

@@ -2,17 +2,23 @@
 
 A causal layer sees no later frames. The first chunk of a video is padded by repeating its first
 frame; a later chunk by the last frames of the chunk before. These are passed on as ``past``: one
-array per convolution, nested like the parameters. Reference: ``autoencoder_kl_cogvideox.py`` of
+array per convolution, nested like the parameters. ``layout`` lists the parameters: a norm of the
+decoder also has the 1×1×1 convolutions ``scale_by`` and ``shift_by`` from latents to its channels.
+Reference: ``autoencoder_kl_cogvideox.py`` of
 diffusers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import VAEConfig
-from pewm_jax.models.cogvideox.vae_convolution import convolve, convolve_2d, convolve_doubled
+from pewm_jax.nn.layers import group_norm_affine
+from pewm_jax.nn.parameters import Leaf, convolution
+from pewm_jax.nn.video_convolution import convolve, convolve_frames, convolve_upsampled
 from pewm_jax.types import Array, Params
 
 EPS = 1e-6
@@ -45,34 +51,6 @@ def pointwise(params: Params, x: Array) -> Array:
     return x @ kernel.reshape(kernel.shape[-2:]) + params["bias"].astype(x.dtype)
 
 
-def group_norm(params: Params, x_BTHWC: Array, groups: int, eps: float) -> tuple[Array, Array]:
-    """Return the (B, C) factor and offset that normalise each group over time, space and channels.
-
-    In float32; ``x·factor + offset`` is the affine group norm.
-    """
-    batch, *_, channels = x_BTHWC.shape
-    x = x_BTHWC.astype(jnp.float32)
-    # Subtracting some pixel first keeps the variance exact when the mean is far from zero.
-    origin = jax.lax.stop_gradient(x[:, :1, :1, :1])
-    near = x - origin
-    count = x[0, ..., 0].size
-    first = jnp.sum(near, (1, 2, 3)) / count
-    second = jnp.sum(near * near, (1, 2, 3)) / count
-    mean = first + origin[:, 0, 0, 0]
-    spread = second - first * first
-
-    def pool(value_BC: Array) -> Array:
-        return value_BC.reshape(batch, groups, -1).mean(-1, keepdims=True)
-
-    mean_g = pool(mean)
-    between = jnp.square(mean.reshape(batch, groups, -1) - mean_g).mean(-1, keepdims=True)
-    scale = jax.lax.rsqrt(pool(spread) + between + eps)
-    scale = jnp.broadcast_to(scale, (batch, groups, channels // groups)).reshape(batch, channels)
-    mean = jnp.broadcast_to(mean_g, (batch, groups, channels // groups)).reshape(batch, channels)
-    factor = scale * params["scale"]
-    return factor, params["bias"] - mean * factor
-
-
 def norm(
     params: Params, x_BTHWC: Array, latents_BthwC: Array | None, groups: int, eps: float
 ) -> Array:
@@ -91,7 +69,9 @@ def norm(
     Returns:
         (B, T, H, W, C).
     """
-    factor, offset = (v[:, None, None, None] for v in group_norm(params, x_BTHWC, groups, eps))
+    factor, offset = (
+        v[:, None, None, None] for v in group_norm_affine(params, x_BTHWC, groups, eps)
+    )
     if latents_BthwC is not None:
         latents = latents_BthwC.astype(jnp.float32)
         by = pointwise(params["scale_by"], latents)
@@ -153,7 +133,7 @@ def downsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
         rest = x_BTHWC[:, odd:].astype(jnp.float32)
         rest = ((rest[:, ::2] + rest[:, 1::2]) / 2).astype(x_BTHWC.dtype)
         x_BTHWC = jnp.concatenate([x_BTHWC[:, :odd], rest], 1)
-    return convolve_2d(params, x_BTHWC, stride=2, padding=((0, 1), (0, 1)))
+    return convolve_frames(params, x_BTHWC, stride=2, padding=((0, 1), (0, 1)))
 
 
 def upsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
@@ -162,9 +142,67 @@ def upsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
     If the number of frames is odd, the first one is not repeated. (Repeating frames after a
     convolution of single frames gives the same as before it, with less work.)
     """
-    x = convolve_doubled(params, x_BTHWC)
+    x = convolve_upsampled(params, x_BTHWC)
     frames = x.shape[1]
     if not in_time or frames == 1:
         return x
     odd = frames % 2
     return jnp.concatenate([x[:, :odd], jnp.repeat(x[:, odd:], 2, axis=1)], 1)
+
+
+def layout(config: VAEConfig) -> dict[str, tuple[int, ...]]:
+    """Return ``{path: shape}`` of the parameters."""
+    return dict([*_encoder_leaves(config), *_decoder_leaves(config)])
+
+
+def _encoder_leaves(config: VAEConfig) -> Iterator[Leaf]:
+    widths = config.widths
+    yield from convolution("encoder/conv_in", (3, 3, 3), config.in_channels, widths[0])
+    inside = widths[0]
+    for level, width in enumerate(widths):
+        where = f"encoder/down_{level}"
+        for k in range(config.resnets):
+            yield from _resnet_leaves(f"{where}/resnet_{k}", inside if k == 0 else width, width)
+        if level + 1 < len(widths):
+            yield from convolution(f"{where}/resample", (3, 3), width, width)
+        inside = width
+    for k in range(2):
+        yield from _resnet_leaves(f"encoder/mid/resnet_{k}", inside, inside)
+    yield from _norm_leaves("encoder/norm_out", inside)
+    yield from convolution("encoder/conv_out", (3, 3, 3), inside, 2 * config.latent_channels)
+
+
+def _decoder_leaves(config: VAEConfig) -> Iterator[Leaf]:
+    widths, latent = config.widths[::-1], config.latent_channels
+    yield from convolution("decoder/conv_in", (3, 3, 3), latent, widths[0])
+    for k in range(2):
+        yield from _resnet_leaves(f"decoder/mid/resnet_{k}", widths[0], widths[0], latent)
+    inside = widths[0]
+    for level, width in enumerate(widths):
+        where = f"decoder/up_{level}"
+        for k in range(config.resnets + 1):
+            yield from _resnet_leaves(
+                f"{where}/resnet_{k}", inside if k == 0 else width, width, latent
+            )
+        if level + 1 < len(widths):
+            yield from convolution(f"{where}/resample", (3, 3), width, width)
+        inside = width
+    yield from _norm_leaves("decoder/norm_out", inside, latent)
+    yield from convolution("decoder/conv_out", (3, 3, 3), inside, config.out_channels)
+
+
+def _norm_leaves(where: str, width: int, latent: int = 0) -> Iterator[Leaf]:
+    yield f"{where}/scale", (width,)
+    yield f"{where}/bias", (width,)
+    if latent:
+        yield from convolution(f"{where}/scale_by", (1, 1, 1), latent, width)
+        yield from convolution(f"{where}/shift_by", (1, 1, 1), latent, width)
+
+
+def _resnet_leaves(where: str, inside: int, outside: int, latent: int = 0) -> Iterator[Leaf]:
+    yield from _norm_leaves(f"{where}/norm1", inside, latent)
+    yield from convolution(f"{where}/conv1", (3, 3, 3), inside, outside)
+    yield from _norm_leaves(f"{where}/norm2", outside, latent)
+    yield from convolution(f"{where}/conv2", (3, 3, 3), outside, outside)
+    if inside != outside:
+        yield from convolution(f"{where}/shortcut", (1, 1, 1), inside, outside)

@@ -16,13 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import CosmosConfig
-from pewm_jax.models.svd.layers import linear
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn import layers, placement
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.nn.layers import linear, rms_norm
+from pewm_jax.nn.parameters import Leaf
+from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.types import Array, Params
-
-Leaf = tuple[str, tuple[int, ...]]
 
 EPS, HEAD_EPS = 1e-6, 1e-5
 """Added to the variances of tokens, and of queries and keys."""
@@ -106,10 +105,7 @@ def modulate(
     if parts.shape[1] > 1:
         parts = layout.per_token(parts)
     shift, scale, *gate = jnp.split(parts, own.shape[-1] // x_BND.shape[-1], -1)
-    value = x_BND.astype(jnp.float32)
-    near = value - value.mean(-1, keepdims=True)
-    normed = near * jax.lax.rsqrt(jnp.square(near).mean(-1, keepdims=True) + EPS)
-    normed = normed.astype(x_BND.dtype) * (1 + scale) + shift
+    normed = layers.standardise(x_BND, EPS).astype(x_BND.dtype) * (1 + scale) + shift
     return placement.constrain(normed, "batch", "tokens"), gate[0] if gate else 1.0
 
 
@@ -132,13 +128,6 @@ def _attend(
     real = None if layout is None else layout.real
     mixed = blocked_attention.attention(q, k, v, config.attention, real)
     return linear(params["to_out"], layers.merge_heads(mixed))
-
-
-def rms_norm(params: Params, x: Array, eps: float = EPS) -> Array:
-    """Divide by the root mean square of the last axis, in float32; returned in x's dtype."""
-    value = x.astype(jnp.float32)
-    scale = jax.lax.rsqrt(jnp.square(value).mean(-1, keepdims=True) + eps)
-    return (value * scale * params["scale"]).astype(x.dtype)
 
 
 def angles(config: CosmosConfig, grid: tuple[int, int, int], fps: Array | float | None) -> Array:

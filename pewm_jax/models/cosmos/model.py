@@ -22,13 +22,12 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import CosmosConfig, UserError
-from pewm_jax.models.cogvideox.vae_shapes import draw
 from pewm_jax.models.cosmos import block as cosmos_block
-from pewm_jax.models.cosmos.block import Leaf, Time
-from pewm_jax.models.svd.layers import linear
+from pewm_jax.models.cosmos.block import Time
 from pewm_jax.nn import layers, placement
-from pewm_jax.nn.patches import patchify
-from pewm_jax.nn.token_layout import TokenLayout
+from pewm_jax.nn.layers import linear
+from pewm_jax.nn.parameters import Leaf, draw
+from pewm_jax.nn.tokens import TokenLayout, patchify
 from pewm_jax.types import Array, Params
 
 SHARDING = (
@@ -75,10 +74,10 @@ def _ends(config: CosmosConfig) -> Iterator[Leaf]:
 def init(config: CosmosConfig, key: Array) -> Params:
     """Return random parameters, float32; the tree is ``layout``'s."""
     ends_key, blocks_key = jax.random.split(key)
-    blocks = jax.vmap(lambda k: draw(dict(cosmos_block.shapes(config)), k))(
+    blocks = jax.vmap(lambda k: draw(dict(cosmos_block.shapes(config)), k, key_per_leaf=True))(
         jax.random.split(blocks_key, config.layers)
     )
-    return {**draw(dict(_ends(config)), ends_key), "blocks": blocks}
+    return {**draw(dict(_ends(config)), ends_key, key_per_leaf=True), "blocks": blocks}
 
 
 def apply(

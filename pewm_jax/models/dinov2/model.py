@@ -20,7 +20,8 @@ from pewm_jax import config as configuration
 from pewm_jax.config import DINOv2Config, UserError
 from pewm_jax.io import weights
 from pewm_jax.nn import attention as blocked_attention
-from pewm_jax.nn import layers
+from pewm_jax.nn import layers, modules
+from pewm_jax.nn.tokens import patchify_images
 from pewm_jax.types import Array, Params
 
 MEAN_3 = (0.485, 0.456, 0.406)
@@ -41,20 +42,20 @@ class Block(nn.Module):
         width = config.width
         normed = _norm(config, "norm1")(x_BND).astype(dtype)
         q, k, v = (
-            layers.split_heads(layers.dense(width, dtype, f"to_{n}")(normed), config.heads)
+            layers.split_heads(modules.dense(width, dtype, f"to_{n}")(normed), config.heads)
             for n in "qkv"
         )
         mixed = layers.merge_heads(blocked_attention.attention(q, k, v))
-        mixed = layers.dense(width, dtype, "to_out")(mixed)
+        mixed = modules.dense(width, dtype, "to_out")(mixed)
         x_BND += mixed * self._scale("scale1", dtype)
         normed = _norm(config, "norm2")(x_BND).astype(dtype)
         if config.swiglu:
-            gate, value = jnp.split(layers.dense(2 * config.hidden, dtype, "up")(normed), 2, -1)
+            gate, value = jnp.split(modules.dense(2 * config.hidden, dtype, "up")(normed), 2, -1)
             hidden = nn.silu(gate) * value
         else:
-            hidden = layers.dense(config.hidden, dtype, "up")(normed)
+            hidden = modules.dense(config.hidden, dtype, "up")(normed)
             hidden = nn.gelu(hidden, approximate=False)
-        return x_BND + layers.dense(width, dtype, "down")(hidden) * self._scale("scale2", dtype)
+        return x_BND + modules.dense(width, dtype, "down")(hidden) * self._scale("scale2", dtype)
 
     def _scale(self, name: str, dtype: jnp.dtype) -> Array:
         return self.param(name, nn.initializers.ones_init(), (self.config.width,)).astype(dtype)
@@ -134,7 +135,7 @@ def _tokens(config: DINOv2Config, params: Params, images: Array) -> Array:
     height, width = _grid(config, images.shape, images.dtype)
     dtype = images.dtype
     patches = nn.Dense(config.width, dtype=dtype).apply(
-        {"params": params["patch_embed"]}, patchify(images, config.patch)
+        {"params": params["patch_embed"]}, patchify_images(images, config.patch)
     )
     positions = interpolate_positions(config, params["position_embed"], height, width)
     tokens = patches + positions[1:].astype(dtype)
@@ -213,13 +214,6 @@ def preprocess(rgb_BHWC: Array, size: int | tuple[int, int], patch: int = 14) ->
     mean, std = (np.asarray(x, np.float32) for x in (MEAN_3, STD_3))
     share = (jnp.clip(rgb, -1, 1) + 1) / 2
     return ((share - mean) / std).astype(rgb.dtype)
-
-
-def patchify(images_BHWC: Array, patch: int) -> Array:
-    """(B, H, W, 3) → (B, H/p·W/p, p·p·3): each patch's pixels row by row, colours innermost."""
-    batch, height, width, channels = images_BHWC.shape
-    grid = images_BHWC.reshape(batch, height // patch, patch, width // patch, patch, channels)
-    return grid.transpose(0, 1, 3, 2, 4, 5).reshape(batch, -1, patch * patch * channels)
 
 
 def interpolate_positions(

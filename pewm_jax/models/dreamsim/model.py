@@ -16,7 +16,11 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.models.dinov2.model import MEAN_3, STD_3, patchify
+from pewm_jax.models.clip.model import MEAN_3 as CLIP_MEAN_3
+from pewm_jax.models.clip.model import STD_3 as CLIP_STD_3
+from pewm_jax.models.dinov2.model import MEAN_3, STD_3
+from pewm_jax.nn.layers import layer_norm, linear
+from pewm_jax.nn.tokens import patchify_images
 from pewm_jax.types import Array, Params
 
 Encoder = Literal["dino_vitb16", "clip_vitb16", "open_clip_vitb16"]
@@ -24,10 +28,6 @@ ENCODERS: tuple[Encoder, ...] = ("dino_vitb16", "clip_vitb16", "open_clip_vitb16
 """In the order in which their features are joined."""
 HEAD = 64
 """Channels of an attention head."""
-CLIP_MEAN_3 = (0.48145466, 0.4578275, 0.40821073)
-"""The mean colour in [0, 1] that CLIP subtracts."""
-CLIP_STD_3 = (0.26862954, 0.26130258, 0.27577711)
-"""The standard deviation of colours by which CLIP divides."""
 QUICK = 1.702
 
 
@@ -114,42 +114,32 @@ def encode(name: Encoder, params: Params, images_BHWC: Array) -> Array:
     images = (images_BHWC - jnp.array(kind.mean_3)) / jnp.array(kind.std_3)
     width = params["cls_token"].shape[0]
     patch = round((params["patch_embed"]["kernel"].shape[0] / 3) ** 0.5)
-    tokens = _dense(params["patch_embed"], patchify(images, patch))
+    tokens = linear(params["patch_embed"], patchify_images(images, patch))
     first = jnp.broadcast_to(params["cls_token"], (len(tokens), 1, width))
     tokens = jnp.concatenate([first, tokens], 1) + params["position_embed"]
     if kind.embeds:
-        tokens = _norm(kind, params["norm_before"], tokens)
+        tokens = layer_norm(params["norm_before"], tokens, kind.epsilon)
 
     def block(x_BND: Array, layer: Params) -> tuple[Array, None]:
-        x_BND = x_BND + _attend(layer, _norm(kind, layer["norm1"], x_BND))
-        hidden = _dense(layer["up"], _norm(kind, layer["norm2"], x_BND))
+        x_BND = x_BND + _attend(layer, layer_norm(layer["norm1"], x_BND, kind.epsilon))
+        hidden = linear(layer["up"], layer_norm(layer["norm2"], x_BND, kind.epsilon))
         hidden = hidden * jax.nn.sigmoid(QUICK * hidden) if kind.quick else _gelu(hidden)
-        return x_BND + _dense(layer["down"], hidden), None
+        return x_BND + linear(layer["down"], hidden), None
 
     token = jax.lax.scan(block, tokens, params["blocks"])[0][:, 0]
     if not kind.embeds:
         return token
-    return _norm(kind, params["norm"], token) @ params["projection"]
+    return layer_norm(params["norm"], token, kind.epsilon) @ params["projection"]
 
 
 def _attend(layer: Params, x_BND: Array) -> Array:
     width = x_BND.shape[-1]
-    qkv = _dense(layer["qkv"], x_BND)
+    qkv = linear(layer["qkv"], x_BND)
     q, k, v = qkv.reshape(*x_BND.shape[:2], 3, width // HEAD, HEAD).transpose(2, 0, 3, 1, 4)
     weights = jax.nn.softmax(q @ k.swapaxes(-1, -2) * HEAD**-0.5, -1)
     mixed = (weights @ v).swapaxes(1, 2).reshape(x_BND.shape)
-    return _dense(layer["to_out"], mixed)
-
-
-def _dense(params: Params, x: Array) -> Array:
-    return x @ params["kernel"] + params["bias"]
+    return linear(layer["to_out"], mixed)
 
 
 def _gelu(x: Array) -> Array:
     return jax.nn.gelu(x, approximate=False)
-
-
-def _norm(kind: Kind, params: Params, x: Array) -> Array:
-    mean = x.mean(-1, keepdims=True)
-    variance = ((x - mean) ** 2).mean(-1, keepdims=True)
-    return (x - mean) * jax.lax.rsqrt(variance + kind.epsilon) * params["scale"] + params["bias"]

@@ -16,7 +16,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.nn.plain_layers import group_norm
+from pewm_jax.nn.layers import group_norm
 from pewm_jax.types import Array, Params
 
 STAGES = (

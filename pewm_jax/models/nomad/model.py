@@ -16,8 +16,8 @@ import numpy as np
 from pewm_jax.config import NomadConfig, UserError
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.nomad import efficientnet, unet1d
-from pewm_jax.nn.layers import merge_heads, split_heads
-from pewm_jax.nn.plain_layers import draw, layer_norm, linear
+from pewm_jax.nn.layers import layer_norm, linear, merge_heads, split_heads
+from pewm_jax.nn.parameters import draw
 from pewm_jax.types import Array, Params
 
 WIDER = 4

@@ -15,7 +15,7 @@ import numpy as np
 
 from pewm_jax.config import NomadConfig
 from pewm_jax.config.nomad import PLANE
-from pewm_jax.nn.plain_layers import group_norm, linear
+from pewm_jax.nn.layers import group_norm, linear
 from pewm_jax.types import Array, Params
 
 LAST_GROUPS = 8

@@ -26,10 +26,10 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import BlocksConfig
-from pewm_jax.models.cosmos.block import rms_norm
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn import layers, placement
-from pewm_jax.nn.plain_layers import draw, linear
+from pewm_jax.nn.layers import linear, rms_norm
+from pewm_jax.nn.parameters import draw
 from pewm_jax.types import Array, Params
 
 EPSILON = 1e-6
@@ -231,10 +231,7 @@ def project(params: Params, x_BTND: Array, condition_BTD: Array) -> Array:
 
 def norm(x: Array) -> Array:
     """Normalise over the last axis, in float32; returned in x's dtype."""
-    wide = x.astype(jnp.float32)
-    apart = wide - wide.mean(-1, keepdims=True)
-    scale = jax.lax.rsqrt(jnp.square(apart).mean(-1, keepdims=True) + EPSILON)
-    return (apart * scale).astype(x.dtype)
+    return layers.standardise(x, EPSILON).astype(x.dtype)
 
 
 def times_of(config: BlocksConfig, first: Array, frames: int, past: int) -> tuple[Array, Array]:

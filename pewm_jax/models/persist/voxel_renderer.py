@@ -26,8 +26,8 @@ from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.nn.costs import Costs, Share
-from pewm_jax.nn.patches import patchify, unpatchify
-from pewm_jax.nn.plain_layers import linear
+from pewm_jax.nn.layers import linear
+from pewm_jax.nn.tokens import patchify, unpatchify
 from pewm_jax.types import Array, Camera, Params
 
 PARTS = ("space", "time")

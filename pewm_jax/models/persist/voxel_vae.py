@@ -25,9 +25,10 @@ import jax.numpy as jnp
 from pewm_jax.config import UserError, VoxelVAEConfig
 from pewm_jax.models.persist.voxel_vae_shapes import follows, shapes
 from pewm_jax.nn import placement
-from pewm_jax.nn.convolution3d import convolve, halved
-from pewm_jax.nn.patches import patchify, unpatchify
-from pewm_jax.nn.plain_layers import draw, layer_norm, linear
+from pewm_jax.nn.convolution import convolve_grid, halve_grid
+from pewm_jax.nn.layers import layer_norm, linear
+from pewm_jax.nn.parameters import draw
+from pewm_jax.nn.tokens import patchify, unpatchify
 from pewm_jax.types import Array, Params
 
 FIRST_DEVIATION = 0.05
@@ -98,7 +99,7 @@ def moments(
             x = _block(config, inside[f"block_{number}"], x)
         if follows(config, level):
             kernel = inside["down"]["kernel"].astype(x.dtype)
-            x = halved(x, kernel, config.convolution) + inside["down"]["bias"].astype(x.dtype)
+            x = halve_grid(x, kernel, config.convolution) + inside["down"]["bias"].astype(x.dtype)
     for number in range(config.middle):
         x = _block(config, part[f"middle_{number}"], x)
     x = jax.nn.silu(layer_norm(part["norm"], x))
@@ -286,9 +287,9 @@ def _block(config: VoxelVAEConfig, part: Params, x: Array) -> Array:
 
 
 def _convolved(config: VoxelVAEConfig, part: Params, x: Array) -> Array:
-    return convolve(x, part["kernel"].astype(x.dtype), config.convolution) + part["bias"].astype(
-        x.dtype
-    )
+    return convolve_grid(x, part["kernel"].astype(x.dtype), config.convolution) + part[
+        "bias"
+    ].astype(x.dtype)
 
 
 def _by_slab(config: VoxelVAEConfig, function: Callable[..., Any], *grids_BXYZ: Array) -> Any:

@@ -20,7 +20,6 @@ from pewm_jax.config import ModelConfig, SVDUNetConfig, UserError
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.clip import model as clip_vision
 from pewm_jax.models.interface import Conditioning, Observed, Readers
-from pewm_jax.models.svd import shapes as svd_shapes
 from pewm_jax.models.svd import unet as svd_unet
 from pewm_jax.nn.attention import LOGITS
 from pewm_jax.nn.costs import FLOAT, Costs, Product, Share
@@ -130,7 +129,7 @@ def costs(model: ModelConfig, share: Share, *, trained: bool) -> Costs:
     )
     sizes = _sizes(config, height, width)
     linear = convolution = times = ends = 0.0
-    for path, shape in svd_shapes.unet(sized).items():
+    for path, shape in svd_unet.layout(sized).items():
         if not path.endswith("kernel"):
             continue
         macs = math.prod(shape) * _vectors(config, path, frames, sizes, modulated(model))

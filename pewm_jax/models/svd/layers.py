@@ -2,36 +2,32 @@
 
 Each layer works on single frames first and then on each pixel's frames; a learned number mixes the
 two results. The U-Net and the decoder of the autoencoder share the residual blocks. Norms and
-softmax are computed in float32, the rest in the dtype of the activations. References:
+softmax are computed in float32, the rest in the dtype of the activations. ``…_leaves`` lists a
+layer's parameters: ``mix`` is one number, the logit of the spatial branch's weight. References:
 ``SpatioTemporalResBlock`` and ``TransformerSpatioTemporalModel`` of diffusers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.models.cogvideox.vae_convolution import SAME, convolve_2d, convolve_doubled
-from pewm_jax.models.cogvideox.vae_layers import group_norm, pointwise
-from pewm_jax.nn import attention as blocked_attention
+from pewm_jax.config import SVDUNetConfig
 from pewm_jax.nn import layers
+from pewm_jax.nn.attention import multi_head_attention
+from pewm_jax.nn.layers import group_norm_affine, layer_norm, linear, mlp
+from pewm_jax.nn.parameters import Leaf, convolution
+from pewm_jax.nn.parameters import linear as linear_leaves
+from pewm_jax.nn.parameters import norm as norm_leaves
+from pewm_jax.nn.video_convolution import SAME, convolve_frames, convolve_upsampled
 from pewm_jax.types import Array, Params
 
 GROUPS = 32
 """Groups of every group norm in the reference."""
 EPS = 1e-6
 """Added to the variance in the group norms before attention."""
-
-
-def linear(params: Params, x: Array) -> Array:
-    """Apply ``kernel`` (C, D) and ``bias``, if there is one, to the last axis."""
-    y = x @ params["kernel"].astype(x.dtype)
-    return y + params["bias"].astype(x.dtype) if "bias" in params else y
-
-
-def embed(params: Params, x: Array) -> Array:
-    """Apply a linear layer, SiLU, and another linear layer."""
-    return linear(params["linear_2"], jax.nn.silu(linear(params["linear_1"], x)))
 
 
 def norm(params: Params, x_BTHWC: Array, eps: float, *, over_time: bool = False) -> Array:
@@ -48,7 +44,7 @@ def norm(params: Params, x_BTHWC: Array, eps: float, *, over_time: bool = False)
     """
     batch, frames, *rest = x_BTHWC.shape
     x = x_BTHWC if over_time else x_BTHWC.reshape(batch * frames, 1, *rest)
-    factor, offset = (v[:, None, None, None] for v in group_norm(params, x, GROUPS, eps))
+    factor, offset = (v[:, None, None, None] for v in group_norm_affine(params, x, GROUPS, eps))
     return (x.astype(jnp.float32) * factor + offset).reshape(x_BTHWC.shape)
 
 
@@ -86,12 +82,12 @@ def resnet_2d(params: Params, x_BTHWC: Array, time_BTE: Array | None, eps: float
         time_BTE: (B, T or 1, E) SiLU of the time embedding, or None.
         eps: added to the variances.
     """
-    h = convolve_2d(params["conv1"], active(params["norm1"], x_BTHWC, eps), 1, SAME)
+    h = convolve_frames(params["conv1"], active(params["norm1"], x_BTHWC, eps), 1, SAME)
     if time_BTE is not None:
         h = h + linear(params["time"], time_BTE)[:, :, None, None]
-    h = convolve_2d(params["conv2"], active(params["norm2"], h, eps), 1, SAME)
+    h = convolve_frames(params["conv2"], active(params["norm2"], h, eps), 1, SAME)
     if "shortcut" in params:
-        x_BTHWC = pointwise(params["shortcut"], x_BTHWC)
+        x_BTHWC = linear(params["shortcut"], x_BTHWC)
     return x_BTHWC + h
 
 
@@ -133,15 +129,15 @@ def _share(params: Params, dtype: jnp.dtype, *, of_time: bool) -> Array:
 
 def downsample(params: Params, x_BTHWC: Array, padding: tuple = SAME) -> Array:
     """Halve height and width by a strided convolution."""
-    return convolve_2d(params, x_BTHWC, 2, padding)
+    return convolve_frames(params, x_BTHWC, 2, padding)
 
 
 def upsample(params: Params, x_BTHWC: Array, height: int, width: int) -> Array:
     """Repeat rows and columns up to a size, twice its own or one less, and convolve."""
     if (height, width) == tuple(2 * side for side in x_BTHWC.shape[2:4]):
-        return convolve_doubled(params, x_BTHWC)
+        return convolve_upsampled(params, x_BTHWC)
     x = jnp.repeat(jnp.repeat(x_BTHWC, 2, 2), 2, 3)[:, :, :height, :width]
-    return convolve_2d(params, x, 1, SAME)
+    return convolve_frames(params, x, 1, SAME)
 
 
 def attend(params: Params, x_BTHWC: Array, image_BMD: Array, heads: int, layers_: int) -> Array:
@@ -159,7 +155,7 @@ def attend(params: Params, x_BTHWC: Array, image_BMD: Array, heads: int, layers_
     x = norm(params["norm"], x_BTHWC, EPS).astype(dtype)
     x = linear(params["proj_in"], x.reshape(batch, frames, pixels, channels))
     number = layers.sinusoid(jnp.arange(frames), channels).astype(dtype)
-    number = embed(params["frame_embed"], number)[None, :, None]
+    number = mlp(params["frame_embed"], number)[None, :, None]
     for k in range(layers_):
         flat = x.reshape(batch * frames, pixels, channels)
         context = jnp.repeat(image_BMD, frames, 0) if image_BMD.shape[1] > 1 else image_BMD
@@ -174,8 +170,8 @@ def attend(params: Params, x_BTHWC: Array, image_BMD: Array, heads: int, layers_
 def _spatial(params: Params, x_NPC: Array, context: Array, heads: int, frames: int) -> Array:
     """Run a layer on the pixels of every frame: self-attention, the image, feed-forward."""
     normed = layer_norm(params["norm1"], x_NPC)
-    x = x_NPC + attention(params["attn1"], normed, normed, heads)
-    x = x + _look(params, x, context, heads, frames)
+    x = x_NPC + multi_head_attention(params["attn1"], normed, normed, heads)
+    x = x + _attend_image(params, x, context, heads, frames)
     return x + _feed_forward(params["ff"], layer_norm(params["norm3"], x))
 
 
@@ -186,11 +182,11 @@ def _temporal(params: Params, x_BTPC: Array, image_BMD: Array, heads: int) -> Ar
     normed = layer_norm(params["norm1"], x)
     x = x + _over_frames(params["attn1"], normed, heads)
     flat = x.reshape(batch, frames * pixels, channels)
-    x = (flat + _look(params, flat, image_BMD, heads, 1)).reshape(x.shape)
+    x = (flat + _attend_image(params, flat, image_BMD, heads, 1)).reshape(x.shape)
     return x + _feed_forward(params["ff"], layer_norm(params["norm3"], x))
 
 
-def _look(params: Params, x_NPC: Array, context: Array, heads: int, repeats: int) -> Array:
+def _attend_image(params: Params, x_NPC: Array, context: Array, heads: int, repeats: int) -> Array:
     """Attend to the image's embedding.
 
     All weight goes to a single token whatever the query is, so queries and keys are not computed.
@@ -198,36 +194,78 @@ def _look(params: Params, x_NPC: Array, context: Array, heads: int, repeats: int
     inside = params["attn2"]
     context = context.astype(x_NPC.dtype)
     if context.shape[1] > 1:
-        return attention(inside, layer_norm(params["norm2"], x_NPC), context, heads)
+        return multi_head_attention(inside, layer_norm(params["norm2"], x_NPC), context, heads)
     return jnp.repeat(linear(inside["to_out"], linear(inside["to_v"], context)), repeats, 0)
-
-
-def attention(params: Params, x_NPC: Array, context_NMD: Array, heads: int) -> Array:
-    """Multi-head attention with its linear layers."""
-    q = layers.split_heads(linear(params["to_q"], x_NPC), heads)
-    k, v = (layers.split_heads(linear(params[n], context_NMD), heads) for n in ("to_k", "to_v"))
-    mixed = layers.merge_heads(blocked_attention.attention(q, k, v))
-    return linear(params["to_out"], mixed)
 
 
 def _over_frames(params: Params, x_BTPC: Array, heads: int) -> Array:
     """Self-attention among the frames of every pixel."""
     batch, frames, pixels, channels = x_BTPC.shape
     x = x_BTPC.swapaxes(1, 2).reshape(batch * pixels, frames, channels)
-    out = attention(params, x, x, heads)
+    out = multi_head_attention(params, x, x, heads)
     return out.reshape(batch, pixels, frames, channels).swapaxes(1, 2)
-
-
-def layer_norm(params: Params, x: Array, eps: float = 1e-5) -> Array:
-    """Layer norm in float32, returned in x's dtype."""
-    value = x.astype(jnp.float32)
-    mean = value.mean(-1, keepdims=True)
-    near = value - mean
-    scale = jax.lax.rsqrt(jnp.square(near).mean(-1, keepdims=True) + eps)
-    return (near * scale * params["scale"] + params["bias"]).astype(x.dtype)
 
 
 def _feed_forward(params: Params, x: Array) -> Array:
     """Gated feed-forward: half of the hidden channels, times GELU of the other half."""
     value, gate = jnp.split(linear(params["up"], x), 2, -1)
     return linear(params["down"], value * jax.nn.gelu(gate, approximate=False))
+
+
+def resnet_2d_leaves(where: str, inside: int, outside: int, time: int = 0) -> Iterator[Leaf]:
+    """Yield a residual block of single frames; ``time`` channels of the time embedding."""
+    yield from norm_leaves(f"{where}/norm1", inside)
+    yield from convolution(f"{where}/conv1", (3, 3), inside, outside)
+    if time:
+        yield from linear_leaves(f"{where}/time", time, outside)
+    yield from norm_leaves(f"{where}/norm2", outside)
+    yield from convolution(f"{where}/conv2", (3, 3), outside, outside)
+    if inside != outside:
+        yield from linear_leaves(f"{where}/shortcut", inside, outside)
+
+
+def resnet_leaves(where: str, inside: int, outside: int, time: int = 0) -> Iterator[Leaf]:
+    """Yield a residual block over space, one over time, and how they are mixed."""
+    yield from resnet_2d_leaves(f"{where}/spatial", inside, outside, time)
+    there = f"{where}/temporal"
+    for k in "12":
+        yield from norm_leaves(f"{there}/norm{k}", outside)
+        yield from convolution(f"{there}/conv{k}", (3,), outside, outside)
+    if time:
+        yield from linear_leaves(f"{there}/time", time, outside)
+    yield f"{where}/mix", (1,)
+
+
+def mlp_leaves(where: str, inside: int, hidden: int, outside: int) -> Iterator[Leaf]:
+    """Yield two linear layers."""
+    yield from linear_leaves(f"{where}/linear_1", inside, hidden)
+    yield from linear_leaves(f"{where}/linear_2", hidden, outside)
+
+
+def attend_leaves(config: SVDUNetConfig, where: str, level: int) -> Iterator[Leaf]:
+    """Yield the attention of one level of the U-Net."""
+    width = config.widths[level]
+    yield from norm_leaves(f"{where}/norm", width)
+    yield from linear_leaves(f"{where}/proj_in", width, width)
+    yield from mlp_leaves(f"{where}/frame_embed", width, 4 * width, width)
+    for k in range(config.layers[level]):
+        for branch in ("spatial", "temporal"):
+            there = f"{where}/{branch}_{k}"
+            if branch == "temporal":
+                yield from norm_leaves(f"{there}/norm_in", width)
+                yield from _feed_forward_leaves(f"{there}/ff_in", width)
+            for n, dim in ((1, width), (2, config.image_dim)):
+                yield from norm_leaves(f"{there}/norm{n}", width)
+                yield f"{there}/attn{n}/to_q/kernel", (width, width)
+                yield f"{there}/attn{n}/to_k/kernel", (dim, width)
+                yield f"{there}/attn{n}/to_v/kernel", (dim, width)
+                yield from linear_leaves(f"{there}/attn{n}/to_out", width, width)
+            yield from norm_leaves(f"{there}/norm3", width)
+            yield from _feed_forward_leaves(f"{there}/ff", width)
+    yield f"{where}/mix", (1,)
+    yield from linear_leaves(f"{where}/proj_out", width, width)
+
+
+def _feed_forward_leaves(where: str, width: int) -> Iterator[Leaf]:
+    yield from linear_leaves(f"{where}/up", width, 8 * width)
+    yield from linear_leaves(f"{where}/down", 4 * width, width)

@@ -9,17 +9,17 @@ steer it (arXiv 2601.15284, Eq. 5).
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import SVDUNetConfig, UserError
-from pewm_jax.models.cogvideox.vae_convolution import SAME, convolve_2d
-from pewm_jax.models.cogvideox.vae_shapes import draw
 from pewm_jax.models.svd import layers as svd_layers
-from pewm_jax.models.svd import shapes as svd_shapes
 from pewm_jax.nn import layers, placement
+from pewm_jax.nn.parameters import Leaf, convolution, draw
+from pewm_jax.nn.parameters import norm as norm_leaves
+from pewm_jax.nn.video_convolution import SAME, convolve_frames
 from pewm_jax.types import Array, Params
 
 EPS, EPS_COARSE = 1e-6, 1e-5
@@ -27,9 +27,14 @@ EPS, EPS_COARSE = 1e-6, 1e-5
 the bottom, on the way down without attention, and in the last norm."""
 
 
+def layout(config: SVDUNetConfig) -> dict[str, tuple[int, ...]]:
+    """Return ``{path: shape}`` of the parameters."""
+    return dict(_leaves(config))
+
+
 def init(config: SVDUNetConfig, key: Array) -> Params:
-    """Return random parameters, float32; the tree is listed in ``svd_shapes``."""
-    return draw(svd_shapes.unet(config), key)
+    """Return random parameters, float32; the tree is ``layout``'s."""
+    return draw(layout(config), key, key_per_leaf=True)
 
 
 def apply(
@@ -78,7 +83,7 @@ def apply(
         )
         return _run(config, run, place[f"attend_{k}"], x, image_BMD)
 
-    x = convolve_2d(params["conv_in"], latents_BThwC, 1, SAME)
+    x = convolve_frames(params["conv_in"], latents_BThwC, 1, SAME)
     skips = [x]
     for level in levels:
         place = params[f"down_{level}"]
@@ -104,7 +109,7 @@ def apply(
             x = attend(place, k, x, level)
         if level:
             x = svd_layers.upsample(place["resample"], x, *skips[-1].shape[2:4])
-    return convolve_2d(
+    return convolve_frames(
         params["conv_out"], svd_layers.active(params["norm_out"], x, EPS_COARSE), 1, SAME
     )
 
@@ -126,7 +131,7 @@ def _time(
     """Return SiLU of the (B, T or 1, time_dim) embedding of level, scalars and modulation."""
     wave = layers.sinusoid(timesteps_B, config.widths[0]).astype(dtype)
     waves = layers.sinusoid(added_BK, config.added_dim).astype(dtype)
-    time = svd_layers.embed(params["time_embed"], wave) + svd_layers.embed(
+    time = layers.mlp(params["time_embed"], wave) + layers.mlp(
         params["added_embed"], waves.reshape(len(waves), -1)
     )
     time = time[:, None]
@@ -162,3 +167,40 @@ def _check(
         if not fits:
             sides = ", ".join(map(str, shape))
             raise UserError(f"{name} has shape {tuple(value.shape)}: it must be ({sides}).")
+
+
+def _leaves(config: SVDUNetConfig) -> Iterator[Leaf]:
+    widths, time = config.widths, config.time_dim
+    last = len(widths) - 1
+    yield from convolution("conv_in", (3, 3), config.in_channels, widths[0])
+    yield from svd_layers.mlp_leaves("time_embed", widths[0], time, time)
+    yield from svd_layers.mlp_leaves("added_embed", config.added * config.added_dim, time, time)
+    skips = [widths[0]]
+    inside = widths[0]
+    for level, width in enumerate(widths):
+        where = f"down_{level}"
+        for k in range(config.resnets[level]):
+            yield from svd_layers.resnet_leaves(f"{where}/resnet_{k}", inside, width, time)
+            if config.attends[level]:
+                yield from svd_layers.attend_leaves(config, f"{where}/attend_{k}", level)
+            inside = width
+            skips.append(width)
+        if level < last:
+            yield from convolution(f"{where}/resample", (3, 3), width, width)
+            skips.append(width)
+    yield from svd_layers.resnet_leaves("mid/resnet_0", inside, inside, time)
+    yield from svd_layers.attend_leaves(config, "mid/attend_0", last)
+    yield from svd_layers.resnet_leaves("mid/resnet_1", inside, inside, time)
+    for step, level in enumerate(reversed(range(len(widths)))):
+        where, width = f"up_{step}", widths[level]
+        for k in range(config.resnets[level] + 1):
+            yield from svd_layers.resnet_leaves(
+                f"{where}/resnet_{k}", inside + skips.pop(), width, time
+            )
+            if config.attends[level]:
+                yield from svd_layers.attend_leaves(config, f"{where}/attend_{k}", level)
+            inside = width
+        if level:
+            yield from convolution(f"{where}/resample", (3, 3), width, width)
+    yield from norm_leaves("norm_out", inside)
+    yield from convolution("conv_out", (3, 3), inside, config.out_channels)

@@ -16,10 +16,14 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import SVDVAEConfig, UserError
-from pewm_jax.models.cogvideox.vae_convolution import SAME, convolve_2d
-from pewm_jax.models.cogvideox.vae_shapes import draw
 from pewm_jax.models.svd import layers as svd_layers
-from pewm_jax.models.svd.shapes import Leaf, conv, norm, resnet, resnet_2d
+from pewm_jax.models.svd.layers import resnet_2d_leaves, resnet_leaves
+from pewm_jax.nn.attention import multi_head_attention
+from pewm_jax.nn.layers import linear
+from pewm_jax.nn.parameters import Leaf, convolution, draw
+from pewm_jax.nn.parameters import linear as linear_leaves
+from pewm_jax.nn.parameters import norm as norm_leaves
+from pewm_jax.nn.video_convolution import SAME, convolve_frames
 from pewm_jax.types import Array, Params
 
 EPS, TEMPORAL_EPS = 1e-6, 1e-5
@@ -29,13 +33,13 @@ AFTER = ((0, 1), (0, 1))
 
 
 def layout(config: SVDVAEConfig) -> dict[str, tuple[int, ...]]:
-    """Return ``{path: shape}`` of the parameters; see ``svd_shapes`` for the layers."""
+    """Return ``{path: shape}`` of the parameters; see ``svd.layers``."""
     return dict([*_encoder(config), *_decoder(config)])
 
 
 def init(config: SVDVAEConfig, key: Array) -> Params:
     """Return random parameters, float32: ``{"encoder": …, "decoder": …}``."""
-    return draw(layout(config), key)
+    return draw(layout(config), key, key_per_leaf=True)
 
 
 def encode(config: SVDVAEConfig, params: Params, video_BTHWC: Array) -> Array:
@@ -94,7 +98,7 @@ def decode(
 
 @partial(jax.jit, static_argnums=0)
 def _encode(config: SVDVAEConfig, params: Params, x: Array) -> Array:
-    x = convolve_2d(params["conv_in"], x, 1, SAME)
+    x = convolve_frames(params["conv_in"], x, 1, SAME)
     for level in range(len(config.widths)):
         place = params[f"down_{level}"]
         for k in range(config.resnets):
@@ -106,14 +110,14 @@ def _encode(config: SVDVAEConfig, params: Params, x: Array) -> Array:
     x = _attend(place["attend_0"], x)
     x = svd_layers.resnet_2d(place["resnet_1"], x, None, EPS)
     x = svd_layers.active(params["norm_out"], x, EPS)
-    moments = svd_layers.linear(params["quant"], convolve_2d(params["conv_out"], x, 1, SAME))
+    moments = linear(params["quant"], convolve_frames(params["conv_out"], x, 1, SAME))
     return moments[..., : config.latent_channels]
 
 
 @partial(jax.jit, static_argnums=0)
 def _decode(config: SVDVAEConfig, params: Params, x: Array) -> Array:
     mix = partial(svd_layers.resnet, eps=EPS, temporal_eps=TEMPORAL_EPS, switched=True)
-    x = convolve_2d(params["conv_in"], x, 1, SAME)
+    x = convolve_frames(params["conv_in"], x, 1, SAME)
     place = params["mid"]
     x = mix(place["resnet_0"], x, None)
     x = _attend(place["attend_0"], x)
@@ -125,7 +129,7 @@ def _decode(config: SVDVAEConfig, params: Params, x: Array) -> Array:
         if "resample" in place:
             x = svd_layers.upsample(place["resample"], x, *(2 * side for side in x.shape[2:4]))
     x = svd_layers.active(params["norm_out"], x, EPS)
-    x = convolve_2d(params["conv_out"], x, 1, SAME)
+    x = convolve_frames(params["conv_out"], x, 1, SAME)
     return svd_layers.convolve_time(params["time_out"], x)
 
 
@@ -134,51 +138,51 @@ def _attend(params: Params, x_BTHWC: Array) -> Array:
     batch, frames, height, width, channels = x_BTHWC.shape
     x = svd_layers.norm(params["norm"], x_BTHWC, EPS).astype(x_BTHWC.dtype)
     x = x.reshape(batch * frames, height * width, channels)
-    return x_BTHWC + svd_layers.attention(params, x, x, 1).reshape(x_BTHWC.shape)
+    return x_BTHWC + multi_head_attention(params, x, x, 1).reshape(x_BTHWC.shape)
 
 
 def _encoder(config: SVDVAEConfig) -> Iterator[Leaf]:
     widths, moments = config.widths, 2 * config.latent_channels
-    yield from conv("encoder/conv_in", (3, 3), config.in_channels, widths[0])
+    yield from convolution("encoder/conv_in", (3, 3), config.in_channels, widths[0])
     inside = widths[0]
     for level, width in enumerate(widths):
         where = f"encoder/down_{level}"
         for k in range(config.resnets):
-            yield from resnet_2d(f"{where}/resnet_{k}", inside, width)
+            yield from resnet_2d_leaves(f"{where}/resnet_{k}", inside, width)
             inside = width
         if level + 1 < len(widths):
-            yield from conv(f"{where}/resample", (3, 3), width, width)
+            yield from convolution(f"{where}/resample", (3, 3), width, width)
     for k in range(2):
-        yield from resnet_2d(f"encoder/mid/resnet_{k}", inside, inside)
+        yield from resnet_2d_leaves(f"encoder/mid/resnet_{k}", inside, inside)
     yield from _attention("encoder/mid/attend_0", inside)
-    yield from norm("encoder/norm_out", inside)
-    yield from conv("encoder/conv_out", (3, 3), inside, moments)
-    yield from conv("encoder/quant", (), moments, moments)
+    yield from norm_leaves("encoder/norm_out", inside)
+    yield from convolution("encoder/conv_out", (3, 3), inside, moments)
+    yield from linear_leaves("encoder/quant", moments, moments)
 
 
 def _decoder(config: SVDVAEConfig) -> Iterator[Leaf]:
     widths = config.widths[::-1]
     inside = widths[0]
-    yield from conv("decoder/conv_in", (3, 3), config.latent_channels, inside)
+    yield from convolution("decoder/conv_in", (3, 3), config.latent_channels, inside)
     for k in range(config.resnets):
-        yield from resnet(f"decoder/mid/resnet_{k}", inside, inside)
+        yield from resnet_leaves(f"decoder/mid/resnet_{k}", inside, inside)
     yield from _attention("decoder/mid/attend_0", inside)
     for level, width in enumerate(widths):
         where = f"decoder/up_{level}"
         for k in range(config.resnets + 1):
-            yield from resnet(f"{where}/resnet_{k}", inside, width)
+            yield from resnet_leaves(f"{where}/resnet_{k}", inside, width)
             inside = width
         if level + 1 < len(widths):
-            yield from conv(f"{where}/resample", (3, 3), width, width)
-    yield from norm("decoder/norm_out", inside)
-    yield from conv("decoder/conv_out", (3, 3), inside, config.out_channels)
-    yield from conv("decoder/time_out", (3,), config.out_channels, config.out_channels)
+            yield from convolution(f"{where}/resample", (3, 3), width, width)
+    yield from norm_leaves("decoder/norm_out", inside)
+    yield from convolution("decoder/conv_out", (3, 3), inside, config.out_channels)
+    yield from convolution("decoder/time_out", (3,), config.out_channels, config.out_channels)
 
 
 def _attention(where: str, width: int) -> Iterator[Leaf]:
-    yield from norm(f"{where}/norm", width)
+    yield from norm_leaves(f"{where}/norm", width)
     for name in ("to_q", "to_k", "to_v", "to_out"):
-        yield from conv(f"{where}/{name}", (), width, width)
+        yield from linear_leaves(f"{where}/{name}", width, width)
 
 
 def _check(x: Array, channels: int, name: str) -> None:

@@ -4,7 +4,9 @@ Four frames of 8 × 8 pixels become one latent; the first frame has a latent of 
 is causal, so 4n + 1 frames become n + 1 latents and 4n + 1 frames again, and no latent depends on
 a later frame. The first frame is encoded alone and then four frames at a time, decoded one latent
 at a time; layers pass their last frames on to the next chunk, and the result is that of the whole
-clip at once. The chunks bound the memory.
+clip at once. The chunks bound the memory. A video starts with one frame of its own, before which
+there are zeros. The last frames are passed on as ``past``: one array per layer, nested like the
+parameters; None at the start. Reference: ``autoencoder_kl_wan.py`` of diffusers.
 
 Chunks share one compiled body. Inside ``jit`` they are scanned. Outside, ``encode`` and ``decode``
 call a compiled function per chunk, so two compilations serve videos of any length.
@@ -21,14 +23,19 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from pewm_jax.config import UserError, WanVAEConfig
-from pewm_jax.models.cogvideox.vae_shapes import draw
-from pewm_jax.models.svd.layers import linear
-from pewm_jax.models.svd.shapes import Leaf, conv
-from pewm_jax.models.wan import layers
+from pewm_jax.nn import attention as blocked_attention
+from pewm_jax.nn.layers import linear
+from pewm_jax.nn.parameters import Leaf, convolution, draw
+from pewm_jax.nn.parameters import linear as linear_leaves
+from pewm_jax.nn.video_convolution import convolve, convolve_frames, convolve_upsampled
 from pewm_jax.types import Array, Params
 
 LOGVAR_RANGE = (-30.0, 20.0)
 """The logarithm of a latent's variance is clipped to this range."""
+SMALLEST = 1e-12
+"""Least length that a pixel's channels are divided by."""
+AFTER = ((0, 1), (0, 1))
+"""Padding of the encoder's strided convolutions."""
 
 
 def layout(config: WanVAEConfig) -> dict[str, tuple[int, ...]]:
@@ -42,7 +49,7 @@ def layout(config: WanVAEConfig) -> dict[str, tuple[int, ...]]:
 
 def init(config: WanVAEConfig, key: Array) -> Params:
     """Return random parameters, float32: ``{"encoder": …, "decoder": …}``."""
-    return draw(layout(config), key)
+    return draw(layout(config), key, key_per_leaf=True)
 
 
 def normalise(config: WanVAEConfig, latents_BthwC: Array) -> Array:
@@ -145,16 +152,16 @@ def _encode_chunk(
     config: WanVAEConfig, params: Params, x: Array, past: Params | None
 ) -> tuple[Array, Params]:
     new: dict[str, Any] = {}
-    x, new["conv_in"] = layers.causal_conv(config, params["conv_in"], x, _of(past, "conv_in"))
+    x, new["conv_in"] = causal_conv(config, params["conv_in"], x, _of(past, "conv_in"))
     for level in range(len(config.multiples)):
         name = f"down_{level}"
         x, new[name] = _resnets(config, params[name], x, _of(past, name))
         if "resample" in params[name]:
             before = _of(_of(past, name), "resample")
-            x, new[name]["resample"] = layers.downsample(params[name]["resample"], x, before)
-    x, new["mid"] = layers.middle(config, params["mid"], x, _of(past, "mid"))
-    x = layers.active(params["norm_out"], x)
-    x, new["conv_out"] = layers.causal_conv(config, params["conv_out"], x, _of(past, "conv_out"))
+            x, new[name]["resample"] = downsample(params[name]["resample"], x, before)
+    x, new["mid"] = middle(config, params["mid"], x, _of(past, "mid"))
+    x = active(params["norm_out"], x)
+    x, new["conv_out"] = causal_conv(config, params["conv_out"], x, _of(past, "conv_out"))
     return linear(params["quant"], x), new
 
 
@@ -164,16 +171,16 @@ def _decode_chunk(
 ) -> tuple[Array, Params]:
     new: dict[str, Any] = {}
     x = linear(params["quant"], x)
-    x, new["conv_in"] = layers.causal_conv(config, params["conv_in"], x, _of(past, "conv_in"))
-    x, new["mid"] = layers.middle(config, params["mid"], x, _of(past, "mid"))
+    x, new["conv_in"] = causal_conv(config, params["conv_in"], x, _of(past, "conv_in"))
+    x, new["mid"] = middle(config, params["mid"], x, _of(past, "mid"))
     for level in range(len(config.multiples)):
         name = f"up_{level}"
         x, new[name] = _resnets(config, params[name], x, _of(past, name))
         if "resample" in params[name]:
             before = _of(_of(past, name), "resample")
-            x, new[name]["resample"] = layers.upsample(params[name]["resample"], x, before)
-    x = layers.active(params["norm_out"], x)
-    x, new["conv_out"] = layers.causal_conv(config, params["conv_out"], x, _of(past, "conv_out"))
+            x, new[name]["resample"] = upsample(params[name]["resample"], x, before)
+    x = active(params["norm_out"], x)
+    x, new["conv_out"] = causal_conv(config, params["conv_out"], x, _of(past, "conv_out"))
     return x, new
 
 
@@ -183,7 +190,7 @@ def _resnets(
     new: dict[str, Any] = {}
     for k in range(sum(name.startswith("resnet") for name in params)):
         name = f"resnet_{k}"
-        x, new[name] = layers.resnet(config, params[name], x, _of(past, name))
+        x, new[name] = resnet(config, params[name], x, _of(past, name))
     return x, new
 
 
@@ -191,42 +198,182 @@ def _of(past: Params | None, name: str) -> Any:
     return None if past is None else past[name]
 
 
+def norm(params: Params, x: Array) -> Array:
+    """Divide the channels of each pixel by their root mean square; float32."""
+    value = x.astype(jnp.float32)
+    length = jnp.sqrt(jnp.square(value).sum(-1, keepdims=True))
+    return value * (x.shape[-1] ** 0.5 / jnp.maximum(length, SMALLEST)) * params["scale"]
+
+
+def active(params: Params, x: Array) -> Array:
+    """Norm and SiLU, in x's dtype."""
+    return jax.nn.silu(norm(params, x)).astype(x.dtype)
+
+
+def causal_conv(
+    config: WanVAEConfig, params: Params, x_BTHWC: Array, past: Array | None
+) -> tuple[Array, Array]:
+    """3×3×3 convolution over this frame and the two before, zeros around the frame.
+
+    Args:
+        config: the autoencoder (which form of the convolution).
+        params: ``kernel`` (3, 3, 3, C, D) and ``bias``.
+        x_BTHWC: (B, T, H, W, C).
+        past: (B, 2, H, W, C), the two frames before.
+
+    Returns:
+        (B, T, H, W, D), and the next chunk's past.
+    """
+    padded = jnp.concatenate([_two_zeros(x_BTHWC) if past is None else past, x_BTHWC], 1)
+    return convolve(config, params, padded), padded[:, -2:]
+
+
+def resnet(
+    config: WanVAEConfig, params: Params, x_BTHWC: Array, past: Params | None
+) -> tuple[Array, Params]:
+    """Residual block: norm, SiLU, convolution, twice; with the next chunk's past."""
+    h, new = x_BTHWC, {}
+    for k in "12":
+        name = f"conv{k}"
+        h = active(params[f"norm{k}"], h)
+        h, new[name] = causal_conv(config, params[name], h, None if past is None else past[name])
+    if "shortcut" in params:
+        x_BTHWC = linear(params["shortcut"], x_BTHWC)
+    return x_BTHWC + h, new
+
+
+def middle(
+    config: WanVAEConfig, params: Params, x_BTHWC: Array, past: Params | None
+) -> tuple[Array, Params]:
+    """Run the bottom: residual block, attention within each frame, residual block."""
+    new = {}
+    for k in range(2):
+        name = f"resnet_{k}"
+        x_BTHWC, new[name] = resnet(
+            config, params[name], x_BTHWC, None if past is None else past[name]
+        )
+        if k == 0:
+            x_BTHWC = _attend(params["attend_0"], x_BTHWC)
+    return x_BTHWC, new
+
+
+def _attend(params: Params, x_BTHWC: Array) -> Array:
+    """Self-attention of each frame with one head, residual."""
+    batch, frames, height, width, channels = x_BTHWC.shape
+    x = norm(params["norm"], x_BTHWC).astype(x_BTHWC.dtype)
+    x = x.reshape(batch * frames, 1, height * width, channels)
+    q, k, v = jnp.split(linear(params["to_qkv"], x), 3, -1)
+    x = linear(params["to_out"], blocked_attention.attention(q, k, v))
+    return x_BTHWC + x.reshape(x_BTHWC.shape)
+
+
+def downsample(params: Params, x_BTHWC: Array, past: Array | None) -> tuple[Array, Array | None]:
+    """Halve height and width; with ``time`` among the parameters, halve frames too.
+
+    The video's first frame stays as it is. Each two further frames become one, together with the
+    frame before them.
+    """
+    x = convolve_frames(params["space"], x_BTHWC, 2, AFTER)
+    if "time" not in params:
+        return x, None
+    last = x[:, -1:]
+    if past is None:
+        return x, last
+    return _taps(params["time"], jnp.concatenate([past, x], 1), 2), last
+
+
+def upsample(params: Params, x_BTHWC: Array, past: Array | None) -> tuple[Array, Array | None]:
+    """Double height and width; with ``time`` among the parameters, double frames too.
+
+    The video's first frame stays one, and later frames do not see it: in its place are zeros.
+    """
+    if "time" not in params:
+        return convolve_upsampled(params["space"], x_BTHWC), None
+    if past is None:
+        return convolve_upsampled(params["space"], x_BTHWC), _two_zeros(x_BTHWC)
+    padded = jnp.concatenate([past, x_BTHWC], 1)
+    batch, frames, *rest = x_BTHWC.shape
+    half = {
+        name: jnp.split(params["time"][name].astype(x_BTHWC.dtype), 2, -1)
+        for name in ("kernel", "bias")
+    }
+    pair = [
+        _taps({"kernel": kernel, "bias": bias}, padded, 1)
+        for kernel, bias in zip(half["kernel"], half["bias"], strict=True)
+    ]
+    doubled = jnp.stack(pair, 2).reshape(batch, 2 * frames, *rest)
+    return convolve_upsampled(params["space"], doubled), padded[:, -2:]
+
+
+def _taps(params: Params, padded_BTHWC: Array, stride: int) -> Array:
+    """Convolve each pixel over three frames, ``kernel`` (3, C, D) and ``bias``."""
+    kernel = params["kernel"].astype(padded_BTHWC.dtype)
+    end = padded_BTHWC.shape[1] - 2
+    parts = [padded_BTHWC[:, k : k + end : stride] @ tap for k, tap in enumerate(kernel)]
+    return sum(parts[1:], parts[0]) + params["bias"].astype(padded_BTHWC.dtype)
+
+
+def _two_zeros(x_BTHWC: Array) -> Array:
+    """Return two frames of zeros."""
+    batch, _, *rest = x_BTHWC.shape
+    return jnp.zeros((batch, 2, *rest), x_BTHWC.dtype)
+
+
 def _encoder(config: WanVAEConfig) -> Iterator[Leaf]:
     inside, moments = config.base_width, 2 * config.latent_channels
-    yield from conv("encoder/conv_in", (3, 3, 3), config.in_channels, inside)
+    yield from convolution("encoder/conv_in", (3, 3, 3), config.in_channels, inside)
     for level, multiple in enumerate(config.multiples):
         where, width = f"encoder/down_{level}", multiple * config.base_width
         for k in range(config.resnets):
-            yield from layers.resnet_shapes(f"{where}/resnet_{k}", inside, width)
+            yield from resnet_leaves(f"{where}/resnet_{k}", inside, width)
             inside = width
         if level < len(config.halves_time):
-            yield from conv(f"{where}/resample/space", (3, 3), width, width)
+            yield from convolution(f"{where}/resample/space", (3, 3), width, width)
             if config.halves_time[level]:
-                yield from conv(f"{where}/resample/time", (3,), width, width)
-    yield from layers.middle_shapes("encoder/mid", inside)
+                yield from convolution(f"{where}/resample/time", (3,), width, width)
+    yield from middle_leaves("encoder/mid", inside)
     yield "encoder/norm_out/scale", (inside,)
-    yield from conv("encoder/conv_out", (3, 3, 3), inside, moments)
-    yield from conv("encoder/quant", (), moments, moments)
+    yield from convolution("encoder/conv_out", (3, 3, 3), inside, moments)
+    yield from linear_leaves("encoder/quant", moments, moments)
 
 
 def _decoder(config: WanVAEConfig) -> Iterator[Leaf]:
     widths = [multiple * config.decoder_base_width for multiple in config.multiples[::-1]]
     inside, latent = widths[0], config.latent_channels
-    yield from conv("decoder/quant", (), latent, latent)
-    yield from conv("decoder/conv_in", (3, 3, 3), latent, inside)
-    yield from layers.middle_shapes("decoder/mid", inside)
+    yield from linear_leaves("decoder/quant", latent, latent)
+    yield from convolution("decoder/conv_in", (3, 3, 3), latent, inside)
+    yield from middle_leaves("decoder/mid", inside)
     for level, width in enumerate(widths):
         where = f"decoder/up_{level}"
         for k in range(config.resnets + 1):
-            yield from layers.resnet_shapes(f"{where}/resnet_{k}", inside, width)
+            yield from resnet_leaves(f"{where}/resnet_{k}", inside, width)
             inside = width
         if level < len(config.halves_time):
             inside = width // 2
-            yield from conv(f"{where}/resample/space", (3, 3), width, inside)
+            yield from convolution(f"{where}/resample/space", (3, 3), width, inside)
             if config.halves_time[::-1][level]:
-                yield from conv(f"{where}/resample/time", (3,), width, 2 * width)
+                yield from convolution(f"{where}/resample/time", (3,), width, 2 * width)
     yield "decoder/norm_out/scale", (inside,)
-    yield from conv("decoder/conv_out", (3, 3, 3), inside, config.out_channels)
+    yield from convolution("decoder/conv_out", (3, 3, 3), inside, config.out_channels)
+
+
+def resnet_leaves(where: str, inside: int, outside: int) -> Iterator[Leaf]:
+    """Yield the leaves of a residual block."""
+    yield f"{where}/norm1/scale", (inside,)
+    yield from convolution(f"{where}/conv1", (3, 3, 3), inside, outside)
+    yield f"{where}/norm2/scale", (outside,)
+    yield from convolution(f"{where}/conv2", (3, 3, 3), outside, outside)
+    if inside != outside:
+        yield from linear_leaves(f"{where}/shortcut", inside, outside)
+
+
+def middle_leaves(where: str, width: int) -> Iterator[Leaf]:
+    """Yield the leaves of the bottom: two residual blocks around an attention."""
+    yield from resnet_leaves(f"{where}/resnet_0", width, width)
+    yield f"{where}/attend_0/norm/scale", (width,)
+    yield from linear_leaves(f"{where}/attend_0/to_qkv", width, 3 * width)
+    yield from linear_leaves(f"{where}/attend_0/to_out", width, width)
+    yield from resnet_leaves(f"{where}/resnet_1", width, width)
 
 
 def _check(x: Array, channels: int, name: str) -> None:

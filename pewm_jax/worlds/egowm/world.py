@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import EgoWMConfig, EgoWMTrainConfig, TrainSettings
-from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Array, Clip, Control, Frames, Params, WorldState
 from pewm_jax.worlds import chunks, objective, sampling, world_model
 from pewm_jax.worlds.control import control_of

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import VoxelVAEConfig
 from pewm_jax.models.persist import voxel_vae
-from pewm_jax.nn.patches import patchify
+from pewm_jax.nn.tokens import patchify
 from pewm_jax.types import Array, Params
 
 

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import PersistConfig, UserError
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
-from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Array, Camera, Clip, Params
 from pewm_jax.worlds.persist import losses, windows
 from pewm_jax.worlds.persist.pictures import drawn

@@ -16,7 +16,7 @@ from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.memory.class_edit import EMPTY, UNKNOWN
 from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.models.persist.blocks import FrameCache
-from pewm_jax.nn.plain_layers import linear
+from pewm_jax.nn.layers import linear
 from pewm_jax.types import Array, Params
 from pewm_jax.worlds.persist import sight as persist_sight
 from pewm_jax.worlds.persist import windows

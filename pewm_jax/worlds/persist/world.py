@@ -19,13 +19,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import PersistConfig, UserError
 from pewm_jax.config import functions as functions_of
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import class_edit, class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist import nets as persist_nets
-from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds import checks
 from pewm_jax.worlds.control import control_of

@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import re
 
+from pewm_jax.codecs import gates
 from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.config import Config, LearnedCodecConfig, ModelConfig, TrainConfig, functions
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.nn import gates
 from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.worlds import codec_gate
 from pewm_jax.worlds.stages import Stage

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs.signals import as_signal, signal_from_depth
 from pewm_jax.config import ModelConfig, TrainConfig, TrainSettings, UserError
 from pewm_jax.memory import memories
+from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.models.lpips import weights as lpips_weights
-from pewm_jax.nn.signals import as_signal, signal_from_depth
 from pewm_jax.types import Array, Clip, Control, Frames, Params
 from pewm_jax.worlds import codec_gate, objective, sampling, world_model
 

@@ -16,12 +16,12 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import ModelConfig, UserError, functions
 from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import memories
 from pewm_jax.memory import views as memory_views
-from pewm_jax.nn.signals import as_signal
 from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, WorldState
 from pewm_jax.worlds import chunks, objective, sampling, world_model
 from pewm_jax.worlds.control import control_of

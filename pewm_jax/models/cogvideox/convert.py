@@ -1,7 +1,7 @@
-"""CogVideoX's transformer: its settings, and the names and layouts of its tensors.
+"""CogVideoX's checkpoints in diffusers: settings and tensor names, theirs and ours.
 
-Reference: ``CogVideoXTransformer3DModel`` of diffusers, ``transformer/config.json`` and
-``transformer/*.safetensors`` of a CogVideoX folder.
+References: ``CogVideoXTransformer3DModel`` and ``AutoencoderKLCogVideoX`` of diffusers,
+``transformer/`` and ``vae/`` of a CogVideoX folder.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from pewm_jax.config import DiTConfig, UserError
-from pewm_jax.convert import settings
-from pewm_jax.convert.mapping import LINEAR, SAME, Entry, Turn
+from pewm_jax.config import DiTConfig, UserError, VAEConfig
+from pewm_jax.io import published
+from pewm_jax.io.published import CONV, LINEAR, SAME, Entry, Network, Transform, rename
+from pewm_jax.models.cogvideox import model, vae
 
-CLASS = "CogVideoXTransformer3DModel"
+TRANSFORMER_CLASS = "CogVideoXTransformer3DModel"
 """The class that the json names."""
 
 DEFAULTS: dict[str, Any] = {
@@ -53,7 +54,7 @@ IGNORED = ("dropout",)
 """Settings that do not touch inference."""
 
 
-def config_from_diffusers(values: dict[str, Any]) -> DiTConfig:
+def transformer_config_from_diffusers(values: dict[str, Any]) -> DiTConfig:
     """Read the settings of ``transformer/config.json``.
 
     Args:
@@ -63,7 +64,7 @@ def config_from_diffusers(values: dict[str, Any]) -> DiTConfig:
     Raises:
         UserError: a key that is unknown, or a value that is not supported, by its name.
     """
-    settings.require_class(values, "The transformer", CLASS)
+    published.require_class(values, "The transformer", TRANSFORMER_CLASS)
     for key, value in values.items():
         if key in FIXED and value != FIXED[key]:
             raise UserError(f"The transformer's {key} is {value!r}; only {FIXED[key]!r} is known.")
@@ -128,7 +129,7 @@ def _positions(given: dict[str, Any]) -> Any:
     return "rope_crop" if rotary else "sincos"
 
 
-def config_to_diffusers(config: DiTConfig) -> dict[str, Any]:
+def transformer_config_to_diffusers(config: DiTConfig) -> dict[str, Any]:
     """Write the settings of ``transformer/config.json``, the inverse of reading them.
 
     Raises:
@@ -140,7 +141,7 @@ def config_to_diffusers(config: DiTConfig) -> dict[str, Any]:
         )
     newer = config.positions == "rope_integer"
     return {
-        "_class_name": CLASS,
+        "_class_name": TRANSFORMER_CLASS,
         **FIXED,
         "dropout": 0.0,
         "num_layers": config.layers,
@@ -166,7 +167,7 @@ def config_to_diffusers(config: DiTConfig) -> dict[str, Any]:
     }
 
 
-def entries(config: DiTConfig) -> list[Entry]:
+def transformer_entries(config: DiTConfig) -> list[Entry]:
     """List every tensor of the reference with the leaf of ours that holds it."""
     return [*_ends(config), *(e for i in range(config.layers) for e in _block(i))]
 
@@ -187,7 +188,7 @@ def _ends(config: DiTConfig) -> Iterator[Entry]:
     yield Entry("patch_embed.proj.bias", "patch_embed/bias")
     yield from _linear("patch_embed.text_proj", "text_embed")
     if config.positions == "rope_learned":
-        table = Turn(lambda x: x[0], lambda x: x[None])
+        table = Transform(lambda x: x[0], lambda x: x[None])
         yield Entry("patch_embed.pos_embedding", "positions", table)
     for part in ("linear_1", "linear_2"):
         yield from _linear(f"time_embedding.{part}", f"time_embed/{part}")
@@ -199,9 +200,9 @@ def _ends(config: DiTConfig) -> Iterator[Entry]:
     yield from _linear("proj_out", "proj_out")
 
 
-def _patches(patch: int) -> Turn:
+def _patches(patch: int) -> Transform:
     """Turn a convolution whose stride is its size into the linear layer on patches that it is."""
-    return Turn(
+    return Transform(
         lambda x: x.reshape(x.shape[0], -1).T,
         lambda x: x.T.reshape(x.shape[1], -1, patch, patch),
     )
@@ -219,3 +220,169 @@ def _block(layer: int) -> Iterator[Entry]:
     yield from _linear(f"{there}.attn1.to_out.0", f"{here}/to_out", layer)
     yield from _linear(f"{there}.ff.net.0.proj", f"{here}/ff/up", layer)
     yield from _linear(f"{there}.ff.net.2", f"{here}/ff/down", layer)
+
+
+VAE_CLASS = "AutoencoderKLCogVideoX"
+"""The reference's class."""
+_VAE_FIELDS = {
+    "in_channels": "in_channels",
+    "out_channels": "out_channels",
+    "latent_channels": "latent_channels",
+    "block_out_channels": "widths",
+    "layers_per_block": "resnets",
+    "norm_num_groups": "groups",
+    "norm_eps": "eps",
+    "temporal_compression_ratio": "temporal",
+    "sample_height": "sample_height",
+    "sample_width": "sample_width",
+    "scaling_factor": "scaling_factor",
+    "invert_scale_latents": "invert_scale_latents",
+}
+"""Their setting → our field."""
+_VAE_FIXED: dict[str, tuple[Any, ...]] = {
+    "act_fn": ("silu", "swish"),
+    "shift_factor": (None,),
+    "latents_mean": (None,),
+    "latents_std": (None,),
+    "use_quant_conv": (False,),
+    "use_post_quant_conv": (False,),
+    "force_upcast": (True, False),
+}
+"""Settings that change nothing here, and the values that may stand there; the first is written."""
+_VAE_FORMER = frozenset(["sample_size"])
+"""Settings of the reference's first release, which it does not have any more."""
+_VAE_BLOCKS = {
+    "down_block_types": "CogVideoXDownBlock3D",
+    "up_block_types": "CogVideoXUpBlock3D",
+}
+
+
+def vae_config_from_diffusers(values: dict[str, Any]) -> VAEConfig:
+    """Read the settings of a diffusers ``vae/config.json``; absent ones have diffusers' defaults.
+
+    Args:
+        values: the JSON object.
+
+    Returns:
+        The autoencoder.
+
+    Raises:
+        UserError: another class, or a setting that is unknown, of the wrong kind or not supported.
+    """
+    kind = values.get("_class_name", VAE_CLASS)
+    if kind != VAE_CLASS:
+        raise UserError(
+            f"the VAE's config.json describes a {kind!r}; only {VAE_CLASS} can be read."
+        )
+    fields: dict[str, Any] = {}
+    for key, value in values.items():
+        if key.startswith("_") or key in _VAE_FORMER:
+            continue
+        if key in _VAE_FIELDS:
+            fields[_VAE_FIELDS[key]] = _checked(key, value)
+        elif key in _VAE_FIXED:
+            _require_one_of(key, value, value in _VAE_FIXED[key], _VAE_FIXED[key])
+        elif key not in _VAE_BLOCKS:
+            raise UserError(
+                f"the VAE's config.json has an unknown setting {key!r}; known are "
+                f"{', '.join(sorted([*_VAE_FIELDS, *_VAE_FIXED, *_VAE_BLOCKS]))}."
+            )
+    config = VAEConfig(**fields)
+    for key, block in _VAE_BLOCKS.items():
+        expected = [block] * len(config.widths)
+        if key in values:
+            _require_one_of(key, values[key], list(values[key] or []) == expected, [expected])
+    return config
+
+
+def vae_config_to_diffusers(config: VAEConfig) -> dict[str, Any]:
+    """Return the JSON object of a diffusers ``vae/config.json``.
+
+    Tiling and the form of the convolutions are not part of it: diffusers switches tiling on when
+    running (``enable_tiling``).
+    """
+    levels = len(config.widths)
+    values = {theirs: getattr(config, ours) for theirs, ours in _VAE_FIELDS.items()}
+    return {
+        "_class_name": VAE_CLASS,
+        **values,
+        "block_out_channels": list(config.widths),
+        **{key: [block] * levels for key, block in _VAE_BLOCKS.items()},
+        **{key: allowed[0] for key, allowed in _VAE_FIXED.items()},
+    }
+
+
+def vae_entries(config: VAEConfig) -> list[Entry]:
+    """Return one entry per tensor of the reference."""
+    return [
+        Entry(_vae_name(path), path, CONV if path.endswith("/kernel") else SAME)
+        for path in vae.layout(config)
+    ]
+
+
+def _vae_name(path: str) -> str:
+    """Turn ``decoder/up_0/resnet_1/norm1/scale`` into the reference's name."""
+    conditioned = path.startswith("decoder/")
+    rules = (
+        (r"^(\w+)/(down|up)_(\d+)/", r"\1.\2_blocks.\3."),
+        (r"^(\w+)/mid/", r"\1.mid_block."),
+        (r"resnet_(\d+)/", r"resnets.\1."),
+        (r"resample/", "downsamplers.0.conv/" if not conditioned else "upsamplers.0.conv/"),
+        (r"shortcut/", "conv_shortcut/"),
+        (r"(norm\w+)/(scale|bias)$", r"\1.norm_layer/\2" if conditioned else r"\1/\2"),
+        (r"scale_by/", "conv_y.conv/"),
+        (r"shift_by/", "conv_b.conv/"),
+        (r"(conv\d|conv_in|conv_out)/", r"\1.conv/"),
+        (r"/(kernel|scale)$", "/weight"),
+        (r"/", "."),
+    )
+    return rename(path, rules)
+
+
+def _checked(key: str, value: Any) -> Any:
+    """Check one of their settings against the kind of our field's default; lists become tuples."""
+    default: Any = getattr(VAEConfig(), _VAE_FIELDS[key])
+    as_type: Any
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if isinstance(default, bool):
+        fits, as_type = isinstance(value, bool), bool
+    elif isinstance(default, tuple):
+        fits = isinstance(value, (list, tuple)) and all(type(item) is int for item in value)
+        as_type = tuple
+    elif isinstance(default, int):
+        fits, as_type = number and value == int(value), int
+    else:
+        fits, as_type = number, float
+    if not fits:
+        raise UserError(
+            f"the VAE's config.json has {key} = {value!r}, where a value like {default!r} belongs."
+        )
+    return as_type(value)
+
+
+def _require_one_of(key: str, value: Any, fits: bool, allowed: Any) -> None:
+    if not fits:
+        raise UserError(
+            f"the VAE's config.json has {key} = {value!r}, which is not supported: only "
+            f"{' or '.join(map(repr, allowed))} is."
+        )
+
+
+TRANSFORMER = Network(
+    "transformer",
+    TRANSFORMER_CLASS,
+    DiTConfig,
+    transformer_config_from_diffusers,
+    transformer_config_to_diffusers,
+    transformer_entries,
+    model.init,
+)
+VAE = Network(
+    "vae",
+    VAE_CLASS,
+    VAEConfig,
+    vae_config_from_diffusers,
+    vae_config_to_diffusers,
+    vae_entries,
+    vae.init,
+)

@@ -70,14 +70,14 @@ def convolve(config: Settings, params: Params, padded_BTHWC: Array) -> Array:
     return (out + params["bias"]).astype(dtype)
 
 
-def convolve_2d(params: Params, x_BTHWC: Array, stride: int, padding: Sequence) -> Array:
+def convolve_frames(params: Params, x_BTHWC: Array, stride: int, padding: Sequence) -> Array:
     """2D convolution of every frame, ``kernel`` (3, 3, C, D) and ``bias``."""
     out = _frames(x_BTHWC, params["kernel"].astype(x_BTHWC.dtype), stride, padding)
     return (out + params["bias"]).astype(x_BTHWC.dtype)
 
 
-def convolve_doubled(params: Params, x_BTHWC: Array) -> Array:
-    """Upsample frames twofold (nearest) and apply ``convolve_2d``, without storing the upsampled.
+def convolve_upsampled(params: Params, x_BTHWC: Array) -> Array:
+    """Upsample frames twofold (nearest) and convolve them, without storing the upsampled.
 
     A 3×3 window of an upsampled frame covers 2×2 different pixels. Each of the four output pixels
     of an input pixel is therefore a 2×2 convolution of the input: 16 products instead of 36.

@@ -17,8 +17,8 @@ import jax
 import numpy as np
 
 from pewm_jax.config import NomadConfig, UserError
-from pewm_jax.convert.mapping import CONV, LINEAR, Entry, Turn
 from pewm_jax.io import tree, weights
+from pewm_jax.io.published import CONV, LINEAR, Entry, Transform
 from pewm_jax.models.nomad import efficientnet, unet1d
 from pewm_jax.models.nomad import model as nomad
 from pewm_jax.types import Params
@@ -29,12 +29,12 @@ UNUSED = (
     r"vision_encoder\.positional_encoding\.pos_enc",
 )
 POSITIONS = "vision_encoder.positional_encoding.pos_enc"
-DEPTHWISE = Turn(
+DEPTHWISE = Transform(
     lambda x: np.moveaxis(x, (0, 1), (3, 2)),
     lambda x: np.moveaxis(x, (3, 2), (0, 1)),
 )
 """torch (channels, 1, k, k) ↔ (k, k, 1, channels)."""
-TRANSPOSED = Turn(
+TRANSPOSED = Transform(
     lambda x: np.flip(np.moveaxis(x, (0, 1), (1, 2)), 0),
     lambda x: np.moveaxis(np.flip(x, 0), (1, 2), (0, 1)),
 )
@@ -63,8 +63,8 @@ def read(path: str | Path, config: NomadConfig | None = None) -> tuple[NomadConf
     if table is not None and table.ndim == 3 and table.shape[1] > 2:
         config = dataclasses.replace(config, context=table.shape[1] - 2)
     listed = list(entries(config))
-    absent = [entry.theirs for entry in listed if entry.theirs not in found]
-    known = {entry.theirs for entry in listed}
+    absent = [entry.name for entry in listed if entry.name not in found]
+    known = {entry.name for entry in listed}
     unknown = [
         name
         for name in found
@@ -77,7 +77,7 @@ def read(path: str | Path, config: NomadConfig | None = None) -> tuple[NomadConf
                 "state_dict and no others, and the sizes it was trained with."
             )
     turned = {
-        entry.path: np.ascontiguousarray(_turned(entry, found[entry.theirs]), np.float32)
+        entry.path: np.ascontiguousarray(_turned(entry, found[entry.name]), np.float32)
         for entry in listed
     }
     params = tree.unflatten(turned)
@@ -89,7 +89,7 @@ def read(path: str | Path, config: NomadConfig | None = None) -> tuple[NomadConf
 def _turned(entry: Entry, x: np.ndarray) -> np.ndarray:
     """Turn a tensor; one with another number of axes is left alone, to be refused by its shape."""
     try:
-        return entry.turn.ours(x)
+        return entry.transform.read(x)
     except (ValueError, np.exceptions.AxisError):
         return x
 
@@ -157,8 +157,8 @@ def _denoiser(config: NomadConfig) -> Iterator[Entry]:
     yield from _affine(f"{net}.final_conv.1", "denoiser/out", CONV)
 
 
-def _affine(theirs: str, ours: str, turn: Turn) -> Iterator[Entry]:
-    yield Entry(f"{theirs}.weight", f"{ours}/kernel", turn)
+def _affine(theirs: str, ours: str, transform: Transform) -> Iterator[Entry]:
+    yield Entry(f"{theirs}.weight", f"{ours}/kernel", transform)
     yield Entry(f"{theirs}.bias", f"{ours}/bias")
 
 

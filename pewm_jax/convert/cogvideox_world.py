@@ -7,22 +7,27 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from pewm_jax import config as configuration
-from pewm_jax.config import ClipConfig, Config, DiTConfig, Encoder, UserError, VAEConfig
-from pewm_jax.convert import base, cogvideox, output, widen
-from pewm_jax.convert.cogvideox import CONFIG, TRANSFORMER, VAE, WEIGHTS
+from pewm_jax.config import (
+    ClipConfig,
+    Config,
+    DiTConfig,
+    Encoder,
+    UserError,
+    VAEConfig,
+)
+from pewm_jax.convert import cogvideox, pipeline, widen
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.io import tensor_files, tree
-from pewm_jax.nn import positions
+from pewm_jax.io import tree
+from pewm_jax.models.cogvideox import positions
+from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
 from pewm_jax.readers import interface as readers
-from pewm_jax.types import Array, Params
+from pewm_jax.types import Params
 from pewm_jax.worlds.pewm import paper
 
 
@@ -116,56 +121,28 @@ def import_world(
         dtype: of the weights; by default the stored one, and float32 for memory blocks.
         seed: of the memory blocks.
     """
-    old = TRANSFORMER.config(record["transformer"], base.BASE)
+    old = TRANSFORMER.config(record["transformer"], cogvideox.BASE)
     channels = config.model.control.channels(config.model)
     plan = widen.plan(old, config.model.codec.latent_channels, channels)
-    key = jax.random.key(seed)
-    new_dtype = np.dtype(jax.numpy.dtype(dtype or "float32"))
 
     def backbone() -> Params:
         return widen.widen(plan, cogvideox.read_transformer(src, dtype)[1])
 
     def blocks() -> Params:
-        return jax.jit(lambda k: readers.init(config.model, k))(key)
+        return jax.jit(lambda k: readers.init(config.model, k))(jax.random.key(seed))
 
-    parts: dict[str, tuple[dict[str, jax.ShapeDtypeStruct], Callable[[], Params]]] = {}
     wide = tree.flatten(TRANSFORMER.like(plan.new))
-    stored = cogvideox.stored_specs(TRANSFORMER, src, dtype)
-    parts["backbone"] = (
-        {p: jax.ShapeDtypeStruct(wide[p].shape, spec.dtype) for p, spec in stored.items()},
-        backbone,
-    )
+    stored = pipeline.specs(TRANSFORMER, src, dtype)
+    specs = {p: jax.ShapeDtypeStruct(wide[p].shape, spec.dtype) for p, spec in stored.items()}
+    parts: dict[str, pipeline.Part] = {"backbone": (specs, backbone)}
     if memory:
-        like = jax.eval_shape(lambda k: readers.init(config.model, k), key)
-        flat = tree.flatten(like)
-        parts["memory"] = (
-            {p: jax.ShapeDtypeStruct(leaf.shape, new_dtype) for p, leaf in flat.items()},
-            blocks,
-        )
-    parts["codec"] = (
-        cogvideox.stored_specs(VAE, src, dtype),
-        lambda: cogvideox.read_vae(src, dtype)[1],
-    )
+        parts["memory"] = (pipeline.cast_specs(jax.eval_shape(blocks), dtype), blocks)
+    parts["codec"] = pipeline.part(VAE, src, dtype)
     given: dict[str, Params] = {}
     if encoder is not None:
         given["encoder"] = encoder
     if prompt_LC is not None:
         given["text"] = {"prompt_LC": prompt_LC}
     for name, params in given.items():
-        flat = tree.flatten(params)
-        specs = {p: jax.ShapeDtypeStruct(leaf.shape, new_dtype) for p, leaf in flat.items()}
-        parts[name] = (specs, functools.partial(_same, params))
-
-    specs = {f"{part}/{p}": spec for part, (like, _) in parts.items() for p, spec in like.items()}
-
-    def tensors() -> Iterator[tuple[str, Array]]:
-        for part, (_, make) in parts.items():
-            for path, leaf in tree.flatten({part: make()}).items():
-                yield path, np.asarray(leaf).astype(specs[path].dtype, copy=False)
-
-    with output.new_folder(dst) as folder:
-        header = tensor_files.header({"stage": "0"})
-        with output.megabytes(f"write {dst.name}", tensor_files.size(specs)) as progress:
-            tensor_files.write(folder / WEIGHTS, specs, tensors(), header, progress)
-        configuration.save(config, folder / CONFIG)
-        base.save(folder, record)
+        parts[name] = (pipeline.cast_specs(params, dtype), functools.partial(_same, params))
+    pipeline.write_world(dst, config, parts, {cogvideox.BASE: record})

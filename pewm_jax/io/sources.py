@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import tensor_files, tree
 from pewm_jax.types import Array
 
@@ -95,6 +95,45 @@ class Files:
         """
         path, place = self.places[name]
         return tensor_files.read_at(path, place)
+
+
+@dataclasses.dataclass(frozen=True)
+class Renamed:
+    """Another source's tensors, or equal parts of their first axis, under other names.
+
+    Attributes:
+        inner: where the tensors are.
+        views: name → (name there, which part, of how many).
+    """
+
+    inner: Source
+    views: Mapping[str, tuple[str, int, int]]
+
+    @property
+    def where(self) -> str:
+        """The file or folder, for messages."""
+        return self.inner.where
+
+    def names(self) -> Iterable[str]:
+        """Return the names of all tensors."""
+        return self.views.keys()
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of a tensor without reading it."""
+        inner, _, of = self.views[name]
+        whole = self.inner.shape(inner)
+        return whole if of == 1 else (whole[0] // of, *whole[1:])
+
+    def dtype(self, name: str) -> np.dtype:
+        """Return the dtype of a tensor without reading it."""
+        return self.inner.dtype(self.views[name][0])
+
+    def read(self, name: str) -> Array:
+        """Read a tensor."""
+        inner, part, of = self.views[name]
+        whole = self.inner.read(inner)
+        rows = len(whole) // of if of > 1 else 0
+        return whole if of == 1 else whole[part * rows : (part + 1) * rows]
 
 
 def open_folder(folder: Path) -> Files:

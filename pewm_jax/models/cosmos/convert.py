@@ -1,18 +1,18 @@
-"""The settings and tensor names of Cosmos' transformer, and ours.
+"""Cosmos' checkpoints in diffusers: the transformer's settings and tensor names, theirs and ours.
 
-Reference: ``CosmosTransformer3DModel`` of diffusers.
+Reference: ``CosmosTransformer3DModel`` of diffusers. The autoencoder is Wan's
+(``models.wan.convert``).
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pewm_jax.config import CosmosConfig, UserError
-from pewm_jax.convert import settings
-from pewm_jax.convert.mapping import LINEAR, SAME, Entry
-from pewm_jax.models.cosmos import model as cosmos
+from pewm_jax.io import published
+from pewm_jax.io.published import LINEAR, SAME, Entry, Network, rename
+from pewm_jax.models.cosmos import model
 
 CLASS = "CosmosTransformer3DModel"
 """The reference's class."""
@@ -69,9 +69,9 @@ def config_from_diffusers(values: Mapping[str, Any]) -> CosmosConfig:
         UserError: another class, or a setting that is unknown or not supported.
     """
     defaults = {**_DEFAULTS, **_CHOICES, **_ONLY}
-    given = settings.of_network(values, WHAT, CLASS, defaults, _WITHOUT_EFFECT)
-    settings.require_only(given, WHAT, _ONLY)
-    settings.require_like(given, WHAT, _DEFAULTS)
+    given = published.read_settings(values, WHAT, CLASS, defaults, _WITHOUT_EFFECT)
+    published.require_only(given, WHAT, _ONLY)
+    published.require_kinds(given, WHAT, _DEFAULTS)
     patch_t, rows, columns = given["patch_size"]
     if rows != columns:
         raise UserError(
@@ -108,11 +108,11 @@ def _three(values: Iterable[Any]) -> tuple[Any, Any, Any]:
 
 def _raw_text(given: Mapping[str, Any]) -> int:
     """Return the channels of given text tokens, or 0 if no layer changes them."""
-    settings.require_like(given, WHAT, {"use_crossattn_projection": False})
+    published.require_kinds(given, WHAT, {"use_crossattn_projection": False})
     if not given["use_crossattn_projection"]:
         return 0
     sizes = ("crossattn_proj_in_channels", "encoder_hidden_states_channels")
-    settings.require_like(given, WHAT, {key: _CHOICES[key] for key in sizes})
+    published.require_kinds(given, WHAT, {key: _CHOICES[key] for key in sizes})
     inside, outside = (given[key] for key in sizes)
     if outside != given["text_embed_dim"]:
         raise UserError(
@@ -150,21 +150,25 @@ def config_to_diffusers(config: CosmosConfig) -> dict[str, Any]:
 def entries(config: CosmosConfig) -> list[Entry]:
     """Return one entry per tensor of the reference."""
     found = []
-    for path in cosmos.layout(config):
-        turn = LINEAR if path.endswith("/kernel") else SAME
+    for path in model.layout(config):
+        transform = LINEAR if path.endswith("/kernel") else SAME
         if path.startswith("blocks/"):
-            inside = _theirs(path.removeprefix("blocks/"))
+            inside = rename(path.removeprefix("blocks/"), _RULES)
             found += [
-                Entry(f"transformer_blocks.{layer}.{inside}", path, turn, layer)
+                Entry(f"transformer_blocks.{layer}.{inside}", path, transform, layer)
                 for layer in range(config.layers)
             ]
         else:
-            found.append(Entry(_theirs(path), path, turn))
+            found.append(Entry(rename(path, _RULES), path, transform))
     return found
 
 
-def _theirs(path: str) -> str:
-    """Turn ``modulate1/down/kernel`` into the reference's name."""
-    for pattern, name in _RULES:
-        path = re.sub(pattern, name, path)
-    return path
+TRANSFORMER = Network(
+    "transformer",
+    CLASS,
+    CosmosConfig,
+    config_from_diffusers,
+    config_to_diffusers,
+    entries,
+    model.init,
+)

@@ -1,4 +1,4 @@
-"""The settings and tensor names of CLIP's image encoder in transformers, and ours.
+"""CLIP's image encoder in transformers: its settings and tensor names, theirs and ours.
 
 Reference: ``CLIPVisionModelWithProjection``.
 """
@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.config import CLIPVisionConfig, UserError
-from pewm_jax.convert.dinov2_source import Renamed
-from pewm_jax.convert.mapping import LINEAR, SAME, Entry, Turn
-from pewm_jax.convert.sources import Source
+from pewm_jax.io.published import LINEAR, SAME, Entry, Network, Transform
+from pewm_jax.models.clip import model
 
 CLASS = "CLIPVisionModelWithProjection"
 """The reference's class."""
-LEFT_BEHIND = ("vision_model.embeddings.position_ids",)
+UNUSED = ("vision_model.embeddings.position_ids",)
 """Tensors that older files hold and no network reads: they count positions."""
 _DEFAULTS: dict[str, Any] = {
     "num_hidden_layers": 12,
@@ -77,7 +76,9 @@ _NO_MATTER = frozenset(
 """Settings that do not change what the network computes once it is trained."""
 
 
-def config_from_transformers(values: Mapping[str, Any], where: str) -> CLIPVisionConfig:
+def config_from_transformers(
+    values: Mapping[str, Any], where: str = "The image encoder"
+) -> CLIPVisionConfig:
     """Read the settings of ``image_encoder/config.json``.
 
     Args:
@@ -120,16 +121,10 @@ def config_to_transformers(config: CLIPVisionConfig) -> dict[str, Any]:
     }
 
 
-def without_positions(source: Source) -> Source:
-    """Return a source without ``LEFT_BEHIND``."""
-    kept = [name for name in source.names() if name not in LEFT_BEHIND]
-    return Renamed(source, {name: (name, 0, 1) for name in kept})
-
-
 def entries(config: CLIPVisionConfig) -> list[Entry]:
     """List every tensor of the reference and where it goes in our tree."""
     p, body = config.patch, "vision_model"
-    patch = Turn(
+    patch = Transform(
         lambda x: np.moveaxis(x, (1, 0), (2, 3)).reshape(p * p * 3, -1),
         lambda x: np.moveaxis(x.reshape(p, p, 3, -1), (2, 3), (1, 0)),
     )
@@ -161,3 +156,17 @@ def entries(config: CLIPVisionConfig) -> list[Entry]:
         for theirs, ours, turn in inside
     ]
     return found
+
+
+IMAGE_ENCODER = Network(
+    "image_encoder",
+    "clip_vision_model",
+    CLIPVisionConfig,
+    config_from_transformers,
+    config_to_transformers,
+    entries,
+    model.init,
+    unused=UNUSED,
+    class_key="model_type",
+    weights_file="model.safetensors",
+)

@@ -1,6 +1,7 @@
-"""The settings and tensor names of Stable Video Diffusion's U-Net, and ours.
+"""Stable Video Diffusion's checkpoints in diffusers: settings and tensor names, theirs and ours.
 
-Reference: ``UNetSpatioTemporalConditionModel`` of diffusers.
+References: ``UNetSpatioTemporalConditionModel`` and ``AutoencoderKLTemporalDecoder`` of diffusers.
+The image encoder is CLIP's (``models.clip.convert``).
 """
 
 from __future__ import annotations
@@ -8,25 +9,26 @@ from __future__ import annotations
 import re
 from typing import Any
 
-import numpy as np
-
-from pewm_jax.config import SVDUNetConfig, UserError
-from pewm_jax.convert import settings
-from pewm_jax.convert.mapping import CONV, LINEAR, SAME, Entry, Turn
-from pewm_jax.models.svd import shapes as svd_shapes
-
-CLASS = "UNetSpatioTemporalConditionModel"
-"""The reference's class."""
-TIME_CONV = Turn(
-    lambda x: np.moveaxis(x[:, :, :, 0, 0], (0, 1), (2, 1)),
-    lambda x: np.moveaxis(x, (2, 1), (0, 1))[:, :, :, None, None],
+from pewm_jax.config import SVDUNetConfig, SVDVAEConfig, UserError
+from pewm_jax.io import published
+from pewm_jax.io.published import (
+    CONV,
+    LINEAR,
+    POINTWISE,
+    SAME,
+    TIME_CONV,
+    Entry,
+    Network,
+    Transform,
+    rename,
 )
-"""torch (out, in, 3, 1, 1) ↔ ours (3, in, out)."""
-POINTWISE = Turn(lambda x: x[:, :, 0, 0].T, lambda x: x.T[:, :, None, None])
-"""torch (out, in, 1, 1) ↔ ours (in, out)."""
+from pewm_jax.models.svd import unet, vae
+
+UNET_CLASS = "UNetSpatioTemporalConditionModel"
+"""The reference's class."""
 DOWN = {True: "CrossAttnDownBlockSpatioTemporal", False: "DownBlockSpatioTemporal"}
 UP = {True: "CrossAttnUpBlockSpatioTemporal", False: "UpBlockSpatioTemporal"}
-_DEFAULTS: dict[str, Any] = {
+_UNET_DEFAULTS: dict[str, Any] = {
     "in_channels": 8,
     "out_channels": 4,
     "block_out_channels": [320, 640, 1280, 1280],
@@ -40,17 +42,19 @@ _DEFAULTS: dict[str, Any] = {
     "num_attention_heads": [5, 10, 20, 20],
 }
 """What diffusers takes for settings that a file leaves out."""
-_WITHOUT_EFFECT = {"sample_size": None, "num_frames": 25}
+_UNET_WITHOUT_EFFECT = {"sample_size": None, "num_frames": 25}
 """Settings that the network does not read, and what is written for them."""
 
 
-def config_from_diffusers(values: dict[str, Any]) -> SVDUNetConfig:
+def unet_config_from_diffusers(values: dict[str, Any]) -> SVDUNetConfig:
     """Read the settings of ``unet/config.json``; absent ones have diffusers' defaults.
 
     Raises:
         UserError: another class, or a setting that is unknown or not supported.
     """
-    given = settings.of_network(values, "The U-Net", CLASS, _DEFAULTS, _WITHOUT_EFFECT)
+    given = published.read_settings(
+        values, "The U-Net", UNET_CLASS, _UNET_DEFAULTS, _UNET_WITHOUT_EFFECT
+    )
     widths = _numbers(given, "block_out_channels", None)
     levels = len(widths)
     attends = tuple(kind == DOWN[True] for kind in given["down_block_types"])
@@ -88,11 +92,11 @@ def config_from_diffusers(values: dict[str, Any]) -> SVDUNetConfig:
     )
 
 
-def config_to_diffusers(config: SVDUNetConfig) -> dict[str, Any]:
+def unet_config_to_diffusers(config: SVDUNetConfig) -> dict[str, Any]:
     """Write the settings of ``unet/config.json``, the inverse of reading them."""
     return {
-        "_class_name": CLASS,
-        **_WITHOUT_EFFECT,
+        "_class_name": UNET_CLASS,
+        **_UNET_WITHOUT_EFFECT,
         "in_channels": config.in_channels,
         "out_channels": config.out_channels,
         "block_out_channels": list(config.widths),
@@ -107,14 +111,15 @@ def config_to_diffusers(config: SVDUNetConfig) -> dict[str, Any]:
     }
 
 
-def entries(config: SVDUNetConfig) -> list[Entry]:
+def unet_entries(config: SVDUNetConfig) -> list[Entry]:
     """Return one entry per tensor of the reference."""
     return [
-        Entry(_theirs(path), path, turn(path, s)) for path, s in svd_shapes.unet(config).items()
+        Entry(_unet_name(path), path, _transform(path, s))
+        for path, s in unet.layout(config).items()
     ]
 
 
-def turn(path: str, shape: tuple[int, ...]) -> Turn:
+def _transform(path: str, shape: tuple[int, ...]) -> Transform:
     """Return the change of layout of a leaf."""
     if not path.endswith("/kernel"):
         return SAME
@@ -138,7 +143,7 @@ RULES = (
     (r"to_out/", "to_out.0/"),
 )
 """Parts of our paths and the reference's names, shared with the autoencoder."""
-_RULES = (
+_UNET_RULES = (
     (r"\bspatial_(\d+)/", r"transformer_blocks.\1."),
     (r"\btemporal_(\d+)/", r"temporal_transformer_blocks.\1."),
     (r"frame_embed/", "time_pos_embed/"),
@@ -149,15 +154,14 @@ _RULES = (
 )
 
 
-def _theirs(path: str) -> str:
+def _unet_name(path: str) -> str:
     """Turn ``up_0/resnet_1/temporal/norm1/scale`` into the reference's name."""
-    return renamed(path, (*_RULES, *RULES))
+    return renamed(path, (*_UNET_RULES, *RULES))
 
 
 def renamed(path: str, rules: tuple[tuple[str, str], ...]) -> str:
     """Apply rules to a path of ours and return the reference's name."""
-    for pattern, name in rules:
-        path = re.sub(pattern, name, path)
+    path = rename(path, rules)
     path = re.sub(r"/(kernel|scale)$", "/weight", path)
     return re.sub(r"\.+", ".", path.replace("/", "."))
 
@@ -171,3 +175,105 @@ def _numbers(given: dict[str, Any], key: str, count: int | None) -> tuple[int, .
             f"The U-Net's {key} is {value!r}; it must be a whole number or one for each level."
         )
     return tuple(values)
+
+
+VAE_CLASS = "AutoencoderKLTemporalDecoder"
+"""The reference's class."""
+BLOCK = "DownEncoderBlock2D"
+"""The only kind of block on the way down."""
+_VAE_DEFAULTS: dict[str, Any] = {
+    "in_channels": 3,
+    "out_channels": 3,
+    "latent_channels": 4,
+    "block_out_channels": [64],
+    "down_block_types": [BLOCK],
+    "layers_per_block": 1,
+    "scaling_factor": 0.18215,
+}
+"""What diffusers takes for settings that a file leaves out."""
+_VAE_WITHOUT_EFFECT = {"sample_size": 768, "force_upcast": True}
+"""Settings that the network does not read, and what is written for them."""
+_VAE_RULES = (
+    (r"^encoder/quant/", "quant_conv/"),
+    (r"time_out/", "time_conv_out/"),
+    (r"attend_(\d+)/norm/", r"attend_\1/group_norm/"),
+)
+
+
+def vae_config_from_diffusers(values: dict[str, Any]) -> SVDVAEConfig:
+    """Read the settings of ``vae/config.json``; absent ones have diffusers' defaults.
+
+    Raises:
+        UserError: another class, or a setting that is unknown or not supported.
+    """
+    given = published.read_settings(
+        values, "The VAE", VAE_CLASS, _VAE_DEFAULTS, _VAE_WITHOUT_EFFECT
+    )
+    widths = given["block_out_channels"]
+    whole = ("in_channels", "out_channels", "latent_channels", "layers_per_block")
+    for key, numbers in (*((k, [given[k]]) for k in whole), ("block_out_channels", widths)):
+        if not isinstance(numbers, list | tuple) or any(type(n) is not int for n in numbers):
+            raise UserError(f"The VAE's {key} is {given[key]!r}; it must be of whole numbers.")
+    if list(given["down_block_types"]) != [BLOCK] * len(widths):
+        raise UserError(
+            f"The VAE's down_block_types is {given['down_block_types']!r}; only one {BLOCK} per "
+            "level is known."
+        )
+    factor = given["scaling_factor"]
+    if isinstance(factor, bool) or not isinstance(factor, int | float):
+        raise UserError(f"The VAE's scaling_factor is {factor!r}; it must be a number.")
+    return SVDVAEConfig(
+        in_channels=given["in_channels"],
+        out_channels=given["out_channels"],
+        latent_channels=given["latent_channels"],
+        widths=tuple(widths),
+        resnets=given["layers_per_block"],
+        scaling_factor=float(factor),
+    )
+
+
+def vae_config_to_diffusers(config: SVDVAEConfig) -> dict[str, Any]:
+    """Write the settings of ``vae/config.json``, the inverse of reading them."""
+    return {
+        "_class_name": VAE_CLASS,
+        **_VAE_WITHOUT_EFFECT,
+        "in_channels": config.in_channels,
+        "out_channels": config.out_channels,
+        "latent_channels": config.latent_channels,
+        "block_out_channels": list(config.widths),
+        "down_block_types": [BLOCK] * len(config.widths),
+        "layers_per_block": config.resnets,
+        "scaling_factor": config.scaling_factor,
+    }
+
+
+def vae_entries(config: SVDVAEConfig) -> list[Entry]:
+    """Return one entry per tensor of the reference."""
+    return [_vae_entry(path, shape) for path, shape in vae.layout(config).items()]
+
+
+def _vae_entry(path: str, shape: tuple[int, ...]) -> Entry:
+    """Pair a leaf with the reference's tensor."""
+    quant = path == "encoder/quant/kernel"
+    change = POINTWISE if quant else _transform(path, shape)
+    return Entry(renamed(path, (*_VAE_RULES, *RULES)), path, change)
+
+
+UNET = Network(
+    "unet",
+    UNET_CLASS,
+    SVDUNetConfig,
+    unet_config_from_diffusers,
+    unet_config_to_diffusers,
+    unet_entries,
+    unet.init,
+)
+VAE = Network(
+    "vae",
+    VAE_CLASS,
+    SVDVAEConfig,
+    vae_config_from_diffusers,
+    vae_config_to_diffusers,
+    vae_entries,
+    vae.init,
+)

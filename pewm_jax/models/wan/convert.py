@@ -1,4 +1,4 @@
-"""The settings and tensor names of Wan's autoencoder, and ours.
+"""Wan's autoencoder in diffusers: its settings and tensor names, theirs and ours.
 
 Reference: ``AutoencoderKLWan`` of diffusers, in the form of Wan 2.1 (that of Wan 2.2 has other
 blocks and is refused).
@@ -12,19 +12,27 @@ from typing import Any
 
 from pewm_jax.config import UserError, WanVAEConfig
 from pewm_jax.config.wan_vae import MEAN_16, STD_16
-from pewm_jax.convert import settings
-from pewm_jax.convert.mapping import CONV, SAME, Entry, Turn
-from pewm_jax.convert.svd_unet import POINTWISE, TIME_CONV
-from pewm_jax.models.wan import vae as wan_vae
+from pewm_jax.io import published
+from pewm_jax.io.published import (
+    CONV,
+    POINTWISE,
+    SAME,
+    TIME_CONV,
+    Entry,
+    Network,
+    Transform,
+    rename,
+)
+from pewm_jax.models.wan import vae
 
 CLASS = "AutoencoderKLWan"
 """The reference's class."""
 WHAT = "The VAE"
-GAMMA_3D = Turn(lambda x: x[:, 0, 0, 0], lambda x: x[:, None, None, None])
+GAMMA_3D = Transform(lambda x: x[:, 0, 0, 0], lambda x: x[:, None, None, None])
 """torch (C, 1, 1, 1) ↔ ours (C,)."""
-GAMMA_2D = Turn(lambda x: x[:, 0, 0], lambda x: x[:, None, None])
+GAMMA_2D = Transform(lambda x: x[:, 0, 0], lambda x: x[:, None, None])
 """torch (C, 1, 1) ↔ ours (C,)."""
-POINTWISE_3D = Turn(lambda x: x[:, :, 0, 0, 0].T, lambda x: x.T[:, :, None, None, None])
+POINTWISE_3D = Transform(lambda x: x[:, :, 0, 0, 0].T, lambda x: x.T[:, :, None, None, None])
 """torch (out, in, 1, 1, 1) ↔ ours (in, out)."""
 _DEFAULTS: dict[str, Any] = {
     "base_dim": 96,
@@ -52,9 +60,9 @@ def config_from_diffusers(values: Mapping[str, Any]) -> WanVAEConfig:
         UserError: another class, or a setting that is unknown or not supported.
     """
     defaults = {**_DEFAULTS, **_BASE, **_ONLY}
-    given = settings.of_network(values, WHAT, CLASS, defaults, _WITHOUT_EFFECT)
-    settings.require_only(given, WHAT, _ONLY)
-    settings.require_like(given, WHAT, _DEFAULTS)
+    given = published.read_settings(values, WHAT, CLASS, defaults, _WITHOUT_EFFECT)
+    published.require_only(given, WHAT, _ONLY)
+    published.require_kinds(given, WHAT, _DEFAULTS)
     decoder = given["decoder_base_dim"]
     if decoder is not None and type(decoder) is not int:
         raise UserError(f"{WHAT}'s decoder_base_dim is {decoder!r}; it must be a whole number.")
@@ -100,12 +108,12 @@ def config_to_diffusers(config: WanVAEConfig) -> dict[str, Any]:
 def entries(config: WanVAEConfig) -> list[Entry]:
     """Return one entry per tensor of the reference."""
     return [
-        Entry(_theirs(config, path), path, _turn(path, shape))
-        for path, shape in wan_vae.layout(config).items()
+        Entry(_name(config, path), path, _transform(path, shape))
+        for path, shape in vae.layout(config).items()
     ]
 
 
-def _turn(path: str, shape: tuple[int, ...]) -> Turn:
+def _transform(path: str, shape: tuple[int, ...]) -> Transform:
     """Return the change of layout of a leaf."""
     attends = "/attend_0/" in path
     if path.endswith("/scale"):
@@ -117,7 +125,7 @@ def _turn(path: str, shape: tuple[int, ...]) -> Turn:
     return TIME_CONV if len(shape) == 3 else CONV
 
 
-def _theirs(config: WanVAEConfig, path: str) -> str:
+def _name(config: WanVAEConfig, path: str) -> str:
     """Turn ``encoder/down_1/resnet_0/conv1/kernel`` into the reference's name.
 
     On the way down it numbers the blocks of all levels in one row.
@@ -145,6 +153,9 @@ def _theirs(config: WanVAEConfig, path: str) -> str:
         (r"/scale$", "/gamma"),
         (r"/", "."),
     )
-    for pattern, name in rules:
-        path = re.sub(pattern, name, path)
-    return path
+    return rename(path, rules)
+
+
+VAE = Network(
+    "vae", CLASS, WanVAEConfig, config_from_diffusers, config_to_diffusers, entries, vae.init
+)

@@ -1,0 +1,388 @@
+"""Convert a checkpoint: read, map names by the family's table, change layouts, check, write.
+
+A family's table of names is a ``Network`` in ``models/<family>/convert.py``. ``read`` brings a
+published network into our parameter tree and ``write`` brings it back, tensor by tensor and
+strictly: every tensor must be there, be of the right shape and be used. What is expected follows
+from the table and the abstract tree alone, before any weight is read, so a wrong name or shape
+costs no time and no memory. ``write_world`` writes a world model's folder part by part, so that one
+network is in memory at a time. Folders are made whole or not at all (``output.new_folder``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax import config as configuration
+from pewm_jax.config import Config, UserError
+from pewm_jax.controls import interface as controls
+from pewm_jax.convert import output
+from pewm_jax.io import sources, tensor_files, tree
+from pewm_jax.io.published import Entry, Network
+from pewm_jax.io.sources import Renamed, Source
+from pewm_jax.types import Array, Params
+
+WEIGHTS = "weights.safetensors"
+CONFIG = "config.json"
+FLOATS = ("float32", "bfloat16", "float16")
+"""The dtypes weights can be converted to, by name."""
+STORED = (*FLOATS, "float64")
+"""The dtypes weights may come in; a table that a network has computed can be float64."""
+Specs = dict[str, jax.ShapeDtypeStruct]
+"""Shape and dtype of every leaf, by path."""
+Part = tuple[Specs, Callable[[], Params]]
+"""What a part's parameters are like, and the function that reads or makes them."""
+
+_LISTED = 200
+"""Most names that a message lists: whoever wrote the file needs all of them."""
+
+
+def read(network: Network, folder: str | Path, dtype: str | None = None) -> tuple[Any, Params]:
+    """Read a published network.
+
+    Args:
+        network: which, from ``models.<family>.convert``.
+        folder: a pipeline's folder, or the network's folder in it.
+        dtype: of the parameters, ``float32``, ``bfloat16`` or ``float16``; by default the stored
+            one.
+
+    Returns:
+        ``(config, params)``, NumPy arrays.
+
+    Raises:
+        UserError: a tensor that is missing, left over or of another shape, a damaged file, a
+            class or setting that is not known.
+    """
+    config, files = _open(network, Path(folder))
+    total = sum(place.size for _, place in files.places.values())
+    with output.megabytes(f"read {network.folder}", total) as progress:
+        source = _used(network, files)
+        like = network.like(config)
+        return config, read_tensors(network.entries(config), source, like, dtype, progress)
+
+
+def read_config(network: Network, folder: str | Path) -> Any:
+    """Read the settings of a published network; see ``read``."""
+    path = sources.component(Path(folder), network.folder) / CONFIG
+    return network.config(published_config(network, Path(folder)), str(path))
+
+
+def published_config(network: Network, folder: Path) -> dict[str, Any]:
+    """Read the settings of a network as they were published, and insist on its class."""
+    path = sources.component(folder, network.folder) / CONFIG
+    return sources.read_config(path, [network.class_name], network.class_key)
+
+
+def specs(network: Network, folder: Path, dtype: str | None = None) -> Specs:
+    """Return shape and dtype of every leaf that ``read`` will give, by path; check the files."""
+    config, files = _open(network, folder)
+    entries, like, source = network.entries(config), network.like(config), _used(network, files)
+    require(entries, source, like)
+    return leaf_specs(entries, source, like, dtype)
+
+
+def part(network: Network, folder: Path, dtype: str | None = None) -> Part:
+    """Return a published network as a part of a world model, to be read when it is written."""
+    return specs(network, folder, dtype), lambda: read(network, folder, dtype)[1]
+
+
+def write(
+    network: Network, config: Any, params: Params, folder: str | Path, dtype: str | None = None
+) -> None:
+    """Write a network as the library that published it reads it; the inverse of ``read``.
+
+    Settings that only change how the network is computed are not part of it.
+
+    Args:
+        network: which.
+        config: our settings.
+        params: our parameters.
+        folder: to make.
+        dtype: of the tensors; by default that of the parameters.
+
+    Raises:
+        UserError: the folder exists.
+    """
+    values = network.write_config(config)
+    with output.new_folder(Path(folder)) as whole:
+        write_published(network, values, params, whole, dtype)
+
+
+def write_published(
+    network: Network,
+    values: dict[str, Any],
+    params: Params,
+    folder: Path,
+    dtype: str | None = None,
+) -> None:
+    """Write settings as they were published, and weights, into a folder.
+
+    Args:
+        network: which.
+        values: its settings as they were published.
+        params: our parameters.
+        folder: to make, or an empty one.
+        dtype: of the tensors; by default that of the parameters.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    output.write_json(folder / CONFIG, values)
+    entries = network.entries(network.config(values, "base.json"))
+    announced = published_specs(entries, params, dtype)
+    tensors = write_tensors(entries, params, dtype)
+    path = folder / network.weights_file
+    with output.megabytes(f"write {network.folder}", tensor_files.size(announced)) as progress:
+        tensor_files.write(path, announced, tensors, {"format": "pt"}, progress)
+
+
+def _open(network: Network, folder: Path) -> tuple[Any, sources.Files]:
+    """Return the settings and the files of a network, no weight read yet."""
+    config = read_config(network, folder)
+    return config, sources.open_folder(sources.component(folder, network.folder))
+
+
+def _used(network: Network, files: sources.Files) -> Source:
+    """Return the tensors without those that no network reads."""
+    if not network.unused:
+        return files
+    return Renamed(files, {n: (n, 0, 1) for n in files.names() if n not in network.unused})
+
+
+def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...]]:
+    """Return the published names and shapes that the entries ask for, nothing allocated.
+
+    Args:
+        entries: the converter's table.
+        like: our tree, abstract (``jax.eval_shape``) or not.
+
+    Raises:
+        ValueError: the table and the tree do not fit: a leaf (or a layer of one) without an
+            entry, or an entry without a leaf.
+    """
+    leaves = tree.flatten(like)
+    layers: dict[str, list[int | None]] = defaultdict(list)
+    shapes: dict[str, tuple[int, ...]] = {}
+    for entry in entries:
+        if entry.path not in leaves or entry.name in shapes:
+            raise ValueError(f"the entry of {entry.name} leads to {entry.path}: none or twice")
+        layers[entry.path].append(entry.layer)
+        shape = tuple(leaves[entry.path].shape)
+        inner = shape if entry.layer is None else shape[1:]
+        shapes[entry.name] = np.shape(entry.transform.write(np.broadcast_to(np.int8(0), inner)))
+    for path, leaf in leaves.items():
+        filled = layers[path]
+        whole = filled == [None] or sorted(x for x in filled if x is not None) == list(
+            range(leaf.shape[0] if leaf.ndim else 0)
+        )
+        if not filled or not whole:
+            raise ValueError(f"{path} is not filled by the entries (layers {filled})")
+    return shapes
+
+
+def require(entries: Sequence[Entry], source: Source, like: Params) -> None:
+    """Insist that a source holds exactly the tensors that the entries name, of the right shapes.
+
+    Raises:
+        UserError: with the list of tensors that are missing, left over or of another shape.
+    """
+    want = expected(entries, like)
+    have = set(source.names())
+    missing, unused = want.keys() - have, have - want.keys()
+    if missing or unused:
+        parts = [f"lacks {len(missing)} tensors ({tree.listing(missing, _LISTED)})"] * bool(missing)
+        parts += [f"has {len(unused)} tensors of no use ({tree.listing(unused, _LISTED)})"] * bool(
+            unused
+        )
+        raise UserError(
+            f"{source.where} does not fit its config.json: it {' and '.join(parts)}; are they of "
+            "the same network?"
+        )
+    wrong = [
+        f"{name} {source.shape(name)} instead of {shape}"
+        for name, shape in want.items()
+        if source.shape(name) != shape
+    ]
+    if wrong:
+        raise UserError(
+            f"{source.where} holds tensors of other shapes than its config.json says: "
+            f"{tree.listing(wrong)}; are they of the same network?"
+        )
+    other = [f"{n} {source.dtype(n)}" for n in want if source.dtype(n).name not in STORED]
+    if other:
+        raise UserError(
+            f"{source.where} holds {tree.listing(other)}: weights of {', '.join(STORED)} can be "
+            "read; save it in one of these."
+        )
+
+
+def read_tensors(
+    entries: Sequence[Entry],
+    source: Source,
+    like: Params,
+    dtype: str | None = None,
+    progress: Callable[[int], None] = lambda _: None,
+) -> Params:
+    """Read published tensors into our tree, one by one into leaves allocated beforehand.
+
+    Memory: the tree, and one tensor.
+
+    Args:
+        entries: the converter's table.
+        source: the published tensors.
+        like: our tree, abstract (``jax.eval_shape``) or not: paths and shapes.
+        dtype: of the result, one of ``FLOATS``; by default the stored one (of several in one
+            leaf, the dtype that holds them all).
+        progress: called after every tensor with the bytes just read.
+
+    Returns:
+        Nested dictionaries of NumPy arrays.
+
+    Raises:
+        UserError: names or shapes do not fit, a damaged file, or a value too large for float16.
+    """
+    require(entries, source, like)
+    announced = leaf_specs(entries, source, like, dtype)
+    leaves = {path: np.empty(spec.shape, spec.dtype) for path, spec in announced.items()}
+    for entry in entries:
+        tensor = source.read(entry.name)
+        place = leaves[entry.path] if entry.layer is None else leaves[entry.path][entry.layer]
+        _cast(entry.transform.read(tensor), place, f"{source.where}: {entry.name}")
+        progress(tensor.nbytes)
+        del tensor  # before the next one is read
+    return tree.unflatten(leaves)
+
+
+def leaf_specs(
+    entries: Sequence[Entry], source: Source, like: Params, dtype: str | None = None
+) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return the shape and dtype of every leaf that ``read_tensors`` will give, by path."""
+    stored: dict[str, set[np.dtype]] = defaultdict(set)
+    for entry in entries:
+        stored[entry.path].add(source.dtype(entry.name))
+    target = None if dtype is None else _dtype(dtype)
+    return {
+        path: jax.ShapeDtypeStruct(leaf.shape, target or _common(stored[path]))
+        for path, leaf in tree.flatten(like).items()
+    }
+
+
+def write_tensors(
+    entries: Sequence[Entry], params: Params, dtype: str | None = None
+) -> Iterator[tuple[str, Array]]:
+    """Yield the published tensors of our tree, one by one: the inverse of ``read_tensors``.
+
+    Args:
+        entries: the converter's table.
+        params: our tree, NumPy or JAX arrays.
+        dtype: of the tensors; by default that of the leaves.
+
+    Raises:
+        UserError: a value too large for float16.
+        ValueError: the tree and the table do not fit.
+    """
+    expected(entries, params)
+    leaves = tree.flatten(params)
+    for entry in entries:
+        leaf = leaves[entry.path]
+        tensor = np.asarray(jax.device_get(leaf if entry.layer is None else leaf[entry.layer]))
+        if dtype is not None and tensor.dtype != _dtype(dtype):
+            out = np.empty(tensor.shape, _dtype(dtype))
+            _cast(tensor, out, entry.path)
+            tensor = out
+        yield entry.name, np.ascontiguousarray(entry.transform.write(tensor))
+
+
+def published_specs(
+    entries: Sequence[Entry], params: Params, dtype: str | None = None
+) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return the names, shapes and dtypes of what ``write_tensors`` will yield."""
+    shapes, leaves = expected(entries, params), tree.flatten(params)
+    return {
+        entry.name: jax.ShapeDtypeStruct(
+            shapes[entry.name], leaves[entry.path].dtype if dtype is None else _dtype(dtype)
+        )
+        for entry in entries
+    }
+
+
+def _common(dtypes: set[np.dtype]) -> np.dtype:
+    """Return the dtype that holds values of all of them."""
+    if len(dtypes) == 1:
+        return next(iter(dtypes))
+    return max(np.dtype(np.float32), *dtypes, key=lambda dtype: dtype.itemsize)
+
+
+def _dtype(name: str) -> np.dtype:
+    if name not in FLOATS:
+        raise UserError(f"There is no dtype {name!r} for weights; there is {', '.join(FLOATS)}.")
+    return np.dtype(jax.numpy.dtype(name))
+
+
+def _cast(tensor: np.ndarray, out: np.ndarray, where: str) -> None:
+    """Write a tensor into ``out`` in out's dtype, and refuse what float16 cannot hold."""
+    narrow = out.dtype == np.float16 and tensor.dtype != np.float16
+    with np.errstate(over="ignore") if narrow else contextlib.nullcontext():
+        out[...] = tensor
+    if narrow and not np.isfinite(out).all():
+        raise UserError(
+            f"{where} holds values beyond float16's 65504; use --dtype bfloat16 or float32."
+        )
+
+
+def write_world(
+    dst: Path,
+    config: Config,
+    parts: Mapping[str, Part],
+    more: Mapping[str, Mapping[str, Any]] | None = None,
+) -> None:
+    """Write a world model's ``config.json`` and ``weights.safetensors``, whole or not at all.
+
+    Args:
+        dst: the folder to make.
+        config: the settings.
+        parts: by the names that parameters have in a world model.
+        more: further JSON files by name.
+
+    Raises:
+        UserError: ``dst`` exists.
+    """
+    specs = {f"{part}/{p}": spec for part, (like, _) in parts.items() for p, spec in like.items()}
+
+    def tensors() -> Iterator[tuple[str, Array]]:
+        for part, (_, make) in parts.items():
+            for path, leaf in tree.flatten({part: make()}).items():
+                yield path, np.asarray(leaf).astype(specs[path].dtype, copy=False)
+
+    with output.new_folder(dst) as folder:
+        header = tensor_files.header({"stage": "0"})
+        with output.megabytes(f"write {dst.name}", tensor_files.size(specs)) as progress:
+            tensor_files.write(folder / WEIGHTS, specs, tensors(), header, progress)
+        configuration.save(config, folder / CONFIG)
+        for name, values in (more or {}).items():
+            output.write_json(folder / name, values)
+
+
+def fresh_actions(config: Config, dtype: str | None) -> Part:
+    """Return fresh layers for the control's actions, which change nothing yet.
+
+    Args:
+        config: the settings.
+        dtype: of the weights; by default float32.
+    """
+
+    def make() -> Params:
+        return jax.jit(controls.init, static_argnums=0)(config.model, jax.random.key(0))
+
+    return cast_specs(jax.eval_shape(make), dtype), make
+
+
+def cast_specs(params: Params, dtype: str | None) -> Specs:
+    """Return what parameters are like in another dtype, by default float32."""
+    new = np.dtype(jax.numpy.dtype(dtype or "float32"))
+    flat = tree.flatten(params)
+    return {path: jax.ShapeDtypeStruct(leaf.shape, new) for path, leaf in flat.items()}

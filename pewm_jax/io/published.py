@@ -1,0 +1,218 @@
+"""Published checkpoints: which tensor goes where, and strict reading of their settings.
+
+Each network that can be converted has a ``Network`` in ``models/<family>/convert.py``. Its table is
+a list of ``Entry``: one per published tensor, with the path of our leaf and the transform between
+the two layouts. The same table reads (published → ours), writes (ours → published), and says which
+names and shapes are expected before any weight is read. ``convert.pipeline`` does the work.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from pewm_jax.errors import UserError
+from pewm_jax.types import Array, Params
+
+
+@dataclasses.dataclass(frozen=True)
+class Transform:
+    """A change of a tensor's layout and its inverse; both are views or permutations.
+
+    Attributes:
+        read: published tensor → our layout.
+        write: our layout → published tensor.
+    """
+
+    read: Callable[[Array], Array]
+    write: Callable[[Array], Array]
+
+
+SAME = Transform(lambda x: x, lambda x: x)
+"""Biases, scales, embeddings: no change."""
+LINEAR = Transform(lambda x: x.T, lambda x: x.T)
+"""torch (out, in) ↔ ours (in, out)."""
+CONV = Transform(
+    lambda x: np.moveaxis(x, (0, 1), (-1, -2)),
+    lambda x: np.moveaxis(x, (-1, -2), (0, 1)),
+)
+"""torch (out, in, k…) ↔ ours (k…, in, out), any number of spatial axes."""
+TIME_CONV = Transform(
+    lambda x: np.moveaxis(x[:, :, :, 0, 0], (0, 1), (2, 1)),
+    lambda x: np.moveaxis(x, (2, 1), (0, 1))[:, :, :, None, None],
+)
+"""torch (out, in, 3, 1, 1) ↔ ours (3, in, out)."""
+POINTWISE = Transform(lambda x: x[:, :, 0, 0].T, lambda x: x.T[:, :, None, None])
+"""torch (out, in, 1, 1) ↔ ours (in, out)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """One published tensor.
+
+    Attributes:
+        name: its name in the published file.
+        path: our leaf, keys joined by slashes (see ``pewm_jax.io.tree``).
+        transform: the change of layout.
+        layer: position on the leading axis of our leaf where layers are stacked, else None.
+    """
+
+    name: str
+    path: str
+    transform: Transform = SAME
+    layer: int | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    """How a network stands in published checkpoints.
+
+    Attributes:
+        folder: its folder in a pipeline, theirs and ours.
+        class_name: its class in the library that published it.
+        config_class: our configuration's class.
+        read_config: ``(values of config.json) -> config``.
+        write_config: the inverse.
+        entries: ``(config) -> table``.
+        init: ``(config, key) -> params``.
+        unused: published tensors that no network reads, left out without complaint.
+        class_key: the setting of config.json that names the class.
+        weights_file: the file of weights that is written.
+    """
+
+    folder: str
+    class_name: str
+    config_class: type
+    read_config: Callable[[dict[str, Any]], Any]
+    write_config: Callable[[Any], dict[str, Any]]
+    entries: Callable[[Any], Sequence[Entry]]
+    init: Callable[[Any, Array], Params]
+    unused: Collection[str] = ()
+    class_key: str = "_class_name"
+    weights_file: str = "diffusion_pytorch_model.safetensors"
+
+    def like(self, config: Any) -> Params:
+        """Return the abstract parameters, nothing allocated."""
+        return jax.eval_shape(lambda key: self.init(config, key), jax.random.key(0))
+
+    def config(self, values: dict[str, Any], where: str) -> Any:
+        """Read the published settings.
+
+        Args:
+            values: the JSON object.
+            where: the file, for messages.
+
+        Raises:
+            UserError: a setting is unknown or unsupported.
+        """
+        try:
+            return self.read_config(values)
+        except UserError as error:
+            raise UserError(f"{where}: {error}") from None
+
+
+def rename(path: str, rules: Sequence[tuple[str, Any]]) -> str:
+    """Apply regular expressions to a path, one after the other."""
+    for pattern, name in rules:
+        path = re.sub(pattern, name, path)
+    return path
+
+
+def require_class(values: Mapping[str, Any], what: str, name: str) -> None:
+    """Insist that settings name a class, or none.
+
+    Args:
+        values: the JSON object.
+        what: what they describe, for the message: ``The U-Net``.
+        name: the class that can be read.
+
+    Raises:
+        UserError: another class.
+    """
+    kind = values.get("_class_name", name)
+    if kind != name:
+        raise UserError(f"{what} is a {kind}; only {name} can be read.")
+
+
+def require_known(values: Mapping[str, Any], what: str, known: Collection[str]) -> None:
+    """Insist that every setting is known; those that begin with ``_`` are the writer's own notes.
+
+    Raises:
+        UserError: with the list of those that are not.
+    """
+    unknown = sorted(key for key in values if not key.startswith("_") and key not in known)
+    if unknown:
+        raise UserError(
+            f"{what} has settings that are not known: {', '.join(unknown)}; known are "
+            f"{', '.join(sorted(known))}."
+        )
+
+
+def read_settings(
+    values: Mapping[str, Any],
+    what: str,
+    name: str,
+    defaults: Mapping[str, Any],
+    without_effect: Collection[str] = (),
+) -> dict[str, Any]:
+    """Return the settings of a network of one class; absent ones have the class's defaults.
+
+    Args:
+        values: the JSON object.
+        what: what they describe, for messages.
+        name: the class that can be read.
+        defaults: the settings that matter, and what the class takes for absent ones.
+        without_effect: settings that may stand there and change nothing.
+
+    Raises:
+        UserError: another class, or a setting that is not known.
+    """
+    require_class(values, what, name)
+    require_known(values, what, {*defaults, *without_effect})
+    return {key: values.get(key, default) for key, default in defaults.items()}
+
+
+def require_only(given: Mapping[str, Any], what: str, only: Mapping[str, Any]) -> None:
+    """Insist on the values of settings of which only one is supported.
+
+    Raises:
+        UserError: another value.
+    """
+    for key, value in only.items():
+        if _plain(given.get(key, value)) != _plain(value):
+            raise UserError(f"{what}'s {key} is {given[key]!r}; only {value!r} is supported.")
+
+
+def require_kinds(given: Mapping[str, Any], what: str, examples: Mapping[str, Any]) -> None:
+    """Insist that settings are of the kinds of examples.
+
+    A whole number will do for a number; a list must be as long as a tuple in the examples, and of
+    any length for a list.
+
+    Raises:
+        UserError: a setting of another kind.
+    """
+    for key, example in examples.items():
+        if not _alike(given[key], example):
+            raise UserError(
+                f"{what}'s {key} is {given[key]!r}; one like {example!r} belongs there."
+            )
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _alike(value: Any, example: Any) -> bool:
+    if isinstance(example, tuple | list):
+        fits = isinstance(value, tuple | list)
+        fits = fits and (isinstance(example, list) or len(value) == len(example))
+        return fits and all(_alike(item, example[0]) for item in value)
+    if isinstance(example, float):
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is type(example)
