@@ -12,7 +12,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import AttentionConfig, CameraConfig, ModelConfig
 from pewm_jax.models.interface import Readers
-from pewm_jax.nn import layers, modules
+from pewm_jax.nn import modules
 from pewm_jax.nn.costs import (
     FLOAT,
     SPLIT,
@@ -67,15 +67,15 @@ def _ray_channels(model: ModelConfig) -> int:
     return CameraConfig().channels(model) * places.patch**2 * places.patch_t
 
 
-def _embeddings(model: ModelConfig) -> tuple[layers.nn.Dense, layers.nn.Dense]:
+def _embeddings(model: ModelConfig) -> tuple[modules.nn.Dense, modules.nn.Dense]:
     """Return the linear layers that embed rays (one vector per video token) and map tokens."""
     dtype = jnp.dtype(model.dtype)
     camera = modules.dense(model.backbone.places.width // 2, dtype, "camera")
     # A layer norm follows, which would discard the magnitude of the features. A random bias of
     # unit variance keeps it visible.
-    constant = layers.nn.initializers.normal(1.0)
+    constant = modules.nn.initializers.normal(1.0)
     width = _settings(model).width
-    tokens = layers.nn.Dense(width, dtype=dtype, bias_init=constant, name="tokens")
+    tokens = modules.nn.Dense(width, dtype=dtype, bias_init=constant, name="tokens")
     return camera, tokens
 
 

@@ -25,7 +25,7 @@ from pewm_jax.codecs.pixel import fold
 from pewm_jax.codecs.signals import signal_from_depth
 from pewm_jax.config import ModelConfig, RenderConfig
 from pewm_jax.models.interface import Readers
-from pewm_jax.nn import layers, modules
+from pewm_jax.nn import modules
 from pewm_jax.nn.costs import SPLIT, Costs, Product, Share, text_tokens, video_times, video_tokens
 from pewm_jax.nn.tokens import TokenLayout, patchify
 from pewm_jax.readers.render_block import RenderBlock
@@ -76,7 +76,7 @@ def token_channels(model: ModelConfig) -> int:
     return cell_channels(model) * places.patch_t * places.patch**2
 
 
-def _embeddings(model: ModelConfig) -> dict[str, layers.nn.Dense]:
+def _embeddings(model: ModelConfig) -> dict[str, modules.nn.Dense]:
     """Return the linear layers on the way from pictures to tokens, by name."""
     config, dtype = _settings(model), jnp.dtype(model.dtype)
     found = {"embed_1": config.picture_width, "embed_2": config.picture_width}

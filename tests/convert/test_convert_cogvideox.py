@@ -21,10 +21,10 @@ from transformers import AutoTokenizer, T5EncoderModel
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import presets
+from pewm_jax import presets, registry
 from pewm_jax.cli.convert import main
 from pewm_jax.config import published
-from pewm_jax.convert import cogvideox, cogvideox_world, pipeline, widen
+from pewm_jax.convert import cogvideox, cogvideox_world, pipeline, schedulers, widen
 from pewm_jax.io import sources, tensor_files, weights
 from pewm_jax.io.published import LINEAR, Entry
 from pewm_jax.models.cogvideox import model as dit
@@ -210,7 +210,7 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     )
     vae = cogvideox.VAE.config(dict(pipelines.vae().config), "vae")
     config = cogvideox_world.config_of(
-        old, vae, cogvideox.scheduler.config_from_diffusers(
+        old, vae, schedulers.cogvideox_from_diffusers(
             {"_class_name": "CogVideoXDDIMScheduler", **pipelines.SCHEDULER}
         ), (9, 32, 32), "float32",
     )  # fmt: skip
@@ -298,7 +298,7 @@ def test_an_imported_checkpoint_starts_from_the_preset_of_its_size(variant, bill
     assert without(made.model, "memory", "backbone") == without(preset.model, "memory", "backbone")
     assert without(made.model.backbone, "prompt") == without(preset.model.backbone, "prompt")
     assert without(made.model.memory, "encoder") == without(preset.model.memory, "encoder")
-    assert configuration.kinds.of(made.model.memory.encoder).name == "patch_colours"
+    assert registry.of(made.model.memory.encoder).name == "patch_colours"
     encoder = preset.model.memory.encoder
     made = cogvideox_world.config_of(
         backbone, codec, noise, (None,) * 3, "bfloat16", encoder=encoder

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from diffusers.pipelines.stable_video_diffusion import (
-    pipeline_stable_video_diffusion as reference_pipeline,
+    pipeline_stable_video_diffusion as svd_pipeline,
 )
 from safetensors.numpy import load_file, save_file
 from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
@@ -86,7 +86,7 @@ def test_the_published_size_has_the_reference_s_tensors():
 @pytest.mark.parametrize("size", [(90, 61), (224, 40), (30, 224), (7, 20)], ids=str)
 def test_images_are_prepared_as_by_the_pipeline(size):
     rgb = np.random.default_rng(0).uniform(-1, 1, (2, *size, 3)).astype(np.float32)
-    resized = reference_pipeline._resize_with_antialiasing(
+    resized = svd_pipeline._resize_with_antialiasing(
         torch.tensor(rgb).permute(0, 3, 1, 2), (28, 28)
     )
     processor = CLIPImageProcessor()
