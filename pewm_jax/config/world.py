@@ -230,7 +230,7 @@ class World(Task):
 
         Args:
             params: the parameters.
-            frames: colours uint8, or float32 in [−1, 1] (``nn.signals.as_signal`` converts them);
+            frames: colours uint8, or float32 in [−1, 1] (``codecs.signals.as_signal`` converts them);
                 depth in metres.
 
         Returns:

@@ -81,7 +81,7 @@ def load(name: str, weights: str | Path | None = None) -> Metric:
     Args:
         name: one of ``NAMES``.
         weights: a file of weights for a metric that is a network (``models.lpips_weights`` and
-            ``models.i3d_weights`` say of which kinds; for ``src`` a folder of DINOv2); by default
+            ``models.i3d.convert`` say of which kinds; for ``src`` a folder of DINOv2); by default
             those of the installed package.
 
     Raises:

@@ -57,7 +57,7 @@ def _distances(params: Params, a_BTHWC: Array, b_BTHWC: Array) -> Array:
 
 
 def read(folder: str | Path | None) -> DreamSim:
-    """Read DreamSim from a folder; see ``models.dreamsim_weights``.
+    """Read DreamSim from a folder; see ``models.dreamsim.convert``.
 
     Raises:
         UserError: none is named, or it is absent or damaged.

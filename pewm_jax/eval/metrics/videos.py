@@ -160,7 +160,7 @@ def read(path: Path, kind: Kind) -> VideoDistance:
     """Read FVD or KVD from a file with the weights of I3D.
 
     Raises:
-        UserError: see ``models.i3d_weights.read``.
+        UserError: see ``models.i3d.convert.read``.
     """
     params = i3d_weights.read(path)
     with path.open("rb") as file:

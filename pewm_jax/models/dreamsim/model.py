@@ -4,7 +4,7 @@ Three vision transformers (DINO, CLIP and OpenCLIP, ViT-B/16 each), adapted to p
 see both pictures; the distance is one minus the cosine between their joined, centred features. The
 reference is ``dreamsim`` 0.2, kind ``ensemble``: of DINO the class token of the last block, before
 the last norm; of both CLIPs the embedding. Its weights come with no package: see
-``models.dreamsim_weights``.
+``models.dreamsim.convert``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def distance(params: Params, a_BHWC: Array, b_BHWC: Array) -> Array:
     """Return DreamSim's distances, (B,) float32; 0 for equal pictures, lower is better.
 
     Args:
-        params: from ``dreamsim_weights.read``: a vision transformer for each encoder.
+        params: from ``convert.read``: a vision transformer for each encoder.
         a_BHWC: (B, H, W, 3) colours in [0, 1]; resized as ``resized`` says.
         b_BHWC: the same shape.
     """

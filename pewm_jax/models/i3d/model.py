@@ -4,7 +4,7 @@ Inception-v1 with its kernels inflated to three dimensions (Carreira and Zisserm
 Kinetics-400. Its 400 logits, averaged over time, are the features of FVD (Unterthiner et al. 2018).
 The references are ``i3d.py`` of deepmind/kinetics-i3d and its port piergiovanni/pytorch-i3d. Zeros
 and windows lie as TensorFlow lays them ("same": the odd one at the end). Batch norms become part of
-kernels and biases where the weights are read (``models.i3d_weights``).
+kernels and biases where the weights are read (``models.i3d.convert``).
 
 Pictures are resized to 224 × 224 linearly **with antialiasing**, whole, whatever their shape. The
 first implementation of FVD resized without antialiasing, which is another measure for pictures that
