@@ -230,8 +230,8 @@ class World(Task):
 
         Args:
             params: the parameters.
-            frames: colours uint8, or float32 in [−1, 1] (``codecs.signals.as_signal`` converts them);
-                depth in metres.
+            frames: colours uint8, or float32 in [−1, 1] (``codecs.signals.as_signal`` converts
+                them); depth in metres.
 
         Returns:
             The present frame (1, H, W, …), colours float32, with any pytree as its memory.
