@@ -144,14 +144,18 @@ def given_weights(config: Config, stage: Stage, mesh: Mesh) -> Params | None:
     return sharding.place(given, like)
 
 
-def lower_step(config: Config, stage: Stage, mesh: Mesh, clip: Any) -> jax.stages.Lowered:
-    """Trace ``train_step`` for one batch shape; arguments as for ``compile_step``."""
-    return _lower(config, stage, mesh, clip, given_weights(config, stage, mesh))
+def trace_step(
+    config: Config, stage: Stage, mesh: Mesh, clip: Any, given: Params | None = None
+) -> jax.stages.Traced:
+    """Trace ``train_step`` for one batch shape; it can be lowered and its jaxpr read.
 
-
-def _lower(
-    config: Config, stage: Stage, mesh: Mesh, clip: Any, given: Params | None
-) -> jax.stages.Lowered:
+    Args:
+        config: the experiment.
+        stage: what is trained.
+        mesh: the devices.
+        clip: a batch, or the shapes of one.
+        given: from ``given_weights``.
+    """
     state = abstract_state(config, stage, mesh)
     everywhere = sharding.replicated(mesh)
     placed = jax.tree.map(lambda leaf: leaf.sharding, state)
@@ -167,7 +171,12 @@ def _lower(
     )
     abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
     with jax.set_mesh(mesh):  # which ``models.placement`` asks for
-        return step.lower(state, batch, abstract_key, *extra)
+        return step.trace(state, batch, abstract_key, *extra)
+
+
+def lower_step(config: Config, stage: Stage, mesh: Mesh, clip: Any) -> jax.stages.Lowered:
+    """Trace and lower ``train_step`` for one batch shape; arguments as for ``compile_step``."""
+    return trace_step(config, stage, mesh, clip, given_weights(config, stage, mesh)).lower()
 
 
 def compile_step(
@@ -186,7 +195,7 @@ def compile_step(
         (its buffers are donated) and wants clip and key placed as ``sharding`` says.
     """
     given = given_weights(config, stage, mesh)
-    compiled = _lower(config, stage, mesh, clip, given).compile()
+    compiled = trace_step(config, stage, mesh, clip, given).lower().compile()
     if given is None:
         return compiled
     return lambda state, clip, key: compiled(state, clip, key, given)
