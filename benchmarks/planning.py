@@ -20,7 +20,7 @@ from record import machine, record, table
 
 import pewm_jax
 from pewm_jax import worlds
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.data.collect import CollectConfig
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import make_episode
@@ -92,10 +92,10 @@ def parts(model, params, state, actions_KN, key) -> dict[str, Clock]:
         return jax.vmap(one)(conditioning, batched, keys)[:, 0]
 
     def decode(params, latents, sight):
-        rgb, depth = codecs.decode_rgbd(model, params, latents[:, -1:])
+        rgb, depth = rgbd.decode_rgbd(model, params, latents[:, -1:])
         if memories.gated(model):
             view = jax.tree.map(lambda x: x[:, -1:], sight.view)
-            rgb, depth = codecs.mix(model, params, rgb, depth, view)
+            rgb, depth = rgbd.mix(model, params, rgb, depth, view)
         return rgb, depth
 
     looking, conditioning, drawing, decoding = (jax.jit(f) for f in (look, condition, draw, decode))

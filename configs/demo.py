@@ -1,12 +1,12 @@
 """Procedural houses at 64×64 pixels: two stages and a report in ten minutes on two CPU cores."""
 
+from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
     DiTConfig,
     EvalConfig,
-    LearnedCodecConfig,
     ModelConfig,
     RenderConfig,
     StageConfig,

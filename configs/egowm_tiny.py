@@ -1,5 +1,6 @@
 """EgoWM, steered by actions alone, without a map: houses at 64×64 pixels, minutes on two cores."""
 
+from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import (
     ActionConfig,
     ClipConfig,
@@ -9,10 +10,9 @@ from pewm_jax.config import (
     EgoWMConfig,
     EgoWMTrainConfig,
     EvalConfig,
-    LearnedCodecConfig,
-    ModulationConfig,
     StageConfig,
 )
+from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 
 

@@ -1,5 +1,6 @@
 """The gate of a trained codec (runs/codec), on the same houses: minutes on two CPU cores."""
 
+from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import (
     ClipConfig,
     CodecTrainConfig,
@@ -7,7 +8,6 @@ from pewm_jax.config import (
     Config,
     DataConfig,
     EvalConfig,
-    LearnedCodecConfig,
     StageConfig,
 )
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import (
     BlocksConfig,
     CameraModelConfig,
@@ -10,8 +11,6 @@ from pewm_jax.config import (
     DataConfig,
     EvalConfig,
     GridConfig,
-    LearnedCodecConfig,
-    ModulationConfig,
     PersistConfig,
     PersistNetsConfig,
     PersistTrainConfig,
@@ -20,6 +19,7 @@ from pewm_jax.config import (
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
+from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.flow import FrameFlowConfig
 
 CLASSES = 73

@@ -2,8 +2,9 @@
 
 import dataclasses
 
-from pewm_jax.config import Config, DINOv2EncoderConfig, VAEConfig, published
+from pewm_jax.config import Config, VAEConfig, published
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.worlds.pewm import paper
 
 

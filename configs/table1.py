@@ -2,12 +2,12 @@
 
 import dataclasses
 
+from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import (
     AttentionConfig,
     Config,
     DataConfig,
     EvalConfig,
-    LearnedCodecConfig,
     StageConfig,
     VoxelConfig,
 )

@@ -85,20 +85,20 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "persist": "pewm_jax.config.persist:PersistNetsConfig",
     },
     "codec": {
-        "pixel": "pewm_jax.config.codec:PixelConfig",
+        "pixel": "pewm_jax.codecs.pixel:PixelConfig",
         "vae": "pewm_jax.config.vae:VAEConfig",
         "svd_vae": "pewm_jax.config.svd_vae:SVDVAEConfig",
         "wan_vae": "pewm_jax.config.wan_vae:WanVAEConfig",
-        "learned": "pewm_jax.config.learned_codec:LearnedCodecConfig",
+        "learned": "pewm_jax.codecs.learned:LearnedCodecConfig",
     },
     "control": {
-        "camera": "pewm_jax.config.control:CameraConfig",
-        "actions": "pewm_jax.config.control:ModulationConfig",
+        "camera": "pewm_jax.controls.camera:CameraConfig",
+        "actions": "pewm_jax.controls.actions:ModulationConfig",
     },
     "encoder": {
-        "patch_colours": "pewm_jax.config.encoder:PatchColoursConfig",
-        "latents": "pewm_jax.config.encoder:LatentsConfig",
-        "dinov2": "pewm_jax.config.encoder:DINOv2EncoderConfig",
+        "patch_colours": "pewm_jax.encoders.patch_colours:PatchColoursConfig",
+        "latents": "pewm_jax.encoders.latents:LatentsConfig",
+        "dinov2": "pewm_jax.models.dinov2.encoder:DINOv2EncoderConfig",
     },
     "reader": {
         "attend": "pewm_jax.config.reader:AttentionConfig",
@@ -133,16 +133,9 @@ MODULES: dict[str, str] = {
     "backbone.svd_unet": "pewm_jax.models.svd.backbone",
     "backbone.cosmos": "pewm_jax.models.cosmos.backbone",
     "backbone.persist": "pewm_jax.models.persist.nets",
-    "codec.pixel": "pewm_jax.codecs.pixel",
     "codec.vae": "pewm_jax.models.cogvideox.vae_codec",
     "codec.svd_vae": "pewm_jax.models.svd.vae_codec",
     "codec.wan_vae": "pewm_jax.models.wan.codec",
-    "codec.learned": "pewm_jax.codecs.learned",
-    "control.camera": "pewm_jax.controls.camera",
-    "control.actions": "pewm_jax.controls.actions",
-    "encoder.patch_colours": "pewm_jax.encoders.patch_colours",
-    "encoder.latents": "pewm_jax.encoders.latents",
-    "encoder.dinov2": "pewm_jax.models.dinov2.encoder",
     "reader.attend": "pewm_jax.readers.attention",
     "reader.render": "pewm_jax.readers.render",
     "reader.both": "pewm_jax.readers.both",
@@ -228,12 +221,18 @@ def part(section: str, name: str, **settings: Any) -> Any:
     Args:
         section: the part of a model.
         name: the kind of the default.
-        settings: of the default, where they differ from the kind's own.
+        settings: of the default, where they differ from the kind's own; parts among them are made
+            by ``part``, too.
     """
-    return dataclasses.field(
-        default_factory=lambda: named(section, name).settings(**settings),
-        metadata={"section": section, "kind": name},
-    )
+
+    def make() -> Any:
+        values = {
+            key: default_of(value) if isinstance(value, dataclasses.Field) else value
+            for key, value in settings.items()
+        }
+        return named(section, name).settings(**values)
+
+    return dataclasses.field(default_factory=make, metadata={"section": section, "kind": name})
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:

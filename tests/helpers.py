@@ -7,15 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import (
-    AttentionConfig,
-    ClipConfig,
-    Config,
-    DiTConfig,
-    ModelConfig,
-    PixelConfig,
-    VoxelConfig,
-)
+from pewm_jax.codecs.pixel import PixelConfig
+from pewm_jax.config import AttentionConfig, ClipConfig, Config, DiTConfig, ModelConfig, VoxelConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import cameras
 from pewm_jax.types import Camera, Frames

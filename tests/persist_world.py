@@ -1,18 +1,18 @@
 """The smallest world of PERSIST."""
 
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     BlocksConfig,
     CameraModelConfig,
     ClipConfig,
     GridConfig,
-    ModulationConfig,
     PersistConfig,
     PersistNetsConfig,
-    PixelConfig,
     VoxelDiTConfig,
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
+from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.flow import FrameFlowConfig
 
 BLOCKS = BlocksConfig(layers=1, heads=1, head_dim=8, mlp_ratio=2, context=3)

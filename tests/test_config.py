@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax import registry as kinds
+from pewm_jax.codecs.learned import LearnedCodecConfig
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     ActionConfig,
     AttentionConfig,
@@ -22,16 +24,11 @@ from pewm_jax.config import (
     ConfigError,
     CosmosConfig,
     DataConfig,
-    DINOv2EncoderConfig,
     DiTConfig,
     EvalConfig,
     ImagesConfig,
-    LatentsConfig,
-    LearnedCodecConfig,
     ModelConfig,
     NoMemoryConfig,
-    PatchColoursConfig,
-    PixelConfig,
     Settings,
     StageConfig,
     TrainConfig,
@@ -42,6 +39,9 @@ from pewm_jax.config import command_line as cli
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
+from pewm_jax.encoders.latents import LatentsConfig
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 
 VERSION_1 = Path(__file__).parent / "version_1"
 """Settings as they were written before there were versions."""
@@ -231,7 +231,7 @@ KINDS = [kind for section in SECTIONS for kind in ours(section)]
 
 def test_every_setting_is_documented():
     """`--help` shows the docstring below each field, so every field needs one."""
-    sections = (f.default.__class__ for f in dataclasses.fields(Config) if f.name != "version")
+    sections = (kinds.usual(f) for f in dataclasses.fields(Config) if f.name != "version")
     for kind in {Config, TrainConfig, ClipConfig, *sections, *(kind.settings for kind in KINDS)}:
         body = ast.parse(inspect.getsource(kind)).body[0].body
         for index, node in enumerate(body):

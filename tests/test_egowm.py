@@ -11,6 +11,7 @@ import pytest
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import worlds
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     ClipConfig,
     Config,
@@ -18,7 +19,6 @@ from pewm_jax.config import (
     DiTConfig,
     EgoWMConfig,
     EgoWMTrainConfig,
-    PixelConfig,
     SurfelConfig,
     UserError,
 )

@@ -9,14 +9,12 @@ import pytest
 
 from pewm_jax import config as configs
 from pewm_jax import worlds
-from pewm_jax.codecs import interface as codecs
-from pewm_jax.codecs import signals
+from pewm_jax.codecs import rgbd, signals
 from pewm_jax.config import (
     AttentionConfig,
     ConfigError,
     DataConfig,
     DINOv2Config,
-    DINOv2EncoderConfig,
     DiTConfig,
     StageConfig,
     TrainConfig,
@@ -26,8 +24,8 @@ from pewm_jax.config import (
 )
 from pewm_jax.data import loader
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import tree, weights
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.train import loop
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import rollouts, world_model
@@ -114,15 +112,15 @@ def test_text_and_encoder_matter_and_depth_goes_through_the_vae(world):
     observed = jax.tree.map(lambda x: x[:, :1], batch)
     said = world_model.condition(model, params, observed, Control(batch.camera)).given
     np.testing.assert_array_equal(said.tokens_BLC[0], params["text"]["prompt_LC"])
-    latents = codecs.encode_rgbd(model, params, batch.rgb_THWC, batch.depth_THW)
+    latents = rgbd.encode_rgbd(model, params, batch.rgb_THWC, batch.depth_THW)
     assert latents.shape == (1, 3, 4, 6, 8)
     grey = signals.signal_from_depth(model.clip, batch.depth_THW)[..., None].repeat(3, -1)
-    alone = codecs.encode(model.codec, params["codec"], grey)
+    alone = model.codec.encode(params["codec"], grey)
     np.testing.assert_allclose(latents[..., 4:], alone, atol=1e-5)
-    rgb, depth = codecs.decode_rgbd(model, params, latents)
+    rgb, depth = rgbd.decode_rgbd(model, params, latents)
     assert rgb.shape == (1, 9, 16, 24, 3)
     assert depth.shape == (1, 9, 16, 24)
-    one = encoders.encode(model.memory.encoder, params["encoder"], frames.rgb_THWC / 127.5 - 1)
+    one = model.memory.encoder.encode(params["encoder"], frames.rgb_THWC / 127.5 - 1)
     assert one.shape == (9, 2, 2, 16)
 
 
@@ -131,8 +129,8 @@ def test_only_an_inverting_vae_divides_the_image_latents_by_its_factor(world):
     image = np.random.default_rng(2).uniform(-1, 1, (1, 1, 16, 24, 3)).astype(np.float32)
     for inverts, power in ((False, 0), (True, 2)):
         settings = dataclasses.replace(VAE, invert_scale_latents=inverts)
-        plain = codecs.encode(settings, params["codec"], image)
-        shown = codecs.encode(settings, params["codec"], image, condition=True)
+        plain = settings.encode(params["codec"], image)
+        shown = settings.encode(params["codec"], image, condition=True)
         np.testing.assert_allclose(shown * VAE.scaling_factor**power, plain, rtol=1e-5, atol=1e-6)
 
 
@@ -141,7 +139,7 @@ def test_unmeasured_depth_weighs_nothing(world):
     depth = np.ones((1, 9, 16, 24), np.float32)
     depth[:, 1:5, :4, :4] = 0
     depth[:, 5:, :4, :2] = 0
-    share = np.asarray(codecs.measured(config.model, depth))
+    share = np.asarray(rgbd.measured(config.model, depth))
     assert share.shape == (1, 3, 4, 6, 1)
     assert share[0, 1, 0, 0, 0] == 0
     assert share[0, 2, 0, 0, 0] == 0.5
@@ -153,7 +151,7 @@ def test_frames_that_decode_to_another_number_are_refused():
     with pytest.raises(ConfigError, match=r"8k \+ 1"):
         full_config(clip=clip)
     with pytest.raises(UserError, match=r"2 latents decode to 8 frames.*5 frames were expected"):
-        codecs.decode(VAE, {}, jnp.zeros((1, 2, 4, 6, 4)))
+        VAE.decode({}, jnp.zeros((1, 2, 4, 6, 4)))
 
 
 def test_training_needs_converted_weights_and_leaves_them_alone(world, tmp_path, monkeypatch):

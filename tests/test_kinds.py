@@ -14,21 +14,21 @@ from pewm_jax import presets
 from pewm_jax import registry as kinds
 from pewm_jax.cli import evaluate, train
 from pewm_jax.cli import plugins as imports
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     AttentionConfig,
-    CameraConfig,
     ClipConfig,
     Config,
     ConfigError,
     ModelConfig,
     Noise,
-    PixelConfig,
     VoxelConfig,
     World,
     flags,
     register,
 )
 from pewm_jax.config import command_line as cli
+from pewm_jax.controls.camera import CameraConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from tests.strangers import run as strangers
 

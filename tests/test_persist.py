@@ -10,13 +10,8 @@ import pytest
 
 from pewm_jax import config as configuration
 from pewm_jax import presets, worlds
-from pewm_jax.config import (
-    Config,
-    ConfigError,
-    PersistTrainConfig,
-    PixelConfig,
-    UserError,
-)
+from pewm_jax.codecs.pixel import PixelConfig
+from pewm_jax.config import Config, ConfigError, PersistTrainConfig, UserError
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.memory import class_edit, class_grid, memories

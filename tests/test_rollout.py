@@ -7,7 +7,6 @@ import pytest
 
 from pewm_jax import worlds
 from pewm_jax.config import UserError
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import memories, voxel_map
 from pewm_jax.types import Frames
@@ -53,7 +52,7 @@ def test_discrete_and_continuous_actions_agree(params):
 def test_imagined_frames_enter_the_map_as_observed_ones_where_they_are_trusted(params):
     state = a_state(params)
     after, frames = roll(CONFIG, params, state, ACTIONS[:8], jax.random.key(1))
-    features = encoders.encode(MODEL.memory.encoder, {}, frames.rgb_THWC)
+    features = MODEL.memory.encoder.encode({}, frames.rgb_THWC)
     trusted = memories.trusted(MODEL, frames)
     expected = voxel_map.insert_frames(MODEL.memory, state.map, trusted, features)
     for name in ("cell_of_slot_V", "features_VF", "occupied"):

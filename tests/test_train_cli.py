@@ -20,6 +20,7 @@ import pewm_jax
 import train
 from pewm_jax import config as configuration
 from pewm_jax import presets
+from pewm_jax import registry as kinds
 from pewm_jax.cli import main as command
 from pewm_jax.config import Config, Launch
 from pewm_jax.config import command_line as cli
@@ -33,8 +34,9 @@ ROOT = Path(__file__).parents[1]
 
 def settings(kind, prefix=""):
     for field in dataclasses.fields(kind):
-        if dataclasses.is_dataclass(field.default):
-            yield from settings(field.default, f"{prefix}{field.name}.")
+        default = kinds.default_of(field)
+        if dataclasses.is_dataclass(default):
+            yield from settings(default, f"{prefix}{field.name}.")
         else:
             yield f"{prefix}{field.name}"
 

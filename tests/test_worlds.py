@@ -12,7 +12,6 @@ import pytest
 from pewm_jax import worlds
 from pewm_jax.config import Config, UserError
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import memories
 from pewm_jax.types import Camera, Control, Frames, WorldState
@@ -66,7 +65,7 @@ def still(moves):
 
 @functools.partial(jax.jit, static_argnums=0)
 def remembered(model, memory, frames):
-    features = encoders.encode(model.memory.encoder, {}, frames.rgb_THWC)
+    features = model.memory.encoder.encode({}, frames.rgb_THWC)
     return memories.remember(model, memory, frames, features, observed=False)
 
 

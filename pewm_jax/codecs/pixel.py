@@ -6,36 +6,73 @@ rule: q·k + 1 frames become k + 1 latent frames, the first of which holds q cop
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any, ClassVar
+
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import ModelConfig, PixelConfig
+from pewm_jax.config.parts import Codec
+from pewm_jax.errors import require_positive
 from pewm_jax.geometry.plucker import fold_frames
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params
 
-SHARDING = ()
-"""It has no parameters."""
 
+@dataclasses.dataclass(frozen=True)
+class PixelConfig(Codec):
+    """Space-to-depth and temporal fold: no parameters, exactly invertible."""
 
-def init(config: PixelConfig, key: Array) -> Params:
-    """Return the parameters: none."""
-    del config, key
-    return {}
+    PIXELWISE: ClassVar[bool] = True
 
+    spatial: int = 4
+    """Pixels per latent cell, along height and along width."""
+    temporal: int = 4
+    """Frames per latent frame after the first."""
 
-def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return the costs, which are negligible."""
-    del model, share
-    return Costs()
+    @property
+    def rgb_channels(self) -> int:
+        """Latent channels of colour."""
+        return 3 * self.depth_channels
 
+    @property
+    def depth_channels(self) -> int:
+        """Latent channels of depth."""
+        return self.temporal * self.spatial**2
 
-def encode(
-    config: PixelConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
-) -> Array:
-    """Encode a video (B, q·k + 1, H, W, C); see ``fold``."""
-    del params, condition
-    return fold(video_BTHWC, config.spatial, config.temporal)
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "codec", "spatial", "temporal")
+
+    def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
+        """Encode a video (B, q·k + 1, H, W, C); see ``fold``."""
+        del params, condition
+        return fold(video_BTHWC, self.spatial, self.temporal)
+
+    def decode(self, params: Params, latents_BthwC: Array) -> Array:
+        """Invert ``encode``; the q copies of the first frame are averaged.
+
+        Args:
+            self: the codec.
+            params: none.
+            latents_BthwC: (B, k + 1, h, w, q·s·s·C).
+
+        Returns:
+            (B, q·k + 1, h·s, w·s, C) video.
+        """
+        del params
+        batch, latent_frames, h, w, width = latents_BthwC.shape
+        s, q = self.spatial, self.temporal
+        grid = latents_BthwC.reshape(batch, latent_frames, h, w, q, s, s, width // (q * s * s))
+        grid = grid.transpose(0, 1, 4, 2, 5, 3, 6, 7)
+        video = grid.reshape(batch, latent_frames, q, h * s, w * s, -1)
+        rest = video[:, 1:].reshape(batch, -1, *video.shape[3:])
+        return jnp.concatenate([video[:, :1].mean(2), rest], 1)
+
+    def costs(self, model: Any, share: Share) -> Costs:
+        """Return the costs, which are negligible."""
+        del model, share
+        return Costs()
 
 
 def fold(video_BTHWC: Array, spatial: int, temporal: int) -> Array:
@@ -63,24 +100,3 @@ def fold(video_BTHWC: Array, spatial: int, temporal: int) -> Array:
     grid = folded.reshape(batch, -1, q, height // s, s, width // s, s, channels)
     grid = grid.transpose(0, 1, 3, 5, 2, 4, 6, 7)
     return grid.reshape(*grid.shape[:4], q * s * s * channels)
-
-
-def decode(config: PixelConfig, params: Params, latents_BthwC: Array) -> Array:
-    """Invert ``encode``; the q copies of the first frame are averaged.
-
-    Args:
-        config: the codec.
-        params: none.
-        latents_BthwC: (B, k + 1, h, w, q·s·s·C).
-
-    Returns:
-        (B, q·k + 1, h·s, w·s, C) video.
-    """
-    del params
-    batch, latent_frames, h, w, width = latents_BthwC.shape
-    s, q = config.spatial, config.temporal
-    grid = latents_BthwC.reshape(batch, latent_frames, h, w, q, s, s, width // (q * s * s))
-    grid = grid.transpose(0, 1, 4, 2, 5, 3, 6, 7)
-    video = grid.reshape(batch, latent_frames, q, h * s, w * s, -1)
-    rest = video[:, 1:].reshape(batch, -1, *video.shape[3:])
-    return jnp.concatenate([video[:, :1].mean(2), rest], 1)

@@ -10,22 +10,14 @@ from typing import Any
 
 from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
 from pewm_jax.config.clip_vision import CLIPVisionConfig
-from pewm_jax.config.codec import PixelConfig
 from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
-from pewm_jax.config.control import CameraConfig, ModulationConfig
 from pewm_jax.config.cosmos import COSMOS_2B, COSMOS_14B, CosmosConfig
 from pewm_jax.config.dinov2 import DINOv2Config
 from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
 from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
-from pewm_jax.config.encoder import (
-    DINOv2EncoderConfig,
-    LatentsConfig,
-    PatchColoursConfig,
-)
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.frame_blocks import BlocksConfig
 from pewm_jax.config.launch import Join, Launch
-from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.memory import (
     ImagesConfig,
     Map2DConfig,
@@ -84,7 +76,6 @@ __all__ = [
     "BlocksConfig",
     "BothConfig",
     "CLIPVisionConfig",
-    "CameraConfig",
     "CameraModelConfig",
     "Capabilities",
     "ClipConfig",
@@ -96,7 +87,6 @@ __all__ = [
     "ConfigError",
     "CosmosConfig",
     "DINOv2Config",
-    "DINOv2EncoderConfig",
     "DataConfig",
     "DiTConfig",
     "EgoWMConfig",
@@ -108,24 +98,19 @@ __all__ = [
     "ImagesConfig",
     "InjectionPoints",
     "Join",
-    "LatentsConfig",
     "Launch",
-    "LearnedCodecConfig",
     "Map2DConfig",
     "Memory",
     "MeshConfig",
     "ModelConfig",
-    "ModulationConfig",
     "NoMemoryConfig",
     "Noise",
     "NomadConfig",
     "NomadTrainConfig",
     "NomadWorldConfig",
-    "PatchColoursConfig",
     "PersistConfig",
     "PersistNetsConfig",
     "PersistTrainConfig",
-    "PixelConfig",
     "PointsConfig",
     "Reader",
     "RenderConfig",
@@ -156,6 +141,13 @@ __all__ = [
 ]
 
 _MOVED = {
+    "ModulationConfig": "pewm_jax.controls.actions",
+    "CameraConfig": "pewm_jax.controls.camera",
+    "DINOv2EncoderConfig": "pewm_jax.models.dinov2.encoder",
+    "LatentsConfig": "pewm_jax.encoders.latents",
+    "PatchColoursConfig": "pewm_jax.encoders.patch_colours",
+    "LearnedCodecConfig": "pewm_jax.codecs.learned",
+    "PixelConfig": "pewm_jax.codecs.pixel",
     "DDPMConfig": "pewm_jax.diffusion.ddpm",
     "EDMConfig": "pewm_jax.diffusion.edm",
     "FlowConfig": "pewm_jax.diffusion.flow",

@@ -6,12 +6,11 @@ import dataclasses
 from typing import ClassVar, Literal
 
 from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.learned_codec import LearnedCodecConfig
-from pewm_jax.config.memory import SurfelConfig
 from pewm_jax.config.parts import Codec, Memory
 from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.config.world import BatchSpec, Task
 from pewm_jax.errors import require
+from pewm_jax.registry import of, part
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +74,7 @@ class CodecWorldConfig(Task):
         ),
         (
             "A model whose `codec.kind` is `learned` starts from it, `train.start` {name}: see the "
-            "preset `demo`. In Python, `pewm_jax.codecs.interface` encodes and decodes."
+            "preset `demo`. In Python, `pewm_jax.codecs.rgbd` encodes and decodes."
         ),
     )
     INSTEAD: ClassVar[str] = (
@@ -84,9 +83,9 @@ class CodecWorldConfig(Task):
 
     clip: ClipConfig = ClipConfig(frames=2)
     """What the loader reads: every frame of a clip is learned from by itself."""
-    codec: Codec = LearnedCodecConfig()
+    codec: Codec = part("codec", "learned")
     """The codec that is trained."""
-    memory: Memory = SurfelConfig()
+    memory: Memory = part("memory", "surfels")
     """The memory that the gate sees rendered; it must show colours."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute precision; master weights of what trains stay float32."""
@@ -99,7 +98,7 @@ class CodecWorldConfig(Task):
     def __post_init__(self):
         """Validate."""
         require(
-            isinstance(self.codec, LearnedCodecConfig),
+            isinstance(self.codec, Codec) and of(self.codec).name == "learned",
             f"codec is a {type(self.codec).__name__}, and the world `codec` trains the learned one "
             "alone: use codec.kind learned.",
         )

@@ -5,14 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from pewm_jax.config.control import ModulationConfig
-from pewm_jax.config.memory import NoMemoryConfig
 from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.parts import Conditioner, Memory
-from pewm_jax.config.reader import RenderConfig
 from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.config.world import BatchSpec, Capabilities
 from pewm_jax.errors import require
+from pewm_jax.registry import part
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,9 +47,9 @@ class EgoWMConfig(ModelConfig):
 
     TRAIN: ClassVar[type[TrainSettings]] = EgoWMTrainConfig
 
-    control: Conditioner = ModulationConfig()
+    control: Conditioner = part("control", "actions")
     """Control: what steers a clip."""
-    memory: Memory = NoMemoryConfig(reader=RenderConfig())
+    memory: Memory = part("memory", "none", reader=part("reader", "render"))
     """There is none: leave it at `none`."""
     history: int = 1
     """Frames that every clip begins with and that are observed, or were imagined before: 1 in

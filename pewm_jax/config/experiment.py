@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, TrainConfig, TrainSettings
-from pewm_jax.config.world import Task
 from pewm_jax.errors import require
-from pewm_jax.registry import require_section
+from pewm_jax.registry import part, require_section
 
 VERSION = 4
 """The version of ``config.json`` that is written; ``migrations`` upgrades earlier ones."""
@@ -21,7 +19,7 @@ class Config:
 
     version: int = VERSION
     """Version of the format; set by the library."""
-    model: Any = dataclasses.field(default=ModelConfig(), metadata={"kinds": Task})
+    model: Any = part("world", "pewm")
     """The world model: all settings that inference needs."""
     data: DataConfig = DataConfig()
     """What training reads."""

@@ -6,10 +6,6 @@ import dataclasses
 from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.clip import ActionConfig, ClipConfig
-from pewm_jax.config.codec import PixelConfig
-from pewm_jax.config.control import CameraConfig
-from pewm_jax.config.dit import DiTConfig
-from pewm_jax.config.memory import VoxelConfig
 from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
 from pewm_jax.config.training import TrainConfig, TrainSettings
 from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities, Facts, World
@@ -27,13 +23,13 @@ class ModelConfig(World):
     """Shape of a clip."""
     actions: ActionConfig = ActionConfig()
     """Effect of an action."""
-    codec: Codec = PixelConfig()
+    codec: Codec = part("codec", "pixel")
     """Codec: pixels to latents and back."""
-    backbone: Backbone = DiTConfig()
+    backbone: Backbone = part("backbone", "dit")
     """Backbone: the denoiser."""
-    control: Conditioner = CameraConfig()
+    control: Conditioner = part("control", "camera")
     """Control: what steers a clip."""
-    memory: Memory = VoxelConfig()
+    memory: Memory = part("memory", "voxel")
     """Memory: what is remembered, as which features, and how it is read."""
     noise: Noise = part("noise", "ddpm")
     """Noise, prediction target, sampler."""

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
-from pewm_jax.errors import require, require_positive
+from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.registry import Settings, part
 
 if TYPE_CHECKING:
@@ -235,7 +235,7 @@ class Codec(Settings):
     def measured(self, depth_BTHW: Array) -> Array | None:
         """Return the share of measured pixels per depth latent, or None for the default.
 
-        See ``codecs.interface.measured``.
+        See ``codecs.rgbd.measured``.
         """
         del depth_BTHW
         return None
@@ -361,13 +361,38 @@ class Encoder(Settings):
         del model
         return self.encode(params.get("encoder", {}), rgb_THWC)
 
+    def weights(self, params: Params) -> Params:
+        """Return those of the world model's parameters that ``features`` uses; {} if none."""
+        return {self.WEIGHTS: params[self.WEIGHTS]} if self.WEIGHTS in params else {}
+
+    def require_own(self, what: str) -> None:
+        """Refuse an encoder that takes another part's parameters.
+
+        Raises:
+            UserError: it does; ``what`` completes the sentence "its features …".
+        """
+        if self.WEIGHTS != "encoder":
+            raise UserError(
+                f"memory.encoder takes the weights of the {self.WEIGHTS}: its features {what}; "
+                "use encoder.features(model, params, colours)."
+            )
+
     def preprocessing(self) -> dict[str, Any]:
         """Return plain values that identify a cache of features, besides the weights."""
         raise NotImplementedError
 
     def colours(self, features_VF: np.ndarray) -> np.ndarray:
-        """Return (V, 3) colours in [−1, 1] in which features are drawn."""
-        raise NotImplementedError
+        """Return (V, 3) colours in [−1, 1] in which features are drawn.
+
+        By default they are the first three principal components of the features.
+        """
+        import numpy as np  # noqa: PLC0415 - reading settings does not need it
+
+        values = np.asarray(features_VF, np.float32)
+        centred = values - values.mean(0)
+        _, _, axes = np.linalg.svd(centred, full_matrices=False)
+        found = centred @ axes[:3].T
+        return np.tanh(found / np.maximum(found.std(0), 1e-6))
 
     def costs(self, model: Any, share: Any, frames: int) -> Any:
         """Return the ``nn.costs.Costs`` of encoding this many context frames of a clip."""

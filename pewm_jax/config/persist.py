@@ -7,8 +7,6 @@ import math
 from typing import Any, ClassVar, Literal
 
 from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.control import ModulationConfig
-from pewm_jax.config.learned_codec import LearnedCodecConfig
 from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise, Reader
 from pewm_jax.config.reader import RenderConfig
@@ -226,13 +224,6 @@ class PersistTrainConfig(TrainSettings):
 
 ACTIONS = 23
 """Numbers of an action, as published."""
-PUBLISHED_ACTIONS = ModulationConfig(
-    actions=ACTIONS,
-    units=(1.0,) * ACTIONS,
-    low=(-1.0,) * ACTIONS,
-    high=(1.0,) * ACTIONS,
-    angles=(),
-)
 PUBLISHED_CLIP = ClipConfig(frames=16, height=288, width=512, depth=False)
 """36×64 latents, as published, with a codec whose cells have 8 pixels."""
 
@@ -245,13 +236,21 @@ class PersistConfig(ModelConfig):
 
     clip: ClipConfig = PUBLISHED_CLIP
     """What one clip is."""
-    codec: Codec = LearnedCodecConfig()
+    codec: Codec = part("codec", "learned")
     """Codec: pictures to latents and back."""
-    backbone: Backbone = PersistNetsConfig()
+    backbone: Backbone = part("backbone", "persist")
     """The four networks."""
-    control: Conditioner = PUBLISHED_ACTIONS
+    control: Conditioner = part(
+        "control",
+        "actions",
+        actions=ACTIONS,
+        units=(1.0,) * ACTIONS,
+        low=(-1.0,) * ACTIONS,
+        high=(1.0,) * ACTIONS,
+        angles=(),
+    )
     """The numbers of an action; nothing else of it is used."""
-    memory: Memory = GridConfig()
+    memory: Memory = part("memory", "grid")
     """The state of the world."""
     noise: Noise = part("noise", "frame_flow", per_frame=True, context_noise=0.1)
     """Noise of pictures, sampler."""

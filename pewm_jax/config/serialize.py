@@ -58,8 +58,8 @@ def from_dict(kind: type[T], values: dict[str, Any], where: str = "config") -> T
     hints = typing.get_type_hints(kind)
     built: dict[str, Any] = {}
     for name, value in values.items():
-        hint = fields[name].metadata.get("kinds", hints[name])
         usual = kinds.usual(fields[name])
+        hint = usual if hints[name] is Any else hints[name]
         if isinstance(value, dict) and "kind" not in value and _has_kinds(usual):
             hint = usual  # a section without a kind is of the default one
         built[name] = _coerce(hint, value, f"{where}.{name}")

@@ -12,143 +12,211 @@ The paper does not say which frequencies its sinusoids have: here they are geome
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import ModelConfig, ModulationConfig, UserError
-from pewm_jax.controls import camera as camera_control
+from pewm_jax.config.parts import Conditioner, Rules
+from pewm_jax.controls import camera
+from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.nn.layers import linear
 from pewm_jax.types import Array, Control, Frames, Params
 
-SHARDING = (
-    (r"control/.*/kernel", P(None, "fsdp")),
-    (r"control/.*/bias", P()),
-)
 SLOWEST, FASTEST = math.pi / 4, 8 * math.pi
 """Radians of the slowest and the fastest sinusoid for a number of 1."""
 TAPS = 3
 """Actions that a convolution sees at least."""
 
 
+@dataclasses.dataclass(frozen=True)
+class ModulationConfig(Conditioner):
+    """Control by actions that are added to the time embedding of each latent frame (EgoWM).
+
+    The defaults are the paper's for three numbers: metres forward and left in units of the data's
+    waypoint spacing, and radians counter-clockwise (arXiv 2601.15284, Eqs. 5 and 6).
+    """
+
+    SHARDING: ClassVar[Rules] = (
+        (r"control/.*/kernel", P(None, "fsdp")),
+        (r"control/.*/bias", P()),
+    )
+    MODULATES: ClassVar[bool] = True
+
+    actions: int = 3  # type: ignore[assignment]
+    """Numbers of an action."""
+    units: tuple[float, ...] = (1.0, 1.0, 1.0)
+    """What each number is first divided by: the data's waypoint spacing in metres, twice, and 1."""
+    low: tuple[float, ...] = (-2.5, -4.0, -1.0)
+    """The value of each number, in its unit, that becomes −1."""
+    high: tuple[float, ...] = (5.0, 4.0, 1.0)
+    """The value of each number, in its unit, that becomes 1."""
+    angles: tuple[int, ...] = (2,)
+    """Which numbers are angles in radians: they are brought into (−π, π] at first."""
+    projection: Literal["sinusoid", "convolution"] = "sinusoid"
+    """`sinusoid`: cosines and sines of each number, then two layers (the paper's on Stable Video
+    Diffusion). `convolution`: two layers, then two convolutions over time, down to the latent rate
+    (the paper's on Cosmos)."""
+    features: int = 32
+    """Cosines and sines of each number, with `sinusoid`; even."""
+    state: int = 0  # type: ignore[assignment]
+    """Numbers of the agent's state at the first frame, which is added to every frame (Eq. 6): as
+    many as those of an action, which then says which state it leads to; 0 for none."""
+    rays: bool = False
+    """Also join the cameras' Plücker rays to the input, as the control `camera` does."""
+    rate: float = 10.0  # type: ignore[assignment]
+    """Factor of the learning rate of these layers, which are new where a model was trained."""
+
+    def channels(self, model: Any) -> int:
+        """Return the rays' channels, if they are joined."""
+        return 6 * model.codec.temporal if self.rays else 0
+
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "control", "actions", "features", "rate")
+        for name in ("units", "low", "high"):
+            require(
+                len(getattr(self, name)) == self.actions,
+                f"control.{name} has {len(getattr(self, name))} values and control.actions is "
+                f"{self.actions}: give one for each number of an action.",
+            )
+        require(
+            all(a < b for a, b in zip(self.low, self.high, strict=True)),
+            f"control.low {self.low} and control.high {self.high}: each low must be below its "
+            "high.",
+        )
+        require(
+            all(unit > 0 and math.isfinite(unit) for unit in self.units),
+            f"control.units is {self.units}: use positive numbers, 1 where nothing is divided.",
+        )
+        require(
+            all(0 <= index < self.actions for index in self.angles),
+            f"control.angles is {self.angles}: name numbers of an action, from 0 to "
+            f"{self.actions - 1}.",
+        )
+        require(
+            self.features % 2 == 0,
+            f"control.features is {self.features}: use an even number, cosines and sines.",
+        )
+        require(
+            self.state in (0, self.actions),
+            f"control.state is {self.state}: use 0 for none, or control.actions ({self.actions}).",
+        )
+
+    def init(self, model: Any, key: Array) -> Params:
+        """Return random parameters; the last layers are zero."""
+        last = {"linear_2" if self.projection == "sinusoid" else "conv_2", "state_2"}
+        params: Params = {}
+        for number, (name, shape) in enumerate(self.layout(model).items()):
+            spread = 0.0 if name in last else 1 / math.sqrt(math.prod(shape[:-1]))
+            kernel = spread * jax.random.normal(jax.random.fold_in(key, number), shape)
+            params[name] = {"kernel": kernel, "bias": jnp.zeros(shape[-1:])}
+        return params
+
+    def condition(
+        self, model: Any, params: Params, observed: Frames, control: Control
+    ) -> Conditioning:
+        """Return the actions as modulation, and rays if asked for.
+
+        Raises:
+            UserError: there are no actions, or no state and the settings ask for it.
+        """
+        if control.actions_TA is None:
+            raise UserError(
+                "this model's control (actions) is steered by actions, and got cameras alone: give "
+                "actions, or a Control with both."
+            )
+        led = jnp.pad(self.embed(model, params, control.actions_TA), ((0, 0), (1, 0), (0, 0)))
+        held = model.codec.frames(observed.depth_THW.shape[1])
+        led = jnp.where((np.arange(led.shape[1]) >= held)[:, None], led, 0)
+        if self.state:
+            if control.state_A is None:
+                raise UserError(
+                    f"control.state is {self.state}, and no state of the agent was given: give a "
+                    "Control with state_A, or use control.state 0."
+                )
+            state = self.normalise(control.state_A)
+            if self.projection == "sinusoid":
+                state = self._waves(state)
+            state = linear(params["state_2"], jax.nn.silu(linear(params["state_1"], state)))
+            led = led + state[:, None]
+        rays = camera.rays(model, control.camera) if self.rays else None
+        return Conditioning(joined_BthwC=rays, modulation_BtE=led)
+
+    def embed(self, model: Any, params: Params, actions_BTA: Array) -> Array:
+        """Return (B, t − 1, E) embeddings of the latent frames that (B, T − 1) actions lead to."""
+        q = model.codec.temporal
+        x = self.normalise(actions_BTA)
+        if self.projection == "sinusoid":
+            waves = self._waves(x)
+            waves = waves.reshape(len(waves), -1, q * waves.shape[-1])
+            return linear(params["linear_2"], jax.nn.silu(linear(params["linear_1"], waves)))
+        x = linear(params["linear_2"], jax.nn.silu(linear(params["linear_1"], x)))
+        for number, step in enumerate(strides(q), 1):
+            x = _convolve(params[f"conv_{number}"], jax.nn.silu(x), step)
+        return x
+
+    def normalise(self, actions_A: Array) -> Array:
+        """Scale actions (..., A) to about −1 … 1 by units, minimum and maximum; wrap angles."""
+        x = jnp.asarray(actions_A, jnp.float32)
+        angle = np.isin(np.arange(self.actions), self.angles)
+        x = jnp.where(angle, math.pi - (math.pi - x) % (2 * math.pi), x)
+        low, high, unit = (np.asarray(v, np.float32) for v in (self.low, self.high, self.units))
+        return 2 * (x / unit - low) / (high - low) - 1
+
+    def layout(self, model: Any) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of the kernels by path; each has a bias."""
+        width = model.backbone.time_dim
+        kernels: dict[str, tuple[int, ...]]
+        if self.projection == "sinusoid":
+            inputs = self.actions * self.features
+            kernels = {
+                "linear_1": (model.codec.temporal * inputs, width),
+                "linear_2": (width, width),
+            }
+            state = {"state_1": (inputs, width)}
+        else:
+            kernels = {"linear_1": (self.actions, width), "linear_2": (width, width)}
+            for number, step in enumerate(strides(model.codec.temporal), 1):
+                kernels[f"conv_{number}"] = (max(TAPS, step), width, width)
+            state = {"state_1": (self.actions, width)}
+        return {**kernels, **({**state, "state_2": (width, width)} if self.state else {})}
+
+    def costs(self, model: Any, share: Share, *, trained: bool) -> Costs:
+        """Return the costs: each kernel, times what it is applied to."""
+        del share
+        clip = model.clip
+        actions, latents = clip.frames - 1, model.latent_shape[0] - 1
+        first, _ = strides(model.codec.temporal)
+        times = {"conv_1": actions // first, "conv_2": latents, "state_1": 1, "state_2": 1}
+        whole = latents if self.projection == "sinusoid" else actions
+        work = {False: 0.0, True: 0.0}  # of layers whose input is data, and of the others
+        for name, shape in self.layout(model).items():
+            work[name not in ("linear_1", "state_1")] += math.prod(shape) * times.get(name, whole)
+        return Costs(
+            tuple(
+                Product("control", "linear", macs, (1.0 + inside) * trained)
+                for inside, macs in work.items()
+            )
+        )
+
+    def _waves(self, x_A: Array) -> Array:
+        """Return (..., A · features) cosines and sines of numbers."""
+        rates = np.geomspace(SLOWEST, FASTEST, self.features // 2).astype(np.float32)
+        angle = x_A[..., None] * rates
+        return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], -1).reshape(*x_A.shape[:-1], -1)
+
+
 def strides(temporal: int) -> tuple[int, int]:
     """Return the steps of the two convolutions, whose product is the codec's temporal factor."""
     second = max(k for k in range(1, math.isqrt(temporal) + 1) if temporal % k == 0)
     return temporal // second, second
-
-
-def layout(model: ModelConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the kernels by path; each has a bias."""
-    config, width = _settings(model), model.backbone.time_dim
-    kernels: dict[str, tuple[int, ...]]
-    if config.projection == "sinusoid":
-        inputs = config.actions * config.features
-        kernels = {"linear_1": (model.codec.temporal * inputs, width), "linear_2": (width, width)}
-        state = {"state_1": (inputs, width)}
-    else:
-        kernels = {"linear_1": (config.actions, width), "linear_2": (width, width)}
-        for number, step in enumerate(strides(model.codec.temporal), 1):
-            kernels[f"conv_{number}"] = (max(TAPS, step), width, width)
-        state = {"state_1": (config.actions, width)}
-    return {**kernels, **({**state, "state_2": (width, width)} if config.state else {})}
-
-
-def init(model: ModelConfig, key: Array) -> Params:
-    """Return random parameters; the last layers are zero."""
-    config = _settings(model)
-    last = {"linear_2" if config.projection == "sinusoid" else "conv_2", "state_2"}
-    params: Params = {}
-    for number, (name, shape) in enumerate(layout(model).items()):
-        spread = 0.0 if name in last else 1 / math.sqrt(math.prod(shape[:-1]))
-        kernel = spread * jax.random.normal(jax.random.fold_in(key, number), shape)
-        params[name] = {"kernel": kernel, "bias": jnp.zeros(shape[-1:])}
-    return params
-
-
-def normalise(config: ModulationConfig, actions_A: Array) -> Array:
-    """Bring actions (..., A) to about −1 … 1: angles wrapped, units divided out, min and max."""
-    x = jnp.asarray(actions_A, jnp.float32)
-    angle = np.isin(np.arange(config.actions), config.angles)
-    x = jnp.where(angle, math.pi - (math.pi - x) % (2 * math.pi), x)
-    low, high, unit = (np.asarray(v, np.float32) for v in (config.low, config.high, config.units))
-    return 2 * (x / unit - low) / (high - low) - 1
-
-
-def embed(model: ModelConfig, params: Params, actions_BTA: Array) -> Array:
-    """Return (B, t − 1, E): the embeddings of the latent frames that (B, T − 1) actions lead to."""
-    config, q = _settings(model), model.codec.temporal
-    x = normalise(config, actions_BTA)
-    if config.projection == "sinusoid":
-        waves = _waves(config, x)
-        waves = waves.reshape(len(waves), -1, q * waves.shape[-1])
-        return linear(params["linear_2"], jax.nn.silu(linear(params["linear_1"], waves)))
-    x = linear(params["linear_2"], jax.nn.silu(linear(params["linear_1"], x)))
-    for number, step in enumerate(strides(q), 1):
-        x = _convolve(params[f"conv_{number}"], jax.nn.silu(x), step)
-    return x
-
-
-def condition(
-    model: ModelConfig, params: Params, observed: Frames, control: Control
-) -> Conditioning:
-    """Return the actions as modulation, and rays if asked for; see ``controls.condition``.
-
-    Raises:
-        UserError: there are no actions, or no state and the settings ask for it.
-    """
-    config = _settings(model)
-    if control.actions_TA is None:
-        raise UserError(
-            "this model's control (actions) is steered by actions, and got cameras alone: give "
-            "actions, or a Control with both."
-        )
-    led = jnp.pad(embed(model, params, control.actions_TA), ((0, 0), (1, 0), (0, 0)))
-    held = model.codec.frames(observed.depth_THW.shape[1])
-    led = jnp.where((np.arange(led.shape[1]) >= held)[:, None], led, 0)
-    if config.state:
-        if control.state_A is None:
-            raise UserError(
-                f"control.state is {config.state}, and no state of the agent was given: give a "
-                "Control with state_A, or use control.state 0."
-            )
-        state = normalise(config, control.state_A)
-        if config.projection == "sinusoid":
-            state = _waves(config, state)
-        state = linear(params["state_2"], jax.nn.silu(linear(params["state_1"], state)))
-        led = led + state[:, None]
-    rays = camera_control.rays(model, control.camera) if config.rays else None
-    return Conditioning(joined_BthwC=rays, modulation_BtE=led)
-
-
-def costs(model: ModelConfig, share: Share, *, trained: bool) -> Costs:
-    """Return the costs: each kernel, times what it is applied to."""
-    del share
-    config, clip = _settings(model), model.clip
-    actions, latents = clip.frames - 1, model.latent_shape[0] - 1
-    first, _ = strides(model.codec.temporal)
-    times = {"conv_1": actions // first, "conv_2": latents, "state_1": 1, "state_2": 1}
-    whole = latents if config.projection == "sinusoid" else actions
-    work = {False: 0.0, True: 0.0}  # of layers whose input is data, and of the others
-    for name, shape in layout(model).items():
-        work[name not in ("linear_1", "state_1")] += math.prod(shape) * times.get(name, whole)
-    return Costs(
-        tuple(
-            Product("control", "linear", macs, (1.0 + inside) * trained)
-            for inside, macs in work.items()
-        )
-    )
-
-
-def _waves(config: ModulationConfig, x_A: Array) -> Array:
-    """Return (..., A · features) cosines and sines of numbers."""
-    rates = np.geomspace(SLOWEST, FASTEST, config.features // 2).astype(np.float32)
-    angle = x_A[..., None] * rates
-    return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], -1).reshape(*x_A.shape[:-1], -1)
 
 
 def _convolve(params: Params, x_BTE: Array, step: int) -> Array:
@@ -162,8 +230,3 @@ def _convolve(params: Params, x_BTE: Array, step: int) -> Array:
         dimension_numbers=("NWC", "WIO", "NWC"),
     )
     return out + params["bias"].astype(x_BTE.dtype)
-
-
-def _settings(model: ModelConfig) -> ModulationConfig:
-    assert isinstance(model.control, ModulationConfig)
-    return model.control

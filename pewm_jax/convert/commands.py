@@ -8,13 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pewm_jax.config import (
-    Config,
-    DINOv2EncoderConfig,
-    DiTConfig,
-    UserError,
-    VAEConfig,
-)
+from pewm_jax.config import Config, DiTConfig, UserError, VAEConfig
 from pewm_jax.config import command_line as cli
 from pewm_jax.config.dit import Learned
 from pewm_jax.convert import (
@@ -42,6 +36,7 @@ from pewm_jax.convert.options import (
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
 from pewm_jax.models.dinov2 import model as dinov2_model
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.types import Params
 
 

@@ -21,7 +21,6 @@ import numpy as np
 
 from pewm_jax import config as configuration
 from pewm_jax.config import Config, UserError
-from pewm_jax.controls import interface as controls
 from pewm_jax.convert import output
 from pewm_jax.io import sources, tensor_files, tree
 from pewm_jax.io.published import Entry, Network
@@ -376,7 +375,7 @@ def fresh_actions(config: Config, dtype: str | None) -> Part:
     """
 
     def make() -> Params:
-        return jax.jit(controls.init, static_argnums=0)(config.model, jax.random.key(0))
+        return jax.jit(config.model.control.init, static_argnums=0)(config.model, jax.random.key(0))
 
     return cast_specs(jax.eval_shape(make), dtype), make
 

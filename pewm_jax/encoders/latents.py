@@ -1,38 +1,69 @@
-"""The codec as image encoder: the memory keeps the latents in which the denoiser thinks.
+"""The codec as image encoder: the memory keeps the denoiser's latents.
 
 Features of a frame are the codec's normalised latents of its colours, at the grid of the latents;
-depth says where they are, and is not encoded. There are no parameters beside the codec's.
+depth says where they are, and is not encoded. There are no parameters besides the codec's.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any, ClassVar
+
 import jax.numpy as jnp
 
-from pewm_jax.codecs import interface as codecs
-from pewm_jax.config import LatentsConfig, ModelConfig
-from pewm_jax.encoders.interface import principal_colours
+from pewm_jax.codecs import rgbd
+from pewm_jax.config.parts import Encoder
+from pewm_jax.errors import require, require_positive
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params
 
-SHARDING = ()
-"""It has no parameters of its own."""
 
-colours = principal_colours
+@dataclasses.dataclass(frozen=True)
+class LatentsConfig(Encoder):
+    """The colours' latents of each frame, as the model's own codec makes them; no other weights."""
 
+    WEIGHTS: ClassVar[str] = "codec"
 
-def init(config: LatentsConfig, key: Array) -> Params:
-    """Return the parameters: none."""
-    del config, key
-    return {}
+    channels: int = 16
+    """Latent channels of colour that the codec has."""
+    spatial: int = 8
+    """Pixels per latent cell of the codec, each way."""
 
+    def grid(self, clip: Any) -> tuple[int, int]:
+        """Return the rows and columns of latents that a frame of a ``ClipConfig`` has."""
+        return clip.height // self.spatial, clip.width // self.spatial
 
-def features(model: ModelConfig, params: Params, rgb_THWC: Array) -> Array:
-    """Return (T, H/s, W/s, C) latents of colours in float32; see ``encoders.features``."""
-    video = rgb_THWC[None].astype(jnp.dtype(model.dtype))
-    latents = codecs.encode(model.codec, params.get("codec", {}), video)
-    return latents[0].astype(jnp.float32)
+    def check(self, model: Any) -> None:
+        """Refuse another codec than the settings describe, and one that folds frames."""
+        q, channels, side = model.codec.temporal, model.codec.rgb_channels, model.codec.spatial
+        require(
+            q == 1,
+            f"memory.encoder.kind latents takes the latents of single frames, and the codec folds "
+            f"{q} frames into one (codec.temporal): use codec.kind learned, or another "
+            "memory.encoder.",
+        )
+        require(
+            (self.channels, self.spatial) == (channels, side),
+            f"memory.encoder.channels is {self.channels} and memory.encoder.spatial is "
+            f"{self.spatial}, and the codec's latents have {channels} channels for {side} pixels "
+            "each way: set them to these.",
+        )
 
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "memory.encoder", "channels", "spatial")
 
-def costs(model: ModelConfig, share: Share, frames: int) -> Costs:
-    """Return the costs of encoding the colours of all context frames."""
-    return codecs.costs_of_images(model, share, frames, "encoder")
+    def encode(self, params: Params, rgb_THWC: Array) -> Array:
+        """Refuse: the features are the codec's latents, which need the model; see ``features``."""
+        del params, rgb_THWC
+        self.require_own("cannot be made without the model")
+
+    def features(self, model: Any, params: Params, rgb_THWC: Array) -> Array:
+        """Return (T, H/s, W/s, C) latents of colours in float32."""
+        video = rgb_THWC[None].astype(jnp.dtype(model.dtype))
+        latents = model.codec.encode(params.get("codec", {}), video)
+        return latents[0].astype(jnp.float32)
+
+    def costs(self, model: Any, share: Share, frames: int) -> Costs:
+        """Return the costs of encoding the colours of all context frames."""
+        return rgbd.costs_of_images(model, share, frames, "encoder")

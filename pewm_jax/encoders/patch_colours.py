@@ -6,23 +6,62 @@ channel and, through −c, the smallest one. The middle of the two is the cell's
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import ModelConfig, PatchColoursConfig
+from pewm_jax.config.parts import Encoder
+from pewm_jax.errors import require, require_positive
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params
 
-SHARDING = ()
-"""It has no parameters."""
 
+@dataclasses.dataclass(frozen=True)
+class PatchColoursConfig(Encoder):
+    """The mean colour of each patch and its negative: six features, no weights."""
 
-def init(config: PatchColoursConfig, key: Array) -> Params:
-    """Return the parameters: none."""
-    del config, key
-    return {}
+    patch: int = 2
+    """Pixels per patch, along height and along width."""
+
+    channels: ClassVar[int] = 6
+
+    def grid(self, clip: Any) -> tuple[int, int]:
+        """Return the rows and columns of patches that a frame of a ``ClipConfig`` has."""
+        return clip.height // self.patch, clip.width // self.patch
+
+    def check(self, model: Any) -> None:
+        """Refuse images that do not split into patches."""
+        clip = model.clip
+        require(
+            clip.height % self.patch == 0 and clip.width % self.patch == 0,
+            f"memory.encoder.patch {self.patch} does not divide the clip "
+            f"{clip.height}×{clip.width}.",
+        )
+
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "memory.encoder", "patch")
+
+    def encode(self, params: Params, rgb_THWC: Array) -> Array:
+        """Return (T, H/p, W/p, 6) features."""
+        del params
+        return patch_colours(rgb_THWC, self.patch)
+
+    def preprocessing(self) -> dict[str, Any]:
+        """Return what the features depend on."""
+        return {"network": {}, "preprocessing": {"patch": self.patch}}
+
+    def colours(self, features_VF: np.ndarray) -> np.ndarray:
+        """Return the middle of each cell's range of colours."""
+        values = np.asarray(features_VF, np.float32)
+        return (values[..., :3] - values[..., 3:6]) / 2
+
+    def costs(self, model: Any, share: Share, frames: int) -> Costs:
+        """Return the costs, which are negligible."""
+        del model, share, frames
+        return Costs()
 
 
 def patch_colours(rgb_THWC: Array, patch: int) -> Array:
@@ -36,25 +75,3 @@ def patch_colours(rgb_THWC: Array, patch: int) -> Array:
     grid = rgb_THWC.reshape(frames, height // patch, patch, width // patch, patch, 3)
     mean = grid.mean((2, 4))
     return jnp.concatenate([mean, -mean], -1)
-
-
-def encode(config: PatchColoursConfig, params: Params, rgb_THWC: Array) -> Array:
-    """Return (T, H/p, W/p, 6) features; see ``encoders.encode``."""
-    del params
-    return patch_colours(rgb_THWC, config.patch)
-
-
-def preprocessing(config: PatchColoursConfig) -> dict[str, Any]:
-    """Return what the features depend on."""
-    return {"network": {}, "preprocessing": {"patch": config.patch}}
-
-
-def colours(features_VF: np.ndarray) -> np.ndarray:
-    """Return the middle of each cell's range of colours."""
-    return (features_VF[..., :3] - features_VF[..., 3:6]) / 2
-
-
-def costs(model: ModelConfig, share: Share, frames: int) -> Costs:
-    """Return the costs, which are negligible."""
-    del model, share, frames
-    return Costs()

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import shipped
-from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.codecs.signals import depth_from_signal, signal_from_depth, signal_from_rgb
 from pewm_jax.config import CodecWorldConfig, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
@@ -119,8 +118,8 @@ def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[st
     whole = depth_images.fill_depth(depth, model.clip.far_m)
     grey = jnp.broadcast_to(signal_from_depth(model.clip, whole)[..., None], rgb.shape)
     both = jnp.stack([rgb, grey])
-    latents = learned_codec.encode(model.codec, params, both)  # type: ignore[arg-type]
-    made = learned_codec.decode(model.codec, params, latents)  # type: ignore[arg-type]
+    latents = model.codec.encode(params, both)  # type: ignore[arg-type]
+    made = model.codec.decode(params, latents)  # type: ignore[arg-type]
     squared = jnp.square(unit_colours(made[0]) - unit_colours(frames.rgb_THWC))
     inside = (depth >= model.clip.near_m) & (depth <= model.clip.far_m)
     off = jnp.abs(depth_from_signal(model.clip, made[1].mean(-1)) - depth) * inside

@@ -17,7 +17,6 @@ from pewm_jax.codecs.signals import signal_from_rgb
 from pewm_jax.config import Encoder, UserError
 from pewm_jax.data.dataset import EpisodeSource, write_json
 from pewm_jax.data.episodes import Episode
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import tree, weights
 from pewm_jax.io.progress import Meter
 from pewm_jax.memory.feature_cache import (
@@ -109,7 +108,7 @@ class _Encoder:
         self._say, self._compiled = say, set()
 
         def encode(params: Params, rgb_THWC: Array) -> Array:
-            return encoders.encode(config, params, signal_from_rgb(rgb_THWC))
+            return config.encode(params, signal_from_rgb(rgb_THWC))
 
         self._encode = jax.jit(encode, out_shardings=self._spread)
 

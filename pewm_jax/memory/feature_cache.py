@@ -17,12 +17,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
 from pewm_jax.config import Encoder, UserError
 from pewm_jax.data.dataset import Manifest, read_manifest
 from pewm_jax.data.episodes import Episode
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.io import tensor_files, tree
 from pewm_jax.types import Params
 
@@ -63,11 +61,11 @@ def fingerprint(config: Encoder, params: Params, data: Manifest) -> dict[str, An
     Raises:
         UserError: the features are the codec's latents.
     """
-    encoders.require_own(config, "are not kept in a cache")
+    config.require_own("are not kept in a cache")
     shards = "\n".join(shard.sha256 for shard in data.shards)
     return {
         "encoder": kinds.of(config).name,
-        **configuration.functions(config).preprocessing(config),
+        **config.preprocessing(),
         "weights": tree.digest(params),
         "data": hashlib.sha256(shards.encode()).hexdigest(),
     }

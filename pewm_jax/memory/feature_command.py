@@ -8,16 +8,13 @@ from typing import Annotated
 
 import tyro
 
-from pewm_jax.config import (
-    DINOv2EncoderConfig,
-    Encoder,
-    PatchColoursConfig,
-    UserError,
-)
+from pewm_jax.config import Encoder, UserError
 from pewm_jax.data import dataset
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.memory import feature_build
 from pewm_jax.memory.feature_cache import Dtype
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.types import Params
 
 

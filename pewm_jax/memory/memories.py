@@ -34,9 +34,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import registry as kinds
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.config import ModelConfig, UserError, functions
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import rendering, views
 from pewm_jax.types import (
     Array,
@@ -295,7 +294,7 @@ def encode(model: ModelConfig, params: Params, view: View) -> EncodedView:
     """
     whole = views.fill_nearest(view)
     depth = jnp.where(whole.depth_THW > 0, whole.depth_THW, model.clip.far_m)
-    latents = codecs.encode_rgbd(model, params, whole.features_THWF[None, ..., :3], depth[None])
+    latents = rgbd.encode_rgbd(model, params, whole.features_THWF[None, ..., :3], depth[None])
     return EncodedView(latents[0], view.seen_THW)
 
 
@@ -321,7 +320,7 @@ def from_context(
     last = jnp.argmax(jnp.where(valid_S, jnp.arange(valid_S.shape[0]), -1))
     memory = empty(model, context.camera.world_from_camera[last, :3, 3])
     if features_ShwF is None:
-        features = encoders.features(model, params, context.rgb_THWC)
+        features = model.memory.encoder.features(model, params, context.rgb_THWC)
     else:
         features = features_ShwF.astype(jnp.float32)
     return remember(model, memory, context, features, valid_S)
@@ -332,4 +331,4 @@ def colours(model: ModelConfig, features_VF: Array) -> np.ndarray:
     values = np.asarray(features_VF)
     if not model.memory.KEEPS_FEATURES or not len(values):
         return values[..., :3]
-    return encoders.colours(model.memory.encoder, values)
+    return model.memory.encoder.colours(values)

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from pewm_jax.config import Memory, UserError
-from pewm_jax.encoders import interface as encoders
+from pewm_jax.config.parts import Encoder
 from pewm_jax.io import atomic
 from pewm_jax.memory import voxel_core
 from pewm_jax.types import Array, VoxelMap
@@ -44,7 +44,7 @@ def export(
         voxels: one map.
         path: the file, whose suffix ``.ply`` or ``.glb`` is the format; its folder is created.
         style: `cubes` or `points`.
-        colours_V3: (V, 3) colours in [−1, 1] of all slots. By default ``encoders.colours``: the
+        colours_V3: (V, 3) colours in [−1, 1] of all slots. By default ``Encoder.colours``: the
             true colours if features are colours, else three principal components.
 
     Raises:
@@ -60,8 +60,10 @@ def export(
     points = points[valid]
     if colours_V3 is None:
         fits = values.shape[-1] == config.encoder.channels
-        draw = functools.partial(encoders.colours, config.encoder)
-        chosen = (draw if fits else encoders.principal_colours)(values[valid])
+        draw = (
+            config.encoder.colours if fits else functools.partial(Encoder.colours, config.encoder)
+        )
+        chosen = draw(values[valid])
     else:
         chosen = np.asarray(colours_V3, np.float32)[valid]
     chosen = np.pad(chosen, ((0, 0), (0, 3 - chosen.shape[1])))

@@ -25,7 +25,6 @@ import numpy as np
 
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import Encoder, ModelConfig, UserError
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.errors import require
 from pewm_jax.geometry.actions import heading
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -182,7 +181,7 @@ class Features(_OfPictures):
         """See ``_OfPictures``."""
         params = self.params
         if not isinstance(self.settings, Encoder):
-            params = encoders.weights(self.settings, params)
+            params = self.settings.memory.encoder.weights(params)
         return _features(self.settings, params, frames.rgb_THWC, goal.rgb_THWC)
 
 
@@ -190,10 +189,11 @@ class Features(_OfPictures):
 def _features(
     settings: Encoder | ModelConfig, params: Params, rgb_PHWC: Array, goal_1HWC: Array
 ) -> Array:
-    made = encoders.encode if isinstance(settings, Encoder) else encoders.features
-
     def encoded(picture_HWC: Array) -> Array:
-        return made(settings, params, picture_HWC[None])[0]  # type: ignore[arg-type]
+        if isinstance(settings, Encoder):
+            settings.require_own("cannot be made without the model")
+            return settings.encode(params, picture_HWC[None])[0]
+        return settings.memory.encoder.features(settings, params, picture_HWC[None])[0]
 
     wanted = encoded(goal_1HWC[0])
     each = jax.lax.map(encoded, rgb_PHWC, batch_size=_at_once(rgb_PHWC))

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import AttentionConfig, CameraConfig, ModelConfig
+from pewm_jax.config import AttentionConfig, ModelConfig
+from pewm_jax.controls.camera import CameraConfig
 from pewm_jax.models.interface import Readers
 from pewm_jax.nn import modules
 from pewm_jax.nn.costs import (

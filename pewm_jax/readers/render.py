@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.pixel import fold
 from pewm_jax.codecs.signals import signal_from_depth
 from pewm_jax.config import ModelConfig, RenderConfig
@@ -218,7 +218,7 @@ def costs(model: ModelConfig, share: Share) -> Costs:
     drawn = share.clips * pixels * (model.memory.rendered_channels + 2) * share.activation_bytes
     made, stays = Costs(), drawn
     if config.READS_LATENTS:
-        made = codecs.costs_of_images(model, share, 2 * clip.frames, "memory")
+        made = rgbd.costs_of_images(model, share, 2 * clip.frames, "memory")
         stays = each * token_channels(model)  # the pictures are gone when the denoiser starts
     kept = 0.0 if remat else depth * (4 * tokens + 3 * part)
     block = 3 * part + 2 * tokens if remat and config.blocks else 0.0

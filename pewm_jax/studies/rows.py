@@ -19,9 +19,7 @@ import jax
 from pewm_jax.config import (
     AttentionConfig,
     Config,
-    DINOv2EncoderConfig,
     ImagesConfig,
-    LatentsConfig,
     Map2DConfig,
     Memory,
     NoMemoryConfig,
@@ -32,7 +30,9 @@ from pewm_jax.config import (
     UserError,
     VoxelConfig,
 )
+from pewm_jax.encoders.latents import LatentsConfig
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.worlds import world_model
 
 POINTS, SURFELS = (0.4, 4), (0.12, 24)

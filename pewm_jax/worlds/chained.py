@@ -23,7 +23,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.config import ModelConfig, UserError
 from pewm_jax.memory import memories
 from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, View
@@ -131,7 +131,7 @@ def _looking_back(
     if model.codec.framewise:  # latents of one frame each
         x0 = latents_BthwC[:, ::-1]
     else:
-        x0 = codecs.encode_rgbd(model, params, back.rgb_THWC, back.depth_THW)
+        x0 = rgbd.encode_rgbd(model, params, back.rgb_THWC, back.depth_THW)
     sight = None if sight is None else backwards(model, sight)
     view = None if sight is None else sight.view
     observed = jax.tree.map(lambda x: x[:, :1], back)
@@ -143,8 +143,8 @@ def _looking_back(
     out = world_model.apply(model, params, inputs, conditioning, network_time, sight)
     latents = model.noise.to_x0(out, x_t, times)
     last = latents[:, -1:] if model.codec.framewise else latents
-    rgb, depth = (x[:, -1:] for x in codecs.decode_rgbd(model, params, last))
+    rgb, depth = (x[:, -1:] for x in rgbd.decode_rgbd(model, params, last))
     if view is not None and memories.gated(model):
         arrived: View = jax.tree.map(lambda x: x[:, -1:], view)
-        rgb, depth = codecs.mix(model, params, rgb, depth, arrived)
+        rgb, depth = rgbd.mix(model, params, rgb, depth, arrived)
     return rgb, depth if model.clip.depth else jnp.zeros_like(depth)

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings
 from pewm_jax.geometry import depth_images
@@ -33,7 +32,7 @@ PULL = 1e-2
 
 def init(model: CodecWorldConfig, key: Array) -> Params:
     """Return random parameters, under ``codec`` as in every model."""
-    return {"codec": learned_codec.init(model.codec, key)}  # type: ignore[arg-type]
+    return {"codec": model.codec.init(key)}  # type: ignore[arg-type]
 
 
 def _without_gate(model: CodecWorldConfig, key: Array) -> Params:
@@ -75,12 +74,12 @@ def reconstruct(
     assert isinstance(train, CodecTrainConfig)
     truth, counts = pictures(model, clip)
     weights, codec = params["codec"], model.codec
-    latents = learned_codec.encode_raw(codec, weights, truth.astype(model.dtype))  # type: ignore[arg-type]
+    latents = codec.encode_raw(weights, truth.astype(model.dtype))  # type: ignore[arg-type]
     latents = latents.astype(jnp.float32)
     mean, variance = _moments(latents)
     noise = jax.random.normal(key, latents.shape) * jnp.sqrt(variance)
     noisy = (latents + train.latent_noise * noise).astype(model.dtype)
-    made = learned_codec.decode_raw(codec, weights, noisy).astype(jnp.float32)  # type: ignore[arg-type]
+    made = codec.decode_raw(weights, noisy).astype(jnp.float32)  # type: ignore[arg-type]
 
     error = (made - truth) * counts
     pixels = jnp.maximum(counts.sum((1, 2, 3, 4)), 1) * error.shape[-1]
@@ -128,7 +127,7 @@ def distribute(
     """
     del train, key
     truth, _ = pictures(model, clip)
-    latents = learned_codec.encode(model.codec, params["codec"], truth.astype(model.dtype))  # type: ignore[arg-type]
+    latents = model.codec.encode(params["codec"], truth.astype(model.dtype))  # type: ignore[arg-type]
     latents = latents.astype(jnp.float32)
     scale = jnp.abs(params["codec"]["latent_scale_C"])
     mean, variance = _moments(latents)
@@ -181,8 +180,7 @@ def stages(model: CodecWorldConfig) -> tuple[Stage, ...]:
 
 def sharding(model: CodecWorldConfig) -> tuple[tuple[str, Any], ...]:
     """Return the codec's rules."""
-    del model
-    return learned_codec.SHARDING
+    return model.codec.SHARDING
 
 
 def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
@@ -194,9 +192,7 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     if stage is not STAGES[1]:
         parts["decoder"] = 2.0 * trained
     products = [
-        Product(
-            "codec", "convolution", frames * learned_codec.macs(model.codec, part, *size), backward
-        )
+        Product("codec", "convolution", frames * model.codec.macs(part, *size), backward)
         for part, backward in parts.items()
     ]
     train = config.train

@@ -7,8 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import gates
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import gates, rgbd
 from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, TrainSettings
 from pewm_jax.memory import memories
@@ -67,11 +66,11 @@ def mix(
     )
     asked = Clip(later, clip.context, clip.context_valid_S)
     shown_BTHWC, seen_BTHW = jax.lax.stop_gradient(rendered(model, asked))
-    latents = codecs.encode_rgbd(model, params, later.rgb_THWC, later.depth_THW)  # type: ignore[arg-type]
+    latents = rgbd.encode_rgbd(model, params, later.rgb_THWC, later.depth_THW)  # type: ignore[arg-type]
     level_key, noise_key = jax.random.split(key)
     level = jax.random.uniform(level_key, (len(latents), 1, 1, 1, 1), maxval=train.gate_noise)
     noisy = latents + level * jax.random.normal(noise_key, latents.shape)
-    rgb, depth = codecs.decode_rgbd(model, params, noisy)  # type: ignore[arg-type]
+    rgb, depth = rgbd.decode_rgbd(model, params, noisy)  # type: ignore[arg-type]
     return score(model, params["codec"]["gate"], rgb, depth, shown_BTHWC, seen_BTHW, later)
 
 

@@ -8,11 +8,10 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, signal_from_rgb
 from pewm_jax.config import ModelConfig, TrainSettings
 from pewm_jax.config.parts import Noise
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import memories
 from pewm_jax.nn import placement
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, MemoryReadout, Params
@@ -50,7 +49,7 @@ def clip_readout(
             return jax.lax.map(lambda one: of_clip(*one), parts)
         return jax.vmap(of_clip)(*parts)
 
-    weights = encoders.weights(model, params)
+    weights = model.memory.encoder.weights(params)
     if model.memory.reader.READS_LATENTS and "codec" in params:
         weights["codec"] = params["codec"]
     return placement.by_batch(of_batch, weights, clip)
@@ -60,9 +59,9 @@ def _features(model: ModelConfig, weights: Params, rgb_BSHWC: Array) -> Array:
     """Return the features of every clip's context; encoders with weights run clip by clip."""
 
     def of_clip(rgb_SHWC: Array) -> Array:
-        return encoders.features(model, weights, signal_from_rgb(rgb_SHWC))
+        return model.memory.encoder.features(model, weights, signal_from_rgb(rgb_SHWC))
 
-    large = encoders.weights(model, weights)
+    large = model.memory.encoder.weights(weights)
     return jax.lax.map(of_clip, rgb_BSHWC) if large else jax.vmap(of_clip)(rgb_BSHWC)
 
 
@@ -86,7 +85,7 @@ def prepare(model: ModelConfig, params: Params, clip: Clip, *, memory: bool) -> 
     )
     return emptied.with_extras(
         context_features_ShwF=None,
-        latents_thwC=codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW),
+        latents_thwC=rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW),
         readout=clip_readout(model, params, clip) if memory else None,
     )
 
@@ -124,7 +123,7 @@ def loss(
     frames = as_signal(clip.frames)
     x0 = clip.extras.get("latents_thwC")
     if x0 is None:
-        x0 = codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
+        x0 = rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
     batch = x0.shape[0]
     time_key, noise_key, level_key, image_key = jax.random.split(key, 4)
     times = model.noise.draw(time_key, batch, x0.shape[1])
@@ -164,7 +163,7 @@ def loss(
     error = (prediction - model.noise.prediction_target(x0, noise, times)) ** 2
     error = error * Noise.expand(model.noise.weight(times), error.ndim)
     split = model.codec.rgb_channels
-    measured = jnp.broadcast_to(codecs.measured(model, frames.depth_THW), error[..., split:].shape)
+    measured = jnp.broadcast_to(rgbd.measured(model, frames.depth_THW), error[..., split:].shape)
     rgb = error[..., :split].mean()
     if conditioning.given.known_Bt is not None:
         counted = Noise.expand(1.0 - conditioning.given.known_Bt, error.ndim)

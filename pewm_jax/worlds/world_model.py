@@ -18,11 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.config import ModelConfig
 from pewm_jax.controls import camera as camera_control
-from pewm_jax.controls import interface as controls
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.interface import NO_READERS, Conditioning, Observed
 from pewm_jax.readers import interface as readers
@@ -66,14 +64,14 @@ def condition(
         clean_BTHWC: these colours before that; None where there is no noise.
     """
     batch, rgb = len(observed.depth_THW), observed.rgb_THWC
-    first = codecs.encode_rgbd(model, params, rgb, observed.depth_THW, condition=True)
+    first = rgbd.encode_rgbd(model, params, rgb, observed.depth_THW, condition=True)
     seen = Observed(
         _seen(model, first),
         rgb if clean_BTHWC is None else clean_BTHWC,
         jnp.zeros((batch,)) if noise_B is None else noise_B,
     )
     shown = backbones.observed(model, params, seen)
-    steering = controls.condition(model, params.get("control", {}), observed, control)
+    steering = model.control.condition(model, params.get("control", {}), observed, control)
     joined = [x for x in (shown.joined_BthwC, steering.joined_BthwC) if x is not None]
     given = dataclasses.replace(
         shown,
@@ -161,9 +159,9 @@ def init(model: ModelConfig, key: Array, *, memory: bool = True) -> Params:
     if memory and model.backbone.places is not None:
         params["memory"] = readers.init(model, memory_key)
     parts = {
-        "codec": codecs.init(model.codec, frozen_key),
-        "encoder": encoders.init(model.memory.encoder, jax.random.fold_in(frozen_key, 1)),
-        "control": controls.init(model, jax.random.fold_in(key, 3)),
+        "codec": model.codec.init(frozen_key),
+        "encoder": model.memory.encoder.init(jax.random.fold_in(frozen_key, 1)),
+        "control": model.control.init(model, jax.random.fold_in(key, 3)),
         "image": backbones.init_image(model.backbone, jax.random.fold_in(key, 4)),
     }
     params |= {name: part for name, part in parts.items() if part}

@@ -8,18 +8,13 @@ import pytest
 
 from pewm_jax.cli import memory as command
 from pewm_jax.codecs import signals
-from pewm_jax.config import (
-    DINOv2Config,
-    DINOv2EncoderConfig,
-    PatchColoursConfig,
-    UserError,
-    save,
-)
+from pewm_jax.config import DINOv2Config, UserError, save
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.encoders import interface as encoders
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.io import weights
 from pewm_jax.memory import feature_build, feature_cache
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from tests.data import data_world
 
 NETWORK = DINOv2Config(layers=1, heads=1, width=8, pretrained_size=28)
@@ -50,10 +45,10 @@ def cache(params, data, tmp_path_factory):
 
 
 def test_what_is_read_is_what_the_encoder_makes(cache, params, data):
-    encode = jax.jit(encoders.encode, static_argnums=0)
+    encode = jax.jit(CONFIG.encode)
     for episode in EpisodeSource(data):
         rgb = signals.signal_from_rgb(episode.frames().rgb_THWC)
-        want = np.asarray(encode(CONFIG, params, rgb))
+        want = np.asarray(encode(params, rgb))
         chosen = [5, 0, 5, 6]
         got = feature_cache.features(cache, episode, chosen)
         assert got.shape == (4, 2, 2, 8)

@@ -11,7 +11,6 @@ from pewm_jax.cli.data import main
 from pewm_jax.codecs.signals import signal_from_rgb
 from pewm_jax.config import VoxelConfig
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import cells, voxel_map
 from pewm_jax.types import Camera, Frames
@@ -43,7 +42,7 @@ def build(episode, cell):
     frames = Frames(signal_from_rgb(seen.rgb_THWC), seen.depth_THW, seen.camera)
     centre = np.asarray(seen.camera.world_from_camera)[0, :3, 3]
     insert = jax.jit(voxel_map.insert_frames, static_argnums=0)
-    patches = encoders.encode(config.encoder, {}, frames.rgb_THWC)
+    patches = config.encoder.encode({}, frames.rgb_THWC)
     voxels = insert(config, voxel_map.empty(config, centre, 6), frames, patches)
     assert int(voxels.dropped) == 0
     assert int(voxels.outside) == 0
@@ -72,7 +71,7 @@ def agreement(episode, cell, bin_px, shift=0.0):
     pose[:3, 3] += shift * pose[:3, 0]
     camera = Camera(later.camera.intrinsics_4[0], pose)
     uv, z = (np.asarray(x) for x in cameras.project(points[valid], camera))
-    colours = np.asarray(encoders.colours(config.encoder, values[valid]))
+    colours = np.asarray(config.encoder.colours(values[valid]))
     mapped, mapped_colour = nearest_in_bins(uv, z, colours, later.depth_THW.shape[1:], bin_px)
     grid = cameras.pixel_grid(*later.depth_THW.shape[1:]).reshape(-1, 2)
     rgb = np.asarray(signal_from_rgb(later.rgb_THWC[0])).reshape(-1, 3)

@@ -22,7 +22,6 @@ from pewm_jax.config import (
     SurfelConfig,
     VoxelConfig,
 )
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import cells, images, map2d, memories, points, voxel_map
 from pewm_jax.types import Camera, Frames
@@ -65,7 +64,7 @@ def scene(seed=0, count=4):
 
 
 def encoded(frames):
-    return encoders.encode(TINY.memory.encoder, {}, frames.rgb_THWC)
+    return TINY.memory.encoder.encode({}, frames.rgb_THWC)
 
 
 @functools.partial(jax.jit, static_argnums=0)

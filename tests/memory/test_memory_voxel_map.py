@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import voxel_map
 from pewm_jax.types import Camera, Frames
@@ -228,7 +227,7 @@ def test_every_point_of_a_frame_is_within_half_a_cell_of_its_centre():
         config,
         voxels,
         frames,
-        encoders.encode(config.encoder, {}, frames.rgb_THWC),
+        config.encoder.encode({}, frames.rgb_THWC),
         np.array([True, False]),
     )
     points = np.asarray(
@@ -252,7 +251,7 @@ def test_pixels_without_depth_leave_no_trace():
     frames = random_frames(rng, 1)
     blank = Frames(rng.uniform(-1, 1, frames.rgb_THWC.shape), frames.depth_THW * 0, frames.camera)
     voxels = voxel_map.empty(config, np.zeros(3), 6)
-    patches = encoders.encode(config.encoder, {}, blank.rgb_THWC)
+    patches = config.encoder.encode({}, blank.rgb_THWC)
     voxels = insert_frames(config, voxels, blank, patches)
     assert int(voxels.occupied) == 0
 
@@ -296,8 +295,8 @@ def test_patch_colours_keep_both_ends_of_the_range():
     config = TINY.memory
     rgb = np.full((1, 4, 4, 3), 0.5, np.float32)
     rgb[:, :, 2:] = -1.0
-    patches = np.asarray(encoders.encode(config.encoder, {}, rgb))
+    patches = np.asarray(config.encoder.encode({}, rgb))
     assert patches.shape == (1, 2, 2, 6)
     np.testing.assert_allclose(patches[0, 0, 0], [0.5] * 3 + [-0.5] * 3, atol=1e-6)
     both = np.maximum(patches[0, 0, 0], patches[0, 0, 1])
-    np.testing.assert_allclose(encoders.colours(config.encoder, both), -0.25, atol=1e-6)
+    np.testing.assert_allclose(config.encoder.colours(both), -0.25, atol=1e-6)

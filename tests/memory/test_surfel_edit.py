@@ -6,7 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import ImagesConfig, PatchColoursConfig, SurfelConfig, UserError, VoxelConfig
+from pewm_jax.config import ImagesConfig, SurfelConfig, UserError, VoxelConfig
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.memory import memories, surfels, voxel_map
 from tests.helpers import tiny_model
 from tests.memory.test_surfels import drawn, insert

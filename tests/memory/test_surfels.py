@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import ConfigError, PatchColoursConfig, SurfelConfig, VoxelConfig
+from pewm_jax.config import ConfigError, SurfelConfig, VoxelConfig
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.eval.seen import seen_masks
 from pewm_jax.memory import memories, rendering, surfels, views
 from pewm_jax.types import Frames

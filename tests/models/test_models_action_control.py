@@ -8,16 +8,10 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import (
-    ConfigError,
-    ModulationConfig,
-    NoMemoryConfig,
-    PixelConfig,
-    RenderConfig,
-    UserError,
-)
+from pewm_jax.codecs.pixel import PixelConfig
+from pewm_jax.config import ConfigError, NoMemoryConfig, RenderConfig, UserError
 from pewm_jax.controls import actions as action_control
-from pewm_jax.controls import interface as controls
+from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.models import interface as backbones
 from pewm_jax.types import Control
 from tests.helpers import TINY, random_camera, random_frames, randomise, tiny_model
@@ -37,10 +31,10 @@ def model_of(temporal=4, **settings):
 def steered(model, actions, params=None, state=None, observed=1):
     """The control's conditioning of a batch of clips."""
     rng = np.random.default_rng(0)
-    params = randomise(controls.init(model, jax.random.key(0))) if params is None else params
+    params = randomise(model.control.init(model, jax.random.key(0))) if params is None else params
     frames, camera = random_frames(rng, observed), random_camera(rng, model.clip.frames)
     both = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], BATCH, 0), (frames, camera))
-    return controls.condition(model, params, both[0], Control(both[1], actions, state))
+    return model.control.condition(model, params, both[0], Control(both[1], actions, state))
 
 
 def actions_of(model, seed=0):
@@ -53,7 +47,7 @@ def test_numbers_are_normalised_as_published():
     turn = np.pi
     given = [[-1.25, -2, turn], [2.5, 2, -turn], [0.625, 0, 0.3 + 2 * turn], [0.625, 0, -3 * turn]]
     want = [[-1, -1, turn], [1, 1, turn], [0, 0, 0.3], [0, 0, turn]]
-    np.testing.assert_allclose(action_control.normalise(config, given), want, atol=1e-5)
+    np.testing.assert_allclose(config.normalise(given), want, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +73,7 @@ def test_an_embedding_per_latent_frame_that_knows_no_later_action(temporal, sett
 def test_only_frames_to_be_imagined_have_actions_and_the_state_is_in_all():
     model = model_of(1, state=3)
     state = np.full((BATCH, 3), 0.5, np.float32)
-    params = randomise(controls.init(model, jax.random.key(0)))
+    params = randomise(model.control.init(model, jax.random.key(0)))
     made = steered(model, actions_of(model), params, state, observed=3).modulation_BtE
     np.testing.assert_array_equal(made[:, 0], made[:, 2])
     assert np.abs(made[:, 3] - made[:, 2]).max() > 1e-3
@@ -101,7 +95,7 @@ def test_before_training_any_action_leaves_the_output_bit_for_bit():
     state = np.ones((BATCH, 3), np.float32)
     for projection in ("sinusoid", "convolution"):
         model = model_of(projection=projection, state=3)
-        fresh = controls.init(model, jax.random.key(1))
+        fresh = model.control.init(model, jax.random.key(1))
         made = steered(model, actions_of(model), fresh, state)
         assert not np.any(made.modulation_BtE)
     x = np.random.default_rng(0).normal(size=(BATCH, *model.latent_shape, 8)).astype(np.float32)

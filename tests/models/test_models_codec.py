@@ -4,13 +4,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.codecs import interface as codecs
-from pewm_jax.codecs import signals
-from pewm_jax.config import ClipConfig, PixelConfig
+from pewm_jax.codecs import rgbd, signals
+from pewm_jax.codecs.pixel import PixelConfig
+from pewm_jax.config import ClipConfig
 from tests.helpers import TINY
 
-encode = jax.jit(codecs.encode, static_argnums=0)
-decode = jax.jit(codecs.decode, static_argnums=0)
+encode = jax.jit(PixelConfig.encode, static_argnums=0)
+decode = jax.jit(PixelConfig.decode, static_argnums=0)
 
 
 @settings(max_examples=15, deadline=None)
@@ -33,13 +33,13 @@ def test_a_latent_frame_holds_only_its_own_frames():
     config = PixelConfig()
     video = np.zeros((1, 9, 8, 8, 1), np.float32)
     video[:, 5] = 1
-    changed = np.abs(np.asarray(codecs.encode(config, {}, video))).sum((0, 2, 3, 4)) > 0
+    changed = np.abs(np.asarray(config.encode({}, video))).sum((0, 2, 3, 4)) > 0
     np.testing.assert_array_equal(changed, [False, False, True])
 
 
 def test_a_frame_count_that_cannot_be_folded_is_refused():
     with pytest.raises(ValueError, match="4k \\+ 1"):
-        codecs.encode(PixelConfig(), {}, np.zeros((1, 8, 8, 8, 3), np.float32))
+        PixelConfig().encode({}, np.zeros((1, 8, 8, 8, 3), np.float32))
 
 
 @pytest.mark.parametrize("scale", ["linear", "log"])
@@ -63,10 +63,10 @@ def test_rgbd_is_encoded_separately_and_concatenated():
     rng = np.random.default_rng(0)
     rgb = rng.uniform(-1, 1, (1, 9, 16, 24, 3)).astype(np.float32)
     depth = rng.uniform(0.2, 8, (1, 9, 16, 24)).astype(np.float32)
-    latents = codecs.encode_rgbd(TINY, {}, rgb, depth)
-    other = codecs.encode_rgbd(TINY, {}, rgb, depth * 0.5)
+    latents = rgbd.encode_rgbd(TINY, {}, rgb, depth)
+    other = rgbd.encode_rgbd(TINY, {}, rgb, depth * 0.5)
     split = TINY.codec.rgb_channels
     np.testing.assert_array_equal(latents[..., :split], other[..., :split])
-    rgb_back, depth_back = codecs.decode_rgbd(TINY, {}, latents)
+    rgb_back, depth_back = rgbd.decode_rgbd(TINY, {}, latents)
     np.testing.assert_allclose(rgb_back, rgb, atol=1e-6)
     np.testing.assert_allclose(depth_back, depth, rtol=1e-4)

@@ -11,7 +11,9 @@ import pytest
 
 from pewm_jax import registry as kinds
 from pewm_jax import worlds
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
+from pewm_jax.codecs.learned import LearnedCodecConfig
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     AttentionConfig,
     BothConfig,
@@ -19,10 +21,6 @@ from pewm_jax.config import (
     Config,
     ConfigError,
     DataConfig,
-    LatentsConfig,
-    LearnedCodecConfig,
-    PatchColoursConfig,
-    PixelConfig,
     PointsConfig,
     RenderConfig,
     SurfelConfig,
@@ -31,7 +29,8 @@ from pewm_jax.config import (
 )
 from pewm_jax.convert import stablehlo_programs
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.encoders import interface as encoders
+from pewm_jax.encoders.latents import LatentsConfig
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.io import tree
 from pewm_jax.memory import feature_cache, memories
 from pewm_jax.readers import interface as readers
@@ -76,8 +75,10 @@ apply = jax.jit(world_model.apply, static_argnums=0)
 condition = jax.jit(world_model.condition, static_argnums=0)
 look = jax.jit(objective.clip_readout, static_argnums=0)
 start = jax.jit(pewm.start, static_argnums=0)
-encode_rgbd = jax.jit(codecs.encode_rgbd, static_argnums=0)
-features = jax.jit(encoders.features, static_argnums=0)
+encode_rgbd = jax.jit(rgbd.encode_rgbd, static_argnums=0)
+features = jax.jit(
+    lambda model, *given: model.memory.encoder.features(model, *given), static_argnums=0
+)
 
 
 @functools.cache
@@ -150,7 +151,7 @@ def test_features_are_the_latents_of_each_frame_s_colours():
     other = features(model, params, rgb.at[3].set(0))
     same = np.abs(other - found).max((1, 2, 3)) == 0
     assert same.tolist() == [True, True, True, False, True]
-    assert encoders.colours(ENCODER, found.reshape(-1, 4)).shape == (30, 3)
+    assert ENCODER.colours(found.reshape(-1, 4)).shape == (30, 3)
 
 
 @ALL
@@ -357,7 +358,7 @@ def test_what_has_no_meaning_is_refused_in_a_sentence():
     with pytest.raises(UserError, match="are not kept in a cache"):
         feature_cache.fingerprint(ENCODER, {}, None)
     with pytest.raises(UserError, match="takes the weights of the codec"):
-        encoders.encode(ENCODER, {}, np.zeros((1, 16, 24, 3)))
+        ENCODER.encode({}, np.zeros((1, 16, 24, 3)))
     assert Config(model=TINY, data=DataConfig(features="kept")).model.memory.encoder == (
         PatchColoursConfig()
     )

@@ -7,26 +7,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.codecs import interface as codecs
 from pewm_jax.codecs import learned as learned_codec
+from pewm_jax.codecs import rgbd
+from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import (
     ClipConfig,
     Codec,
     CodecWorldConfig,
     ConfigError,
     DiTConfig,
-    LearnedCodecConfig,
     UserError,
     from_dict,
-    functions,
 )
 from pewm_jax.worlds import objective
 from tests.helpers import init_world, random_frames, randomise, tiny_model
 
 TINY = LearnedCodecConfig(latent_channels=4, fine=8, coarse=12, fine_blocks=1, coarse_blocks=1)
-init = jax.jit(learned_codec.init, static_argnums=0)
-encode = jax.jit(codecs.encode, static_argnums=0)
-decode = jax.jit(codecs.decode, static_argnums=0)
+init = jax.jit(LearnedCodecConfig.init, static_argnums=0)
+encode = jax.jit(LearnedCodecConfig.encode, static_argnums=0)
+decode = jax.jit(LearnedCodecConfig.decode, static_argnums=0)
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +51,9 @@ def test_frames_are_coded_each_by_itself_under_jit_or_not(params):
     made = decode(TINY, params, latents)
     for b in range(2):
         for t in range(3):
-            one = codecs.encode(TINY, params, video[b : b + 1, t : t + 1])
+            one = TINY.encode(params, video[b : b + 1, t : t + 1])
             np.testing.assert_allclose(one[0, 0], latents[b, t], atol=1e-5, rtol=1e-5)
-            back = codecs.decode(TINY, params, one)
+            back = TINY.decode(params, one)
             np.testing.assert_allclose(back[0, 0], made[b, t], atol=1e-4, rtol=1e-4)
 
 
@@ -82,7 +81,7 @@ def test_normalised_latents_have_mean_0_and_variance_1_and_decode_the_same(param
 )
 def test_sizes_that_do_not_fit_are_refused_in_a_sentence(params, video, says):
     with pytest.raises(UserError, match=says):
-        codecs.encode(TINY, params, video)
+        TINY.encode(params, video)
 
 
 def test_settings_that_cannot_work_are_refused_in_a_sentence():
@@ -98,14 +97,14 @@ def test_settings_that_cannot_work_are_refused_in_a_sentence():
 
 def test_the_default_has_at_most_three_million_parameters_as_its_layout_says():
     config = LearnedCodecConfig()
-    shapes = jax.eval_shape(lambda: learned_codec.init(config, jax.random.key(0)))
+    shapes = jax.eval_shape(lambda: config.init(jax.random.key(0)))
     count = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     assert 1e6 < count <= 3e6
-    done = jax.jit(learned_codec.encode_raw, static_argnums=0)
+    done = jax.jit(LearnedCodecConfig.encode_raw, static_argnums=0)
     video = jax.ShapeDtypeStruct((1, 1, 64, 64, 3), jnp.float32)
     flops = done.lower(config, shapes, video).cost_analysis()["flops"]
     # XLA leaves out what multiplies the zeros around the frame.
-    assert flops == pytest.approx(2 * learned_codec.macs(config, "encoder", 64, 64), rel=0.15)
+    assert flops == pytest.approx(2 * config.macs("encoder", 64, 64), rel=0.15)
 
 
 def model():
@@ -123,19 +122,19 @@ def test_colour_and_depth_go_through_the_same_weights(params):
     rgb = videos(2, 3, 16, 32)
     depth = rng.uniform(0.5, 4, (2, 3, 16, 32)).astype(np.float32)
     weights = {"codec": params}
-    outside = codecs.encode_rgbd(world, weights, rgb, depth)
+    outside = rgbd.encode_rgbd(world, weights, rgb, depth)
     assert outside.shape == (2, *world.latent_shape, 8)
-    inside = jax.jit(codecs.encode_rgbd, static_argnums=0)(world, weights, rgb, depth)
+    inside = jax.jit(rgbd.encode_rgbd, static_argnums=0)(world, weights, rgb, depth)
     np.testing.assert_allclose(inside, outside, atol=1e-5)
-    colours, metres = codecs.decode_rgbd(world, weights, outside)
+    colours, metres = rgbd.decode_rgbd(world, weights, outside)
     assert colours.shape == rgb.shape
     assert metres.shape == depth.shape
-    assert codecs.measured(world, depth).shape == (2, *world.latent_shape, 1)
+    assert rgbd.measured(world, depth).shape == (2, *world.latent_shape, 1)
 
 
 def test_a_world_model_with_it_is_built_and_traced():
     world = model()
-    assert functions(world.codec) is learned_codec
+    assert isinstance(world.codec, LearnedCodecConfig)
     weights = init_world(world)
     frames = random_frames(np.random.default_rng(0), 3, 16, 32)
     clip = jax.tree.map(lambda x: jnp.asarray(x)[None], frames)

@@ -15,7 +15,7 @@ from transformers import AutoTokenizer, T5EncoderModel
 
 import pewm_jax
 from pewm_jax import worlds
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.config import ConfigError, EgoWMConfig, UserError
 from pewm_jax.convert import commands, cosmos
 from pewm_jax.convert.options import ImportCosmos2
@@ -130,7 +130,7 @@ def test_what_the_pipeline_samples_the_world_samples(pipeline, model, params, mo
     ).frames
     got = sampled(model, params, FIRST, MOVES, START)
     assert distance(got, seen[-1]) < 1e-4
-    rgb, depth = jax.jit(codecs.decode_rgbd, static_argnums=0)(model, params, got)
+    rgb, depth = jax.jit(rgbd.decode_rgbd, static_argnums=0)(model, params, got)
     theirs = 2 * np.moveaxis(frames[0].numpy(), 1, -1) - 1
     assert np.abs(np.asarray(rgb[0]) - theirs).max() < 2 / 255 + 1e-3  # theirs went through 8 bits
     assert not np.any(depth)

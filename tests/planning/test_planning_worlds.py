@@ -8,17 +8,12 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets, worlds
-from pewm_jax.config import (
-    ConfigError,
-    LearnedCodecConfig,
-    PatchColoursConfig,
-    RenderConfig,
-    SurfelConfig,
-    UserError,
-)
+from pewm_jax.codecs.learned import LearnedCodecConfig
+from pewm_jax.config import ConfigError, RenderConfig, SurfelConfig, UserError
 from pewm_jax.data.navigation import is_free, navigable, sample_free
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.geometry.actions import discrete_table, rotation_z
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.models.lpips import convert as lpips_weights

@@ -1,7 +1,6 @@
-"""A stranger's codec: every patch of every frame turned by a fixed orthonormal matrix."""
+"""A codec of one's own: every patch of every frame turned by a fixed orthonormal matrix."""
 
 import dataclasses
-import sys
 from typing import ClassVar
 
 import jax
@@ -9,14 +8,16 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.codecs.pixel import fold
-from pewm_jax.config import Codec, register
+from pewm_jax.config.parts import Codec
 from pewm_jax.nn.costs import Costs, Product
+from pewm_jax.registry import register
 
-SHARDING = ((r"codec/(colour|depth)", P(None, "fsdp")),)
 
-
+@register("codec", "turn")
 @dataclasses.dataclass(frozen=True)
 class TurnConfig(Codec):
+    SHARDING: ClassVar = ((r"codec/(colour|depth)", P(None, "fsdp")),)
+
     spatial: int = 4
     temporal: ClassVar[int] = 1
 
@@ -28,31 +29,23 @@ class TurnConfig(Codec):
     def depth_channels(self):
         return self.spatial**2
 
+    def init(self, key):
+        sizes = {"colour": self.rgb_channels, "depth": self.depth_channels}
+        drawn = {name: jax.random.normal(key, (n, n)) for name, n in sizes.items()}
+        return {name: jnp.linalg.qr(matrix)[0] for name, matrix in drawn.items()}
 
-def init(config, key):
-    sizes = {"colour": config.rgb_channels, "depth": config.depth_channels}
-    drawn = {name: jax.random.normal(key, (n, n)) for name, n in sizes.items()}
-    return {name: jnp.linalg.qr(matrix)[0] for name, matrix in drawn.items()}
+    def encode(self, params, video_BTHWC, *, condition=False):
+        patches = fold(video_BTHWC, self.spatial, 1)
+        return patches @ params["depth" if video_BTHWC.shape[-1] == 1 else "colour"]
 
+    def decode(self, params, latents_BthwC):
+        s = self.spatial
+        grid = latents_BthwC @ params["depth" if latents_BthwC.shape[-1] == s**2 else "colour"].T
+        b, t, h, w, _ = grid.shape
+        pixels = grid.reshape(b, t, h, w, s, s, -1).transpose(0, 1, 2, 4, 3, 5, 6)
+        return pixels.reshape(b, t, h * s, w * s, -1)
 
-def encode(config, params, video_BTHWC, *, condition=False):
-    patches = fold(video_BTHWC, config.spatial, 1)
-    return patches @ params["depth" if video_BTHWC.shape[-1] == 1 else "colour"]
-
-
-def decode(config, params, latents_BthwC):
-    s = config.spatial
-    matrix = params["depth" if latents_BthwC.shape[-1] == s**2 else "colour"]
-    grid = latents_BthwC @ matrix.T
-    b, t, h, w, _ = grid.shape
-    pixels = grid.reshape(b, t, h, w, s, s, -1).transpose(0, 1, 2, 4, 3, 5, 6)
-    return pixels.reshape(b, t, h * s, w * s, -1)
-
-
-def costs(model, share):
-    config, (t, h, w) = model.codec, model.latent_shape
-    macs = (t + 1) * h * w * (config.rgb_channels**2 + config.depth_channels**2)
-    return Costs(products=(Product("codec", "linear", macs),))
-
-
-register("codec", "turn", TurnConfig, sys.modules[__name__])
+    def costs(self, model, share):
+        t, h, w = model.latent_shape
+        macs = (t + 1) * h * w * (self.rgb_channels**2 + self.depth_channels**2)
+        return Costs(products=(Product("codec", "linear", macs),))

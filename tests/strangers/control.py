@@ -1,45 +1,39 @@
-"""A stranger's control: actions added to the time embedding of the latent frames they lead to."""
+"""A control of one's own: actions added to the time embedding of the frames they lead to."""
 
 import dataclasses
-import sys
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import Conditioner, register
+from pewm_jax.config.parts import Conditioner
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.nn.costs import Costs, Product
+from pewm_jax.registry import register
 
-SHARDING = ((r"control/project", P(None, "fsdp")),)
 
-
+@register("control", "push")
 @dataclasses.dataclass(frozen=True)
 class PushConfig(Conditioner):
     MODULATES: ClassVar[bool] = True
+    SHARDING: ClassVar = ((r"control/project", P(None, "fsdp")),)
 
     width: int = 3
 
     actions = property(lambda self: self.width)
 
+    def init(self, model, key):
+        shape = (model.codec.temporal * self.width, model.backbone.places.time)
+        return {"project": 0.1 * jax.random.normal(key, shape)}
 
-def init(model, key):
-    shape = (model.codec.temporal * model.control.width, model.backbone.places.time)
-    return {"project": 0.1 * jax.random.normal(key, shape)}
+    def condition(self, model, params, observed, control):
+        t = model.latent_shape[0]
+        actions = control.actions_TA.reshape(len(control.actions_TA), t - 1, -1)
+        led = actions @ params["project"]
+        return Conditioning(modulation_BtE=jnp.pad(led, ((0, 0), (1, 0), (0, 0))))
 
-
-def condition(model, params, observed, control):
-    t = model.latent_shape[0]
-    actions = control.actions_TA.reshape(len(control.actions_TA), t - 1, -1)
-    led = actions @ params["project"]
-    return Conditioning(modulation_BtE=jnp.pad(led, ((0, 0), (1, 0), (0, 0))))
-
-
-def costs(model, share, *, trained):
-    steps = (model.latent_shape[0] - 1) * model.codec.temporal
-    macs = steps * model.control.width * model.backbone.places.time
-    return Costs(products=(Product("control", "linear", macs, float(trained)),))
-
-
-register("control", "push", PushConfig, sys.modules[__name__])
+    def costs(self, model, share, *, trained):
+        steps = (model.latent_shape[0] - 1) * model.codec.temporal
+        macs = steps * self.width * model.backbone.places.time
+        return Costs(products=(Product("control", "linear", macs, float(trained)),))

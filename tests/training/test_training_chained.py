@@ -11,9 +11,10 @@ import training_fakes as fakes
 from test_training_prepared import a_batch
 
 from pewm_jax import worlds
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import BothConfig, ConfigError, PixelConfig, TrainConfig, UserError
+from pewm_jax.config import BothConfig, ConfigError, TrainConfig, UserError
 from pewm_jax.memory import memories
 from pewm_jax.types import EncodedView, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import chained, objective, world_model
@@ -58,7 +59,7 @@ def ready_batch(config):
     """A batch whose latents and memories are known."""
     clip = jax.tree.map(jnp.asarray, a_batch(config, BATCH))
     frames = as_signal(clip.frames)
-    encode = jax.jit(lambda f: codecs.encode_rgbd(config.model, {}, f.rgb_THWC, f.depth_THW))
+    encode = jax.jit(lambda f: rgbd.encode_rgbd(config.model, {}, f.rgb_THWC, f.depth_THW))
     clip = dataclasses.replace(clip, frames=frames)
     return clip.with_extras(latents_thwC=encode(frames), readout=shows(config))
 
@@ -133,7 +134,7 @@ def looking_back(monkeypatch, config, share):
     def apply(model, params, noisy, conditioning, time, sight):
         got.update(conditioning=conditioning, sight=sight, time=time)
         back = jax.tree.map(lambda x: x[: len(noisy), ::-1], ready.frames)
-        return codecs.encode_rgbd(model, {}, back.rgb_THWC, back.depth_THW)
+        return rgbd.encode_rgbd(model, {}, back.rgb_THWC, back.depth_THW)
 
     @jax.jit
     def made():
@@ -149,7 +150,7 @@ def test_the_clip_before_leads_back_to_the_first_frame(monkeypatch):
     """Its depth is decoded, and its colours are mixed with what the memory shows there."""
     monkeypatch.setattr(memories, "gated", lambda model: True)
     monkeypatch.setattr(
-        codecs, "mix", lambda m, p, rgb, depth, view: (view.features_THWF[..., :3], depth)
+        rgbd, "mix", lambda m, p, rgb, depth, view: (view.features_THWF[..., :3], depth)
     )
     ready, (rgb, depth), got = looking_back(monkeypatch, CONFIG, 1.0)
     frames, model = ready.frames, CONFIG.model

@@ -12,6 +12,8 @@ import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import presets, worlds
 from pewm_jax.cli import evaluate
+from pewm_jax.codecs.learned import LearnedCodecConfig
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     ClipConfig,
     CodecTrainConfig,
@@ -20,8 +22,6 @@ from pewm_jax.config import (
     ConfigError,
     DataConfig,
     Launch,
-    LearnedCodecConfig,
-    PixelConfig,
     StageConfig,
     UserError,
 )

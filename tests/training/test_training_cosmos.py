@@ -11,7 +11,7 @@ import training_fakes as fakes
 from test_training_egowm import changed, trained
 
 from pewm_jax import worlds
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.config import (
     ClipConfig,
     Config,
@@ -21,12 +21,11 @@ from pewm_jax.config import (
     EgoWMConfig,
     EgoWMTrainConfig,
     MeshConfig,
-    ModulationConfig,
     StageConfig,
     TrainConfig,
     WanVAEConfig,
 )
-from pewm_jax.controls import interface as controls
+from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
 from pewm_jax.plan import hlo
@@ -101,9 +100,9 @@ def test_frames_that_are_given_do_not_count_in_the_loss(monkeypatch):
         grid = (model.codec.frames(rgb.shape[1]), *model.latent_shape[1:], model.codec.channels)
         return jnp.zeros((len(rgb), *grid))
 
-    monkeypatch.setattr(codecs, "encode_rgbd", latents)
+    monkeypatch.setattr(rgbd, "encode_rgbd", latents)
     config = Config(model=MODEL, data=DataConfig(context=1), train=EgoWMTrainConfig(blind=0.5))
-    params = {"control": jax.jit(controls.init, static_argnums=0)(MODEL, jax.random.key(0))}
+    params = {"control": jax.jit(MODEL.control.init, static_argnums=0)(MODEL, jax.random.key(0))}
     batch = jax.tree.map(np.asarray, fakes.clip(config, 1, 0))
 
     def loss(wrong_at):

@@ -9,6 +9,7 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax import worlds
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     ClipConfig,
     CLIPVisionConfig,
@@ -18,13 +19,12 @@ from pewm_jax.config import (
     EgoWMConfig,
     EgoWMTrainConfig,
     MeshConfig,
-    ModulationConfig,
-    PixelConfig,
     StageConfig,
     SVDUNetConfig,
     SVDVAEConfig,
     TrainConfig,
 )
+from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree

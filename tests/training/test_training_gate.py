@@ -10,7 +10,7 @@ import pytest
 import pewm_jax
 from pewm_jax import shipped, worlds
 from pewm_jax.codecs import gates
-from pewm_jax.codecs import learned as learned_codec
+from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import (
     AttentionConfig,
     ClipConfig,
@@ -19,7 +19,6 @@ from pewm_jax.config import (
     Config,
     ConfigError,
     DataConfig,
-    LearnedCodecConfig,
     RenderConfig,
     StageConfig,
     SurfelConfig,
@@ -126,7 +125,7 @@ def test_weights_that_come_with_the_library_are_found_by_name(tmp_path, monkeypa
         assert all(leaf.dtype.itemsize == 2 for leaf in jax.tree.leaves(params))
         if isinstance(config.model, CodecWorldConfig):
             video = jnp.zeros((1, 2, 16, 24, 3))
-            latents = learned_codec.encode(config.model.codec, params["codec"], video)
+            latents = config.model.codec.encode(params["codec"], video)
             assert latents.shape == (1, 2, 2, 3, 16)
 
 

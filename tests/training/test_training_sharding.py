@@ -11,16 +11,9 @@ import training_fakes as fakes
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax import presets as configs
-from pewm_jax.config import (
-    AXES,
-    ConfigError,
-    DINOv2Config,
-    DINOv2EncoderConfig,
-    MeshConfig,
-    VAEConfig,
-    published,
-)
+from pewm_jax.config import AXES, ConfigError, DINOv2Config, MeshConfig, VAEConfig, published
 from pewm_jax.io import tree, weights
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.train import sharding, state
 from pewm_jax.worlds.pewm.world import STAGES
 

@@ -18,22 +18,22 @@ from test_training_loop import train
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import presets
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     AttentionConfig,
     ConfigError,
     DINOv2Config,
-    DINOv2EncoderConfig,
     ImagesConfig,
     Map2DConfig,
     NoMemoryConfig,
-    PatchColoursConfig,
-    PixelConfig,
     PointsConfig,
     VAEConfig,
     VoxelConfig,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.io import tree, weights
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.train import integrity, loop, runs, sharding, step
 from pewm_jax.train.checkpoint import CONFIG_ITEM, Checkpoints
 from pewm_jax.worlds.pewm.world import STAGES

@@ -7,6 +7,7 @@ import json
 import sys
 from typing import Literal
 
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     AttentionConfig,
     BothConfig,
@@ -14,17 +15,16 @@ from pewm_jax.config import (
     Config,
     DataConfig,
     DINOv2Config,
-    DINOv2EncoderConfig,
     DiTConfig,
     MeshConfig,
     ModelConfig,
-    PatchColoursConfig,
-    PixelConfig,
     StageConfig,
     TrainConfig,
     VAEConfig,
     VoxelConfig,
 )
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.plan import hlo, plan, predict
 from pewm_jax.plan.footprint import MeshSizes
 from pewm_jax.worlds import costs

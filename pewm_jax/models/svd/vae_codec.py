@@ -32,7 +32,7 @@ init = svd_vae.init
 def encode(
     config: SVDVAEConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
 ) -> Array:
-    """Encode a video to the mean of its latents; see ``pewm_jax.codecs.interface.encode``."""
+    """Encode a video to the mean of its latents; see ``pewm_jax.codecs.rgbd.encode``."""
     mean = svd_vae.encode(config, params, video_BTHWC)
     return mean if condition else mean * config.scaling_factor
 

@@ -30,7 +30,7 @@ init = wan_vae.init
 def encode(
     config: WanVAEConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
 ) -> Array:
-    """Encode a video to the mean of its latents; see ``pewm_jax.codecs.interface.encode``."""
+    """Encode a video to the mean of its latents; see ``pewm_jax.codecs.rgbd.encode``."""
     del condition
     mean, _ = wan_vae.encode(config, params, video_BTHWC)
     return wan_vae.normalise(config, mean)

@@ -7,7 +7,6 @@ import math
 from typing import Literal
 
 from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.control import ModulationConfig
 from pewm_jax.config.cosmos import CosmosConfig
 from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
 from pewm_jax.config.experiment import Config
@@ -16,6 +15,7 @@ from pewm_jax.config.svd_unet import SVDUNetConfig
 from pewm_jax.config.svd_vae import SVDVAEConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig
 from pewm_jax.config.wan_vae import WanVAEConfig
+from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.edm import EDMConfig
 
 NOISE = EDMConfig(sigma_data=1.0, sigma_max=700.0, target="v", sample_steps=25)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import EgoWMConfig, EgoWMTrainConfig, TrainSettings
 from pewm_jax.types import Array, Clip, Control, Frames, Params, WorldState
@@ -159,7 +159,7 @@ def imagine_chunk(
     if model.noise.guidance != 1:
         blind = world_model.blind(model, params, given, np.ones((1,), bool))
     latents = sampling.draw(model, params, given, None, key, blind=blind)
-    rgb, depth = codecs.decode_rgbd(model, params, latents)
+    rgb, depth = rgbd.decode_rgbd(model, params, latents)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     return Frames(rgb[0, model.history :], depth[0, model.history :], control.camera)
 

@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.config import Noise, PersistConfig
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist.blocks import FrameCache
@@ -76,7 +76,7 @@ class Given:
 
 def encoded(model: PersistConfig, params: Params, rgb_HWC: Array, depth_HW: Array) -> Array:
     """Return the latents (h, w, C) of a picture: those of its depth with them, if it has any."""
-    both = codecs.encode_rgbd(model, params, rgb_HWC[None, None], depth_HW[None, None])
+    both = rgbd.encode_rgbd(model, params, rgb_HWC[None, None], depth_HW[None, None])
     return both[0, 0, ..., : model.picture_channels]
 
 
@@ -84,7 +84,7 @@ def decoded(model: PersistConfig, params: Params, latents_hwC: Array) -> tuple[A
     """Return colours (H, W, 3) and depth (H, W) of a picture's latents; depth 0 without any."""
     missing = model.codec.channels - latents_hwC.shape[-1]
     latents = jnp.pad(latents_hwC, ((0, 0), (0, 0), (0, missing)))
-    rgb, depth = codecs.decode_rgbd(model, params, latents[None, None])
+    rgb, depth = rgbd.decode_rgbd(model, params, latents[None, None])
     return rgb[0, 0], depth[0, 0] if model.clip.depth else jnp.zeros_like(depth[0, 0])
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import PersistConfig, UserError
 from pewm_jax.geometry.actions import camera_numbers
@@ -70,7 +70,7 @@ def cut(model: PersistConfig, clip: Clip, start_BT3: Array, recorded_BT3: Array)
 def pictures(model: PersistConfig, params: Params, clip: Clip) -> tuple[Array, windows.Shown]:
     """Return (B, T, h, w, C) latents of the frames, and the same as voxel frames are shown them."""
     frames = as_signal(clip.frames)
-    latents = codecs.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
+    latents = rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
     latents = latents[..., : model.picture_channels]
     camera = jax.tree.map(jnp.asarray, frames.camera)
     return latents, windows.shown_of(latents, jnp.asarray(frames.depth_THW), camera)

@@ -12,9 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.config import Config, PersistConfig, PersistTrainConfig, TrainSettings
-from pewm_jax.config import functions as functions_of
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.models.persist import nets as persist_nets
@@ -39,7 +38,7 @@ def init(model: PersistConfig, key: Array, networks: int = len(persist_nets.NETW
     """Return random parameters of the codec and of the first so many networks."""
     codec_key, key = jax.random.split(key)
     names = persist_nets.NETWORKS[:networks]
-    made = {"codec": functions_of(model.codec).init(model.codec, codec_key)}
+    made = {"codec": model.codec.init(codec_key)}
     return made | persist_nets.init(model.backbone, key, names)  # type: ignore[arg-type]
 
 
@@ -193,11 +192,11 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
         return {"voxel_vae": made}
     if stage.name == "camera":
         return {"camera_model": camera_model.costs(nets.camera_model, share, frames, trained=True)}
-    found = {"codec": functions_of(model.codec).costs(model, share)}
+    found = {"codec": model.codec.costs(model, share)}
     if stage.name == "renderer":
         made = voxel_renderer.costs(nets.renderer, share, frames, trained=True)
         if nets.renderer.drawn:  # the drawn voxels are encoded, too
-            found["drawn"] = codecs.costs_of_images(model, share, 2 * frames, "codec")
+            found["drawn"] = rgbd.costs_of_images(model, share, 2 * frames, "codec")
         return found | {"renderer": made}
     pixels = nets.renderer.height * nets.renderer.width
     return found | {

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import PersistConfig, UserError
-from pewm_jax.config import functions as functions_of
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import class_edit, class_grid
 from pewm_jax.memory.class_grid import ClassGrid
@@ -52,7 +51,7 @@ def stages(model: PersistConfig) -> tuple[Stage, ...]:
 
 def sharding(model: PersistConfig) -> tuple[tuple[str, Any], ...]:
     """Return the rules of the four networks and of the codec."""
-    return (*persist_nets.SHARDING, *functions_of(model.codec).SHARDING)
+    return (*persist_nets.SHARDING, *model.codec.SHARDING)
 
 
 def split_heads(model: PersistConfig, stage: Stage) -> dict[str, int]:

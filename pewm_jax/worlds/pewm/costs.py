@@ -6,8 +6,8 @@ import dataclasses
 import re
 
 from pewm_jax.codecs import gates
-from pewm_jax.codecs import learned as learned_codec
-from pewm_jax.config import Config, LearnedCodecConfig, ModelConfig, TrainConfig, functions
+from pewm_jax.codecs.learned import LearnedCodecConfig
+from pewm_jax.config import Config, ModelConfig, TrainConfig, functions
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.worlds import codec_gate
@@ -33,14 +33,13 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
     trained = any(re.fullmatch(pattern, "backbone/any") for pattern in stage.trained)
     found = {
         "backbone": functions(model.backbone).costs(model, share, trained=trained),
-        "control": functions(model.control).costs(model, share, trained=trained),
-        "codec": functions(model.codec).costs(model, share),
+        "control": model.control.costs(model, share, trained=trained),
+        "codec": model.codec.costs(model, share),
     }
     if stage.memory:
         found["memory"] = functions(model.memory.reader).costs(model, share)
         if encodes(config):
-            encoder = functions(model.memory.encoder)
-            found["encoder"] = encoder.costs(model, share, config.data.context)
+            found["encoder"] = model.memory.encoder.costs(model, share, config.data.context)
     if config.train.chained:
         for part in found.keys() & {"backbone", "control", "memory"}:
             found[part] = _once_more(found[part], config.train.chained)
@@ -63,8 +62,8 @@ def _gate(model: ModelConfig, perceptual: bool) -> Costs:
     """
     codec, clip = model.codec, model.clip
     if not isinstance(codec, LearnedCodecConfig):
-        return functions(codec).costs(model, Share())
-    decoder = 2 * clip.frames * learned_codec.macs(codec, "decoder", clip.height, clip.width)
+        return codec.costs(model, Share())
+    decoder = 2 * clip.frames * codec.macs("decoder", clip.height, clip.width)
     gate = (clip.frames - 1) * gates.macs(codec.gate, clip.height, clip.width)
     products = [Product("codec", "convolution", decoder)]
     products.append(Product("codec", "convolution", gate, 2.0))

@@ -13,7 +13,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, signal_from_depth
 from pewm_jax.config import ModelConfig, TrainConfig, TrainSettings, UserError
 from pewm_jax.memory import memories
@@ -73,7 +73,7 @@ def loss(
         clip = jax.lax.stop_gradient(prepare(model, params, clip))
     view = clip.extras["readout"].view
     assert view is not None
-    rgb, depth = codecs.decode_rgbd(model, params, clip.extras["latents_thwC"])
+    rgb, depth = rgbd.decode_rgbd(model, params, clip.extras["latents_thwC"])
     far = signal_from_depth(model.clip, view.depth_THW)[..., None]
     shown = jnp.concatenate([view.features_THWF[..., :3], far], -1)
     frames = as_signal(clip.frames)

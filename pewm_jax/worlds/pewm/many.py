@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.config import ModelConfig
 from pewm_jax.memory import memories
 from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params, View, WorldState
@@ -140,11 +140,11 @@ def _clip(
         latents, seen_there = latents[:, seen], slice(None)
     else:
         seen_there = seen
-    rgb, depth = codecs.decode_rgbd(model, params, latents)
+    rgb, depth = rgbd.decode_rgbd(model, params, latents)
     rgb, depth = rgb[:, seen_there], depth[:, seen_there]
     if sight is not None and sight.view is not None and memories.gated(model):
         remembered_there = jax.tree.map(lambda x: x[:, seen], sight.view)
-        rgb, depth = codecs.mix(model, params, rgb, depth, remembered_there)
+        rgb, depth = rgbd.mix(model, params, rgb, depth, remembered_there)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     return Frames(rgb, depth, jax.tree.map(lambda x: x[:, shown], control.camera))
 

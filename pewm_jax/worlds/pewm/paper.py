@@ -10,7 +10,6 @@ from typing import Literal
 
 from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.dit import DiTConfig
-from pewm_jax.config.encoder import PatchColoursConfig
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.memory import VoxelConfig
 from pewm_jax.config.mesh import MeshConfig
@@ -18,6 +17,7 @@ from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.parts import Codec, Encoder, Noise
 from pewm_jax.config.reader import AttentionConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
+from pewm_jax.encoders.patch_colours import PatchColoursConfig
 
 CLIP = ClipConfig(frames=9, height=512, width=512)
 """The paper's clip."""

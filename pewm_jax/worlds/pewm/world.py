@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.codecs import interface as codecs
+from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import ModelConfig, UserError, functions
-from pewm_jax.encoders import interface as encoders
 from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import memories
 from pewm_jax.memory import views as memory_views
@@ -201,9 +200,9 @@ def imagine_clip(
         shown = memories.look(model, state.map, camera, params=params, pictures=gated)
         sight = jax.tree.map(lambda x: x[None], shown)
     latents = sampling.draw(model, params, conditioning, sight, key)
-    rgb, depth = codecs.decode_rgbd(model, params, latents)
+    rgb, depth = rgbd.decode_rgbd(model, params, latents)
     if sight is not None and memories.gated(model):
-        rgb, depth = codecs.mix(model, params, rgb, depth, sight.view)
+        rgb, depth = rgbd.mix(model, params, rgb, depth, sight.view)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
     remembered = state.map
@@ -296,7 +295,7 @@ def _remember(
     observed: bool = True,
 ) -> Any:
     """Put frames into the memory."""
-    features = encoders.features(model, params, frames.rgb_THWC)
+    features = model.memory.encoder.features(model, params, frames.rgb_THWC)
     return memories.remember(model, memory, frames, features, valid_T, observed=observed)
 
 

@@ -1,17 +1,4 @@
-"""Pixels ↔ latents: every codec behind one interface, chosen by the type of its settings.
-
-A codec is a ``Codec`` and a module (or object) with
-
-    init(settings, key) -> params                                    {} if it has none
-    encode(settings, params, video_BTHWC, *, condition=False) -> latents_BthwC
-    decode(settings, params, latents_BthwC) -> video_BTHWC
-    SHARDING                                                         rules over ``codec/…`` paths
-    costs(model, share) -> Costs                                     see ``models.costs``
-
-and obeys the frame rule: q·k + 1 frames become k + 1 latent frames. Colour and depth are encoded
-separately and their channels concatenated, as in the paper. The VAE sees depth as a grey image
-(``DEPTH_AS_GREY``). A codec whose ``depth_channels`` are 0 encodes colour alone.
-"""
+"""Encode and decode colour and depth with a model's codec, and mix frames with rendered ones."""
 
 from __future__ import annotations
 
@@ -24,52 +11,11 @@ from jax.core import Tracer
 
 from pewm_jax.codecs.pixel import fold
 from pewm_jax.codecs.signals import depth_from_signal, signal_from_depth
-from pewm_jax.config import Codec, ModelConfig, functions
+from pewm_jax.config import ModelConfig
 from pewm_jax.geometry import depth_images
 from pewm_jax.nn import placement
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params, View
-
-
-def init(config: Codec, key: Array) -> Params:
-    """Return random parameters of a codec; the pixel codec has none."""
-    return functions(config).init(config, key)
-
-
-def encode(config: Codec, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
-    """Encode a video.
-
-    Args:
-        config: the codec.
-        params: its parameters, empty for the pixel codec.
-        video_BTHWC: (B, q·k + 1, H, W, C) float in [−1, 1]; C is 3 where depth is encoded as grey.
-        condition: whether the latents are what the denoiser is conditioned on. CogVideoX-1.5's
-            image-to-video model divides such latents by the scaling factor; others multiply.
-
-    Returns:
-        (B, k + 1, H/s, W/s, C') latents.
-
-    Raises:
-        ValueError: the video's size cannot be encoded.
-    """
-    return functions(config).encode(config, params, video_BTHWC, condition=condition)
-
-
-def decode(config: Codec, params: Params, latents_BthwC: Array) -> Array:
-    """Decode latents, the inverse of ``encode``.
-
-    Args:
-        config: the codec.
-        params: its parameters, empty for the pixel codec.
-        latents_BthwC: (B, k + 1, h, w, C') latents; for the VAE k is even.
-
-    Returns:
-        (B, q·k + 1, h·s, w·s, C) video.
-
-    Raises:
-        UserError: latents that the VAE decodes to another number of frames.
-    """
-    return functions(config).decode(config, params, latents_BthwC)
 
 
 def encode_rgbd(
@@ -90,13 +36,13 @@ def encode_rgbd(
         params: the world model's parameters; those of the codec are under ``codec``.
         rgb_BTHWC: (B, T, H, W, 3).
         depth_BTHW: (B, T, H, W) metres.
-        condition: see ``encode``.
+        condition: see ``Codec.encode``.
     """
     weights = params.get("codec", {})
     if not model.codec.depth_channels:
         return _clip_by_clip(
-            lambda weights, rgb: encode(
-                model.codec, weights, rgb.astype(jnp.dtype(model.dtype)), condition=condition
+            lambda weights, rgb: model.codec.encode(
+                weights, rgb.astype(jnp.dtype(model.dtype)), condition=condition
             ).astype(jnp.float32),
             weights,
             rgb_BTHWC,
@@ -105,13 +51,13 @@ def encode_rgbd(
     whole = depth_images.fill_depth(depth.reshape(-1, *depth.shape[-2:]), model.clip.far_m)
     signal = signal_from_depth(model.clip, whole.reshape(depth.shape))[..., None]
     if not model.codec.DEPTH_AS_GREY:
-        parts = [encode(model.codec, weights, x, condition=condition) for x in (rgb_BTHWC, signal)]
+        parts = [model.codec.encode(weights, x, condition=condition) for x in (rgb_BTHWC, signal)]
         return jnp.concatenate(parts, -1)
 
     def together(weights: Params, rgb: Array, signal: Array) -> Array:
         grey = jnp.broadcast_to(signal, rgb.shape)
         both = jnp.concatenate([rgb, grey]).astype(jnp.dtype(model.dtype))
-        latents = encode(model.codec, weights, both, condition=condition)
+        latents = model.codec.encode(weights, both, condition=condition)
         return jnp.concatenate(jnp.split(latents.astype(jnp.float32), 2), -1)
 
     return _clip_by_clip(together, weights, rgb_BTHWC, signal)
@@ -137,15 +83,15 @@ def decode_rgbd(model: ModelConfig, params: Params, latents_BthwC: Array) -> tup
     """
     if not model.codec.depth_channels:
         latents = latents_BthwC.astype(jnp.dtype(model.dtype))
-        rgb = decode(model.codec, params.get("codec", {}), latents).astype(jnp.float32)
+        rgb = model.codec.decode(params.get("codec", {}), latents).astype(jnp.float32)
         return jnp.clip(rgb, -1, 1), jnp.zeros(rgb.shape[:-1])
     parts = jnp.split(latents_BthwC, [model.codec.rgb_channels], -1)
     weights = params.get("codec", {})
     if not model.codec.DEPTH_AS_GREY:
-        rgb, signal = (decode(model.codec, weights, part) for part in parts)
+        rgb, signal = (model.codec.decode(weights, part) for part in parts)
     else:
         both = jnp.concatenate(parts).astype(jnp.dtype(model.dtype))
-        video = decode(model.codec, weights, both).astype(jnp.float32)
+        video = model.codec.decode(weights, both).astype(jnp.float32)
         rgb, signal = jnp.split(video, 2)
     return jnp.clip(rgb, -1, 1), depth_from_signal(model.clip, signal.mean(-1))
 
@@ -170,16 +116,12 @@ def mix(
         four = jnp.concatenate([rgb, signal_from_depth(model.clip, depth)[..., None]], -1)
         return four.reshape(-1, *four.shape[-3:])
 
-    made = (
-        functions(model.codec)
-        .mix(
-            params["codec"],
-            pictures(rgb_BTHWC, depth_BTHW),
-            pictures(view.features_THWF[..., :3], view.depth_THW),
-            view.seen_THW.reshape(-1, *view.seen_THW.shape[-2:]),
-        )
-        .reshape(*rgb_BTHWC.shape[:-1], 4)
-    )
+    made = model.codec.mix(  # type: ignore[attr-defined]
+        params["codec"],
+        pictures(rgb_BTHWC, depth_BTHW),
+        pictures(view.features_THWF[..., :3], view.depth_THW),
+        view.seen_THW.reshape(-1, *view.seen_THW.shape[-2:]),
+    ).reshape(*rgb_BTHWC.shape[:-1], 4)
     depth = jnp.where(view.seen_THW, depth_from_signal(model.clip, made[..., 3]), depth_BTHW)
     return jnp.clip(made[..., :3], -1, 1), depth
 
@@ -191,9 +133,9 @@ def measured(model: ModelConfig, depth_BTHW: Array) -> Array:
     one pixel, as in the pixel codec, the share is 0 or 1. Otherwise it is the mean over the
     latent's pixels.
     """
-    own = getattr(functions(model.codec), "measured", None)
+    own = model.codec.measured(depth_BTHW)
     if own is not None:
-        return own(model.codec, depth_BTHW)
+        return own
     valid = (depth_BTHW > 0).astype(jnp.float32)[..., None]
     share = fold(valid, model.codec.spatial, model.codec.temporal)
     return share if model.codec.PIXELWISE else share.mean(-1, keepdims=True)
@@ -210,7 +152,7 @@ def costs_of_images(model: ModelConfig, share: Share, images: int, part: str) ->
         images: images that are encoded.
         part: the part of the model that they are encoded for.
     """
-    whole = functions(model.codec).costs(model, share)
+    whole = model.codec.costs(model, share)
     times = images / (2 * (model.clip.frames + 1))
     products = (dataclasses.replace(x, part=part, macs=x.macs * times) for x in whole.products)
     return Costs(tuple(products), streamed=whole.streamed * times, held=whole.held * times)
