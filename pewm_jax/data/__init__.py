@@ -1,1 +1,1 @@
-"""Chapter 2b, what was seen: scenes, renderer, trajectories, episodes, import, loader."""
+"""Datasets: scenes and their renderer, collecting and importing episodes, checks, the loader."""

@@ -40,7 +40,7 @@ def choose(config: Config, length: int, rng: np.random.Generator, where: str = "
     Args:
         config: ``clip.frames``, ``data.stride_min``, ``data.stride_max``, ``data.context``.
         length: frames of the episode.
-        rng: everything random comes from here.
+        rng: source of all randomness.
         where: the episode's name in error messages.
 
     Raises:
@@ -68,7 +68,7 @@ def choose_context(start: int, slots: int, rng: np.random.Generator | None = Non
     Args:
         start: first frame of the clip; always the last context frame.
         slots: S.
-        rng: draws the frame of each part of the past; None takes the middle.
+        rng: draws the frame of each part of the past; None takes the middle one.
 
     Returns:
         (≤ S,) increasing frame numbers.
@@ -98,11 +98,11 @@ def cut(
     """Decode the frames of a clip, each once, and join its actions.
 
     Args:
-        episode: where they come from.
-        choice: which frames.
+        episode: the episode.
+        choice: the frames of the clip.
         slots: S; slots without a frame are black, have no depth and the camera of the clip's
             first frame, and are marked invalid.
-        features: reads the context's features, if they are kept; slots without a frame have the
+        features: reads the context's features, if they are cached; slots without a frame have the
             features of the clip's first frame.
         voxels: whether the grids around the agent are read, if the episode has them.
 
@@ -145,9 +145,9 @@ def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:
         frames_T: (T,) evenly spaced frames of the episode.
 
     Returns:
-        (T − 1, A) float32. The actions between two frames of the clip become one: planar actions
-        (A = 3) by composing the motions; of other kinds nothing is known, and they are laid end to
-        end, (T − 1, stride · A).
+        (T − 1, A) float32. The actions between two frames of the clip become one: the motions of
+        planar actions (A = 3) are composed; actions of other kinds are concatenated,
+        (T − 1, stride · A).
     """
     stride = int(frames_T[1] - frames_T[0]) if len(frames_T) > 1 else 1
     steps_TSA = actions_TA[frames_T[:-1, None] + np.arange(stride)]
@@ -159,7 +159,7 @@ def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:
 def clip_at(
     config: Config, episode: Episode, start: int, stride: int = 1, frames: int | None = None
 ) -> Clip:
-    """Return the clip at given frames, without randomness; its context is spread evenly.
+    """Return the clip at these frames, without randomness; its context is spread evenly.
 
     Args:
         config: ``clip.frames`` and ``data.context``.
@@ -175,8 +175,8 @@ def clip_at(
     chosen = start + stride * np.arange(count)
     if start < 0 or chosen[-1] >= episode.length:
         raise UserError(
-            f"episode {episode.name} has {episode.length} frames, a clip from {start} to "
-            f"{chosen[-1]} does not lie in it; start earlier or collect longer episodes."
+            f"episode {episode.name} has {episode.length} frames, so it holds no clip from {start} "
+            f"to {chosen[-1]}; start earlier or collect longer episodes."
         )
     slots = config.data.context
     return cut(episode, Choice(chosen, choose_context(start, slots)), slots)
@@ -186,7 +186,7 @@ def stack(clips: Sequence[Clip]) -> Clip:
     """Stack clips to a batch: every array gets a leading B.
 
     Raises:
-        UserError: some clips have actions or voxels and others have none, or of another size.
+        UserError: some clips have actions or voxels and others have none, or have another size.
     """
 
     def optional(field: str, parts: Sequence[np.ndarray | None]) -> np.ndarray | None:

@@ -1,8 +1,8 @@
-"""A split on disk: ArrayRecord shards, and ``dataset.json`` written last.
+"""Splits on disk: ArrayRecord shards, and ``dataset.json``, which is written last.
 
 A split folder without ``dataset.json`` is unfinished and is never read. ``dataset.json`` lists
-every shard with its number of records, size and SHA-256, so a truncated shard is noticed when the
-split is opened.
+every shard with its number of records, size and SHA-256, so opening a split detects truncated
+shards.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Shard:
 
     Attributes:
         file: its name inside the split folder.
-        records: how many episodes it holds.
+        records: number of episodes in it.
         bytes: its size.
-        sha256: of the whole file.
+        sha256: hash of the whole file.
     """
 
     file: str
@@ -54,8 +54,8 @@ class Manifest:
     Attributes:
         split: name of the split.
         shards: its files, in reading order.
-        settings: what the split was made with.
-        frames: frames in all episodes together.
+        settings: the settings with which the split was made.
+        frames: total number of frames.
     """
 
     split: str
@@ -70,7 +70,7 @@ class Manifest:
 
 
 def write_shard(path: Path, records: Iterable[bytes]) -> int:
-    """Write records to an ArrayRecord file, aside and then renamed.
+    """Write records to an ArrayRecord file, under a temporary name that is then replaced.
 
     Returns:
         The number of records written.
@@ -81,7 +81,7 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
     path.parent.mkdir(parents=True, exist_ok=True)
     count = 0
     with atomic.replacing(path) as partial:
-        # Images are compressed already, and one record per group makes a single one cheap to read.
+        # Images are compressed already; with one record per group, reading a single one is cheap.
         with _refused_writes(path):
             writer = array_file.ArrayRecordWriter(str(partial), "group_size:1,uncompressed")
         try:
@@ -106,8 +106,8 @@ def _refused_writes(path: Path) -> Iterator[None]:
         free = shutil.disk_usage(path.parent).free / 1e6
         raise UserError(
             f"{path} cannot be written ({str(error).splitlines()[0]}); {free:.0f} MB are free "
-            "there: make room, or check the limits and rights of the folder, and run the same "
-            "command again."
+            "there: free some space, or check the folder's quota and permissions, then run the "
+            "same command again."
         ) from None
 
 
@@ -122,7 +122,7 @@ def count_records(path: Path) -> int:
     """Return the number of records of an ArrayRecord file.
 
     Raises:
-        UserError: it is not one, or it was cut short.
+        UserError: the file is not an ArrayRecord file, or is truncated.
     """
     reader = None
     try:
@@ -149,14 +149,14 @@ def read_record(path: Path, index: int) -> bytes:
     """Read one record of an ArrayRecord file.
 
     Raises:
-        UserError: it does not read.
+        UserError: the record cannot be read.
     """
     reader = array_file.ArrayRecordReader(str(path))
     try:
         return reader.read([index])[0]
     except (RuntimeError, ValueError, IndexError) as error:
         raise UserError(
-            f"{path}, record {index} does not read ({str(error).splitlines()[0]}); the file is "
+            f"{path}, record {index} cannot be read ({str(error).splitlines()[0]}); the file is "
             "damaged, delete it and make it again."
         ) from None
     finally:
@@ -165,7 +165,7 @@ def read_record(path: Path, index: int) -> bytes:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON, whole or not at all."""
+    """Write a JSON file atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic.write_text(path, json.dumps(value, indent=2, ensure_ascii=False) + "\n")
 
@@ -188,17 +188,19 @@ def read_manifest(folder: Path, check_files: bool = True) -> Manifest:
     """Read ``dataset.json`` and compare the shards' sizes with it (hashes: ``validate``).
 
     Raises:
-        UserError: no such folder, an unfinished split, or a shard that is missing or cut short.
+        UserError: the folder does not exist, the split is unfinished, or a shard is missing or
+            truncated.
     """
     path = folder / MANIFEST
     if not folder.is_dir():
         raise UserError(
-            f"{folder} does not exist; make it with `python -m pewm_jax.data collect` or `import`."
+            f"{folder} does not exist; make it with `pewm-jax data collect` or `pewm-jax data "
+            "import`."
         )
     if not path.is_file():
         inside = splits(folder)
         hint = (
-            f"it holds the splits {', '.join(inside)}, name one of them"
+            f"it holds the splits {', '.join(inside)}; name one of them"
             if inside
             else "the collection did not finish, run the same command again to resume it"
         )
@@ -225,17 +227,17 @@ def read_manifest(folder: Path, check_files: bool = True) -> Manifest:
 
 
 def check_size(path: Path, shard: Shard) -> None:
-    """Compare a file's size with what ``dataset.json`` says.
+    """Compare a file's size with the one listed in ``dataset.json``.
 
     Raises:
-        UserError: it is missing or of another size.
+        UserError: the file is missing or has another size.
     """
     if not path.is_file():
         raise UserError(f"{path} is missing but {MANIFEST} lists it; make the split again.")
     size = path.stat().st_size
     if size != shard.bytes:
         raise UserError(
-            f"{path} has {size} bytes where {MANIFEST} says {shard.bytes}: the shard is truncated "
+            f"{path} has {size} bytes but {MANIFEST} lists {shard.bytes}: the shard is truncated "
             "or was changed; delete it and make the split again."
         )
 
@@ -248,12 +250,12 @@ def splits(path: Path) -> list[str]:
 class EpisodeSource(Sequence[Episode]):
     """Random access to the episodes of a finished split, read through Grain.
 
-    ``source[i]`` opens episode i; its images are decoded only when asked for. Picklable, so that
-    loader processes can each open their own files.
+    ``source[i]`` opens episode i; its images are decoded on request. A source can be pickled, so
+    that every loader process opens its own files.
 
     Raises:
-        UserError: the split is absent, unfinished, or a shard was cut short.
-        DamagedError: (where an episode is opened) this record does not read.
+        UserError: the split is absent or unfinished, or a shard is truncated.
+        DamagedError: (when an episode is opened) its record cannot be read.
     """
 
     def __init__(self, path: str | Path):
@@ -270,7 +272,7 @@ class EpisodeSource(Sequence[Episode]):
         self._length = len(self._records)
         if self._length != self.manifest.records:
             raise UserError(
-                f"{self.path}: the shards hold {self._length} records where {MANIFEST} says "
+                f"{self.path}: the shards hold {self._length} records but {MANIFEST} lists "
                 f"{self.manifest.records}; make the split again."
             )
 
@@ -293,7 +295,7 @@ class EpisodeSource(Sequence[Episode]):
             raise
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise DamagedError(
-                f"{where}: the header and the bytes do not fit together ({error!r}); the record is "
+                f"{where}: the header and the payload do not match ({error!r}); the record is "
                 "damaged, collect or import it again."
             ) from None
 
@@ -302,12 +304,12 @@ class EpisodeSource(Sequence[Episode]):
             return self._records[index]
         except (RuntimeError, ValueError) as error:
             raise DamagedError(
-                f"{self.where(index)} does not read ({str(error).splitlines()[0]}); the shard is "
+                f"{self.where(index)} cannot be read ({str(error).splitlines()[0]}); the shard is "
                 "damaged, delete it and make the split again."
             ) from None
 
     def where(self, index: int, between: str = ", record ") -> str:
-        """Return the file and record of an episode, for messages."""
+        """Return the file and the record number of an episode, for messages."""
         for shard in self.manifest.shards:
             if index < shard.records:
                 return f"{self.path / shard.file}{between}{index}"

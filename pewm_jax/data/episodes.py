@@ -1,8 +1,7 @@
-"""The episode: its fields, and how it is written to and read from a record.
+"""Episodes: their fields, and writing and reading them as records.
 
-One record is one episode. Its header says where every array and every encoded image lies, so that
-single frames are decoded without reading the others (``record_format.py``,
-``docs/data_format.md``).
+One record is one episode. Its header gives the offset of every array and every encoded image, so
+single frames can be decoded without the others (``record_format.py``, ``docs/data_format.md``).
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from pewm_jax.types import Camera, Frames
 
 MILLIMETRES = 1000.0
 SATURATED = 65535
-"""The largest 16-bit value: sensors mark missing or too far depth with it. It is never written."""
+"""The largest 16-bit value: sensors mark missing or too large depth with it. Never written."""
 DEPTH_LIMIT_M = (SATURATED - 1) / MILLIMETRES
 """The largest depth stored; depths beyond it become 0, "no measurement"."""
 PNG_LEVEL = 1
@@ -48,11 +47,11 @@ class EpisodeArrays:
         depth_THW: (T, H, W) float metres along z, 0 = no measurement.
         intrinsics_4: (4,) fx, fy, cx, cy in pixels, centres at +0.5.
         world_from_camera: (T, 4, 4) camera-to-world.
-        actions: (T − 1, 3) dx, dy, dyaw, or (T − 1, A) of another kind of control, or None where
-            the camera does not move like the agent.
+        actions: (T − 1, 3) dx, dy, dyaw, or (T − 1, A) of another kind of control, or None if the
+            camera does not move like the agent.
         action_ids: (T − 1,) discrete actions, or None.
         ids_THW: (T, H, W) instance ids from −1 (nothing) to 65534, or None.
-        voxels: the grids of class ids around the agent at each frame, or None.
+        voxels: the grid of class ids around the agent at each frame, or None.
     """
 
     rgb_THWC: np.ndarray
@@ -67,7 +66,7 @@ class EpisodeArrays:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Episode:
-    """An episode read from disk: small arrays are decoded, images on request.
+    """An episode read from disk; small arrays are decoded at once, images on request.
 
     Attributes:
         name: name of the episode, e.g. ``house-000012/follow``.
@@ -80,7 +79,7 @@ class Episode:
         actions: (T − 1, A) float32 or None; A = 3 is (dx, dy, dyaw).
         action_ids: (T − 1,) int32 or None.
         voxel_origin_T3: (T, 3) float32 lowest corners of the grids around the agent, or None.
-        info: free-form facts about the episode, e.g. ``return_frame`` of a revisit episode.
+        info: further JSON values, e.g. ``return_frame`` of a revisit episode.
         header: the whole JSON header.
         record: the bytes.
     """
@@ -116,7 +115,7 @@ class Episode:
             NumPy frames: rgb uint8, depth float32 in metres.
 
         Raises:
-            DamagedError: an image does not decode, naming the frame.
+            DamagedError: an image does not decode; the message names the frame.
         """
         chosen = np.arange(self.length) if indices is None else np.asarray(indices, np.int64)
         rgb = np.empty((len(chosen), self.height, self.width, 3), np.uint8)
@@ -131,7 +130,7 @@ class Episode:
         """Decode instance ids (T, H, W) int32, −1 = nothing.
 
         Raises:
-            UserError: the episode has none.
+            UserError: the episode has no instance ids.
         """
         if not self.has_ids:
             raise UserError(f"episode {self.name} has no instance ids; collect it with --ids.")
@@ -140,10 +139,10 @@ class Episode:
 
     @property
     def voxel_grid(self) -> VoxelGrid | None:
-        """The cell, side and classes of the grids around the agent, None if none were recorded.
+        """The cell, side and classes of the grids around the agent; None if none were recorded.
 
         Raises:
-            DamagedError: the header makes no sense.
+            DamagedError: the header is inconsistent.
         """
         stream = self.header["streams"].get("voxels")
         return None if stream is None else voxel_frames.grid_in(stream, f"episode {self.name}")
@@ -152,8 +151,8 @@ class Episode:
         """Decode the grids around the agent of some frames (all by default), in that order.
 
         Raises:
-            UserError: the episode has none.
-            DamagedError: a grid does not decode, naming the frame.
+            UserError: the episode has no voxels.
+            DamagedError: a grid does not decode; the message names the frame.
         """
         grid, origin = self.voxel_grid, self.voxel_origin_T3
         if grid is None or origin is None:
@@ -190,13 +189,13 @@ def write_episode(
     """Encode an episode as one record; the same input gives the same bytes.
 
     Args:
-        arrays: what was recorded.
+        arrays: the arrays of the episode.
         name: name of the episode.
         scene: name of the scene.
-        info: JSON values to keep in the header.
+        info: JSON values to store in the header.
 
     Raises:
-        UserError: arrays whose shapes or dtypes do not fit together.
+        UserError: the arrays' shapes or dtypes do not fit together.
     """
     _check_arrays(arrays, name)
     frames, height, width = arrays.depth_THW.shape
@@ -235,7 +234,7 @@ def write_episode(
 
 
 def to_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Return metres as uint16 millimetres, rounded; beyond 65.534 m or not finite becomes 0."""
+    """Return metres as uint16 millimetres, rounded; beyond 65.534 m and not finite become 0."""
     millimetres = np.rint(np.asarray(depth, np.float64) * MILLIMETRES)
     with np.errstate(invalid="ignore"):
         kept = (millimetres > 0) & (millimetres < SATURATED)
@@ -246,12 +245,12 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
     """Open a record and decode its small arrays; images stay encoded.
 
     Args:
-        record: the bytes of ``write_episode``.
-        where: name of the place in error messages.
+        record: the bytes that ``write_episode`` returned.
+        where: name of the record in error messages.
 
     Raises:
-        UserError: of another version.
-        DamagedError: damaged, or with counts that do not match.
+        UserError: the record has another format version.
+        DamagedError: the record is damaged, or its counts do not match.
     """
     header = read_header(record, where)
     frames = header["frames"]
@@ -297,7 +296,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
 
 
 def decode_image(code: bytes | memoryview, flags: int) -> np.ndarray | None:
-    """Decode an image as ``cv2.imdecode`` does; None where it does not, empty or not an image."""
+    """Decode an image with ``cv2.imdecode``; return None for bytes that are not an image."""
     try:
         return cv2.imdecode(np.frombuffer(code, np.uint8), flags)
     except cv2.error:  # raised for no bytes at all, and for sizes that no image has
@@ -321,7 +320,7 @@ def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
         "ids": depth.shape,
         **array_shapes(frames),
     }
-    given = {
+    arrays_by_field = {
         "rgb": rgb,
         "ids": arrays.ids_THW,
         "intrinsics": arrays.intrinsics_4,
@@ -329,7 +328,7 @@ def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
         "actions": arrays.actions,
         "action_ids": arrays.action_ids,
     }
-    for field, array in given.items():
+    for field, array in arrays_by_field.items():
         if array is not None and not shape_fits(np.shape(array), expected[field]):
             raise UserError(
                 f"episode {name}, field {field}: shape {np.shape(array)} for {frames} frames of "

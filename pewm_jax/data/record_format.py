@@ -1,6 +1,6 @@
 """The layout of a record: magic word, header, payload.
 
-Byte by byte in ``docs/data_format.md``.
+``docs/data_format.md`` describes it byte by byte.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ UNITS = {
 
 
 class DamagedError(UserError):
-    """A record is damaged: it must be made again, or it can be skipped."""
+    """A damaged record; it can be skipped, or must be made again."""
 
 
 def array_shapes(frames: int) -> dict[str, tuple[int | str, ...]]:
@@ -75,7 +75,7 @@ def shape_fits(shape: tuple[int, ...], expected: tuple[int | str, ...]) -> bool:
 
 
 def shape_text(expected: tuple[int | str, ...] | None) -> str:
-    """Return an expected shape as text, or that there is no such field."""
+    """Return an expected shape as text; "no such field" for None."""
     return "no such field" if expected is None else f"({', '.join(map(str, expected))})"
 
 
@@ -91,7 +91,7 @@ def pack_record(
         header: without ``arrays`` and ``streams``, which are filled in.
         arrays: the arrays by field.
         streams: the encoded images, or grids, of each frame, by stream.
-        about: what the header says of a stream that is not of PNG images.
+        about: header entries of the streams that are not PNG images.
     """
     blobs: list[bytes] = []
     offset = 0
@@ -130,7 +130,7 @@ def check_span(record: bytes, offset: int, size: int, where: str, field: str) ->
     """Refuse a record that ends before a field does.
 
     Raises:
-        DamagedError: it does.
+        DamagedError: the record is truncated.
     """
     if offset + size > len(record):
         raise DamagedError(
@@ -143,13 +143,13 @@ def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
     """Parse the header of a record; spans become offsets from the start of the record.
 
     Raises:
-        UserError: another format version.
-        DamagedError: not an episode, or a header that does not parse.
+        UserError: the record has another format version.
+        DamagedError: the record is not an episode, or its header does not parse.
     """
     if len(record) < len(MAGIC) + 4 or record[: len(MAGIC)] != MAGIC:
         raise DamagedError(
             f"{where} is not a pewm episode (its first bytes differ); read a file made by "
-            "`python -m pewm_jax.data collect` or `import`."
+            "`pewm-jax data collect` or `pewm-jax data import`."
         )
     (length,) = struct.unpack_from("<I", record, len(MAGIC))
     start = len(MAGIC) + 4

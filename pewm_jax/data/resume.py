@@ -133,8 +133,8 @@ def examine(folder: Path, settings: Mapping[str, Any], *, overwrite: bool = Fals
         name = differ[0]
         raise ConfigError(
             f"{folder} was made with other settings ({name.replace('_', '-')} was "
-            f"{found.get(name)}, now {settings.get(name)}); choose another folder, or replace it "
-            "with --overwrite."
+            f"{found.get(name)}, is now {settings.get(name)}); choose another folder, or replace "
+            "it with --overwrite."
         )
     if differ:
         return "fresh"

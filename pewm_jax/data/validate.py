@@ -1,4 +1,4 @@
-"""Validate data on disk: every file, every record, every frame; each problem in one line."""
+"""Validate a dataset on disk: every file, record and frame; each problem is one line."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from pewm_jax.data.voxels import VoxelGrid, require_alike
 from pewm_jax.io.progress import Meter
 
 SHOWN = 20
-"""Most problems printed."""
+"""Largest number of problems printed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,12 +39,12 @@ class ValidateConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class Verdict:
+class ValidationResult:
     """The result of a validation.
 
     Attributes:
-        episodes: how many were checked.
-        frames: how many frames these have.
+        episodes: number of episodes checked.
+        frames: their total number of frames.
         problems: all problems found.
     """
 
@@ -53,15 +53,15 @@ class Verdict:
     problems: list[Problem]
 
 
-def validate(config: ValidateConfig, log: Callable[[str], None] = print) -> Verdict:
+def validate(config: ValidateConfig, log: Callable[[str], None] = print) -> ValidationResult:
     """Check everything under a path.
 
     Args:
-        config: where to look.
+        config: the path.
         log: receives the lines to print.
 
     Raises:
-        UserError: there is nothing to check at the path, or a split is unfinished or cut short.
+        UserError: there is nothing to check at the path, or a split is unfinished or truncated.
     """
     path = config.path
     if path.is_file():
@@ -82,8 +82,8 @@ def validate(config: ValidateConfig, log: Callable[[str], None] = print) -> Verd
     if len(problems) > SHOWN:
         log(f"… and {len(problems) - SHOWN} more.")
     if not problems:
-        log(f"{path}: {episodes} episodes, {frames} frames, all well.")
-    return Verdict(episodes, frames, problems)
+        log(f"{path}: {episodes} episodes, {frames} frames, no problems.")
+    return ValidationResult(episodes, frames, problems)
 
 
 def _files(path: Path) -> tuple[list[Path], list[Problem]]:
@@ -99,11 +99,11 @@ def _files(path: Path) -> tuple[list[Path], list[Problem]]:
 
 
 def _unfinished(path: Path) -> list[Problem]:
-    """Return a problem for every split of a dataset that holds data but is unfinished."""
+    """Return a problem for every unfinished split of a dataset."""
     begun = {
         file.parent for mark in ("*.array_record", UNFINISHED) for file in path.glob(f"*/{mark}")
     }
-    what = "is missing: the split is unfinished and is not read; run the same command again."
+    what = "is missing: the split is unfinished and cannot be read; run the same command again."
     missing = sorted(folder for folder in begun if not (folder / MANIFEST).is_file())
     return [Problem(str(folder), None, MANIFEST, what) for folder in missing]
 
@@ -111,11 +111,11 @@ def _unfinished(path: Path) -> list[Problem]:
 def _check_hashes(folder: Path, manifest: Manifest) -> list[Problem]:
     problems = []
     for shard in manifest.shards:
-        there = describe_shard(folder / shard.file)
+        found = describe_shard(folder / shard.file)
         for field in ("records", "sha256"):
-            if getattr(there, field) != getattr(shard, field):
+            if getattr(found, field) != getattr(shard, field):
                 what = (
-                    f"is {getattr(there, field)}, {MANIFEST} says {getattr(shard, field)}: the "
+                    f"is {getattr(found, field)} but {MANIFEST} lists {getattr(shard, field)}: the "
                     "file was changed after it was made; make the split again."
                 )
                 problems.append(Problem(str(folder / shard.file), None, field, what))
@@ -130,7 +130,7 @@ def _check_record(
     Args:
         file: the shard.
         index: the record's number in it.
-        grids: what the voxels of a folder's first record are like, by folder; filled in here.
+        grids: the voxel grid of each folder's first record; filled in here.
     """
     where = f"{file}, record {index}"
     try:
@@ -143,7 +143,7 @@ def _check_record(
         if grid is not None:
             require_alike(grids.setdefault(file.parent, grid), grid, "it")
     except DamagedError:
-        pass  # found already
+        pass  # check_episode has reported it
     except UserError as error:
         found.append(Problem(where, None, "voxels", str(error)))
     return episode.length, found

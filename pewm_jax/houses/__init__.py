@@ -1,1 +1,1 @@
-"""Chapter 2a, worlds we make: floor plans, furniture, textures."""
+"""Procedural houses: floor plans, furniture, textures."""

@@ -13,7 +13,7 @@ import pytest
 from data_world import split
 
 from pewm_jax.cli.data import COMMANDS, main
-from pewm_jax.data.validate import Verdict
+from pewm_jax.data.validate import ValidationResult
 from pewm_jax.io.progress import Meter
 from pewm_jax.presets.demo import config as demo
 
@@ -84,7 +84,7 @@ def test_the_commands_of_the_format_description_fit_together(monkeypatch):
     monkeypatch.setattr("pewm_jax.data.show.show", ran["show"].append)
     monkeypatch.setattr(
         "pewm_jax.data.validate.validate",
-        lambda asked: ran["validate"].append(asked) or Verdict(0, 0, []),
+        lambda asked: ran["validate"].append(asked) or ValidationResult(0, 0, []),
     )
     text = (ROOT / "docs" / "data_format.md").read_text("utf-8")
     lines = [x for x in text.splitlines() if x.startswith("python -m pewm_jax.data ")]
@@ -105,7 +105,7 @@ def test_what_the_system_refuses_ends_in_one_sentence(capsys, tmp_path):
 def test_validate_and_show_from_the_command_line(capsys, tmp_path):
     folder = split(tmp_path / "train", frames=20)
     assert main(["validate", str(tmp_path)]) == 0
-    assert "4 episodes, 80 frames, all well" in capsys.readouterr().out
+    assert "4 episodes, 80 frames, no problems" in capsys.readouterr().out
     picture = tmp_path / "x.png"
     assert main(["show", str(folder), "--episode", "2", "--out", str(picture)]) == 0
     assert cv2.imread(str(picture)) is not None

@@ -28,7 +28,7 @@ def imported(tmp_path_factory):
 
 def test_it_imports_and_validates(imported, capsys):
     assert main(["validate", str(imported)]) == 0
-    assert "1 episodes, 43 frames, all well" in capsys.readouterr().out
+    assert "1 episodes, 43 frames, no problems" in capsys.readouterr().out
     episode = EpisodeSource(imported / "train")[0]
     assert (episode.length, episode.height, episode.width) == (43, 120, 160)
     np.testing.assert_allclose(episode.intrinsics_4, [131.25, 131.25, 80, 60])

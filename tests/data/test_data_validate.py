@@ -165,7 +165,7 @@ def test_a_whole_dataset_is_walked_through(tmp_path):
     said = []
     verdict = validate(ValidateConfig(tmp_path), said.append)
     assert (verdict.episodes, verdict.frames, verdict.problems) == (6, 120, [])
-    assert said == [f"{tmp_path}: 6 episodes, 120 frames, all well."]
+    assert said == [f"{tmp_path}: 6 episodes, 120 frames, no problems."]
     single = tmp_path / "train" / "shard-00000-of-00002.array_record"
     assert validate(ValidateConfig(single), said.append).episodes == 2
 
@@ -180,7 +180,7 @@ def test_an_unfinished_split_beside_a_finished_one_is_named(tmp_path, left):
     found = validate(ValidateConfig(tmp_path), said.append).problems
     assert [(p.where, p.field) for p in found] == [(str(tmp_path / "revisit"), "dataset.json")]
     assert "unfinished" in said[0]
-    assert "all well" not in said[-1]
+    assert "no problems" not in said[-1]
 
 
 def test_a_bad_record_is_found_among_good_ones(tmp_path):

@@ -102,7 +102,7 @@ def test_the_command_walks_a_registered_house(tmp_path, capsys):
     counts = ["--train", "2", "--validation", "1", "--test", "0", "--frames", "20"]
     assert data.main([*arguments, *counts]) == 0
     assert data.main(["validate", str(tmp_path)]) == 0
-    assert "3 episodes, 60 frames, all well" in capsys.readouterr().out
+    assert "3 episodes, 60 frames, no problems" in capsys.readouterr().out
     assert data.main([*arguments, *counts]) == 0
     assert "nothing to do" in capsys.readouterr().out
     episode = EpisodeSource(tmp_path / "train")[0]

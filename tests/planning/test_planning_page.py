@@ -34,7 +34,7 @@ def test_the_commands_run(monkeypatch, tmp_path, capsys):
         counts = ["--train", "1", "--validation", "0", "--test", "1", "--frames", "12"]
         assert main([*words[1:], *counts]) == 0
         assert main(["data", "validate", words[3]]) == 0
-        assert "2 episodes, 24 frames, all well" in capsys.readouterr().out
+        assert "2 episodes, 24 frames, no problems" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("title", ["House-v0", "WorldModelEnv", "Your own environment as data"])
