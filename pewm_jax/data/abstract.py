@@ -1,4 +1,4 @@
-"""Shapes and types of frames and batches, for compiling before anything is read."""
+"""Abstract frames and batches (shapes and dtypes), for compiling before data is read."""
 
 from __future__ import annotations
 

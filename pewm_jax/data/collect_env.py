@@ -1,6 +1,6 @@
-"""One episode of an environment of one's own.
+"""Collect episodes from a user's environment: ``pewm-jax data collect OUT --env MODULE:NAME``.
 
-The environment follows Gymnasium's API and shows, in its observation (a dictionary) or in ``info``,
+The environment follows Gymnasium's API and provides, in its observation (a dictionary) or ``info``,
 
     rgb         (H, W, 3) uint8
     depth       (H, W) float, metres along the camera's z axis, 0 = no measurement
@@ -8,9 +8,9 @@ The environment follows Gymnasium's API and shows, in its observation (a diction
     intrinsics  (4,) fx, fy, cx, cy in pixels, centres at +0.5; or the attribute ``intrinsics_4``
                 of the environment
 
-Every episode begins with a ``reset`` whose seed follows from the settings and its number. Planar
-actions are found from the poses: they say what the agent did, and not what it wanted to. Each
-episode is validated before it is written.
+Every episode begins with a ``reset`` whose seed follows from the settings and the episode's number,
+so an interrupted collection can be resumed. Planar actions are computed from the poses: they are
+the agent's actual motion, not its intended one. Each episode is validated before it is written.
 """
 
 from __future__ import annotations
@@ -37,41 +37,41 @@ from pewm_jax.io.progress import Meter
 SPLITS = ("train", "validation", "test")
 """Folders written."""
 TRIES = 20
-"""Episodes in a row that may be too short."""
+"""Largest number of consecutive episodes that may be too short."""
 FORM = (
     "rgb (H, W, 3) uint8, depth (H, W) in metres along z, pose (4, 4) world_from_camera (OpenCV "
     "axes, z up), and intrinsics (4,) fx, fy, cx, cy, which may also be the environment's "
     "attribute intrinsics_4"
 )
-"""What an environment has to provide, for refusals."""
+"""The arrays that an environment has to provide, for error messages."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CollectEnvConfig:
-    """Walk an agent through an environment of your own and write what it sees as episodes."""
+    """Let an agent walk through your own environment and write its frames as episodes."""
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder to write; gets train/, validation/ and test/."""
     env: str
-    """MODULE:NAME of a function or class that gives a gymnasium.Env, or the name of a registered
-    one, after the module that registers it: pewm_jax.planning:pewm_jax/House-v0."""
+    """MODULE:NAME of a function or class that returns a gymnasium.Env, or of a registered
+    environment after the module that registers it: pewm_jax.planning:pewm_jax/House-v0."""
     env_args: str = "{}"
-    """Arguments of the function, as a JSON table: '{"task": "image"}'."""
+    """Arguments of the function, as a JSON object: '{"task": "image"}'."""
     policy: str = ""
-    """MODULE:FUNCTION, from observation to action; empty: random actions that persist."""
+    """MODULE:FUNCTION that maps an observation to an action; empty: random, repeated actions."""
     persistence: float = 0.7
-    """Without a policy: probability of doing once more what was done last, if it had an effect."""
+    """Without a policy: probability of repeating the last action, if it moved the agent."""
     train: int = 320
     """Episodes to train on."""
     validation: int = 8
     """Episodes to watch training with."""
     test: int = 24
-    """Episodes to score."""
+    """Episodes to evaluate on."""
     frames: int = 96
     """Frames of an episode."""
     min_frames: int = 9
-    """Episodes that the environment ends before --frames are kept from this length on; shorter
-    ones are made anew."""
+    """Episodes that the environment ends before --frames are kept if they have this many frames;
+    shorter ones are made again with another seed."""
     seed: int = 0
     """Seed of the environment and of random actions."""
     shard_episodes: int = 8
@@ -110,14 +110,14 @@ class CollectEnvConfig:
         except ValueError:
             table = None
         if not isinstance(table, dict):
-            raise ConfigError(f"--env-args is {self.env_args!r}: give a JSON table.")
+            raise ConfigError(f"--env-args is {self.env_args!r}: give a JSON object.")
 
     def episodes(self, split: str) -> int:
         """Episodes of a split."""
         return getattr(self, split)
 
     def settings(self, split: str) -> dict[str, Any]:
-        """Return what determines the bytes of a split, as plain values."""
+        """Return the settings that determine the bytes of a split."""
         settings = dataclasses.asdict(self)
         for name in ("out", "overwrite", *SPLITS):
             del settings[name]
@@ -131,18 +131,18 @@ def make(
     split: str,
     index: int,
 ) -> bytes:
-    """Walk one episode and return its record.
+    """Run one episode and return its record.
 
     Args:
         env: from ``open_env``.
         policy: from ``open_policy``.
         config: the settings.
         split: the episode's split.
-        index: its number there.
+        index: the episode's number in the split.
 
     Raises:
-        UserError: the environment does not show what is needed, or ends its episodes too soon, or
-            the episode does not pass validation.
+        UserError: the environment does not provide the arrays needed or ends its episodes too soon,
+            or the episode fails validation.
     """
     longest = 0
     for attempt in range(TRIES):
@@ -162,20 +162,20 @@ def _walk(
     env: Any, act: Callable[[Any], Any], config: CollectEnvConfig, seed: int
 ) -> tuple[list[dict[str, np.ndarray]], np.ndarray, str]:
     """Return the frames of an episode, the intrinsics, and the scene's name."""
-    observation, info = _called(config, "reset", env.reset, seed=seed)
-    first, intrinsics = _look(env, observation, info, config)
+    observation, info = _call_user(config, "reset", env.reset, seed=seed)
+    first, intrinsics = _read_frame(env, observation, info, config)
     seen = [first]
     while len(seen) < config.frames:
-        action = _called(config, "the policy", act, observation)
-        observation, _, terminated, truncated, info = _called(config, "step", env.step, action)
-        frame, same = _look(env, observation, info, config)
+        action = _call_user(config, "the policy", act, observation)
+        observation, _, terminated, truncated, info = _call_user(config, "step", env.step, action)
+        frame, same = _read_frame(env, observation, info, config)
         if not np.array_equal(same, intrinsics) or frame["rgb"].shape != first["rgb"].shape:
             raise UserError(
                 f"--env {config.env} changed its intrinsics or image size within an episode: an "
                 "episode has one camera."
             )
         if isinstance(act, _Persistent) and np.array_equal(frame["pose"], seen[-1]["pose"]):
-            act.forget()  # what was done had no effect: it stands before a wall
+            act.forget()  # the action had no effect: the agent stands before a wall
         seen.append(frame)
         if terminated or truncated:
             break
@@ -183,23 +183,23 @@ def _walk(
     return seen, intrinsics, str(shown or config.env.partition(":")[2])
 
 
-def _called(config: CollectEnvConfig, what: str, function: Callable, *given: Any, **named: Any):
-    """Call what is a user's own, which may raise anything."""
+def _call_user(config: CollectEnvConfig, what: str, function: Callable, *args: Any, **kwargs: Any):
+    """Call a user's function; turn whatever it raises into a ``UserError``."""
     try:
-        return function(*given, **named)
+        return function(*args, **kwargs)
     except UserError:
         raise
     except Exception as error:
         raise UserError(
             f"--env {config.env}: {what} failed ({type(error).__name__}: "
-            f"{' '.join(str(error).split())}); mend it."
+            f"{' '.join(str(error).split())}); fix it."
         ) from error
 
 
-def _look(
+def _read_frame(
     env: Any, observation: Any, info: Any, config: CollectEnvConfig
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return the frame that an environment shows, and the intrinsics; refuse another form."""
+    """Return the frame that an environment provides, and the intrinsics; check their form."""
     places = [place for place in (observation, info) if isinstance(place, Mapping)]
 
     def find(name: str) -> Any:
@@ -211,8 +211,8 @@ def _look(
     absent = [name for name, value in found.items() if value is None]
     if absent:
         raise UserError(
-            f"--env {config.env} shows no {', '.join(absent)}: provide {FORM}, in the observation "
-            "(a dictionary) or in info."
+            f"--env {config.env} provides no {', '.join(absent)}: provide {FORM}, in the "
+            "observation (a dictionary) or in info."
         )
     frame = {name: np.asarray(value) for name, value in found.items()}
     size = frame["depth"].shape
@@ -227,8 +227,8 @@ def _look(
     wrong = [name for name, fit in fits.items() if not fit]
     if wrong:
         what = ", ".join(f"{name} {frame[name].shape} {frame[name].dtype}" for name in wrong)
-        raise UserError(f"--env {config.env} shows {what}: provide {FORM}.")
-    # Copied: an environment may use its buffers again.
+        raise UserError(f"--env {config.env} provides {what}: provide {FORM}.")
+    # Copied, because an environment may reuse its buffers.
     kept = {name: frame[name].copy() for name in ("rgb", "depth", "pose")}
     return kept, frame["intrinsics"]
 
@@ -240,7 +240,7 @@ def _record(
     name: str,
     scene: str,
 ) -> bytes:
-    """Encode an episode, after the checks that ``data validate`` makes."""
+    """Encode an episode and check it as ``data validate`` does."""
     rgb, depth, pose = (np.stack([frame[key] for frame in seen]) for key in seen[0])
     arrays = EpisodeArrays(rgb, depth, intrinsics, pose, planar_actions(pose))
     record = write_episode(arrays, name, scene, {"policy": config.policy or "random-persistent"})
@@ -251,7 +251,7 @@ def _record(
 
 
 class _Persistent:
-    """A policy: random actions of a space, each repeated with a probability."""
+    """A policy that draws random actions from a space and repeats each with a probability."""
 
     def __init__(self, space: Any, persistence: float, rng: np.random.Generator):
         self._space, self._persistence, self._rng = space, persistence, rng
@@ -259,14 +259,14 @@ class _Persistent:
         space.seed(int(rng.integers(2**31)))
 
     def __call__(self, observation: Any) -> Any:
-        """Return an action; the observation does not count."""
+        """Return an action; the observation is ignored."""
         del observation
         if self._last is None or self._rng.random() >= self._persistence:
             self._last = self._space.sample()
         return self._last
 
     def forget(self) -> None:
-        """Draw the next action anew."""
+        """Draw a new action next."""
         self._last = None
 
 
@@ -274,7 +274,7 @@ def open_env(config: CollectEnvConfig) -> Any:
     """Return the environment that ``--env`` names.
 
     Raises:
-        UserError: there is none of the name, it cannot be made, or it is no environment.
+        UserError: no environment has this name, it cannot be created, or it is not an environment.
     """
     arguments = json.loads(config.env_args)
     module, _, name = config.env.partition(":")
@@ -285,30 +285,30 @@ def open_env(config: CollectEnvConfig) -> Any:
         env = made(**arguments)
     except UserError:
         raise
-    except Exception as error:  # what is a user's own may raise anything
+    except Exception as error:  # a user's function may raise anything
         raise UserError(
-            f"--env {config.env} cannot be made ({type(error).__name__}: "
-            f"{' '.join(str(error).split())}): mend it, or its --env-args."
+            f"--env {config.env} cannot be created ({type(error).__name__}: "
+            f"{' '.join(str(error).split())}): fix it, or its --env-args."
         ) from error
     for wanted in ("reset", "step", "close", "action_space"):
         if not hasattr(env, wanted):
             raise UserError(
-                f"--env {config.env} gives a {type(env).__name__} without {wanted}: give a "
-                "function or class that gives a gymnasium.Env."
+                f"--env {config.env} returns a {type(env).__name__} without {wanted}: give a "
+                "function or class that returns a gymnasium.Env."
             )
     return env
 
 
 def _registered(config: CollectEnvConfig, name: str) -> Callable[..., Any]:
-    """Return what makes a registered environment of Gymnasium."""
+    """Return a function that creates a registered environment of Gymnasium."""
     try:
-        import gymnasium  # noqa: PLC0415 - an extra: other environments do without
+        import gymnasium  # noqa: PLC0415 - optional: other environments do not need it
     except ImportError:
         gymnasium = None
     if gymnasium is None or name not in gymnasium.registry:
         raise UserError(
             f"--env {config.env}: the module has no {name!r}, and Gymnasium (pip install "
-            "'pewm-jax[planning]') knows no such environment after importing it."
+            "'pewm-jax[planning]') has no such environment registered after importing it."
         )
     return lambda **arguments: gymnasium.make(name, **arguments)
 
@@ -317,7 +317,7 @@ def open_policy(config: CollectEnvConfig) -> Callable[[Any], Any] | None:
     """Return the policy that ``--policy`` names, or None.
 
     Raises:
-        UserError: there is no such function.
+        UserError: the function does not exist.
     """
     if not config.policy:
         return None
@@ -325,14 +325,14 @@ def open_policy(config: CollectEnvConfig) -> Callable[[Any], Any] | None:
     found = getattr(_module(module, "--policy"), name, None)
     if not callable(found):
         raise UserError(
-            f"--policy {config.policy}: there is no function {name}: give MODULE:FUNCTION, from "
-            "observation to action."
+            f"--policy {config.policy}: the module has no function {name}; give MODULE:FUNCTION "
+            "that maps an observation to an action."
         )
     return found
 
 
 def _module(name: str, flag: str) -> Any:
-    """Import a user's module, which may also lie in the current folder."""
+    """Import a user's module; it may also be in the current folder."""
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)

@@ -1,7 +1,7 @@
 """Engines that make shards: this process, a pool of processes, or a Ray cluster.
 
 A shard is a pure function of the settings and its number, so the files do not depend on the engine.
-Machines of a cluster send the bytes of a shard back; they need no shared folder.
+Machines of a cluster send the bytes of a shard back; a shared folder is not needed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.io import atomic
 
 SHARDS_PER_PROCESSOR = 2
-"""Shards submitted to a cluster per processor: one that is made and one that waits."""
+"""Shards submitted to a cluster per processor: one in progress and one waiting."""
 RETRIES = 3
 """Retries of a shard whose worker or machine was lost."""
 CONNECT_S = 10.0
@@ -43,13 +43,13 @@ CONNECT_S = 10.0
 CANCEL_S = 5.0
 """Timeout for cancelled shards to stop, seconds."""
 DIED = (
-    "a worker process died (killed, or out of memory); run the same command again to go on, with "
+    "a worker process died (killed, or out of memory); run the same command again to resume, with "
     "fewer --workers if memory is short."
 )
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 """Environment variables for Ray: no usage reports, no warning about unused GPUs."""
 PACKAGES = ("config", "geometry", "houses", "data", "io")
-"""Folders of this library whose code can change the bytes of a shard."""
+"""Packages of this library whose code can change the bytes of a shard."""
 LIBRARIES = (
     "numpy",
     "scipy",
@@ -92,7 +92,7 @@ def run(
 
     Args:
         jobs: the shards.
-        config: ``engine``, ``address`` and ``workers`` count.
+        config: ``engine``, ``address`` and ``workers`` are used.
         log: receives the lines to print.
 
     Raises:
@@ -112,12 +112,12 @@ def on_processes(jobs: list[Job], workers: int) -> Generator[tuple[Job, Shard]]:
         return
     others = set(multiprocessing.active_children())
     done = False
-    # Spawned, not forked: JAX has threads, and a fork of a process with threads may hang.
+    # Spawned, not forked: JAX runs threads, and a fork of a process with threads may hang.
     pool = concurrent.futures.ProcessPoolExecutor(
         min(workers, len(jobs)), multiprocessing.get_context("spawn"), _start_worker
     )
     try:
-        with sigint_ignored():  # workers are spawned here and inherit it from their first line on
+        with sigint_ignored():  # workers are spawned here and inherit it from the start
             futures = {pool.submit(job.run): job for job in jobs}
         for future in concurrent.futures.as_completed(futures):
             yield futures[future], future.result()
@@ -125,17 +125,17 @@ def on_processes(jobs: list[Job], workers: int) -> Generator[tuple[Job, Shard]]:
     except BrokenProcessPool:
         raise UserError(DIED) from None
     finally:
-        if not done:  # what they are writing is marked as partial, and is made again
+        if not done:  # their unfinished files have temporary names and are made again
             for worker in set(multiprocessing.active_children()) - others:
                 worker.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _start_worker() -> None:
-    """Set up a worker: one thread, ignores Ctrl-C (its parent ends it), ends with its parent."""
+    """Set up a worker that uses one thread, ignores Ctrl-C, and exits with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
-    jax.config.update("jax_platforms", "cpu")  # no worker takes an accelerator's memory
+    jax.config.update("jax_platforms", "cpu")  # workers must not allocate accelerator memory
     parent = multiprocessing.parent_process()
     if parent is not None:
 
@@ -152,7 +152,7 @@ def on_cluster(
     """Make shards on the machines of a Ray cluster; arguments and errors as for ``run``.
 
     Few shards are submitted at a time, so that results do not fill the cluster's memory, but more
-    than there are processors, so that an autoscaling cluster grows.
+    than there are processors, so that an autoscaling cluster adds machines.
     """
     ray = _import_ray()
     with cluster(ray, config, log):
@@ -185,28 +185,28 @@ def on_cluster(
 
 
 def make_bytes(job: Job, software: Mapping[str, str]) -> tuple[Shard, bytes]:
-    """Make a shard on another machine: its description and the bytes of its file.
+    """Make a shard on another machine; return its description and the bytes of its file.
 
     Args:
-        job: the shard; only the last part of its path counts.
-        software: what the machine that asks has, see ``software_here``.
+        job: the shard; only the last part of its path is used.
+        software: the versions on the requesting machine, see ``software_here``.
 
     Raises:
-        UserError: this machine has other software, or a mesh is not there.
+        UserError: this machine has other software, or lacks a mesh.
     """
     here = software_here()
     for name in software:
         if here[name] != software[name]:
             raise UserError(
-                f"{platform.node()} has {name} {here[name]}, the machine that asks has "
-                f"{software[name]}: install the same on every machine of the cluster, since the "
-                "shards could differ."
+                f"{platform.node()} has {name} {here[name]}, the requesting machine has "
+                f"{software[name]}: install the same version on every machine of the cluster, "
+                "because the shards could differ."
             )
     for path in job.config.scene:
         if not path.is_file():
             raise UserError(
-                f"{path} does not exist on {platform.node()}; put the meshes of --scene into the "
-                "same place on every machine of the cluster."
+                f"{path} does not exist on {platform.node()}; put the meshes of --scene at the "
+                "same path on every machine of the cluster."
             )
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory(prefix="pewm-collect-") as folder:
@@ -215,7 +215,7 @@ def make_bytes(job: Job, software: Mapping[str, str]) -> tuple[Shard, bytes]:
 
 
 def software_here() -> dict[str, str]:
-    """Return the versions that a shard's bytes depend on; of this library, a hash of its code."""
+    """Return the versions that a shard's bytes depend on; for this library, a hash of its code."""
     root = Path(__file__).parents[1]
     code = hashlib.sha256()
     for package in PACKAGES:
@@ -235,7 +235,7 @@ def require(config: CollectConfig) -> None:
         return
     _import_ray()
     host, colon, port = config.address.rpartition("/")[2].rpartition(":")
-    if colon:  # Ray itself would wait for a quarter of an hour
+    if colon:  # Ray itself would wait for 15 minutes
         try:
             socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
         except OSError as error:
@@ -247,7 +247,7 @@ def _import_ray() -> Any:
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
     try:
-        import ray  # noqa: PLC0415 - an extra: only this engine needs it
+        import ray  # noqa: PLC0415 - optional: only this engine needs it
     except ImportError:
         raise UserError(
             "--engine ray needs Ray, which is not installed: pip install 'pewm-jax[ray]'."
@@ -269,7 +269,7 @@ def cluster(ray: Any, config: CollectConfig, log: Callable[[str], None]) -> Iter
 
     Args:
         ray: the module.
-        config: ``address`` and ``workers`` count.
+        config: ``address`` and ``workers`` are used.
         log: receives the lines to print.
 
     Raises:
@@ -283,7 +283,7 @@ def cluster(ray: Any, config: CollectConfig, log: Callable[[str], None]) -> Iter
         quiet |= {"num_cpus": config.workers or os.cpu_count() or 1, "include_dashboard": False}
     try:
         with warnings.catch_warnings(), sigint_postponed():
-            # Ray starts programs of its own, which is safe also where JAX has threads.
+            # Ray starts programs of its own, which is safe although JAX runs threads.
             warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
             try:
                 ray.init(address=config.address or "local", **quiet)
@@ -307,7 +307,7 @@ def _with_absolute_paths(job: Job) -> Job:
 def _write_received(path: Path, made: Shard, content: bytes) -> Shard:
     """Write a shard that another machine made, after comparing its hash."""
     if hashlib.sha256(content).hexdigest() != made.sha256:
-        raise UserError(f"{path} arrived damaged; run the same command again to go on.")
+        raise UserError(f"{path} arrived damaged; run the same command again to resume.")
     with atomic.replacing(path) as partial, partial.open("wb") as file:
         file.write(content)
         file.flush()
@@ -332,7 +332,7 @@ def sigint_ignored() -> Iterator[None]:
 def sigint_postponed() -> Iterator[None]:
     """Raise the KeyboardInterrupt of a first Ctrl-C after the block, that of a second at once.
 
-    Ray that is interrupted while it starts leaves processes behind, or crashes at its end.
+    If Ray is interrupted while it starts, it leaves processes behind or crashes at its end.
     """
     if threading.current_thread() is not threading.main_thread():  # others cannot set signals
         yield

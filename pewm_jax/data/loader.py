@@ -1,4 +1,10 @@
-"""Records that fail to decode: they are skipped up to a limit, and each is reported once."""
+"""Batches of clips by Grain: batch k is a function of (seed, k), so a position is one integer.
+
+Every epoch visits every episode once, in an order drawn from the seed, and draws one clip from
+each. An interrupted training resumes from k alone. An episode that does not decode is replaced by
+another, drawn from the same seed and position, so the replacement depends only on the files.
+``BadRecords`` counts these episodes and reports each once.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +32,7 @@ class BadRecords:
     """The records that failed to decode; may be shared by threads and by several loaders.
 
     Args:
-        budget: most distinct records that may be skipped, ``data.bad_records``; None = no limit.
+        budget: largest number of distinct records to skip, ``data.bad_records``; None = no limit.
         log: called once per skipped record with a line that names it.
     """
 
@@ -49,10 +55,10 @@ class BadRecords:
 
         Args:
             record: its name.
-            reason: the sentence with which it was refused.
+            reason: the error message.
 
         Raises:
-            UserError: the limit is exceeded; the message names all of them.
+            UserError: the limit is exceeded; the message names all these records.
         """
         with self._lock:
             known = record in self._reasons
@@ -66,18 +72,18 @@ class BadRecords:
     def _too_many(self, reason: str) -> str:
         count = len(self)
         if count == 1:
-            return f"{reason.rstrip('.')}, or train without it by --data.bad_records 1."
+            return f"{reason.rstrip('.')}, or skip it with --data.bad_records 1."
         return (
             f"{count} records do not decode and data.bad_records allows {self._budget}: "
-            f"{'; '.join(self._reasons)}. `python -m pewm_jax.data validate` finds all there are; "
-            "make their shards again, or allow more by --data.bad_records."
+            f"{'; '.join(self._reasons)}. `pewm-jax data validate` lists all of them; make their "
+            "shards again, or allow more with --data.bad_records."
         )
 
 
 BATCHES_AHEAD = 2
-"""Batches decoded before they are asked for; with the one in use, what the loader holds."""
+"""Batches prefetched; the loader holds these and the one in use."""
 EPOCHS = 2**31
-"""Epochs of the dataset: practically endless, and its length still fits an integer."""
+"""Epochs of the dataset: practically endless, while its length still fits an integer."""
 
 
 RECORDED = ("classes_TXYZ", "origin_T3")
@@ -102,8 +108,8 @@ class _DrawClip(grain.transforms.RandomMap):
         source: the episodes.
         features: as for ``clips``.
         bad: as for ``clips``.
-        actions: whether batches have actions: all episodes do.
-        grid: what the voxels of all episodes must be like, if all episodes have them.
+        actions: whether batches have actions, because all episodes do.
+        grid: the grid that all episodes must have, if all episodes have voxels.
     """
 
     def __init__(
@@ -179,9 +185,9 @@ def dataset(
 ) -> grain.MapDataset:
     """Return the endless dataset whose element k is batch k, or some rows of it.
 
-    All batches have the same arrays: those that the model's ``batch_spec`` asks for and that all
-    episodes have (``import`` lists which have actions and voxels; a split of another maker is
-    judged by its first episode).
+    All batches have the same arrays: those that the model's ``batch_spec`` names and that all
+    episodes have. ``import`` lists which episodes have actions and voxels; of other splits the
+    first episode decides.
 
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit the
@@ -212,11 +218,11 @@ def records(config: Config, split: str = "train", *, seed: int, batch: int, step
         split: folder inside ``data.path``.
         seed: as for ``clips``.
         batch: clips per batch.
-        step: number of the batch, from 0: the one that a training's step ``step + 1`` learns from.
+        step: number of the batch, from 0; training uses it in step ``step + 1``.
 
     Returns:
         B names such as ``train/shard-00000-of-00004.array_record record 12 (episode house-3/follow)
-        frames 3–11``; records that do not decode are passed over as ``clips`` does.
+        frames 3–11``; records that do not decode are replaced as in ``clips``.
     """
     source = EpisodeSource(Path(config.data.path) / split)
     named = _order(source, seed).random_map(
@@ -241,26 +247,26 @@ def clips(
     bad: BadRecords | None = None,
     rows: slice | None = None,
 ) -> Iterator[Clip]:
-    """Iterate over batches of clips for ever.
+    """Return an endless iterator over batches of clips.
 
     Args:
-        config: ``clip`` and ``data`` say what is read, ``data.workers`` how many threads read it
-            (decoding leaves Python's lock to others). The batches do not depend on that number.
+        config: ``clip`` and ``data`` define the clips; ``data.workers`` is the number of threads
+            (decoding releases Python's lock). The batches do not depend on that number.
         split: folder inside ``data.path``.
         seed: order of the episodes and choice of the clips.
         batch: clips per batch.
-        start_step: number of the first batch; going on from step k gives what an iterator that
-            started at 0 gives from its k-th batch on.
-        features: reads the context's features, if they are kept.
+        start_step: number of the first batch; resuming from step k continues an iterator that
+            started at 0.
+        features: reads the context's features, if they are cached.
         bad: counts and names the records that do not decode; by default ``data.bad_records`` are
             skipped silently.
-        rows: which of a batch's clips are read and returned, by default all: a process of several
-            reads its own. Each clip is the same whoever reads it.
+        rows: the clips of a batch that are read and returned, by default all; with several
+            processes each reads its own. The clips do not depend on which process reads them.
 
     Returns:
         NumPy clips with a leading B (the number of rows): rgb uint8, depth float32 in metres,
-        actions where all episodes have them, and the extras that the model's ``batch_spec`` names
-        where all episodes have those.
+        actions if all episodes have them, and the extras that the model's ``batch_spec`` names if
+        all episodes have those.
 
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit, or (where
@@ -278,7 +284,7 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Epis
         That episode.
 
     Raises:
-        UserError: it does not fit, or none is left.
+        UserError: it does not fit, or no episode decodes.
     """
     for record in range(len(source)):
         try:
@@ -319,7 +325,7 @@ def _in_all(source: EpisodeSource, first: Episode) -> tuple[bool, bool]:
     settings = source.manifest.settings
     if settings.get("made_by") == "import":  # hand-held cameras among others
         listed = settings.get("actions")
-        if listed is None:  # imported before actions were listed: a few recordings, looked at
+        if listed is None:  # an older import did not list actions: open its few recordings
             listed = {k: source[k].actions is not None for k in range(len(source))}
         actions = all(listed.values())
         voxels = voxels and all(settings.get("voxels", {None: False}).values())
@@ -346,20 +352,20 @@ def _check_size(config: Config, episode: Episode) -> None:
     if (episode.height, episode.width) != (clip.height, clip.width):
         raise UserError(
             f"episode {episode.name} has images of {episode.width}×{episode.height} pixels, the "
-            f"configuration wants {clip.width}×{clip.height}: collect or import with that size, or "
+            f"configuration needs {clip.width}×{clip.height}: collect or import with that size, or "
             f"set clip.width {episode.width} and clip.height {episode.height}."
         )
 
 
 def _check_actions(config: Config, episode: Episode) -> None:
-    """Compare the settings of the actions with what an episode was made with, or has."""
+    """Compare the settings of the actions with those of an episode."""
     data, actions = config.data, episode.actions
-    table = getattr(config.model, "actions", None)  # a world that is not steered has none
+    table = getattr(config.model, "actions", None)  # a world without control has none
     if actions is not None and actions.shape[1] != PLANAR and data.stride_min < data.stride_max:
         raise ConfigError(
-            f"episode {episode.name} has actions of width {actions.shape[1]}, which only join to "
-            "one size where all clips have one stride: set data.stride_min and data.stride_max "
-            f"to the same number, for instance --data.stride_max {data.stride_min}."
+            f"episode {episode.name} has actions of width {actions.shape[1]}, which can only be "
+            "joined if all clips have the same stride: set data.stride_min and data.stride_max to "
+            f"the same number, for instance --data.stride_max {data.stride_min}."
         )
     for name in ("step_m", "turn_deg"):
         made, wanted = episode.info.get(name), getattr(table, name, None)
@@ -371,14 +377,15 @@ def _check_actions(config: Config, episode: Episode) -> None:
 
 
 def require_same_cells(world: World, episode: Episode) -> None:
-    """Refuse collected grids of other classes, or pictures of something else, than a world expects.
+    """Refuse an episode whose voxel classes or pictures are not those that a world expects.
 
     Args:
-        world: its settings; worlds without a memory of kind ``grid`` ask for nothing.
-        episode: of the data. Tables of other makers are not compared.
+        world: its settings; worlds without a memory of kind ``grid`` expect nothing.
+        episode: an episode of the data. Class tables that ``collect`` did not make are not
+            compared.
 
     Raises:
-        ConfigError: another table of classes, or pictures of surfaces where cells are expected.
+        ConfigError: the episode has another table of classes, or other pictures.
     """
     memory = getattr(world, "memory", None)
     if not isinstance(memory, GridConfig) or episode.voxel_grid is None:

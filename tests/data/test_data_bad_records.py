@@ -98,7 +98,7 @@ def test_replacements_depend_on_nothing_but_the_place(folder):
 
 def test_beyond_the_budget_training_stops_with_their_names(folder):
     flip(folder, 1)
-    with pytest.raises(UserError, match=r"record 1 does not read .* by --data\.bad_records 1\."):
+    with pytest.raises(UserError, match=r"record 1 cannot be read .* with --data\.bad_records 1\."):
         first(6, config(folder.parent), seed=1, batch=4)
     flip(folder, 2)
     with pytest.raises(UserError, match=r"2 records do not decode and .* allows 1: ") as refused:

@@ -162,7 +162,7 @@ def test_a_certain_clip_is_always_the_same(folder):
 
 
 def test_what_does_not_fit_is_refused_before_training(folder):
-    with pytest.raises(UserError, match="16×16 pixels, the configuration wants 64×64"):
+    with pytest.raises(UserError, match="16×16 pixels, the configuration needs 64×64"):
         loader.clips(config(folder).with_model(clip=ClipConfig()), seed=0, batch=2)
     long = config(folder).with_model(clip=ClipConfig(frames=25, height=16, width=16))
     with pytest.raises(UserError, match="has 24 frames, a clip of 25 frames at stride 1 needs 25"):

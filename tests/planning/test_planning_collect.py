@@ -200,7 +200,7 @@ def test_what_is_no_source_of_episodes_is_refused_and_nothing_is_written(tmp_pat
         ({"env": "make"}, "--env is 'make': give MODULE:NAME"),
         ({"env": "a b:make"}, "--env is 'a b:make'"),
         ({"policy": "x"}, "--policy is 'x'"),
-        ({"env_args": "[1]"}, "--env-args is '[1]': give a JSON table."),
+        ({"env_args": "[1]"}, "--env-args is '[1]': give a JSON object."),
         ({"env_args": "{"}, "--env-args is"),
         ({"train": -1}, "--train is -1"),
         ({"train": 0, "test": 0}, "nothing to collect"),
