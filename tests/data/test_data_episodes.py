@@ -213,7 +213,7 @@ def test_a_changed_byte_is_noticed_when_read(tmp_path):
     where = content.index(b"PEWMEPIS") + 4000
     content[where] ^= 1
     shard.write_bytes(content)
-    with pytest.raises(UserError, match="record 0 does not read"):
+    with pytest.raises(UserError, match="record 0 cannot be read"):
         EpisodeSource(folder)[0]
 
 
