@@ -50,7 +50,7 @@ _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 
 @dataclasses.dataclass(frozen=True)
 class _Imported:
-    """A shard of a split made by ``import``: it holds one episode.
+    """A shard of a split made by ``import``; it holds one episode.
 
     Attributes:
         shard: the file.
@@ -69,9 +69,9 @@ class _Imported:
 class ImportConfig:
     """Import a recording: a folder of colour images, depth images and a trajectory.
 
-    The camera has OpenCV axes (x right, y down, z forward) and the trajectory is camera-to-world,
-    as Open3D and TUM write them. Grids of class ids around the agent are imported with them from
-    voxels/, if there is such a folder: a .npz for each colour image, and classes.json.
+    The camera must have OpenCV axes (x right, y down, z forward) and the trajectory must be
+    camera-to-world, as Open3D and TUM write them. If there is a folder voxels/ (a .npz for each
+    colour image, and classes.json), its grids of class ids around the agent are imported as well.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -82,14 +82,14 @@ class ImportConfig:
     intrinsics: tuple[float, float, float, float]
     """fx fy cx cy in pixels of the recorded images."""
     pixel_centres: Literal["integer", "half"] = "integer"
-    """Where cx and cy have the centre of the first pixel: `integer` at 0 (Open3D, TUM, OpenCV),
-    `half` at 0.5."""
+    """Coordinate of the centre of the first pixel in cx and cy: `integer` is 0 (Open3D, TUM,
+    OpenCV), `half` is 0.5."""
     depth_scale: float = 1000.0
     """Value of a depth image that means one metre: 1000 for millimetres, 5000 for TUM. The largest
-    value of 16 bits, 65535, is no measurement whatever the scale."""
+    16-bit value, 65535, means no measurement whatever the scale."""
     max_depth: float = DEPTH_LIMIT_M
-    """Depths beyond this are no measurement, metres. By default all that the format can store is
-    kept; give the range of the sensor, such as 10, to leave out what it measures badly."""
+    """Depths beyond this become "no measurement", metres. By default all depths that the format can
+    store are kept; give the range of the sensor, such as 10, to drop unreliable depths."""
     stride: int = 1
     """Keep every n-th frame."""
     size: tuple[int, int] | None = None
@@ -97,12 +97,12 @@ class ImportConfig:
     trajectory: Path | None = None
     """Trajectory file; by default groundtruth.txt or the only .log file of the recording."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "-y"
-    """Axis of the recording's world that points up, written --up=-y. Trajectories that start at
-    a level camera have y down, so up is -y; motion capture (TUM) has z."""
+    """Axis of the recording's world that points up, written --up=-y. Trajectories that start at a
+    level camera have y down, so up is -y; with motion capture (TUM) it is z."""
     split: str = "train"
     """Split to add to."""
     name: str | None = None
-    """Name of the episode; by default that of the folder."""
+    """Name of the episode; by default the name of the folder."""
     overwrite: bool = False
     """Replace an episode of the same name."""
 
@@ -129,15 +129,14 @@ class ImportConfig:
 def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -> None:
     """Read, convert, check and add a recording to a dataset.
 
-    A recording with something wrong is refused before anything is written.
+    A recording with problems is refused before anything is written.
 
     Args:
         config: what to read and how.
         log: receives the lines to print.
 
     Raises:
-        UserError: files that are missing or do not fit, or an episode that does not pass
-            validation.
+        UserError: files are missing or do not match, or the episode fails validation.
     """
     name = config.name or config.src.resolve().name
     folder = config.out / config.split
@@ -149,7 +148,7 @@ def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -
     intrinsics = np.array(config.intrinsics, np.float32) + np.array([0, 0, half, half], np.float32)
     scale = (width / source_size[0], height / source_size[1])
     pose = world_from_recording(config.up) @ np.stack([f.world_from_camera for f in frames])
-    # The units are judged before anything is left out, which could hide that they are wrong.
+    # Check the units before large depths are dropped, which could hide that they are wrong.
     _refuse(check_depth(depth, str(config.src)), config, frames)
     depth[depth > config.max_depth] = 0
     voxels = read_voxels(
@@ -183,7 +182,7 @@ def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -
     write_manifest(
         folder, Manifest(config.split, tuple(one.shard for one in imported), settings, total)
     )
-    moves = "planar actions" if acts else "poses only (moves in 6 degrees)"
+    moves = "planar actions" if acts else "poses only (6 degrees of freedom)"
     grids = "" if voxels is None else f", voxels of {voxels.grid.side}³ cells"
     log(f"{folder}: added {name}, {len(frames)} frames of {width}×{height} pixels, {moves}{grids}.")
 
@@ -191,7 +190,7 @@ def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -
 def world_from_recording(up: str) -> np.ndarray:
     """Return the (4, 4) rotation that takes a recording's up axis to z."""
     axis = np.array(_AXES[up[-1]], float) * (-1 if up.startswith("-") else 1)
-    keep = np.array(_AXES["y" if up[-1] == "x" else "x"], float)  # this one stays horizontal
+    keep = np.array(_AXES["y" if up[-1] == "x" else "x"], float)  # this axis stays horizontal
     rotation = np.eye(4)
     rotation[:3, :3] = np.stack([keep, np.cross(axis, keep), axis])
     return rotation
@@ -201,7 +200,7 @@ def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     """Return the (T − 1, 3) actions of a camera that only moves and turns on the ground.
 
     Returns:
-        None where the poses (T, 4, 4) cannot be reached that way (a hand-held camera).
+        None if no such actions lead through the poses (T, 4, 4), as with a hand-held camera.
     """
     if len(world_from_camera) < 2:
         return None
@@ -211,19 +210,19 @@ def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
 
 
 def _others(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
-    """Return the shards that are there already, without the one to replace."""
+    """Return the existing shards without the one to replace."""
     if not folder.exists():
         return []
     file = f"recording-{name}.array_record"
     if not (folder / MANIFEST).is_file():
-        # An import that was killed leaves its shard: whole and checked, for it was renamed.
+        # A killed import leaves its shard, which is complete and checked because it was renamed.
         strays = sorted(folder.glob("recording-*.array_record"))
         if len(strays) < len([*folder.glob("*.array_record"), *folder.glob("*.json")]):
             raise UserError(
                 f"{folder} holds an unfinished collection; finish it, or give another --split."
             )
         return [_look(path, describe_shard(path)) for path in strays if path.name != file]
-    # The shard to replace may be newer than the list, where an import was killed between the two.
+    # The shard to replace may be newer than the list, if an import was killed between the two.
     manifest = read_manifest(folder, check_files=False)
     if manifest.settings.get("made_by") != "import":
         raise UserError(f"{folder} was made by `collect`; import into another --split or folder.")
@@ -245,7 +244,7 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
 
 
 def _look(path: Path, shard: Shard) -> _Imported:
-    """Open a shard to see what it holds."""
+    """Open a shard and return which fields it holds."""
     episode = read_episode(read_record(path, 0), str(path))
     acts, grid = episode.actions is not None, episode.voxel_grid
     return _Imported(shard, episode.length, acts, grid is not None)
@@ -254,7 +253,7 @@ def _look(path: Path, shard: Shard) -> _Imported:
 def _require_like_others(
     folder: Path, imported: list[_Imported], voxels: VoxelFrames, config: ImportConfig
 ) -> None:
-    """Refuse voxels that do not go together with those of the split."""
+    """Refuse voxels whose grid is not that of the split."""
     for one in imported:
         if one.voxels:
             path = folder / one.shard.file
@@ -281,11 +280,13 @@ def _read_images(
                 if (image.shape[1], image.shape[0]) != source:
                     raise UserError(
                         f"{path} has {image.shape[1]}×{image.shape[0]} pixels, the first image "
-                        f"{source[0]}×{source[1]}: colour and depth must be registered and all of "
-                        "one size."
+                        f"{source[0]}×{source[1]}: colour and depth must be registered and have "
+                        "the same size."
                     )
             if distance.ndim != 2:
-                raise UserError(f"{frame.depth} has {distance.shape[2]} channels: not a depth.")
+                raise UserError(
+                    f"{frame.depth} has {distance.shape[2]} channels; a depth image must have one."
+                )
             shrink = size[0] < source[0]
             how = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
             rgb[k] = cv2.resize(colour, size, interpolation=how)[..., ::-1]
@@ -312,7 +313,7 @@ def _nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def _read(path: Path, flags: int) -> np.ndarray:
     if not path.is_file():
-        raise UserError(f"{path} does not exist but the recording lists it.")
+        raise UserError(f"{path} does not exist, but the recording lists it.")
     code = path.read_bytes()
     image = decode_image(code, flags)
     if image is None:
@@ -322,7 +323,7 @@ def _read(path: Path, flags: int) -> np.ndarray:
 
 
 def _refuse(problems: list[Problem], config: ImportConfig, frames: list[RecordedFrame]) -> None:
-    """Refuse a recording with problems; name the first, with the file of its depth image."""
+    """Refuse a recording with problems; report the first with the file of its depth image."""
     if not problems:
         return
     first = problems[0]

@@ -1,6 +1,6 @@
-"""Make one episode: scene, trajectory, rendered frames, encoded record.
+"""Make one episode of a house or a mesh: scene, trajectory, rendered frames, encoded record.
 
-Every episode is a pure function of the settings and its index.
+An episode is a pure function of the settings and its index.
 """
 
 from __future__ import annotations
@@ -29,22 +29,21 @@ from pewm_jax.houses.fixtures import ROBOT_HEIGHT_M
 from pewm_jax.types import Camera
 
 SPLITS = ("train", "validation", "revisit")
-"""Folders written; ``revisit`` holds the test scenes, by default walked out and back
-(``CollectConfig.test_policy``)."""
+"""Folders written; ``revisit`` holds the test scenes, in which the agent by default goes out and
+back (``CollectConfig.test_policy``)."""
 HOUSES_PER_SEED = 1_000_000
 _NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
 """Settings that do not change the files."""
 UNRECORDED = VoxelsConfig()
 HEADROOM_M = 0.1
-"""Free room above the camera where the agent may stand, metres."""
+"""Free space above the camera where the agent may stand, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CollectConfig:
-    """Walk an agent through houses and write what it sees as episodes.
+    """Let an agent walk through houses and write its frames as episodes.
 
-    With --env MODULE:NAME an environment of your own takes their place; `collect --env --help`
-    explains.
+    With --env MODULE:NAME your own environment is used instead; see `collect --env --help`.
     """
 
     out: Annotated[Path, tyro.conf.Positional]
@@ -52,10 +51,10 @@ class CollectConfig:
     train: int = 320
     """Episodes to train on."""
     validation: int = 8
-    """Episodes to watch training with."""
+    """Episodes for validation during training."""
     test: int = 24
     """Episodes in test scenes, in revisit/: out and back over the same places, unless test_policy
-    says otherwise."""
+    is another."""
     frames: int = 96
     """Frames of an episode."""
     size: int = 64
@@ -71,23 +70,23 @@ class CollectConfig:
     turn_around: float = 0.5
     """Probability of a full turn at the start of an episode; revisit episodes always have it."""
     policy: Literal["follow", "walk"] = "follow"
-    """`follow`: shortest paths between far goals. `walk`: straight on until something is there."""
+    """`follow`: shortest paths between far goals. `walk`: straight on up to an obstacle."""
     test_policy: Policy = "revisit"
-    """How test scenes are walked: `revisit` turns around, goes out and comes back the same way;
-    `follow` and `walk` are those of `policy`. A revisit turns by 540 degrees in all: with turns of
-    10 degrees these are 54 actions, so a short episode has few others."""
+    """Policy in test scenes: `revisit` turns around, goes out and comes back the same way; `follow`
+    and `walk` as for `policy`. A revisit turns by 540 degrees in total, which takes 54 actions with
+    turns of 10 degrees, so that few actions of a short episode remain for moving."""
     continuous: bool = False
     """Small continuous (dx, dy, dyaw) actions instead of forward / turn left / turn right."""
     ids: bool = False
     """Also write instance ids, and the names of the instances."""
     moving: bool = False
-    """Made houses have doors that open as the agent comes near, and robots on their rounds."""
+    """Generated houses have doors that open as the agent approaches, and patrolling robots."""
     voxels: VoxelsConfig = UNRECORDED
     episodes_per_house: int = 1
-    """Episodes recorded in one house before the next is made."""
+    """Episodes recorded in one house before the next is generated."""
     scene: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
-    """A mesh to walk in instead of made houses (GLB, OBJ, PLY); may be given several times: the
-    meshes are shared out over the splits, a single one serves all of them."""
+    """A mesh to walk in instead of generated houses (GLB, OBJ, PLY); may be given several times:
+    the meshes are distributed over the splits; a single mesh is used for all of them."""
     up: Literal["auto", "y", "z"] = "auto"
     """Which axis of the meshes points up; `auto`: y for GLB and glTF, z for the others."""
     seed: int = 0
@@ -95,11 +94,11 @@ class CollectConfig:
     workers: int = 0
     """Processes; 0 = as many as there are CPU cores. The result does not depend on it."""
     engine: Literal["processes", "ray"] = "processes"
-    """What makes the shards: `processes` of this machine, or a `ray` cluster (pip install
+    """Where the shards are made: in `processes` of this machine, or on a `ray` cluster (pip install
     'pewm-jax[ray]'). The result does not depend on it."""
     address: str = ""
-    """With `--engine ray`: HOST:PORT of the cluster, or `auto` on one of its machines; empty
-    starts one of this machine alone."""
+    """With `--engine ray`: HOST:PORT of the cluster, or `auto` on one of its machines; if empty, a
+    cluster of this machine alone is started."""
     shard_episodes: int = 8
     """Episodes per file."""
     overwrite: bool = False
@@ -131,22 +130,22 @@ class CollectConfig:
     def _check_moving_and_voxels(self) -> None:
         if self.moving and self.scene:
             raise ConfigError(
-                "--moving is for made houses: a mesh of --scene has no parts that move; leave out "
+                "--moving needs generated houses: a mesh of --scene has no moving parts; leave out "
                 "one of the two."
             )
         if self.moving and self.camera_height < ROBOT_HEIGHT_M + HEADROOM_M:
             raise ConfigError(
                 f"--camera-height is {self.camera_height}: with --moving use "
-                f"{ROBOT_HEIGHT_M + HEADROOM_M:g} m or more, as robots go below the camera."
+                f"{ROBOT_HEIGHT_M + HEADROOM_M:g} m or more, to be above the robots."
             )
         for field in () if self.voxels.record else dataclasses.fields(self.voxels):
             value = getattr(self.voxels, field.name)
             if value != field.default:
-                raise ConfigError(f"--voxels.{field.name} {value} needs --voxels, which records.")
+                raise ConfigError(f"--voxels.{field.name} {value} needs --voxels: add it.")
         if self.ids and self.voxels.pictures == "cells":
             raise ConfigError(
-                "--ids are of the house's own things, which --voxels.pictures cells does not show: "
-                "leave out one of the two."
+                "--ids records the instances of the house, which --voxels.pictures cells does not "
+                "show: leave out one of the two."
             )
 
     def _check_address(self) -> None:
@@ -159,7 +158,7 @@ class CollectConfig:
 
     @property
     def actions(self) -> ActionConfig:
-        """What one action does."""
+        """The motion of one action."""
         return ActionConfig(self.step_m, self.turn_deg)
 
     def episodes(self, split: str) -> int:
@@ -168,13 +167,14 @@ class CollectConfig:
 
 
 def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
-    """Return what determines the bytes of a split, as plain values."""
+    """Return the settings that determine the bytes of a split."""
     settings = dataclasses.asdict(config)
     for name in (*_NOT_IN_FILES, "train", "validation", "test"):
         del settings[name]
-    if split != "revisit" or config.test_policy == "revisit":  # as before there was a choice
+    # Defaults of newer settings are left out, so that older datasets compare as equal.
+    if split != "revisit" or config.test_policy == "revisit":
         del settings["test_policy"]
-    if not config.moving:  # datasets of before there was a choice stay what they are
+    if not config.moving:
         del settings["moving"]
     if settings["voxels"]["pictures"] == UNRECORDED.pictures:
         del settings["voxels"]["pictures"]
@@ -185,19 +185,19 @@ def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
 
 
 def house_seed(config: CollectConfig, split: str, index: int) -> int:
-    """Return the seed of an episode's house; no seed serves two splits, whatever the settings."""
+    """Return the seed of an episode's house; seeds never serve two splits."""
     number = config.seed * HOUSES_PER_SEED + index // config.episodes_per_house
     return number * len(SPLITS) + SPLITS.index(split)
 
 
 def scenes_of(config: CollectConfig, split: str) -> tuple[Path, ...]:
-    """Return the meshes of a split: disjoint between splits where there are enough of them."""
+    """Return the meshes of a split: disjoint between splits if there are enough of them."""
     scenes = config.scene
     used = [name for name in SPLITS if config.episodes(name)]
     if len(scenes) < len(used):
         return scenes
     order = np.random.default_rng(config.seed).permutation(len(scenes))
-    # One mesh for every small split, the others to the first (largest) one.
+    # One mesh for every small split, the others for the first (largest) one.
     position = used.index(split)
     chosen = order[: len(scenes) - len(used) + 1] if position == 0 else [order[-position]]
     return tuple(scenes[i] for i in sorted(chosen))
@@ -207,7 +207,7 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     """Make one episode and return its record.
 
     Raises:
-        UserError: a mesh that does not load or has no floor to stand on.
+        UserError: a mesh does not load or has no floor to stand on.
     """
     moving: MovingHouse | None = None
     if config.scene:
@@ -288,5 +288,5 @@ def _mesh(path: Path, up: Literal["auto", "y", "z"], camera_height: float) -> tu
 
 
 def dashed(name: str) -> str:
-    """Return a setting's name as it is written on the command line."""
+    """Return a setting's name in its command-line form."""
     return name.replace("_", "-")

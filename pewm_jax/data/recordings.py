@@ -1,9 +1,18 @@
-"""Recordings in the folders of Open3D and TUM: which files form a frame, and its camera pose.
+"""Read recordings in the layouts of Open3D and TUM: the files and the camera pose of each frame.
 
 Two layouts are read. Open3D's: a folder of colour images, a folder of depth images and a ``.log``
 trajectory (a line of three integers, then a 4×4 camera-to-world matrix, per frame). Its images
-are taken in natural order (2.png before 10.png), and frames are matched by their position. TUM's:
+are sorted in natural order (2.png before 10.png), and frames are matched by their position. TUM's:
 ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt`` whose lines begin with a time stamp.
+
+A folder ``voxels/`` beside the images may hold grids of class ids: for the colour image
+``00012.png`` the file ``00012.npz`` with
+
+* ``classes``: (n, n, n) integers, class ids along the recording's own x, y and z axes, 0 = empty;
+* ``origin``: (3,) position of the lowest corner of the grid in the recording's own world, metres;
+* ``cell``: side of a cell, metres;
+
+and ``classes.json``, a list of the names of the classes, the name of empty cells first.
 """
 
 from __future__ import annotations
@@ -51,10 +60,10 @@ def read_recording(folder: Path, trajectory: Path | None = None) -> list[Recorde
     Args:
         folder: the recording.
         trajectory: its trajectory, by default ``groundtruth.txt`` or the only ``.log`` file in it;
-            a name that ends in ``.log`` is read as Open3D's, any other as TUM's.
+            a file that ends in ``.log`` is read as Open3D's, any other as TUM's.
 
     Raises:
-        UserError: files that are missing or do not parse, or counts that do not match.
+        UserError: files are missing or do not parse, or counts do not match.
     """
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder; give the folder of a recording.")
@@ -70,7 +79,9 @@ def _find_trajectory(folder: Path, trajectory: Path | None) -> Path:
         for path in (folder / trajectory, trajectory):
             if path.is_file():
                 return path
-        raise UserError(f"--trajectory {trajectory} exists neither in {folder} nor by itself.")
+        raise UserError(
+            f"--trajectory {trajectory} exists neither in {folder} nor in the current folder."
+        )
     if (folder / "groundtruth.txt").is_file():
         return folder / "groundtruth.txt"
     logs = sorted(folder.glob("*.log"))
@@ -103,7 +114,7 @@ def natural_key(path: Path) -> tuple[tuple[tuple[int, int | str], ...], str]:
 
 
 def _require_same_numbers(folder: Path, colours: list[Path], depths: list[Path]) -> None:
-    """Refuse colour and depth images that are numbered and do not have the same numbers.
+    """Refuse numbered colour and depth images whose numbers differ.
 
     The first or the last number in a name may count the frames (the other can be a time stamp).
     Two series that begin with different numbers, or count in different steps, are matched by
@@ -129,11 +140,11 @@ def _require_same_numbers(folder: Path, colours: list[Path], depths: list[Path])
 
 
 def _numbers(files: list[Path], place: int) -> list[int] | None:
-    """Return a number of each name; None if a name has none, or two names share one.
+    """Return one number per name; None if a name has none, or two names share one.
 
     Args:
         files: the files.
-        place: which of the numbers in a name, by its index.
+        place: index of the number among those in a name.
     """
     found = [re.findall(r"[0-9]+", path.stem) for path in files]
     numbers = [int(each[place]) for each in found if each]
@@ -158,13 +169,13 @@ def read_log(path: Path) -> np.ndarray:
     """Read an Open3D ``.log`` trajectory as (T, 4, 4) camera-to-world.
 
     Raises:
-        UserError: it does not parse, naming the line.
+        UserError: it does not parse; the message names the line.
     """
     lines = [(i, line.split()) for i, line in enumerate(_lines(path), 1) if line.strip()]
     if len(lines) % 5:
         raise UserError(
             f"{path} has {len(lines)} lines, a .log trajectory has 5 per frame (three integers, "
-            "then four rows of a matrix); it is cut short or of another format."
+            "then four rows of a matrix); the file is truncated or has another format."
         )
     poses = np.empty((len(lines) // 5, 4, 4))
     for k, (number, fields) in enumerate(lines):
@@ -234,7 +245,7 @@ def _lines(path: Path) -> list[str]:
     try:
         return path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} does not read as text ({error}).") from None
+        raise UserError(f"{path} cannot be read as text ({error}).") from None
 
 
 def _floats(path: Path, line: int, fields: list[str], count: int) -> np.ndarray:
@@ -252,13 +263,13 @@ def _floats(path: Path, line: int, fields: list[str], count: int) -> np.ndarray:
 FOLDER, TABLE = "voxels", "classes.json"
 FIELDS = ("classes", "origin", "cell")
 _UNREADABLE = (EOFError, KeyError, OSError, ValueError, zipfile.BadZipFile, zlib.error)
-"""What NumPy raises on files that are no ``.npz``, are cut short, or hold pickled objects."""
+"""Errors that NumPy raises for files that are not ``.npz``, are truncated, or hold pickles."""
 
 
 def read_voxels(
     recording: Path, colours: Sequence[Path], world_from_recording: np.ndarray
 ) -> VoxelFrames | None:
-    """Read the grids of a recording's frames, turned with its world.
+    """Read the grids of a recording's frames, rotated with its world.
 
     Args:
         recording: the folder.
@@ -266,10 +277,10 @@ def read_voxels(
         world_from_recording: (4, 4) rotation by right angles from the recording's axes to ours.
 
     Returns:
-        The grids, or None where there is no folder ``voxels/``.
+        The grids, or None if there is no folder ``voxels/``.
 
     Raises:
-        UserError: a frame's file is missing or does not read, grids are of different sides or
+        UserError: a frame's file is missing or cannot be read, the grids have different sides or
             cells, or a class is not in the table.
     """
     folder = recording / FOLDER
@@ -282,7 +293,7 @@ def read_voxels(
             path = folder / f"{colour.stem}.npz"
             if not path.is_file():
                 raise UserError(
-                    f"{path} is missing: every colour image needs a grid of its name, here for "
+                    f"{path} is missing: every colour image needs a grid of the same name, here "
                     f"{colour.name}."
                 )
             classes, origin, here = _read(path)
@@ -291,7 +302,7 @@ def read_voxels(
             if classes.shape[0] != len(grids[0] if grids else classes) or here != cell:
                 raise UserError(
                     f"{path} has {classes.shape[0]}³ cells of {here:g} m, {first.name} has "
-                    f"{len(grids[0])}³ of {cell:g} m: all grids must be alike."
+                    f"{len(grids[0])}³ of {cell:g} m: all grids must have the same size."
                 )
             if int(classes.max()) >= len(names) or int(classes.min()) < 0:
                 wrong = int(classes.min() if classes.min() < 0 else classes.max())
@@ -309,16 +320,16 @@ def read_voxels(
 def turned(
     classes_XYZ: np.ndarray, origin_3: np.ndarray, cell_m: float, rotation_33: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Turn a grid about the world's origin by right angles.
+    """Rotate a grid about the world's origin by right angles.
 
     Args:
         classes_XYZ: (n, n, n) the cells.
-        origin_3: their lowest corner, metres.
+        origin_3: lowest corner of the grid, metres.
         cell_m: side of a cell, metres.
         rotation_33: a signed permutation of the axes, from the old to the new.
 
     Returns:
-        The cells along the new axes, and their lowest corner.
+        The cells along the new axes, and the grid's lowest corner.
     """
     exact = np.rint(rotation_33).astype(int)
     order = np.abs(exact).argmax(1)  # new axis k is old axis order[k]
@@ -333,8 +344,8 @@ def _table(path: Path) -> tuple[str, ...]:
     """Read the names of the classes."""
     if not path.is_file():
         raise UserError(
-            f"{path} is missing: give the names of the classes there, as a JSON list whose first "
-            "entry is for empty cells."
+            f"{path} is missing: write the names of the classes there, as a JSON list whose first "
+            "entry is the name of empty cells."
         )
     try:
         names = json.loads(path.read_text("utf-8"))
@@ -343,7 +354,7 @@ def _table(path: Path) -> tuple[str, ...]:
     fits = isinstance(names, list) and all(isinstance(name, str) for name in names)
     if not fits or not 2 <= len(names) <= 1 << 16:
         raise UserError(
-            f"{path} must hold a JSON list of 2 to {1 << 16} names, of empty cells first."
+            f"{path} must hold a JSON list of 2 to {1 << 16} names, that of empty cells first."
         )
     return tuple(names)
 
@@ -355,8 +366,8 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
             classes, origin, cell = (np.asarray(file[field]) for field in FIELDS)
     except _UNREADABLE as error:
         raise UserError(
-            f"{path} does not read as a grid ({' '.join(str(error).split())[:120]}): write it with "
-            f"numpy.savez_compressed, with the arrays {', '.join(FIELDS)}."
+            f"{path} cannot be read as a grid ({' '.join(str(error).split())[:120]}): write the "
+            f"arrays {', '.join(FIELDS)} with numpy.savez_compressed."
         ) from None
     cubic = classes.ndim == 3 and len(set(classes.shape)) == 1
     if not cubic or not 1 <= len(classes) <= SIDE_LIMIT or classes.dtype.kind not in "iu":

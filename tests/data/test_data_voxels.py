@@ -390,9 +390,9 @@ def test_recorded_grids_that_do_not_fit_are_refused(tmp_path, box_walk):
     frame.unlink()
     refused(r"00004\.npz is missing")
     frame.write_bytes(good[:200])
-    refused(r"00004\.npz does not read as a grid")
+    refused(r"00004\.npz cannot be read as a grid")
     with_(classes=np.array([object()]))
-    refused(r"00004\.npz does not read as a grid")
+    refused(r"00004\.npz cannot be read as a grid")
     with_(classes=np.zeros((8, 8, 8), int))
     refused(r"00004\.npz has 8³ cells of 0.5 m, 00000\.npz has 16³")
     with_(classes=np.zeros((8, 8, 9), int))
@@ -445,7 +445,7 @@ def test_the_flags_record_and_draw(tmp_path, capsys):
 def test_grids_that_cannot_work_are_refused(wrong, says):
     with pytest.raises(ConfigError, match=says):
         VoxelsConfig(**wrong)
-    with pytest.raises(ConfigError, match="made houses"):
+    with pytest.raises(ConfigError, match="generated houses"):
         CollectConfig(Path("x"), scene=(Path("a.glb"),), moving=True)
     with pytest.raises(ConfigError, match=r"with --moving use 0\.7 m or more"):
         CollectConfig(Path("x"), camera_height=0.5, moving=True)
