@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pewm_jax import config as configuration
-from pewm_jax import presets
+from pewm_jax import presets, registry
 from pewm_jax.cli import plugins as imports
 from pewm_jax.config import Config, Launch, World
 from pewm_jax.config import command_line as cli
@@ -17,6 +17,7 @@ USAGE = """usage: {prog} PRESET [--config FILE.json] [--SETTING VALUE …]
 
 Presets:
 {presets}
+  WORLD        the name of a world that a plugin registers, with its own defaults
   FOLDER       made by `pewm-jax convert import`: the settings in it, starting from its weights
 
 Beside the settings there are
@@ -116,6 +117,10 @@ def _read(argv: Sequence[str], prog: str) -> tuple[Config, Launch]:
     launch, argv = cli.take(Launch, argv)
     if name not in known and (folder / "config.json").is_file():
         default, about = _settings_in(folder), f"The settings in {folder}."
+    elif name not in known and name in registry.names("world"):
+        world = registry.named("world", name).settings
+        default = Config(model=world(), train=world.TRAIN())
+        about = f"The world {name}, with its own defaults."
     else:
         default = presets.load(cli.choose(name, known, "preset"))
         about = presets.describe(name)

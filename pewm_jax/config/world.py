@@ -188,9 +188,11 @@ class Task(Settings):
 class World(Task):
     """Base class of the settings of a world.
 
-    A world overrides ``start``, ``observe`` and ``imagine``, the methods that its capabilities
-    name, and may have three further ones, for which there are defaults:
+    A world overrides ``observe`` and ``imagine`` and the methods that its capabilities name. It may
+    have four further ones, for which there are defaults:
 
+    * ``start(params, frames)`` returns the state after S ≥ 1 observed frames (S, H, W, …), the last
+      of which is the present. By default ``observe`` makes it from a state whose memory is None.
     * ``imagine_many(params, state, controls, keys, *, memory=True, last=False)`` imagines K
       candidates from one state; see ``worlds.imagine_many``. By default ``imagine`` is vmapped.
     * ``to_compare(state)`` returns a smaller state that ``imagine_many`` takes as well.
@@ -225,8 +227,8 @@ class World(Task):
         return self
 
     @abc.abstractmethod
-    def start(self, params: Params, frames: Frames) -> WorldState:
-        """Return the state after S ≥ 1 observed frames (S, H, W, …); the last is the present.
+    def observe(self, params: Params, state: WorldState, frames: Frames) -> WorldState:
+        """Return the state after S ≥ 1 more observed frames (S, H, W, …); the last is the present.
 
         Args:
             params: the parameters.
@@ -236,10 +238,6 @@ class World(Task):
         Returns:
             The present frame (1, H, W, …), colours float32, with any pytree as its memory.
         """
-
-    @abc.abstractmethod
-    def observe(self, params: Params, state: WorldState, frames: Frames) -> WorldState:
-        """Return the state after S ≥ 1 more observed frames."""
 
     @abc.abstractmethod
     def imagine(

@@ -37,7 +37,7 @@ def rules(model: World) -> tuple[tuple[str, P], ...]:
     (stacked layers, taps of a convolution) are never split. The first match wins, and every
     parameter must be matched. Each network says its own (``SHARDING``, beside its functions).
     """
-    parameters = [(path, P(*spec)) for path, spec in worlds.sharding(model)]
+    parameters = worlds.sharding(model)
     return (
         *((rf"(params|ema|opt_state/.+)/{path}", spec) for path, spec in parameters),
         (r"opt_state/.*(count|ns_coeffs)", WHOLE),

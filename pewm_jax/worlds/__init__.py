@@ -31,6 +31,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+from jax.sharding import PartitionSpec
 
 from pewm_jax.config import Config, Task, UserError, World, functions
 from pewm_jax.types import Array, Frames, Params, WorldState
@@ -329,7 +330,8 @@ def stages(model: Config | Task) -> tuple[Stage, ...]:
 def sharding(model: Config | Task) -> tuple[tuple[str, Any], ...]:
     """Return the rules from paths of parameters to the mesh axes of their last axes."""
     model = model_of(model)
-    return function(model, "sharding")(model)
+    rules = function(model, "sharding")(model)
+    return tuple((pattern, PartitionSpec(*spec)) for pattern, spec in rules)
 
 
 def split_heads(model: Config | Task, stage: Stage) -> dict[str, int]:
@@ -360,6 +362,11 @@ def _imagine_each(
     return WorldState(present, state.map), frames
 
 
+def _start_by_observing(model: World, params: Params, frames: Frames) -> WorldState:
+    """Observe frames from a state without a memory: the default of ``start``."""
+    return function(model, "observe")(model, params, WorldState(frames, None), frames)
+
+
 def _same_state(model: World, state: WorldState) -> WorldState:
     del model
     return state
@@ -375,6 +382,7 @@ def _no_costs(config: Config, stage: Stage, share: Any) -> dict[str, Any]:
 
 
 DEFAULTS: dict[str, Callable[..., Any]] = {
+    "start": _start_by_observing,
     "imagine_many": _imagine_each,
     "to_compare": _same_state,
     "views": _no_views,
