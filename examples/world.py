@@ -11,10 +11,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.config import Capabilities, ClipConfig, StageConfig, TrainSettings, World, register
 from pewm_jax.geometry.actions import actions_between
 from pewm_jax.nn.convolution import convolve
-from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.types import Frames, WorldState
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.stages import TRAIN, Stage

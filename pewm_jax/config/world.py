@@ -232,6 +232,7 @@ class World(Task):
 
         Args:
             params: the parameters.
+            state: the state before; its memory is None where a world begins.
             frames: colours uint8, or float32 in [−1, 1] (``codecs.signals.as_signal`` converts
                 them); depth in metres.
 
