@@ -15,6 +15,7 @@ from pewm_jax.cli import (
     horizon,
     memory,
     play,
+    plugins,
     practice,
     protocol,
     table1,
@@ -70,7 +71,8 @@ def _main(argv: Sequence[str]) -> int:
     if argv[0] == "--version":
         print(f"{PROGRAM} {pewm_jax.__version__}")
         return 0
-    name = cli.choose(argv[0], list(COMMANDS), "command")
+    argv = plugins.take(argv)  # also for commands that need no worlds of a user's own
+    name = cli.choose(argv[0] if argv else "", list(COMMANDS), "command")
     return COMMANDS[name].main(argv[1:], f"{PROGRAM} {name}")
 
 

@@ -157,8 +157,8 @@ def open_none(opened: Opened, config: Config) -> Opened | None:
     if done < needed:
         raise UserError(
             f"evaluate.none: {name} was trained for {done} steps without a memory and "
-            f"{opened.folder} for {needed} in all; train it longer (--train.stage1.steps {needed} "
-            "--train.stage2.steps 0), or the comparison would favour the memory."
+            f"{opened.folder} for {needed} in all; train it longer{_how(opened, needed)}, "
+            "or the comparison would favour the memory."
         )
     model = other.config.model
     if config.model.sample_steps and model.sample_steps:
@@ -167,6 +167,17 @@ def open_none(opened: Opened, config: Config) -> Opened | None:
         other.config, model=model, data=config.data, evaluate=config.evaluate
     )
     return dataclasses.replace(other, config=laid)
+
+
+def _how(opened: Opened, steps: int) -> str:
+    """Return the flags that train a world as long without its memory, in brackets."""
+    known = [stage for stage in stages.all_stages(opened.config) if not stage.optional]
+    alone = next((stage for stage in known if not stage.memory), None)
+    if alone is None:
+        return ""
+    flags = [f"--train.{alone.name}.steps {steps}"]
+    flags += [f"--train.{stage.name}.steps 0" for stage in known if stage.memory]
+    return f" ({' '.join(flags)})"
 
 
 def none_facts(none: Opened, opened: Opened) -> dict[str, Any]:

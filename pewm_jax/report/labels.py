@@ -66,6 +66,10 @@ NONE_HOW = (
     "codec and number of steps with all steps in stage 1 (--train.stage1.steps N "
     "--train.stage2.steps 0) and name its folder by --none."
 )
+NONE_LACKING = (
+    "There is no row for a model that was trained as long without a memory: name the folder of one "
+    "by --none."
+)
 
 
 def own_method(names: Iterable[str]) -> str:
@@ -267,7 +271,9 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
         ]
     rivals = [name for name in ("reproject", "none") if name in margins]
     lines += [format_comparison(margins[name], name, own) for name in rivals]
-    lines += [NONE_HOW] if own == "memory" and "none" not in margins else []
+    if own == "memory" and "none" not in margins:
+        of_pewm = "stage1" in metrics["protocol"]["config"]["train"]
+        lines.append(NONE_HOW if of_pewm else NONE_LACKING)
     lines += [format_lpips(metrics), format_fvd(metrics)]
     lines += [format_coverage(metrics["coverage"])] if metrics["coverage"] else []
     lines += [format_drift(metrics["long"]["drift"][own]), *format_map_growth(metrics)]
