@@ -18,9 +18,8 @@ from pewm_jax.config.launch import is_address
 from pewm_jax.data import voxel_pictures
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.moving import MovingHouse, moving_house, render_moving
-from pewm_jax.data.navigation import NavGrid, navigable
 from pewm_jax.data.render import render
-from pewm_jax.data.scenes import Scene, house, load_scene
+from pewm_jax.data.simulator import HEADROOM_M, open_house, open_mesh
 from pewm_jax.data.trajectories import Policy, make_trajectory
 from pewm_jax.data.voxelise import record_voxels
 from pewm_jax.data.voxels import VoxelsConfig
@@ -35,8 +34,6 @@ HOUSES_PER_SEED = 1_000_000
 _NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
 """Settings that do not change the files."""
 UNRECORDED = VoxelsConfig()
-HEADROOM_M = 0.1
-"""Free space above the camera where the agent may stand, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,21 +267,13 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     return write_episode(arrays, f"{split}-{index:06d}", scene.name, info)
 
 
-@functools.lru_cache(maxsize=1)
-def _house(seed: int, camera_height: float) -> tuple[Scene, NavGrid]:
-    scene = house(seed)
-    return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
+_house = functools.lru_cache(maxsize=1)(open_house)
+_mesh = functools.lru_cache(maxsize=2)(open_mesh)
 
 
 @functools.lru_cache(maxsize=1)
 def _moving(seed: int, camera_height: float) -> MovingHouse:
     return moving_house(seed, agent_height_m=camera_height + HEADROOM_M)
-
-
-@functools.lru_cache(maxsize=2)
-def _mesh(path: Path, up: Literal["auto", "y", "z"], camera_height: float) -> tuple[Scene, NavGrid]:
-    scene = load_scene(path, up)
-    return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
 
 
 def dashed(name: str) -> str:

@@ -1,13 +1,13 @@
-"""Houses in which something moves: doors that open for the agent, robots on their rounds.
+"""Houses with moving parts: doors that open for the agent, and robots that patrol rooms.
 
-A moving house is a made house with parts that have poses of their own. Where they are at frame t is
-a pure function of the house and of where the agent has been up to t, so pictures and voxels of a
-frame show the same moment, and frame t never depends on what the agent does after t.
+A moving house is a generated house with parts that have poses of their own. Their poses at frame t
+are a pure function of the house and of the agent's positions up to t, so the pictures and the
+voxels of a frame show the same moment, and frame t never depends on later actions.
 
-* A **door** opens as the agent comes near: from closed at ``doors.FAR_M`` to open at
-  ``doors.NEAR_M`` from the middle of the doorway. Some doors close again behind it, the others stay
-  as far open as they ever were.
-* A **robot** goes its round in one room at a steady speed, whoever is there.
+* A **door** opens as the agent approaches: it is closed at ``FAR_M`` and open at ``NEAR_M`` from
+  the middle of the doorway. Some doors close again behind the agent, the others stay as far open as
+  they ever were. A leaf is hung only where it has space to open and where, open, it blocks no way.
+* A **robot** follows a closed path in one room at constant speed.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from pewm_jax.houses.shapes import Piece
 from pewm_jax.types import Camera
 
 _STREAM = 0x0D00E5
-"""Keeps the random numbers of what moves apart from those of the house, which stays as it is."""
+"""Separates the random numbers of moving parts from those of the house, which is unchanged."""
 ROBOT_PROBABILITY = 0.6
-"""Probability that a room has a robot, where there is room for its round."""
+"""Probability that a room has a robot, if it has space for a path."""
 ROBOT_STEP_M = 0.12
-"""Metres that a robot goes from frame to frame."""
+"""Metres that a robot moves from frame to frame."""
 ROBOT_DISTANCE_M = 1.4
-"""Robots keep this far from doorways, where leaves swing."""
+"""Distance that robots keep from doorways, where leaves swing, metres."""
 _APART_M = 20.0
-"""Parts are lit this far from each other, so that none shades another."""
+"""Distance between parts while their light is baked, so that none shades another, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Round:
-    """A robot's round.
+class RobotPath:
+    """The closed path of a robot.
 
     Attributes:
-        way_N2: (N, 2) corners of a closed way, the first one again at its end, metres.
-        start_m: how far along it the robot is at frame 0.
+        way_N2: (N, 2) corners of the path, the first one repeated at its end, metres.
+        start_m: position of the robot along the path at frame 0.
     """
 
     way_N2: np.ndarray
     start_m: float
 
     def poses(self, xy_T2: np.ndarray) -> np.ndarray:
-        """Return (T, 4, 4) world_from_part; of the agent only the number of frames counts."""
+        """Return (T, 4, 4) world_from_part; only the number of the agent's positions is used."""
         sides = np.diff(self.way_N2, axis=0)
         ends = np.append(0, np.cumsum(np.linalg.norm(sides, axis=-1)))
         along = (self.start_m + ROBOT_STEP_M * np.arange(len(xy_T2))) % ends[-1]
@@ -64,23 +64,23 @@ class MovingHouse:
     """A house with parts that move.
 
     Attributes:
-        scene: all that stands still.
-        grid: where the agent can stand whatever the doors do.
-        moves: the leaves and rounds, one per part.
+        scene: the static part of the house.
+        grid: the cells where the agent can stand, whether doors are open or closed.
+        moves: the door leaves and robot paths, one per part.
         parts: the parts, each in its own frame; ``object_F`` is the number of the part.
     """
 
     scene: Scene
     grid: NavGrid
-    moves: tuple[Leaf | Round, ...]
+    moves: tuple[DoorLeaf | RobotPath, ...]
     parts: Scene | None
 
     def poses(self, xy_T2: np.ndarray) -> np.ndarray:
         """Return (T, P, 4, 4) world_from_part of all parts.
 
         Args:
-            xy_T2: (T, 2) where the agent is at each frame, metres; frame t depends on those up
-                to t.
+            xy_T2: (T, 2) positions of the agent, metres; the poses of frame t depend on the
+                positions up to t.
         """
         if not self.moves:
             return np.zeros((len(xy_T2), 0, 4, 4))
@@ -88,20 +88,20 @@ class MovingHouse:
 
 
 def moving_house(seed: int, agent_height_m: float) -> MovingHouse:
-    """Return the made house of a seed with doors and robots; the house itself is that of ``house``.
+    """Return the generated house of a seed (that of ``scenes.house``) with doors and robots.
 
     Args:
-        seed: of the house.
-        agent_height_m: obstacles above this height are passed under.
+        seed: seed of the house.
+        agent_height_m: the agent passes under obstacles above this height.
     """
     scene = house(seed)
     rng = np.random.default_rng([_STREAM, seed])
-    moves: list[Leaf | Round] = []
+    moves: list[DoorLeaf | RobotPath] = []
     pieces: list[Piece] = []
     free = navigable(scene, agent_height_m=agent_height_m)
     for *_, x0, y0, x1, y1 in scene.metadata["doorways"]:
         draw = np.random.default_rng(rng.integers(1 << 30))
-        leaves, width, free = hang(scene, free, draw, (x0, y0, x1, y1))
+        leaves, width, free = hang_leaves(scene, free, draw, (x0, y0, x1, y1))
         moves += leaves
         pieces += [door_leaf(draw, width)] * len(leaves)
     opened = _placed(_parts(pieces), _opened(moves)) if moves else None
@@ -121,7 +121,7 @@ def parts_at(moving: MovingHouse, world_from_part_P44: np.ndarray) -> Scene:
 
 
 def part_at(moving: MovingHouse, number: int, world_from_part_44: np.ndarray) -> Scene:
-    """Return one part alone as a scene, at a pose; its colours are not to be rendered."""
+    """Return one part alone as a scene, at a pose; the scene must not be rendered."""
     assert moving.parts is not None
     poses = np.broadcast_to(world_from_part_44, (len(moving.moves), 4, 4))
     whole, mine = _placed(moving.parts, poses), moving.parts.object_F == number
@@ -137,7 +137,7 @@ def part_at(moving: MovingHouse, number: int, world_from_part_44: np.ndarray) ->
 def render_moving(
     moving: MovingHouse, poses_TP44: np.ndarray, camera: Camera, height: int, width: int
 ) -> Rendered:
-    """Render T frames of a moving house: at each pixel the nearer of what stands and what moves.
+    """Render T frames of a moving house: at each pixel the nearer of the static and moving parts.
 
     Args:
         moving: the house.
@@ -147,7 +147,7 @@ def render_moving(
         width: image width in pixels.
 
     Returns:
-        As ``render``; ids of parts follow on those of the scene's objects.
+        As ``render``; the ids of parts follow those of the scene's objects.
     """
     seen = render(moving.scene, camera, height, width)
     if moving.parts is None:
@@ -165,14 +165,14 @@ def render_moving(
     return seen
 
 
-def _opened(moves: list[Leaf | Round]) -> np.ndarray:
-    """Return (P, 4, 4) poses of doors that are open."""
-    leaves = [move for move in moves if isinstance(move, Leaf)]
+def _opened(moves: list[DoorLeaf | RobotPath]) -> np.ndarray:
+    """Return the (P, 4, 4) poses of open doors."""
+    leaves = [move for move in moves if isinstance(move, DoorLeaf)]
     return np.concatenate([leaf.poses(leaf.middle_2[None]) for leaf in leaves])
 
 
 def _together(scene: Scene, other: Scene | None) -> Scene:
-    """Return two scenes as one to cast rays in; its colours are not to be used."""
+    """Return two scenes as one for casting rays; it must not be rendered."""
     if other is None:
         return scene
     return dataclasses.replace(
@@ -185,8 +185,8 @@ def _together(scene: Scene, other: Scene | None) -> Scene:
 
 def _round(
     grid: NavGrid, rng: np.random.Generator, room: list[float], doorways: list[list[float]]
-) -> Round | None:
-    """Return a robot's round in a room: through three places and back; None without one."""
+) -> RobotPath | None:
+    """Return a robot's path in a room, through three points and back; None without a robot."""
     draw = np.random.default_rng(rng.integers(1 << 30))
     if draw.uniform() > ROBOT_PROBABILITY:
         return None
@@ -208,12 +208,12 @@ def _round(
             closed = np.concatenate([found[0], *(way[1:] for way in found[1:])])
             length = float(np.linalg.norm(np.diff(closed, axis=0), axis=-1).sum())
             if length > 6 * ROBOT_RADIUS_M:
-                return Round(closed, float(draw.uniform(0, length)))
+                return RobotPath(closed, float(draw.uniform(0, length)))
     return None
 
 
 def _parts(pieces: list[Piece]) -> Scene:
-    """Return pieces as one scene, each lit by itself and in its own frame."""
+    """Return pieces as one scene, each lit alone and in its own frame."""
     scene = trimesh.Scene(metadata={"shading": "soft"})
     for number, piece in enumerate(pieces):
         apart = np.eye(4)
@@ -246,22 +246,22 @@ def _part_of_vertex(parts: Scene) -> np.ndarray:
 
 
 NEAR_M, FAR_M = 1.3, 2.4
-"""Distances of the agent at which a door is open, and at which it begins to open."""
+"""Distances of the agent at which a door is fully open and at which it begins to open."""
 WIDE_M = 1.3
-"""Doorways from this width on have two leaves."""
+"""Smallest width of doorways with two leaves."""
 LEAST_LEFT = 0.9
-"""Share of the floor that must still be within reach when one more leaf is open."""
+"""Smallest share of the floor that must stay reachable when one more leaf is open."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Leaf:
+class DoorLeaf:
     """A leaf of a door.
 
     Attributes:
-        hinge_2: (2,) where it turns, metres.
-        yaw: of the closed leaf, from the hinge to its end, radians.
+        hinge_2: (2,) position of the hinge, metres.
+        yaw: direction of the closed leaf, from the hinge to its end, radians.
         swing: angle between closed and open, ± a right angle.
-        middle_2: (2,) of the doorway.
+        middle_2: (2,) middle of the doorway.
         stays: whether it stays open.
     """
 
@@ -272,7 +272,7 @@ class Leaf:
     stays: bool
 
     def poses(self, xy_T2: np.ndarray) -> np.ndarray:
-        """Return (T, 4, 4) world_from_part for an agent that was at these places, in order."""
+        """Return (T, 4, 4) world_from_part for an agent that passes these positions in order."""
         away = np.linalg.norm(np.asarray(xy_T2) - self.middle_2, axis=-1)
         opened = np.clip((FAR_M - away) / (FAR_M - NEAR_M), 0, 1)
         if self.stays:
@@ -281,17 +281,17 @@ class Leaf:
         return planar_poses(np.broadcast_to(self.hinge_2, (len(angle), 2)), angle)
 
 
-def hang(
+def hang_leaves(
     scene: Scene,
     grid: NavGrid,
     rng: np.random.Generator,
     rect: tuple[float, float, float, float],
-) -> tuple[list[Leaf], float, NavGrid]:
-    """Hang a doorway's leaves.
+) -> tuple[list[DoorLeaf], float, NavGrid]:
+    """Hang the leaves of a doorway.
 
     Returns:
-        The leaves, none where they have no room to open or would shut off a place; their width; and
-        what the agent can reach beside them.
+        The leaves (none where they lack space to open or would block a way), their width, and the
+        cells that the agent can reach beside them.
     """
     x0, y0, x1, y1 = rect
     middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
@@ -302,12 +302,12 @@ def hang(
     width = opening / 2 if double else opening
     stays = bool(rng.uniform() < 0.5)
 
-    def leaf(end: int, side: int) -> Leaf:
-        """Return the leaf that hangs at one end of the opening and opens to one side."""
-        # It turns at the wall's surface, so that the open leaf stands beside the opening.
+    def leaf(end: int, side: int) -> DoorLeaf:
+        """Return the leaf at one end of the opening that opens to one side."""
+        # The hinge lies in the wall's surface, so that the open leaf stands beside the opening.
         hinge = middle + end * opening / 2 * axis + side * (wall / 2 - LEAF_M / 2) * across
         closed = float(np.arctan2(-end * axis[1], -end * axis[0]))
-        return Leaf(hinge, closed, -end * side * np.pi / 2, middle, stays)
+        return DoorLeaf(hinge, closed, -end * side * np.pi / 2, middle, stays)
 
     choices = [(end, side) for end in (-1, 1) for side in (-1, 1)]
     for k in rng.permutation(4):
@@ -321,8 +321,8 @@ def hang(
     return [], width, grid
 
 
-def _beside(grid: NavGrid, leaves: list[Leaf], width: float) -> NavGrid:
-    """Return the largest free region that keeps away from open leaves."""
+def _beside(grid: NavGrid, leaves: list[DoorLeaf], width: float) -> NavGrid:
+    """Return the largest free region that keeps clear of open leaves."""
     rows, columns = np.indices(grid.free_YX.shape)
     centres = grid.centre_of(np.stack([rows, columns], -1))
     free = grid.free_YX.copy()
@@ -338,8 +338,8 @@ def _beside(grid: NavGrid, leaves: list[Leaf], width: float) -> NavGrid:
     return dataclasses.replace(grid, free_YX=(labels == sizes.argmax()) & free)
 
 
-def _has_room(scene: Scene, leaf: Leaf, width: float) -> bool:
-    """Tell whether nothing is in the way of a leaf while it opens."""
+def _has_room(scene: Scene, leaf: DoorLeaf, width: float) -> bool:
+    """Return whether a leaf can open without obstacles."""
     angles = leaf.yaw + leaf.swing * np.linspace(0.25, 1, 10)
     ways = np.stack([np.cos(angles), np.sin(angles), np.zeros(10)], -1)
     heights = scene.metadata.get("floor", 0.0) + np.linspace(0.05, 2.0, 14)
@@ -352,7 +352,7 @@ def _has_room(scene: Scene, leaf: Leaf, width: float) -> bool:
 
 
 def planar_poses(place_T2: np.ndarray, yaw_T: np.ndarray) -> np.ndarray:
-    """Return (T, 4, 4) poses on the ground."""
+    """Return (T, 4, 4) poses on the ground from positions and yaws."""
     pose = np.tile(np.eye(4), (len(yaw_T), 1, 1))
     cos, sin = np.cos(yaw_T), np.sin(yaw_T)
     pose[:, :2, :2] = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)

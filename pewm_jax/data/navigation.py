@@ -1,7 +1,8 @@
-"""The navigable area of any mesh, as a grid, and shortest paths on it.
+"""The navigable area of any mesh as a grid, and shortest paths on it.
 
-The grid is found with rays alone, so scans and procedural houses go the same way: rays downward
-from head height must land on the floor, and rays across cells at several heights must be free.
+The grid is computed by casting rays, so scans and procedural houses are treated alike: rays
+downward from head height must land on the floor, and rays across cells at several heights must be
+free.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pewm_jax.config import UserError
 from pewm_jax.data.scenes import Scene
 
 STEP_M = 0.12
-"""Height differences that count as the same floor."""
+"""Largest height difference on one floor, metres."""
 _HEIGHTS = (0.15, 0.4, 0.7, 1.0)
 """Heights at which obstacles are tested, as fractions of the agent's height."""
 
@@ -59,20 +60,20 @@ def navigable(
     agent_radius_m: float = 0.2,
     agent_height_m: float = 1.2,
 ) -> NavGrid:
-    """Find the cells in which an agent can stand.
+    """Return the cells in which an agent can stand.
 
     Args:
         scene: any mesh, z up.
         cell_m: side of a grid cell, metres.
-        agent_radius_m: the agent's radius; free cells keep this far from obstacles.
-        agent_height_m: obstacles above this height are passed under.
+        agent_radius_m: the agent's radius; free cells keep this distance from obstacles.
+        agent_height_m: the agent passes under obstacles above this height.
 
     Returns:
         The largest connected region of free cells, on the storey with most floor.
 
     Raises:
         UserError: the sizes are not positive, the scene is too wide for the cell, or there is
-            no place to stand.
+            no free cell.
     """
     if min(cell_m, agent_radius_m, agent_height_m) <= 0:
         raise UserError("cell_m, agent_radius_m and agent_height_m must all be above 0 metres.")
@@ -127,7 +128,7 @@ def estimate_floor(scene: Scene, bin_m: float = 0.1) -> float:
 
 
 def _landing(scene: Scene, centres_YX2: np.ndarray, start_z: float) -> np.ndarray:
-    """Return (Y, X) height that a downward ray from ``start_z`` meets, −inf where none."""
+    """Return the (Y, X) height that a downward ray from ``start_z`` hits, −inf for none."""
     points = centres_YX2.reshape(-1, 2)
     origins = np.concatenate([points, np.full((len(points), 1), start_z)], 1) - scene.centre_3
     down = np.tile(np.array([[0, 0, -1]], np.float32), (len(points), 1))
@@ -145,7 +146,7 @@ def _obstructed(
     height_m: float,
     cell_m: float,
 ) -> np.ndarray:
-    """Return (Y, X) cells in which a short ray along +x or +y meets something."""
+    """Return the (Y, X) cells in which a short ray along +x or +y hits something."""
     points = centres_YX2[stand_YX]
     blocked = np.zeros(len(points), bool)
     z = floor_z + height_m * np.array(_HEIGHTS)
@@ -155,7 +156,7 @@ def _obstructed(
         starts = np.concatenate(
             [np.repeat(points, len(z), 0), np.tile(z, len(points))[:, None]], axis=1
         )
-        # Rays of neighbours overlap a little: a wall right on the border of two cells counts.
+        # Rays of neighbours overlap a little, so a wall on the border of two cells is hit.
         starts[:, axis] -= 0.52 * cell_m
         starts = (starts - scene.centre_3).astype(np.float32)
         reach = np.full(len(starts), 1.04 * cell_m, np.float32)
@@ -201,15 +202,15 @@ def distance_field(grid: NavGrid, source_xy: np.ndarray) -> np.ndarray:
 
 
 def shortest_path(grid: NavGrid, start_xy: np.ndarray, goal_xy: np.ndarray) -> np.ndarray | None:
-    """Return (N, 2) world points from start to goal around obstacles; see ``WaysTo.path``."""
-    return WaysTo(grid, goal_xy).path(start_xy)
+    """Return (N, 2) world points from start to goal around obstacles; see ``PathsToGoal.path``."""
+    return PathsToGoal(grid, goal_xy).path(start_xy)
 
 
-class WaysTo:
-    """The shortest ways from everywhere to one goal; found once, then looked up.
+class PathsToGoal:
+    """The shortest paths from all cells to one goal; computed once, then looked up.
 
     Attributes:
-        grid: where the agent can stand.
+        grid: the cells where the agent can stand.
         goal_xy: (2,) the goal, metres.
         distance_YX: (Y, X) metres to the goal from cell to cell, as ``distance_field``.
     """
@@ -224,7 +225,7 @@ class WaysTo:
         Corners of the path are pulled tight wherever the straight line is free.
 
         Returns:
-            The polyline, or None where start or goal is not in a free cell.
+            The polyline, or None if start or goal is not in a free cell.
         """
         grid, ends = self.grid, np.stack([np.asarray(start_xy, float), self.goal_xy])
         if not is_free(grid, ends).all():
@@ -240,7 +241,7 @@ class WaysTo:
         return _pull_tight(grid, points)
 
     def length(self, start_xy: np.ndarray) -> float:
-        """Return the length of ``path``, metres; infinite where there is none."""
+        """Return the length of ``path``, metres; infinite if there is none."""
         path = self.path(start_xy)
         if path is None:
             return float("inf")
@@ -281,7 +282,7 @@ def _graph(grid: NavGrid) -> csr_matrix:
         a = (slice(0, free.shape[0] - dy), slice(max(0, -dx), free.shape[1] - max(0, dx)))
         b = (slice(dy, None), slice(max(0, dx), free.shape[1] + min(0, dx)))
         open_ = free[a] & free[b]
-        if dy and dx:  # no cutting of corners
+        if dy and dx:  # diagonal moves must not cut corners
             open_ &= free[a[0], b[1]] & free[b[0], a[1]]
         starts.append(index[a][open_])
         ends.append(index[b][open_])
@@ -291,7 +292,7 @@ def _graph(grid: NavGrid) -> csr_matrix:
 
 
 def _pull_tight(grid: NavGrid, points_N2: np.ndarray) -> np.ndarray:
-    """Drop waypoints that the straight line can skip, keeping the line in free cells."""
+    """Drop the waypoints between points that a straight line through free cells can join."""
     kept, at = [points_N2[0]], 0
     while at < len(points_N2) - 1:
         low, high = at + 1, len(points_N2) - 1

@@ -1,7 +1,7 @@
-"""RGB, metric z-depth and instance ids of a scene, by casting one ray per pixel with Embree.
+"""Render RGB, metric z-depth and instance ids of a scene, casting one ray per pixel with Embree.
 
-Ray directions have z = 1 in the camera, so the distance Embree returns along a ray *is* the
-z-depth in metres.
+Ray directions have z = 1 in the camera, so the distance that Embree returns is the z-depth in
+metres.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pewm_jax.data.shading import LEVELS, sample
 from pewm_jax.types import Camera
 
 CHUNK = 1 << 14
-"""Pixels shaded at once: big enough to amortise calls, small enough for the caches."""
+"""Pixels shaded at a time: large enough to amortise calls, small enough for the caches."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +38,7 @@ def render(scene: Scene, camera: Camera, height: int, width: int) -> Rendered:
     """Render a scene from T cameras.
 
     Args:
-        scene: the world.
+        scene: the scene.
         camera: (T,) cameras: intrinsics (T, 4) or one (4,) for all, poses (T, 4, 4), metres.
         height: image height in pixels.
         width: image width in pixels.

@@ -1,7 +1,8 @@
 """Scenes: triangle meshes as flat arrays for ray casting and shading.
 
-A scene is built once; colours, texture coordinates and baked light of a triangle are stored as
-one row, affine in the barycentric coordinates of a hit, so that shading gathers once per pixel.
+A scene is built once. The colours, texture coordinates and baked light of a triangle are stored as
+one row, affine in the barycentric coordinates of a hit, so that shading needs one gather per pixel.
+``read_surface`` reads the positions and colours of one mesh, whatever kind of colours it has.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _UNREADABLE = (
     struct.error,
     zlib.error,
 )
-"""Errors that trimesh's parsers raise on files that they cannot read."""
+"""Errors that trimesh's parsers raise for files that they cannot read."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -85,7 +86,7 @@ class Scene:
         return shading.embree(self.vertices_V3 - self.centre_3, self.faces_F3)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle without Embree's structure, which other processes build again."""
+        """Pickle without Embree's structure, which other processes rebuild."""
         return {key: value for key, value in self.__dict__.items() if key != "tracer"}
 
 
@@ -114,7 +115,7 @@ def load_scene(path: Path, up: Literal["auto", "z", "y"] = "auto") -> Scene:
     except _UNREADABLE as error:
         raise UserError(
             f"{path} could not be read as a mesh ({_one_line(error)}): check that the file is "
-            "whole and of a kind that trimesh loads (GLB, OBJ, PLY, …)."
+            "complete and of a kind that trimesh loads (GLB, OBJ, PLY, …)."
         ) from None
     if up == "auto":
         up = "y" if path.suffix.lower() in {".glb", ".gltf"} else "z"
@@ -130,15 +131,15 @@ def from_trimesh(
 ) -> Scene:
     """Turn a trimesh scene, with its instances, textures and colours, into a `Scene`.
 
-    Meshes of one colour (grey where they bring none) are shaded by the direction of each face;
-    textures and vertex colours are kept as they are, as scans bring their own light. A scene
-    whose metadata says ``shading: soft`` gets light and ambient occlusion baked all over.
+    Meshes of one colour (grey if they have none) are shaded by the direction of each face. Textures
+    and vertex colours are kept as they are, because scans contain their own light. A scene whose
+    metadata says ``shading: soft`` gets light and ambient occlusion baked everywhere.
 
     Args:
         scene: meshes in metres; entries that are not triangle meshes are left out.
         name: name of the result.
         up: axis that points up; y is turned to z.
-        where: what to call the scene in error messages, its name by default.
+        where: name of the scene in error messages; ``name`` by default.
 
     Raises:
         UserError: there are no triangles, or vertices are not finite.
@@ -160,8 +161,7 @@ def from_trimesh(
         parts.append(_place(str(node), np.asarray(transform), up, surfaces[key], where))
     if not parts:
         raise UserError(
-            f"{where} holds no triangles, so there is nothing to see: give a surface mesh, "
-            "not a point cloud or an empty file."
+            f"{where} holds no triangles: give a surface mesh, not a point cloud or an empty file."
         )
     return _assemble(parts, name, soft, dict(scene.metadata))
 
@@ -250,7 +250,7 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
 
 
 def _albedo(parts: list[_Part]) -> np.ndarray:
-    """Return (F, 3) float32 mean colours of faces; of an image, the mean of all of it."""
+    """Return (F, 3) float32 mean colours of faces; for an image, the mean of the whole image."""
     found = []
     for part in parts:
         image = part.surface.image
@@ -278,8 +278,8 @@ class Surface:
         colour_F33: (F, 3, 3) float32, RGB in [0, 1] at each corner; multiplies the image.
         uv_F32: (F, 3, 2) float32, from the image's top left corner.
         image: (H, W, 3) uint8, or None.
-        bare: it has a single colour and no image; it is shaded by its normals.
-        glowing: it emits light and is not shaded.
+        bare: whether it has a single colour and no image, and so is shaded by its normals.
+        glowing: whether it emits light, and so is not shaded.
     """
 
     vertices_V3: np.ndarray
@@ -294,8 +294,8 @@ class Surface:
 def read_surface(mesh: trimesh.Trimesh, where: str) -> Surface:
     """Read positions, colours and image of one mesh; instances of it share the result.
 
-    Image × factor × vertex tint, as glTF has it, but without its conversion to linear light:
-    colours are multiplied as they are stored, which is how scans are meant to look.
+    The colour is image × factor × vertex tint, as in glTF, but without its conversion to linear
+    light: colours are multiplied as they are stored, which reproduces the look of scans.
 
     Raises:
         UserError: faces point past the vertices.

@@ -1,6 +1,11 @@
-"""Texture images as one flat array of texels with mip levels, sampled bilinearly.
+"""Textures and baked light of scenes.
 
-Colours are multiplied as they are stored (sRGB); nothing is converted to linear light.
+Texture images form one flat array of texels with mip levels, which is sampled bilinearly. Colours
+are multiplied as they are stored (sRGB), without conversion to linear light.
+
+Light is baked and independent of the view: a surface point has the same colour from everywhere. The
+light at a vertex is a soft directional term of the face normal × ambient occlusion, the fraction of
+short rays over the hemisphere that hit nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +28,7 @@ LEVELS = 7
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Textures:
-    """All images of a scene, end to end.
+    """All images of a scene, concatenated.
 
     Attributes:
         texels_P4: uint8 RGB and padding, every level of every image, row-major.
@@ -39,7 +44,7 @@ class Textures:
 
 
 def pack(images: list[np.ndarray]) -> Textures:
-    """Build mip chains and lay them end to end.
+    """Build mip chains and concatenate them.
 
     Args:
         images: (H, W, 3) uint8 each, first row on top.
@@ -131,13 +136,13 @@ LIFT_M = 0.04
 
 
 def require_embree() -> None:
-    """Refuse to render where Embree is not installed; it has no wheel for every processor.
+    """Refuse to render without Embree, which has no wheels for some processors.
 
     Raises:
         UserError: it cannot be imported.
     """
     try:
-        import embreex.rtcore_scene  # noqa: F401, PLC0415 - only what renders needs it
+        import embreex.rtcore_scene  # noqa: F401, PLC0415 - only rendering needs it
     except ImportError as error:
         raise UserError(
             f"rendering needs embreex, which cannot be imported on this {platform.machine()} "
@@ -172,10 +177,10 @@ def face_light(normals_F3: np.ndarray) -> np.ndarray:
 def occlusion(
     tracer: EmbreeScene, points_P3: np.ndarray, normals_P3: np.ndarray, reach_m: float = 1.2
 ) -> np.ndarray:
-    """Return the ambient occlusion of points, (P,) in [0, 1]; 1 = nothing within reach.
+    """Return the (P,) openness of points in [0, 1]; 1 means that nothing is within reach.
 
     Args:
-        tracer: the scene's rays.
+        tracer: Embree's structure of the scene.
         points_P3: points on surfaces, in the tracer's coordinates.
         normals_P3: unit normals.
         reach_m: the longest occlusion ray, metres.
@@ -203,7 +208,7 @@ def soft_light(
     """Return (F, 3, 3) baked RGB light at the corners of every face.
 
     Args:
-        tracer: the scene's rays, in the coordinates of ``vertices_V3``.
+        tracer: Embree's structure of the scene, in the coordinates of ``vertices_V3``.
         vertices_V3: vertices, not shared across hard edges.
         faces_F3: vertex indices.
         normals_F3: unit face normals.
@@ -219,7 +224,7 @@ def soft_light(
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     inward = inside - vertices_V3
     length = np.linalg.norm(inward, axis=-1, keepdims=True).clip(1e-9)
-    # Corners touch the next surface: the rays start a little inside the face.
+    # Corners touch the next surface, so the rays start a little inside the face.
     points = vertices_V3 + inward * np.minimum(0.03 / length, 0.4)
     used = np.flatnonzero(np.bincount(index, minlength=size))
     openness = np.ones(size)

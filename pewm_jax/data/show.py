@@ -1,4 +1,4 @@
-"""Show an episode as one picture: a contact sheet of colour and depth, and the path from above."""
+"""Draw an episode as one image: a contact sheet of colour and depth, and the path from above."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import tyro
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.voxel_pictures import above, ahead
+from pewm_jax.data.voxel_pictures import grid_from_above, grid_from_camera
 from pewm_jax.io import atomic
 
 THUMB = 128
 """Height of a thumbnail, pixels."""
 MARGIN = 8
 CEILING_M = 0.6
-"""Points this far above the camera are left out of the view from above."""
+"""Points this far above the camera are omitted from the view from above, metres."""
 BACKGROUND, FREE = 24, 70
 
 
@@ -40,8 +40,8 @@ class ShowConfig:
     rows: int = 2
     """Rows of thumbnails, each of colour over depth."""
     voxels: bool = False
-    """Draw the grids around the agent instead: what the camera sees, over what it would see of the
-    grid alone, over the grid from above."""
+    """Draw the grids around the agent instead: the camera's image, below it the grid as the camera
+    would see it, below that the grid from above."""
 
     def __post_init__(self):
         """Validate."""
@@ -52,10 +52,10 @@ class ShowConfig:
 
 
 def show(config: ShowConfig, log: Callable[[str], None] = print) -> None:
-    """Draw an episode and write the picture.
+    """Draw an episode and write the image.
 
     Raises:
-        UserError: the split does not read, or has no such episode.
+        UserError: the split cannot be read, or has no such episode.
     """
     source = EpisodeSource(config.path)
     if not 0 <= config.episode < len(source):
@@ -77,7 +77,7 @@ def show(config: ShowConfig, log: Callable[[str], None] = print) -> None:
 
 
 def draw(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray:
-    """Return an RGB picture: rows of colour and depth, and under them the view from above."""
+    """Return an RGB image: rows of colour and depth, and below them the view from above."""
     count = min(columns * rows, episode.length)
     chosen = np.round(np.linspace(0, episode.length - 1, count)).astype(int)
     frames = episode.frames(chosen)
@@ -99,10 +99,10 @@ def draw(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray:
 
 
 def draw_voxels(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray:
-    """Return an RGB picture of grids; each row of frames has five images of each.
+    """Return an RGB image of grids; every frame has a column of five images.
 
-    They are: colour; the grid as the camera sees it; the depth of either, to one scale; and the
-    grid from above without what is over the camera, x to the right, with the camera's view.
+    They are: colour; the grid as the camera sees it; the depths of both, to one scale; and the grid
+    from above up to the height of the camera, x to the right, with the camera's field of view.
 
     Raises:
         UserError: the episode has no voxels.
@@ -114,8 +114,8 @@ def draw_voxels(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray
     farthest = max(float(frames.depth_THW.max()), 1e-3)
     sheet = []
     for k, number in enumerate(chosen):
-        seen = ahead(voxels, k, frames.camera, episode.height, episode.width)
-        plan = above(voxels, k, frames.camera)
+        seen = grid_from_camera(voxels, k, frames.camera, episode.height, episode.width)
+        plan = grid_from_above(voxels, k, frames.camera)
         images = [
             _thumb(frames.rgb_THWC[k], width, str(number)),
             _thumb(seen.rgb_HWC, width),
@@ -140,8 +140,8 @@ def depth_colours(depth_HW: np.ndarray, farthest_m: float) -> np.ndarray:
 def view_from_above(episode: Episode, width: int) -> np.ndarray:
     """Return the world from above (RGB, x to the right, y up) with the path drawn over it.
 
-    Surfaces have their colours, higher ones cover lower ones; the path goes from green to red. A
-    revisit episode has a white ring where it turns back, and a thinner line from there.
+    Surfaces have their own colours and higher ones cover lower ones; the path goes from green to
+    red. In a revisit episode a white ring marks the turn, after which the line is thinner.
     """
     points, colours = _points(episode)
     path = np.asarray(episode.world_from_camera[:, :3, 3], np.float64)

@@ -1,6 +1,7 @@
-"""The simulator: an agent in a scene, from planar poses to posed RGB-D frames, and its collisions.
+"""Simulate an agent in a scene: render frames from planar poses, and move with collisions.
 
-This is what environments are made of. It holds no agent: a pose goes in, frames come out.
+Environments are built on it. It is stateless: ``frames`` maps poses to frames, ``move`` maps a pose
+and an action to the next pose.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from typing import Literal
 import numpy as np
 
 from pewm_jax.data.episodes import DEPTH_LIMIT_M
-from pewm_jax.data.make_episode import HEADROOM_M
 from pewm_jax.data.navigation import NavGrid, is_free, line_is_free, navigable
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import Scene, house, load_scene
@@ -23,21 +23,23 @@ from pewm_jax.data.trajectories import advance
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera, Frames
 
+HEADROOM_M = 0.1
+"""Free space above the camera where the agent may stand, metres."""
 KEPT_HOUSES, KEPT_MESHES = 16, 2
-"""Scenes kept in memory by a process, so that environments of one scene share it."""
+"""Scenes that a process keeps in memory, so that environments of one scene share it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Simulator:
-    """A scene, where an agent can stand in it, and the agent's camera.
+    """A scene, the cells where an agent can stand, and the agent's camera.
 
     Attributes:
-        scene: the world.
+        scene: the scene.
         grid: the cells in which the agent's centre may be.
         intrinsics_4: (4,) fx, fy, cx, cy in pixels, centres at +0.5.
-        height: of the images, pixels.
-        width: of the images, pixels.
-        camera_height: above the floor, metres.
+        height: image height in pixels.
+        width: image width in pixels.
+        camera_height: height of the camera above the floor, metres.
     """
 
     scene: Scene
@@ -53,14 +55,14 @@ class Simulator:
         return pose_from_yaw(np.array([x, y, self.grid.floor_z + self.camera_height]), yaw)
 
     def frames(self, planar_T3: np.ndarray) -> Frames:
-        """Render what is seen from planar poses.
+        """Render the frames seen from planar poses.
 
         Args:
             planar_T3: (T, 3) x, y, yaw in the world, metres and radians.
 
         Returns:
-            T NumPy frames: rgb uint8, depth in metres; 0 where nothing is hit, or beyond what
-            episodes can store (65.534 m).
+            T NumPy frames: rgb uint8, depth in metres; 0 where nothing is hit, and beyond the
+            largest depth that episodes can store (65.534 m).
         """
         poses = np.stack([self.world_from_camera(pose) for pose in np.asarray(planar_T3)])
         intrinsics = np.tile(self.intrinsics_4, (len(poses), 1))
@@ -83,22 +85,24 @@ def open_simulator(
     """Open a mesh, or the generated house of a seed.
 
     Args:
-        house_seed: seed of the house, where no mesh is given.
+        house_seed: seed of the house, used without a mesh.
         scene: a mesh (GLB, OBJ, PLY, …) in metres.
         up: which axis of the mesh points up; ``auto``: y for GLB and glTF, z for the others.
-        height: of the images, pixels.
-        width: of the images, pixels.
+        height: image height in pixels.
+        width: image width in pixels.
         hfov: horizontal field of view, degrees.
-        camera_height: above the floor, metres.
+        camera_height: height of the camera above the floor, metres.
 
     Raises:
-        UserError: there is no renderer, or a mesh does not load or has no place to stand.
+        UserError: there is no renderer, or a mesh does not load or has no free floor.
     """
     require_embree()
     world, grid = (
-        _house(house_seed, camera_height)
+        _kept_house(house_seed, camera_height)
         if scene is None
-        else _mesh(scene, scene.stat().st_mtime_ns if scene.is_file() else 0, up, camera_height)
+        else _kept_mesh(
+            scene, scene.stat().st_mtime_ns if scene.is_file() else 0, up, camera_height
+        )
     )
     intrinsics = intrinsics_from_fov(height, width, hfov)
     return Simulator(world, grid, intrinsics, height, width, camera_height)
@@ -107,21 +111,21 @@ def open_simulator(
 def move(
     grid: NavGrid, planar_3: np.ndarray, action_3: np.ndarray, *, sliding: bool = False
 ) -> tuple[np.ndarray, bool]:
-    """Carry out an action where there is room for it: first move, then turn.
+    """Return the pose after an action with collisions: first move, then turn.
 
-    A move is made if the whole straight way is free. Otherwise the agent stays where it is, or
-    slides: of the two parts of the way along the grid's axes it goes the longer one that is free.
-    The turn is made in either case.
+    The move is made if the whole straight line is free. Otherwise the agent stays in place, or
+    slides: of the two components of the move along the grid's axes it makes the longer one that is
+    free. The turn is made in either case.
 
     Args:
-        grid: where the agent can stand.
+        grid: the cells where the agent can stand.
         planar_3: x, y, yaw; x and y lie in a free cell.
         action_3: dx, dy, dyaw: metres forward, metres left, radians counter-clockwise.
-        sliding: see above.
+        sliding: whether the agent slides along obstacles.
 
     Returns:
         ``(planar_3, collided)``: the next pose, yaw in (−π, π], in a free cell; and whether the
-        way was not free.
+        straight line was blocked.
     """
     planar = np.asarray(planar_3, np.float64)
     after = advance(planar, np.asarray(action_3, np.float64))
@@ -139,21 +143,31 @@ def move(
 
 
 def _passable(grid: NavGrid, start_xy: np.ndarray, end_xy: np.ndarray) -> bool:
-    """Tell whether the way is free, its end included whatever rounding does."""
+    """Return whether the straight line is free, including its end whatever the rounding."""
     return line_is_free(grid, start_xy, end_xy) and bool(is_free(grid, end_xy))
 
 
-@functools.lru_cache(maxsize=KEPT_HOUSES)
-def _house(seed: int, camera_height: float) -> tuple[Scene, NavGrid]:
+def open_house(seed: int, camera_height: float) -> tuple[Scene, NavGrid]:
+    """Return the generated house of a seed, and the cells where the agent can stand."""
     scene = house(seed)
     return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
 
 
-@functools.lru_cache(maxsize=KEPT_MESHES)
-def _mesh(
-    path: Path, changed: int, up: Literal["auto", "y", "z"], camera_height: float
+def open_mesh(
+    path: Path, up: Literal["auto", "y", "z"], camera_height: float
 ) -> tuple[Scene, NavGrid]:
-    """Open a mesh; one that has changed on disk is read again."""
-    del changed
+    """Return the scene of a mesh file, and the cells where the agent can stand."""
     scene = load_scene(path, up)
     return scene, navigable(scene, agent_height_m=camera_height + HEADROOM_M)
+
+
+_kept_house = functools.lru_cache(maxsize=KEPT_HOUSES)(open_house)
+
+
+@functools.lru_cache(maxsize=KEPT_MESHES)
+def _kept_mesh(
+    path: Path, changed: int, up: Literal["auto", "y", "z"], camera_height: float
+) -> tuple[Scene, NavGrid]:
+    """Open a mesh; it is read again if it has changed on disk."""
+    del changed
+    return open_mesh(path, up, camera_height)

@@ -1,7 +1,7 @@
 """Policies that walk over a navigation grid, with discrete or continuous actions.
 
 A trajectory is a list of planar poses (x, y, yaw), one per frame, and the actions between them.
-No policy ever moves through a wall: a forward move is made only where the whole segment is free.
+Policies never move through walls: a forward move is made only if the whole segment is free.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from pewm_jax.geometry.cameras import pose_from_yaw
 
 Policy = Literal["follow", "walk", "revisit"]
 TURN_COST_M = 0.02
-"""Cost of a turn, metres: without it the agent zigzags."""
+"""Cost of a turn, metres; without it the agent zigzags."""
 CLEARANCE_M = 0.3
-"""The agent prefers to stay this far inside the free area."""
+"""Distance that the agent prefers to keep from the border of the free area, metres."""
 GOALS_TRIED = 24
-"""Free cells drawn as candidates of the next goal; one of the farther half is taken."""
+"""Free cells drawn as candidates for the next goal; one of the farther half is chosen."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +72,7 @@ def action_to(pose_3: np.ndarray, after_3: np.ndarray) -> np.ndarray:
 
 
 class _Agent:
-    """An agent in a grid; records its poses and actions up to a number of frames."""
+    """An agent in a grid that records its poses and actions up to a number of frames."""
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class _Agent:
         self.record(self.table[action_id], action_id)
 
     def clear(self, targets_N2: np.ndarray) -> np.ndarray:
-        """Return (...) bool: whether the straight way to each of these points is free."""
+        """Return (...) bool: whether the straight line to each of these points is free."""
         ways = np.asarray(targets_N2) - self.pose[:2]
         longest = float(np.linalg.norm(ways, axis=-1).max())
         steps = np.linspace(0, 1, 2 + int(longest / (0.25 * self.grid.cell_m)))
@@ -149,13 +149,13 @@ def make_trajectory(
     """Walk through a scene.
 
     Args:
-        grid: where the agent can stand.
+        grid: the cells where the agent can stand.
         actions: step length and turning angle (upper bounds for continuous actions).
         frames: number of frames T; T − 1 actions are made.
-        rng: everything random comes from here.
-        policy: ``follow`` walks shortest paths between far goals, ``walk`` goes straight until
-            something is in the way, ``revisit`` looks around, goes out to a far goal and comes
-            back over the very same places.
+        rng: source of all randomness.
+        policy: ``follow`` walks shortest paths between far goals, ``walk`` goes straight up to
+            obstacles, ``revisit`` turns around, goes out to a far goal and comes back through the
+            same positions.
         turn_around: probability of a full turn at the start (``revisit`` always makes it).
         continuous: small (dx, dy, dyaw) instead of the three discrete actions.
 
@@ -178,8 +178,8 @@ def _half_turn(config: ActionConfig) -> int:
     turns = 180 / config.turn_deg
     if abs(turns - round(turns)) > 1e-6:
         raise UserError(
-            f"turn_deg is {config.turn_deg}: a revisit trajectory turns back by 180 degrees, so "
-            "use an angle that divides 180, such as 30, or make no revisit episodes."
+            f"turn_deg is {config.turn_deg}: a revisit trajectory turns by 180 degrees, so use an "
+            "angle that divides 180, such as 30, or collect no revisit episodes."
         )
     return round(turns)
 
@@ -217,7 +217,7 @@ def _revisit(agent: _Agent) -> Trajectory:
 
 
 def _follow(agent: _Agent) -> None:
-    """Walk shortest paths to far goals, one after the other."""
+    """Walk along shortest paths to far goals, one after the other."""
     while not agent.done:
         field, before = _next_goal(agent), len(agent.poses)
         stalled, best = 0, _value(agent, field, agent.pose[None, :2])[0]
@@ -235,12 +235,12 @@ def _follow(agent: _Agent) -> None:
             best = min(best, value)
             if _distance(agent.grid, field, agent.pose[None, :2])[0] < 2 * agent.config.step_m:
                 break
-        if stalled >= 3 or len(agent.poses) == before:  # steps do not fit here: leave the place
+        if stalled >= 3 or len(agent.poses) == before:  # steps do not fit here: move elsewhere
             _walk(agent, steps=4)
 
 
 def _next_goal(agent: _Agent) -> np.ndarray:
-    """Draw a far goal, and return the field of distances to it."""
+    """Draw a far goal and return the field of distances to it."""
     here = distance_field(agent.grid, agent.pose[:2])
     candidates = sample_free(agent.grid, agent.rng, GOALS_TRIED)
     distance = _distance(agent.grid, here, candidates)
@@ -264,7 +264,7 @@ def _value(agent: _Agent, field_YX: np.ndarray, xy_N2: np.ndarray) -> np.ndarray
 
 
 def _best_heading(agent: _Agent, field_YX: np.ndarray) -> tuple[float, int]:
-    """Return the heading whose next step is best, and how many turns it takes (left > 0)."""
+    """Return the heading whose next step is best, and the number of turns to it (left > 0)."""
     count = max(2, round(2 * math.pi / agent.turn))
     turns = np.arange(count) - count // 2
     turns = turns[np.argsort(np.abs(turns), kind="stable")]
@@ -294,7 +294,7 @@ def _drift(agent: _Agent, heading: float) -> None:
 
 
 def _walk(agent: _Agent, steps: int | None = None) -> None:
-    """Go straight; turn by a random angle at obstacles and with probability 0.05."""
+    """Go straight; turn by a random angle at obstacles, and elsewhere with probability 0.05."""
     remaining = agent.frames if steps is None else steps
     while not agent.done and remaining > 0:
         remaining -= 1

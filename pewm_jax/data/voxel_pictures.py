@@ -1,4 +1,8 @@
-"""Pictures of a grid of class ids: as a camera sees it, and from above."""
+"""Images of grids of class ids: as a camera sees them, as a block world, and from above.
+
+The world of the published PERSIST is a game of blocks. ``draw_blocks`` renders such images of
+houses: every cell is a block in the colour of its class, lit as in ``geometry.block_light``.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +23,22 @@ from pewm_jax.geometry.march import EMPTY, through_pixels
 from pewm_jax.types import Array, Camera
 
 SIDES = np.array([0.85, 0.7, 1.0, 0.5])
-"""How bright a face is that a ray meets across x, y, z, and the cell in which it begins."""
+"""Brightness of faces perpendicular to x, y and z, and of the cell in which a ray begins."""
 ABOVE_M = 0.5
-"""Cells this far above the camera are left out of the view from above, as ceilings are."""
+"""Cells this far above the camera (ceilings) are omitted from the view from above, metres."""
 BACKGROUND = 24
 PIXELS = 8
 """Pixels along the side of a cell in the view from above."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Ahead:
-    """What a camera sees of a grid.
+class GridView:
+    """A grid as a camera sees it.
 
     Attributes:
         rgb_HWC: (H, W, 3) uint8 colours of the classes, shaded by the side of the cell.
-        depth_HW: (H, W) float32 metres along z, 0 where the ray meets nothing.
-        classes_HW: (H, W) class ids, 0 where it meets nothing.
+        depth_HW: (H, W) float32 metres along z, 0 where the ray hits nothing.
+        classes_HW: (H, W) class ids, 0 where the ray hits nothing.
     """
 
     rgb_HWC: np.ndarray
@@ -42,15 +46,17 @@ class Ahead:
     classes_HW: np.ndarray
 
 
-def ahead(voxels: VoxelFrames, frame: int, camera: Camera, height: int, width: int) -> Ahead:
-    """March through the grid of one frame from its camera.
+def grid_from_camera(
+    voxels: VoxelFrames, frame: int, camera: Camera, height: int, width: int
+) -> GridView:
+    """Return the grid of one frame as its camera sees it.
 
     Args:
         voxels: the grids of T frames.
-        frame: which of them.
-        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
-        height: of the image, pixels.
-        width: of the image, pixels.
+        frame: number of the frame.
+        camera: (T,) cameras, whose intrinsics belong to images of ``height`` × ``width``.
+        height: image height in pixels.
+        width: image width in pixels.
     """
     one = Camera(camera.intrinsics_4[frame : frame + 1], camera.world_from_camera[frame][None])
     hits = _march(height, width)(
@@ -62,21 +68,21 @@ def ahead(voxels: VoxelFrames, frame: int, camera: Camera, height: int, width: i
     seen = ids != EMPTY
     colours = table_colours(voxels.names)[ids] * SIDES[side][..., None]
     rgb = np.where(seen[..., None], colours, BACKGROUND).astype(np.uint8)
-    return Ahead(rgb, np.where(seen, depth, 0).astype(np.float32), ids)
+    return GridView(rgb, np.where(seen, depth, 0).astype(np.float32), ids)
 
 
 @functools.lru_cache(maxsize=4)
 def _march(height: int, width: int):
-    """Return the march for a size of images, compiled."""
+    """Return the compiled march for an image size."""
     march = functools.partial(through_pixels, height=height, width=width, layers=1)
     return jax.jit(march)
 
 
-def above(voxels: VoxelFrames, frame: int, camera: Camera) -> np.ndarray:
-    """Return the grid of one frame from above (RGB, x to the right, y up), with the camera's view.
+def grid_from_above(voxels: VoxelFrames, frame: int, camera: Camera) -> np.ndarray:
+    """Return the grid of one frame from above (RGB, x to the right, y up), with the field of view.
 
-    Of each column the highest cell is drawn that is no higher than the camera and a little more;
-    higher cells are lighter.
+    Of each column the highest cell below ``ABOVE_M`` over the camera is drawn; higher cells are
+    lighter.
     """
     grid, origin, cell = voxels.classes_TXYZ[frame], voxels.origin_T3[frame], voxels.cell_m
     pose = np.asarray(camera.world_from_camera[frame], np.float64)
@@ -105,17 +111,17 @@ AIR = 24
 
 
 def draw_blocks(voxels: VoxelFrames, camera: Camera, height: int, width: int) -> Rendered:
-    """Return what T cameras see of the grids of T frames; drawn by the processor.
+    """Render the grids of T frames as block worlds from T cameras, on the CPU.
 
     Args:
         voxels: the grids.
-        camera: (T,) cameras: intrinsics (T, 4) or one (4,) for all, for images of ``height`` ×
+        camera: (T,) cameras: intrinsics (T, 4) or one (4,) for all, of images of ``height`` ×
             ``width``.
-        height: of the images, pixels.
-        width: of the images, pixels.
+        height: image height in pixels.
+        width: image width in pixels.
 
     Returns:
-        Colours; depth along z, 0 where nothing is met; and as ids those of the classes, −1 there.
+        Colours, z-depth (0 where a ray hits nothing), and class ids as ids (−1 there).
     """
     count = len(voxels.classes_TXYZ)
     intrinsics = np.broadcast_to(np.asarray(camera.intrinsics_4, np.float32), (count, 4))
@@ -133,7 +139,7 @@ def draw_blocks(voxels: VoxelFrames, camera: Camera, height: int, width: int) ->
 
 @functools.lru_cache(maxsize=4)
 def _drawer(height: int, width: int) -> Any:
-    """Return ``_draw`` for a size of images, compiled."""
+    """Return ``_draw`` compiled for an image size."""
     return jax.jit(functools.partial(_draw, height, width))
 
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.data.navigation import NavGrid, WaysTo, sample_free
+from pewm_jax.data.navigation import NavGrid, PathsToGoal, sample_free
 from pewm_jax.planning.house_config import HouseConfig
 
 GOALS_TRIED = 20
@@ -28,7 +28,7 @@ class Task:
 
     start_3: np.ndarray
     goal_3: np.ndarray
-    ways: WaysTo
+    ways: PathsToGoal
     shortest_m: float
 
 
@@ -50,7 +50,7 @@ def draw(config: HouseConfig, grid: NavGrid, rng: np.random.Generator, where: st
     low, high = config.min_distance_m, config.max_distance_m
     farthest = 0.0
     for goal in sample_free(grid, rng, GOALS_TRIED):
-        ways = WaysTo(grid, goal)
+        ways = PathsToGoal(grid, goal)
         distance = np.where(np.isfinite(ways.distance_YX), ways.distance_YX, -1.0)
         farthest = max(farthest, float(distance.max()))
         # Distances from cell to cell are up to 8 % longer than the way pulled tight.

@@ -14,7 +14,7 @@ import numpy as np
 
 from pewm_jax.config import ActionConfig, UserError
 from pewm_jax.data.make_episode import SPLITS
-from pewm_jax.data.navigation import WaysTo, line_is_free, sample_free
+from pewm_jax.data.navigation import PathsToGoal, line_is_free, sample_free
 from pewm_jax.data.simulator import Simulator, move, open_simulator
 from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT, discrete_table
 from pewm_jax.types import Frames
@@ -120,7 +120,7 @@ def open_goal(
         context_frames = simulator.frames(
             np.concatenate([around, _around(walk[0], context - context // 2)])
         )
-        shortest = WaysTo(simulator.grid, walk[-1, :2]).length(walk[0, :2])
+        shortest = PathsToGoal(simulator.grid, walk[-1, :2]).length(walk[0, :2])
         goal = simulator.frames(walk[-1:])
         return Goal(number, simulator, table, expert, walk, context_frames, goal, shortest)
     raise UserError(
@@ -164,7 +164,7 @@ def near(home: Goal, count: int, actions: int) -> list[Goal]:
             continue
         seen = simulator.frames(np.stack([walk[0], walk[-1]]))
         present = jax.tree.map(lambda *x: np.concatenate(x), home.context, _one(seen, 0))
-        shortest = WaysTo(simulator.grid, walk[-1, :2]).length(walk[0, :2])
+        shortest = PathsToGoal(simulator.grid, walk[-1, :2]).length(walk[0, :2])
         goal = _one(seen, 1)
         number = home.number * count + len(made)
         made.append(Goal(number, simulator, home.table_A3, expert, walk, present, goal, shortest))

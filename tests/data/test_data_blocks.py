@@ -11,7 +11,7 @@ from pewm_jax.data import voxel_pictures
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.loader import require_same_cells
 from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
-from pewm_jax.data.voxel_pictures import ahead
+from pewm_jax.data.voxel_pictures import grid_from_camera
 from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig
 from pewm_jax.geometry import block_light
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
@@ -66,7 +66,7 @@ def test_an_episode_of_cells_shows_the_cells_it_records():
     frames, cells = episode.frames(range(3)), episode.voxels(range(3))
     again = voxel_pictures.draw_blocks(cells, frames.camera, 32, 32)
     np.testing.assert_array_equal(again.rgb_THWC, frames.rgb_THWC)
-    drawn = ahead(cells, 1, frames.camera, 32, 32)
+    drawn = grid_from_camera(cells, 1, frames.camera, 32, 32)
     np.testing.assert_allclose(frames.depth_THW[1], drawn.depth_HW, atol=2e-3)
     others = dataclasses.replace(config, voxels=dataclasses.replace(voxels, pictures="surfaces"))
     house = read_episode(make_episode(others, "train", 0))

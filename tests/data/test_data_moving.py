@@ -9,11 +9,19 @@ import math
 import numpy as np
 import pytest
 
-from pewm_jax.data.moving import FAR_M, NEAR_M, Leaf, Round, moving_house, parts_at, render_moving
+from pewm_jax.data.moving import (
+    FAR_M,
+    NEAR_M,
+    DoorLeaf,
+    RobotPath,
+    moving_house,
+    parts_at,
+    render_moving,
+)
 from pewm_jax.data.navigation import is_free
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
-from pewm_jax.data.voxel_pictures import ahead
+from pewm_jax.data.voxel_pictures import grid_from_camera
 from pewm_jax.data.voxelise import record_voxels
 from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
@@ -40,7 +48,7 @@ def approach(leaf, frames=16):
 
 
 def doors(moving, *, stays=None):
-    moves = [(k, m) for k, m in enumerate(moving.moves) if isinstance(m, Leaf)]
+    moves = [(k, m) for k, m in enumerate(moving.moves) if isinstance(m, DoorLeaf)]
     return [(k, leaf) for k, leaf in moves if stays is None or leaf.stays is stays]
 
 
@@ -55,7 +63,7 @@ def test_most_doorways_have_doors_and_some_rooms_robots():
     leaves = sum(len(doors(opened(seed))) for seed in (1, SEED))
     doorways = sum(len(opened(seed).scene.metadata["doorways"]) for seed in (1, SEED))
     assert leaves >= doorways - 1
-    assert any(isinstance(move, Round) for seed in (1, SEED) for move in opened(seed).moves)
+    assert any(isinstance(move, RobotPath) for seed in (1, SEED) for move in opened(seed).moves)
     assert len({leaf.stays for _, leaf in [*doors(opened(1)), *doors(opened(SEED))]}) == 2
 
 
@@ -101,12 +109,12 @@ def test_the_agent_can_pass_open_doors_and_stands_in_none():
         assert not is_free(moving.grid, leaf.hinge_2 + along).any()
     assert is_free(moving.grid, np.array([leaf.middle_2 for leaf in leaves])).mean() > 0.7
     for move in moving.moves:
-        if isinstance(move, Round):
+        if isinstance(move, RobotPath):
             assert is_free(moving.grid, move.poses(np.zeros((60, 2)))[:, :2, 3]).all()
 
 
 def test_robots_go_on_steadily():
-    (way, *_) = [move for move in opened().moves if isinstance(move, Round)]
+    (way, *_) = [move for move in opened().moves if isinstance(move, RobotPath)]
     place = way.poses(np.zeros((80, 2)))[:, :2, 3]
     steps = np.linalg.norm(np.diff(place, axis=0), axis=-1)
     assert steps.max() < 0.1201
@@ -153,7 +161,7 @@ def test_a_door_that_opens_changes_its_cells_as_the_camera_sees_it(stays):
     assert (door_cells(31) == door_cells(0)) is (not stays)
     seen = render_moving(moving, poses[:16], camera, 40, 40)
     for t in (0, 15):
-        grid = ahead(voxels, t, camera, 40, 40)
+        grid = grid_from_camera(voxels, t, camera, 40, 40)
         part = seen.ids_THW[t] >= len(moving.scene.objects)
         kinds = np.array([name.partition("/")[0] for name in GRID.names])[grid.classes_HW]
         assert np.isin(kinds[part], ["door", "robot", "doorway", "wall", "trim"]).mean() > 0.8

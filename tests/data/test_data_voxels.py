@@ -29,7 +29,7 @@ from pewm_jax.data.recordings import turned
 from pewm_jax.data.scenes import house
 from pewm_jax.data.show import draw_voxels
 from pewm_jax.data.validate import ValidateConfig, validate
-from pewm_jax.data.voxel_pictures import ahead
+from pewm_jax.data.voxel_pictures import grid_from_camera
 from pewm_jax.data.voxelise import around, cut, fill, lattice_of
 from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig, class_ids, table_colours
 from pewm_jax.geometry.cameras import unproject
@@ -105,7 +105,7 @@ def test_a_march_through_the_grid_ends_where_the_camera_sees_a_surface(moving):
     inside = ((at > 0.2) & (at < GRID.side - 0.2)).all(-1)
     behind, near, kinds = [], [], []
     for t in range(0, 24, 3):
-        seen = ahead(voxels, t, frames.camera, 32, 32)
+        seen = grid_from_camera(voxels, t, frames.camera, 32, 32)
         met = np.where(seen.classes_HW > 0, seen.depth_HW, np.inf)[inside[t]]
         depth = frames.depth_THW[t][inside[t]]
         behind.append(met - depth)
