@@ -11,8 +11,8 @@ from pewm_jax.config import command_line as cli
 USAGE = """usage: {prog} COMMAND …
 
 commands:
-  collect   walk an agent through houses and write what it sees as episodes; with
-            --env MODULE:NAME, through an environment of your own
+  collect   let an agent walk through houses and write its frames as episodes; with
+            --env MODULE:NAME, through your own environment
   import    import a recording: a folder of colour, depth and a trajectory
   validate  check a dataset: files, counts, units, poses, geometry
   show      draw an episode as a contact sheet and its path from above
@@ -45,7 +45,7 @@ def _main(argv: Sequence[str], prog: str) -> int:
         where = f"{error.filename}: " if error.filename else ""
         raise UserError(f"{where}{error.strerror or error}.") from None
     except KeyboardInterrupt:
-        again = "; the same command goes on where it was" if command == "collect" else ""
+        again = "; run the same command again to resume" if command == "collect" else ""
         raise KeyboardInterrupt(f"Interrupted{again}.") from None
 
 

@@ -27,7 +27,7 @@ from pewm_jax.data.record_format import (
     shape_fits,
     shape_text,
 )
-from pewm_jax.data.voxels import VoxelFrames, VoxelGrid, refuse_misfits
+from pewm_jax.data.voxels import VoxelFrames, VoxelGrid, check_voxels
 from pewm_jax.types import Camera, Frames
 
 MILLIMETRES = 1000.0
@@ -335,6 +335,6 @@ def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
                 f"depth, expected {shape_text(expected[field])}; the counts do not match."
             )
     if arrays.voxels is not None:
-        refuse_misfits(arrays.voxels, frames, f"episode {name}")
+        check_voxels(arrays.voxels, frames, f"episode {name}")
     if rgb.dtype != np.uint8:
         raise UserError(f"episode {name}, field rgb: dtype {rgb.dtype}, expected uint8 in 0…255.")

@@ -1,14 +1,14 @@
-"""Surfaces to cells: a house as a lattice of class ids, and the grid around an agent.
+"""Voxelise surfaces: a house as a lattice of class ids, and the grids around an agent.
 
 Cells are aligned with the world: their corners are whole multiples of their side from a point of
-the lattice. Triangles are cut at the borders of cells, so every cell that a surface passes is
-found, however little of it is there. Of several classes a cell has the one with the largest area in
-it; walls and floors count less than what stands before them.
+the lattice. Triangles are cut at the borders of cells, so every cell that a surface passes through
+is found. A cell has the class with the largest area in it; walls and floors have less weight than
+the things in front of them.
 
 A surface belongs to the cell just behind it (``BEHIND_M``): a floor at height 0 fills the cells
-below 0, and a rug on it lies in these too. Only walls belong to the cell just before them, so that
-the two sides of one wall, in two colours, are farther apart. Solid things are hollow: a cell
-without a surface is empty.
+below 0, and so does a rug on it. Only walls belong to the cell just in front of them, so that the
+two sides of one wall, in two colours, are farther apart. Solid things are hollow: a cell without a
+surface is empty.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from pewm_jax.data.voxels import VoxelFrames, VoxelsConfig, class_ids
 from pewm_jax.houses.kinds import KINDS, SHELL, kind_of
 
 BEHIND_M = 0.02
-"""Surfaces are moved back by this, walls forward, at most by a quarter of a cell, before they are
-cut."""
+"""Distance by which surfaces are moved back, and walls forward, before they are cut; at most a
+quarter of a cell."""
 SHELL_WEIGHT = 1.0 / 3
-"""What an area of a wall or a floor counts beside the same area of a thing in front of it."""
+"""Weight of an area of a wall or a floor relative to the same area of a thing in front of it."""
 EQUAL = 1e-3
-"""Areas that differ by less than this part of a cell's face are equal: then the class with the
-smaller id has the cell, and not rounding."""
+"""Areas that differ by less than this share of a cell's face are equal, so that the smaller class
+id decides and not rounding."""
 NEAR = 1e-9
-"""Cells: a corner this near to a border does not reach over it."""
+"""A corner within this distance of a border does not cross it, cells."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Filled:
-    """The cells that surfaces pass, each once.
+class FilledCells:
+    """The cells that surfaces pass through, each once.
 
     Attributes:
-        cell_N3: (N, 3) int64 numbers of the cells in the lattice, any sign.
+        cell_N3: (N, 3) int64 indices of the cells in the lattice, any sign.
         class_N: (N,) class ids.
-        weight_N: (N,) what the class counts there: its area, in faces of a cell.
+        weight_N: (N,) weights of the classes: their area, in faces of a cell.
     """
 
     cell_N3: np.ndarray
@@ -53,12 +53,12 @@ class Filled:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lattice:
-    """What fills the cells of a box of the world.
+    """The class ids of the cells in a box of the world.
 
     Attributes:
-        classes_XYZ: (X, Y, Z) class ids, 0 where nothing is.
-        weight_XYZ: (X, Y, Z) float32, what the class counts there.
-        first_3: (3,) number of the lowest cell along each axis.
+        classes_XYZ: (X, Y, Z) class ids, 0 in empty cells.
+        weight_XYZ: (X, Y, Z) float32 weights of the classes.
+        first_3: (3,) index of the lowest cell along each axis.
         cell_m: side of a cell, metres.
         point_3: (3,) the lowest corner of cell (0, 0, 0), metres.
     """
@@ -70,19 +70,21 @@ class Lattice:
     point_3: np.ndarray
 
 
-def fill(config: VoxelsConfig, scene: Scene, point_3: np.ndarray) -> Filled:
-    """Find the cells that the surfaces of a scene pass.
+def fill(config: VoxelsConfig, scene: Scene, point_3: np.ndarray) -> FilledCells:
+    """Return the cells that the surfaces of a scene pass through.
 
     Args:
         config: the cell and the classes.
-        scene: the world, or what moves in it at one moment.
+        scene: the static scene, or its moving parts at one moment.
         point_3: the lowest corner of the lattice's cell (0, 0, 0), metres.
     """
     kind_O = np.array([KINDS.index(kind_of(name)) for name in scene.objects])
     kind_F = kind_O[scene.object_F]
     back_F = np.where(kind_F == KINDS.index("wall"), -1, 1) * min(BEHIND_M, config.cell / 4)
     back = back_F[:, None, None] * scene.normals_F3[:, None]
-    piece_N33, face_N = cut((scene.vertices_V3[scene.faces_F3] - back - point_3) / config.cell)
+    piece_N33, face_N = split_at_borders(
+        (scene.vertices_V3[scene.faces_F3] - back - point_3) / config.cell
+    )
     sides = piece_N33[:, 1:] - piece_N33[:, :1]
     area_N = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1) / 2
     class_F = class_ids(config, kind_F, scene.albedo_F3)
@@ -91,8 +93,8 @@ def fill(config: VoxelsConfig, scene: Scene, point_3: np.ndarray) -> Filled:
     return _heaviest(np.floor(piece_N33.mean(1)).astype(np.int64), class_F[face_N], weight_N)
 
 
-def lattice_of(config: VoxelsConfig, filled: Filled, point_3: np.ndarray) -> Lattice:
-    """Return cells as a box that holds them all."""
+def lattice_of(config: VoxelsConfig, filled: FilledCells, point_3: np.ndarray) -> Lattice:
+    """Return filled cells as a box that contains them all."""
     first = filled.cell_N3.min(0)
     shape = tuple(filled.cell_N3.max(0) - first + 1)
     classes, weight = np.zeros(shape, config.dtype), np.zeros(shape, np.float32)
@@ -101,18 +103,17 @@ def lattice_of(config: VoxelsConfig, filled: Filled, point_3: np.ndarray) -> Lat
     return Lattice(classes, weight, first, config.cell, np.asarray(point_3, np.float64))
 
 
-def around(
-    lattice: Lattice, side: int, centre_T3: np.ndarray, moving: list[Filled] | None = None
+def crop_grids(
+    lattice: Lattice, side: int, centre_T3: np.ndarray, moving: list[FilledCells] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cut the grids around places out of a lattice.
+    """Crop the grids around positions from a lattice.
 
     Args:
-        lattice: all that stands still.
+        lattice: the static cells.
         side: n, cells along each axis.
-        centre_T3: (T, 3) places, metres: in the middle cell of its grid where n is odd, within half
-            a cell of its middle where n is even.
-        moving: T times the cells of what moves; a cell is theirs where they count more than what
-            stands there.
+        centre_T3: (T, 3) positions, metres. If n is odd, a position lies in the middle cell of its
+            grid; if n is even, within half a cell of the grid's middle.
+        moving: the moving cells of each frame; they replace static cells of lower weight.
 
     Returns:
         ``(classes_TXYZ, origin_T3)``: (T, n, n, n) class ids, and (T, 3) float64 lowest corners,
@@ -128,15 +129,15 @@ def around(
     return grids, lattice.point_3 + low_T3 * lattice.cell_m
 
 
-def cut(corners_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def split_at_borders(corners_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cut triangles at whole numbers along each axis.
 
     Args:
         corners_F33: (F, 3, 3) the corners of triangles, in cells.
 
     Returns:
-        ``(piece_N33, face_N)``: triangles that each lie within one cell, and which one they were
-        part of.
+        ``(piece_N33, face_N)``: triangles that each lie within one cell, and the index of the
+        triangle that each is part of.
     """
     pieces, faces = np.asarray(corners_F33, np.float64), np.arange(len(corners_F33))
     for axis in range(3):
@@ -157,12 +158,12 @@ def cut(corners_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _halve(
     corners_F33: np.ndarray, axis: int, plane_F: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cut triangles at a plane between their corners, into three each; and say of which each is."""
+    """Cut each triangle into three at a plane between its corners; return their triangle too."""
     order = corners_F33[:, :, axis].argsort(1)
     low, mid, high = np.take_along_axis(corners_F33, order[:, :, None], 1).swapaxes(0, 1)
 
     def meet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return where the side from a to b meets the plane."""
+        """Return the intersection of the side from a to b with the plane."""
         length = b[:, axis] - a[:, axis]
         share = (plane_F - a[:, axis]) / np.where(length == 0, 1, length)
         point = a + np.clip(share, 0, 1)[:, None] * (b - a)
@@ -170,7 +171,7 @@ def _halve(
         return point
 
     across = meet(low, high)
-    below = (mid[:, axis] <= plane_F)[:, None]  # the middle corner: its side to the one beyond
+    below = (mid[:, axis] <= plane_F)[:, None]  # the middle corner lies below the plane
     alone, pair = np.where(below, high, low), np.where(below, low, high)
     other = np.where(below, meet(mid, high), meet(low, mid))
     pieces = [(alone, other, across), (pair, mid, across), (mid, other, across)]
@@ -178,12 +179,12 @@ def _halve(
     return found, np.tile(np.arange(len(corners_F33)), 3)
 
 
-def _heaviest(cell_N3: np.ndarray, class_N: np.ndarray, weight_N: np.ndarray) -> Filled:
-    """Add up what counts in each cell, and keep the class that counts most."""
+def _heaviest(cell_N3: np.ndarray, class_N: np.ndarray, weight_N: np.ndarray) -> FilledCells:
+    """Sum the weights of each class in each cell, and keep the class with the largest sum."""
     kept = weight_N > 0
     cell_N3, class_N, weight_N = cell_N3[kept], class_N[kept], weight_N[kept]
     if not len(cell_N3):
-        return Filled(cell_N3, class_N, weight_N)
+        return FilledCells(cell_N3, class_N, weight_N)
     first = cell_N3.min(0)
     shape = tuple(cell_N3.max(0) - first + 1)
     classes = 1 + int(class_N.max())
@@ -191,14 +192,14 @@ def _heaviest(cell_N3: np.ndarray, class_N: np.ndarray, weight_N: np.ndarray) ->
     key, inverse = np.unique(number_N * classes + class_N, return_inverse=True)
     counted = np.round(np.bincount(inverse, weight_N) / EQUAL) * EQUAL
     number, name = np.divmod(key, classes)
-    order = np.lexsort((-name, counted, number))  # the heaviest last; of equal ones the smaller id
+    order = np.lexsort((-name, counted, number))  # the heaviest last; among equals the smaller id
     chosen = order[np.append(np.flatnonzero(np.diff(number[order])), len(order) - 1)]
     cell = np.stack(np.unravel_index(number[chosen], shape), -1) + first
-    return Filled(cell, name[chosen], counted[chosen])
+    return FilledCells(cell, name[chosen], counted[chosen])
 
 
-def together(parts: Sequence[Filled]) -> Filled:
-    """Return the cells that any of the parts fill, each with the class that counts most."""
+def merge_cells(parts: Sequence[FilledCells]) -> FilledCells:
+    """Return the cells that any of the parts fill, each with its heaviest class."""
     return _heaviest(
         np.concatenate([part.cell_N3 for part in parts]),
         np.concatenate([part.class_N for part in parts]),
@@ -206,8 +207,8 @@ def together(parts: Sequence[Filled]) -> Filled:
     )
 
 
-def _overlay(grid_XYZ: np.ndarray, low_3: np.ndarray, moving: Filled, still: Lattice) -> None:
-    """Fill the cells of a grid in which what moves counts more than what stands there."""
+def _overlay(grid_XYZ: np.ndarray, low_3: np.ndarray, moving: FilledCells, still: Lattice) -> None:
+    """Fill the cells of a grid in which a moving class has a larger weight than the static one."""
     here_N3 = moving.cell_N3 - low_3
     inside = ((here_N3 >= 0) & (here_N3 < grid_XYZ.shape)).all(-1)
     there_N3 = moving.cell_N3 - still.first_3
@@ -219,7 +220,7 @@ def _overlay(grid_XYZ: np.ndarray, low_3: np.ndarray, moving: Filled, still: Lat
 
 
 def _copy(source_XYZ: np.ndarray, at_3: np.ndarray, target_XYZ: np.ndarray) -> None:
-    """Copy a box into another, its lowest cell to a place that may lie outside."""
+    """Copy a box into another, with its lowest cell at an index that may lie outside."""
     take, put = [], []
     for start, size, room in zip(at_3, source_XYZ.shape, target_XYZ.shape, strict=True):
         low, high = max(0, int(start)), min(room, int(start) + size)
@@ -231,7 +232,7 @@ def _copy(source_XYZ: np.ndarray, at_3: np.ndarray, target_XYZ: np.ndarray) -> N
 
 
 PART_M = 1.5
-"""Parts reach no farther than this from their own origin, metres."""
+"""Largest distance of a part's surface from its own origin, metres."""
 
 
 def record_voxels(
@@ -246,23 +247,23 @@ def record_voxels(
 
     Args:
         config: cell, side and classes.
-        scene: all that stands still.
+        scene: the static scene.
         floor_z: height of the floor, which becomes a border of cells, metres.
-        centre_T3: (T, 3) the agent's camera, metres.
-        moving: the house whose parts move, if they do.
-        poses_TP44: (T, P, 4, 4) where these are, from ``MovingHouse.poses``.
+        centre_T3: (T, 3) positions of the agent's camera, metres.
+        moving: the house with moving parts, if there are any.
+        poses_TP44: (T, P, 4, 4) poses of these parts, from ``MovingHouse.poses``.
     """
     lattice = _lattice(config, scene, floor_z)
-    moved: list[Filled] | None = None
+    moved: list[FilledCells] | None = None
     if moving is not None and poses_TP44 is not None and len(moving.moves):
         moved = _moved(config, moving, poses_TP44, centre_T3, lattice)
-    classes, origin = around(lattice, config.side, centre_T3, moved)
+    classes, origin = crop_grids(lattice, config.side, centre_T3, moved)
     return VoxelFrames(classes, origin.astype(np.float32), config.cell, config.names)
 
 
 @functools.lru_cache(maxsize=1)
 def _lattice(config: VoxelsConfig, scene: Scene, floor_z: float) -> Lattice:
-    """Fill the lattice of a scene; that of the last one is kept, for its next episode."""
+    """Return the lattice of a scene; the last one is cached for the scene's next episode."""
     point_3 = np.array([0.0, 0.0, floor_z])
     return lattice_of(config, fill(config, scene, point_3), point_3)
 
@@ -273,11 +274,11 @@ def _moved(
     poses_TP44: np.ndarray,
     centre_T3: np.ndarray,
     lattice: Lattice,
-) -> list[Filled]:
-    """Return the cells of what moves at each frame; what stays where it was is found once."""
-    known: dict[tuple[int, bytes], Filled] = {}
+) -> list[FilledCells]:
+    """Return the cells of the moving parts at each frame; each pose of a part is voxelised once."""
+    known: dict[tuple[int, bytes], FilledCells] = {}
     reach = (config.side / 2 + 1) * config.cell + PART_M
-    nothing = Filled(np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros(0))
+    nothing = FilledCells(np.zeros((0, 3), np.int64), np.zeros(0, np.int64), np.zeros(0))
     frames = []
     for poses, centre in zip(poses_TP44, centre_T3, strict=True):
         parts = [nothing]
@@ -288,5 +289,5 @@ def _moved(
             if key not in known:
                 known[key] = fill(config, part_at(moving, number, pose), lattice.point_3)
             parts.append(known[key])
-        frames.append(together(parts))
+        frames.append(merge_cells(parts))
     return frames

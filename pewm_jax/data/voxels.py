@@ -1,7 +1,11 @@
-"""What a cell of a voxel grid may be: a kind of thing in one of a few named colours.
+"""Voxel grids around the agent: their classes, their arrays and bytes, and their checks.
 
-The renderer of a voxel world knows of a cell only its class, so a class holds what appearance
-needs: a wall of another colour is another class. Class 0 is empty.
+A class is a kind of thing in one of a few named colours: the renderer of a voxel world knows only
+the class of a cell, so a wall of another colour is another class. Class 0 is empty.
+
+A grid is a cube of cells, aligned with the world (it does not turn with the agent). The corners of
+the grids of one episode are whole cells apart. In a record a grid is its cells, x slowest,
+little-endian, deflated (zlib), so that a frame can be read without the others.
 """
 
 from __future__ import annotations
@@ -46,7 +50,7 @@ PALETTE = {
     "magenta": (195, 80, 165),
     "aqua": (120, 205, 210),
 }
-"""Names of colours and what they look like; the first ones are those that tell most apart."""
+"""Named colours and their RGB values; the first ones distinguish most things."""
 SIDE_LIMIT = 256
 
 
@@ -55,19 +59,19 @@ class VoxelsConfig:
     """Grids of class ids around the agent."""
 
     record: bool = False
-    """Record a grid with every frame; `--voxels` alone is short for it."""
+    """Record a grid with every frame; `--voxels` alone is a short form."""
     cell: float = 0.2
-    """Side of a cell, metres. Up to 0.16 the two sides of a wall are never in one cell, which can
-    have the colour of one of them only."""
+    """Side of a cell, metres. Up to 0.16 the two sides of a wall, which may have different colours,
+    never share a cell."""
     side: int = 48
     """Cells of the grid along each axis; the agent's camera is in the middle."""
     kinds: Literal["all", "groups"] = "all"
-    """Kinds of things: `all` (every kind of furniture its own), or `groups` (all furniture one)."""
+    """Kinds of things: `all` (every kind of furniture), or `groups` (all furniture is one kind)."""
     colours: int = 16
-    """Colours of each kind, 1 (colours make no difference) to 24."""
+    """Colours of each kind, 1 (colours are ignored) to 24."""
     pictures: Literal["surfaces", "cells"] = "surfaces"
-    """What the images show: the house's own surfaces, or the recorded `cells` as blocks in the
-    colours of their classes, as in a game of blocks."""
+    """What the images show: the `surfaces` of the house, or the recorded `cells` as blocks in the
+    colours of their classes."""
 
     def __post_init__(self):
         """Validate."""
@@ -103,7 +107,7 @@ def class_ids(config: VoxelsConfig, kind_N: np.ndarray, rgb_N3: np.ndarray) -> n
     """Return (N,) class ids of surfaces.
 
     Args:
-        config: which classes there are.
+        config: the classes.
         kind_N: (N,) indices into ``KINDS``.
         rgb_N3: (N, 3) their colours without light, in [0, 1].
     """
@@ -115,10 +119,10 @@ def class_ids(config: VoxelsConfig, kind_N: np.ndarray, rgb_N3: np.ndarray) -> n
 
 
 def table_colours(names: tuple[str, ...]) -> np.ndarray:
-    """Return (classes, 3) uint8 colours to draw classes with.
+    """Return (classes, 3) uint8 colours for drawing classes.
 
-    A name that ends in a colour of the palette has that; others have one that follows from their
-    place in the table.
+    A class whose name ends in a colour of the palette has that colour; the colours of other classes
+    follow from their position in the table.
     """
     found = np.zeros((len(names), 3), np.uint8)
     for k, name in enumerate(names[1:], 1):
@@ -129,7 +133,7 @@ def table_colours(names: tuple[str, ...]) -> np.ndarray:
 
 
 def _opponent(rgb_N3: np.ndarray) -> np.ndarray:
-    """Return colours as lightness, red − green and blue − yellow, in which hue weighs more."""
+    """Return colours as lightness, red − green and blue − yellow, with more weight on hue."""
     red, green, blue = np.moveaxis(rgb_N3, -1, 0)
     light = (red + green + blue) / 3
     return np.stack([0.6 * light, red - green, (red + green) / 2 - blue], -1)
@@ -141,7 +145,7 @@ DTYPES = ("|u1", "<u2")
 
 @dataclasses.dataclass(frozen=True)
 class VoxelGrid:
-    """What the grids of an episode have in common.
+    """The properties that the grids of an episode share.
 
     Attributes:
         cell_m: side of a cell, metres.
@@ -174,7 +178,7 @@ class VoxelFrames:
 
     @property
     def grid(self) -> VoxelGrid:
-        """What the frames have in common."""
+        """The properties that the frames share."""
         dtype = self.classes_TXYZ.dtype.newbyteorder("<").str
         return VoxelGrid(float(self.cell_m), self.classes_TXYZ.shape[-1], tuple(self.names), dtype)
 
@@ -189,7 +193,7 @@ def decode(code: bytes | memoryview, grid: VoxelGrid, where: str) -> np.ndarray:
     """Return a grid (n, n, n) from its bytes.
 
     Raises:
-        DamagedError: they are not those of a grid of this side, or a class is not in the table.
+        DamagedError: they do not decode to a grid of this side, or a class is not in the table.
     """
     shape, dtype = (grid.side,) * 3, np.dtype(grid.dtype)
     size = grid.side**3 * dtype.itemsize
@@ -213,7 +217,7 @@ def decode(code: bytes | memoryview, grid: VoxelGrid, where: str) -> np.ndarray:
 
 
 def header_of(voxels: VoxelFrames) -> dict[str, Any]:
-    """Return what a record's header says of the grids, beside where they lie."""
+    """Return the entries of a record's header that describe the grids, without their offsets."""
     grid = voxels.grid
     return {
         "codec": "zlib",
@@ -225,10 +229,10 @@ def header_of(voxels: VoxelFrames) -> dict[str, Any]:
 
 
 def grid_in(stream: dict[str, Any], where: str) -> VoxelGrid:
-    """Read what a record's header says of the grids.
+    """Return the grid that the header of a record describes.
 
     Raises:
-        DamagedError: it is incomplete, or makes no sense.
+        DamagedError: the header is incomplete or inconsistent.
     """
     try:
         cell, side, dtype = float(stream["cell_m"]), int(stream["side"]), str(stream["dtype"])
@@ -239,17 +243,17 @@ def grid_in(stream: dict[str, Any], where: str) -> VoxelGrid:
         sound = False
     if not sound:
         raise DamagedError(
-            f"{where}: what the header says of the voxels cannot be; the record is damaged, "
+            f"{where}: the header's entries of the voxels are inconsistent; the record is damaged, "
             "collect or import it again."
         )
     return VoxelGrid(cell, side, names, dtype)
 
 
 def require_alike(first: VoxelGrid, other: VoxelGrid, where: str) -> None:
-    """Refuse grids that do not go together with others.
+    """Refuse grids that differ from others of the same data.
 
     Raises:
-        UserError: another cell, side or table.
+        UserError: the cell, the side or the table of classes differs.
     """
     if (other.side, other.dtype) != (first.side, first.dtype) or not np.isclose(
         other.cell_m, first.cell_m
@@ -257,7 +261,7 @@ def require_alike(first: VoxelGrid, other: VoxelGrid, where: str) -> None:
         raise UserError(
             f"{where} has grids of {other.side}³ cells of {other.cell_m:g} m ({other.dtype}), the "
             f"others have {first.side}³ of {first.cell_m:g} m ({first.dtype}): record all with the "
-            "same."
+            "same grid."
         )
     if other.names != first.names:
         k = next(
@@ -266,30 +270,30 @@ def require_alike(first: VoxelGrid, other: VoxelGrid, where: str) -> None:
         )
         raise UserError(
             f"{where} has another table of classes than the others ({len(other.names)} names and "
-            f"{len(first.names)}, which differ from class {k} on): record all with the same."
+            f"{len(first.names)}, which differ from class {k} on): record all with the same table."
         )
 
 
 OFF_CELLS = 1e-3
-"""Largest distance of a grid's corner from the lattice of the first frame's, cells."""
+"""Largest distance of a grid's corner from the lattice of the first frame, cells."""
 MOST_FLOATING = 0.1
-"""Largest share of the points seen in a grid with only empty cells around them, over ``LOOKS``
-frames; right data has next to none."""
+"""Largest allowed share of the points seen in a grid that have only empty cells around them, over
+``LOOKS`` frames; correct data has almost none."""
 LOOKS, STEP = 8, 3
-"""Frames looked at, and of these every n-th row and column."""
+"""Frames checked, and the stride of their rows and columns."""
 
 
-def refuse_misfits(voxels: VoxelFrames, frames: int, where: str) -> None:
+def check_voxels(voxels: VoxelFrames, frames: int, where: str) -> None:
     """Check grids before they are written.
 
     Args:
         voxels: the grids.
-        frames: how many there have to be.
-        where: what to call them in messages.
+        frames: the expected number of grids.
+        where: their name in messages.
 
     Raises:
-        UserError: another number of frames, a grid that is no cube, classes that are not in the
-            table, or corners that are not whole cells apart.
+        UserError: the number of grids is wrong, a grid is not a cube, a class is not in the table,
+            or corners are not whole cells apart.
     """
     classes, origin, names = voxels.classes_TXYZ, voxels.origin_T3, voxels.names
     shape = classes.shape
@@ -310,7 +314,7 @@ def refuse_misfits(voxels: VoxelFrames, frames: int, where: str) -> None:
     if not 1 <= shape[-1] <= SIDE_LIMIT or not voxels.cell_m > 0 or len(names) < 2:
         raise UserError(
             f"{where}, field voxels: {shape[-1]} cells of {voxels.cell_m} m and {len(names)} "
-            f"classes: give 1 to {SIDE_LIMIT} cells above 0 m, and the names of 2 or more classes."
+            f"classes: use 1 to {SIDE_LIMIT} cells above 0 m, and name 2 or more classes."
         )
     unknown = np.flatnonzero(classes.reshape(frames, -1).max(1) >= len(names))
     if len(unknown):
@@ -327,17 +331,17 @@ def refuse_misfits(voxels: VoxelFrames, frames: int, where: str) -> None:
 
 
 def off_lattice(origin_T3: np.ndarray, cell_m: float) -> Iterator[tuple[int, float]]:
-    """Yield the frames whose corners are not whole cells from the first one's, and by how much."""
+    """Yield the frames whose corners are not whole cells from the first frame's, and the offset."""
     cells = (np.asarray(origin_T3, np.float64) - origin_T3[0]) / cell_m
     off = np.abs(cells - np.round(cells)).max(-1)
-    # Places are stored in single precision: far from the world's origin they are coarser.
+    # Positions are stored in single precision, which is coarser far from the world's origin.
     allowed = OFF_CELLS + 4 * np.spacing(np.abs(origin_T3).max().astype(np.float32)) / cell_m
     for frame in np.flatnonzero(off > allowed):
         yield int(frame), float(off[frame])
 
 
 def outside(origin_T3: np.ndarray, grid: VoxelGrid, place_T3: np.ndarray) -> list[int]:
-    """Return the frames in which a place (T, 3) does not lie in the grid."""
+    """Return the frames in which a position (T, 3) does not lie in the grid."""
     at = (np.asarray(place_T3, np.float64) - origin_T3) / (grid.cell_m * grid.side)
     return np.flatnonzero(((at < 0) | (at > 1)).any(-1)).tolist()
 
@@ -345,9 +349,9 @@ def outside(origin_T3: np.ndarray, grid: VoxelGrid, place_T3: np.ndarray) -> lis
 def disagreement(
     voxels: VoxelFrames, depth_THW: np.ndarray, camera: Camera
 ) -> tuple[int, float] | None:
-    """Return the frame that fits its grid worst, and the share of points that float in all frames.
+    """Return the frame that disagrees most with its grid, and the share of floating points.
 
-    A point that the camera sees in the grid floats if its cell and those around it are empty.
+    A point that the camera sees in the grid floats if its cell and the cells around it are empty.
 
     Args:
         voxels: the grids of T frames.
@@ -355,7 +359,7 @@ def disagreement(
         camera: (T,) their cameras.
 
     Returns:
-        None where at most ``MOST_FLOATING`` float.
+        None if at most ``MOST_FLOATING`` of the points of all frames float.
     """
     frames, height, width = depth_THW.shape
     rows, columns = np.mgrid[0:height:STEP, 0:width:STEP]

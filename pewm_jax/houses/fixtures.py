@@ -1,4 +1,8 @@
-"""Furniture of kitchen, bathroom, hall and children's room; plants, lamps, wall objects, rugs."""
+"""Furniture of kitchen, bathroom, hall and children's room; decoration; the parts that move.
+
+Unlike furniture, the frame of a door's leaf has its origin in the hinge (x along the closed leaf, y
+through the wall), and the origin of a robot is on the floor under its middle.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rooms, doorways and windows of a house, as rectangles on the ground."""
+"""Floor plans: rooms, doorways and windows as rectangles on the ground, and which are reachable."""
 
 from __future__ import annotations
 
@@ -63,16 +63,16 @@ class Room:
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
-    """The ground plan of a house: rooms, and doorways as (room, room, rectangle)."""
+class FloorPlan:
+    """The floor plan of a house: rooms, and doorways as (room, room, rectangle)."""
 
     rooms: tuple[Room, ...]
     doorways: tuple[tuple[int, int, Rect], ...]
     height: float
 
 
-def draw_plan(rng: np.random.Generator) -> Plan:
-    """Draw a plan of 3 to 8 rooms in which every room can be reached."""
+def draw_plan(rng: np.random.Generator) -> FloorPlan:
+    """Draw a floor plan of 3 to 8 rooms in which every room can be reached."""
     count = int(rng.integers(3, 9))
     cells = _split(rng, count)
     shared = _shared_walls(cells)
@@ -93,7 +93,7 @@ def draw_plan(rng: np.random.Generator) -> Plan:
     passages = tuple(
         (a, b, _passage(cells[a], side, low, high)) for a, b, side, low, high in doorways
     )
-    return Plan(rooms, passages, float(rng.uniform(2.5, 2.8)))
+    return FloorPlan(rooms, passages, float(rng.uniform(2.5, 2.8)))
 
 
 def _split(rng: np.random.Generator, count: int) -> list[Rect]:
@@ -251,17 +251,17 @@ def wall_frame(room: Room, side: int, at: float) -> np.ndarray:
 
 
 CELL_M = 0.05
-"""Cell of the raster."""
+"""Side of a raster cell, metres."""
 CLEAR_M = 0.33
-"""Distance kept from walls and furniture; an agent of 0.2 m and grid cells of 0.1 m."""
+"""Distance kept from walls and furniture: an agent's radius of 0.2 m and grid cells of 0.1 m."""
 
 
-def all_reachable(plan: Plan, footprints: list[Rect]) -> bool:
+def all_reachable(plan: FloorPlan, footprints: list[Rect]) -> bool:
     """Return whether free floor joins all doorways and covers part of every room.
 
     Args:
         plan: rooms and doorways.
-        footprints: rectangles on the ground that furniture takes.
+        footprints: rectangles on the ground occupied by furniture.
     """
     rects = np.array([room.rect for room in plan.rooms])
     origin = rects[:, :2].min(0) - 2 * CELL_M

@@ -1,4 +1,9 @@
-"""Which furniture belongs in which room."""
+"""Place furniture in rooms so that every doorway stays reachable.
+
+``FURNITURE`` lists which furniture belongs in which room. A piece is accepted only if it keeps
+clear of other pieces, of doorways and of windows, and if the free floor still connects all doorways
+of the room.
+"""
 
 from __future__ import annotations
 
@@ -107,11 +112,11 @@ RUG_PROBABILITY = {
 
 
 CLEAR_M = 0.32
-"""Free space that an agent needs around its centre: a radius of 0.2 m and a grid margin."""
+"""Free space that an agent needs around its centre: its radius of 0.2 m and a grid margin."""
 CELL_M = 0.1
-"""Cell of the floor grid on which reachability is checked."""
+"""Side of a cell of the floor grid on which reachability is checked, metres."""
 TRIES = 12
-"""Random places tried for a piece before it is skipped."""
+"""Random positions tried for a piece before it is skipped."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +128,7 @@ class Placed:
 
 
 class Furnisher:
-    """Places furniture in one room and tracks which walls and floor cells are taken."""
+    """Places furniture in one room and tracks which walls and floor cells are occupied."""
 
     def __init__(self, room: Room, rng: np.random.Generator, palette: Palette, height: float):
         """Start with the bare room."""
@@ -168,7 +173,7 @@ class Furnisher:
         return self.placed
 
     def decorate(self) -> None:
-        """Add what blocks no floor: a rug, objects on the walls, a ceiling lamp."""
+        """Add pieces that block no floor: a rug, objects on the walls, a ceiling lamp."""
         rng = self.rng
         if rng.uniform() < RUG_PROBABILITY.get(self.room.use, 0.3):
             self.rug()
@@ -181,7 +186,7 @@ class Furnisher:
         self.ceiling_lamp()
 
     def at_wall(self, piece: Piece) -> bool:
-        """Put a piece with its back to a random wall; return False if no place was found."""
+        """Put a piece with its back to a random wall; return whether a position was found."""
         width, depth, high = piece.size
         for _ in range(TRIES):
             side = int(self.rng.integers(4))
@@ -220,7 +225,7 @@ class Furnisher:
         return False
 
     def before_last(self, piece: Piece, distance: float, *, turned: bool) -> bool:
-        """Put a piece in front of the last one at the wall, facing it or facing away."""
+        """Put a piece in front of the last one at a wall, facing it (``turned``) or facing away."""
         side, at, _ = self._last
         frame = wall_frame(self.room, side, at)
         depth = piece.size[1]
@@ -287,7 +292,7 @@ class Furnisher:
             )
             if any(overlap(span, other) for other in self.used[side]):
                 continue
-            # What reaches far into the room takes floor: heads and cameras would run into it.
+            # Pieces that reach far into the room also block the floor: cameras pass below them.
             rect = against(self.room, side, at, piece.size[1], width)
             if piece.size[1] < 0.1 or self._accept(rect, over_others=True):
                 pose = wall_frame(self.room, side, at)
@@ -323,7 +328,7 @@ class Furnisher:
         return True
 
     def _accept(self, rect: Rect, margin: float = 0.0, *, over_others: bool = False) -> bool:
-        """Take a footprint if it is clear and the doorways stay connected; else change nothing."""
+        """Occupy a footprint if it is clear and the doorways stay connected; return whether so."""
         grown = (rect[0] - margin, rect[1] - margin, rect[2] + margin, rect[3] + margin)
         if not over_others and any(overlap(grown, other) for other in self.footprints):
             return False
@@ -339,14 +344,14 @@ class Furnisher:
         return False
 
     def _cells(self, rect: Rect, grow: float) -> tuple[slice, slice]:
-        """Return the rows and columns of cells whose centres lie in a rectangle grown by that."""
+        """Return the rows and columns of cells with centres in a rectangle, grown by a margin."""
         x0, y0 = self.room.rect[:2]
         low = [int(np.ceil((rect[i] - o - grow) / CELL_M - 0.5)) for i, o in ((0, x0), (1, y0))]
         high = [int(np.floor((rect[i] - o + grow) / CELL_M + 0.5)) for i, o in ((2, x0), (3, y0))]
         return slice(max(0, low[1]), max(0, high[1])), slice(max(0, low[0]), max(0, high[0]))
 
     def _reachable(self) -> bool:
-        """Whether free floor connects all doorways and most of what is free."""
+        """Return whether one region of free floor has all doorways and most of the free cells."""
         free = ~self.blocked
         labels = np.zeros(free.shape, np.int32)
         ndimage.label(free, output=labels)

@@ -16,7 +16,7 @@ from pewm_jax.houses.shell import doorway_piece, level_mesh, trim_piece, wall_me
 from pewm_jax.houses.textures import hsv, shade
 
 _STREAM = 0x50457
-"""Keeps the generator's random numbers apart from other uses of the same seed."""
+"""Separates the generator's random numbers from other uses of the same seed."""
 _WALLS = ("plaster", "stripes", "wainscot", "diamonds", "band", "plaster")
 _FLOORS = {
     "kitchen": ("checks", "tiles"),
@@ -48,7 +48,7 @@ def generate_house(seed: int) -> trimesh.Scene:
 
 
 def _draw(rng: np.random.Generator) -> trimesh.Scene | None:
-    """Draw one house; None if some room of it could not be reached."""
+    """Draw one house; return None if one of its rooms cannot be reached."""
     plan = draw_plan(rng)
     first_hue = rng.uniform()
     palettes = [

@@ -1,11 +1,11 @@
-"""Kinds of things in a house, read from the names that the generator gives to its parts."""
+"""Kinds of things in a house, derived from the names that the generator gives its parts."""
 
 from __future__ import annotations
 
 import re
 
 OTHER = "other"
-"""What no name tells, such as the parts of a mesh that was not made here."""
+"""The kind of parts whose name tells nothing, such as those of a user's mesh."""
 SHELL = ("wall", "floor", "ceiling", "trim", "doorway", "window")
 MOVING = ("door", "robot")
 FURNITURE = (
@@ -42,14 +42,14 @@ FURNITURE = (
     "washing_machine",
 )
 KINDS = (OTHER, *SHELL, *MOVING, *FURNITURE)
-"""All kinds; the order is part of the data format, new ones go last."""
+"""All kinds; their order is part of the data format, so new ones go last."""
 GROUPS = {
     **dict.fromkeys(("wall", "trim", "doorway"), "wall"),
     **{kind: kind for kind in (OTHER, "floor", "ceiling", "window", *MOVING)},
     **dict.fromkeys(FURNITURE, "furniture"),
     **dict.fromkeys(("rug", "picture", "clock", "ceiling_lamp", "wall_shelf"), "decoration"),
 }
-"""A coarser division, for small models."""
+"""A coarser division into groups, for small models."""
 _NODE = re.compile(
     r"room\d+-(?:[a-z]+-(?P<shell>wall|floor|ceiling|trim|window)|(?P<piece>[a-z_]+)-\d)"
     r"|(?P<part>doorway|door|robot)\d"

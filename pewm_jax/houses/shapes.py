@@ -1,7 +1,8 @@
-"""Boxes, prisms, ellipsoids and textured rectangles, merged into meshes.
+"""Pieces of furniture built from boxes, prisms, ellipsoids and textured rectangles.
 
-A piece of furniture lives in its own frame: x along the wall, y away from it (the back is at
-y = 0), z up, metres. Faces keep their own vertices, so that baked light has hard edges.
+A piece has its own frame: x along the wall, y away from it (the back is at y = 0), z up, metres.
+Faces do not share vertices, so that baked light has hard edges. Parts that many pieces share (legs,
+books, small objects) are here as well, and the palette of a room.
 """
 
 from __future__ import annotations

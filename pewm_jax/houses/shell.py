@@ -13,7 +13,7 @@ from pewm_jax.houses.shapes import Palette, Piece, textured
 from pewm_jax.houses.textures import shade
 
 GRID_M = 0.5
-"""Surfaces are cut at least this finely, so that light baked at corners is smooth."""
+"""Largest side of a surface's cells, so that the light baked at their corners is smooth, metres."""
 TILE_M = 2.0
 """Metres covered by one repeat of a floor or ceiling image."""
 

@@ -204,7 +204,7 @@ def picture(rng: np.random.Generator) -> np.ndarray:
 
 
 def window_view(rng: np.random.Generator) -> np.ndarray:
-    """Return what is outside: a bright sky over hills, behind a window cross."""
+    """Return the view out of a window: a bright sky over hills, behind a window cross."""
     side = 64
     y, x = (np.mgrid[0:side, 0:side] + 0.5) / side
     image = (

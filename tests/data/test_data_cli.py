@@ -141,7 +141,7 @@ def test_an_interruption_says_so(capsys, monkeypatch, tmp_path):
 
     monkeypatch.setattr("pewm_jax.data.collect.collect", interrupted)
     assert main(["collect", str(tmp_path / "x")]) == 130
-    assert "goes on where it was" in capsys.readouterr().err
+    assert "run the same command again to resume" in capsys.readouterr().err
 
 
 def test_progress_off_the_terminal_is_a_line_now_and_then(capsys, monkeypatch):

@@ -176,7 +176,7 @@ def test_a_killed_collection_goes_on(tmp_path, mesh, how):
     told = process.communicate(timeout=60)[1]
     if how == signal.SIGINT:
         assert process.returncode == 130
-        assert told == "Interrupted; the same command goes on where it was.\n"
+        assert told == "Interrupted; run the same command again to resume.\n"
     assert not (out / "train" / "dataset.json").exists()
     with pytest.raises(UserError, match="did not finish"):
         EpisodeSource(out / "train")

@@ -138,7 +138,7 @@ def test_ctrl_c_ends_the_cluster_that_was_started_and_the_pool_goes_on(tmp_path)
     out, err = process.communicate()
     assert (process.returncode, err) == (
         130,
-        "Interrupted; the same command goes on where it was.\n",
+        "Interrupted; run the same command again to resume.\n",
     )
     assert "ray: 2 processors of 1 machine.\n" in out
     with pytest.raises(UserError, match="did not finish"):

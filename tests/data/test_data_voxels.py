@@ -30,7 +30,7 @@ from pewm_jax.data.scenes import house
 from pewm_jax.data.show import draw_voxels
 from pewm_jax.data.validate import ValidateConfig, validate
 from pewm_jax.data.voxel_pictures import grid_from_camera
-from pewm_jax.data.voxelise import around, cut, fill, lattice_of
+from pewm_jax.data.voxelise import crop_grids, fill, lattice_of, split_at_borders
 from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig, class_ids, table_colours
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.houses.kinds import GROUPS, KINDS, OTHER, kind_of
@@ -62,7 +62,7 @@ def test_triangles_are_cut_at_the_borders_of_cells_and_nothing_is_lost(seed, siz
     corners = rng.normal(0, size, (5, 3, 3))
     if on_borders:  # corners on the borders, and sides along them
         corners = np.round(corners * 2) / 2
-    pieces, face = cut(corners)
+    pieces, face = split_at_borders(corners)
 
     def areas(triangles):
         sides = triangles[:, 1:] - triangles[:, :1]
@@ -137,7 +137,7 @@ def test_the_grid_goes_with_the_agent_and_the_world_stays():
     low = np.rint(voxels.origin_T3 / GRID.cell).astype(int)
     assert len(np.unique(low, axis=0)) > 4
     for t in range(24):
-        classes, _ = around(lattice(0), GRID.side, place[t : t + 1])
+        classes, _ = crop_grids(lattice(0), GRID.side, place[t : t + 1])
         np.testing.assert_array_equal(voxels.classes_TXYZ[t], classes[0])
     for a, b in ((0, 23), (3, 11)):  # one world in two grids
         shift = low[b] - low[a]
@@ -149,7 +149,7 @@ def test_the_grid_goes_with_the_agent_and_the_world_stays():
 
 def test_an_odd_grid_has_the_place_in_its_middle_cell():
     for x in (0.1, -0.05, 3.39):
-        _, origin = around(lattice(), 5, np.array([[x, x, x]]))
+        _, origin = crop_grids(lattice(), 5, np.array([[x, x, x]]))
         assert (np.floor((x - origin) / GRID.cell + 1e-9) == 2).all()
 
 
@@ -242,7 +242,7 @@ def test_damaged_grids_are_refused_by_frame():
         (b'"side":4', b'"side":3', "does not decode"),
         (b'["empty","wall","sofa"]', b'["empty","wall_sofa" ] ', "class 2 is not in the table"),
         (b'"cell_m":0.5', b'"cell_m":-.5', "header does not parse"),
-        (b'"cell_m":0.5', b'"cell_m":0.0', "what the header says"),
+        (b'"cell_m":0.5', b'"cell_m":0.0', "entries of the voxels are inconsistent"),
     ):
         assert old in whole
         with pytest.raises(DamagedError, match=says):
