@@ -24,10 +24,10 @@ import numpy as np
 import record
 import torch
 
-from pewm_jax.config import DiTConfig, published
 from pewm_jax.convert import pipeline
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import positions
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.convert import TRANSFORMER
 
 with warnings.catch_warnings():
@@ -42,12 +42,12 @@ SHAPE = (3, 32, 32)
 Row = tuple[str, ...]
 
 
-def narrow(width: int, layers: int) -> DiTConfig:
+def narrow(width: int, layers: int) -> DiTBackbone:
     """Return CogVideoX-5b with fewer, narrower layers; heads keep their 64 channels."""
-    return dataclasses.replace(published("5b"), layers=layers, heads=width // 64)
+    return dataclasses.replace(DiTBackbone.published("5b"), layers=layers, heads=width // 64)
 
 
-def same_weights(config: DiTConfig) -> tuple[Any, CogVideoXTransformer3DModel]:
+def same_weights(config: DiTBackbone) -> tuple[Any, CogVideoXTransformer3DModel]:
     """Return random parameters, and the reference network with the same ones."""
     like = jax.eval_shape(lambda: dit.init(config, jax.random.key(0)))
     rng = np.random.default_rng(0)
@@ -88,7 +88,7 @@ def distance(got: Any, want: Any) -> float:
     return float(np.abs(np.asarray(got) - want).max() / np.abs(want).max())
 
 
-def dit_rows(config: DiTConfig, shape: tuple[int, int, int], count: int) -> list[Row]:
+def dit_rows(config: DiTBackbone, shape: tuple[int, int, int], count: int) -> list[Row]:
     """Time the transformer, forward and with the gradient of every parameter."""
     params, network = same_weights(config)
     rng = np.random.default_rng(1)
@@ -133,7 +133,7 @@ def dit_rows(config: DiTConfig, shape: tuple[int, int, int], count: int) -> list
     return rows
 
 
-def compile_seconds(config: DiTConfig, shape: tuple[int, int, int], *, gradient: bool) -> float:
+def compile_seconds(config: DiTBackbone, shape: tuple[int, int, int], *, gradient: bool) -> float:
     """Return the seconds to trace and compile at full size, on abstract weights."""
     params = jax.eval_shape(lambda: dit.init(config, jax.random.key(0)))
     latents = jax.ShapeDtypeStruct((1, *shape, config.in_channels), jnp.float32)
@@ -150,7 +150,7 @@ def compile_seconds(config: DiTConfig, shape: tuple[int, int, int], *, gradient:
     return time.perf_counter() - start
 
 
-def compile_table(config: DiTConfig, depths: tuple[int, int], shape: tuple[int, int, int]) -> str:
+def compile_table(config: DiTBackbone, depths: tuple[int, int], shape: tuple[int, int, int]) -> str:
     """Return the seconds of compiling two depths of the same network."""
     rows = []
     for depth in depths:
@@ -175,7 +175,7 @@ def main() -> None:
     rows, compiled = [], ""
     if options.only != "vae":
         config, shape = narrow(options.width, options.layers), SHAPE
-        deep, depths = published("5b"), (4, 42)
+        deep, depths = DiTBackbone.published("5b"), (4, 42)
         if options.smoke:
             config, shape = dataclasses.replace(narrow(64, 2), text_dim=32), (1, 4, 4)
             deep, depths = config, (1, 2)

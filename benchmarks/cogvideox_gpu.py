@@ -30,12 +30,14 @@ import numpy as np
 import optax
 import record
 
-from pewm_jax.config import DiTConfig, UserError, VAEConfig, published
+from pewm_jax.config import UserError
 from pewm_jax.config import command_line as cli
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import atomic
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import vae
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 
 NAME = "cogvideox_gpu"
 OURS = ("ceiling", "forward", "train", "clip", "decode")
@@ -47,8 +49,8 @@ HEADER = ("", "ms", "TFLOP/s", "MFU", "peak memory, GB", "compile, s", "batch")
 class Setting:
     """What is measured."""
 
-    dit: DiTConfig
-    vae: VAEConfig
+    dit: DiTBackbone
+    vae: VAECodec
     frames: int
     pixels: int
     batch: int
@@ -78,16 +80,30 @@ class Setting:
 def full(batch: int, repeats: int) -> Setting:
     """Return the setting that is recorded: the 2b network, one 9-frame 512² clip."""
     return Setting(
-        published("2b"), VAEConfig(), 9, 512, batch, 50, repeats, 8192, jnp.dtype("bfloat16")
+        DiTBackbone.published("2b"),
+        VAECodec(),
+        9,
+        512,
+        batch,
+        50,
+        repeats,
+        8192,
+        jnp.dtype("bfloat16"),
     )
 
 
 def smoke() -> Setting:
     """Return a setting that a CPU runs in seconds."""
     config = dataclasses.replace(
-        published("2b"), layers=2, heads=2, head_dim=16, text_length=3, text_dim=8, time_dim=16
+        DiTBackbone.published("2b"),
+        layers=2,
+        heads=2,
+        head_dim=16,
+        text_length=3,
+        text_dim=8,
+        time_dim=16,
     )
-    small = VAEConfig(widths=(8, 8, 8, 8), resnets=1, groups=4)
+    small = VAECodec(widths=(8, 8, 8, 8), resnets=1, groups=4)
     return Setting(config, small, 9, 32, 1, 2, 1, 64, jnp.dtype("float32"))
 
 

@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from record import machine, record, table
 
-from pewm_jax.config import VAEConfig
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import vae
 from pewm_jax.models.cogvideox.convert import VAE
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 
 NAME = "cogvideox_vae"
 GOAL = 0.8
@@ -42,7 +42,7 @@ HEADER = (
 )
 
 
-def pair() -> tuple[Any, VAEConfig, dict[str, Any]]:
+def pair() -> tuple[Any, VAECodec, dict[str, Any]]:
     """Return the reference with random weights, our settings and the same weights."""
     import torch
 
@@ -122,7 +122,7 @@ def decode_memory(
     frames: int, height: int, width: int, dtype: jnp.dtype, *, tiling: bool
 ) -> tuple[float, float]:
     """Return GiB of temporaries and of output that decoding a clip needs, from the compiler."""
-    config = VAEConfig(tiling=tiling)
+    config = VAECodec(tiling=tiling)
     params = jax.eval_shape(partial(vae.init, config), jax.random.key(0))
     side = config.spatial
     shape = (1, vae.latents_of(config, frames), height // side, width // side)

@@ -20,9 +20,9 @@ import record
 import torch
 from transformers import Dinov2Config, Dinov2Model
 
-from pewm_jax.config.dinov2 import published
 from pewm_jax.convert import pipeline
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.config import published
 from pewm_jax.models.dinov2.convert import entries
 
 SIZE = 518

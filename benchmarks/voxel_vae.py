@@ -24,9 +24,9 @@ import optax
 from record import table
 
 from pewm_jax import presets
-from pewm_jax.config import VoxelVAEConfig
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.models.persist import voxel_vae
+from pewm_jax.models.persist.config import VoxelVAEConfig
 
 SMALL = VoxelVAEConfig(
     side=32,

@@ -5,7 +5,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DiTConfig,
     EvalConfig,
     ModelConfig,
     RenderConfig,
@@ -14,6 +13,7 @@ from pewm_jax.config import (
     TrainConfig,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 
 
 def config() -> Config:
@@ -27,7 +27,7 @@ def config() -> Config:
         model=ModelConfig(
             clip=ClipConfig(height=64, width=64),
             codec=LearnedCodecConfig(gate=48),
-            backbone=DiTConfig(layers=6, heads=6, head_dim=32),
+            backbone=DiTBackbone(layers=6, heads=6, head_dim=32),
             memory=SurfelConfig(
                 cell_m=(0.03, 0.03, 0.03),
                 capacity=98304,

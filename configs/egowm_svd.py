@@ -1,6 +1,8 @@
 """EgoWM on Stable Video Diffusion: 9 frames of 512×512, steered by (dx, dy, dyaw)."""
 
-from pewm_jax.config import Config, SVDUNetConfig, SVDVAEConfig
+from pewm_jax.config import Config
+from pewm_jax.models.svd.backbone import SVDUNetBackbone
+from pewm_jax.models.svd.vae_codec import SVDVAECodec
 from pewm_jax.worlds.egowm import paper as egowm_paper
 
 
@@ -10,4 +12,4 @@ def config() -> Config:
     Training needs ``train.start``: converted weights (``pewm-jax convert import svd SRC DST``; then
     ``pewm-jax train DST`` has these settings too). ``--plan`` needs nothing.
     """
-    return egowm_paper.experiment(SVDUNetConfig(), SVDVAEConfig(), run="egowm_svd")
+    return egowm_paper.experiment(SVDUNetBackbone(), SVDVAECodec(), run="egowm_svd")

@@ -6,7 +6,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DiTConfig,
     EgoWMConfig,
     EgoWMTrainConfig,
     EvalConfig,
@@ -14,6 +13,7 @@ from pewm_jax.config import (
 )
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 
 
 def config() -> Config:
@@ -30,7 +30,7 @@ def config() -> Config:
         model=EgoWMConfig(
             clip=ClipConfig(height=64, width=64, depth=False),
             codec=LearnedCodecConfig(gate=48),
-            backbone=DiTConfig(layers=4, heads=4, head_dim=32),
+            backbone=DiTBackbone(layers=4, heads=4, head_dim=32),
             actions=ActionConfig(step_m=0.12, turn_deg=10.0),
             control=ModulationConfig(units=(0.25, 0.25, 1.0)),
             noise=DDPMConfig(snr_shift=4.0, max_weight=1.0, sample_steps=6),

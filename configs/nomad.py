@@ -5,11 +5,11 @@ from pewm_jax.config import (
     Config,
     DataConfig,
     EvalConfig,
-    NomadConfig,
     NomadTrainConfig,
     NomadWorldConfig,
     StageConfig,
 )
+from pewm_jax.config.nomad import NomadConfig
 
 
 def config() -> Config:

@@ -4,23 +4,25 @@ import dataclasses
 
 from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import (
-    BlocksConfig,
-    CameraModelConfig,
     ClipConfig,
     Config,
     DataConfig,
     EvalConfig,
     GridConfig,
     PersistConfig,
-    PersistNetsConfig,
     PersistTrainConfig,
     StageConfig,
+)
+from pewm_jax.controls.actions import ModulationConfig
+from pewm_jax.diffusion.flow import FrameFlowConfig
+from pewm_jax.models.persist.config import (
+    BlocksConfig,
+    CameraModelConfig,
     VoxelDiTConfig,
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
-from pewm_jax.controls.actions import ModulationConfig
-from pewm_jax.diffusion.flow import FrameFlowConfig
+from pewm_jax.models.persist.nets import PersistNetsConfig
 
 CLASSES = 73
 """Nine groups of kinds in eight colours, and nothing."""

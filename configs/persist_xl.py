@@ -1,19 +1,21 @@
 """PERSIST at its published sizes: 288×512 pixels, grids of 48³ cells with 2,138 classes."""
 
 from pewm_jax.config import (
-    BlocksConfig,
     Config,
     DataConfig,
     EvalConfig,
     GridConfig,
     PersistConfig,
-    PersistNetsConfig,
     PersistTrainConfig,
     StageConfig,
+)
+from pewm_jax.models.persist.config import (
+    BlocksConfig,
     VoxelDiTConfig,
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
+from pewm_jax.models.persist.nets import PersistNetsConfig
 
 
 def config() -> Config:

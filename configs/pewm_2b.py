@@ -2,8 +2,10 @@
 
 import dataclasses
 
-from pewm_jax.config import Config, VAEConfig, published
+from pewm_jax.config import Config
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.worlds.pewm import paper
 
@@ -23,8 +25,8 @@ def on(variant: str) -> Config:
     """
     snr_shift = 3.0 if variant == "2b" else 1.0
     return paper.experiment(
-        dataclasses.replace(published(variant), prompt="stored"),
-        VAEConfig.published(variant),
+        dataclasses.replace(DiTBackbone.published(variant), prompt="stored"),
+        VAECodec.published(variant),
         DDPMConfig(target="v", snr_shift=snr_shift, sample_steps=50),
         run=f"pewm_{variant.lower().replace('-', '_')}",
         encoder=DINOv2EncoderConfig(),

@@ -5,13 +5,13 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DiTConfig,
     ModelConfig,
     StageConfig,
     TrainConfig,
     VoxelConfig,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 
 
 def config() -> Config:
@@ -28,7 +28,7 @@ def config() -> Config:
     return Config(
         model=ModelConfig(
             clip=ClipConfig(height=48, width=48),
-            backbone=DiTConfig(layers=4, heads=6, head_dim=32),
+            backbone=DiTBackbone(layers=4, heads=6, head_dim=32),
             memory=VoxelConfig(
                 cell_m=(0.25, 0.25, 0.25),
                 tokens=384,

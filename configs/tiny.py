@@ -5,7 +5,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DiTConfig,
     EvalConfig,
     ModelConfig,
     StageConfig,
@@ -13,6 +12,7 @@ from pewm_jax.config import (
     VoxelConfig,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 
 
 def config() -> Config:
@@ -21,7 +21,7 @@ def config() -> Config:
     return Config(
         model=ModelConfig(
             clip=ClipConfig(frames=5, height=16, width=16),
-            backbone=DiTConfig(
+            backbone=DiTBackbone(
                 layers=2, heads=2, head_dim=16, text_length=1, text_dim=8, time_dim=16
             ),
             memory=VoxelConfig(

@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import AttentionConfig, ClipConfig, Config, DiTConfig, ModelConfig, VoxelConfig
+from pewm_jax.config import AttentionConfig, ClipConfig, Config, ModelConfig, VoxelConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import cameras
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import world_model
 
 TINY = ModelConfig(
     clip=ClipConfig(frames=9, height=16, width=24),
     codec=PixelConfig(spatial=4),
-    backbone=DiTConfig(
+    backbone=DiTBackbone(
         layers=2, heads=2, head_dim=16, patch=2, text_length=3, text_dim=8, time_dim=16
     ),
     memory=VoxelConfig(

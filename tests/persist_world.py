@@ -1,19 +1,17 @@
 """The smallest world of PERSIST."""
 
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import (
+from pewm_jax.config import ClipConfig, GridConfig, PersistConfig
+from pewm_jax.controls.actions import ModulationConfig
+from pewm_jax.diffusion.flow import FrameFlowConfig
+from pewm_jax.models.persist.config import (
     BlocksConfig,
     CameraModelConfig,
-    ClipConfig,
-    GridConfig,
-    PersistConfig,
-    PersistNetsConfig,
     VoxelDiTConfig,
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
-from pewm_jax.controls.actions import ModulationConfig
-from pewm_jax.diffusion.flow import FrameFlowConfig
+from pewm_jax.models.persist.nets import PersistNetsConfig
 
 BLOCKS = BlocksConfig(layers=1, heads=1, head_dim=8, mlp_ratio=2, context=3)
 NOISE = FrameFlowConfig(per_frame=True, sample_steps=1)

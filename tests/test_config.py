@@ -22,9 +22,7 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     ConfigError,
-    CosmosConfig,
     DataConfig,
-    DiTConfig,
     EvalConfig,
     ImagesConfig,
     ModelConfig,
@@ -32,7 +30,6 @@ from pewm_jax.config import (
     Settings,
     StageConfig,
     TrainConfig,
-    VAEConfig,
     VoxelConfig,
 )
 from pewm_jax.config import command_line as cli
@@ -41,6 +38,9 @@ from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
 from pewm_jax.encoders.latents import LatentsConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 
 VERSION_1 = Path(__file__).parent / "version_1"
@@ -64,14 +64,14 @@ def model_of(memory, codec=None):
     [
         (lambda: ClipConfig(frames=1), "use 9"),
         (lambda: ModelConfig(clip=ClipConfig(frames=8)), r"use 4k \+ 1 frames \(5, 9, …\)"),
-        (lambda: ModelConfig(ClipConfig(frames=13), codec=VAEConfig()), r"8k \+ 1"),
+        (lambda: ModelConfig(ClipConfig(frames=13), codec=VAECodec()), r"8k \+ 1"),
         (lambda: ClipConfig(near_m=5, far_m=2), "below far"),
         (lambda: ClipConfig(height=0), "at least 12 pixels"),
         (lambda: ClipConfig(width=11), "window of 11"),
         (lambda: ActionConfig(step_m=0), "above 0"),
         (lambda: ActionConfig(turn_deg=0), "degrees"),
-        (lambda: DiTConfig(head_dim=20), "multiple of 16"),
-        (lambda: DiTConfig(layers=0), "at least 1"),
+        (lambda: DiTBackbone(head_dim=20), "multiple of 16"),
+        (lambda: DiTBackbone(layers=0), "at least 1"),
         (lambda: VoxelConfig(tokens=99, capacity=10), "raise capacity"),
         (lambda: model_of(VoxelConfig(reader=AttentionConfig(heads=2))), "use at least 4 heads"),
         (
@@ -115,7 +115,7 @@ def test_settings_that_cannot_work_are_refused_with_the_fix(build, sentence):
 
 SIZES = {
     PixelConfig: ("codec", "spatial temporal"),
-    DiTConfig: (
+    DiTBackbone: (
         "backbone",
         "layers heads head_dim patch text_length text_dim time_dim mlp_ratio",
     ),
@@ -233,7 +233,8 @@ def test_every_setting_is_documented():
     """`--help` shows the docstring below each field, so every field needs one."""
     sections = (kinds.usual(f) for f in dataclasses.fields(Config) if f.name != "version")
     for kind in {Config, TrainConfig, ClipConfig, *sections, *(kind.settings for kind in KINDS)}:
-        body = ast.parse(inspect.getsource(kind)).body[0].body
+        classes = [one for one in kind.__mro__ if dataclasses.is_dataclass(one)]
+        body = [node for one in classes for node in ast.parse(inspect.getsource(one)).body[0].body]
         for index, node in enumerate(body):
             if isinstance(node, ast.AnnAssign) and "ClassVar" not in ast.unparse(node.annotation):
                 after = body[index + 1]
@@ -267,7 +268,7 @@ def experiments(draw):
     """An experiment of kinds of every section, with a few settings of each drawn."""
     names = {"backbone", "codec", "control", "noise"}
     parts = {name: draw(some(name))() for name in sorted(names)}
-    if isinstance(parts["backbone"], CosmosConfig):  # is told times in its own units alone
+    if isinstance(parts["backbone"], CosmosBackbone):  # is told times in its own units alone
         flow = EDMConfig(target="flow", sigma_data=1.0)
         parts["noise"] = draw(st.sampled_from([flow, FlowConfig(scale=1.0)]))
     steps = dataclasses.replace(parts["noise"], sample_steps=draw(st.integers(1, 50)))

@@ -16,7 +16,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     ConfigError,
-    DiTConfig,
     EgoWMConfig,
     EgoWMTrainConfig,
     SurfelConfig,
@@ -24,6 +23,7 @@ from pewm_jax.config import (
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Control
 from pewm_jax.worlds import world_model
@@ -32,7 +32,7 @@ from tests.helpers import init_world, random_frames, randomise
 MODEL = EgoWMConfig(
     clip=ClipConfig(frames=5, height=16, width=16, depth=False),
     codec=PixelConfig(temporal=1),
-    backbone=DiTConfig(layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16),
+    backbone=DiTBackbone(layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16),
     noise=DDPMConfig(sample_steps=1, guidance=2.0),
 )
 CONFIG = Config(model=MODEL, train=EgoWMTrainConfig())

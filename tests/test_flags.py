@@ -9,10 +9,11 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax import registry as kinds
-from pewm_jax.config import Config, ConfigError, ImagesConfig, VAEConfig, flags
+from pewm_jax.config import Config, ConfigError, ImagesConfig, flags
 from pewm_jax.config import command_line as cli
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 
 TINY = presets.load("tiny")
@@ -188,7 +189,7 @@ def test_a_file_of_settings_old_or_new_does_what_flags_do(table, argv, tmp_path)
 
 
 DINO = TINY.with_model(memory=dataclasses.replace(TINY.model.memory, encoder=DINOv2EncoderConfig()))
-VAE = TINY.with_model(clip=dataclasses.replace(TINY.model.clip, frames=9), codec=VAEConfig())
+VAE = TINY.with_model(clip=dataclasses.replace(TINY.model.clip, frames=9), codec=VAECodec())
 IMAGES = TINY.with_model(memory=ImagesConfig(reader=TINY.model.memory.reader))
 
 
@@ -256,7 +257,7 @@ def test_a_whole_file_of_an_earlier_version_takes_the_place_of_any_preset(name):
 def test_a_kind_may_need_another_setting_to_fit(tmp_path):
     """The VAE does not fit the five frames of `tiny`; with nine it does, whatever comes first."""
     kind, frames = ["--codec.kind", "vae"], ["--clip.frames", 9]
-    assert isinstance(parse(*kind, *frames).model.codec, VAEConfig)
+    assert isinstance(parse(*kind, *frames).model.codec, VAECodec)
     assert parse(*frames, *kind) == parse(*kind, *frames)
     file = tmp_path / "mine.json"
     file.write_text('{"model": {"codec": {"kind": "vae"}, "clip": {"frames": 9}}}')

@@ -14,24 +14,24 @@ from pewm_jax.config import (
     AttentionConfig,
     ConfigError,
     DataConfig,
-    DINOv2Config,
-    DiTConfig,
     StageConfig,
     TrainConfig,
     UserError,
-    VAEConfig,
     VoxelConfig,
 )
 from pewm_jax.data import loader
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree, weights
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.train import loop
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import rollouts, world_model
 from tests.helpers import random_frames, randomise, tiny_config
 
-VAE = VAEConfig(widths=(8, 8, 8), resnets=1, groups=4, latent_channels=4, sample_height=16)
+VAE = VAECodec(widths=(8, 8, 8), resnets=1, groups=4, latent_channels=4, sample_height=16)
 STAGE = StageConfig(steps=2, batch=2, warmup=1)
 
 
@@ -46,7 +46,7 @@ def full_config(**sections):
         ),
         reader=AttentionConfig(heads=8, head_dim=8),
     )
-    backbone = DiTConfig(
+    backbone = DiTBackbone(
         layers=1,
         heads=2,
         head_dim=16,

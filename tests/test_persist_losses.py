@@ -4,18 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import (
+from pewm_jax.diffusion.flow import PERSIST_VOXELS
+from pewm_jax.geometry import cameras
+from pewm_jax.geometry.actions import camera_steps_between
+from pewm_jax.geometry.march import RayHits
+from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
+from pewm_jax.models.persist.config import (
     BlocksConfig,
     CameraModelConfig,
     VoxelDiTConfig,
     VoxelRendererConfig,
     VoxelVAEConfig,
 )
-from pewm_jax.diffusion.flow import PERSIST_VOXELS
-from pewm_jax.geometry import cameras
-from pewm_jax.geometry.actions import camera_steps_between
-from pewm_jax.geometry.march import RayHits
-from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.types import Camera
 from pewm_jax.worlds.persist import losses as persist_losses
 from tests.persist_nets import normal, weights

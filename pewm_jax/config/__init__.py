@@ -9,14 +9,9 @@ import warnings
 from typing import Any
 
 from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
-from pewm_jax.config.clip_vision import CLIPVisionConfig
 from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
-from pewm_jax.config.cosmos import COSMOS_2B, COSMOS_14B, CosmosConfig
-from pewm_jax.config.dinov2 import DINOv2Config
-from pewm_jax.config.dit import PUBLISHED, DiTConfig, published
 from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
 from pewm_jax.config.experiment import VERSION, Config
-from pewm_jax.config.frame_blocks import BlocksConfig
 from pewm_jax.config.launch import Join, Launch
 from pewm_jax.config.memory import (
     ImagesConfig,
@@ -40,32 +35,17 @@ from pewm_jax.config.parts import (
     Noise,
     Reader,
 )
-from pewm_jax.config.persist import (
-    POINT_WAVES,
-    GridConfig,
-    PersistConfig,
-    PersistNetsConfig,
-    PersistTrainConfig,
-)
+from pewm_jax.config.persist import POINT_WAVES, GridConfig, PersistConfig, PersistTrainConfig
 from pewm_jax.config.reader import AttentionConfig, BothConfig, RenderConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
-from pewm_jax.config.svd_unet import SVDUNetConfig
-from pewm_jax.config.svd_vae import SVDVAEConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
-from pewm_jax.config.vae import VAEConfig
-from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
-from pewm_jax.config.voxel_vae import VoxelVAEConfig
-from pewm_jax.config.wan_vae import WanVAEConfig
 from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities, Facts, Task, World
 from pewm_jax.errors import ConfigError, UserError
 from pewm_jax.registry import Settings, functions, register
 
 __all__ = [
     "AXES",
-    "COSMOS_2B",
-    "COSMOS_14B",
     "POINT_WAVES",
-    "PUBLISHED",
     "SMALLEST",
     "VERSION",
     "ActionConfig",
@@ -73,10 +53,7 @@ __all__ = [
     "AttentionConfig",
     "Backbone",
     "BatchSpec",
-    "BlocksConfig",
     "BothConfig",
-    "CLIPVisionConfig",
-    "CameraModelConfig",
     "Capabilities",
     "ClipConfig",
     "Codec",
@@ -85,10 +62,7 @@ __all__ = [
     "Conditioner",
     "Config",
     "ConfigError",
-    "CosmosConfig",
-    "DINOv2Config",
     "DataConfig",
-    "DiTConfig",
     "EgoWMConfig",
     "EgoWMTrainConfig",
     "Encoder",
@@ -109,13 +83,10 @@ __all__ = [
     "NomadTrainConfig",
     "NomadWorldConfig",
     "PersistConfig",
-    "PersistNetsConfig",
     "PersistTrainConfig",
     "PointsConfig",
     "Reader",
     "RenderConfig",
-    "SVDUNetConfig",
-    "SVDVAEConfig",
     "Settings",
     "StageConfig",
     "SurfelConfig",
@@ -123,17 +94,11 @@ __all__ = [
     "TrainConfig",
     "TrainSettings",
     "UserError",
-    "VAEConfig",
     "VoxelConfig",
-    "VoxelDiTConfig",
-    "VoxelRendererConfig",
-    "VoxelVAEConfig",
-    "WanVAEConfig",
     "World",
     "from_dict",
     "functions",
     "load",
-    "published",
     "register",
     "save",
     "to_dict",
@@ -141,6 +106,24 @@ __all__ = [
 ]
 
 _MOVED = {
+    "WanVAEConfig": "pewm_jax.models.wan.codec:WanVAECodec",
+    "CosmosConfig": "pewm_jax.models.cosmos.backbone:CosmosBackbone",
+    "SVDVAEConfig": "pewm_jax.models.svd.vae_codec:SVDVAECodec",
+    "SVDUNetConfig": "pewm_jax.models.svd.backbone:SVDUNetBackbone",
+    "VAEConfig": "pewm_jax.models.cogvideox.vae_codec:VAECodec",
+    "DiTConfig": "pewm_jax.models.cogvideox.backbone:DiTBackbone",
+    "COSMOS_14B": "pewm_jax.models.cosmos.backbone",
+    "COSMOS_2B": "pewm_jax.models.cosmos.backbone",
+    "PUBLISHED": "pewm_jax.models.cogvideox.config",
+    "PersistNetsConfig": "pewm_jax.models.persist.nets",
+    "VoxelRendererConfig": "pewm_jax.models.persist.config",
+    "CameraModelConfig": "pewm_jax.models.persist.config",
+    "VoxelDiTConfig": "pewm_jax.models.persist.config",
+    "VoxelVAEConfig": "pewm_jax.models.persist.config",
+    "BlocksConfig": "pewm_jax.models.persist.config",
+    "NomadConfig": "pewm_jax.config.nomad",
+    "DINOv2Config": "pewm_jax.models.dinov2.config",
+    "CLIPVisionConfig": "pewm_jax.models.clip.config",
     "ModulationConfig": "pewm_jax.controls.actions",
     "CameraConfig": "pewm_jax.controls.camera",
     "DINOv2EncoderConfig": "pewm_jax.models.dinov2.encoder",

@@ -11,93 +11,12 @@ from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise, Reader
 from pewm_jax.config.reader import RenderConfig
 from pewm_jax.config.training import StageConfig, TrainSettings
-from pewm_jax.config.voxel_nets import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig
-from pewm_jax.config.voxel_vae import VoxelVAEConfig
 from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities
 from pewm_jax.errors import require
-from pewm_jax.registry import part
+from pewm_jax.registry import named, part
 
 POINT_WAVES = 4
 """Wavelengths of the sinusoids of a place, with ``model.points``."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PersistNetsConfig(Backbone):
-    """The four networks of PERSIST; by default as published."""
-
-    voxel_vae: VoxelVAEConfig = VoxelVAEConfig()
-    """The autoencoder of voxels."""
-    world_frames: VoxelDiTConfig = VoxelDiTConfig()
-    """The transformer that makes the next voxel frame."""
-    camera_model: CameraModelConfig = CameraModelConfig()
-    """The transformer that says where the camera goes."""
-    renderer: VoxelRendererConfig = VoxelRendererConfig()
-    """The transformer that makes pictures of voxels."""
-
-    @property
-    def places(self) -> None:  # type: ignore[override]
-        """No memory reader runs in them: the voxels are the memory."""
-        return None
-
-    @property
-    def time_dim(self) -> int:
-        """Width of the world frames' condition."""
-        return self.world_frames.blocks.width
-
-    @property
-    def split_heads(self) -> int:  # type: ignore[override]
-        """Heads of the world frames' transformer."""
-        return self.world_frames.blocks.heads
-
-    @property
-    def remat(self) -> bool:  # type: ignore[override]
-        """Whether the backward pass recomputes activations."""
-        return self.world_frames.blocks.remat
-
-    @property
-    def token_cells(self) -> int:
-        """Cells along an axis of the grid for one token of a world frame."""
-        return self.voxel_vae.factor * self.world_frames.patch
-
-    def check(self, model: Any) -> None:
-        """Refuse networks that do not fit together."""
-        require(
-            isinstance(model, PersistConfig),
-            "backbone.kind persist is of the world persist alone: use model.kind persist.",
-        )
-        vae, frames, view = self.voxel_vae, self.world_frames, self.renderer
-        for name, found, wanted in (
-            ("world_frames.latent_side", frames.latent_side, vae.latent_side),
-            ("world_frames.latent_channels", frames.latent_channels, vae.latent_channels),
-            ("world_frames.pixel_channels", frames.pixel_channels, model.shown_channels),
-            ("world_frames.actions", frames.actions, model.control.actions),
-            ("camera_model.actions", self.camera_model.actions, model.control.actions),
-            ("camera_model.classes", self.camera_model.classes, vae.classes),
-            ("renderer.classes", view.classes, vae.classes),
-            ("renderer.latent_channels", view.latent_channels, model.picture_channels),
-            ("renderer.height", view.height, model.clip.height // model.codec.spatial),
-            ("renderer.width", view.width, model.clip.width // model.codec.spatial),
-        ):
-            require(
-                found == wanted,
-                f"backbone.{name} is {found}, and the other parts of the model ask for {wanted}: "
-                "use that.",
-            )
-        require(
-            view.actions in (0, model.control.actions),
-            f"backbone.renderer.actions is {view.actions}: use 0, or control.actions "
-            f"({model.control.actions}).",
-        )
-        require(
-            view.drawn in (0, model.picture_channels),
-            f"backbone.renderer.drawn is {view.drawn}: use 0, or the {model.picture_channels} "
-            "channels of a picture's latents.",
-        )
-        require(
-            model.codec.temporal == 1,
-            f"codec.temporal is {model.codec.temporal}: this world makes frame after frame; use a "
-            "codec that encodes frames one by one, such as codec.kind learned.",
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -300,7 +219,10 @@ class PersistConfig(ModelConfig):
 
     def __post_init__(self):
         """Validate."""
-        for name, kind in (("backbone", PersistNetsConfig), ("memory", GridConfig)):
+        for name, kind in (
+            ("backbone", named("backbone", "persist").settings),
+            ("memory", GridConfig),
+        ):
             found = getattr(self, name)
             require(
                 isinstance(found, kind),

@@ -28,13 +28,15 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax.config import Config, DiTConfig, UserError, VAEConfig
+from pewm_jax.config import Config, UserError
 from pewm_jax.convert import output, pipeline, schedulers, widen
 from pewm_jax.convert.pipeline import CONFIG, WEIGHTS
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import sources, tensor_files, tree, weights
 from pewm_jax.io.published import Network
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.types import Params
 
 PIPELINES = (
@@ -51,12 +53,12 @@ _TEXT = ("text_encoder", "tokenizer")
 """Parts that are not converted, only copied."""
 
 
-def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[DiTConfig, Params]:
+def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[DiTBackbone, Params]:
     """Read the transformer for ``pewm_jax.models.cogvideox.model.apply``; see ``pipeline.read``."""
     return pipeline.read(TRANSFORMER, folder, dtype)
 
 
-def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[VAEConfig, Params]:
+def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[VAECodec, Params]:
     """Read the VAE for ``pewm_jax.models.cogvideox.vae``; see ``pipeline.read``."""
     return pipeline.read(VAE, folder, dtype)
 
@@ -93,7 +95,7 @@ def require_pipeline(src: Path) -> None:
         )
 
 
-def load_transformer(folder: str | Path) -> tuple[DiTConfig, Params]:
+def load_transformer(folder: str | Path) -> tuple[DiTBackbone, Params]:
     """Load the transformer of an imported folder.
 
     Raises:
@@ -102,7 +104,7 @@ def load_transformer(folder: str | Path) -> tuple[DiTConfig, Params]:
     return _load(TRANSFORMER, Path(folder))
 
 
-def load_vae(folder: str | Path) -> tuple[VAEConfig, Params]:
+def load_vae(folder: str | Path) -> tuple[VAECodec, Params]:
     """Load the VAE of an imported folder; see ``load_transformer``."""
     return _load(VAE, Path(folder))
 

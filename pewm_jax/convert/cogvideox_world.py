@@ -13,27 +13,22 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    DiTConfig,
-    Encoder,
-    UserError,
-    VAEConfig,
-)
+from pewm_jax.config import ClipConfig, Config, Encoder, UserError
 from pewm_jax.convert import cogvideox, pipeline, widen
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import positions
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.readers import interface as readers
 from pewm_jax.types import Params
 from pewm_jax.worlds.pewm import paper
 
 
 def config_of(
-    dit: DiTConfig,
-    vae: VAEConfig,
+    dit: DiTBackbone,
+    vae: VAECodec,
     noise: DDPMConfig,
     size: tuple[int | None, int | None, int | None],
     dtype: str | None,

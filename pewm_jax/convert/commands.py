@@ -8,9 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pewm_jax.config import Config, DiTConfig, UserError, VAEConfig
+from pewm_jax.config import Config, UserError
 from pewm_jax.config import command_line as cli
-from pewm_jax.config.dit import Learned
 from pewm_jax.convert import (
     cogvideox,
     cogvideox_world,
@@ -34,7 +33,10 @@ from pewm_jax.convert.options import (
     ImportSVD,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.config import Learned
 from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2 import model as dinov2_model
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.types import Params
@@ -77,7 +79,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
 
 
 def _world(
-    options: ImportCogVideoX, dit: DiTConfig, vae: VAEConfig, noise: DDPMConfig
+    options: ImportCogVideoX, dit: DiTBackbone, vae: VAECodec, noise: DDPMConfig
 ) -> tuple[Config, Params | None]:
     """Return the settings of the world model, and its image encoder if it has one.
 
@@ -111,7 +113,7 @@ def _world(
     return config, params
 
 
-def _with_positions(dit: DiTConfig, learned: Learned | None) -> DiTConfig:
+def _with_positions(dit: DiTBackbone, learned: Learned | None) -> DiTBackbone:
     """Return a transformer with a choice for its learned positions.
 
     Raises:

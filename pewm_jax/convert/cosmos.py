@@ -13,27 +13,24 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from pewm_jax.config import (
-    Config,
-    CosmosConfig,
-    UserError,
-    WanVAEConfig,
-)
+from pewm_jax.config import Config, UserError
 from pewm_jax.convert import output, pipeline, schedulers, text
 from pewm_jax.diffusion.edm import EDMConfig
+from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.cosmos.convert import TRANSFORMER
+from pewm_jax.models.wan.codec import WanVAECodec
 from pewm_jax.models.wan.convert import VAE
 from pewm_jax.types import Params
 from pewm_jax.worlds.egowm import paper as egowm_paper
 
 
-def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[CosmosConfig, Params]:
+def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[CosmosBackbone, Params]:
     """Read the transformer for ``pewm_jax.models.cosmos.model.apply``; see ``pipeline.read``."""
     return pipeline.read(TRANSFORMER, folder, dtype)
 
 
 def write_transformer(
-    config: CosmosConfig, params: Params, folder: str | Path, dtype: str | None = None
+    config: CosmosBackbone, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
     """Write the transformer as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``.
 
@@ -42,13 +39,13 @@ def write_transformer(
     pipeline.write(TRANSFORMER, config, params, folder, dtype)
 
 
-def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[WanVAEConfig, Params]:
+def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[WanVAECodec, Params]:
     """Read the autoencoder for ``pewm_jax.models.wan.vae``; see ``pipeline.read``."""
     return pipeline.read(VAE, folder, dtype)
 
 
 def write_vae(
-    config: WanVAEConfig, params: Params, folder: str | Path, dtype: str | None = None
+    config: WanVAECodec, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
     """Write the autoencoder as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``."""
     pipeline.write(VAE, config, params, folder, dtype)
@@ -84,8 +81,8 @@ def config_of(
         ConfigError: the networks do not fit each other or the clip.
     """
     transformer, vae = (pipeline.read_config(network, src) for network in (TRANSFORMER, VAE))
-    assert isinstance(transformer, CosmosConfig)
-    assert isinstance(vae, WanVAEConfig)
+    assert isinstance(transformer, CosmosBackbone)
+    assert isinstance(vae, WanVAECodec)
     latents = vae.latent_channels
     found = transformer.in_channels, transformer.out_channels
     if found != (latents + 1, latents):

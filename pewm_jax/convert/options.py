@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import tyro
 
 from pewm_jax.config import ConfigError
-from pewm_jax.config.dit import Learned
 from pewm_jax.convert import stablehlo
+from pewm_jax.models.cogvideox.config import Learned
 
 Dtype = Literal["float32", "bfloat16", "float16"]
 

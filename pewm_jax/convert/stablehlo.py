@@ -33,7 +33,7 @@ import jax.export
 import numpy as np
 
 from pewm_jax import __version__
-from pewm_jax.config import Config, DiTConfig, UserError
+from pewm_jax.config import Config, UserError
 from pewm_jax.convert import output, standalone
 from pewm_jax.convert.stablehlo_programs import (
     Arrays,
@@ -44,6 +44,7 @@ from pewm_jax.convert.stablehlo_programs import (
 )
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.io import tree
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.train import runs
 from pewm_jax.types import Params
 from pewm_jax.worlds import rollouts
@@ -93,7 +94,7 @@ def export(
         say(f"reading {run} …")
         config, params = rollouts.load_finished(run)
         backbone = getattr(config.model, "backbone", None)
-        if isinstance(backbone, DiTConfig):
+        if isinstance(backbone, DiTBackbone):
             anywhere = dataclasses.replace(backbone, attention="xla")
             config = config.with_model(backbone=anywhere)
         if what == "rollout":

@@ -11,39 +11,37 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from pewm_jax.config import (
-    CLIPVisionConfig,
-    Config,
-    SVDUNetConfig,
-    SVDVAEConfig,
-)
+from pewm_jax.config import Config
 from pewm_jax.convert import output, pipeline, schedulers
 from pewm_jax.diffusion.edm import EDMConfig
+from pewm_jax.models.clip.config import CLIPVisionConfig
 from pewm_jax.models.clip.convert import IMAGE_ENCODER
+from pewm_jax.models.svd.backbone import SVDUNetBackbone
 from pewm_jax.models.svd.convert import UNET, VAE
+from pewm_jax.models.svd.vae_codec import SVDVAECodec
 from pewm_jax.types import Params
 from pewm_jax.worlds.egowm import paper as egowm_paper
 
 
-def read_unet(folder: str | Path, dtype: str | None = None) -> tuple[SVDUNetConfig, Params]:
+def read_unet(folder: str | Path, dtype: str | None = None) -> tuple[SVDUNetBackbone, Params]:
     """Read the U-Net for ``pewm_jax.models.svd.unet.apply``; see ``pipeline.read``."""
     return pipeline.read(UNET, folder, dtype)
 
 
 def write_unet(
-    config: SVDUNetConfig, params: Params, folder: str | Path, dtype: str | None = None
+    config: SVDUNetBackbone, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
     """Write the U-Net as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``."""
     pipeline.write(UNET, config, params, folder, dtype)
 
 
-def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[SVDVAEConfig, Params]:
+def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[SVDVAECodec, Params]:
     """Read the autoencoder for ``pewm_jax.models.svd.vae``; see ``pipeline.read``."""
     return pipeline.read(VAE, folder, dtype)
 
 
 def write_vae(
-    config: SVDVAEConfig, params: Params, folder: str | Path, dtype: str | None = None
+    config: SVDVAECodec, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
     """Write the autoencoder as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``."""
     pipeline.write(VAE, config, params, folder, dtype)

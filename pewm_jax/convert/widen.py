@@ -15,7 +15,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pewm_jax.config import DiTConfig, UserError
+from pewm_jax.config import UserError
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.nn import tokens
 from pewm_jax.types import Array, Params
 
@@ -31,13 +32,13 @@ class Widening:
         outputs: for each old output channel, the new one.
     """
 
-    old: DiTConfig
-    new: DiTConfig
+    old: DiTBackbone
+    new: DiTBackbone
     inputs: tuple[int, ...]
     outputs: tuple[int, ...]
 
 
-def plan(old: DiTConfig, latents: int, camera: int) -> Widening:
+def plan(old: DiTBackbone, latents: int, camera: int) -> Widening:
     """Say where each channel goes.
 
     Args:
@@ -96,13 +97,13 @@ def narrow(plan: Widening, params: Params) -> Params:
     }
 
 
-def _rows(config: DiTConfig, wide: int, narrow: int, channels: tuple[int, ...]) -> np.ndarray:
+def _rows(config: DiTBackbone, wide: int, narrow: int, channels: tuple[int, ...]) -> np.ndarray:
     """Return, for each value of a narrow patch, its place in the wide one."""
     of_narrow, of_wide = _places(config, narrow), _places(config, wide)
     return np.array([of_wide[cell, channels[channel]] for cell, channel in of_narrow])
 
 
-def _places(config: DiTConfig, channels: int) -> Mapping[tuple[int, int], int]:
+def _places(config: DiTBackbone, channels: int) -> Mapping[tuple[int, int], int]:
     """Return (cell of a patch, channel) → place in the row of ``tokens.patchify``."""
     p, p_t = config.patch, config.patch_t
     ids = np.arange(p_t * p * p * channels).reshape(1, p_t, p, p, channels)

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from pewm_jax.config import PersistConfig, VoxelVAEConfig
+from pewm_jax.config import PersistConfig
 from pewm_jax.models.persist import voxel_vae
+from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.types import Array, Params
 
 EVERY = 40

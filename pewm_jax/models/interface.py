@@ -1,21 +1,4 @@
-"""Backbones: every denoiser behind one interface, chosen by the type of its settings.
-
-A backbone is a ``Backbone`` and a module (or object) with
-
-    init(settings, key, in_channels, out_channels) -> params
-    apply(settings, params, x_BthwC, time_B, conditioning, readers) -> prediction_BthwC
-    SHARDING                                    rules over ``backbone/…`` paths, see ``tree``
-    costs(model, share, *, trained) -> Costs    see ``models.costs``
-
-and ``settings.places`` says where a memory reader may run. ``models.dit_backbone`` is an example.
-One that is shown the observed frames in another way than joined to its input has also
-
-    observed(model, params, seen) -> Conditioning
-    init_image(settings, key) -> params         frozen, under ``image/``; {} if it needs none
-
-and ``models.svd_backbone`` is an example of that. ``models.cosmos_backbone`` holds observed frames
-in the place of noisy ones.
-"""
+"""What a backbone gets besides the noisy latents: conditioning, observed frames, memory readers."""
 
 from __future__ import annotations
 
@@ -26,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import Backbone, ModelConfig, functions
+from pewm_jax.config import ModelConfig
 from pewm_jax.types import Array, Params
 
 
@@ -41,8 +24,8 @@ class Conditioning:
         tokens_BLC: text tokens, or other tokens of the same width.
         image_BMD: tokens of the observed image, of a width of their own.
         scalars_BK: numbers that are embedded as the time is, such as frames per second.
-        known_BthwC: latents that are known, at frames that are given; zeros at the others.
-        known_Bt: (B, t) bool, the latent frames that are given; sampling holds them.
+        known_BthwC: latents of known frames; zeros at the others.
+        known_Bt: (B, t) bool, the known latent frames; sampling keeps them.
         fps: frames per second, one number, where positions in time depend on it.
     """
 
@@ -94,41 +77,6 @@ NO_READERS = Readers()
 """No memory is read."""
 
 
-def init(config: Backbone, key: Array, in_channels: int, out_channels: int) -> Params:
-    """Return random parameters of a backbone with these input and output channels."""
-    return functions(config).init(config, key, in_channels, out_channels)
-
-
-def apply(
-    config: Backbone,
-    params: Params,
-    x_BthwC: Array,
-    time_B: Array,
-    conditioning: Conditioning,
-    readers: Readers = NO_READERS,
-) -> Array:
-    """Predict from noisy latents what the noise asks for.
-
-    Args:
-        config: the backbone.
-        params: its parameters.
-        x_BthwC: (B, t, h, w, C) noisy latents; their dtype is the dtype of the computation.
-        time_B: (B,) noise level as the network sees it, or (B, t), one for each latent frame.
-        conditioning: further inputs.
-        readers: how the memory is read.
-
-    Returns:
-        (B, t, h, w, C_out) prediction.
-    """
-    return functions(config).apply(config, params, x_BthwC, time_B, conditioning, readers)
-
-
-def init_image(config: Backbone, key: Array) -> Params:
-    """Return random parameters of what a backbone sees images with; {} if it has nothing."""
-    own = getattr(functions(config), "init_image", None)
-    return {} if own is None else own(config, key)
-
-
 def observed(model: ModelConfig, params: Params, seen: Observed) -> Conditioning:
     """Turn the observed frames into inputs of the backbone, by its own ways if it has any.
 
@@ -143,9 +91,9 @@ def observed(model: ModelConfig, params: Params, seen: Observed) -> Conditioning
         Conditioning with ``settings.shown_channels(model)`` joined channels: by default as many as
         the latents have.
     """
-    own = getattr(functions(model.backbone), "observed", None)
+    own = model.backbone.observed(model, params, seen)
     if own is not None:
-        return own(model, params, seen)
+        return own
     first = seen.latents_BthwC
     missing = model.latent_shape[0] - first.shape[1]
     padding = jnp.zeros((len(first), missing, *first.shape[2:]), first.dtype)

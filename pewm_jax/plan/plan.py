@@ -17,9 +17,11 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import Config, Launch, UserError, VAEConfig, WanVAEConfig
+from pewm_jax.config import Config, Launch, UserError
 from pewm_jax.data import abstract
 from pewm_jax.io import tree
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.wan.codec import WanVAECodec
 from pewm_jax.plan import hlo, suggest
 from pewm_jax.plan import text as plan_text
 from pewm_jax.plan.footprint import MeshSizes, footprint
@@ -136,7 +138,7 @@ def compile_stage(config: Config, stage: Stage, devices: Sequence[Any]) -> Compi
 def _as_on_chips(config: Config) -> Config:
     """Choose the form of the VAE's convolutions that accelerators use."""
     codec = getattr(config.model, "codec", None)  # a policy has none
-    if not isinstance(codec, VAEConfig | WanVAEConfig) or codec.convolution != "auto":
+    if not isinstance(codec, VAECodec | WanVAECodec) or codec.convolution != "auto":
         return config
     return config.with_model(codec=dataclasses.replace(codec, convolution="volume"))
 

@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs.signals import signal_from_rgb
-from pewm_jax.config import ActionConfig, NomadConfig, UserError
+from pewm_jax.config import ActionConfig, UserError
+from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.diffusion import squared_cosine
 from pewm_jax.geometry.actions import discrete_table
 from pewm_jax.models.nomad import model as nomad

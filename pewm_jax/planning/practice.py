@@ -21,7 +21,8 @@ import numpy as np
 
 from pewm_jax import worlds
 from pewm_jax.codecs.signals import rgb_from_signal
-from pewm_jax.config import ActionConfig, Config, NomadConfig, UserError
+from pewm_jax.config import ActionConfig, Config, UserError
+from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.data.simulator import Simulator, move
 from pewm_jax.data.trajectories import advance
 from pewm_jax.errors import require

@@ -25,7 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import ActionConfig, Config, NomadConfig, UserError
+from pewm_jax.config import ActionConfig, Config, UserError
+from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.eval.reproject import ReprojectSettings, reproject
 from pewm_jax.geometry.actions import continuous, integrate
 from pewm_jax.planning import nomad_policy

@@ -155,14 +155,14 @@ def init(model: ModelConfig, key: Array, *, memory: bool = True) -> Params:
     backbone_key, memory_key = jax.random.split(key)
     frozen_key = jax.random.fold_in(key, 2)
     channels = model.in_channels, model.codec.channels
-    params: Params = {"backbone": backbones.init(model.backbone, backbone_key, *channels)}
+    params: Params = {"backbone": model.backbone.init(backbone_key, *channels)}
     if memory and model.backbone.places is not None:
         params["memory"] = readers.init(model, memory_key)
     parts = {
         "codec": model.codec.init(frozen_key),
         "encoder": model.memory.encoder.init(jax.random.fold_in(frozen_key, 1)),
         "control": model.control.init(model, jax.random.fold_in(key, 3)),
-        "image": backbones.init_image(model.backbone, jax.random.fold_in(key, 4)),
+        "image": model.backbone.init_image(jax.random.fold_in(key, 4)),
     }
     params |= {name: part for name, part in parts.items() if part}
     if model.backbone.stores_prompt:
@@ -198,8 +198,8 @@ def apply(
             model, params["memory"], sight, conditioning.camera, conditioning.rays_BthwC
         )
     noisy = _seen(model, noisy_BthwC).astype(dtype)
-    out = backbones.apply(
-        model.backbone, params["backbone"], noisy, time_B, conditioning.given, memory_readers
+    out = model.backbone.apply(
+        params["backbone"], noisy, time_B, conditioning.given, memory_readers
     )
     return _seen(model, out.astype(jnp.float32))
 

@@ -23,11 +23,11 @@ import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import presets, registry
 from pewm_jax.cli.convert import main
-from pewm_jax.config import published
 from pewm_jax.convert import cogvideox, cogvideox_world, pipeline, schedulers, widen
 from pewm_jax.io import sources, tensor_files, weights
 from pewm_jax.io.published import LINEAR, Entry
 from pewm_jax.models.cogvideox import model as dit
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.readers import interface as readers
 from pewm_jax.types import Camera, MapTokens, MemoryReadout
@@ -291,7 +291,7 @@ def test_an_imported_checkpoint_starts_from_the_preset_of_its_size(variant, bill
     """All but the features of the map, which come with --encoder."""
     preset = presets.load(f"pewm_{variant}")
     noise = preset.model.noise
-    backbone, codec = published(variant), preset.model.codec
+    backbone, codec = DiTBackbone.published(variant), preset.model.codec
     made = cogvideox_world.config_of(backbone, codec, noise, (None, None, None), "bfloat16")
     assert without(made.train, "run") == without(preset.train, "run")
     assert (made.data, made.evaluate) == (preset.data, preset.evaluate)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from pewm_jax.config import DINOv2Config, UserError
+from pewm_jax.config import UserError
 from pewm_jax.convert import dinov2, pipeline
 from pewm_jax.models.dinov2 import model
+from pewm_jax.models.dinov2.config import DINOv2Config
 
 CONFIG = DINOv2Config(layers=2, heads=1, width=64, pretrained_size=28, registers=2, antialias=True)
 SETTINGS = {

@@ -7,14 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import DiTConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.convert import widen
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.nn import tokens
 
 
 def build(patch, patch_t, latents, *, image):
     inputs = 2 * latents if image else latents
-    return DiTConfig(patch=patch, patch_t=patch_t, in_channels=inputs, out_channels=latents)
+    return DiTBackbone(patch=patch, patch_t=patch_t, in_channels=inputs, out_channels=latents)
 
 
 @settings(max_examples=30, deadline=None)

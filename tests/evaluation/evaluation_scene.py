@@ -12,7 +12,6 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DiTConfig,
     EvalConfig,
     ModelConfig,
     TrainConfig,
@@ -23,6 +22,7 @@ from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry.actions import discrete_table, integrate
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, ray_directions
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.types import Camera, Frames
 
 SIZE = 16
@@ -34,7 +34,7 @@ def tiny(tmp, **evaluate):
     return Config(
         model=ModelConfig(
             clip=ClipConfig(frames=5, height=SIZE, width=SIZE),
-            backbone=DiTConfig(
+            backbone=DiTBackbone(
                 layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16
             ),
             memory=VoxelConfig(

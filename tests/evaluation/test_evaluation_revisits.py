@@ -4,13 +4,13 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import DINOv2Config, UserError
-from pewm_jax.config.dinov2 import published, size_name
+from pewm_jax.config import UserError
 from pewm_jax.convert import dinov2 as convert
 from pewm_jax.eval import metrics
 from pewm_jax.eval.metrics import revisits, similarity
 from pewm_jax.io import tree, weights
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.config import DINOv2Config, published, size_name
 from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips

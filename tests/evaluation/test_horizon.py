@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from pewm_jax.cli import horizon as command
-from pewm_jax.config import UserError, VoxelVAEConfig
+from pewm_jax.config import UserError
 from pewm_jax.config.command_line import ConfigError
 from pewm_jax.eval import edit_trials, horizon, voxel_score
 from pewm_jax.models.persist import voxel_vae
+from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.report import horizon_page
 
 

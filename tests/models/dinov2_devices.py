@@ -9,8 +9,8 @@ os.environ["XLA_FLAGS"] = " ".join(
 import jax
 import numpy as np
 
-from pewm_jax.config import DINOv2Config
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.nn import attention as blocked_attention
 
 blocked_attention.LOGITS = 64  # a few tokens are cut like a thousand

@@ -103,11 +103,11 @@ def test_before_training_any_action_leaves_the_output_bit_for_bit():
 
     @functools.partial(jax.jit, static_argnums=0)
     def init(backbone, key):
-        return backbones.init(backbone, key, 8, 4)
+        return backbone.init(key, 8, 4)
 
     @functools.partial(jax.jit, static_argnums=0)
     def run(backbone, params, x, time, given):
-        return backbones.apply(backbone, params, x, time, given)
+        return backbone.apply(params, x, time, given)
 
     params = randomise(init(model.backbone, jax.random.key(0)))
     without = run(model.backbone, params, x, time, backbones.Conditioning())

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import ConfigError, DINOv2Config, UserError
-from pewm_jax.config.dinov2 import published
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.config import DINOv2Config, published
 from tests.helpers import randomise
 
 ROOT = Path(__file__).parents[2]

@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import PUBLISHED, ConfigError, DiTConfig, UserError, published
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import model as dit_block
 from pewm_jax.models.cogvideox import positions
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.config import PUBLISHED
 from pewm_jax.nn import layers
 from pewm_jax.nn.tokens import TokenLayout, patchify, unpatchify
 from pewm_jax.types import MemoryReadout
@@ -187,7 +189,7 @@ def refused(config, shape, **changes):
 
 def small(name):
     """A published network with its sizes divided, everything else as published."""
-    config = published(name)
+    config = DiTBackbone.published(name)
     sample = {"sample_height": 4, "sample_width": 6, "sample_frames": 9}
     return dataclasses.replace(
         config, layers=1, heads=1, head_dim=16, text_dim=8, text_length=3, **sample
@@ -229,17 +231,19 @@ def test_the_second_scalar_is_two_unless_given():
 
 def test_channels_left_open_need_a_world_model():
     with pytest.raises(UserError, match="set both"):
-        dit.init(DiTConfig(), jax.random.key(0))
+        dit.init(DiTBackbone(), jax.random.key(0))
 
 
 def test_published_networks_have_the_sizes_of_their_names():
     billions = {"2b": 1.7, "5b": 5.6, "5b-I2V": 5.6, "1.5-5B": 5.6, "1.5-5B-I2V": 5.6}
     for name in PUBLISHED:
-        shapes = jax.eval_shape(lambda n=name: dit.init(published(n), jax.random.key(0)))
+        shapes = jax.eval_shape(
+            lambda n=name: dit.init(DiTBackbone.published(n), jax.random.key(0))
+        )
         count = sum(x.size for x in jax.tree.leaves(shapes))
         assert abs(count / 1e9 - billions[name]) < 0.1, (name, count)
     with pytest.raises(ConfigError, match="choose one of 2b"):
-        published("3b")
+        DiTBackbone.published("3b")
 
 
 @pytest.mark.parametrize(
@@ -255,4 +259,4 @@ def test_published_networks_have_the_sizes_of_their_names():
 )
 def test_settings_that_cannot_work_are_refused(changes, says):
     with pytest.raises(ConfigError, match=says):
-        DiTConfig(**changes)
+        DiTBackbone(**changes)

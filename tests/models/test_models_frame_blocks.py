@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import (
-    BlocksConfig,
-    CameraModelConfig,
-    ConfigError,
-    UserError,
-    VoxelDiTConfig,
-    VoxelRendererConfig,
-)
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.io import tree
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer
+from pewm_jax.models.persist.config import (
+    BlocksConfig,
+    CameraModelConfig,
+    VoxelDiTConfig,
+    VoxelRendererConfig,
+)
 from pewm_jax.nn.costs import Share
 from tests.persist_nets import normal, weights
 

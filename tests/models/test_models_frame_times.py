@@ -74,7 +74,7 @@ def test_a_reader_and_the_last_layer_are_told_of_each_frame_its_own(config, fram
     @jax.jit
     def run(modulation):
         given = Conditioning(None, modulation, text)
-        return backbones.apply(config, params, latents, times, given, readers)
+        return config.apply(params, latents, times, given, readers)
 
     base, other = run(modulation), run(modulation.at[:, frame].add(1.0))
     changed = np.abs(other - base).max((0, 2, 3, 4)) > 0

@@ -10,15 +10,8 @@ import pytest
 from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.config import (
-    ClipConfig,
-    Codec,
-    CodecWorldConfig,
-    ConfigError,
-    DiTConfig,
-    UserError,
-    from_dict,
-)
+from pewm_jax.config import ClipConfig, Codec, CodecWorldConfig, ConfigError, UserError, from_dict
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.worlds import objective
 from tests.helpers import init_world, random_frames, randomise, tiny_model
 
@@ -111,7 +104,7 @@ def model():
     return tiny_model(
         codec=TINY,
         clip=ClipConfig(frames=3, height=16, width=32),
-        backbone=DiTConfig(
+        backbone=DiTBackbone(
             layers=1, heads=2, head_dim=16, patch=1, text_length=1, text_dim=8, time_dim=16
         ),
     )

@@ -12,14 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax import presets
-from pewm_jax.config import ConfigError, DiTConfig, UserError, published
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import positions
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.worlds import world_model
 from tests.helpers import randomise
 
 TABLE = dataclasses.replace(
-    published("5b-I2V"),
+    DiTBackbone.published("5b-I2V"),
     layers=1,
     heads=1,
     head_dim=16,
@@ -143,4 +144,4 @@ def test_the_preset_takes_its_clip():
 
 def test_only_a_table_can_be_chosen_for():
     with pytest.raises(ConfigError, match="leave it at exact"):
-        DiTConfig(learned="interpolate")
+        DiTBackbone(learned="interpolate")

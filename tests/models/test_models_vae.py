@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pewm_jax.config import ConfigError, UserError, VAEConfig
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.models.cogvideox import vae, vae_layers
 from pewm_jax.models.cogvideox.convert import VAE
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.nn import layers, video_convolution
 from tests.helpers import randomise
 
-TINY = VAEConfig(
+TINY = VAECodec(
     widths=(4, 4, 4), resnets=1, groups=2, latent_channels=2, sample_height=16, sample_width=16
 )
 
@@ -206,14 +207,14 @@ def test_group_norm_keeps_its_digits_far_from_zero():
 def test_settings_that_cannot_work_are_refused(change, sentence):
     base = dataclasses.asdict(TINY) | {"groups": 4}
     with pytest.raises(ConfigError, match=sentence):
-        VAEConfig(**{**base, **change})
+        VAECodec(**{**base, **change})
 
 
 def test_only_published_names_are_known():
-    assert VAEConfig.published("1.5-5B-I2V").invert_scale_latents
-    assert VAEConfig.published("2b").scaling_factor == 1.15258426
+    assert VAECodec.published("1.5-5B-I2V").invert_scale_latents
+    assert VAECodec.published("2b").scaling_factor == 1.15258426
     with pytest.raises(ConfigError, match=r"1\.5-5B-I2V"):
-        VAEConfig.published("7b")
+        VAECodec.published("7b")
 
 
 @pytest.mark.parametrize(
@@ -231,7 +232,7 @@ def test_only_published_names_are_known():
     ],
 )
 def test_settings_of_a_checkpoint_are_read_strictly(change, sentence):
-    values = VAE.write_config(VAEConfig())
+    values = VAE.write_config(VAECodec())
     with pytest.raises(UserError, match=sentence):
         VAE.read_config({**values, **change})
 
@@ -240,4 +241,4 @@ def test_settings_come_back_from_a_checkpoints_json():
     config = dataclasses.replace(TINY, invert_scale_latents=True, scaling_factor=0.7)
     values = {**VAE.write_config(config), "_diffusers_version": "0.30.0"}
     assert VAE.read_config(values) == config
-    assert VAE.read_config({}) == VAEConfig()
+    assert VAE.read_config({}) == VAECodec()

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from pewm_jax.config import BlocksConfig, UserError, VoxelRendererConfig
+from pewm_jax.config import UserError
 from pewm_jax.geometry import cameras
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import voxel_renderer
+from pewm_jax.models.persist.config import BlocksConfig, VoxelRendererConfig
 from pewm_jax.types import Camera
 from tests.persist_nets import weights
 

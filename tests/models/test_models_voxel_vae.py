@@ -10,9 +10,10 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import ConfigError, UserError, VoxelVAEConfig
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.io import tree
 from pewm_jax.models.persist import voxel_vae, voxel_vae_shapes
+from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.nn.costs import Share
 from tests.persist_nets import weights
 

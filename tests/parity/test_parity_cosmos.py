@@ -17,10 +17,11 @@ from diffusers.models.transformers.transformer_cosmos import (
 )
 from safetensors.numpy import load_file, save_file
 
-from pewm_jax.config import COSMOS_2B, COSMOS_14B, CosmosConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.convert import cosmos, pipeline
 from pewm_jax.io import tree
 from pewm_jax.models.cosmos import model
+from pewm_jax.models.cosmos.backbone import COSMOS_2B, COSMOS_14B, CosmosBackbone
 from pewm_jax.models.cosmos.convert import TRANSFORMER
 from tests.parity.cosmos_references import channels_first, channels_last, transformer
 from tests.parity.svd_references import distance, draw
@@ -299,5 +300,5 @@ def test_sizes_that_do_not_fit_are_refused(pair, sizes, settings, words):
 
 
 def test_the_defaults_are_those_of_the_published_model():
-    assert CosmosConfig() == COSMOS_2B
+    assert CosmosBackbone() == COSMOS_2B
     assert (COSMOS_2B.width, COSMOS_14B.width) == (2048, 5120)

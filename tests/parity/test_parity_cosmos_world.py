@@ -20,7 +20,6 @@ from pewm_jax.config import ConfigError, EgoWMConfig, UserError
 from pewm_jax.convert import commands, cosmos
 from pewm_jax.convert.options import ImportCosmos2
 from pewm_jax.io import tree
-from pewm_jax.models import interface as backbones
 from pewm_jax.train import starting
 from pewm_jax.types import Camera, Control, Frames
 from pewm_jax.worlds import sampling, world_model
@@ -144,7 +143,7 @@ def test_before_training_any_action_leaves_the_output_bit_for_bit(model, params)
     @functools.partial(jax.jit, static_argnums=0)
     def predicted(model, params, x, given):
         part = params["backbone"]
-        return backbones.apply(model.backbone, part, x, jnp.float32([0.7]), given)
+        return model.backbone.apply(part, x, jnp.float32([0.7]), given)
 
     given, _ = conditioned(model, params, FIRST, MOVES)
     assert given.given.modulation_BtE.shape == (1, 3, 32)

@@ -15,9 +15,9 @@ from transformers import (
     Dinov2WithRegistersModel,
 )
 
-from pewm_jax.config.dinov2 import published
 from pewm_jax.convert import dinov2, pipeline
 from pewm_jax.models.dinov2 import model
+from pewm_jax.models.dinov2.config import published
 from pewm_jax.models.dinov2.convert import with_transformers_names
 
 SHRUNKEN = {"small": (64, 1), "base": (128, 2), "large": (192, 3), "giant": (192, 3)}

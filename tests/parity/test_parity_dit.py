@@ -15,10 +15,12 @@ from diffusers.pipelines.cogvideo.pipeline_cogvideox import get_resize_crop_regi
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import PUBLISHED, UserError, published
+from pewm_jax.config import UserError
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import positions
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.config import PUBLISHED
 from pewm_jax.models.cogvideox.convert import TRANSFORMER
 
 LENGTH = 7
@@ -39,7 +41,7 @@ run = jax.jit(dit.apply, static_argnums=0)
 
 
 def shrunken(name):
-    config = published(name)
+    config = DiTBackbone.published(name)
     small = {"layers": 2, "heads": 2, "head_dim": 32, "text_dim": 24, "text_length": LENGTH}
     small |= {"time_dim": 48, "ofs_dim": 48 if config.ofs_dim else 0}
     small |= {"learned": "reference"} if config.positions == "rope_learned" else {}
@@ -190,7 +192,7 @@ def test_gradients_are_equal():
     columns=st.integers(1, 60),
 )
 def test_rotary_angles_are_the_pipelines(name, t, rows, columns):
-    config = published(name)
+    config = DiTBackbone.published(name)
     want = rotary(config, (t * config.patch_t, 2 * rows, 2 * columns))
     angles = positions.joint_angles(config, (t, rows, columns), 5)
     assert not angles[:5].any(), "text is not turned"
@@ -201,7 +203,7 @@ def test_rotary_angles_are_the_pipelines(name, t, rows, columns):
 @settings(max_examples=20, deadline=None)
 @given(t=st.integers(1, 13), rows=st.integers(1, 40), columns=st.integers(1, 40))
 def test_the_sinusoid_of_positions_is_the_references(t, rows, columns):
-    config = dataclasses.replace(published("2b"), heads=1, temporal_interpolation=1.25)
+    config = dataclasses.replace(DiTBackbone.published("2b"), heads=1, temporal_interpolation=1.25)
     want = get_3d_sincos_pos_embed(
         config.width, (columns, rows), t, config.spatial_interpolation, 1.25
     )
@@ -211,7 +213,7 @@ def test_the_sinusoid_of_positions_is_the_references(t, rows, columns):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_at_full_size_names_and_shapes_are_the_references(name):
-    config = published(name)
+    config = DiTBackbone.published(name)
     with torch.device("meta"):
         network = build(config)
     there = network.state_dict()
@@ -236,7 +238,7 @@ def test_at_full_size_names_and_shapes_are_the_references(name):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_settings_survive_the_journey(name):
-    for config in (published(name), shrunken(name)):
+    for config in (DiTBackbone.published(name), shrunken(name)):
         values = TRANSFORMER.write_config(config)
         stated = dataclasses.replace(config, learned="exact")  # diffusers has no name for it
         assert TRANSFORMER.read_config(values) == stated
@@ -264,4 +266,4 @@ def test_settings_that_are_not_known_are_refused_by_name(changes, says):
 
 
 def test_absent_settings_are_the_references_defaults():
-    assert TRANSFORMER.read_config({}) == published("2b")
+    assert TRANSFORMER.read_config({}) == DiTBackbone.published("2b")

@@ -11,7 +11,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from pewm_jax.config import NomadConfig, UserError
+from pewm_jax.config import UserError
+from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.diffusion import squared_cosine
 from pewm_jax.models.nomad import convert as converter
 from pewm_jax.models.nomad import efficientnet

@@ -11,9 +11,10 @@ from diffusers import UNetSpatioTemporalConditionModel
 from diffusers.models.resnet import SpatioTemporalResBlock
 from safetensors.numpy import load_file, save_file
 
-from pewm_jax.config import SVDUNetConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.convert import pipeline, svd
 from pewm_jax.models.svd import unet as model
+from pewm_jax.models.svd.backbone import SVDUNetBackbone
 from pewm_jax.models.svd.convert import DOWN, UNET, UP
 from tests.parity.svd_references import distance, draw, first, randomise
 
@@ -111,7 +112,7 @@ def test_the_published_size_has_the_reference_s_tensors():
     with torch.device("meta"):
         network = UNetSpatioTemporalConditionModel()
     config = UNET.read_config(dict(network.config))
-    assert config == SVDUNetConfig()
+    assert config == SVDUNetBackbone()
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     want = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     assert pipeline.expected(UNET.entries(config), like) == want

@@ -9,10 +9,11 @@ import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX
 
-from pewm_jax.config import UserError, VAEConfig
+from pewm_jax.config import UserError
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import vae
 from pewm_jax.models.cogvideox.convert import VAE
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 
 SHRUNKEN = {
     "block_out_channels": (8, 12, 12, 16),
@@ -151,7 +152,7 @@ def test_bfloat16_is_as_near_to_float32_as_the_references(reference, ours):
 
 @pytest.mark.parametrize("variant", ["2b", "5b", "5b-I2V", "1.5-5B", "1.5-5B-I2V"])
 def test_names_and_shapes_of_the_published_size_fit_without_a_weight(variant):
-    config = VAEConfig.published(variant)
+    config = VAECodec.published(variant)
     with torch.device("meta"):
         network = AutoencoderKLCogVideoX.from_config(VAE.write_config(config))
     wanted = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}

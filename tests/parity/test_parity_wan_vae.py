@@ -9,9 +9,10 @@ import torch
 from diffusers import AutoencoderKLWan
 from safetensors.numpy import load_file
 
-from pewm_jax.config import UserError, WanVAEConfig
+from pewm_jax.config import UserError
 from pewm_jax.convert import cosmos, pipeline
 from pewm_jax.models.wan import vae as model
+from pewm_jax.models.wan.codec import WanVAECodec
 from pewm_jax.models.wan.convert import VAE
 from tests.parity.cosmos_references import channels_first, channels_last
 from tests.parity.svd_references import distance, draw, randomise
@@ -114,7 +115,7 @@ def test_the_published_size_has_the_reference_s_tensors():
     with torch.device("meta"):
         network = AutoencoderKLWan()
     config = VAE.read_config(dict(network.config))
-    assert config == WanVAEConfig()
+    assert config == WanVAECodec()
     assert (config.spatial, config.temporal) == (8, 4)
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     want = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import ActionConfig, ConfigError, NomadConfig, UserError
+from pewm_jax.config import ActionConfig, ConfigError, UserError
+from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.geometry.actions import discrete_table, integrate
 from pewm_jax.io import tree
 from pewm_jax.models.nomad import model as nomad

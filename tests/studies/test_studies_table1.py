@@ -17,7 +17,7 @@ from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax.cli import table1 as command
 from pewm_jax.cli.data import main as data_command
-from pewm_jax.config import AttentionConfig, DINOv2Config, UserError
+from pewm_jax.config import AttentionConfig, UserError
 from pewm_jax.convert import dinov2 as convert
 from pewm_jax.eval import metrics
 from pewm_jax.eval.images import MASKS, SUMS
@@ -25,6 +25,7 @@ from pewm_jax.geometry.actions import integrate, there_and_back
 from pewm_jax.geometry.cameras import pose_from_yaw
 from pewm_jax.io import tree, weights
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.studies import (
     recorded,

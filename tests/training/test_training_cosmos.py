@@ -16,28 +16,28 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     ConfigError,
-    CosmosConfig,
     DataConfig,
     EgoWMConfig,
     EgoWMTrainConfig,
     MeshConfig,
     StageConfig,
     TrainConfig,
-    WanVAEConfig,
 )
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
+from pewm_jax.models.cosmos.backbone import CosmosBackbone
+from pewm_jax.models.wan.codec import WanVAECodec
 from pewm_jax.plan import hlo
 from pewm_jax.plan.plan import QUICK
 from pewm_jax.train import sharding, state
 from pewm_jax.worlds import costs, world_model
 from tests.helpers import TINY, init_world, random_frames, randomise, with_reader
 
-COSMOS = CosmosConfig(
+COSMOS = CosmosBackbone(
     layers=2, heads=2, head_dim=16, mlp_ratio=2.0, text_dim=24, text_length=3, lora_dim=8
 )
-VAE = WanVAEConfig(
+VAE = WanVAECodec(
     latent_channels=4,
     base_width=4,
     decoder_base_width=4,

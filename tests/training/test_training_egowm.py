@@ -12,7 +12,6 @@ from pewm_jax import worlds
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     ClipConfig,
-    CLIPVisionConfig,
     Config,
     ConfigError,
     DataConfig,
@@ -20,17 +19,16 @@ from pewm_jax.config import (
     EgoWMTrainConfig,
     MeshConfig,
     StageConfig,
-    SVDUNetConfig,
-    SVDVAEConfig,
     TrainConfig,
 )
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
-from pewm_jax.models import interface as backbones
+from pewm_jax.models.clip.config import CLIPVisionConfig
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.models.svd import backbone as svd_backbone
+from pewm_jax.models.svd.backbone import SVDUNetBackbone
+from pewm_jax.models.svd.vae_codec import SVDVAECodec
 from pewm_jax.plan import hlo
 from pewm_jax.plan.plan import QUICK
 from pewm_jax.train import sharding, state, step
@@ -40,7 +38,7 @@ from tests.helpers import TINY, randomise, with_reader
 IMAGE = CLIPVisionConfig(
     layers=1, heads=2, width=16, hidden=32, projection=16, image_size=28, patch=14
 )
-UNET = SVDUNetConfig(
+UNET = SVDUNetBackbone(
     widths=(32,),
     heads=(2,),
     attends=(False,),
@@ -52,7 +50,7 @@ UNET = SVDUNetConfig(
 )
 SVD = EgoWMConfig(
     clip=ClipConfig(frames=3, height=16, width=16, depth=False),
-    codec=SVDVAEConfig(widths=(32,), depth=False),
+    codec=SVDVAECodec(widths=(32,), depth=False),
     backbone=UNET,
     noise=EDMConfig(sigma_data=1.0, target="v", log_mean=0.7, log_std=1.6, sample_steps=2),
     image_noise=0.1,
@@ -135,10 +133,10 @@ def test_every_leaf_has_its_place_on_many_devices():
 def test_before_training_any_action_leaves_the_u_net_s_output_bit_for_bit():
     @functools.partial(jax.jit, static_argnums=0)
     def run(config, params, x, time, given):
-        return backbones.apply(config, params, x, time, given)
+        return config.apply(params, x, time, given)
 
     rng = np.random.default_rng(0)
-    init = jax.jit(svd_backbone.init, static_argnums=(0, 2, 3))
+    init = jax.jit(SVDUNetBackbone.init, static_argnums=(0, 2, 3))
     params = randomise(init(UNET, jax.random.key(0), 4, 4), scale=0.1)
     x, image, scalars = (
         rng.normal(size=shape).astype(np.float32) for shape in ((2, 3, 5, 4, 4), (2, 1, 16), (2, 3))

@@ -14,7 +14,6 @@ import training_fakes as fakes
 from pewm_jax import presets as configs
 from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
 from pewm_jax.data import abstract
-from pewm_jax.models.cogvideox import vae_codec
 from pewm_jax.nn.costs import SPLIT, Share
 from pewm_jax.plan import plan, predict, suggest
 from pewm_jax.plan import text as plan_text
@@ -162,9 +161,9 @@ def test_the_vae_holds_a_chunk_of_a_long_clip():
 
 def test_the_vae_works_clip_by_clip_and_streams_all_clips_in_their_precision():
     model = configs.load("pewm_2b").model
-    one = vae_codec.costs(model, Share(clips=1, activation_bytes=2))
+    one = model.codec.costs(model, Share(clips=1, activation_bytes=2))
     four, wide = (
-        vae_codec.costs(model, Share(clips=n, activation_bytes=w)) for n, w in ((4, 2), (1, 4))
+        model.codec.costs(model, Share(clips=n, activation_bytes=w)) for n, w in ((4, 2), (1, 4))
     )
     assert (four.held, four.streamed) == (one.held, 4 * one.streamed)
     assert (wide.held, wide.streamed) == (2 * one.held, 2 * one.streamed)

@@ -11,8 +11,11 @@ import training_fakes as fakes
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax import presets as configs
-from pewm_jax.config import AXES, ConfigError, DINOv2Config, MeshConfig, VAEConfig, published
+from pewm_jax.config import AXES, ConfigError, MeshConfig
 from pewm_jax.io import tree, weights
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.train import sharding, state
 from pewm_jax.worlds.pewm.world import STAGES
@@ -24,10 +27,10 @@ MESH = jax.sharding.AbstractMesh((1, 4, 2, 1), AXES)
 def large():
     """All networks there are, in published form but for size."""
     tiny = configs.load("tiny")
-    vae = VAEConfig(widths=(8, 8, 8, 8), groups=4, resnets=1)
+    vae = VAECodec(widths=(8, 8, 8, 8), groups=4, resnets=1)
     network = DINOv2Config(layers=2, heads=2, width=32, registers=4)
     backbone = dataclasses.replace(
-        published("1.5-5B-I2V"),
+        DiTBackbone.published("1.5-5B-I2V"),
         layers=2,
         heads=4,
         head_dim=16,

@@ -10,8 +10,9 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax import presets as configs
-from pewm_jax.config import AXES, ConfigError, DiTConfig
+from pewm_jax.config import AXES, ConfigError
 from pewm_jax.io import tree
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.train import optimizer, sharding, stages, state, step
 from pewm_jax.worlds import world_model
 from pewm_jax.worlds.pewm import world as pewm
@@ -120,7 +121,7 @@ def test_every_leaf_of_the_state_needs_a_sharding_rule(monkeypatch):
 
 def test_freezing_the_backbone_makes_the_step_of_the_real_model_cheaper():
     small = configs.load("tiny")
-    wide = DiTConfig(layers=1, heads=16, head_dim=32, text_length=1, text_dim=8, time_dim=16)
+    wide = DiTBackbone(layers=1, heads=16, head_dim=32, text_length=1, text_dim=8, time_dim=16)
     config = small.with_model(backbone=wide)
     clip, mesh = fakes.clip(config, 2, 0), sharding.make_mesh(jax.devices()[:1])
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets as configs
-from pewm_jax.config import DiTConfig, RenderConfig, SurfelConfig
+from pewm_jax.config import RenderConfig, SurfelConfig
 from pewm_jax.io import tree
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.train import sharding, stages, step
 from pewm_jax.types import Clip
 from pewm_jax.worlds import world_model
@@ -23,7 +24,7 @@ EVERYTHING = dataclasses.replace(TWO, rules=((r".*", stages.TRAIN),))
 def small():
     """A backbone that is large beside its memory blocks, as CogVideoX beside the paper's."""
     config = configs.load("tiny")
-    wide = DiTConfig(layers=1, heads=16, head_dim=32, text_length=1, text_dim=8, time_dim=16)
+    wide = DiTBackbone(layers=1, heads=16, head_dim=32, text_length=1, text_dim=8, time_dim=16)
     return config.with_model(backbone=wide, memory=with_reader(config.model, mlp_ratio=1).memory)
 
 

@@ -22,17 +22,17 @@ from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     AttentionConfig,
     ConfigError,
-    DINOv2Config,
     ImagesConfig,
     Map2DConfig,
     NoMemoryConfig,
     PointsConfig,
-    VAEConfig,
     VoxelConfig,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.io import tree, weights
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.train import integrity, loop, runs, sharding, step
 from pewm_jax.train.checkpoint import CONFIG_ITEM, Checkpoints
@@ -178,7 +178,7 @@ def test_the_autoencoder_the_encoder_the_noise_and_the_dtype_arrive():
     values["train"]["dtype"] = "bfloat16"
     found = parsed(values)
     model, train = found.model, found.train
-    assert model.codec == VAEConfig(widths=(8, 16, 16, 16), groups=4, scaling_factor=0.7)
+    assert model.codec == VAECodec(widths=(8, 16, 16, 16), groups=4, scaling_factor=0.7)
     assert model.memory.encoder == DINOv2EncoderConfig(56, DINOv2Config(**network))
     assert model.noise == DDPMConfig(
         sample_steps=2, target="v", snr_shift=3.0, guidance=2.0, sampler="dpm"

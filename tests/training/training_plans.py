@@ -14,16 +14,16 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     DataConfig,
-    DINOv2Config,
-    DiTConfig,
     MeshConfig,
     ModelConfig,
     StageConfig,
     TrainConfig,
-    VAEConfig,
     VoxelConfig,
 )
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.plan import hlo, plan, predict
 from pewm_jax.plan.footprint import MeshSizes
@@ -32,7 +32,7 @@ from pewm_jax.worlds.pewm.world import STAGES
 
 DINOV2 = DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56)
 ENCODERS = {
-    "codec": VAEConfig(widths=(16, 16, 32, 32), groups=16, resnets=1),
+    "codec": VAECodec(widths=(16, 16, 32, 32), groups=16, resnets=1),
     "encoder": DINOv2EncoderConfig(size=56, network=DINOV2),
 }
 FSDP = MeshConfig(fsdp=8)
@@ -72,7 +72,7 @@ def experiment(
     kind = BothConfig if both else AttentionConfig
     reader = kind(heads=8, head_dim=16, mlp_ratio=mlp, positions="sinusoid")
     memory = VoxelConfig(tokens=tokens, encoder=encoder or PatchColoursConfig(), reader=reader)
-    backbone = DiTConfig(
+    backbone = DiTBackbone(
         layers=layers,
         heads=heads,
         head_dim=32,

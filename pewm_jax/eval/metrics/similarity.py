@@ -20,10 +20,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import DINOv2Config, UserError
-from pewm_jax.config.dinov2 import size_name
+from pewm_jax.config import UserError
 from pewm_jax.eval.metrics.pictures import colours, marked
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.config import DINOv2Config, size_name
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.models.lpips.model import Net

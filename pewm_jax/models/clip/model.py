@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import CLIPVisionConfig, UserError
+from pewm_jax.config import UserError
+from pewm_jax.models.clip.config import CLIPVisionConfig
 from pewm_jax.models.dinov2.model import resize_matrix
 from pewm_jax.nn.attention import multi_head_attention
 from pewm_jax.nn.layers import layer_norm, linear

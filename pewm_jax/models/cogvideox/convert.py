@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from pewm_jax.config import DiTConfig, UserError, VAEConfig
+from pewm_jax.config import UserError
 from pewm_jax.io import published
 from pewm_jax.io.published import CONV, LINEAR, SAME, Entry, Network, Transform, rename
 from pewm_jax.models.cogvideox import model, vae
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.vae_codec import VAECodec
 
 TRANSFORMER_CLASS = "CogVideoXTransformer3DModel"
 """The class that the json names."""
@@ -54,7 +56,7 @@ IGNORED = ("dropout",)
 """Settings that do not touch inference."""
 
 
-def transformer_config_from_diffusers(values: dict[str, Any]) -> DiTConfig:
+def transformer_config_from_diffusers(values: dict[str, Any]) -> DiTBackbone:
     """Read the settings of ``transformer/config.json``.
 
     Args:
@@ -77,7 +79,7 @@ def transformer_config_from_diffusers(values: dict[str, Any]) -> DiTConfig:
         kinds = (int, float) if like is float else (like,)
         if not optional and (type(value) not in kinds):
             raise UserError(f"The transformer's {key} is {value!r}; it must be {_a(like)}.")
-    return DiTConfig(
+    return DiTBackbone(
         layers=given["num_layers"],
         heads=given["num_attention_heads"],
         head_dim=given["attention_head_dim"],
@@ -129,7 +131,7 @@ def _positions(given: dict[str, Any]) -> Any:
     return "rope_crop" if rotary else "sincos"
 
 
-def transformer_config_to_diffusers(config: DiTConfig) -> dict[str, Any]:
+def transformer_config_to_diffusers(config: DiTBackbone) -> dict[str, Any]:
     """Write the settings of ``transformer/config.json``, the inverse of reading them.
 
     Raises:
@@ -167,7 +169,7 @@ def transformer_config_to_diffusers(config: DiTConfig) -> dict[str, Any]:
     }
 
 
-def transformer_entries(config: DiTConfig) -> list[Entry]:
+def transformer_entries(config: DiTBackbone) -> list[Entry]:
     """List every tensor of the reference with the leaf of ours that holds it."""
     return [*_ends(config), *(e for i in range(config.layers) for e in _block(i))]
 
@@ -182,7 +184,7 @@ def _norm(theirs: str, ours: str, layer: int | None = None) -> Iterator[Entry]:
     yield Entry(f"{theirs}.bias", f"{ours}/bias", SAME, layer)
 
 
-def _ends(config: DiTConfig) -> Iterator[Entry]:
+def _ends(config: DiTBackbone) -> Iterator[Entry]:
     turn = LINEAR if config.positions == "rope_integer" else _patches(config.patch)
     yield Entry("patch_embed.proj.weight", "patch_embed/kernel", turn)
     yield Entry("patch_embed.proj.bias", "patch_embed/bias")
@@ -257,7 +259,7 @@ _VAE_BLOCKS = {
 }
 
 
-def vae_config_from_diffusers(values: dict[str, Any]) -> VAEConfig:
+def vae_config_from_diffusers(values: dict[str, Any]) -> VAECodec:
     """Read the settings of a diffusers ``vae/config.json``; absent ones have diffusers' defaults.
 
     Args:
@@ -287,7 +289,7 @@ def vae_config_from_diffusers(values: dict[str, Any]) -> VAEConfig:
                 f"the VAE's config.json has an unknown setting {key!r}; known are "
                 f"{', '.join(sorted([*_VAE_FIELDS, *_VAE_FIXED, *_VAE_BLOCKS]))}."
             )
-    config = VAEConfig(**fields)
+    config = VAECodec(**fields)
     for key, block in _VAE_BLOCKS.items():
         expected = [block] * len(config.widths)
         if key in values:
@@ -295,7 +297,7 @@ def vae_config_from_diffusers(values: dict[str, Any]) -> VAEConfig:
     return config
 
 
-def vae_config_to_diffusers(config: VAEConfig) -> dict[str, Any]:
+def vae_config_to_diffusers(config: VAECodec) -> dict[str, Any]:
     """Return the JSON object of a diffusers ``vae/config.json``.
 
     Tiling and the form of the convolutions are not part of it: diffusers switches tiling on when
@@ -312,7 +314,7 @@ def vae_config_to_diffusers(config: VAEConfig) -> dict[str, Any]:
     }
 
 
-def vae_entries(config: VAEConfig) -> list[Entry]:
+def vae_entries(config: VAECodec) -> list[Entry]:
     """Return one entry per tensor of the reference."""
     return [
         Entry(_vae_name(path), path, CONV if path.endswith("/kernel") else SAME)
@@ -341,7 +343,7 @@ def _vae_name(path: str) -> str:
 
 def _checked(key: str, value: Any) -> Any:
     """Check one of their settings against the kind of our field's default; lists become tuples."""
-    default: Any = getattr(VAEConfig(), _VAE_FIELDS[key])
+    default: Any = getattr(VAECodec(), _VAE_FIELDS[key])
     as_type: Any
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if isinstance(default, bool):
@@ -371,7 +373,7 @@ def _require_one_of(key: str, value: Any, fits: bool, allowed: Any) -> None:
 TRANSFORMER = Network(
     "transformer",
     TRANSFORMER_CLASS,
-    DiTConfig,
+    DiTBackbone,
     transformer_config_from_diffusers,
     transformer_config_to_diffusers,
     transformer_entries,
@@ -380,7 +382,7 @@ TRANSFORMER = Network(
 VAE = Network(
     "vae",
     VAE_CLASS,
-    VAEConfig,
+    VAECodec,
     vae_config_from_diffusers,
     vae_config_to_diffusers,
     vae_entries,

@@ -19,8 +19,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import DiTConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.models.cogvideox import positions
+from pewm_jax.models.cogvideox.config import DiTConfig
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn import layers, modules, placement
 from pewm_jax.nn.tokens import TokenLayout, patchify, unpatchify

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import DiTConfig, UserError
+from pewm_jax.config import UserError
+from pewm_jax.models.cogvideox.config import DiTConfig
 from pewm_jax.types import Array
 
 Grid = tuple[int, int, int]

@@ -33,8 +33,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from pewm_jax.config import UserError, VAEConfig
+from pewm_jax.config import UserError
 from pewm_jax.models.cogvideox import vae_layers as layers
+from pewm_jax.models.cogvideox.config import VAEConfig
 from pewm_jax.models.cogvideox.vae_layers import layout
 from pewm_jax.nn.parameters import draw
 from pewm_jax.types import Array, Params

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import VAEConfig
+from pewm_jax.models.cogvideox.config import VAEConfig
 from pewm_jax.nn.layers import group_norm_affine
 from pewm_jax.nn.parameters import Leaf, convolution
 from pewm_jax.nn.video_convolution import convolve, convolve_frames, convolve_upsampled

@@ -10,19 +10,20 @@ read after every block.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import CosmosConfig, ModelConfig, UserError
+from pewm_jax.config.parts import Backbone, InjectionPoints, Rules
+from pewm_jax.errors import UserError, require
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.cosmos import model as cosmos
+from pewm_jax.models.cosmos.config import CosmosConfig
 from pewm_jax.models.interface import Conditioning, Observed, Readers
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn.costs import FLOAT, SPLIT, Costs, Product, Share, video_tokens
 from pewm_jax.types import Array, Params
-
-SHARDING = cosmos.SHARDING
 
 GIVEN_SIGMA = 1e-4
 """The noise σ that the network is told of observed frames; of the reference's pipeline."""
@@ -30,104 +31,153 @@ STREAMS = (24, 60)
 """How often element-wise work reads or writes a block's tokens: forward, backward."""
 
 
-def init(config: CosmosConfig, key: Array, in_channels: int, out_channels: int) -> Params:
-    """Return random parameters; see ``cosmos.init``."""
-    sized = dataclasses.replace(config, in_channels=in_channels, out_channels=out_channels)
-    return cosmos.init(sized, key)
+@dataclasses.dataclass(frozen=True)
+class CosmosBackbone(CosmosConfig, Backbone):
+    """Cosmos' transformer as the denoiser of a world model; guidance is on its text.
 
-
-def observed(model: ModelConfig, params: Params, seen: Observed) -> Conditioning:
-    """Hold the observed frames at their latents, and mark them; see ``backbones.observed``."""
-    del params
-    config, first = model.backbone, seen.latents_BthwC
-    assert isinstance(config, CosmosConfig)
-    frames, height, width = model.latent_shape
-    batch, held = first.shape[:2]
-    is_known = np.arange(frames) < held
-    rest = ((0, 0), (0, frames - held), (0, 0), (0, 0), (0, 0))
-    marks = jnp.asarray(is_known, first.dtype)[:, None, None, None]
-    return Conditioning(
-        joined_BthwC=jnp.broadcast_to(marks, (batch, frames, height, width, 1)),
-        known_BthwC=jnp.pad(first, rest),
-        known_Bt=jnp.broadcast_to(is_known, (batch, frames)),
-        fps=jnp.float32(config.fps),
-    )
-
-
-def apply(
-    config: CosmosConfig,
-    params: Params,
-    x_BthwC: Array,
-    time_B: Array,
-    conditioning: Conditioning,
-    readers: Readers,
-) -> Array:
-    """Predict from noisy latents; see ``backbones.apply``. For known frames it means nothing.
-
-    Raises:
-        UserError: it is not said which frames are known.
+    ``COSMOS_2B`` and ``COSMOS_14B`` are the published video models.
     """
-    if conditioning.known_Bt is None:
-        raise UserError(
-            "this backbone (cosmos) needs to know which frames are given: make its conditioning by "
-            "models.world_model.condition."
+
+    SHARDING: ClassVar[Rules] = cosmos.SHARDING
+    GUIDED_BY_TEXT: ClassVar[bool] = True
+
+    @property
+    def places(self) -> InjectionPoints:
+        """Where a memory reader runs: after every block."""
+        return InjectionPoints(self.layers, self.width, self.width, self.patch, self.patch_t)
+
+    @property
+    def text_shape(self) -> tuple[int, int]:
+        """(length, channels) of the text tokens."""
+        return self.text_length, self.raw_text_dim or self.text_dim
+
+    @property
+    def stores_prompt(self) -> bool:
+        """Whether embeddings of prompts are stored with the weights."""
+        return self.prompt == "stored"
+
+    @property
+    def split_heads(self) -> int:
+        """The number that ``train.mesh.tensor`` must divide."""
+        return self.heads
+
+    def shown_channels(self, model: Any) -> int:
+        """Return 1: a mask marks observed frames, whose latents stand where noisy ones would."""
+        del model
+        return 1
+
+    def check(self, model: Any) -> None:
+        """Refuse noise in other units than the network's, and frames that share a token."""
+        super().check(model)
+        require(
+            model.noise.velocity_in_unit_time,
+            "this backbone (cosmos) is told times from 0 to 1 and predicts velocities: use "
+            "noise.kind edm with noise.target flow, or noise.kind flow with noise.scale 1.",
         )
-    dtype = x_BthwC.dtype
-    known_Bt = conditioning.known_Bt
-    times_Bt = time_B if time_B.ndim == 2 else time_B[:, None]
-    latents = backbones.held(conditioning, x_BthwC).astype(dtype)
-    cells = config.patch_t * config.patch**2
-    sized = dataclasses.replace(
-        config,
-        in_channels=params["patch_embed"]["kernel"].shape[-2] // cells - config.padding_mask,
-        out_channels=params["proj_out"]["kernel"].shape[-1] // cells,
-    )
-    text = conditioning.tokens_BLC
-    if text is None:
-        text = jnp.zeros((len(latents), *config.text_shape))
-    return cosmos.apply(
-        sized,
-        params,
-        latents,
-        jnp.where(known_Bt, GIVEN_SIGMA / (1 + GIVEN_SIGMA), times_Bt),
-        text,
-        conditioning.joined_BthwC,
-        fps=conditioning.fps,
-        modulation_BtE=conditioning.modulation_BtE,
-        expert=readers.block,
-        expert_params=readers.params,
-        added_BND=readers.added_BND,
-    )
+        require(
+            self.patch_t == 1,
+            f"backbone.patch_t is {self.patch_t}: in a world model observed frames have a time of "
+            "their own, so a token is of one latent frame; use 1.",
+        )
+
+    def init(self, key: Array, in_channels: int, out_channels: int) -> Params:
+        """Return random parameters."""
+        sized = dataclasses.replace(self, in_channels=in_channels, out_channels=out_channels)
+        return cosmos.init(sized, key)
+
+    def observed(self, model: Any, params: Params, seen: Observed) -> Conditioning:
+        """Hold the observed frames at their latents, and mark them."""
+        del params
+        first = seen.latents_BthwC
+        frames, height, width = model.latent_shape
+        batch, held = first.shape[:2]
+        is_known = np.arange(frames) < held
+        rest = ((0, 0), (0, frames - held), (0, 0), (0, 0), (0, 0))
+        marks = jnp.asarray(is_known, first.dtype)[:, None, None, None]
+        return Conditioning(
+            joined_BthwC=jnp.broadcast_to(marks, (batch, frames, height, width, 1)),
+            known_BthwC=jnp.pad(first, rest),
+            known_Bt=jnp.broadcast_to(is_known, (batch, frames)),
+            fps=jnp.float32(self.fps),
+        )
+
+    def apply(
+        self,
+        params: Params,
+        x_BthwC: Array,
+        time_B: Array,
+        conditioning: Conditioning,
+        readers: Readers,
+    ) -> Array:
+        """Predict from noisy latents. For known frames it means nothing.
+
+        Raises:
+            UserError: it is not said which frames are known.
+        """
+        if conditioning.known_Bt is None:
+            raise UserError(
+                "this backbone (cosmos) needs to know which frames are given: make its "
+                "conditioning by worlds.world_model.condition."
+            )
+        dtype = x_BthwC.dtype
+        known_Bt = conditioning.known_Bt
+        times_Bt = time_B if time_B.ndim == 2 else time_B[:, None]
+        latents = backbones.held(conditioning, x_BthwC).astype(dtype)
+        cells = self.patch_t * self.patch**2
+        sized = dataclasses.replace(
+            self,
+            in_channels=params["patch_embed"]["kernel"].shape[-2] // cells - self.padding_mask,
+            out_channels=params["proj_out"]["kernel"].shape[-1] // cells,
+        )
+        text = conditioning.tokens_BLC
+        if text is None:
+            text = jnp.zeros((len(latents), *self.text_shape))
+        return cosmos.apply(
+            sized,
+            params,
+            latents,
+            jnp.where(known_Bt, GIVEN_SIGMA / (1 + GIVEN_SIGMA), times_Bt),
+            text,
+            conditioning.joined_BthwC,
+            fps=conditioning.fps,
+            modulation_BtE=conditioning.modulation_BtE,
+            expert=readers.block,
+            expert_params=readers.params,
+            added_BND=readers.added_BND,
+        )
+
+    def costs(self, model: Any, share: Share, *, trained: bool) -> Costs:
+        """Return the transformer's costs, trained or frozen.
+
+        Every latent frame has a time embedding of its own. Tokens here are those of the video; keys
+        and values of the text are counted once a clip.
+        """
+        frames, patches = video_tokens(model)
+        tokens, depth, width = frames * patches, self.layers, self.width
+        whole = share.clips * tokens * width * share.activation_bytes / share.context
+        part = whole / share.tensor
+        hidden = part * self.mlp_ratio
+        logits = _logits(self, tokens, share)
+        kept = depth * whole if self.remat else depth * (9 * whole + 9 * part + 2 * hidden)
+        block = 18 * whole + 18 * part + (5 if self.remat else 1) * hidden
+        forward, backward = STREAMS
+        again = float(self.remat)
+        passes = 2 + self.remat
+        return Costs(
+            products=_products(self, model, trained=trained),
+            kept=kept,
+            block=block + 4 * FLOAT * logits + 2 * part * (share.context - 1),
+            streamed=depth * whole * (forward * (1 + again) + backward),
+            summed=3 * depth * passes * whole,
+            gathered=(1 + again) * depth * 2 * whole / share.tensor,
+            scattered=depth * 2 * whole / share.tensor,
+        )
 
 
-def costs(model: ModelConfig, share: Share, *, trained: bool) -> Costs:
-    """Return the transformer's costs, trained or frozen; see ``dit_backbone.costs``.
-
-    Every latent frame has a time embedding of its own. Tokens here are those of the video; keys and
-    values of the text are counted once a clip.
-    """
-    config = model.backbone
-    assert isinstance(config, CosmosConfig)
-    frames, patches = video_tokens(model)
-    tokens, depth, width = frames * patches, config.layers, config.width
-    whole = share.clips * tokens * width * share.activation_bytes / share.context
-    part = whole / share.tensor
-    hidden = part * config.mlp_ratio
-    logits = _logits(config, tokens, share)
-    kept = depth * whole if config.remat else depth * (9 * whole + 9 * part + 2 * hidden)
-    block = 18 * whole + 18 * part + (5 if config.remat else 1) * hidden
-    forward, backward = STREAMS
-    again = float(config.remat)
-    passes = 2 + config.remat
-    return Costs(
-        products=_products(config, model, trained=trained),
-        kept=kept,
-        block=block + 4 * FLOAT * logits + 2 * part * (share.context - 1),
-        streamed=depth * whole * (forward * (1 + again) + backward),
-        summed=3 * depth * passes * whole,
-        gathered=(1 + again) * depth * 2 * whole / share.tensor,
-        scattered=depth * 2 * whole / share.tensor,
-    )
+COSMOS_2B = CosmosBackbone()
+"""Cosmos-Predict2-2B-Video2World."""
+COSMOS_14B = CosmosBackbone(layers=36, heads=40, rope_scale=(20 / 24, 2.0, 2.0))
+"""Cosmos-Predict2-14B-Video2World."""
 
 
 def _logits(config: CosmosConfig, tokens: int, share: Share) -> float:
@@ -141,7 +191,7 @@ def _logits(config: CosmosConfig, tokens: int, share: Share) -> float:
     return logits
 
 
-def _products(config: CosmosConfig, model: ModelConfig, *, trained: bool) -> tuple[Product, ...]:
+def _products(config: CosmosConfig, model: Any, *, trained: bool) -> tuple[Product, ...]:
     depth, width, lora = config.layers, config.width, config.lora_dim
     frames, patches = video_tokens(model)
     tokens, (length, raw) = frames * patches, config.text_shape

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import CosmosConfig
+from pewm_jax.models.cosmos.config import CosmosConfig
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn import layers, placement
 from pewm_jax.nn.layers import linear, rms_norm

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pewm_jax.config import CosmosConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.io import published
 from pewm_jax.io.published import LINEAR, SAME, Entry, Network, rename
 from pewm_jax.models.cosmos import model
+from pewm_jax.models.cosmos.backbone import CosmosBackbone
 
 CLASS = "CosmosTransformer3DModel"
 """The reference's class."""
@@ -62,7 +63,7 @@ _RULES = (
 )
 
 
-def config_from_diffusers(values: Mapping[str, Any]) -> CosmosConfig:
+def config_from_diffusers(values: Mapping[str, Any]) -> CosmosBackbone:
     """Read the settings of ``transformer/config.json``; absent ones have diffusers' defaults.
 
     Raises:
@@ -82,7 +83,7 @@ def config_from_diffusers(values: Mapping[str, Any]) -> CosmosConfig:
         raise UserError(
             f"{WHAT}'s extra_pos_embed_type is {extra!r}; only None and 'learnable' are supported."
         )
-    return CosmosConfig(
+    return CosmosBackbone(
         in_channels=given["in_channels"],
         out_channels=given["out_channels"],
         layers=given["num_layers"],
@@ -122,7 +123,7 @@ def _raw_text(given: Mapping[str, Any]) -> int:
     return inside
 
 
-def config_to_diffusers(config: CosmosConfig) -> dict[str, Any]:
+def config_to_diffusers(config: CosmosBackbone) -> dict[str, Any]:
     """Write the settings of ``transformer/config.json``, the inverse of reading them."""
     return {
         "_class_name": CLASS,
@@ -147,7 +148,7 @@ def config_to_diffusers(config: CosmosConfig) -> dict[str, Any]:
     }
 
 
-def entries(config: CosmosConfig) -> list[Entry]:
+def entries(config: CosmosBackbone) -> list[Entry]:
     """Return one entry per tensor of the reference."""
     found = []
     for path in model.layout(config):
@@ -166,7 +167,7 @@ def entries(config: CosmosConfig) -> list[Entry]:
 TRANSFORMER = Network(
     "transformer",
     CLASS,
-    CosmosConfig,
+    CosmosBackbone,
     config_from_diffusers,
     config_to_diffusers,
     entries,

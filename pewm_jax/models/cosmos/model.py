@@ -21,9 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import CosmosConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.models.cosmos import block as cosmos_block
 from pewm_jax.models.cosmos.block import Time
+from pewm_jax.models.cosmos.config import CosmosConfig
 from pewm_jax.nn import layers, placement
 from pewm_jax.nn.layers import linear
 from pewm_jax.nn.parameters import Leaf, draw

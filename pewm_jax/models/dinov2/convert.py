@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax.config import DINOv2Config, UserError
-from pewm_jax.config.dinov2 import HEAD_DIM
+from pewm_jax.config import UserError
 from pewm_jax.io import tree
 from pewm_jax.io.published import LINEAR, SAME, Entry, Transform
 from pewm_jax.io.sources import Renamed, Source
+from pewm_jax.models.dinov2.config import HEAD_DIM, DINOv2Config
 
 _LEFT_BEHIND = re.compile(r"(embeddings\.)?mask_token|classifier\.(weight|bias)")
 _BODY = re.compile(r"^(dinov2|dinov2_with_registers)\.")

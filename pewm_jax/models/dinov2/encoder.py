@@ -7,10 +7,11 @@ from typing import Any, ClassVar
 
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import DINOv2Config, serialize
+from pewm_jax.config import serialize
 from pewm_jax.config.parts import Encoder, Rules
 from pewm_jax.errors import require, require_positive
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.nn.costs import FLOAT, Costs, Product, Share
 from pewm_jax.types import Array, Params
 

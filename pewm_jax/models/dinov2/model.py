@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax.config import DINOv2Config, UserError
+from pewm_jax.config import UserError
 from pewm_jax.io import weights
+from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn import layers, modules
 from pewm_jax.nn.tokens import patchify_images

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import NomadConfig, UserError
+from pewm_jax.config import UserError
+from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.nomad import efficientnet, unet1d
 from pewm_jax.nn.layers import layer_norm, linear, merge_heads, split_heads

@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import NomadConfig
-from pewm_jax.config.nomad import PLANE
+from pewm_jax.config.nomad import PLANE, NomadConfig
 from pewm_jax.nn.layers import group_norm, linear
 from pewm_jax.types import Array, Params
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import BlocksConfig
+from pewm_jax.models.persist.config import BlocksConfig
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn import layers, placement
 from pewm_jax.nn.layers import linear, rms_norm

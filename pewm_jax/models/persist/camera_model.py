@@ -14,11 +14,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from pewm_jax.config import CameraModelConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.geometry.actions import CAMERA_NUMBERS, CAMERA_STEP_NUMBERS
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache
+from pewm_jax.models.persist.config import CameraModelConfig
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params
 

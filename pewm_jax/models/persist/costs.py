@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pewm_jax.config import BlocksConfig
 from pewm_jax.models.persist.blocks import Parts
+from pewm_jax.models.persist.config import BlocksConfig
 from pewm_jax.nn.costs import SPLIT, Costs, Product, Share
 
 

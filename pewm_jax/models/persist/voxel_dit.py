@@ -18,10 +18,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from pewm_jax.config import UserError, VoxelDiTConfig
+from pewm_jax.config import UserError
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache
+from pewm_jax.models.persist.config import VoxelDiTConfig
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.nn.layers import linear
 from pewm_jax.nn.tokens import patchify, unpatchify

@@ -18,13 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import UserError, VoxelRendererConfig
+from pewm_jax.config import UserError
 from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import resize_intrinsics
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache
+from pewm_jax.models.persist.config import VoxelRendererConfig
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.nn.layers import linear
 from pewm_jax.nn.tokens import patchify, unpatchify

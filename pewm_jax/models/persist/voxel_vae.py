@@ -22,7 +22,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import UserError, VoxelVAEConfig
+from pewm_jax.config import UserError
+from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.models.persist.voxel_vae_shapes import follows, shapes
 from pewm_jax.nn import placement
 from pewm_jax.nn.convolution import convolve_grid, halve_grid

@@ -7,7 +7,7 @@ import math
 
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import VoxelVAEConfig
+from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.nn.costs import Costs, Product, Share
 
 SHARDING = (

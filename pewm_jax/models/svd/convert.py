@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from pewm_jax.config import SVDUNetConfig, SVDVAEConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.io import published
 from pewm_jax.io.published import (
     CONV,
@@ -23,6 +23,8 @@ from pewm_jax.io.published import (
     rename,
 )
 from pewm_jax.models.svd import unet, vae
+from pewm_jax.models.svd.backbone import SVDUNetBackbone
+from pewm_jax.models.svd.vae_codec import SVDVAECodec
 
 UNET_CLASS = "UNetSpatioTemporalConditionModel"
 """The reference's class."""
@@ -46,7 +48,7 @@ _UNET_WITHOUT_EFFECT = {"sample_size": None, "num_frames": 25}
 """Settings that the network does not read, and what is written for them."""
 
 
-def unet_config_from_diffusers(values: dict[str, Any]) -> SVDUNetConfig:
+def unet_config_from_diffusers(values: dict[str, Any]) -> SVDUNetBackbone:
     """Read the settings of ``unet/config.json``; absent ones have diffusers' defaults.
 
     Raises:
@@ -78,7 +80,7 @@ def unet_config_from_diffusers(values: dict[str, Any]) -> SVDUNetConfig:
             f"The U-Net's projection_class_embeddings_input_dim {joint} is not a multiple of "
             f"addition_time_embed_dim {added_dim}; it holds one embedding per scalar."
         )
-    return SVDUNetConfig(
+    return SVDUNetBackbone(
         in_channels=_numbers(given, "in_channels", 1)[0],
         out_channels=_numbers(given, "out_channels", 1)[0],
         widths=widths,
@@ -92,7 +94,7 @@ def unet_config_from_diffusers(values: dict[str, Any]) -> SVDUNetConfig:
     )
 
 
-def unet_config_to_diffusers(config: SVDUNetConfig) -> dict[str, Any]:
+def unet_config_to_diffusers(config: SVDUNetBackbone) -> dict[str, Any]:
     """Write the settings of ``unet/config.json``, the inverse of reading them."""
     return {
         "_class_name": UNET_CLASS,
@@ -111,7 +113,7 @@ def unet_config_to_diffusers(config: SVDUNetConfig) -> dict[str, Any]:
     }
 
 
-def unet_entries(config: SVDUNetConfig) -> list[Entry]:
+def unet_entries(config: SVDUNetBackbone) -> list[Entry]:
     """Return one entry per tensor of the reference."""
     return [
         Entry(_unet_name(path), path, _transform(path, s))
@@ -200,7 +202,7 @@ _VAE_RULES = (
 )
 
 
-def vae_config_from_diffusers(values: dict[str, Any]) -> SVDVAEConfig:
+def vae_config_from_diffusers(values: dict[str, Any]) -> SVDVAECodec:
     """Read the settings of ``vae/config.json``; absent ones have diffusers' defaults.
 
     Raises:
@@ -222,7 +224,7 @@ def vae_config_from_diffusers(values: dict[str, Any]) -> SVDVAEConfig:
     factor = given["scaling_factor"]
     if isinstance(factor, bool) or not isinstance(factor, int | float):
         raise UserError(f"The VAE's scaling_factor is {factor!r}; it must be a number.")
-    return SVDVAEConfig(
+    return SVDVAECodec(
         in_channels=given["in_channels"],
         out_channels=given["out_channels"],
         latent_channels=given["latent_channels"],
@@ -232,7 +234,7 @@ def vae_config_from_diffusers(values: dict[str, Any]) -> SVDVAEConfig:
     )
 
 
-def vae_config_to_diffusers(config: SVDVAEConfig) -> dict[str, Any]:
+def vae_config_to_diffusers(config: SVDVAECodec) -> dict[str, Any]:
     """Write the settings of ``vae/config.json``, the inverse of reading them."""
     return {
         "_class_name": VAE_CLASS,
@@ -247,7 +249,7 @@ def vae_config_to_diffusers(config: SVDVAEConfig) -> dict[str, Any]:
     }
 
 
-def vae_entries(config: SVDVAEConfig) -> list[Entry]:
+def vae_entries(config: SVDVAECodec) -> list[Entry]:
     """Return one entry per tensor of the reference."""
     return [_vae_entry(path, shape) for path, shape in vae.layout(config).items()]
 
@@ -262,7 +264,7 @@ def _vae_entry(path: str, shape: tuple[int, ...]) -> Entry:
 UNET = Network(
     "unet",
     UNET_CLASS,
-    SVDUNetConfig,
+    SVDUNetBackbone,
     unet_config_from_diffusers,
     unet_config_to_diffusers,
     unet_entries,
@@ -271,7 +273,7 @@ UNET = Network(
 VAE = Network(
     "vae",
     VAE_CLASS,
-    SVDVAEConfig,
+    SVDVAECodec,
     vae_config_from_diffusers,
     vae_config_to_diffusers,
     vae_entries,

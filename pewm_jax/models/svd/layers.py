@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import SVDUNetConfig
+from pewm_jax.models.svd.config import SVDUNetConfig
 from pewm_jax.nn import layers
 from pewm_jax.nn.attention import multi_head_attention
 from pewm_jax.nn.layers import group_norm_affine, layer_norm, linear, mlp

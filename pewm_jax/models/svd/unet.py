@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import SVDUNetConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.models.svd import layers as svd_layers
+from pewm_jax.models.svd.config import SVDUNetConfig
 from pewm_jax.nn import layers, placement
 from pewm_jax.nn.parameters import Leaf, convolution, draw
 from pewm_jax.nn.parameters import norm as norm_leaves

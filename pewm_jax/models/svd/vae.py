@@ -15,8 +15,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import SVDVAEConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.models.svd import layers as svd_layers
+from pewm_jax.models.svd.config import SVDVAEConfig
 from pewm_jax.models.svd.layers import resnet_2d_leaves, resnet_leaves
 from pewm_jax.nn.attention import multi_head_attention
 from pewm_jax.nn.layers import linear

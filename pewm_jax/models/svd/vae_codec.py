@@ -6,59 +6,82 @@ not, as in the reference's pipeline.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Any, ClassVar
 
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import ModelConfig, SVDVAEConfig
+from pewm_jax.config.parts import Codec, Rules
 from pewm_jax.models.svd import vae as svd_vae
+from pewm_jax.models.svd.config import SVDVAEConfig
 from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.types import Array, Params
-
-SHARDING = (
-    (r"codec/.*/kernel", P(None, "fsdp")),
-    (r"codec/.*/(scale|bias|mix)", P()),
-)
-"""Weights are stored sharded and gathered for use; each device encodes its own clips."""
 
 PASSES = 60
 """How often encoding a frame reads or writes as many values as its widest array has."""
 HELD = 4
 """Peak memory of encoding a clip, in copies of its widest array."""
 
-init = svd_vae.init
 
+@dataclasses.dataclass(frozen=True)
+class SVDVAECodec(SVDVAEConfig, Codec):
+    """The autoencoder of Stable Video Diffusion; its weights come from a converted checkpoint."""
 
-def encode(
-    config: SVDVAEConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
-) -> Array:
-    """Encode a video to the mean of its latents; see ``pewm_jax.codecs.rgbd.encode``."""
-    mean = svd_vae.encode(config, params, video_BTHWC)
-    return mean if condition else mean * config.scaling_factor
-
-
-def decode(config: SVDVAEConfig, params: Params, latents_BthwC: Array) -> Array:
-    """Decode scaled latents to as many frames, all of a clip together."""
-    return svd_vae.decode(config, params, latents_BthwC / config.scaling_factor)
-
-
-def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return the costs of encoding the clip and its first frame, and their depth if it is asked."""
-    config, clip = model.codec, model.clip
-    assert isinstance(config, SVDVAEConfig)
-    kinds = 1 + config.depth
-    frames = kinds * (clip.frames + 1)
-    widest = clip.height * clip.width * config.widths[0] * share.activation_bytes
-    cells = clip.height * clip.width // config.spatial**2
-    attention = frames * 2 * cells**2 * config.widths[-1]
-    return Costs(
-        products=(
-            Product("codec", "convolution", frames * _encode_macs(config, clip.height, clip.width)),
-            Product("codec", "attention", attention),
-        ),
-        streamed=PASSES * share.clips * frames * widest,
-        held=HELD * kinds * clip.frames * widest,
+    SHARDING: ClassVar[Rules] = (
+        (r"codec/.*/kernel", P(None, "fsdp")),
+        (r"codec/.*/(scale|bias|mix)", P()),
     )
+    """Weights are stored sharded and gathered for use; each device encodes its own clips."""
+    DEPTH_AS_GREY: ClassVar[bool] = True
+    CONVERTED: ClassVar[bool] = True
+
+    @property
+    def framewise(self) -> bool:
+        """Whether a latent frame is decoded by itself: no, with its neighbours."""
+        return False
+
+    @property
+    def rgb_channels(self) -> int:
+        """Latent channels of colour."""
+        return self.latent_channels
+
+    @property
+    def depth_channels(self) -> int:
+        """Latent channels of depth."""
+        return self.latent_channels * self.depth
+
+    def init(self, key: Array) -> Params:
+        """Return random parameters."""
+        return svd_vae.init(self, key)
+
+    def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
+        """Encode a video to the mean of its latents."""
+        mean = svd_vae.encode(self, params, video_BTHWC)
+        return mean if condition else mean * self.scaling_factor
+
+    def decode(self, params: Params, latents_BthwC: Array) -> Array:
+        """Decode scaled latents to as many frames, all of a clip together."""
+        return svd_vae.decode(self, params, latents_BthwC / self.scaling_factor)
+
+    def costs(self, model: Any, share: Share) -> Costs:
+        """Return the costs of encoding the clip and its first frame, and depth with ``depth``."""
+        clip = model.clip
+        kinds = 1 + self.depth
+        frames = kinds * (clip.frames + 1)
+        widest = clip.height * clip.width * self.widths[0] * share.activation_bytes
+        cells = clip.height * clip.width // self.spatial**2
+        attention = frames * 2 * cells**2 * self.widths[-1]
+        return Costs(
+            products=(
+                Product(
+                    "codec", "convolution", frames * _encode_macs(self, clip.height, clip.width)
+                ),
+                Product("codec", "attention", attention),
+            ),
+            streamed=PASSES * share.clips * frames * widest,
+            held=HELD * kinds * clip.frames * widest,
+        )
 
 
 def _encode_macs(config: SVDVAEConfig, height: int, width: int) -> float:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from typing import Any, ClassVar
 
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import ModelConfig, WanVAEConfig
+from pewm_jax.config.parts import Codec, Rules
+from pewm_jax.errors import require
 from pewm_jax.models.wan import vae as wan_vae
+from pewm_jax.models.wan.config import WanVAEConfig
 from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.types import Array, Params
-
-SHARDING = (
-    (r"codec/.*/kernel", P(None, "fsdp")),
-    (r"codec/.*/(scale|bias)", P()),
-)
-"""Weights are stored sharded and gathered for use; each device encodes its own clips."""
 
 PASSES = 60
 """How often encoding a frame reads or writes as many values as its widest array has."""
@@ -24,41 +22,74 @@ HELD = 6.0
 CHUNK = 4
 """Frames that are encoded at a time."""
 
-init = wan_vae.init
 
+@dataclasses.dataclass(frozen=True)
+class WanVAECodec(WanVAEConfig, Codec):
+    """Wan's video autoencoder; its weights come from a converted checkpoint."""
 
-def encode(
-    config: WanVAEConfig, params: Params, video_BTHWC: Array, *, condition: bool = False
-) -> Array:
-    """Encode a video to the mean of its latents; see ``pewm_jax.codecs.rgbd.encode``."""
-    del condition
-    mean, _ = wan_vae.encode(config, params, video_BTHWC)
-    return wan_vae.normalise(config, mean)
-
-
-def decode(config: WanVAEConfig, params: Params, latents_BthwC: Array) -> Array:
-    """Decode normalised latents to q·(t − 1) + 1 frames."""
-    return wan_vae.decode(config, params, wan_vae.restore(config, latents_BthwC))
-
-
-def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return the costs of encoding the clip and its first frame, and their depth if it is asked."""
-    config, clip = model.codec, model.clip
-    assert isinstance(config, WanVAEConfig)
-    kinds = 1 + config.depth
-    macs = attention = 0.0
-    for frames in (clip.frames, 1):
-        macs += encode_macs(config, clip.height, clip.width, frames)
-        attention += _attention(config, clip.height, clip.width, frames)
-    widest = clip.height * clip.width * config.base_width * share.activation_bytes
-    return Costs(
-        products=(
-            Product("codec", "convolution", kinds * macs),
-            Product("codec", "attention", kinds * attention),
-        ),
-        streamed=PASSES * share.clips * kinds * (clip.frames + 1) * widest,
-        held=HELD * kinds * CHUNK * widest,
+    SHARDING: ClassVar[Rules] = (
+        (r"codec/.*/kernel", P(None, "fsdp")),
+        (r"codec/.*/(scale|bias)", P()),
     )
+    """Weights are stored sharded and gathered for use; each device encodes its own clips."""
+    DEPTH_AS_GREY: ClassVar[bool] = True
+    CONVERTED: ClassVar[bool] = True
+
+    @property
+    def framewise(self) -> bool:
+        """Whether a latent frame is decoded by itself: no, with those before it."""
+        return False
+
+    @property
+    def rgb_channels(self) -> int:
+        """Latent channels of colour."""
+        return self.latent_channels
+
+    @property
+    def depth_channels(self) -> int:
+        """Latent channels of depth."""
+        return self.latent_channels * self.depth
+
+    def check(self, model: Any) -> None:
+        """Refuse clips that are not encoded four frames at a time."""
+        super().check(model)
+        require(
+            model.clip.frames % 4 == 1,
+            f"clip.frames is {model.clip.frames}: this codec encodes four frames at a time after "
+            "the first, so use 4k + 1 frames (5, 9, …).",
+        )
+
+    def init(self, key: Array) -> Params:
+        """Return random parameters."""
+        return wan_vae.init(self, key)
+
+    def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
+        """Encode a video to the mean of its latents."""
+        del condition
+        mean, _ = wan_vae.encode(self, params, video_BTHWC)
+        return wan_vae.normalise(self, mean)
+
+    def decode(self, params: Params, latents_BthwC: Array) -> Array:
+        """Decode normalised latents to q·(t − 1) + 1 frames."""
+        return wan_vae.decode(self, params, wan_vae.restore(self, latents_BthwC))
+
+    def costs(self, model: Any, share: Share) -> Costs:
+        """Return the costs of encoding the clip and its first frame, and depth with ``depth``."""
+        clip = model.clip
+        kinds = 1 + self.depth
+        macs = attention = 0.0
+        for frames in (clip.frames, 1):
+            macs += encode_macs(self, clip.height, clip.width, frames)
+            attention += _attention(self, clip.height, clip.width, frames)
+        widest = clip.height * clip.width * self.base_width * share.activation_bytes
+        return Costs(
+            products=(
+                Product("codec", "convolution", kinds * macs),
+                Product("codec", "attention", kinds * attention),
+            ),
+            streamed=PASSES * share.clips * kinds * (clip.frames + 1) * widest,
+            held=HELD * kinds * CHUNK * widest,
+        )
 
 
 def encode_macs(config: WanVAEConfig, height: int, width: int, frames: int) -> float:

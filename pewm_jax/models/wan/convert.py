@@ -10,8 +10,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from pewm_jax.config import UserError, WanVAEConfig
-from pewm_jax.config.wan_vae import MEAN_16, STD_16
+from pewm_jax.config import UserError
 from pewm_jax.io import published
 from pewm_jax.io.published import (
     CONV,
@@ -24,6 +23,8 @@ from pewm_jax.io.published import (
     rename,
 )
 from pewm_jax.models.wan import vae
+from pewm_jax.models.wan.codec import WanVAECodec
+from pewm_jax.models.wan.config import MEAN_16, STD_16
 
 CLASS = "AutoencoderKLWan"
 """The reference's class."""
@@ -53,7 +54,7 @@ _WITHOUT_EFFECT = ("dropout", "scale_factor_temporal", "scale_factor_spatial")
 """Settings that do not change what the network computes, unless in tiles."""
 
 
-def config_from_diffusers(values: Mapping[str, Any]) -> WanVAEConfig:
+def config_from_diffusers(values: Mapping[str, Any]) -> WanVAECodec:
     """Read the settings of ``vae/config.json``; absent ones have diffusers' defaults.
 
     Raises:
@@ -66,7 +67,7 @@ def config_from_diffusers(values: Mapping[str, Any]) -> WanVAEConfig:
     decoder = given["decoder_base_dim"]
     if decoder is not None and type(decoder) is not int:
         raise UserError(f"{WHAT}'s decoder_base_dim is {decoder!r}; it must be a whole number.")
-    return WanVAEConfig(
+    return WanVAECodec(
         in_channels=given["in_channels"],
         out_channels=given["out_channels"],
         latent_channels=given["z_dim"],
@@ -80,7 +81,7 @@ def config_from_diffusers(values: Mapping[str, Any]) -> WanVAEConfig:
     )
 
 
-def config_to_diffusers(config: WanVAEConfig) -> dict[str, Any]:
+def config_to_diffusers(config: WanVAECodec) -> dict[str, Any]:
     """Write the settings of ``vae/config.json``, the inverse of reading them.
 
     The form of the convolutions is not part of it.
@@ -105,7 +106,7 @@ def config_to_diffusers(config: WanVAEConfig) -> dict[str, Any]:
     }
 
 
-def entries(config: WanVAEConfig) -> list[Entry]:
+def entries(config: WanVAECodec) -> list[Entry]:
     """Return one entry per tensor of the reference."""
     return [
         Entry(_name(config, path), path, _transform(path, shape))
@@ -125,7 +126,7 @@ def _transform(path: str, shape: tuple[int, ...]) -> Transform:
     return TIME_CONV if len(shape) == 3 else CONV
 
 
-def _name(config: WanVAEConfig, path: str) -> str:
+def _name(config: WanVAECodec, path: str) -> str:
     """Turn ``encoder/down_1/resnet_0/conv1/kernel`` into the reference's name.
 
     On the way down it numbers the blocks of all levels in one row.
@@ -157,5 +158,5 @@ def _name(config: WanVAEConfig, path: str) -> str:
 
 
 VAE = Network(
-    "vae", CLASS, WanVAEConfig, config_from_diffusers, config_to_diffusers, entries, vae.init
+    "vae", CLASS, WanVAECodec, config_from_diffusers, config_to_diffusers, entries, vae.init
 )

@@ -7,16 +7,16 @@ import math
 from typing import Literal
 
 from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.cosmos import CosmosConfig
 from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.mesh import MeshConfig
-from pewm_jax.config.svd_unet import SVDUNetConfig
-from pewm_jax.config.svd_vae import SVDVAEConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig
-from pewm_jax.config.wan_vae import WanVAEConfig
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.edm import EDMConfig
+from pewm_jax.models.cosmos.backbone import CosmosBackbone
+from pewm_jax.models.svd.backbone import SVDUNetBackbone
+from pewm_jax.models.svd.vae_codec import SVDVAECodec
+from pewm_jax.models.wan.codec import WanVAECodec
 
 NOISE = EDMConfig(sigma_data=1.0, sigma_max=700.0, target="v", sample_steps=25)
 """The published scheduler of Stable Video Diffusion."""
@@ -29,8 +29,8 @@ COSMOS_CLIP = (17, 480, 640)
 
 
 def experiment(
-    unet: SVDUNetConfig,
-    vae: SVDVAEConfig,
+    unet: SVDUNetBackbone,
+    vae: SVDVAECodec,
     noise: EDMConfig = NOISE,
     *,
     run: str,
@@ -76,8 +76,8 @@ def experiment(
 
 
 def cosmos_experiment(
-    transformer: CosmosConfig,
-    vae: WanVAEConfig,
+    transformer: CosmosBackbone,
+    vae: WanVAECodec,
     noise: EDMConfig = COSMOS_NOISE,
     *,
     run: str,

@@ -12,8 +12,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import VoxelVAEConfig
 from pewm_jax.models.persist import voxel_vae
+from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.nn.tokens import patchify
 from pewm_jax.types import Array, Params
 

@@ -15,13 +15,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import CameraModelConfig, VoxelDiTConfig, VoxelRendererConfig, VoxelVAEConfig
 from pewm_jax.config.parts import Noise
 from pewm_jax.diffusion.flow import FrameFlowConfig
 from pewm_jax.geometry.actions import camera_numbers, camera_steps_between
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer
 from pewm_jax.models.persist import voxel_vae as voxel_vae_model
+from pewm_jax.models.persist.config import (
+    CameraModelConfig,
+    VoxelDiTConfig,
+    VoxelRendererConfig,
+    VoxelVAEConfig,
+)
 from pewm_jax.types import Array, Camera, Params
 
 Measured = dict[str, Array]

@@ -39,7 +39,7 @@ def init(model: PersistConfig, key: Array, networks: int = len(persist_nets.NETW
     codec_key, key = jax.random.split(key)
     names = persist_nets.NETWORKS[:networks]
     made = {"codec": model.codec.init(codec_key)}
-    return made | persist_nets.init(model.backbone, key, names)  # type: ignore[arg-type]
+    return made | model.backbone.init(key, names)  # type: ignore[call-arg, arg-type]
 
 
 def _of(

@@ -24,7 +24,6 @@ from pewm_jax.config import PersistConfig, UserError
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import class_edit, class_grid
 from pewm_jax.memory.class_grid import ClassGrid
-from pewm_jax.models.persist import nets as persist_nets
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds import checks
 from pewm_jax.worlds.control import control_of
@@ -51,7 +50,7 @@ def stages(model: PersistConfig) -> tuple[Stage, ...]:
 
 def sharding(model: PersistConfig) -> tuple[tuple[str, Any], ...]:
     """Return the rules of the four networks and of the codec."""
-    return (*persist_nets.SHARDING, *model.codec.SHARDING)
+    return (*model.backbone.SHARDING, *model.codec.SHARDING)
 
 
 def split_heads(model: PersistConfig, stage: Stage) -> dict[str, int]:

@@ -32,7 +32,7 @@ def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
         return {"codec": _gate(model, config.train.gate_lpips > 0)}
     trained = any(re.fullmatch(pattern, "backbone/any") for pattern in stage.trained)
     found = {
-        "backbone": functions(model.backbone).costs(model, share, trained=trained),
+        "backbone": model.backbone.costs(model, share, trained=trained),
         "control": model.control.costs(model, share, trained=trained),
         "codec": model.codec.costs(model, share),
     }

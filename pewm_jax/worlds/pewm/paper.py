@@ -9,7 +9,6 @@ import dataclasses
 from typing import Literal
 
 from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.dit import DiTConfig
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.memory import VoxelConfig
 from pewm_jax.config.mesh import MeshConfig
@@ -18,6 +17,7 @@ from pewm_jax.config.parts import Codec, Encoder, Noise
 from pewm_jax.config.reader import AttentionConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 
 CLIP = ClipConfig(frames=9, height=512, width=512)
 """The paper's clip."""
@@ -30,7 +30,7 @@ them evenly."""
 
 
 def experiment(
-    backbone: DiTConfig,
+    backbone: DiTBackbone,
     codec: Codec,
     noise: Noise,
     *,
@@ -95,7 +95,7 @@ def experiment(
     )
 
 
-def reader_for(backbone: DiTConfig) -> AttentionConfig:
+def reader_for(backbone: DiTBackbone) -> AttentionConfig:
     """Return the settings of memory blocks: the paper's, but no wider than a small transformer."""
     head_dim = min(READER.head_dim, max(8, backbone.head_dim // 8 * 8))
     return dataclasses.replace(READER, heads=min(READER.heads, backbone.heads), head_dim=head_dim)

@@ -1,11 +1,10 @@
-"""The settings of Wan's video autoencoder, which Cosmos-Predict2 uses; defaults: as published."""
+"""Settings of Wan's video autoencoder, which Cosmos-Predict2 uses; defaults: as published."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
-from pewm_jax.config.parts import Codec
 from pewm_jax.errors import require, require_positive
 
 MEAN_16 = (
@@ -19,11 +18,8 @@ STD_16 = (
 
 
 @dataclasses.dataclass(frozen=True)
-class WanVAEConfig(Codec):
+class WanVAEConfig:
     """Wan 2.1's video autoencoder (arXiv 2503.20314): causal, four frames to a latent."""
-
-    DEPTH_AS_GREY: ClassVar[bool] = True
-    CONVERTED: ClassVar[bool] = True
 
     in_channels: int = 3
     """Channels of an input frame."""
@@ -61,30 +57,6 @@ class WanVAEConfig(Codec):
     def temporal(self) -> int:
         """Frames per latent after the first."""
         return 2 ** sum(self.halves_time)
-
-    @property
-    def framewise(self) -> bool:
-        """Whether a latent frame is decoded by itself: no, with those before it."""
-        return False
-
-    @property
-    def rgb_channels(self) -> int:
-        """Latent channels of colour."""
-        return self.latent_channels
-
-    @property
-    def depth_channels(self) -> int:
-        """Latent channels of depth."""
-        return self.latent_channels * self.depth
-
-    def check(self, model: Any) -> None:
-        """Refuse clips that are not encoded four frames at a time."""
-        super().check(model)
-        require(
-            model.clip.frames % 4 == 1,
-            f"clip.frames is {model.clip.frames}: this codec encodes four frames at a time after "
-            "the first, so use 4k + 1 frames (5, 9, …).",
-        )
 
     def __post_init__(self):
         """Validate."""

@@ -1,20 +1,18 @@
-"""The settings of Stable Video Diffusion's U-Net; the defaults are the published sizes."""
+"""Settings of Stable Video Diffusion's networks; the defaults are the published sizes."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
-from pewm_jax.config.clip_vision import CLIPVisionConfig
-from pewm_jax.config.parts import Backbone
 from pewm_jax.errors import require, require_positive
+from pewm_jax.models.clip.config import CLIPVisionConfig
 
 GROUPS = 32
 """Groups of every group norm in the reference."""
 
 
 @dataclasses.dataclass(frozen=True)
-class SVDUNetConfig(Backbone):
+class SVDUNetConfig:
     """A U-Net over space and time in the form of Stable Video Diffusion (arXiv 2311.15127).
 
     As a backbone it takes any number of channels: those that codec and control have. It has no
@@ -53,24 +51,6 @@ class SVDUNetConfig(Backbone):
     """Recompute the activations of each residual block and attention in the backward pass: less
     memory, more work."""
 
-    def check(self, model: Any) -> None:
-        """Refuse a model around it that gives it what it cannot take; any size will do."""
-        require(
-            self.added == 3,
-            f"backbone.added is {self.added}: a world model gives three scalars, frames per "
-            "second, motion bucket and the noise of the image; use 3.",
-        )
-        require(
-            self.image.projection == self.image_dim,
-            f"backbone.image.projection is {self.image.projection} and backbone.image_dim is "
-            f"{self.image_dim}: the image's embedding is attended to, so use the same.",
-        )
-        require(
-            not model.noise.per_frame,
-            "noise.per_frame is true, and this backbone takes one noise level for a clip: use "
-            "false.",
-        )
-
     @property
     def time_dim(self) -> int:
         """Channels of the time embedding, to which a modulation is added."""
@@ -104,3 +84,55 @@ class SVDUNetConfig(Backbone):
             f"backbone.added_dim is {self.added_dim}: use an even number.",
         )
         require(self.fps > 0, f"backbone.fps is {self.fps}: use a number above 0.")
+
+
+@dataclasses.dataclass(frozen=True)
+class SVDVAEConfig:
+    """An image encoder and a decoder over space and time (arXiv 2311.15127, appendix D)."""
+
+    in_channels: int = 3
+    """Channels of an input frame."""
+    out_channels: int = 3
+    """Channels of an output frame."""
+    latent_channels: int = 4
+    """Channels of a latent."""
+    widths: tuple[int, ...] = (128, 256, 512, 512)
+    """Channels of each level of the encoder; each level but the last halves height and width."""
+    resnets: int = 2
+    """Residual blocks per level of the encoder; the decoder has one more."""
+    scaling_factor: float = 0.18215
+    """Factor that gives latents unit variance for the diffusion model. The latents of the
+    conditioning image stay without it."""
+    depth: bool = True
+    """Whether depth is encoded too, as grey pictures by the same weights, in as many channels more;
+    Stable Video Diffusion itself knows colour alone."""
+
+    @property
+    def spatial(self) -> int:
+        """Pixels per latent cell, along height and along width."""
+        return 2 ** (len(self.widths) - 1)
+
+    @property
+    def temporal(self) -> int:
+        """Frames per latent frame after the first: every frame has its own latents."""
+        return 1
+
+    def __post_init__(self):
+        """Validate."""
+        require(len(self.widths) > 0, "codec.widths is empty: name at least one level's channels.")
+        require_positive(self, "codec", "in_channels", "out_channels", "latent_channels")
+        require(
+            self.resnets >= 2,
+            f"codec.resnets is {self.resnets}: use at least 2, or the decoder's bottom has no "
+            "attention.",
+        )
+        for width in self.widths:
+            require(
+                width >= 1 and width % GROUPS == 0,
+                f"codec.widths holds {width}, which is not a multiple of {GROUPS} groups.",
+            )
+        require(
+            self.scaling_factor > 0,
+            f"codec.scaling_factor is {self.scaling_factor}: use the checkpoint's positive factor "
+            "(0.18215).",
+        )

@@ -1,23 +1,19 @@
-"""The settings of Cosmos' transformer, and the published ones of Cosmos-Predict2."""
+"""Settings of Cosmos' transformer; the defaults are the published ones of Cosmos-Predict2-2B."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
-from pewm_jax.config.parts import Backbone, InjectionPoints
 from pewm_jax.errors import require, require_positive
 
 
 @dataclasses.dataclass(frozen=True)
-class CosmosConfig(Backbone):
+class CosmosConfig:
     """A diffusion transformer in Cosmos' form (arXiv 2501.03575); defaults: Predict2-2B for video.
 
-    ``COSMOS_2B`` and ``COSMOS_14B`` are the published video models. As a backbone it holds observed
-    frames at their latents, and guidance is on its text.
+    ``CosmosBackbone`` makes a denoiser of it.
     """
-
-    GUIDED_BY_TEXT: ClassVar[bool] = True
 
     in_channels: int = 17
     """Channels of the input without the padding mask: noisy latents, and 1 for the mask that marks
@@ -65,26 +61,6 @@ class CosmosConfig(Backbone):
     """Recompute activations in the backward pass: less memory, about a third more time."""
 
     @property
-    def places(self) -> InjectionPoints:
-        """Where a memory reader runs: after every block."""
-        return InjectionPoints(self.layers, self.width, self.width, self.patch, self.patch_t)
-
-    @property
-    def text_shape(self) -> tuple[int, int]:
-        """(length, channels) of the text tokens."""
-        return self.text_length, self.raw_text_dim or self.text_dim
-
-    @property
-    def stores_prompt(self) -> bool:
-        """Whether embeddings of prompts are stored with the weights."""
-        return self.prompt == "stored"
-
-    @property
-    def split_heads(self) -> int:
-        """The number that ``train.mesh.tensor`` must divide."""
-        return self.heads
-
-    @property
     def width(self) -> int:
         """Model width D."""
         return self.heads * self.head_dim
@@ -99,25 +75,6 @@ class CosmosConfig(Backbone):
         """Tokens along time, height and width that positions reach."""
         frames, rows, columns = self.max_size
         return frames // self.patch_t, rows // self.patch, columns // self.patch
-
-    def shown_channels(self, model: Any) -> int:
-        """Return 1: a mask marks observed frames, whose latents stand where noisy ones would."""
-        del model
-        return 1
-
-    def check(self, model: Any) -> None:
-        """Refuse noise in other units than the network's, and frames that share a token."""
-        super().check(model)
-        require(
-            model.noise.velocity_in_unit_time,
-            "this backbone (cosmos) is told times from 0 to 1 and predicts velocities: use "
-            "noise.kind edm with noise.target flow, or noise.kind flow with noise.scale 1.",
-        )
-        require(
-            self.patch_t == 1,
-            f"backbone.patch_t is {self.patch_t}: in a world model observed frames have a time of "
-            "their own, so a token is of one latent frame; use 1.",
-        )
 
     def __post_init__(self):
         """Validate."""
@@ -148,9 +105,3 @@ class CosmosConfig(Backbone):
             min(self.max_grid) >= 1,
             f"backbone.max_size {self.max_size} is smaller than one token.",
         )
-
-
-COSMOS_2B = CosmosConfig()
-"""Cosmos-Predict2-2B-Video2World."""
-COSMOS_14B = CosmosConfig(layers=36, heads=40, rope_scale=(20 / 24, 2.0, 2.0))
-"""Cosmos-Predict2-14B-Video2World."""
