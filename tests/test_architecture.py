@@ -69,7 +69,7 @@ HOMES = {
     "tyro": {"config", "convert/options", "data", "memory/feature_command"},
     "viser": {"play/extra"},
     "wandb": {"train/wandb_log"},
-    "websockets": {"play/visitors"},
+    "websockets": {"play/serving"},
 }
 """Libraries and the only files and folders that import them."""
 FORMER_COMMANDS = {f"{name}/__main__" for name in ("convert", "data", "memory")}

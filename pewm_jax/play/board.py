@@ -1,4 +1,4 @@
-"""The picture of a step: what is imagined, large; under it the truth, and without memory."""
+"""The picture of a step: the imagined frame, the ground truth and the frame without memory."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ DARK, TILE, LIGHT, QUIET, ACCENT = (
     (140, 150, 166),
     (96, 200, 255),
 )
-"""Background, empty pictures, text, secondary text, and the colour of what is imagined."""
+"""Colours of the background, empty pictures, text, secondary text, and of imagined frames."""
 WIDTH, GAP, LINE = 720, 12, 30
 """Width of a board, space between pictures, and height of a caption, pixels."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pictures:
-    """What is seen at a step; uint8 (H, W, 3).
+    """The frames of a step; uint8 (H, W, 3).
 
     Attributes:
-        imagined: with the memory.
-        truth: what is really there; None where nobody knows.
-        blind: without memory; None for a model that has none.
-        observed: whether ``imagined`` is still what was really seen, before the first step.
+        imagined: the frame imagined with memory.
+        truth: the ground truth; None if it is unknown.
+        blind: the frame imagined without memory; None for a model that has no memory.
+        observed: whether ``imagined`` is an observed frame, before the first step.
     """
 
     imagined: np.ndarray
@@ -44,11 +44,11 @@ class Pictures:
 
 
 def pictures(engine: Engine, session: Session) -> Pictures:
-    """Return what is seen at present."""
+    """Return the present frames of a drive."""
     camera = session.world.frame.camera
     here = Camera(np.asarray(camera.intrinsics_4), pose(session)[None])
     real = places.truth(session.place, here, *engine.size)
-    blind = as_bytes(np.asarray(session.blind.frame.rgb_THWC[0])) if engine.forgets else None
+    blind = as_bytes(np.asarray(session.blind.frame.rgb_THWC[0])) if engine.has_memory else None
     return Pictures(
         as_bytes(np.asarray(session.world.frame.rgb_THWC[0])),
         None if real is None else real.rgb_THWC[0],
@@ -61,8 +61,8 @@ def board(shown: Pictures, name: str) -> np.ndarray:
     """Draw a step as one uint8 picture with even sides.
 
     Args:
-        shown: what is seen.
-        name: of the model, for the caption.
+        shown: the frames.
+        name: name of the model, for the caption.
     """
     tall, wide = shown.imagined.shape[:2]
     below = [("truth", shown.truth), ("without memory", shown.blind)]
@@ -72,7 +72,7 @@ def board(shown: Pictures, name: str) -> np.ndarray:
     height = LINE + high + (LINE + low if below else 0)
     canvas = Image.new("RGB", (WIDTH, height + height % 2), DARK)
     draw = ImageDraw.Draw(canvas)
-    title = "really seen" if shown.observed else f"imagined by {name}"
+    title = "observed" if shown.observed else f"imagined by {name}"
     draw.ellipse([4, LINE / 2 - 5, 14, LINE / 2 + 5], fill=QUIET if shown.observed else ACCENT)
     write(draw, (24, LINE / 2), title, size=18, colour=LIGHT)
     canvas.paste(_large(shown.imagined, (WIDTH, high)), (0, LINE))
@@ -84,7 +84,7 @@ def board(shown: Pictures, name: str) -> np.ndarray:
 
 
 def waiting(text: str) -> np.ndarray:
-    """Draw a board that says what is being waited for."""
+    """Draw a board that shows a waiting message."""
     canvas = Image.new("RGB", (WIDTH, LINE + WIDTH), DARK)
     draw = ImageDraw.Draw(canvas)
     draw.rectangle([0, LINE, WIDTH, LINE + WIDTH], fill=TILE)
@@ -93,7 +93,7 @@ def waiting(text: str) -> np.ndarray:
 
 
 def _large(image: np.ndarray, size: tuple[int, int]) -> Image.Image:
-    """Enlarge smoothly, with a little of the sharpness that enlarging takes."""
+    """Enlarge an image smoothly and sharpen it a little."""
     big = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC)
     soft = cv2.GaussianBlur(big, (0, 0), size[0] / image.shape[1] / 2)
     return Image.fromarray(cv2.addWeighted(big, 1.4, soft, -0.4, 0))

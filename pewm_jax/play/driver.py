@@ -1,8 +1,8 @@
-"""A thread that drives: it takes events, tells what came of them, and looks ahead while it waits.
+"""A thread that drives: it handles requests, reports their results, and imagines steps ahead.
 
-Steps that were asked for while one is imagined are not kept: the last one wins, so that a key that
-is held down and let go leaves nothing behind. All else is done in order. What goes wrong becomes
-one sentence, and the world stays as it was.
+Of the steps requested while one is being imagined, only the newest is kept, so that releasing a key
+stops the drive. Other requests are handled in order. An error becomes one message, and the world
+stays as it was.
 """
 
 from __future__ import annotations
@@ -12,34 +12,37 @@ import contextlib
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.play import board, kept, places, session, ticking
-from pewm_jax.play.drive_film import DriveFilm
+from pewm_jax.play import board, places, saved, session
 from pewm_jax.play.engine import Engine
-from pewm_jax.play.requests import (
+from pewm_jax.play.saved import DriveFilm
+from pewm_jax.play.session import (
     Begin,
+    Drive,
+    Event,
     GoTo,
     Load,
+    PageUpdate,
     Record,
     Request,
     Sampler,
     Save,
-    Shown,
+    Session,
     Undo,
+    Walls,
 )
-from pewm_jax.play.session import Drive, Event, Session, Walls
 from pewm_jax.play.settings import Start
 from pewm_jax.types import WorldState
 
 MOST_UNDO, MOST_WAITING, MOST_WAY = 4, 32, 64
-"""Edits that can be undone, requests that may wait, and steps that one drag may take."""
+"""Largest numbers of edits that can be undone, of waiting requests, and of steps per drag."""
 NEWEST = ((Drive, GoTo), (Walls,), (Sampler,), (Begin,))
-"""Kinds of requests of which only the newest waits: it replaces an earlier one of its group."""
+"""Groups of requests of which only the newest waits: it replaces an earlier one of its group."""
 PAUSE_S = 0.1
 """Seconds for a browser on the same machine to draw before the next step is imagined ahead."""
 PATIENCE_S = 5.0
@@ -53,7 +56,7 @@ class Driver:
         self,
         load: Callable[[], Engine],
         start: Start,
-        show: Callable[[Shown], None],
+        show: Callable[[PageUpdate], None],
         folder: Path,
         *,
         ahead: bool = True,
@@ -61,11 +64,11 @@ class Driver:
         """Begin to load the model.
 
         Args:
-            load: gives the model; called in the thread, it may take long.
+            load: returns the model; called in the thread, as it may take long.
             start: where the drive begins.
-            show: told of everything, in the thread.
-            folder: of saved worlds and videos.
-            ahead: imagine the likely next steps while nobody asks for anything.
+            show: receives all updates, in the thread.
+            folder: folder of saved worlds and videos.
+            ahead: imagine the likely next steps while no requests wait.
         """
         self._load, self._show, self._folder = load, show, folder
         self._looks_ahead = ahead
@@ -90,14 +93,14 @@ class Driver:
         return self._engine
 
     def tell(self, sentence: str) -> None:
-        """Show a sentence about what cannot be done."""
+        """Show an error message."""
         self._say(sentence, failed=True)
 
     def put(self, request: Request) -> None:
-        """Ask for something; returns at once.
+        """Queue a request; return at once.
 
-        A request replaces an earlier one of its group (``NEWEST``) that still waits. A request that
-        finds ``MOST_WAITING`` others waiting is dropped, and the page says so.
+        A request replaces an earlier one of its group (``NEWEST``) that still waits. If
+        ``MOST_WAITING`` others wait, the request is dropped and the page shows a message.
         """
         with self._changed:
             group = next((kinds for kinds in NEWEST if isinstance(request, kinds)), ())
@@ -114,9 +117,9 @@ class Driver:
             )
 
     def close(self) -> None:
-        """End the thread after what it is doing, and finish a video that is being recorded.
+        """End the thread after its present work, and finish a video that is being recorded.
 
-        Waits ``PATIENCE_S`` at most: what compiles is not waited for.
+        Waits at most ``PATIENCE_S``, because compilations may take longer.
         """
         with self._changed:
             self._ended = True
@@ -124,7 +127,7 @@ class Driver:
         self._thread.join(PATIENCE_S)
 
     def wait(self, seconds: float) -> bool:
-        """Wait until there is nothing left to do; tells whether that came about in time."""
+        """Wait until all requests are done; return whether that happened in time."""
         return self._idle.wait(seconds)
 
     def _run(self) -> None:
@@ -142,34 +145,34 @@ class Driver:
         self._guarded(self._end_film)
 
     def _rest(self) -> None:
-        """Wait, using no processor, until something is asked for."""
+        """Sleep until a request arrives."""
         with self._changed:
             if not self._waiting and not self._ended:
                 self._idle.set()
                 self._changed.wait()
 
     def _asked_within(self, seconds: float) -> bool:
-        """Wait a moment; tells, at once, if something is asked for."""
+        """Wait some seconds for a request; return whether one has arrived."""
         with self._changed:
             return self._changed.wait_for(lambda: bool(self._waiting) or self._ended, seconds)
 
     def _guarded(self, work: Callable[[], None]) -> None:
-        """Do something; an error becomes a sentence."""
+        """Call a function; show its error as a message."""
         try:
             work()
         except UserError as error:
             self._todo.clear()
             self._say(str(error), failed=True)
-        except Exception as error:  # noqa: BLE001 - whatever it is, the page must go on
+        except Exception as error:  # noqa: BLE001 - no error may stop the page
             self._todo.clear()
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             self._say(
-                f"That failed ({type(error).__name__}: {reason}); the world is as it was.",
+                f"That failed ({type(error).__name__}: {reason}); the world is unchanged.",
                 failed=True,
             )
 
     def _take(self, request: Request, asked: float) -> None:
-        """Do what one request asks for."""
+        """Handle one request."""
         if isinstance(request, Begin):
             self._begin(request.start)
             return
@@ -186,8 +189,8 @@ class Driver:
             parts = places.way(now.planar_3, target, steps.step_m, steps.turn_deg)
             if len(parts) > MOST_WAY:
                 self._say(
-                    f"That place is {len(parts)} steps away: driving the first {MOST_WAY}; drag "
-                    "again from there."
+                    f"That place is {len(parts)} steps away: driving the first {MOST_WAY} steps. "
+                    "Drag again from there."
                 )
             steps_3 = parts[:MOST_WAY].tolist()
             self._todo = collections.deque(Drive((x, y, turn)) for x, y, turn in steps_3)
@@ -199,20 +202,20 @@ class Driver:
             self._edit(engine, now, request, asked)
 
     def _keep(self, engine: Engine, now: Session, request: Save | Load | Undo) -> None:
-        """Save a world, load one, or go back to one."""
+        """Save a world, load one, or undo an edit."""
         if isinstance(request, Save):
-            path = kept.save(engine, now.world, self._folder, request.name)
+            path = saved.save(engine, now.world, self._folder, request.name)
             self._say(f"Saved this world as {request.name!r}.", link=path)
             return
         self._todo.clear()
         if isinstance(request, Load):
-            world = kept.load(engine, now.world, self._folder, request.name)
+            world = saved.load(engine, now.world, self._folder, request.name)
             self._before.append(now)
             self._set(session.resume(now, world, f"This is the world {request.name!r}."))
             return
         if not self._before:
-            raise UserError("There is nothing to take back.")
-        self._set(dataclasses.replace(self._before.pop(), said="Taken back."))
+            raise UserError("There is nothing to undo.")
+        self._set(dataclasses.replace(self._before.pop(), said="Undone."))
 
     def _sample_in(self, engine: Engine, now: Session) -> None:
         steps = engine.sampler_steps
@@ -224,7 +227,7 @@ class Driver:
     def _edit(self, engine: Engine, now: Session, request: Event, asked: float) -> None:
         if isinstance(request, session.Walls):
             self._session = session.apply(engine, now, request)
-            self._made = {}  # other steps are possible now
+            self._made = {}  # the steps imagined ahead may be different now
             self._say(self._session.said)
             return
         with self._during("changing the map"):
@@ -251,7 +254,7 @@ class Driver:
         self._say(f"{begun.said} Press W, A, S, D or the arrows.")
 
     def _warm(self, engine: Engine, now: Session) -> None:
-        """Compile what a step needs, by making one ahead."""
+        """Compile the programs of a step by imagining one ahead."""
         step = Drive((engine.model.actions.step_m, 0.0, 0.0))
         action, _, _ = session.wanted(now, step)
         made = session.ahead(engine, now, action)
@@ -265,7 +268,7 @@ class Driver:
         assert self._session is not None
         action, _, collided = session.wanted(self._session, step)
         if collided:
-            self._todo.clear()  # the rest of the way begins elsewhere
+            self._todo.clear()  # the remaining steps assumed another position
         made = self._made.get(action.tobytes())
         after = session.apply(self._engine, self._session, step, made)
         self._last = step.action
@@ -273,7 +276,7 @@ class Driver:
         self._catch_up()
 
     def _catch_up(self) -> None:
-        """Imagine the step without memory, too, and then film it."""
+        """Imagine the step without memory as well, and then record it."""
         assert self._engine is not None
         assert self._session is not None
         if self._session.due is not None:
@@ -283,16 +286,16 @@ class Driver:
             self._film.add(self._board())
 
     def _set(self, after: Session, asked: float | None = None) -> None:
-        """Take a state and show it; ``asked`` is when it was asked for."""
+        """Set the state and show it; ``asked`` is the time of the request."""
         if self._session is None or after.world is not self._session.world:
             self._made = {}
         self._session = after
-        picture = self._board()  # waits for what is being imagined
+        picture = self._board()  # waits for the imagined frame
         taken = None if asked is None else time.monotonic() - asked
         self._say(after.said, picture=picture, session=after, seconds=taken)
 
     def _look_ahead(self) -> bool:
-        """Imagine one likely next step; tells whether there was one left."""
+        """Imagine one likely next step; return whether there was one left."""
         now, engine = self._session, self._engine
         if not self._looks_ahead or now is None or engine is None:
             return False
@@ -311,7 +314,7 @@ class Driver:
 
     def _make(self, engine: Engine, now: Session, action: np.ndarray) -> None:
         made = session.ahead(engine, now, action)
-        _ = np.asarray(made.frame.rgb_THWC)  # waits for it
+        _ = np.asarray(made.frame.rgb_THWC)  # wait for it
         self._made[action.tobytes()] = made
 
     def _board(self) -> np.ndarray:
@@ -332,13 +335,41 @@ class Driver:
         self._say(f"The video is {path.name}.", link=path)
 
     def _during(self, text: str) -> contextlib.AbstractContextManager[None]:
-        """Say what takes long, and how long it has taken."""
-        return ticking.during(text, lambda said: self._say(said, busy=True))
+        """Show what is being done, and for how long."""
+        return ticking(text, lambda said: self._say(said, busy=True))
 
     def _say(self, said: str, **rest) -> None:
-        worlds = tuple(kept.names(self._folder))
-        shown = Shown(
+        worlds = tuple(saved.names(self._folder))
+        shown = PageUpdate(
             said, engine=self._engine, recording=self._film is not None, worlds=worlds, **rest
         )
-        with contextlib.suppress(Exception):  # a page that is gone must not stop the drive
+        with contextlib.suppress(Exception):  # a closed page must not stop the drive
             self._show(shown)
+
+
+TICK_S = 1.0
+"""Seconds between two messages."""
+
+
+@contextlib.contextmanager
+def ticking(text: str, say: Callable[[str], None]) -> Iterator[None]:
+    """Report once a second what is being done and for how long, while the block runs.
+
+    Args:
+        text: what is being done.
+        say: receives the messages, also from another thread.
+    """
+    begun, ended = time.monotonic(), threading.Event()
+    say(f"{text.capitalize()} …")
+
+    def tick() -> None:
+        while not ended.wait(TICK_S):
+            say(f"{text.capitalize()} … {time.monotonic() - begun:.0f} s")
+
+    ticker = threading.Thread(target=tick, name="ticker", daemon=True)
+    ticker.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        ticker.join()

@@ -1,7 +1,7 @@
-"""A world model, compiled: the few programs that a drive needs, each of one shape.
+"""A world model as the few compiled programs that a drive needs, each with one shape.
 
-Every step is one action, imagined as a clip of its own and remembered, as ``worlds.imagine`` does.
-So there is one program to compile, whatever keys are pressed.
+Every step is one action, imagined as a clip of its own and stored in the memory, as in
+``worlds.imagine``. So one program is compiled, whatever keys are pressed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Engine:
     """A trained world model.
 
     Attributes:
-        name: for people.
+        name: its name, for display.
         config: the experiment.
         params: its parameters, on the device.
     """
@@ -47,8 +47,8 @@ class Engine:
         return self.model.clip.height, self.model.clip.width
 
     @property
-    def forgets(self) -> bool:
-        """Whether there is a memory to go without."""
+    def has_memory(self) -> bool:
+        """Whether the model has a memory."""
         return self.model.capabilities.memory
 
     @property
@@ -70,9 +70,9 @@ class Engine:
         """Return the same model with another number of the sampler's steps.
 
         Raises:
-            ConfigError: the sampler cannot take so many.
+            ConfigError: the sampler does not support this number.
         """
-        require(self.sampler_steps > 0, f"{self.name} has no steps of a sampler to choose.")
+        require(self.sampler_steps > 0, f"{self.name} has no sampler whose steps can be set.")
         model = self.model.with_sample_steps(steps)
         return dataclasses.replace(self, config=dataclasses.replace(self.config, model=model))
 
@@ -81,12 +81,12 @@ class Engine:
         return worlds.start(self.model, self.params, frames)
 
     def imagine(self, world: WorldState, action_3: np.ndarray, key: Array) -> WorldState:
-        """Return the world after one action (dx, dy, dyaw); its frame is what is seen then."""
+        """Return the world after one action (dx, dy, dyaw), with the frame seen then."""
         action = np.asarray(action_3, np.float32)[None]
         return worlds.imagine(self.model, self.params, world, action, key)[0]
 
     def imagine_blind(self, world: WorldState, action_3: np.ndarray, key: Array) -> WorldState:
-        """Return the same, the memory neither looked at nor added to."""
+        """Return the world after one action, without reading or updating the memory."""
         action = np.asarray(action_3, np.float32)[None]
         return worlds.imagine(
             self.model, self.params, world, action, key, remember=False, memory=False
@@ -95,7 +95,7 @@ class Engine:
     def points(self, world: WorldState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the map: (N, 3) points in metres, (N, 3) uint8 colours, (N,) bool if observed.
 
-        Where a memory does not tell, everything counts as observed.
+        If the memory does not record which points were observed, all count as observed.
         """
         if not self.model.capabilities.points:
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, bool)
@@ -104,18 +104,18 @@ class Engine:
         colours = worlds.function(self.model, "point_colours")(self.model, features[valid])
         colours = np.asarray(colours)
         shown = ((np.clip(colours, -1, 1) + 1) * 127.5).round().astype(np.uint8)
-        told = np.ones(len(shown), bool) if observed is None else np.asarray(observed)[valid]
-        return points[valid], shown, told
+        seen = np.ones(len(shown), bool) if observed is None else np.asarray(observed)[valid]
+        return points[valid], shown, seen
 
     def erase(self, world: WorldState, box_23: np.ndarray) -> WorldState:
-        """Forget what is in a box, in the map and in the present picture."""
+        """Erase the content of a box from the map and from the present frame."""
         _require_box(box_23)
         return _erase(self.model, self.params, world, jnp.asarray(box_23, jnp.float32))
 
     def move(
         self, world: WorldState, box_23: np.ndarray, transform: np.ndarray, *, leave: bool
     ) -> WorldState:
-        """Move or copy what is in a box, in the map and in the present picture."""
+        """Move or copy the content of a box, in the map and in the present frame."""
         _require_box(box_23)
         box, motion = (jnp.asarray(x, jnp.float32) for x in (box_23, transform))
         return _move(self.model, self.params, world, box, motion, leave=leave)
@@ -125,16 +125,16 @@ def open_engine(name: str, config: Config, params: Params) -> Engine:
     """Return an engine, its parameters on the device.
 
     Raises:
-        UserError: these are no parameters of a world that can be driven.
+        UserError: the model is not a world that can be driven.
     """
     world = worlds.require_world(config.model, f"the viewer of {name}")
     if not world.capabilities.actions:
-        raise UserError(f"{name} is not steered by planar actions (dx, dy, dyaw), as a drive is.")
+        raise UserError(f"{name} has no planar actions (dx, dy, dyaw), which a drive needs.")
     return Engine(name, config, jax.tree.map(jnp.asarray, params))
 
 
 def _require_box(box_23: np.ndarray) -> None:
-    """Refuse what is no box, which compiled programs do not check."""
+    """Refuse an invalid box; compiled programs cannot check it."""
     box = np.asarray(box_23)
     if box.shape != (2, 3) or not np.isfinite(box).all() or (box[0] >= box[1]).any():
-        raise UserError("The box has no inside: choose one in the map with a size above 0.")
+        raise UserError("The box is empty: choose one in the map with a size above 0.")

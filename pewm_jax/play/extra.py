@@ -1,4 +1,4 @@
-"""viser, or a sentence that says how to install it."""
+"""Import viser, or explain how to install it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map in 3D: its points, the agent's camera and path, a box to edit; all updated in place."""
+"""The 3D view of the map: its points, the agent's camera and path, and a box to edit."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ DARK, PATH, IMAGINED, BOX, GOAL = (
     (255, 120, 120),
     (140, 255, 170),
 )
-"""Background, path, what was imagined, the chosen box, and where it goes."""
+"""Colours of the background, the path, imagined points, the chosen box, and its target."""
 HEADROOM_M = 0.35
-"""Points so far above the camera are ceiling, which one looks through from above, metres."""
+"""Points this far above the camera count as ceiling, which is hidden by default, metres."""
 FRUSTUM_M, WIDE = 0.3, 1.5
 """Length of the agent's camera, metres; and width of a point, in cells."""
 
@@ -80,16 +80,16 @@ class MapView:
 
     @property
     def points(self) -> np.ndarray:
-        """Return the (N, 3) points that are shown, metres."""
+        """Return the (N, 3) points shown, metres."""
         return self._points
 
     def show(self, engine: Engine, session: Session, image: np.ndarray | None = None) -> None:
-        """Show a drive: its map, where the agent is, and its path.
+        """Show a drive: its map, the agent, and its path.
 
         Args:
             engine: the model.
             session: the drive.
-            image: what the agent sees, uint8, drawn into its frustum.
+            image: the agent's frame, uint8, drawn into its frustum.
         """
         with self._lock:
             before, self._session, self._engine = self._session, session, engine
@@ -100,13 +100,13 @@ class MapView:
             self._look(before, session)
 
     def redraw(self) -> None:
-        """Draw the points again, as the settings say now."""
+        """Draw the points again, after a setting has changed."""
         with self._lock, self._server.atomic():
             if self._session is not None:
                 self._draw_points()
 
     def choose(self, box_23: np.ndarray | None) -> None:
-        """Choose a box, which has not moved yet; None chooses none."""
+        """Choose a box; None clears the choice."""
         with self._lock, self._server.atomic():
             self.box_23 = box_23
             for node in (self._source, self.target):
@@ -119,13 +119,13 @@ class MapView:
             self.target.wxyz = (1.0, 0.0, 0.0, 0.0)
 
     def moved(self) -> tuple[tuple[float, float, float], float]:
-        """Return how far the chosen box was dragged: metres, and degrees about its upright axis."""
+        """Return how far the box was dragged: metres, and degrees about its vertical axis."""
         assert self.box_23 is not None
         x, y, z = (float(v) for v in np.asarray(self.target.position) - self.box_23.mean(0))
         return (x, y, z), float(np.degrees(_yaw(self.target.wxyz)))
 
     def dragged(self) -> tuple[float, float, float]:
-        """Return x, y, yaw to which the agent was dragged."""
+        """Return the x, y, yaw to which the agent was dragged."""
         x, y, _ = (float(v) for v in self.handle.position)
         return x, y, _yaw(self.handle.wxyz)
 
@@ -166,7 +166,7 @@ class MapView:
         self._path.visible = len(path) > 1
 
     def _look(self, before: Session | None, now: Session) -> None:
-        """Place the browsers' cameras above a new place, and let them follow the agent."""
+        """Put the browsers' cameras above a new place, and let them follow the agent."""
         here = pose(now)[:3, 3]
         if before is None or before.place is not now.place:
             self.look_from_above()
@@ -181,7 +181,7 @@ class MapView:
                 client.camera.look_at = look_at + shift
 
     def look_from_above(self) -> None:
-        """Look at the agent from behind and above, in every browser and in those to come."""
+        """Look at the agent from behind and above, in all present and future browsers."""
         if self._session is None:
             return
         camera = pose(self._session).astype(np.float64)
@@ -194,7 +194,7 @@ class MapView:
 
 
 def box_edges(size_3: np.ndarray) -> np.ndarray:
-    """Return (12, 2, 3) the edges of a box around the origin, metres."""
+    """Return the (12, 2, 3) edges of a box around the origin, metres."""
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
     pairs = [(a, b) for a, b in itertools.combinations(range(8), 2) if (a ^ b).bit_count() == 1]
     return (corners[np.array(pairs)] * size_3).astype(np.float32)

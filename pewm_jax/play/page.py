@@ -1,7 +1,7 @@
-"""The page: pictures, buttons, keys and the map, in the browser; served by viser.
+"""The page in the browser: pictures, buttons, keys and the map, served by viser.
 
 Keys are commands with a hotkey. viser's own page moves its 3D camera by the same keys; a listener
-that the page installs (``KEYS``) keeps them from it, so that they drive and do nothing else.
+that the page installs (``KEYS``) stops these key events, so that the keys only drive.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.config import ActionConfig
-from pewm_jax.play import board, picking, requests, serving, session, status
+from pewm_jax.play import board, panels, picking, serving, session
 from pewm_jax.play.driver import Driver
 from pewm_jax.play.extra import viser
-from pewm_jax.play.files_panel import FilesPanel
 from pewm_jax.play.map_view import MapView, eye_of
-from pewm_jax.play.requests import Request, Shown
+from pewm_jax.play.panels import FilesPanel
+from pewm_jax.play.session import PageUpdate, Request
 from pewm_jax.play.settings import Serve, Start
 from pewm_jax.report.pictures import as_bytes
 
@@ -37,7 +37,7 @@ STEPS = {
     "step left": (0, 1, 0),
     "step right": (0, -1, 0),
 }
-"""What one may do, as parts of a step forward, a step left and a turn counter-clockwise."""
+"""The possible moves, in units of a step forward, a step left and a turn counter-clockwise."""
 SIGNS = {
     "◀": "step left",
     "▲": "forward",
@@ -46,7 +46,7 @@ SIGNS = {
     "↶ left": "turn left",
     "right ↷": "turn right",
 }
-"""What the buttons do."""
+"""The moves of the buttons."""
 HOTKEYS = {
     "forward": ("W", "arrowup"),
     "back": ("S", "arrowdown"),
@@ -62,16 +62,16 @@ KEYS = (
     "if(k.test(e.code)&&!e.ctrlKey&&!e.metaKey&&!e.altKey&&!/^(INPUT|TEXTAREA|SELECT)$/.test(e.target.tagName))"
     '{e.stopPropagation();e.preventDefault()}})}">'
 )
-"""Keeps the keys that drive from listeners of the document, which move the 3D camera; those of the
-root element, which are the hotkeys, have had them by then."""
+"""Stops the driving keys before they reach the listeners of the document, which move the 3D camera;
+the listeners of the root element, which are the hotkeys, run before that."""
 
 
 class Page:
-    """A page that is being served; ``close`` ends it.
+    """A served page; ``close`` ends it.
 
     Attributes:
-        url: where.
-        driver: what drives.
+        url: its address.
+        driver: its driver.
     """
 
     def __init__(
@@ -86,19 +86,19 @@ class Page:
         """Serve the page, and begin to load the model.
 
         Args:
-            load: gives the model, an ``Engine``.
+            load: returns the model, an ``Engine``.
             start: where the drive begins.
             serve: address, port and names.
-            folder: of saved worlds and videos.
-            name: of the model, for the title.
-            say: told where the page is, what it waits for, and what goes wrong, once each.
+            folder: folder of saved worlds and videos.
+            name: name of the model, for the title.
+            say: receives the page's address, its progress and its errors.
 
         Raises:
-            ConfigError: the address cannot be served on.
+            ConfigError: the page cannot be served at the address.
         """
-        self._start, self._seconds, self._tell = start, None, status.Terminal(say)
+        self._start, self._seconds, self._tell = start, None, panels.Terminal(say)
         self._server = serving.server(serve, say)
-        # Sharing asks a server elsewhere for a public address; this page is local.
+        # Sharing would ask an external server for a public address; this page stays local.
         self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
         self.url = f"http://{serving.here(serve.host)}:{self._server.get_port()}"
         say(f"drive: {self.url}  (Ctrl-C ends)")
@@ -132,15 +132,15 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def show(self, shown: Shown) -> None:
-        """Show what the driver tells; called in its thread."""
+    def show(self, shown: PageUpdate) -> None:
+        """Show an update of the driver; called in its thread."""
         self._seconds = shown.seconds if shown.seconds is not None else self._seconds
         self._tell(shown)
         with self._server.atomic():
             if shown.picture is not None:
                 self._view.image = shown.picture
             self._busy.visible = shown.busy
-            self._status.content = status.line(shown, self._seconds, len(self._map.points))
+            self._status.content = panels.status_line(shown, self._seconds, len(self._map.points))
         if shown.session is not None and shown.engine is not None:
             seen = as_bytes(np.asarray(shown.session.world.frame.rgb_THWC[0]))
             self._map.show(shown.engine, shown.session, seen)
@@ -150,7 +150,7 @@ class Page:
         self.driver.put(request)
 
     def _act(self, name: str) -> None:
-        """Ask for one of ``STEPS``."""
+        """Request one of ``STEPS``."""
         forward, left, turn = STEPS[name]
         actions = self._actions()
         angle = math.radians(actions.turn_deg)
@@ -189,7 +189,7 @@ class Page:
         @self._map.handle.on_update
         def _(event: Any) -> None:
             if event.phase == "end":
-                self._put(requests.GoTo(self._map.dragged()))
+                self._put(session.GoTo(self._map.dragged()))
 
     def _redraw(self, name: str, value: bool) -> None:
         setattr(self._map, name, value)
@@ -201,7 +201,7 @@ class Page:
             gui.add_html(
                 "<div style='padding:0 12px 4px;opacity:.75;font-size:12.5px;line-height:1.45'>"
                 "<b>Shift + drag</b> a rectangle in the map, or <b>shift + click</b>, to choose a "
-                "box. Drag the green box to where it shall go.</div>"
+                "box. Drag the green box to its new place.</div>"
             )
             self._middle = gui.add_vector3("Middle", (0.0, 0.0, 0.0), step=0.05)
             self._size = gui.add_vector3("Size", (0.9, 0.9, 1.1), step=0.05, min=(0.05, 0.05, 0.05))
@@ -214,7 +214,7 @@ class Page:
         erase.on_click(lambda _: self._edit("erase"))
         move.on_click(lambda _: self._edit("move"))
         copy.on_click(lambda _: self._edit("copy"))
-        undo.on_click(lambda _: self._put(requests.Undo()))
+        undo.on_click(lambda _: self._put(session.Undo()))
 
         @scene.on_rect_select(modifier="shift")
         def _(event: Any) -> None:
@@ -228,7 +228,7 @@ class Page:
             self._choose(picking.at_click(self._map.points, origin, direction))
 
     def _choose(self, box_23: np.ndarray | None) -> None:
-        """Choose a box, and write its numbers into the fields."""
+        """Choose a box and write its numbers into the fields."""
         self._map.choose(box_23)
         if box_23 is not None:
             x, y, z = (round(float(v), 2) for v in box_23.mean(0))
@@ -237,7 +237,7 @@ class Page:
             self._size.value = (x, y, z)
 
     def _typed(self, event: Any) -> None:
-        """Choose the box that was typed; what the page itself writes is no choice."""
+        """Choose the box that a user typed; ignore values that the page itself wrote."""
         if event.client is not None:
             middle, half = np.array(self._middle.value), np.array(self._size.value) / 2
             self._map.choose(np.stack([middle - half, middle + half]))
@@ -271,18 +271,16 @@ class Page:
             if source.value == sources[0]:
                 changes |= {"scene": "", "episode": "", "recording": ""}
             self._map.choose(None)
-            self._put(requests.Begin(dataclasses.replace(start, **changes)))
+            self._put(session.Begin(dataclasses.replace(start, **changes)))
 
         begin.on_click(anew)
-        steps.on_update(
-            lambda event: event.client and self._put(requests.Sampler(int(steps.value)))
-        )
+        steps.on_update(lambda event: event.client and self._put(session.Sampler(int(steps.value))))
 
         self._steps = steps
 
-    def _show_choices(self, shown: Shown) -> None:
-        """Show which steps of the sampler, worlds and files there are."""
-        if not hasattr(self, "_files"):  # the page is still being made
+    def _show_choices(self, shown: PageUpdate) -> None:
+        """Show the available sampler steps, worlds and files."""
+        if not hasattr(self, "_files"):  # the page is still being built
             return
         count = str(shown.engine.sampler_steps) if shown.engine is not None else "0"
         if count not in ("0", self._steps.value):

@@ -1,4 +1,4 @@
-"""Choosing a box in the map: by a rectangle on the screen, or by a click."""
+"""Choose a box in the map, by a rectangle on the screen or by a click."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import dataclasses
 import numpy as np
 
 FLOOR_M, PAD_M = 0.08, 0.05
-"""What is lower than this above the floor is floor; a box is so much wider than what it holds."""
+"""Points less than this above the floor count as floor; and the margin of a box, metres."""
 CLICK_M = (0.9, 0.9, 1.1)
 """Size of the box around a click, metres."""
 NEAR_RAY_M = 0.12
-"""A click means a point this near to its ray."""
+"""Largest distance of a clicked point from the ray of the click, metres."""
 FIELDS, BEHIND_M = 12, 0.3
-"""A rectangle is looked at in so many fields across and down; what is farther behind the nearest
-point of its field is hidden, metres."""
+"""Fields along each side of a rectangle; points farther behind the nearest point of their field are
+hidden, metres."""
 EDGE = 2.0
-"""Percent of the points of a rectangle that may lie outside of its box, at each end."""
+"""Percentage of the points of a rectangle that may lie outside its box, at each end."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Eye:
-    """The camera of a browser, which looks at the map.
+    """The camera of a browser that shows the map.
 
     Attributes:
-        position_3: metres.
+        position_3: position in metres.
         rotation_33: world from camera, OpenCV axes.
         fov: vertical, radians.
         aspect: width over height.
@@ -37,19 +37,19 @@ class Eye:
 
 
 def floor_of(points_N3: np.ndarray) -> float:
-    """Return the height of the floor: nearly the lowest that is known."""
+    """Return the height of the floor: a low percentile of the points' heights."""
     return float(np.percentile(points_N3[:, 2], 2)) if len(points_N3) else 0.0
 
 
 def in_rectangle(
     points_N3: np.ndarray, eye: Eye, low_2: tuple[float, float], high_2: tuple[float, float]
 ) -> np.ndarray | None:
-    """Return the (2, 3) box of what is seen in a rectangle of the screen; None if nothing is.
+    """Return the (2, 3) box of the points seen in a rectangle of the screen, or None.
 
-    The floor does not count, unless there is nothing else, nor does what is hidden by other things.
+    Floor points are ignored unless there are no others, and hidden points always.
 
     Args:
-        points_N3: what the map shows, metres.
+        points_N3: the points of the map, metres.
         eye: the camera that shows it.
         low_2: upper left corner of the rectangle, from 0 to 1 across and down.
         high_2: lower right corner.
@@ -78,7 +78,7 @@ def _in_front(
     low_2: tuple[float, float],
     high_2: tuple[float, float],
 ) -> np.ndarray:
-    """Return (P,) bool: which points of a rectangle are not hidden, field by field."""
+    """Return (P,) bool: which points of a rectangle are visible, field by field."""
     fields = np.zeros(len(depth_P), int)
     for place, low, high in zip((across_P, down_P), low_2, high_2, strict=True):
         share = (place - low) / max(high - low, 1e-9)
@@ -91,14 +91,14 @@ def _in_front(
 def at_click(
     points_N3: np.ndarray, origin_3: np.ndarray, direction_3: np.ndarray
 ) -> np.ndarray | None:
-    """Return the (2, 3) box around what a ray of the screen meets first; None if it meets nothing.
+    """Return the (2, 3) box around the first point that a screen ray hits; None if it hits nothing.
 
-    It stands just above the floor.
+    The box stands just above the floor.
 
     Args:
-        points_N3: what the map shows, metres.
-        origin_3: of the ray.
-        direction_3: of the ray.
+        points_N3: the points of the map, metres.
+        origin_3: origin of the ray.
+        direction_3: direction of the ray.
     """
     if not len(points_N3):
         return None

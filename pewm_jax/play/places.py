@@ -1,4 +1,4 @@
-"""What is seen before a drive, fitted to the model: a house, a mesh, an episode, a recording."""
+"""Where a drive begins: in a house, a mesh, an episode or a recording, fitted to the model."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from pewm_jax.play.settings import Start
 from pewm_jax.types import Camera, Frames
 
 LOOKS, CANDIDATES, OPEN_M, TURN = 12, 16, 3.0, np.pi / 6
-"""Frames of a look around; places that a drive may begin at; metres around that count as room for
-it; headings that it may begin with are multiples of this, radians."""
+"""Frames of the look around at the start; candidate positions for the start; radius in which free
+space around them is counted, metres; start headings are multiples of this, radians."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Place:
-    """Where a drive begins.
+class StartPoint:
+    """The frames with which a drive begins, and the scene they show.
 
     Attributes:
-        name: for people.
+        name: name of the scene, for display.
         frames: S ≥ 1 frames of the model's size, rgb uint8; the last one is the present.
         planar_3: x, y, yaw of the present in a house or mesh, else None.
-        simulator: the house or mesh, which knows the truth and its walls, else None.
+        simulator: the house or mesh, which gives the ground truth and walls, else None.
     """
 
     name: str
@@ -44,16 +44,16 @@ class Place:
     simulator: Simulator | None = None
 
 
-def open_place(start: Start, height: int, width: int) -> Place:
-    """Open what a drive begins with.
+def open_place(start: Start, height: int, width: int) -> StartPoint:
+    """Open the scene in which a drive begins.
 
     Args:
-        start: what was asked for.
-        height: of the model's images, pixels.
-        width: of the model's images, pixels.
+        start: the settings.
+        height: height of the model's images, pixels.
+        width: width of the model's images, pixels.
 
     Raises:
-        UserError: it does not exist or cannot be used, in one sentence.
+        UserError: the scene does not exist or cannot be used.
     """
     if start.episode:
         return _episode(Path(start.episode), start.number, start.frames, height, width)
@@ -72,7 +72,7 @@ def open_place(start: Start, height: int, width: int) -> Place:
     around = np.tile(planar, (LOOKS, 1))
     around[:-1, 2] += 2 * np.pi * np.arange(1, LOOKS) / LOOKS
     name = Path(start.scene).name if start.scene else f"house {start.house}"
-    return Place(name, simulator.frames(around), planar, simulator)
+    return StartPoint(name, simulator.frames(around), planar, simulator)
 
 
 def require_shown(model: World, start: Start) -> None:
@@ -97,8 +97,8 @@ def require_shown(model: World, start: Start) -> None:
         )
 
 
-def truth(place: Place, camera: Camera, height: int, width: int) -> Frames | None:
-    """Return what is really seen by (T,) cameras, or None where nobody knows."""
+def truth(place: StartPoint, camera: Camera, height: int, width: int) -> Frames | None:
+    """Return the ground truth of (T,) cameras, or None if it is unknown."""
     if place.simulator is None:
         return None
     host = Camera(np.asarray(camera.intrinsics_4), np.asarray(camera.world_from_camera))
@@ -107,18 +107,18 @@ def truth(place: Place, camera: Camera, height: int, width: int) -> Frames | Non
 
 
 def walk(
-    place: Place, planar_3: np.ndarray, action_3: np.ndarray, *, walls: bool = True
+    place: StartPoint, planar_3: np.ndarray, action_3: np.ndarray, *, walls: bool = True
 ) -> tuple[np.ndarray, bool]:
-    """Return the next planar pose, and whether a wall was in the way.
+    """Return the next planar pose, and whether a wall blocked the move.
 
-    An agent slides along walls. One that stands outside of the free area (its walls were off) may
+    The agent slides along walls. An agent outside the free area (after driving through walls) can
     go anywhere.
 
     Args:
-        place: where.
+        place: the start point of the drive.
         planar_3: x, y, yaw.
-        action_3: dx, dy, dyaw, as ``types`` says.
-        walls: False lets it through walls.
+        action_3: dx, dy, dyaw, see ``types``.
+        walls: whether walls block the agent.
     """
     simulator = place.simulator
     if walls and simulator is not None and bool(is_free(simulator.grid, planar_3[:2])):
@@ -138,7 +138,7 @@ def action_between(before_3: np.ndarray, after_3: np.ndarray) -> np.ndarray:
 
 
 def way(before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: float) -> np.ndarray:
-    """Return (n, 3) actions of equal parts from one planar pose to another, none above a step.
+    """Return (n, 3) equal actions from one planar pose to another, none larger than a step.
 
     Args:
         before_3: x, y, yaw.
@@ -156,12 +156,12 @@ def way(before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: floa
 
 
 def fitted(frames: Frames, height: int, width: int) -> Frames:
-    """Crop frames to a shape around their middle, and resize them and their intrinsics.
+    """Crop frames around their middle to an aspect ratio, and resize them and their intrinsics.
 
     Args:
         frames: NumPy frames, rgb uint8.
-        height: wanted, pixels.
-        width: wanted, pixels.
+        height: new height, pixels.
+        width: new width, pixels.
     """
     tall, wide = frames.depth_THW.shape[1:]
     if (tall, wide) == (height, width):
@@ -180,7 +180,7 @@ def fitted(frames: Frames, height: int, width: int) -> Frames:
     return Frames(small, depth[:, rows][:, :, columns], camera)
 
 
-def _episode(folder: Path, number: int, count: int, height: int, width: int) -> Place:
+def _episode(folder: Path, number: int, count: int, height: int, width: int) -> StartPoint:
     source = EpisodeSource(folder)
     if number >= len(source):
         raise UserError(
@@ -188,10 +188,10 @@ def _episode(folder: Path, number: int, count: int, height: int, width: int) -> 
         )
     episode = source[number]
     seen = episode.frames(range(min(count, episode.length)))
-    return Place(episode.name, fitted(seen, height, width))
+    return StartPoint(episode.name, fitted(seen, height, width))
 
 
-def _recording(start: Start, height: int, width: int) -> Place:
+def _recording(start: Start, height: int, width: int) -> StartPoint:
     folder = Path(start.recording)
     stride = max(1, len(read_recording(folder)) // start.frames)
     assert start.intrinsics is not None
@@ -210,7 +210,7 @@ def _recording(start: Start, height: int, width: int) -> Place:
 
 
 def _beginning(grid: NavGrid, rng: np.random.Generator) -> np.ndarray:
-    """Return x, y, yaw: of some places the one with most room, looking to where it is."""
+    """Return x, y, yaw: of some free positions the one with most free space, facing that space."""
     free = grid.centre_of(np.argwhere(grid.free_YX))
     places = sample_free(grid, rng, CANDIDATES)
     around = [free[np.linalg.norm(free - place, axis=-1) < OPEN_M] - place for place in places]

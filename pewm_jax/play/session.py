@@ -1,13 +1,15 @@
-"""The drive itself: state in, event in, state out. No server, no threads, nothing on disk.
+"""The state of a drive and its events; pure functions, without server, threads or files.
 
 A step is ``engine.imagine`` of one action with a key made of the drive's seed and the number of the
-step. So a drive is a function of its events: what was imagined ahead (``ahead``) is what would have
-been imagined when asked for, bit for bit, or it is not used.
+step, so a drive is a function of its events. A step imagined ahead (``ahead``) is bit-identical to
+the same step imagined on request. Requests that need more than the state (saving, recording, …) and
+the updates of the page are defined here as well.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import TypeAlias
 
 import jax
@@ -17,13 +19,14 @@ from pewm_jax.config import UserError
 from pewm_jax.geometry.actions import heading
 from pewm_jax.play import places
 from pewm_jax.play.engine import Engine
-from pewm_jax.play.places import Place
+from pewm_jax.play.places import StartPoint
+from pewm_jax.play.settings import Start
 from pewm_jax.types import Array, WorldState
 
 MOST_PATH = 4096
-"""Positions of the path that are kept."""
+"""Largest number of positions of the path."""
 STILL = np.zeros(3, np.float32)
-"""The action that stays: what is seen is imagined anew."""
+"""The action that stays in place: the present frame is imagined again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,20 +42,20 @@ class Drive:
 
 @dataclasses.dataclass(frozen=True)
 class Erase:
-    """Event: forget what is in a box (2, 3), metres."""
+    """Event: erase the content of a box (2, 3), metres."""
 
     box: tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """Event: move or copy what is in a box.
+    """Event: move or copy the content of a box.
 
     Attributes:
         box: its lower and upper corner, metres.
         shift: metres along x, y, z.
         turn_deg: degrees counter-clockwise, seen from above, about the middle of the box.
-        leave: leave it where it is, too.
+        leave: keep the original, which makes a copy.
     """
 
     box: tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -63,7 +66,7 @@ class Move:
 
 @dataclasses.dataclass(frozen=True)
 class Walls:
-    """Event: let walls stop the agent, or not."""
+    """Event: set whether walls stop the agent."""
 
     stop: bool
 
@@ -76,20 +79,20 @@ class Session:
     """A drive.
 
     Attributes:
-        place: where it began.
+        place: its start point.
         world: the world: the present frame and the map.
-        blind: the same drive without memory; its map is the first and is not looked at.
+        blind: the same drive without memory; its map is the initial one and is not read.
         planar_3: x, y, yaw of the agent, float64.
         path_P3: camera positions so far, newest last, at most ``MOST_PATH``.
-        steps: steps made, edits included.
-        seed: of the noise.
+        steps: number of steps made, edits included.
+        seed: seed of the noise.
         walls: whether walls stop the agent.
         due: the action that ``blind`` has yet to make, and its key; None if there is none.
-        observed: whether the present frame was really seen, not imagined.
-        said: one sentence on what happened last.
+        observed: whether the present frame was observed, not imagined.
+        said: a message about the last event.
     """
 
-    place: Place
+    place: StartPoint
     world: WorldState
     blind: WorldState
     planar_3: np.ndarray
@@ -102,24 +105,25 @@ class Session:
     said: str = ""
 
 
-def begin(engine: Engine, place: Place, seed: int = 0) -> Session:
-    """Begin a drive with what was seen of a place."""
+def begin(engine: Engine, place: StartPoint, seed: int = 0) -> Session:
+    """Begin a drive with the observed frames of a start point."""
     world = engine.start(place.frames)
-    said = f"This is {place.name}, as it was really seen: drive on, and it is imagined."
+    said = f"This is {place.name} as observed; every step from here is imagined."
     return dataclasses.replace(_begun(place, world, seed, said), observed=True)
 
 
 def resume(session: Session, world: WorldState, said: str) -> Session:
-    """Return a drive through another world, in the same place: one that was kept in a file."""
+    """Return a drive through another world, such as a saved one, with the same start point."""
     return dataclasses.replace(
         _begun(session.place, world, session.seed, said), walls=session.walls
     )
 
 
 def wanted(session: Session, event: Drive) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return what a step would do: ``(action_3, planar_3, collided)``.
+    """Return the effect of a step with collisions: ``(action_3, planar_3, collided)``.
 
-    That is the action that is free, the pose x, y, yaw after it, and whether a wall is in its way.
+    These are the action that is possible, the pose x, y, yaw after it, and whether a wall blocked
+    the requested action.
     """
     asked = np.asarray(event.action, np.float32)
     after, collided = places.walk(session.place, session.planar_3, asked, walls=session.walls)
@@ -127,7 +131,7 @@ def wanted(session: Session, event: Drive) -> tuple[np.ndarray, np.ndarray, bool
 
 
 def ahead(engine: Engine, session: Session, action_3: np.ndarray) -> WorldState:
-    """Return the world that one action leads to; ``apply`` takes it as ``made``."""
+    """Return the world after one action; ``apply`` takes it as ``made``."""
     return engine.imagine(session.world, action_3, key_of(session))
 
 
@@ -139,14 +143,14 @@ def apply(
     Args:
         engine: the model.
         session: the drive so far.
-        event: what is asked for.
-        made: what ``ahead`` gave for this session and this event's action, if it was asked before.
+        event: the event.
+        made: the result of ``ahead`` for this session and this event's action, if there is one.
 
     Raises:
-        UserError: a box without inside, or a memory that cannot be edited.
+        UserError: the box is empty, or the memory cannot be edited.
     """
     if isinstance(event, Walls):
-        said = "Walls stop you." if event.stop else "You go through walls; beyond all is imagined."
+        said = "Walls stop the agent." if event.stop else "The agent passes through walls."
         return dataclasses.replace(session, walls=event.stop, said=said)
     if isinstance(event, Drive):
         return _driven(engine, session, event, made)
@@ -154,11 +158,11 @@ def apply(
 
 
 def catch_up(engine: Engine, session: Session) -> Session:
-    """Return the drive after what is seen without memory was imagined, too."""
+    """Return the drive after its step without memory was imagined as well."""
     if session.due is None:
         return session
     action, key = session.due
-    if not engine.forgets:
+    if not engine.has_memory:
         return dataclasses.replace(session, due=None)
     blind = engine.imagine_blind(session.blind, action, key)
     return dataclasses.replace(session, blind=blind, due=None)
@@ -172,17 +176,17 @@ def pose(session: Session) -> np.ndarray:
 def _driven(engine: Engine, session: Session, event: Drive, made: WorldState | None) -> Session:
     action, planar, collided = wanted(session, event)
     if collided and not np.abs(action).max() > 1e-6:
-        return dataclasses.replace(session, said="There is a wall: turn, or go another way.")
+        return dataclasses.replace(session, said="Blocked by a wall.")
     world = ahead(engine, session, action) if made is None else made
     return _after(engine, session, world, action, planar, "")
 
 
 def _edited(engine: Engine, session: Session, event: Erase | Move) -> Session:
-    """Change the map, then look again from where the agent is: holes are imagined."""
+    """Edit the map, then imagine the present frame again, which fills holes."""
     if not engine.editable:
         raise UserError(
-            f"The memory of {engine.name} keeps no places that could be edited: drive a model that "
-            "remembers surfels or voxels."
+            f"The memory of {engine.name} cannot be edited: use a model whose memory is of surfels "
+            "or voxels."
         )
     box = np.asarray(event.box, np.float32)
     before = len(engine.points(session.world)[0])
@@ -202,7 +206,7 @@ def _edited(engine: Engine, session: Session, event: Erase | Move) -> Session:
 def about_middle(
     box_23: np.ndarray, shift: tuple[float, float, float], turn_deg: float
 ) -> np.ndarray:
-    """Return the (4, 4) transform that turns upright about a box's middle, then shifts."""
+    """Return the (4, 4) transform that turns about the vertical axis of a box, then shifts."""
     angle, middle = np.radians(turn_deg), np.asarray(box_23, np.float64).mean(0)
     c, s = np.cos(angle), np.sin(angle)
     transform = np.eye(4)
@@ -226,20 +230,99 @@ def _after(
         planar_3=planar,
         path_P3=np.concatenate([session.path_P3, here[None]])[-MOST_PATH:],
         steps=session.steps + 1,
-        due=(action, key_of(session)) if engine.forgets else None,
+        due=(action, key_of(session)) if engine.has_memory else None,
         observed=False,
         said=said,
     )
 
 
-def _begun(place: Place, world: WorldState, seed: int, said: str) -> Session:
+def _begun(place: StartPoint, world: WorldState, seed: int, said: str) -> Session:
     camera = np.asarray(world.frame.camera.world_from_camera)[0]
     planar = np.array([camera[0, 3], camera[1, 3], float(heading(camera))], np.float64)
     if place.planar_3 is not None and np.allclose(planar[:2], place.planar_3[:2], atol=1e-4):
-        planar = place.planar_3.copy()  # of which rounding has not put the agent into a wall
+        planar = place.planar_3.copy()  # exact: rounding could put the agent into a wall
     return Session(place, world, world, planar, camera[None, :3, 3], seed=seed, said=said)
 
 
 def key_of(session: Session) -> Array:
-    """Return the randomness of the next step."""
+    """Return the random key of the next step."""
     return jax.random.fold_in(jax.random.key(session.seed), session.steps)
+
+
+@dataclasses.dataclass(frozen=True)
+class Begin:
+    """Request: begin a drive elsewhere."""
+
+    start: Start
+
+
+@dataclasses.dataclass(frozen=True)
+class GoTo:
+    """Request: drive straight to a pose: x, y in metres, yaw in radians."""
+
+    planar: tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampler:
+    """Request: set the number of the sampler's steps."""
+
+    steps: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Save:
+    """Request: save the world to a file."""
+
+    name: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Load:
+    """Request: load a saved world."""
+
+    name: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """Request: begin or end a video."""
+
+    on: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Undo:
+    """Request: undo the last edit."""
+
+
+Request: TypeAlias = Event | Begin | GoTo | Sampler | Save | Load | Record | Undo
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PageUpdate:
+    """An update of the page; parts that have not changed are None.
+
+    Attributes:
+        said: one message.
+        busy: whether something is being imagined, opened or compiled.
+        failed: whether the message is an error.
+        picture: the board, uint8 (H, W, 3).
+        session: the drive, for the map.
+        engine: the model that imagines it.
+        seconds: duration of the last step, from the key to the picture; None if there was none.
+        recording: whether a video is being recorded.
+        worlds: names of the saved worlds.
+        link: a file that was written.
+    """
+
+    said: str
+    busy: bool = False
+    failed: bool = False
+    picture: np.ndarray | None = None
+    session: Session | None = None
+    engine: Engine | None = None
+    seconds: float | None = None
+    recording: bool = False
+    worlds: tuple[str, ...] = ()
+    link: Path | None = None

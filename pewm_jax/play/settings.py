@@ -1,4 +1,4 @@
-"""Where a drive begins, and how its page is served; light, so that help comes at once."""
+"""Settings of a drive and of its page; cheap to import, so that --help is fast."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import Literal
 from pewm_jax.errors import require
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-"""Hosts that only this machine reaches."""
+"""Hosts that only this machine can reach."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """What is seen before the drive; a generated house unless another source is named."""
+    """Where the drive begins: in a generated house unless another source is given."""
 
     house: int = 2
-    """Seed of the generated house. The model that comes with the library was trained on 0, 3, 6, …
-    and has never seen 2, 5, 8, …"""
+    """Seed of the generated house. The model shipped with the library was trained on 0, 3, 6, … and
+    not on 2, 5, 8, …"""
     seed: int = 0
-    """Where in the house the drive begins, and the noise of what is imagined."""
+    """Seed of the start position and of the sampler's noise."""
     scene: str = ""
     """A mesh to drive in (GLB, OBJ, PLY, …), in metres, instead of a house."""
     up: Literal["auto", "y", "z"] = "auto"
@@ -39,7 +39,7 @@ class Start:
     recording_up: Literal["x", "y", "z", "-x", "-y", "-z"] = "-y"
     """Axis of the recording's world that points up."""
     frames: int = 24
-    """How many frames of an episode or a recording are seen before the drive, at most."""
+    """Largest number of frames of an episode or a recording observed before the drive."""
     hfov: float = 90.0
     """Horizontal field of view in a house or mesh, degrees."""
     camera_height: float = 1.25
@@ -50,8 +50,8 @@ class Start:
         named = [name for name in ("scene", "episode", "recording") if getattr(self, name)]
         require(
             len(named) < 2,
-            f"--{' and --'.join(named)} are given: a drive begins in one place, leave out all but "
-            "one.",
+            f"--{' and --'.join(named)} are given: a drive begins in one place; keep only one of "
+            "them.",
         )
         for name in ("house", "seed", "number"):
             value = getattr(self, name)
@@ -76,19 +76,18 @@ class Serve:
     """How the page is served."""
 
     host: str = "127.0.0.1"
-    """Address to serve on. Others than this machine reach the page with 0.0.0.0, without a
-    password."""
+    """Address to serve on. With 0.0.0.0 other machines can reach the page, without a password."""
     port: int = 8080
     """Port of the page; the next free one is taken if it is in use."""
     names: tuple[str, ...] = ()
-    """Names that stand in the browser's address bar beside this machine's own, such as that of a
-    proxy in front of it. Pages of other sites are refused."""
+    """Further names of the page in the browser's address bar, such as that of a proxy. Pages of
+    other sites are refused."""
     worlds: Path | None = None
     """Folder of saved worlds and videos; by default worlds/ beside the run's reports."""
     ahead: bool = True
-    """While nobody presses a key, imagine the next steps ahead, so that they are there at once."""
+    """Imagine likely next steps while no key is pressed, so that they appear at once."""
     open: bool = True
-    """Open the page in the browser, where there is a desktop."""
+    """Open the page in the browser if there is a desktop."""
 
     def __post_init__(self):
         """Validate."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import UserError
-from pewm_jax.play import board, driver, kept, requests, session
+from pewm_jax.play import board, driver, saved, session
 from pewm_jax.play.settings import Start
 from tests.play.tiny_drive import FORWARD, LEFT, Telling, Toy, a_toy
 
@@ -74,7 +74,7 @@ def test_of_steps_asked_for_meanwhile_the_last_one_wins(drives):
     assert slow.begun.wait(LONG)
     for _ in range(10):
         one.put(LEFT)
-    one.put(requests.Save("between"))
+    one.put(session.Save("between"))
     one.put(session.Drive((0.0, 0.0, -float(np.pi / 6))))
     slow.go.set()
     assert one.wait(LONG)
@@ -83,7 +83,7 @@ def test_of_steps_asked_for_meanwhile_the_last_one_wins(drives):
     assert first is not None
     begun = next(shown.session for shown in told.told if shown.session is not None)
     np.testing.assert_allclose(told.session.planar_3, begun.planar_3, atol=1e-9)
-    assert kept.names(one._folder) == ["between"]
+    assert saved.names(one._folder) == ["between"]
 
 
 def test_what_is_imagined_ahead_is_taken_and_bounded(drives):
@@ -132,7 +132,7 @@ def test_a_model_that_does_not_load_is_a_sentence_and_can_be_tried_again(drives)
     one.put(FORWARD)
     assert one.wait(LONG)
     assert "no world yet" in told.told[-1].said
-    one.put(requests.Begin(Start(house=2)))
+    one.put(session.Begin(Start(house=2)))
     assert one.wait(LONG)
     assert told.session.steps == 0
 
@@ -152,25 +152,25 @@ def test_edits_are_taken_back_and_worlds_kept_and_gone_on_in(drives):
     begun = told.session
     here = begun.planar_3
     box = ((here[0] - 3.0, here[1] - 3.0, -1.0), (here[0] + 3.0, here[1] + 3.0, 3.0))
-    one.put(requests.Save("before"))
+    one.put(session.Save("before"))
     one.put(session.Erase(box))
     assert one.wait(LONG)
     assert told.session.steps == 1
     before, after = (len(one.engine.points(now.world)[0]) for now in (begun, told.session))
     assert after < before
-    one.put(requests.Undo())
+    one.put(session.Undo())
     assert one.wait(LONG)
     assert told.session.world is begun.world
-    one.put(requests.Undo())
+    one.put(session.Undo())
     assert one.wait(LONG)
-    assert told.told[-1].said == "There is nothing to take back."
-    one.put(requests.Load("before"))
+    assert told.told[-1].said == "There is nothing to undo."
+    one.put(session.Load("before"))
     assert one.wait(LONG)
     assert told.session.said == "This is the world 'before'."
-    one.put(requests.Sampler(2))
+    one.put(session.Sampler(2))
     assert one.wait(LONG)
     assert one.engine.sampler_steps == 2
-    one.put(requests.Sampler(0))
+    one.put(session.Sampler(0))
     assert one.wait(LONG)
     assert told.told[-1].failed
     assert one.engine.sampler_steps == 2
@@ -180,7 +180,7 @@ def test_it_drives_to_a_place_in_steps_and_a_key_stops_it(drives):
     one, told = drives()
     x, y, yaw = told.session.planar_3
     ahead = 0.3
-    one.put(requests.GoTo((x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), yaw + 0.3)))
+    one.put(session.GoTo((x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), yaw + 0.3)))
     assert one.wait(LONG)
     assert told.session.steps == 2
     there = told.session.planar_3
@@ -191,12 +191,12 @@ def test_it_drives_to_a_place_in_steps_and_a_key_stops_it(drives):
 @pytest.mark.parametrize("ended", ["asked", "closed"])
 def test_a_video_has_a_frame_for_each_step_and_is_whole_however_it_ends(drives, tmp_path, ended):
     one, told = drives()
-    one.put(requests.Record(on=True))
+    one.put(session.Record(on=True))
     for event in (FORWARD, LEFT):
         one.put(event)
         assert one.wait(LONG)
     assert told.told[-1].recording
-    one.put(requests.Record(on=False)) if ended == "asked" else one.close()
+    one.put(session.Record(on=False)) if ended == "asked" else one.close()
     one.wait(LONG)
     one.close()
     (path,) = tmp_path.glob("*.mp4")
@@ -218,17 +218,17 @@ def test_a_request_that_finds_too_many_waiting_is_dropped_and_said(drives):
     one.put(LEFT)
     assert slow.begun.wait(LONG)
     for number in range(driver.MOST_WAITING):
-        one.put(requests.Save(f"w{number:02}"))
+        one.put(session.Save(f"w{number:02}"))
     assert not [shown for shown in told.told if shown.failed]
-    one.put(requests.Save("lost"))
-    one.put(requests.Undo())
+    one.put(session.Save("lost"))
+    one.put(session.Undo())
     said = [shown.said for shown in told.told if shown.failed]
     assert len(said) == 2
     assert "32 requests are waiting: Save was dropped." in said[0]
     assert "Undo was dropped" in said[1]
     slow.go.set()
     assert one.wait(LONG)
-    assert kept.names(one._folder) == [f"w{number:02}" for number in range(driver.MOST_WAITING)]
+    assert saved.names(one._folder) == [f"w{number:02}" for number in range(driver.MOST_WAITING)]
 
 
 def test_drags_and_switches_are_coalesced_while_a_step_is_imagined(drives):
@@ -240,11 +240,11 @@ def test_drags_and_switches_are_coalesced_while_a_step_is_imagined(drives):
     one.put(LEFT)
     assert slow.begun.wait(LONG)
     for number in range(200):
-        one.put(requests.GoTo((x, y, yaw + number)))
+        one.put(session.GoTo((x, y, yaw + number)))
         one.put(session.Walls(number % 2 == 0))
     assert len(one._waiting) == 2
     assert not [shown for shown in told.told if shown.failed]
-    one.put(requests.GoTo((x, y, yaw)))
+    one.put(session.GoTo((x, y, yaw)))
     slow.go.set()
     assert one.wait(LONG)
     np.testing.assert_allclose(told.session.planar_3, [x, y, yaw], atol=1e-6)
@@ -255,7 +255,7 @@ def test_one_drag_drives_a_bounded_number_of_steps_and_says_so(drives):
     one, told = drives()
     before = told.session
     one.put(session.Walls(False))
-    one.put(requests.GoTo((before.planar_3[0] + 1000.0, *before.planar_3[1:].tolist())))
+    one.put(session.GoTo((before.planar_3[0] + 1000.0, *before.planar_3[1:].tolist())))
     assert one.wait(LONG)
     assert told.session.steps == before.steps + driver.MOST_WAY
     assert any(f"driving the first {driver.MOST_WAY}" in said for said in told.sentences)

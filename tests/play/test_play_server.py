@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from pewm_jax.cli import play
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.play import page, requests, serving, status, visitors
+from pewm_jax.play import page, panels, serving, session
 from pewm_jax.play.settings import Serve, Start
 from tests.play.tiny_drive import FORWARD, a_place, a_toy
 
@@ -99,10 +99,10 @@ def test_the_terminal_is_told_now_and_then_what_is_waited_for(tmp_path, monkeypa
         assert told[1:] == ["Loading the model …", "error: nothing to load here"]
         told.clear()
         for seconds in range(1, 4):
-            one._tell(requests.Shown(f"Preparing … {seconds} s", busy=True))
-        monkeypatch.setattr(status, "SAY_AGAIN_S", 0.0)
-        one._tell(requests.Shown("Preparing … 4 s", busy=True))
-        one._tell(requests.Shown("Drive."))
+            one._tell(session.PageUpdate(f"Preparing … {seconds} s", busy=True))
+        monkeypatch.setattr(panels, "SAY_AGAIN_S", 0.0)
+        one._tell(session.PageUpdate("Preparing … 4 s", busy=True))
+        one._tell(session.PageUpdate("Drive."))
         assert told == ["Preparing … 1 s", "Preparing … 4 s", "Ready."]
 
 
@@ -124,7 +124,7 @@ def test_a_box_goes_where_it_was_dragged_and_the_agent_too(tmp_path):
         x, y, yaw = begun.planar_3
         view.handle.position = np.array([x, y, 0.0])
         view.handle.wxyz = viser.transforms.SO3.from_z_radians(yaw + 0.4).wxyz
-        one._put(requests.GoTo(view.dragged()))
+        one._put(session.GoTo(view.dragged()))
         assert one.driver.wait(LONG)
         assert np.cos(one.driver._session.planar_3[2] - yaw - 0.4) > 1 - 1e-6
         view.ceiling = view.tint = True
@@ -167,7 +167,7 @@ def test_which_visitors_are_welcome():
         ("https://Box.example", "box.example:443", ("box.example",)),
         ("https://box.example", "127.0.0.1:8080", ("box.example",)),  # a proxy that renames
     ):
-        assert visitors.objection(origin, host, here, names) == "", (origin, host)
+        assert serving.objection(origin, host, here, names) == "", (origin, host)
     for origin, host, names in (
         ("http://localhost:8080", "localhost:8081", ()),
         ("https://localhost", "localhost:80", ()),
@@ -177,11 +177,11 @@ def test_which_visitors_are_welcome():
         (None, None, ("",)),
         (None, "localhost:port", ()),
     ):
-        assert visitors.objection(origin, host, here, names), (origin, host)
-    assert visitors.objection("http://box:80", "box", "box") == ""
+        assert serving.objection(origin, host, here, names), (origin, host)
+    assert serving.objection("http://box:80", "box", "box") == ""
     for odd in ("a;b", "a\udc9b", "a b", "<b>", "a" * 300):
         for origin, host in ((None, odd), (f"http://{odd}", "localhost")):
-            said = visitors.objection(origin, host, here)
+            said = serving.objection(origin, host, here)
             assert said.isascii()
             assert "--names" not in said
 
@@ -201,7 +201,7 @@ def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so(
     assert serving.warning(Serve()) == ""
     assert "no password" in serving.warning(Serve(host="0.0.0.0"))
     assert [serving.here(host) for host in ("0.0.0.0", "::1", "me")] == ["127.0.0.1", "[::1]", "me"]
-    with pytest.raises(ConfigError, match="no address that this machine"):
+    with pytest.raises(ConfigError, match="is not an address that this machine"):
         serving.server(Serve(host="203.0.113.7"))  # an address of nobody
 
 
@@ -233,4 +233,4 @@ def test_settings_of_a_page_are_those_of_its_parts():
     assert play._part(Serve, settings).port == 0
     with pytest.raises(ConfigError):
         play.Settings(port=-1)
-    assert requests.Begin(Start()).start.house == 2
+    assert session.Begin(Start()).start.house == 2

@@ -26,7 +26,7 @@ from pewm_jax.config import (
 )
 from pewm_jax.config import command_line as cli
 from pewm_jax.data.navigation import is_free
-from pewm_jax.play import board, engine, kept, picking, places, session
+from pewm_jax.play import board, engine, picking, places, saved, session
 from pewm_jax.play.settings import Serve, Start
 from tests.persist_world import MODEL as PERSIST
 from tests.play.tiny_drive import (
@@ -174,7 +174,7 @@ def test_a_box_is_copied_and_moved():
 
 @pytest.mark.parametrize("box", [((0, 0, 0), (0, 1, 1)), ((1, 1, 1), (0, 0, 0))])
 def test_a_box_without_inside_is_refused(box):
-    with pytest.raises(UserError, match="no inside"):
+    with pytest.raises(UserError, match="is empty"):
         session.apply(an_engine(), a_session(), session.Erase(box))
 
 
@@ -189,9 +189,9 @@ def test_a_memory_without_places_is_refused_an_edit_and_a_codec_a_drive():
 
 def test_a_world_that_is_kept_comes_back_bit_for_bit(tmp_path):
     model, now = an_engine(), session.apply(an_engine(), a_session(), FORWARD)
-    kept.save(model, now.world, tmp_path / "worlds", "my world")
-    assert kept.names(tmp_path / "worlds") == ["my world"]
-    back = kept.load(model, a_session().world, tmp_path / "worlds", "my world")
+    saved.save(model, now.world, tmp_path / "worlds", "my world")
+    assert saved.names(tmp_path / "worlds") == ["my world"]
+    back = saved.load(model, a_session().world, tmp_path / "worlds", "my world")
     same(back, now.world)
     resumed = session.resume(now, back, "back")
     np.testing.assert_allclose(resumed.planar_3, now.planar_3, atol=1e-4)
@@ -199,15 +199,15 @@ def test_a_world_that_is_kept_comes_back_bit_for_bit(tmp_path):
     other = dataclasses.replace(MODEL, clip=dataclasses.replace(MODEL.clip, far_m=9.0))
     stranger = dataclasses.replace(model, config=Config(model=other))
     with pytest.raises(UserError, match="another memory"):
-        kept.load(stranger, now.world, tmp_path / "worlds", "my world")
+        saved.load(stranger, now.world, tmp_path / "worlds", "my world")
     with pytest.raises(UserError, match="no world"):
-        kept.load(model, now.world, tmp_path, "none yet")
+        saved.load(model, now.world, tmp_path, "none yet")
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "", ".hidden", "x" * 61, "a\n"])
 def test_names_that_lead_elsewhere_are_refused(name, tmp_path):
-    with pytest.raises(ConfigError, match="no name for a world"):
-        kept.path_of(tmp_path, name)
+    with pytest.raises(ConfigError, match="is not a valid name of a world"):
+        saved.path_of(tmp_path, name)
 
 
 POSES = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
@@ -220,7 +220,7 @@ def test_a_way_leads_to_its_end_in_small_steps(before, after):
     for action in actions:
         assert np.linalg.norm(action[:2]) <= 0.25 + 1e-4
         assert abs(action[2]) <= np.radians(30) + 1e-4
-        planar, _ = places.walk(places.Place("", a_place().frames), planar, action)
+        planar, _ = places.walk(places.StartPoint("", a_place().frames), planar, action)
     np.testing.assert_allclose(planar[:2], after[:2], atol=1e-4)
     assert np.cos(planar[2] - after[2]) > 1 - 1e-5
 

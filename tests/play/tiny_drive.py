@@ -76,7 +76,7 @@ class Toy(engine.Engine):
     def imagine_blind(self, world, action_3, key):
         pose = world.frame.camera.world_from_camera[0]
         yaw = np.arctan2(pose[1, 2], pose[0, 2])
-        free = places.Place("", world.frame)
+        free = places.StartPoint("", world.frame)
         x, y, yaw = places.walk(free, np.array([*pose[:2, 3], yaw]), action_3)[0]
         there = pose_from_yaw(np.array([x, y, pose[2, 3]]), yaw)[None]
         camera = Camera(world.frame.camera.intrinsics_4, there)

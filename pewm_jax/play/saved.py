@@ -1,8 +1,9 @@
-"""Worlds in files: a folder of them by plain names, each written whole or not at all."""
+"""Files of the viewer: saved worlds and videos, in one folder, written atomically."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pewm_jax.config import UserError, serialize
 from pewm_jax.errors import require
 from pewm_jax.io import tree, weights
 from pewm_jax.play.engine import Engine
+from pewm_jax.report.video import Film
 from pewm_jax.types import WorldState
 
 FORMAT, SUFFIX = "world 1", ".world.safetensors"
@@ -29,10 +31,12 @@ def path_of(folder: Path, name: str) -> Path:
     """Return a world's file.
 
     Raises:
-        ConfigError: the name is not plain: it could lead out of the folder.
+        ConfigError: the name is not plain, so it could point outside the folder.
     """
     plain = re.fullmatch(r"\w[\w \-]*", name) is not None and len(name) <= MOST_NAME
-    require(plain, f"{name!r} is no name for a world: use letters, digits, spaces and hyphens.")
+    require(
+        plain, f"{name!r} is not a valid name of a world: use letters, digits, spaces and hyphens."
+    )
     return folder / f"{name}{SUFFIX}"
 
 
@@ -40,10 +44,10 @@ def save(engine: Engine, world: WorldState, folder: Path, name: str) -> Path:
     """Write a world: its present frame and its map.
 
     Args:
-        engine: the model it belongs to; its clip and memory are noted in the file.
+        engine: the model it belongs to; the settings of its clip and memory are stored in the file.
         world: the world.
-        folder: where; it is made.
-        name: a plain name. A world of that name is replaced.
+        folder: the folder; it is created if necessary.
+        name: a plain name; a world of this name is replaced.
 
     Raises:
         ConfigError: the name is not plain.
@@ -60,7 +64,7 @@ def load(engine: Engine, like: WorldState, folder: Path, name: str) -> WorldStat
     Args:
         engine: the model to drive it with.
         like: a world of that model, for its shapes.
-        folder: where.
+        folder: the folder.
         name: its name.
 
     Raises:
@@ -71,10 +75,10 @@ def load(engine: Engine, like: WorldState, folder: Path, name: str) -> WorldStat
         raise UserError(f"There is no world {name!r} in {folder}.")
     facts = weights.metadata(path)
     if facts.get("format") != FORMAT:
-        raise UserError(f"{path} is no world that the viewer has saved.")
+        raise UserError(f"{path} is not a world saved by the viewer.")
     if facts.get("of") != _facts(engine):
         raise UserError(
-            f"The world {name!r} was made by a model with other images or another memory than "
+            f"The world {name!r} was made by a model whose images or memory differ from those of "
             f"{engine.name}: open it with the model that made it."
         )
     found = weights.load(path)
@@ -85,6 +89,39 @@ def load(engine: Engine, like: WorldState, folder: Path, name: str) -> WorldStat
 
 
 def _facts(engine: Engine) -> str:
-    """Return what two models must share to share worlds."""
+    """Return the settings that two models must share to exchange worlds."""
     sections = (engine.model.clip, getattr(engine.model, "memory", engine.model))
     return json.dumps([serialize.to_dict(section) for section in sections], sort_keys=True)
+
+
+FPS = 6
+"""Steps per second of video."""
+
+
+class DriveFilm:
+    """A video that is being recorded; the next free number is its name."""
+
+    def __init__(self, folder: Path, picture_HWC: np.ndarray):
+        """Begin a video.
+
+        Args:
+            folder: the folder of the video; it is created if necessary.
+            picture_HWC: the first frame, uint8.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        numbers = [path.stem.removeprefix("drive-") for path in folder.glob("drive-*.mp4")]
+        number = 1 + max((int(text) for text in numbers if text.isdigit()), default=0)
+        self._path = folder / f"drive-{number:03d}.mp4"
+        self._partial = self._path.with_name(f"{self._path.name}.{os.getpid()}.partial")
+        self._film = Film(str(self._partial), picture_HWC.shape[:2], FPS)
+        self._film.add(picture_HWC)
+
+    def add(self, picture_HWC: np.ndarray) -> None:
+        """Add a frame."""
+        self._film.add(picture_HWC)
+
+    def close(self) -> Path:
+        """End the video and return its file."""
+        self._film.close()
+        self._partial.replace(self._path)
+        return self._path
