@@ -21,7 +21,7 @@ import tyro
 
 from pewm_jax import worlds
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.eval import edit_trials
+from pewm_jax.eval import voxel_trials
 from pewm_jax.memory import class_edit, class_grid, memories
 from pewm_jax.report.pictures import as_bytes, grid, save_png
 from pewm_jax.types import Camera
@@ -88,7 +88,7 @@ def main(settings: Settings) -> None:
 
     eye = model.memory.eye_m
     floor = float(frames.camera.world_from_camera[0, 2, 3]) - eye
-    box = edit_trials.room(model, true, floor)
+    box = voxel_trials.room(model, true, floor)
     if box is None:
         print("no room for a block in front of the agent: name another --frame.")
         return

@@ -30,12 +30,11 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode, read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.eval import metrics
-from pewm_jax.eval.imagine import Imagination
-from pewm_jax.eval.methods import Methods
-from pewm_jax.eval.metrics import Perceptual, VideoDistance
-from pewm_jax.eval.metrics.videos import read as read_video
-from pewm_jax.eval.protocol import choose
+from pewm_jax.eval.clips import choose
+from pewm_jax.eval.metrics import VideoDistance
+from pewm_jax.eval.metrics.videos import read_i3d as read_video
 from pewm_jax.eval.reproject import ReprojectSettings
+from pewm_jax.eval.runner import Methods, ModelRunner
 from pewm_jax.eval.scoring import load_batch
 from pewm_jax.io import tree
 from pewm_jax.models.i3d import convert as i3d_weights
@@ -107,13 +106,13 @@ def parts(clips: int) -> tuple[dict[str, Callable[[], object]], Any, Any]:
     config = dataclasses.replace(config, evaluate=evaluate)
     episodes = houses(config, 2)
     choices = choose(config, episodes, clips, 1)
-    model = Imagination(config, params, clips, config.data.context)
+    model = ModelRunner(config, params, clips, config.data.context)
     methods = Methods(model, ReprojectSettings())
     methods.prepare(["memory", "empty"])
     batch = load_batch(config, episodes, choices, 0, cameras=False)
     frames = batch.imagine(methods, "memory", 0)[2]
     lpips = metrics.load("lpips_alex")
-    assert isinstance(lpips, Perceptual)
+    assert isinstance(lpips, LPIPS)
 
     def read() -> Any:
         """Read a batch, and wait for what has been seen before."""
@@ -150,7 +149,7 @@ def _i3d() -> VideoDistance:
 def peers(imagined: Any, truth: Any) -> dict[str, Callable[[], object]]:
     """Return LPIPS of the same pairs of frames, ours and torch's, which agree."""
     net, params = lpips_weights.read(lpips_weights.find("alex"), "alex")
-    ours = Perceptual(net, jax.device_put(params))
+    ours = LPIPS(net, jax.device_put(params))
     reference = TorchLPIPS(params).eval()
     flat = [np.asarray(x).reshape(-1, *x.shape[-3:]) for x in (imagined, truth)]
     flat = [x / 127.5 - 1 if x.dtype == np.uint8 else np.clip(x, -1, 1) for x in flat]

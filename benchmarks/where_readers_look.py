@@ -26,7 +26,7 @@ from record import machine, record, table
 import pewm_jax
 from pewm_jax.config import AttentionConfig, Config, UserError
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.eval.protocol import choose, load_clip
+from pewm_jax.eval.clips import choose, load_clip
 from pewm_jax.geometry.cameras import project
 from pewm_jax.readers import attention as attention_reader
 from pewm_jax.readers import memory_block

@@ -151,7 +151,7 @@ def test_evaluation_imports_before_it_opens_the_run(tmp_path, monkeypatch):
     package(tmp_path, "mine_first", PART.format(name="first"), entry=False)
     package(tmp_path, "mine_second", PART.format(name="second"), entry=False)
     monkeypatch.chdir(tmp_path)
-    from pewm_jax.eval import report
+    from pewm_jax.eval import evaluate as report
 
     seen = []
     monkeypatch.setattr(

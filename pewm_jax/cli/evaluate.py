@@ -96,7 +96,7 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
 
     with processes.joined(join):
         # After joining: these imports take seconds, and JAX must not be used before it.
-        from pewm_jax.eval import report
+        from pewm_jax.eval import evaluate as report
 
         cli.cache_compilation(Path(run).parent)
         try:

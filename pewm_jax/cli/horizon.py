@@ -112,11 +112,11 @@ def _measured(
     from pewm_jax.config import PersistConfig
     from pewm_jax.data.dataset import EpisodeSource
     from pewm_jax.data.loader import require_same_cells
-    from pewm_jax.eval import edit_trials, horizon, voxel_score
-    from pewm_jax.eval.metrics.videos import read
+    from pewm_jax.eval import horizon, voxel_trials
+    from pewm_jax.eval.metrics.videos import read_i3d
     from pewm_jax.models.i3d import convert as i3d_weights
 
-    i3d = read(i3d_weights.find(None), "fvd") if settings.fvd == "on" else None
+    i3d = read_i3d(i3d_weights.find(None), "fvd") if settings.fvd == "on" else None
     episodes = EpisodeSource(settings.data / settings.split)
     if len(episodes) < settings.walks:
         raise cli.ConfigError(
@@ -127,30 +127,34 @@ def _measured(
     first = settings.context - 1
     chosen = [episodes[k] for k in range(settings.walks)]
     require_same_cells(config.model, chosen[0])
-    walks = [horizon.walk_of(one, first, ends[-1], settings.context) for one in chosen]
+    walks = [horizon.read_walk(one, first, ends[-1], settings.context) for one in chosen]
     tried = _tried(settings, chosen, first)
     of_voxels = isinstance(config.model, PersistConfig)
     if tried:  # before hours of imagining
         if not of_voxels:
             raise cli.ConfigError("--trials places blocks in a world of voxels; this has none.")
-        edit_trials.class_of(config, tried)
+        voxel_trials.block_class(config, tried)
     truth = np.stack([walk.truth_THWC for walk in walks])
-    made: dict[str, Any] = {"world": horizon.roll(config, params, walks)}
+    made: dict[str, Any] = {"world": horizon.imagine_walks(config, params, walks)}
     facts: dict[str, Any] = {}
     if of_voxels:
-        made["without"] = horizon.roll(config, params, walks, memory=False, say="without voxels")
+        made["without"] = horizon.imagine_walks(
+            config, params, walks, memory=False, label="without voxels"
+        )
         grids = [walk.classes_TXYZ for walk in walks if walk.classes_TXYZ is not None]
         if len(grids) == len(walks):
-            made["known"] = horizon.roll(config, params, walks, known=True, say="from known grids")
-            made["bound"] = horizon.bound(config, params, walks)
-            facts["autoencoder"] = voxel_score.given_back(config.model, params, grids)
+            made["known"] = horizon.imagine_walks(
+                config, params, walks, known=True, label="from known grids"
+            )
+            made["bound"] = horizon.render_bound(config, params, walks)
+            facts["autoencoder"] = voxel_trials.reconstruction_shares(config.model, params, grids)
     for name, other in others:
-        made[name] = horizon.roll(other.config, other.params, walks, say=name)
+        made[name] = horizon.imagine_walks(other.config, other.params, walks, label=name)
     facts["psnr"] = {name: horizon.stretches(video, truth, ends) for name, video in made.items()}
     if i3d is not None:
         facts["distances"] = horizon.distances(made, truth, ends, settings.windows, i3d)
     if tried:
-        facts["edits"] = edit_trials.run(config, params, tried, count=settings.trials).facts()
+        facts["edits"] = voxel_trials.run(config, params, tried, count=settings.trials).facts()
     return facts, {"truth": truth, **made}
 
 
@@ -171,4 +175,4 @@ def _tried(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
     each = -(-wanted // len(chosen))
     places = [starts[len(starts) * k // each] for k in range(each)]
     walks = ((one, at) for at in places for one in chosen)
-    return [horizon.walk_of(one, at, settings.trial_frames, 1) for one, at in walks][:wanted]
+    return [horizon.read_walk(one, at, settings.trial_frames, 1) for one, at in walks][:wanted]

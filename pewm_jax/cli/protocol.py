@@ -62,9 +62,9 @@ def main(argv: Sequence[str], prog: str = "pewm-jax protocol") -> int:
     settings = cli.parse(Settings, flags, default=Settings(), prog=prog, description=about)
     config = _laid(_settings_of(name), settings)
     # Imported here and not above: help and refusals come at once.
-    from pewm_jax.eval import protocol_file
+    from pewm_jax.eval import protocol as protocols
 
-    protocol_file.write(config, settings.out, print)
+    protocols.write_protocol(config, settings.out, print)
     print(f"protocol: {settings.out}")
     return 0
 

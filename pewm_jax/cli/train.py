@@ -70,11 +70,11 @@ def main(argv: Sequence[str], prog: str = "python train.py") -> int:
     with processes.joined(launch):
         # After joining: these imports take seconds, and JAX must not be used before it.
         from pewm_jax.eval import preview as pictures
-        from pewm_jax.eval import protocol_file
+        from pewm_jax.eval import protocol as protocols
         from pewm_jax.train import loop
 
         if isinstance(config.model, World):
-            protocol_file.given(config, {})  # refused now, and not after the training
+            protocols.apply_protocol_file(config, {})  # refused now, and not after the training
         run = loop.runs.check(config)
         cli.cache_compilation(run.parent)
         preview = pictures.make_preview(config, run) if config.train.preview_every else None

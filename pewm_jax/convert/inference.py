@@ -29,9 +29,9 @@ from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
 from pewm_jax.config import Config, UserError
 from pewm_jax.convert import card, output
-from pewm_jax.eval.protocol import file_hash
-from pewm_jax.eval.report import METRICS
+from pewm_jax.eval.evaluate import METRICS
 from pewm_jax.io import sources, tensor_files, tree, weights
+from pewm_jax.io.store import file_hash
 from pewm_jax.train import runs
 from pewm_jax.types import Params
 from pewm_jax.worlds import rollouts

@@ -19,11 +19,11 @@ from pewm_jax import shipped
 from pewm_jax.codecs.signals import depth_from_signal, signal_from_depth, signal_from_rgb
 from pewm_jax.config import CodecWorldConfig, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
-from pewm_jax.eval.images import psnr, unit_colours
-from pewm_jax.eval.imagine import print_now
-from pewm_jax.eval.protocol import file_hash
+from pewm_jax.eval.metrics.images import psnr, unit_colours
+from pewm_jax.eval.runner import print_now
 from pewm_jax.geometry import depth_images
 from pewm_jax.io import atomic
+from pewm_jax.io.store import file_hash
 from pewm_jax.train import runs
 from pewm_jax.types import Array, Frames, Params
 from pewm_jax.worlds.rollouts import load_finished
@@ -37,7 +37,7 @@ def score(
     *,
     data: str | Path | None = None,
     split: str | None = None,
-    say: Callable[[str], Any] = print_now,
+    log: Callable[[str], Any] = print_now,
 ) -> Path:
     """Score a trained codec on a split and print and write the numbers.
 
@@ -46,7 +46,7 @@ def score(
             with the library.
         data: the data set's folder; by default the run's.
         split: the folder inside it; by default the run's ``evaluate.split``.
-        say: told the numbers.
+        log: told the numbers.
 
     Returns:
         The file written, ``RUN/report/codec-SPLIT.json`` (``runs/NAME/report/…`` of a codec that
@@ -93,9 +93,9 @@ def score(
     path = home / "report" / f"codec-{folder.name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic.write_text(path, json.dumps(result, indent=1, ensure_ascii=False) + "\n")
-    say(f"{folder}: {len(scenes)} scenes, {', '.join(sizes)} pixels")
+    log(f"{folder}: {len(scenes)} scenes, {', '.join(sizes)} pixels")
     for line in _lines(numbers):
-        say(line)
+        log(line)
     return path
 
 

@@ -13,12 +13,13 @@ import numpy as np
 from pewm_jax import config as configuration
 from pewm_jax import shipped
 from pewm_jax.config import Config, UserError
-from pewm_jax.eval import intervals, protocol_file, samples
-from pewm_jax.eval.fixed import Protocol, difference
-from pewm_jax.eval.images import MASKS
+from pewm_jax.eval import intervals, results
+from pewm_jax.eval import protocol as protocols
+from pewm_jax.eval.evaluate import METRICS, PAGE, PROTOCOL, make_folder
 from pewm_jax.eval.loaded_run import OWN
-from pewm_jax.eval.measure import SCHEMA as REPORT_SCHEMA
-from pewm_jax.eval.report import METRICS, PAGE, PROTOCOL, make_folder
+from pewm_jax.eval.metrics.images import MASKS
+from pewm_jax.eval.protocol import Protocol, difference
+from pewm_jax.eval.results import SCHEMA as REPORT_SCHEMA
 from pewm_jax.io import atomic
 from pewm_jax.report import compare_page
 from pewm_jax.train import runs
@@ -46,7 +47,7 @@ class Report:
     name: str
     folder: Path
     metrics: Mapping[str, Any]
-    samples: samples.Samples
+    samples: results.Samples
     protocol: Protocol
 
     @property
@@ -71,7 +72,7 @@ def compare(
     also_one: Sequence[str | Path] = (),
     also_two: Sequence[str | Path] = (),
     out: str | Path | None = None,
-    say: Callable[[str], Any] = print,
+    log: Callable[[str], Any] = print,
 ) -> Path:
     """Write a page and ``comparison.json`` on two runs that were scored by one protocol.
 
@@ -81,7 +82,7 @@ def compare(
         also_one: runs that differ from ``one`` in the training seed alone.
         also_two: the same of ``two``.
         out: the folder to write; by default ``compare-TWO`` beside the first one's report.
-        say: shows a line.
+        log: shows a line.
 
     Returns:
         The path of the page.
@@ -106,7 +107,7 @@ def compare(
     text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
     atomic.write_text(folder / COMPARISON, text + "\n")
     for line in compare_page.sentences(content):
-        say(line)
+        log(line)
     return folder / PAGE
 
 
@@ -138,7 +139,11 @@ def read(name: str | Path) -> Report:
     if not isinstance(metrics, dict) or metrics.get("schema") != REPORT_SCHEMA:
         raise UserError(f"the report in {folder} is of another version of the library: {again}.")
     report = Report(
-        str(name), folder, metrics, samples.load(folder), protocol_file.load(folder / PROTOCOL)
+        str(name),
+        folder,
+        metrics,
+        results.load_samples(folder),
+        protocols.load_protocol(folder / PROTOCOL),
     )
     said, about = metrics["protocol"], report.samples.about
     hashes = {said["protocol_sha256"], about["protocol_sha256"], report.protocol.sha256}
@@ -210,7 +215,7 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
     for side, group in sides.items():
         content[side] = {"name": group[0].name, "runs": [report.facts for report in group]}
     content["differences"] = {}
-    for part in samples.PARTS:
+    for part in results.PARTS:
         houses_C = np.unique(one[0].samples.houses(part), return_inverse=True)[1]
         values = {side: _values(group, part, skip) for side, group in sides.items()}
         averaged = {side: _map(lambda x: x.mean(0), found) for side, found in values.items()}

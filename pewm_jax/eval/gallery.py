@@ -10,8 +10,8 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
+from pewm_jax.eval.clips import ClipChoice, load_clip
 from pewm_jax.eval.long_rollouts import LongRollouts
-from pewm_jax.eval.protocol import ClipChoice, load_clip
 from pewm_jax.eval.seen import TOLERANCE_M, TOLERANCE_RELATIVE, seen_masks
 from pewm_jax.geometry.actions import heading
 from pewm_jax.report.evaluation_page import Gallery

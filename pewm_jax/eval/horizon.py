@@ -20,7 +20,7 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import Config, PersistConfig, UserError
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval.images import psnr, unit_colours
+from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.metrics.videos import DISTANCES, VideoDistance
 from pewm_jax.geometry.actions import PLANAR
 from pewm_jax.io.progress import Meter
@@ -35,7 +35,7 @@ CHUNK = 40
 
 
 @dataclasses.dataclass(frozen=True)
-class Walk:
+class RecordedWalk:
     """A held-out walk.
 
     Attributes:
@@ -59,7 +59,7 @@ class Walk:
     first: tuple[np.ndarray, np.ndarray] | None
 
 
-def walk_of(episode: Episode, start: int, frames: int, context: int) -> Walk:
+def read_walk(episode: Episode, start: int, frames: int, context: int) -> RecordedWalk:
     """Read a walk of ``frames`` frames after frame ``start`` of an episode.
 
     Raises:
@@ -80,7 +80,7 @@ def walk_of(episode: Episode, start: int, frames: int, context: int) -> Walk:
     if episode.voxel_grid is not None:
         found, here = episode.voxels(after), episode.voxels([start])
         first = here.classes_TXYZ[0], here.origin_T3[0]
-    return Walk(
+    return RecordedWalk(
         episode.name,
         seen,
         np.asarray(episode.actions[start : start + frames], np.float32),
@@ -92,14 +92,14 @@ def walk_of(episode: Episode, start: int, frames: int, context: int) -> Walk:
     )
 
 
-def roll(
+def imagine_walks(
     config: Config,
     params: Params,
-    walks: Sequence[Walk],
+    walks: Sequence[RecordedWalk],
     *,
     memory: bool = True,
     known: bool = False,
-    say: str = "imagining",
+    label: str = "imagining",
 ) -> np.ndarray:
     """Imagine all walks at once; returns (B, T, H, W, 3) uint8 colours.
 
@@ -109,7 +109,7 @@ def roll(
         walks: of one length.
         memory: False goes on from the last picture alone, clip after clip.
         known: begins in the recorded grid of the present frame, of a ``persist`` world.
-        say: what the progress is called.
+        label: name of the work in the progress line.
     """
     model = config.model
     each = CHUNK if memory else model.clip.frames - 1
@@ -125,13 +125,13 @@ def roll(
     return _in_chunks(
         actions.shape[1],
         each,
-        say,
+        label,
         state,
         lambda state, at: imagine(params, state, actions[:, at : at + each], _folded(keys, at)),
     )
 
 
-def bound(config: Config, params: Params, walks: Sequence[Walk]) -> np.ndarray:
+def render_bound(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> np.ndarray:
     """Return what the renderer of a ``persist`` world makes of the true voxels and cameras."""
     model: PersistConfig = config.model
     render = functools.partial(persist.render_true, model)
@@ -153,7 +153,7 @@ def bound(config: Config, params: Params, walks: Sequence[Walk]) -> np.ndarray:
     return _in_chunks(count, CHUNK, "rendering true voxels", state, made)
 
 
-def _begun(config: Config, params: Params, walks: Sequence[Walk]) -> Any:
+def _begun(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> Any:
     """Return the worlds that begin in the recorded grids of the present frames."""
     context = _stacked([jax.tree.map(lambda x: x[-1:], walk.context) for walk in walks])
     firsts = [walk.first for walk in walks if walk.first is not None]
@@ -201,10 +201,10 @@ def distances(
 
 
 def _in_chunks(
-    count: int, each: int, say: str, state: Any, make: Callable[[Any, int], Any]
+    count: int, each: int, label: str, state: Any, make: Callable[[Any, int], Any]
 ) -> np.ndarray:
     parts = []
-    with Meter(say, count, "frames") as meter:
+    with Meter(label, count, "frames") as meter:
         for at in range(0, count, each):
             state, frames = make(state, at)
             parts.append(as_bytes(np.asarray(frames.rgb_THWC)))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from pewm_jax.eval.images import MASKS
+from pewm_jax.eval.metrics.images import MASKS
 from pewm_jax.eval.statistics import scores
 from pewm_jax.report.labels import own_method
 

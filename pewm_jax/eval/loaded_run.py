@@ -8,8 +8,8 @@ from typing import Any
 
 from pewm_jax import shipped
 from pewm_jax.config import Config, UserError
-from pewm_jax.eval.protocol import file_hash
 from pewm_jax.io import weights
+from pewm_jax.io.store import file_hash
 from pewm_jax.train import stages
 from pewm_jax.types import Params
 from pewm_jax.worlds import require_world
@@ -21,7 +21,7 @@ OWN = "report"
 
 
 @dataclasses.dataclass(frozen=True)
-class Opened:
+class LoadedRun:
     """A trained run.
 
     Attributes:
@@ -66,7 +66,7 @@ def folders(run: str | Path) -> tuple[Path, Path]:
     return folder, shipped.home(run)
 
 
-def open_run(run: str | Path) -> Opened:
+def open_run(run: str | Path) -> LoadedRun:
     """Open a run of a world model.
 
     Raises:
@@ -75,10 +75,10 @@ def open_run(run: str | Path) -> Opened:
     folder, home = folders(run)
     config, params = load_finished(folder)
     require_world(config.model, f"a report of {run}")
-    return Opened(folder, home, config, params, file_hash(folder / WEIGHTS))
+    return LoadedRun(folder, home, config, params, file_hash(folder / WEIGHTS))
 
 
-def remembers(opened: Opened) -> bool:
+def has_memory(opened: LoadedRun) -> bool:
     """Tell whether a run's model has a memory; False where it was trained without one on purpose.
 
     That is, its memory is of kind ``none``, or no stage that trains one was asked for.
@@ -103,7 +103,7 @@ def remembers(opened: Opened) -> bool:
     return can.memory
 
 
-def _require_all_steps(opened: Opened) -> None:
+def _require_all_steps(opened: LoadedRun) -> None:
     """Refuse a run of which a stage was trained for fewer steps than its settings ask for."""
     for stage in stages.all_stages(opened.config):
         wanted = stage.settings(opened.config).steps
@@ -115,7 +115,7 @@ def _require_all_steps(opened: Opened) -> None:
             )
 
 
-def report_folder(opened: Opened, config: Config) -> Path:
+def report_folder(opened: LoadedRun, config: Config) -> Path:
     """Return where the report of some data goes: ``report``, or ``report-NAME`` of other data.
 
     Args:
@@ -131,7 +131,7 @@ def report_folder(opened: Opened, config: Config) -> Path:
     return opened.home / "-".join([OWN, *other])
 
 
-def open_none(opened: Opened, config: Config) -> Opened | None:
+def open_none(opened: LoadedRun, config: Config) -> LoadedRun | None:
     """Open the run without a memory that ``evaluate.none`` names, or return None.
 
     Its configuration is laid under the protocol of the evaluation: the same clips, context, batch
@@ -169,7 +169,7 @@ def open_none(opened: Opened, config: Config) -> Opened | None:
     return dataclasses.replace(other, config=laid)
 
 
-def _how(opened: Opened, steps: int) -> str:
+def _how(opened: LoadedRun, steps: int) -> str:
     """Return the flags that train a world as long without its memory, in brackets."""
     known = [stage for stage in stages.all_stages(opened.config) if not stage.optional]
     alone = next((stage for stage in known if not stage.memory), None)
@@ -180,7 +180,7 @@ def _how(opened: Opened, steps: int) -> str:
     return f" ({' '.join(flags)})"
 
 
-def none_facts(none: Opened, opened: Opened) -> dict[str, Any]:
+def none_facts(none: LoadedRun, opened: LoadedRun) -> dict[str, Any]:
     """Return what the report says of the run without a memory."""
     return {
         "run": str(none.folder),
@@ -190,13 +190,13 @@ def none_facts(none: Opened, opened: Opened) -> dict[str, Any]:
     }
 
 
-def _in_all(opened: Opened) -> int:
+def _in_all(opened: LoadedRun) -> int:
     """Return the steps of all stages: those done, or those planned where the file does not say."""
     planned = [stage.settings(opened.config).steps for stage in stages.all_stages(opened.config)]
     return sum(opened.steps.values() or planned)
 
 
-def _without_memory(opened: Opened) -> int:
+def _without_memory(opened: LoadedRun) -> int:
     """Return the steps of the stages that train the part that works without a memory."""
     known = {stage.name: stage for stage in stages.all_stages(opened.config)}
     return sum(steps for name, steps in opened.steps.items() if not known[name].memory)

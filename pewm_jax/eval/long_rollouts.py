@@ -1,14 +1,14 @@
 """Long rollouts: clip after clip from the model's own last frame; can be resumed.
 
-What is kept of them: the errors of every frame, the frames and the map of the first few, and how
-much the memory of the model holds after each clip.
+Stored are the errors of every frame, the frames and the map of the first few rollouts, and how many
+points the model's memory holds after each clip.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -17,15 +17,13 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval.images import unit_colours
-from pewm_jax.eval.imagine import print_now
-from pewm_jax.eval.methods import SAMPLED, Methods
-from pewm_jax.eval.metrics import Perceptual
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import ClipChoice, long_choices
+from pewm_jax.eval.clips import ClipChoice, long_choices
+from pewm_jax.eval.metrics import LPIPS
+from pewm_jax.eval.metrics.images import unit_colours
+from pewm_jax.eval.runner import SAMPLED, Methods, print_now, workers
 from pewm_jax.eval.scoring import Batch, Scored, load_batch
-from pewm_jax.eval.shares import gathered, share
 from pewm_jax.io.progress import Meter
+from pewm_jax.io.store import ResultCache, map_resumable
 from pewm_jax.types import WorldState
 
 
@@ -53,9 +51,9 @@ def roll_long(
     config: Config,
     episodes: Sequence[Episode],
     methods: Methods,
-    partials: Partials,
-    say: Callable[[str], Any] = print_now,
-    lpips: Perceptual | None = None,
+    cache: ResultCache,
+    log: Callable[[str], Any] = print_now,
+    lpips: LPIPS | None = None,
     choices: list[ClipChoice] | None = None,
 ) -> LongRollouts:
     """Make long rollouts with every method (first seed), score all, store the first few.
@@ -71,35 +69,33 @@ def roll_long(
     count, size = len(choices[0].targets_N), config.evaluate.batch
     shown, seed = min(config.evaluate.videos, len(choices)), config.evaluate.seeds[0]
     starts = range(0, len(choices), size)
-    keys = [(method, first) for first in starts for method in methods.names]
-    names = {
-        (method, first): f"rollouts-{methods.piece(method)}-seed{seed}-clip{first:04d}"
-        for method, first in keys
-    }
-    pieces = {
-        key: piece
-        for key in keys
-        if (piece := partials.get(names[key])) is not None
-        and len(piece["rgb"]) >= _shown(shown, key[1], len(choices), size)
-    }
-    own = set(share(keys, lambda key: key[0] not in SAMPLED))
-    todo = [key for key in keys if key not in pieces and key in own]
-    if todo:
+
+    def work(todo: list[tuple[str, int]]) -> Iterator[tuple[tuple[str, int], Any]]:
         methods.prepare(method for method, _ in todo)
         total = count * sum(min(size, len(choices) - first) for _, first in todo)
+        loaded: tuple[int, Batch] | None = None
         with Meter("long rollouts", total, "frames") as meter:
-            loaded: tuple[int, Batch] | None = None
             for method, first in todo:
                 if loaded is None or loaded[0] != first:
-                    chosen, cameras = choices[first : first + size], methods.model.cameras
-                    batch = load_batch(config, episodes, chosen, first, cameras=cameras)
-                    loaded = first, batch
+                    some, cameras = choices[first : first + size], methods.model.cameras
+                    loaded = first, load_batch(config, episodes, some, first, cameras=cameras)
                 batch, here = loaded[1], _shown(shown, first, len(choices), size)
-                made = _roll(config, methods, method, batch, here, lpips)
-                pieces[method, first] = partials.put(names[method, first], **made)
+                yield (method, first), _roll(config, methods, method, batch, here, lpips)
                 meter.advance(count * batch.real)
-        say(meter.summary())
-    found = gathered(partials, names, pieces, "long rollouts")
+        log(meter.summary())
+
+    found = map_resumable(
+        [(method, first) for first in starts for method in methods.names],
+        lambda key: f"rollouts-{methods.piece(key[0])}-seed{seed}-clip{key[1]:04d}",
+        work,
+        cache=cache,
+        what="long rollouts",
+        is_usable=lambda key, arrays: (
+            len(arrays["rgb"]) >= _shown(shown, key[1], len(choices), size)
+        ),
+        workers=workers(),
+        is_light=lambda key: key[0] not in SAMPLED,
+    )
     kept = {
         method: _joined([found[method, first] for first in starts], shown)
         for method in methods.names
@@ -110,12 +106,12 @@ def roll_long(
 
 
 def _shown(shown: int, first: int, rollouts: int, size: int) -> int:
-    """Return how many rollouts of a batch are shown."""
+    """Return the number of rollouts of a batch that are shown."""
     return min(max(shown - first, 0), size, rollouts - first)
 
 
 def _joined(parts: Sequence[dict[str, np.ndarray]], shown: int) -> dict[str, np.ndarray]:
-    """Join batches; of what is shown no more than was asked for now."""
+    """Join batches; of the shown rollouts no more than are asked for now."""
     joined = {key: np.concatenate([part[key] for part in parts if key in part]) for key in parts[0]}
     every = ("sums", "occupied")
     return {key: array if key in every else array[:shown] for key, array in joined.items()}
@@ -127,7 +123,7 @@ def _roll(
     method: str,
     batch: Batch,
     shown: int,
-    lpips: Perceptual | None,
+    lpips: LPIPS | None,
 ) -> dict[str, np.ndarray]:
     """Imagine a batch of long rollouts; frames and maps of the first ``shown`` are kept."""
     held: list[np.ndarray] = []

@@ -10,9 +10,7 @@ always shows one picture comes back to it perfectly.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -22,17 +20,15 @@ import numpy as np
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval import intervals
-from pewm_jax.eval.images import psnr, unit_colours
-from pewm_jax.eval.imagine import print_now
-from pewm_jax.eval.methods import SAMPLED, Methods
+from pewm_jax.eval.clips import ClipChoice, load_clip, stack
 from pewm_jax.eval.metrics import Revisit
+from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.metrics.revisits import ways
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import ClipChoice, load_clip, stack
+from pewm_jax.eval.runner import SAMPLED, Methods, print_now, workers
 from pewm_jax.eval.scoring import TRUTH, Batch, Scored
-from pewm_jax.eval.shares import gathered, share
 from pewm_jax.geometry.actions import there_and_back
 from pewm_jax.io.progress import Meter
+from pewm_jax.io.store import ResultCache, inputs_hash, map_resumable
 from pewm_jax.report.labels import own_method
 from pewm_jax.types import Frames
 
@@ -98,27 +94,27 @@ def way_out(config: Config, rollouts: Sequence[ClipChoice]) -> tuple[int, str]:
     )
 
 
-def look_back(
+def mirror_test(
     config: Config,
     episodes: Sequence[Episode],
     methods: Methods,
-    partials: Partials,
+    cache: ResultCache,
     rollouts: Sequence[ClipChoice],
     measures: Mapping[str, Revisit],
-    say: Callable[[str], Any] = print_now,
+    log: Callable[[str], Any] = print_now,
 ) -> Mirror | None:
     """Do the mirror test with every method that is a network (first seed); None if it is left out.
 
-    Pieces that ``partials`` holds are reused; several processes share the others.
+    Results in ``cache`` are reused; several processes share the work.
 
     Args:
         config: the experiment.
         episodes: held-out episodes.
         methods: who imagines.
-        partials: where scores are kept.
+        cache: where results are stored.
         rollouts: the long rollouts, of whose ways the first frames are taken.
-        measures: by which both visits are compared (``metrics.chosen.revisits``).
-        say: shows a line.
+        measures: by which both visits are compared (``metrics.selection.revisits``).
+        log: shows a line.
 
     Raises:
         UserError: as for ``scoring.score_table``.
@@ -128,24 +124,22 @@ def look_back(
         return None
     choices = [dataclasses.replace(one, targets_N=one.targets_N[:out]) for one in rollouts]
     seed, size = config.evaluate.seeds[0], config.evaluate.batch
-    starts, names = range(0, len(choices), size), {}
-    for first in starts:
-        for method in (*[name for name in methods.names if name in SAMPLED], TRUTH):
-            who = TRUTH if method == TRUTH else methods.piece(method)
-            name = f"mirror-{who}-seed{seed}-out{out}-{_digest(measures)}-clip{first:04d}"
-            names[method, first] = name
-    known = {key: piece for key, name in names.items() if (piece := partials.get(name)) is not None}
-    own = share(list(names), lambda key: key[0] == TRUTH)
-    todo = [key for key in own if key not in known]
-    if todo:
+    starts = range(0, len(choices), size)
+    everyone = (*[name for name in methods.names if name in SAMPLED], TRUTH)
+
+    def name(key: tuple[str, int]) -> str:
+        who = TRUTH if key[0] == TRUTH else methods.piece(key[0])
+        return f"mirror-{who}-seed{seed}-out{out}-{_digest(measures)}-clip{key[1]:04d}"
+
+    def work(todo: list[tuple[str, int]]) -> Iterator[tuple[tuple[str, int], Any]]:
         methods.prepare(method for method, _ in todo)
         total = 2 * out * sum(min(size, len(choices) - first) for _, first in todo)
         with Meter("mirror test", total, "frames") as meter:
             for method, first in todo:
-                chosen = choices[first : first + size]
-                batch = _there_and_back(config, episodes, chosen, first, methods.model.cameras)
+                some = choices[first : first + size]
+                batch = _there_and_back(config, episodes, some, first, methods.model.cameras)
                 if method == TRUTH:
-                    others = [choices[(first + k - 1) % len(choices)] for k in range(len(chosen))]
+                    others = [choices[(first + k - 1) % len(choices)] for k in range(len(some))]
                     other = None
                     if len(choices) > 1:
                         other = _there_and_back(config, episodes, others, first, True)
@@ -153,11 +147,19 @@ def look_back(
                 else:
                     frames = batch.imagine(methods, method, seed)[2]
                     made = _of_model(batch, frames, measures)
-                made = {name: array[: batch.real] for name, array in made.items()}
-                known[method, first] = partials.put(names[method, first], **made)
+                yield (method, first), {key: array[: batch.real] for key, array in made.items()}
                 meter.advance(2 * out * batch.real)
-        say(meter.summary())
-    found = gathered(partials, names, known, "mirror test")
+        log(meter.summary())
+
+    found = map_resumable(
+        [(method, first) for first in starts for method in everyone],
+        name,
+        work,
+        cache=cache,
+        what="mirror test",
+        workers=workers(),
+        is_light=lambda key: key[0] == TRUTH,
+    )
 
     def joined(method: str, kind: str) -> dict[str, np.ndarray]:
         parts = [found[method, first] for first in starts]
@@ -167,7 +169,6 @@ def look_back(
             if name.partition("/")[0] == kind
         }
 
-    everyone = list(dict.fromkeys(method for method, _ in names))
     return Mirror(
         scored=Scored(choices, {}),
         out=out,
@@ -180,7 +181,7 @@ def look_back(
 def _digest(measures: Mapping[str, Revisit]) -> str:
     """Return a hash of what both visits are compared by."""
     content = [VERSION, [[n, getattr(m.compare, "sha256", "")] for n, m in measures.items()]]
-    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
+    return inputs_hash(content)[:12]
 
 
 def _there_and_back(

@@ -11,9 +11,9 @@ import numpy as np
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.eval.images import psnr, unit_colours
-from pewm_jax.eval.imagine import Imagination, print_now
-from pewm_jax.eval.protocol import choose, load_clip, needs_cameras, stack
+from pewm_jax.eval.clips import choose, load_clip, needs_cameras, stack
+from pewm_jax.eval.metrics.images import psnr, unit_colours
+from pewm_jax.eval.runner import ModelRunner, print_now
 from pewm_jax.io import atomic
 from pewm_jax.report.pictures import as_bytes, farthest, grid, save_png
 from pewm_jax.report.video import encode_h264, side_by_side
@@ -26,7 +26,7 @@ SPLIT, CLIPS, SHOWN = "validation", 8, 3
 
 
 def make_preview(
-    config: Config, run: Path, say: Callable[[str], Any] = print_now
+    config: Config, run: Path, log: Callable[[str], Any] = print_now
 ) -> Preview | None:
     """Prepare previews for a training run, if its data allows any.
 
@@ -36,7 +36,7 @@ def make_preview(
     Args:
         config: the experiment; clips come from ``data.path``/validation.
         run: the run's folder; images and videos go to its folder ``previews/``.
-        say: shows a line that says why there are no previews.
+        log: shows a line that says why there are no previews.
 
     Returns:
         ``preview(params, stage, step)``. It imagines the clips with the current weights and
@@ -53,16 +53,16 @@ def make_preview(
         cameras = needs_cameras(episodes, choices)
         clips = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
     except UserError as error:
-        say(f"no previews of this training: {error}")
+        log(f"no previews of this training: {error}")
         return None
     context = stack([clip[0] for clip in clips], CLIPS)
     control = stack([clip[2] for clip in clips], CLIPS)
     seeds = np.stack([np.zeros(CLIPS, int), np.arange(CLIPS)], -1)
-    models: dict[str, Imagination] = {}
+    models: dict[str, ModelRunner] = {}
 
     def preview(params: Params, stage: Stage, step: int) -> Previewed:
         if stage.name not in models:
-            models[stage.name] = Imagination(
+            models[stage.name] = ModelRunner(
                 config, params, CLIPS, config.data.context, cameras=cameras
             )
         variants = {"memory": True, "empty": False} if stage.memory else {"model": False}

@@ -1,8 +1,8 @@
-"""The evaluation protocol: which clips are scored, with what context and which actions.
+"""The protocol as a value with a hash: what is scored, whatever model it is scored with.
 
-Nothing here is random. Clips start on the way back of every held-out episode, where the agent sees
-places again. Their context is thinned in the same way for every method, and the recorded motion
-drives the model. Equal ``fingerprint`` of protocol and weights means equal scores.
+It says which episodes (by the hash of what they hold), starts, context, motion, noise and horizon.
+It knows nothing of a model, so any two models of its size can be scored by it and compared clip by
+clip. Equal choices have equal hashes, wherever the data lie (``protocol_file.py`` keeps them).
 """
 
 from __future__ import annotations
@@ -10,265 +10,458 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
-import jax
 import numpy as np
 
-from pewm_jax.config import Config, UserError, to_dict
-from pewm_jax.data.clips import choose_context
+import pewm_jax
+from pewm_jax.config import Config, ConfigError, UserError
+from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
-from pewm_jax.geometry.actions import PLANAR, actions_between, continuous, integrate
-from pewm_jax.types import Array, Camera, Frames
+from pewm_jax.eval.clips import VERSION, ClipChoice, choose, long_choices, needs_cameras
+from pewm_jax.io import atomic
 
-VERSION = 2
-"""Increase it whenever the same settings would give other scores."""
-POSE_TOLERANCE = 2e-3
-"""Largest difference between integrated and recorded poses (metres, matrix entries)."""
-ROLLOUTS = 16
-"""The most long rollouts, one per episode."""
-T = TypeVar("T")
+NOISE = "key(seed), folded with the clip's place in the list and its number in the chain"
+"""How noise follows from a seed."""
 
 
 @dataclasses.dataclass(frozen=True)
-class ClipChoice:
-    """One clip to imagine.
+class EpisodeKey:
+    """An episode, recognised by ``sha256`` of its record: every picture, depth, pose and action."""
+
+    name: str
+    scene: str
+    sha256: str
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipKey:
+    """A clip to imagine.
 
     Attributes:
-        episode: index of the episode.
-        name: its name.
-        scene: where it was recorded.
-        start: the present frame; all earlier ones may be context.
-        context_S: (S,) frames given to ``worlds.start``, oldest first, the present last. If an
-            episode has fewer, the oldest is repeated as padding; ``load_clip`` gives padding no
-            depth, so that nothing of it is remembered twice.
-        targets_N: (N,) frames to imagine.
+        episode: place in ``Protocol.episodes``.
+        start: the present frame.
+        context: frames observed, oldest first, the present last.
+        targets: frames to imagine.
+        motion_sha256: hash of the recorded poses at the start and the targets, and of the actions
+            recorded between them.
     """
 
     episode: int
-    name: str
-    scene: str
     start: int
-    context_S: tuple[int, ...]
-    targets_N: tuple[int, ...]
+    context: tuple[int, ...]
+    targets: tuple[int, ...]
+    motion_sha256: str
 
 
-def context_frames(start: int, count: int) -> tuple[int, ...]:
-    """Return ``count`` frames spread over the past as in training, with ``start`` last."""
-    spread = choose_context(start, count)
-    padded = np.concatenate([np.repeat(spread[:1], count - len(spread)), spread])
-    return tuple(int(index) for index in padded)
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """Everything that is chosen.
+
+    Attributes:
+        split: name of the folder that the episodes were chosen from.
+        height: of a picture, pixels.
+        width: the same.
+        context: frames observed before each clip.
+        stride: recorded actions between two imagined frames.
+        horizon: frames imagined from each start.
+        long_horizon: the same of long rollouts.
+        seeds: of the sampling noise; long rollouts take the first.
+        control: ``actions`` or ``cameras``: what drives the model.
+        episodes: those that clips are of.
+        clips: what is scored, in the order that gives each clip its noise.
+        rollouts: the long rollouts.
+        noise: how noise follows from a seed.
+        scoring: version of the rules by which pixels are scored.
+    """
+
+    split: str
+    height: int
+    width: int
+    context: int
+    stride: int
+    horizon: int
+    long_horizon: int
+    seeds: tuple[int, ...]
+    control: str
+    episodes: tuple[EpisodeKey, ...]
+    clips: tuple[ClipKey, ...]
+    rollouts: tuple[ClipKey, ...]
+    noise: str = NOISE
+    scoring: int = VERSION
+
+    @property
+    def sha256(self) -> str:
+        """The hash of all choices."""
+        return hash_of(dataclasses.asdict(self))
+
+    @property
+    def pieces_sha256(self) -> str:
+        """The hash of all choices but the seeds: what the scores of one seed depend on."""
+        return hash_of(dataclasses.asdict(self) | {"seeds": None})
 
 
-def way_back(episode: Episode) -> int:
-    """Return the frame where the way back begins: the recorded one, or else the middle."""
-    frame = episode.info.get("return_frame")
-    return episode.length // 2 if frame is None else int(frame)
+def hash_of(content: Any) -> str:
+    """Return the sha256 of a JSON value, whatever the order of its keys."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
-def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) -> list[ClipChoice]:
-    """Choose the clips to imagine: starts spread evenly over every episode's way back.
+def choose_clips(
+    config: Config, episodes: Sequence[Episode]
+) -> tuple[list[ClipChoice], list[ClipChoice]]:
+    """Choose clips and long rollouts by an experiment's settings, on the way back of every episode.
 
     Args:
-        config: gives ``clip.frames``, ``data.context`` and ``evaluate.stride``.
+        config: gives the length of clips, ``data.context`` and ``evaluate``.
         episodes: held-out episodes.
-        clips: the most clips to choose; fewer if the episodes have fewer distinct starts.
-        chain: clips generated one after the other from each start.
-
-    Returns:
-        The choices: the first start of every episode, then every second start, and so on. Any
-        leading part of the list thus covers as many episodes as possible.
 
     Raises:
         UserError: no episode is long enough.
     """
-    length = chain * (config.model.clip.frames - 1) * config.evaluate.stride
-    per_episode = -(-clips // max(len(episodes), 1))
-    ranked: list[tuple[int, ClipChoice]] = []
-    longest = 0
+    clips = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
+    return clips, long_choices(config, episodes)
+
+
+def describe_shortened(config: Config, protocol: Protocol) -> str:
+    """Log that long rollouts are shorter than the settings ask, where they are; or ""."""
+    asked = config.evaluate.video_clips * (config.model.clip.frames - 1)
+    if protocol.long_horizon >= asked:
+        return ""
+    return (
+        f"long rollouts have {protocol.long_horizon} frames, and not the {asked} of "
+        "evaluate.video_clips: no walk of these data is long enough"
+    )
+
+
+def make_protocol(
+    config: Config,
+    episodes: Sequence[Episode],
+    clips: Sequence[ClipChoice],
+    rollouts: Sequence[ClipChoice],
+) -> Protocol:
+    """Return the protocol of chosen clips and long rollouts.
+
+    Args:
+        config: gives the size of pictures, ``data.context`` and ``evaluate``.
+        episodes: held-out episodes.
+        clips: what is scored.
+        rollouts: the long rollouts.
+
+    Raises:
+        UserError: the episodes have other frames than the clip's.
+    """
+    shape, keys, clip_keys = config.model.clip, [], {}
+    for index in sorted({choice.episode for choice in (*clips, *rollouts)}):
+        episode = episodes[index]
+        if (episode.height, episode.width) != (shape.height, shape.width):
+            raise UserError(
+                f"episode {episode.name} has frames of {episode.height}×{episode.width} and clips "
+                f"are of {shape.height}×{shape.width}: collect or import the data at that size."
+            )
+        for choice in (*clips, *rollouts):
+            if choice.episode == index:
+                clip_keys[choice] = ClipKey(
+                    len(keys),
+                    choice.start,
+                    choice.context_S,
+                    choice.targets_N,
+                    motion_hash(episode, choice),
+                )
+        keys.append(EpisodeKey(episode.name, episode.scene, content_hash(episode)))
+    return Protocol(
+        split=config.evaluate.split,
+        height=shape.height,
+        width=shape.width,
+        context=config.data.context,
+        stride=config.evaluate.stride,
+        horizon=len(clips[0].targets_N),
+        long_horizon=len(rollouts[0].targets_N),
+        seeds=tuple(config.evaluate.seeds),
+        control="cameras" if needs_cameras(episodes, [*rollouts, *clips]) else "actions",
+        episodes=tuple(keys),
+        clips=tuple(clip_keys[choice] for choice in clips),
+        rollouts=tuple(clip_keys[choice] for choice in rollouts),
+    )
+
+
+def content_hash(episode: Episode) -> str:
+    """Return the sha256 of an episode's record."""
+    return hashlib.sha256(episode.record).hexdigest()
+
+
+def motion_hash(episode: Episode, choice: ClipChoice) -> str:
+    """Return the hash of a clip's motion, as it was recorded and before any arithmetic."""
+    poses = episode.world_from_camera[[choice.start, *choice.targets_N]]
+    digest = hashlib.sha256(np.ascontiguousarray(poses, "<f4").tobytes())
+    if episode.actions is not None:
+        steps = episode.actions[choice.start : choice.targets_N[-1]]
+        digest.update(np.ascontiguousarray(steps, "<f4").tobytes())
+    return digest.hexdigest()
+
+
+def find_clips(
+    protocol: Protocol, episodes: Sequence[Episode], where: str
+) -> tuple[list[ClipChoice], list[ClipChoice]]:
+    """Find a protocol's clips in a data set; its episodes may lie in any order, among others.
+
+    Args:
+        protocol: what was chosen.
+        episodes: the data set.
+        where: its name in messages.
+
+    Returns:
+        ``(clips, rollouts)``.
+
+    Raises:
+        UserError: an episode is missing, or is not the same any more.
+    """
+    wanted, found, names = {key.name for key in protocol.episodes}, {}, set()
     for index in range(len(episodes)):
         episode = episodes[index]
-        longest = max(longest, episode.length)
-        last = episode.length - 1 - length
-        if last < 0:
-            continue
-        first = min(way_back(episode), last)
-        starts = np.unique(np.round(np.linspace(first, last, per_episode)).astype(int))
-        for rank, start in enumerate(starts):
-            count = length // config.evaluate.stride
-            ranked.append((rank, choice_of(config, episode, index, int(start), count)))
-    if not ranked:
-        raise UserError(
-            f"no episode of {config.data.path}/{config.evaluate.split} is long enough: "
-            f"{chain} clips need {length + 1} frames and the longest has {longest}; collect "
-            "longer episodes or lower evaluate.chain, video_clips or stride."
-        )
-    ranked.sort(key=lambda item: item[0])
-    return [choice for _, choice in ranked[:clips]]
+        names.add(episode.name)
+        if episode.name in wanted:  # the record holds its name, so no other can be the same
+            found[content_hash(episode)] = index
+    for key in protocol.episodes:
+        if key.sha256 not in found:
+            there = "holds another one of that name" if key.name in names else "does not hold it"
+            raise UserError(
+                f"the protocol scores episode {key.name} (sha256 {key.sha256[:12]}…), and {where} "
+                f"{there}; name the folder of the protocol's data by --data and --split, or write "
+                "a protocol of this one."
+            )
+
+    def choice(clip: ClipKey) -> ClipChoice:
+        key = protocol.episodes[clip.episode]
+        index = found[key.sha256]
+        return ClipChoice(index, key.name, key.scene, clip.start, clip.context, clip.targets)
+
+    return [choice(clip) for clip in protocol.clips], [choice(clip) for clip in protocol.rollouts]
 
 
-def choice_of(config: Config, episode: Episode, index: int, start: int, count: int) -> ClipChoice:
-    """Return the clip of an episode that begins at a frame.
+def resolve_clips(
+    config: Config, episodes: Sequence[Episode], fixed: Protocol | None, where: str
+) -> tuple[Protocol, list[ClipChoice], list[ClipChoice]]:
+    """Return the protocol with its clips and long rollouts: those that are fixed, or chosen now.
 
     Args:
-        config: gives ``data.context`` and ``evaluate.stride``.
-        episode: the episode.
-        index: its place among the episodes.
-        start: the present frame.
-        count: frames to imagine.
-    """
-    targets = start + config.evaluate.stride * np.arange(1, count + 1)
-    return ClipChoice(
-        episode=index,
-        name=episode.name,
-        scene=episode.scene,
-        start=start,
-        context_S=context_frames(start, config.data.context),
-        targets_N=tuple(int(target) for target in targets),
-    )
-
-
-def long_choices(config: Config, episodes: Sequence[Episode]) -> list[ClipChoice]:
-    """Choose one long rollout per episode, from the start of its way back.
-
-    Returns:
-        At most ``ROLLOUTS`` of ``evaluate.video_clips`` clips, or of fewer if the episodes are too
-        short.
+        config: the experiment, under the protocol that is fixed.
+        episodes: the data set.
+        fixed: a protocol that was chosen before, or None.
+        where: the data set's name in messages.
 
     Raises:
-        UserError: no episode is long enough for one clip.
+        UserError: as ``find_clips``, ``choose_clips`` and ``make_protocol``.
     """
-    count = min(ROLLOUTS, len(episodes))
-    for chain in range(config.evaluate.video_clips, 1, -1):
-        try:
-            return choose(config, episodes, count, chain)
-        except UserError:
-            continue
-    return choose(config, episodes, count, 1)
+    if fixed is not None:
+        return fixed, *find_clips(fixed, episodes, where)
+    clips, rollouts = choose_clips(config, episodes)
+    return make_protocol(config, episodes, clips, rollouts), clips, rollouts
 
 
-def needs_cameras(episodes: Sequence[Episode], choices: Sequence[ClipChoice]) -> bool:
-    """Tell whether clips must be driven by cameras: some motion is not upright (by hand, say)."""
-    for choice in choices:
-        episode = episodes[choice.episode]
-        poses = episode.world_from_camera[[choice.start, *choice.targets_N]]
-        replayed = np.asarray(integrate(poses[0], np.asarray(actions_between(poses))))
-        if np.abs(replayed - poses).max() > POSE_TOLERANCE:
-            return True
-    return False
-
-
-def load_clip(
-    config: Config, episodes: Sequence[Episode], choice: ClipChoice, *, cameras: bool = False
-) -> tuple[Frames, Frames, Array | Camera]:
-    """Read one chosen clip.
-
-    Args:
-        config: the experiment.
-        episodes: held-out episodes.
-        choice: the clip.
-        cameras: whether it is driven by the recorded cameras, in six degrees of freedom, and not
-            by actions (``needs_cameras``).
-
-    Returns:
-        ``(context, targets, control)``: S context frames, N true frames, and what leads from the
-        present through them: (N, 3) actions composed from the recorded poses, or (N,) cameras.
-        Frames that pad the context have a depth of 0 (not measured) everywhere.
+def apply_protocol(protocol: Protocol, config: Config) -> Config:
+    """Return an experiment's settings with those that the protocol fixes in their place.
 
     Raises:
-        UserError: the recorded actions or the upright motion of poses do not lead to the
-            recorded poses, or the frames have another size than the model's.
+        UserError: the model's clips have another size, or do not fill the horizon.
     """
-    episode = episodes[choice.episode]
-    context = _without_padding(episode.frames(list(choice.context_S)), choice.context_S)
-    targets = episode.frames(list(choice.targets_N))
-    size = (config.model.clip.height, config.model.clip.width)
-    if targets.rgb_THWC.shape[1:3] != size:
-        height, width = targets.rgb_THWC.shape[1:3]
+    clip = config.model.clip
+    if (clip.height, clip.width) != (protocol.height, protocol.width):
         raise UserError(
-            f"episode {choice.name} has frames of {height}×{width} and this model was trained on "
-            f"{size[0]}×{size[1]}: collect or import the data at the model's size."
+            f"the protocol is of pictures of {protocol.height}×{protocol.width} and this model "
+            f"makes {clip.height}×{clip.width}: write a protocol of data of the model's size."
         )
-    if cameras:
-        return context, targets, targets.camera
-    poses = np.concatenate(
-        [context.camera.world_from_camera[-1:], targets.camera.world_from_camera]
+    each = clip.frames - 1
+    for horizon in (protocol.horizon, protocol.long_horizon):
+        if horizon % each:
+            raise UserError(
+                f"the protocol asks for {horizon} imagined frames and this model imagines {each} "
+                f"at once: write a protocol whose horizon is a multiple of {each}."
+            )
+    evaluate = dataclasses.replace(
+        config.evaluate,
+        split=protocol.split,
+        clips=len(protocol.clips),
+        chain=protocol.horizon // each,
+        stride=protocol.stride,
+        seeds=protocol.seeds,
+        video_clips=protocol.long_horizon // each,
     )
-    actions_N3 = np.asarray(actions_between(poses))
-    _check_motion(np.asarray(_followed(poses[0], actions_N3)), poses, choice, "upright motion")
-    if episode.actions is not None and episode.actions.shape[1] == PLANAR:
-        recorded = np.asarray(continuous(config.model.actions, episode.actions))
-        steps = recorded[choice.start : choice.targets_N[-1]]
-        every = np.asarray(_followed(poses[0], steps))
-        taken = every[[index - choice.start for index in (choice.start, *choice.targets_N)]]
-        _check_motion(taken, poses, choice, "recorded actions")
-    return context, targets, actions_N3
+    data = dataclasses.replace(config.data, context=protocol.context)
+    return dataclasses.replace(config, evaluate=evaluate, data=data)
 
 
-def _without_padding(context: Frames, context_S: Sequence[int]) -> Frames:
-    """Return a context in which frames that are repeated have depth in the last copy alone."""
-    repeated = np.append(np.diff(context_S) == 0, False)
-    depth = np.where(repeated[:, None, None], 0, context.depth_THW).astype(np.float32)
-    return dataclasses.replace(context, depth_THW=depth)
+def difference(one: Protocol, two: Protocol) -> str:
+    """Return in a few words what differs between two protocols; "" if nothing does."""
+    for field in dataclasses.fields(Protocol):
+        first, second = getattr(one, field.name), getattr(two, field.name)
+        if first == second:
+            continue
+        if field.name not in ("episodes", "clips", "rollouts"):
+            return f"{field.name.replace('_', ' ')} {first} and {second}"
+        if len(first) != len(second):
+            return f"{len(first)} and {len(second)} {field.name}"
+        if field.name == "episodes":
+            return "other episodes"
+        pair = next((a, b) for a, b in zip(first, second, strict=True) if a != b)
+        starts = " and ".join(f"frame {key.start}" for key in pair)
+        return f"other {field.name}, such as one from {starts}"
+    return ""
 
 
-_followed = jax.jit(integrate)
-"""``integrate``, compiled once for each length and not for each clip."""
+FORMAT, FILE_VERSION = "pewm-protocol", 1
+OFF = "off"
+"""The setting that chooses clips by the settings, though the run names a file."""
+FIXED = ("clips", "seeds", "chain", "stride", "video_clips")
+"""Settings of ``EvalConfig`` that a file stands above."""
 
 
-def _check_motion(integrated: np.ndarray, poses: np.ndarray, choice: ClipChoice, what: str) -> None:
-    error = np.abs(integrated - poses).max((1, 2))
-    if error.max() > POSE_TOLERANCE:
-        worst = int(error.argmax())
-        frame = (choice.start, *choice.targets_N)[worst]
-        raise UserError(
-            f"episode {choice.name}: at frame {frame} the {what} and the recorded pose disagree "
-            f"by {error[worst]:.3g}; run `python -m pewm_jax.data validate` on the data."
-        )
-
-
-def stack(trees: list[T], size: int) -> T:
-    """Stack pytrees along a new leading axis, repeating the last one up to ``size``."""
-    padded = trees + [trees[-1]] * (size - len(trees))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
-
-
-def file_hash(path: Path) -> str:
-    """Return the sha256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def fingerprint(
-    config: Config,
-    weights: str,
-    dataset: str,
-    lpips: str = "",
-    protocol: str = "",
-    baseline: str = "",
-) -> str:
-    """Return a hash of all that scores depend on, but the choice of seeds, rivals and measures.
+def apply_protocol_file(
+    config: Config, changes: Mapping[str, Any]
+) -> tuple[Config, Protocol | None]:
+    """Return the settings under the protocol's file that they name, and what it holds.
 
     Args:
-        config: the run's configuration, with overrides for the evaluation.
-        weights: sha256 of the weights.
-        dataset: sha256 of the data set's index.
-        lpips: sha256 of the weights of LPIPS; "" if it is left out.
-        protocol: hash of the choices in a protocol's file, except for seeds; "" if clips are chosen
-            by the settings.
-        baseline: with a protocol, sha256 of the index of the split that chooses the reprojection's
-            settings; "" if there is none.
+        config: the run's, with overrides for the evaluation.
+        changes: those overrides; None is none.
+
+    Returns:
+        The settings as they are, and None, if they name no file.
+
+    Raises:
+        UserError: the file cannot be used, the model does not fit it, or an override says something
+            that it fixes.
     """
-    settings = to_dict(config)
-    for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src", "scs"):
-        settings["evaluate"].pop(key)
-    for key in ("train", "data"):
-        settings.pop(key)
-    settings["context"] = config.data.context
-    content = {"version": VERSION, "settings": settings, "weights": weights, "data": dataset}
-    content["lpips"] = lpips
-    if protocol:
-        content |= {"protocol": protocol, "data": baseline}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    name = config.evaluate.protocol
+    if name in ("", OFF):
+        return config, None
+    also = [f"--{key}" for key in FIXED if changes.get(key) is not None]
+    if also:
+        raise ConfigError(
+            f"{' and '.join(also)} cannot be chosen beside the protocol {name}, which fixes that: "
+            f"leave it out, or say --protocol {OFF}."
+        )
+    protocol = load_protocol(Path(name))
+    config = apply_protocol(protocol, config)
+    if changes.get("split") is not None:
+        evaluate = dataclasses.replace(config.evaluate, split=changes["split"])
+        config = dataclasses.replace(config, evaluate=evaluate)
+    return config, protocol
+
+
+def write_protocol(config: Config, path: Path, log: Callable[[str], Any]) -> Protocol:
+    """Choose clips by an experiment's settings and write them to a file, before training.
+
+    A file that holds the same protocol is left as it is.
+
+    Args:
+        config: gives the size and length of clips, ``data.path``, ``data.context`` and
+            ``evaluate``.
+        path: the file.
+        log: shows a line.
+
+    Raises:
+        UserError: the data are absent or too short, or the file holds another protocol.
+    """
+    split = Path(config.data.path) / config.evaluate.split
+    episodes = EpisodeSource(split)
+    protocol = make_protocol(config, episodes, *choose_clips(config, episodes))
+    if path.exists():
+        other = difference(load_protocol(path), protocol)
+        if other:
+            raise UserError(
+                f"{path} holds another protocol ({other}): name another file by --out, or delete "
+                "it if nothing has been scored by it."
+            )
+        log(f"{path} holds this protocol already")
+    else:
+        save_protocol(path, protocol, {"data": str(split)})
+    scenes = {key.scene for key in protocol.episodes}
+    log(
+        f"protocol {protocol.sha256}\n{len(protocol.clips)} clips of {protocol.horizon} imagined "
+        f"frames and {len(protocol.rollouts)} long rollouts of {protocol.long_horizon}, in "
+        f"{len(protocol.episodes)} episodes of {len(scenes)} houses of {split}; seeds "
+        f"{', '.join(map(str, protocol.seeds))}, {protocol.context} frames of context, stride "
+        f"{protocol.stride}, driven by {protocol.control}"
+    )
+    if short := describe_shortened(config, protocol):
+        log(short)
+    return protocol
+
+
+def save_protocol(path: Path, protocol: Protocol, notes: dict[str, Any]) -> None:
+    """Write a protocol's file; its folder is made.
+
+    Args:
+        path: the file.
+        protocol: what was chosen.
+        notes: facts that are not hashed, such as where the data lie.
+    """
+    value = {
+        "format": FORMAT,
+        "version": FILE_VERSION,
+        "sha256": protocol.sha256,
+        "notes": {"written_by": f"pewm_jax {pewm_jax.__version__}", **notes},
+        "protocol": dataclasses.asdict(protocol),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
+
+
+def load_protocol(path: Path) -> Protocol:
+    """Read a protocol's file.
+
+    Raises:
+        UserError: it is absent, no protocol, of another version, or was changed since it was
+            written.
+    """
+    try:
+        value = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise UserError(
+            f"the protocol {path} cannot be read ({error.strerror}); write one with `pewm-jax "
+            "protocol`."
+        ) from None
+    except ValueError as error:
+        raise UserError(f"the protocol {path} is not JSON ({error}); write it again.") from None
+    content = value.get("protocol") if isinstance(value, dict) else None
+    if not isinstance(content, dict) or value.get("format") != FORMAT:
+        raise UserError(f"{path} is no protocol: write one with `pewm-jax protocol`.")
+    versions = value.get("version"), content.get("scoring")
+    if versions != (FILE_VERSION, VERSION):
+        raise UserError(
+            f"the protocol {path} has versions {versions[0]} (file) and {versions[1]} (scoring), "
+            f"this library's are {FILE_VERSION} and {VERSION}; write it again, and score every run "
+            "by the new one."
+        )
+    if hash_of(content) != value.get("sha256"):
+        raise UserError(
+            f"the protocol {path} was changed after it was written: what it says is not what its "
+            "hash is of; write it again with `pewm-jax protocol`."
+        )
+    try:
+        return _parse(content)
+    except (KeyError, TypeError) as error:
+        raise UserError(
+            f"the protocol {path} does not parse ({error!r}); write it again."
+        ) from None
+
+
+def _parse(content: dict[str, Any]) -> Protocol:
+    def clips(name: str) -> tuple[ClipKey, ...]:
+        lists = ("context", "targets")
+        return tuple(
+            ClipKey(**clip | {key: tuple(clip[key]) for key in lists}) for clip in content[name]
+        )
+
+    return Protocol(
+        **content
+        | {
+            "seeds": tuple(content["seeds"]),
+            "episodes": tuple(EpisodeKey(**episode) for episode in content["episodes"]),
+            "clips": clips("clips"),
+            "rollouts": clips("rollouts"),
+        }
+    )

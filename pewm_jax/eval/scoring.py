@@ -1,13 +1,13 @@
 """Scoring: imagine every chosen clip with every method and sum the errors; can be resumed.
 
-Every piece of work is a file of its own: one batch of clips, one method, one sampling seed. Several
-processes share them (``shares``).
+Every piece of work is one batch of clips, one method and one sampling seed. Its result is a file of
+the ``ResultCache``, and several processes share the pieces.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,10 +15,9 @@ import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval.images import error_sums_batch, unit_colours, with_lpips
-from pewm_jax.eval.imagine import print_now
-from pewm_jax.eval.methods import SAMPLED, Methods
-from pewm_jax.eval.metrics import Perceptual, VideoDistance
+from pewm_jax.eval.clips import ClipChoice, choose, load_clip, stack
+from pewm_jax.eval.metrics import LPIPS, VideoDistance
+from pewm_jax.eval.metrics.images import error_sums_batch, unit_colours, with_lpips
 from pewm_jax.eval.metrics.structure import (
     Consistency,
     average,
@@ -26,15 +25,14 @@ from pewm_jax.eval.metrics.structure import (
     object_masks,
     things_of,
 )
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import ClipChoice, choose, load_clip, stack
+from pewm_jax.eval.runner import SAMPLED, Methods, print_now, workers
 from pewm_jax.eval.seen import seen_masks_batch
-from pewm_jax.eval.shares import gathered, share
 from pewm_jax.io.progress import Meter
+from pewm_jax.io.store import ResultCache, map_resumable
 from pewm_jax.types import Array, Frames
 
 TRUTH = "truth"
-"""Whose features are kept beside the methods'."""
+"""The recorded clips, which are measured like a method."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +67,7 @@ class Scored:
 
 @dataclasses.dataclass(frozen=True)
 class Tracked:
-    """What SCS knows of a true clip.
+    """What SCS needs of a true clip.
 
     Attributes:
         ids_THW: (T, H, W) instance ids of the present frame and the N frames to imagine.
@@ -94,10 +92,10 @@ class Tracked:
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """Chosen clips, padded to one size by repeating the last; ``real`` of them are asked for.
+    """Clips, padded to one size by repeating the last; ``real`` of them are not padding.
 
-    ``described`` keeps what LPIPS makes of their truth, from its first use on. ``tracked`` holds
-    what SCS needs of the clips asked for, where it is measured.
+    ``described`` caches the features of LPIPS of their truth. ``tracked`` holds what SCS needs, if
+    it is measured.
     """
 
     context: Frames
@@ -111,7 +109,7 @@ class Batch:
     tracked: tuple[Tracked, ...] = ()
 
     def seeds(self, seed: int) -> np.ndarray:
-        """Return what the sampler's noise is drawn from: sampling seed, clip number."""
+        """Return (B, 2) what the sampler's noise is drawn from: sampling seed, clip number."""
         return np.stack([np.full_like(self.numbers_B, seed), self.numbers_B], -1)
 
     def imagine(
@@ -131,14 +129,14 @@ class Batch:
         return jnp.concatenate([2 * unit_colours(part) - 1 for part in parts], 1)
 
     def structure(self, frames: Frames, measure: Consistency) -> np.ndarray:
-        """Return SCS of the clips asked for and of their frames, see ``Scored.structure``."""
+        """Return SCS of the clips and of their frames, see ``Scored.structure``."""
         whole = unit_colours(self.whole(frames.rgb_THWC)[: self.real])
         videos = np.rint(255 * np.asarray(whole)).astype(np.uint8)
         pairs = zip(self.tracked, videos, strict=True)
         return np.stack([tracked.score(measure, video) for tracked, video in pairs])
 
-    def sums(self, frames: Frames, lpips: Perceptual | None) -> np.ndarray:
-        """Return ``images.error_sums`` of the clips asked for, with LPIPS if it is given."""
+    def sums(self, frames: Frames, lpips: LPIPS | None) -> np.ndarray:
+        """Return ``images.error_sums`` of the clips, with LPIPS if it is given."""
         sums = np.asarray(error_sums_batch(frames, self.targets, self.seen, self.unseen))
         if lpips is not None:
             known = lpips.net, lpips.sha256
@@ -189,29 +187,34 @@ def _tracked(episode: Episode, choice: ClipChoice) -> Tracked:
 
 
 @dataclasses.dataclass(frozen=True)
-class Task:
-    """A piece of the table: one batch of clips, one method, one seed, and what is kept of them.
+class Piece:
+    """A piece of the table: one batch of clips, one method, one seed, and what is measured.
 
     Attributes:
         method: one of ``Methods.names``, or ``truth``.
         seed: of the sampling noise.
         first: number of the batch's first clip.
-        kept: ``sums`` of the errors, ``features`` for the distances of videos, or ``structure`` for
-            SCS.
+        measured: ``sums`` of the errors, ``features`` for the distances of videos, or ``structure``
+            for SCS.
     """
 
     method: str
     seed: int
     first: int
-    kept: str
+    measured: str
+
+    @property
+    def rollout(self) -> tuple[int, str, int]:
+        """The imagined clips that it measures; pieces of one rollout are computed together."""
+        return self.first, self.method, self.seed
 
     def name(
         self, methods: Methods, i3d: VideoDistance | None, structure: Consistency | None = None
     ) -> str:
-        """Return the name of its file, which says what its content depends on beside the clips."""
+        """Return the name of its file, with all that the result depends on beside the clips."""
         who = "truth" if self.method == TRUTH else methods.piece(self.method)
-        kind = f"i3d-{i3d.sha256[:16]}" if i3d and self.kept == "features" else "table"
-        if structure and self.kept == "structure":
+        kind = f"i3d-{i3d.sha256[:16]}" if i3d and self.measured == "features" else "table"
+        if structure and self.measured == "structure":
             kind = "-".join(filter(None, ("scs", structure.encoder, structure.sha256[:16])))
         return f"{kind}-{who}-seed{self.seed}-clip{self.first:04d}"
 
@@ -220,18 +223,28 @@ def score_table(
     config: Config,
     episodes: Sequence[Episode],
     methods: Methods,
-    partials: Partials,
-    say: Callable[[str], Any] = print_now,
-    lpips: Perceptual | None = None,
+    cache: ResultCache,
+    log: Callable[[str], Any] = print_now,
+    lpips: LPIPS | None = None,
     choices: list[ClipChoice] | None = None,
     i3d: VideoDistance | None = None,
     structure: Consistency | None = None,
 ) -> Scored:
     """Score ``evaluate.clips`` choices, chains of ``evaluate.chain`` clips, by method and seed.
 
-    Pieces that ``partials`` already holds are reused. Without ``lpips`` that is left out, without
-    ``i3d`` the features of whole clips, and without ``structure`` SCS. Without ``choices`` they are
-    those of ``choose``. Several processes share the work, and all return the whole table.
+    Results in ``cache`` are reused. Several processes share the work, and all return the whole
+    table.
+
+    Args:
+        config: the experiment.
+        episodes: held-out episodes.
+        methods: who imagines.
+        cache: where results are stored.
+        log: shows a line.
+        lpips: LPIPS; None leaves it out.
+        choices: the clips; by default those of ``choose``.
+        i3d: the network of FVD; None leaves out the features of whole clips.
+        structure: SCS; None leaves it out.
 
     Raises:
         UserError: no episode is long enough, the data is inconsistent or does not fit the model,
@@ -240,81 +253,83 @@ def score_table(
     if choices is None:
         choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
     size, starts = config.evaluate.batch, range(0, len(choices), config.evaluate.batch)
-    extras = [kept for kept, one in (("features", i3d), ("structure", structure)) if one]
-    tasks = _tasks(config, methods, starts, extras)
-    names = {task: task.name(methods, i3d, structure) for task in tasks}
-    known = {task: piece for task in tasks if (piece := partials.get(names[task])) is not None}
-    # What is kept of one imagination is one process's, so that nothing is imagined twice.
-    groups = list(dict.fromkeys((task.first, task.method, task.seed) for task in tasks))
-    own = set(share(groups, lambda group: group[1] not in SAMPLED))
-    todo = [t for t in tasks if t not in known and (t.first, t.method, t.seed) in own]
-    if known:
-        say(f"{len(known)} of {len(tasks)} pieces were scored before and are kept")
-    methods.prepare(task.method for task in todo)
-    frames_each = config.evaluate.chain * (config.model.clip.frames - 1)
-    total = sum(frames_each * min(size, len(choices) - task.first) for task in todo)
-    with Meter("scoring", total, "frames") as meter:
-        loaded: tuple[int, Batch] | None = None
-        made: tuple[tuple[Any, ...], Any] | None = None
-        for task in todo:
-            if loaded is None or loaded[0] != task.first:
-                chosen = choices[task.first : task.first + size]
-                cameras = methods.model.cameras
-                track = structure is not None
-                batch = load_batch(
-                    config, episodes, chosen, task.first, cameras=cameras, track=track
-                )
-                loaded, made = (task.first, batch), None
-            batch, group = loaded[1], (task.method, task.seed)
-            if task.method == TRUTH:
-                made = group, batch.targets
-            elif made is None or made[0] != group:
-                made = group, batch.imagine(methods, task.method, task.seed)[2]
-            kept = _kept(task, batch, made[1], lpips, i3d, structure)
-            known[task] = partials.put(names[task], **kept)
-            meter.advance(frames_each * batch.real)
-    if todo:
-        say(meter.summary())
-    found = gathered(partials, names, known, "table")
+    extras = [name for name, one in (("features", i3d), ("structure", structure)) if one]
 
-    def joined(method: str, seed: int, kept: str) -> np.ndarray:
-        return np.concatenate([found[Task(method, seed, f, kept)][kept] for f in starts])
+    def work(todo: list[Piece]) -> Iterator[tuple[Piece, dict[str, np.ndarray]]]:
+        methods.prepare(piece.method for piece in todo)
+        frames_each = config.evaluate.chain * (config.model.clip.frames - 1)
+        total = sum(frames_each * min(size, len(choices) - piece.first) for piece in todo)
+        loaded: tuple[int, Batch] | None = None
+        made: tuple[tuple[int, str, int], Any] | None = None
+        with Meter("scoring", total, "frames") as meter:
+            for piece in todo:
+                if loaded is None or loaded[0] != piece.first:
+                    some = choices[piece.first : piece.first + size]
+                    cameras, track = methods.model.cameras, structure is not None
+                    batch = load_batch(
+                        config, episodes, some, piece.first, cameras=cameras, track=track
+                    )
+                    loaded = piece.first, batch
+                batch = loaded[1]
+                if piece.method == TRUTH:
+                    made = piece.rollout, batch.targets
+                elif made is None or made[0] != piece.rollout:
+                    made = piece.rollout, batch.imagine(methods, piece.method, piece.seed)[2]
+                yield piece, _measure(piece, batch, made[1], lpips, i3d, structure)
+                meter.advance(frames_each * batch.real)
+        log(meter.summary())
+
+    found = map_resumable(
+        _pieces(config, methods, starts, extras),
+        lambda piece: piece.name(methods, i3d, structure),
+        work,
+        cache=cache,
+        what="scores",
+        log=log,
+        workers=workers(),
+        group_of=lambda piece: piece.rollout,
+        is_light=lambda piece: piece.method not in SAMPLED,
+    )
+
+    def joined(method: str, seed: int, measured: str) -> np.ndarray:
+        return np.concatenate([found[Piece(method, seed, f, measured)][measured] for f in starts])
 
     seeds = {method: methods.seeds(method, config.evaluate.seeds) for method in methods.names}
     sums = {name: np.stack([joined(name, seed, "sums") for seed in seeds[name]]) for name in seeds}
     firsts = {name: some[0] for name, some in seeds.items()} | {TRUTH: 0}
     more = {
-        kept: {name: joined(name, seed, kept) for name, seed in firsts.items()} for kept in extras
+        measured: {name: joined(name, seed, measured) for name, seed in firsts.items()}
+        for measured in extras
     }
     return Scored(choices, sums, **more)
 
 
-def _tasks(
+def _pieces(
     config: Config, methods: Methods, starts: Sequence[int], extras: Sequence[str]
-) -> list[Task]:
-    """Return all pieces, those of one batch and of one imagination beside each other."""
-    tasks = []
+) -> list[Piece]:
+    """Return all pieces; those of one batch, and of one rollout, follow one another."""
+    pieces = []
     for first in starts:
         for method in methods.names:
             for place, seed in enumerate(methods.seeds(method, config.evaluate.seeds)):
-                tasks.append(Task(method, seed, first, "sums"))
+                pieces.append(Piece(method, seed, first, "sums"))
                 if place == 0:
-                    tasks += [Task(method, seed, first, kept) for kept in extras]
-        tasks += [Task(TRUTH, 0, first, kept) for kept in extras]
-    return tasks
+                    pieces += [Piece(method, seed, first, measured) for measured in extras]
+        pieces += [Piece(TRUTH, 0, first, measured) for measured in extras]
+    return pieces
 
 
-def _kept(
-    task: Task,
+def _measure(
+    piece: Piece,
     batch: Batch,
     frames: Frames,
-    lpips: Perceptual | None,
+    lpips: LPIPS | None,
     i3d: VideoDistance | None,
     structure: Consistency | None,
 ) -> dict[str, np.ndarray]:
-    if task.kept == "sums":
+    if piece.measured == "sums":
         return {"sums": batch.sums(frames, lpips)}
-    if task.kept == "structure":
+    if piece.measured == "structure":
         assert structure is not None
         return {"structure": batch.structure(frames, structure)}
     assert i3d is not None

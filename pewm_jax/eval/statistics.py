@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax.eval.images import MASKS, PSNR_CEILING, SUMS
+from pewm_jax.eval.metrics.images import MASKS, PSNR_CEILING, SUMS
 from pewm_jax.report.labels import own_method
 
 METRICS = ("psnr", "ssim", "depth_mae", "depth_rel")

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -25,12 +25,12 @@ from pewm_jax import worlds
 from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval import intervals
-from pewm_jax.eval.images import psnr, unit_colours
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import ClipChoice, choice_of, load_clip, stack, way_back
-from pewm_jax.eval.shares import gathered, share
+from pewm_jax.eval.clips import ClipChoice, choice_of, load_clip, stack, way_back
+from pewm_jax.eval.metrics.images import psnr, unit_colours
+from pewm_jax.eval.runner import workers
 from pewm_jax.geometry.actions import actions_between
 from pewm_jax.io.progress import Meter
+from pewm_jax.io.store import ResultCache, map_resumable
 from pewm_jax.types import Array, Frames, Params
 
 TRUE, SHUFFLED, NONE, COPY = "true", "shuffled", "none", "copy"
@@ -296,18 +296,18 @@ def score(
     params: Params,
     episodes: Sequence[Episode],
     choices: Sequence[ClipChoice],
-    partials: Partials,
-    say: Callable[[str], Any],
+    cache: ResultCache,
+    log: Callable[[str], Any],
 ) -> tuple[Steered | None, str | None]:
-    """Measure it for a report, shared among processes and kept with its partial results.
+    """Measure it for a report, shared among processes and resumable.
 
     Args:
         config: the experiment.
         params: its weights.
         episodes: held-out episodes.
         choices: the report's clips: as many walks are chosen, in the same episodes.
-        partials: where finished pieces are kept.
-        say: shows a line.
+        cache: where results are stored.
+        log: shows a line.
 
     Returns:
         What was measured, and a sentence on the clips. The first is None, and the sentence says
@@ -322,14 +322,20 @@ def score(
     except UserError as error:
         return None, f"Whether the actions steer is not measured: {error}"
     pieces = _Pieces(config, params, episodes, walks, config.evaluate.seeds[0])
-    names = {key: f"steering-walks-{key[0]}-clip{key[1]:04d}" for key in pieces.keys}
-    known = {key: piece for key in pieces.keys if (piece := partials.get(names[key])) is not None}
-    todo = [key for key in share(pieces.keys) if key not in known]
-    if todo:
-        say("imagining with true, shuffled and no actions …")
-    for key in todo:
-        known[key] = partials.put(names[key], errors=pieces.errors(*key))
-    found = gathered(partials, names, known, "steering")
+
+    def work(todo: list[tuple[str, int]]) -> Iterator[tuple[tuple[str, int], Any]]:
+        log("imagining with true, shuffled and no actions …")
+        for key in todo:
+            yield key, {"errors": pieces.errors(*key)}
+
+    found = map_resumable(
+        pieces.keys,
+        lambda key: f"steering-walks-{key[0]}-clip{key[1]:04d}",
+        work,
+        cache=cache,
+        what="steering",
+        workers=workers(),
+    )
     return pieces.joined({key: piece["errors"] for key, piece in found.items()}), walks.about
 
 

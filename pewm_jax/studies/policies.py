@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pewm_jax import config as configuration
 from pewm_jax.config import ActionConfig, Config, NomadWorldConfig, UserError
-from pewm_jax.eval.protocol import file_hash
+from pewm_jax.io.store import file_hash
 from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.types import Params
 from pewm_jax.worlds.rollouts import load_finished

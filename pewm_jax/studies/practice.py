@@ -18,7 +18,7 @@ import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.eval import intervals
-from pewm_jax.eval.loaded_run import Opened, open_run, remembers
+from pewm_jax.eval.loaded_run import LoadedRun, has_memory, open_run
 from pewm_jax.io import atomic
 from pewm_jax.io.progress import Meter
 from pewm_jax.planning import practice
@@ -41,13 +41,13 @@ from pewm_jax.studies.practice_piece import (
     place_of,
 )
 
-Say = Callable[[str], Any]
+Log = Callable[[str], Any]
 DECIDED_BY, LEVEL = "success", 0.01
 """The score by which practice in the house itself has to beat chance before worlds are compared,
 and the level of that test."""
 
 
-def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: Say = print) -> Path:
+def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, log: Log = print) -> Path:
     """Let a policy practise in every house, and measure it before and after.
 
     Args:
@@ -55,7 +55,7 @@ def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: S
         policy: the run of a NoMaD.
         out: the folder that everything is kept in; the same call goes on.
         errand: the settings.
-        say: shows a line.
+        log: shows a line.
 
     Returns:
         The path of the table in Markdown; beside it .png and ``results.json``.
@@ -88,7 +88,7 @@ def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: S
                 kept.write(folder / "scores.json", piece)
             made[how].append(piece)
             meter.advance(1)
-    say(meter.summary())
+    log(meter.summary())
     results = summary(made) | {
         "about": about
         | {"model": str(model), "date": dt.datetime.now(dt.UTC).date().isoformat()}
@@ -105,10 +105,10 @@ def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, say: S
 
 
 def _require_fit(
-    world: Opened, begun: OpenedPolicy, errand: Errand, model: str | Path, policy: str | Path
+    world: LoadedRun, begun: OpenedPolicy, errand: Errand, model: str | Path, policy: str | Path
 ) -> None:
     """Refuse what would end later, and in words that do not help."""
-    if not remembers(world):
+    if not has_memory(world):
         raise UserError(f"{model} has no memory, and what a memory adds is the question.")
     clip, own = world.config.model.clip, begun.config.model.clip
     if clip.height != clip.width or not clip.depth:
@@ -132,7 +132,7 @@ def _require_fit(
         )
 
 
-def _places_shown(world: Opened, errand: Errand) -> Iterator[tuple[Goal, dict[str, Place]]]:
+def _places_shown(world: LoadedRun, errand: Errand) -> Iterator[tuple[Goal, dict[str, Place]]]:
     for house in range(min(errand.shown, errand.houses)):
         home = open_home(errand, world.config, house)
         motion = world.config.model.actions

@@ -22,7 +22,7 @@ from pewm_jax.data.dataset import EpisodeSource, describe_shard, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.navigation import line_is_free
 from pewm_jax.errors import require
-from pewm_jax.eval.loaded_run import Opened
+from pewm_jax.eval.loaded_run import LoadedRun
 from pewm_jax.geometry.actions import FORWARD, discrete_table
 from pewm_jax.planning import practice, scores
 from pewm_jax.planning.practice import Act, Imagined, Place, Practice, Real, Walk
@@ -85,7 +85,7 @@ class Errand:
 
 
 def make(
-    world: Opened,
+    world: LoadedRun,
     begun: OpenedPolicy,
     home: Goal,
     errand: Errand,
@@ -156,7 +156,7 @@ def open_home(errand: Errand, config: Config, house: int) -> Goal:
     )
 
 
-def place_of(world: Opened, home: Goal, motion: ActionConfig, how: str) -> Place:
+def place_of(world: LoadedRun, home: Goal, motion: ActionConfig, how: str) -> Place:
     """Return where a policy practises: one of ``LEARNED``."""
     if how == REAL:
         return Real(home.simulator, motion, home.context)
@@ -169,7 +169,7 @@ def act_of(policy: OpenedPolicy) -> Act:
 
 
 def _learned(
-    world: Opened,
+    world: LoadedRun,
     begun: OpenedPolicy,
     home: Goal,
     errand: Errand,

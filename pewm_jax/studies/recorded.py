@@ -20,8 +20,8 @@ import numpy as np
 from pewm_jax import shipped
 from pewm_jax.config import Config
 from pewm_jax.data.dataset import MANIFEST
-from pewm_jax.eval.protocol import file_hash
 from pewm_jax.io import atomic
+from pewm_jax.io.store import file_hash
 from pewm_jax.studies.rows import Row
 from pewm_jax.studies.trainings import Study, backbone_of, settings
 from pewm_jax.train.runs import WEIGHTS, identity

@@ -8,8 +8,6 @@ and back, SRC. Each row's numbers are a file beside its weights.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,18 +17,16 @@ import numpy as np
 
 from pewm_jax.config import Config, to_dict
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.eval import protocol_file
-from pewm_jax.eval.fixed import Protocol, decide, lay
-from pewm_jax.eval.imagine import Imagination, copy_last
+from pewm_jax.eval import protocol as protocols
 from pewm_jax.eval.metrics import load_all
 from pewm_jax.eval.metrics.revisits import ways
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import file_hash
-from pewm_jax.eval.reproject import reproject_batch
-from pewm_jax.eval.reproject_choice import ReprojectChoice, choose_settings
+from pewm_jax.eval.protocol import Protocol, apply_protocol, resolve_clips
+from pewm_jax.eval.reproject import ReprojectChoice, choose_settings, reproject_batch
+from pewm_jax.eval.runner import ModelRunner, copy_last
 from pewm_jax.eval.scoring import Batch, load_batch
 from pewm_jax.geometry.actions import there_and_back
 from pewm_jax.io.progress import Meter
+from pewm_jax.io.store import ResultCache, file_hash, inputs_hash
 from pewm_jax.models.lpips.model import LEAST
 from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.types import Camera, Frames
@@ -60,7 +56,7 @@ class Scorer:
         nets: the measures that need weights, as far as they are at hand.
         left_out: name → why a measure is left out.
         name: a hash of all that scores depend on beside the weights.
-        say: shows a line.
+        log: shows a line.
     """
 
     config: Config
@@ -69,7 +65,7 @@ class Scorer:
     nets: Mapping[str, Any]
     left_out: Mapping[str, str]
     name: str
-    say: Callable[[str], Any]
+    log: Callable[[str], Any]
 
     @property
     def house(self) -> str:
@@ -100,51 +96,51 @@ class Scorer:
             UserError: its weights are absent or damaged, or what it imagines is not finite.
         """
         run = Path(config.train.run)
-        found = Partials(run / SCORES, file_hash(run / WEIGHTS), self.name)
+        cache = ResultCache.for_weights(run / SCORES, file_hash(run / WEIGHTS), self.name)
         piece = "memory" if memory else "empty"
-        kept = found.get(piece)
-        if kept is not None:
-            return kept
-        laid = lay(self.protocol, config)
-        batch, context = self.config.evaluate.batch, self.config.data.context
-        params, devices = load_finished(run)[1], jax.devices()
-        model = Imagination(laid, params, batch, context, self.say, devices=devices)
 
-        def imagine(context: Frames, control: Any, camera: Camera, seeds_B2: np.ndarray) -> Frames:
-            del camera
-            return model.run(context, control, seeds_B2, memory=memory)[2]
+        def score() -> Arrays:
+            laid = apply_protocol(self.protocol, config)
+            batch, context = self.config.evaluate.batch, self.config.data.context
+            params, devices = load_finished(run)[1], jax.devices()
+            model = ModelRunner(laid, params, batch, context, self.log, devices=devices)
 
-        return found.put(piece, **self._score(imagine, f"scoring {run.name} ({piece})"))
+            def imagine(
+                context: Frames, control: Any, camera: Camera, seeds_B2: np.ndarray
+            ) -> Frames:
+                del camera
+                return model.run(context, control, seeds_B2, memory=memory)[2]
+
+            return self._score(imagine, f"scoring {run.name} ({piece})")
+
+        return cache.compute(piece, score)
+
+    def _cache(self, out: Path) -> ResultCache:
+        """Return the cache of results that depend on no weights."""
+        return ResultCache.for_weights(out / SCORES, "no weights", self.name)
 
     def reprojection(self, out: Path) -> ReprojectChoice:
-        """Return the settings of ``reproject``, chosen on the validation split, or found chosen."""
-        found = Partials(out / SCORES, "no weights", self.name)
-        return choose_settings(self.config, found, self.say)
+        """Return the settings of ``reproject``, chosen on the validation split."""
+        return choose_settings(self.config, self._cache(out), self.log)
 
     def baseline(self, name: str, out: Path) -> Arrays:
         """Score ``reproject`` or ``copy``, which have no network, or find it scored."""
-        found, piece = Partials(out / SCORES, "no weights", self.name), name
-        if name == "reproject":
-            chosen = self.reprojection(out).settings
-            piece = f"{name}-{chosen.name}"
-        kept = found.get(piece)
-        if kept is not None:
-            return kept
+        settings = self.reprojection(out).settings if name == "reproject" else None
 
         def imagine(context: Frames, control: Any, camera: Camera, seeds_B2: np.ndarray) -> Frames:
             del control, seeds_B2
-            if name == "copy":
+            if settings is None:
                 return copy_last(context, camera.intrinsics_4.shape[1])
-            return reproject_batch(chosen, context, camera)
+            return reproject_batch(settings, context, camera)
 
-        return found.put(piece, **self._score(imagine, f"scoring {name}"))
+        piece = name if settings is None else f"{name}-{settings.name}"
+        return self._cache(out).compute(piece, lambda: self._score(imagine, f"scoring {name}"))
 
     def truth(self, out: Path) -> Arrays:
         """Return the truth's own logits, and the ceiling and floor of SRC."""
-        found = Partials(out / SCORES, "no weights", self.name)
-        kept = found.get(TRUTH)
-        if kept is not None:
-            return kept
+        return self._cache(out).compute(TRUTH, self._score_truth)
+
+    def _score_truth(self) -> Arrays:
         parts: dict[str, list[np.ndarray]] = {}
         with Meter("the truth's own numbers", len(self.protocol.clips), "clips") as meter:
             for batch in self.batches:
@@ -154,7 +150,7 @@ class Scorer:
         whole = {key: np.concatenate(each) for key, each in parts.items()}
         if "walks" in whole:
             whole |= self._consistency(whole.pop("walks"))
-        return found.put(TRUTH, **whole)
+        return whole
 
     def _truth_of(self, batch: Batch) -> Arrays:
         video = _joined(batch.context, batch.targets)
@@ -203,14 +199,14 @@ class Scorer:
                 for key, value in values.items():
                     parts.setdefault(key, []).append(value[: batch.real])
                 meter.advance(batch.real)
-        self.say(meter.summary())
+        self.log(meter.summary())
         return {key: np.concatenate(each) for key, each in parts.items()}
 
 
 def open_scorer(
     config: Config,
     out: Path,
-    say: Callable[[str], Any],
+    log: Callable[[str], Any],
     weights: Mapping[str, str | Path] | None = None,
 ) -> Scorer:
     """Fix what is scored, before anything is trained, and read it.
@@ -218,21 +214,21 @@ def open_scorer(
     Args:
         config: the settings that all rows share.
         out: the folder of the table; its ``protocol.json`` is written, or followed.
-        say: shows a line.
+        log: shows a line.
         weights: measure → its file or folder of weights, for those that no package has.
 
     Raises:
         UserError: the data are absent or have changed, or another protocol lies there.
     """
     out.mkdir(parents=True, exist_ok=True)
-    protocol = protocol_file.write(config, out / PROTOCOL, say)
-    config = lay(protocol, config)
+    protocol = protocols.write_protocol(config, out / PROTOCOL, log)
+    config = apply_protocol(protocol, config)
     split = Path(config.data.path) / config.evaluate.split
     episodes = EpisodeSource(split)
-    clips = decide(config, episodes, protocol, str(split))[1]
+    clips = resolve_clips(config, episodes, protocol, str(split))[1]
     nets, left_out = _measures(config, weights, len(clips))
     for sentence in left_out.values():
-        say(sentence)
+        log(sentence)
     size = config.evaluate.batch
     batches = []
     with Meter("reading held-out clips", len(clips), "clips") as meter:
@@ -246,8 +242,7 @@ def open_scorer(
         "noise": to_dict(config.model.noise),
         "nets": {name: getattr(net, "sha256", name) for name, net in nets.items()},
     }
-    name = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-    return Scorer(config, protocol, tuple(batches), nets, left_out, name, say)
+    return Scorer(config, protocol, tuple(batches), nets, left_out, inputs_hash(facts), log)
 
 
 def _measures(

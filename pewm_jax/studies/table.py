@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.eval import intervals
-from pewm_jax.eval.images import MASKS
+from pewm_jax.eval.metrics.images import MASKS
 from pewm_jax.eval.statistics import scores
 from pewm_jax.studies.rows import CONTROL, PAPER_FORM
 from pewm_jax.studies.scorer import SRC, Arrays

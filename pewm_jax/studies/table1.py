@@ -44,7 +44,7 @@ def run(
     ablation: str = "",
     values: tuple[str, ...] = (),
     weights: Mapping[str, str | Path] | None = None,
-    say: Callable[[str], Any] = print,
+    log: Callable[[str], Any] = print,
 ) -> Path:
     """Train and score the rows of Table 1, or of an ablation, and write the table.
 
@@ -58,7 +58,7 @@ def run(
         ablation: one of ``rows.ABLATIONS`` instead of the table.
         values: of the ablation; by default its own.
         weights: see ``scorer.open_scorer``.
-        say: shows a line.
+        log: shows a line.
 
     Returns:
         The path of the table in Markdown; beside it are ``.tex``, ``.csv``, ``.png`` and
@@ -74,11 +74,11 @@ def run(
             f"seeds are {list(seeds)}: give each training seed once, one at least, from 0 on."
         )
     study = Study(base, out, minutes, steps)
-    scorer = open_scorer(base, out, say, weights)
+    scorer = open_scorer(base, out, log, weights)
     title = "-".join(["table1", *([ablation] if ablation else []), *(["part"] if only else [])])
     pieces: dict[str, list[Arrays]] = {}
     with _timing(out, "before"):
-        plan = planned(study, chosen, say)
+        plan = planned(study, chosen, log)
         for name in BASELINES:
             pieces[name] = [scorer.baseline(name, out)]
         truth = scorer.truth(out)
@@ -86,7 +86,7 @@ def run(
     for number, seed in enumerate(seeds):
         for row in chosen:
             with _timing(out, f"seed{seed}/{row.name}"):
-                found = _one(study, scorer, row, seed, plan, say)
+                found = _one(study, scorer, row, seed, plan, log)
             for name, arrays in found.items():
                 group = pieces.setdefault(name, [])
                 if len(group) == number:
@@ -97,7 +97,7 @@ def run(
         text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
         atomic.write_text(out / f"{title}-{RESULTS}", text + "\n")
         table_page.write(results, page)
-        say(f"{number + 1} of {len(seeds)} training seeds: {page}")
+        log(f"{number + 1} of {len(seeds)} training seeds: {page}")
     return page
 
 
@@ -124,7 +124,7 @@ def _rows(
 
 
 def _one(
-    study: Study, scorer: Scorer, row: Row, seed: int, plan: dict[str, Any], say: Callable
+    study: Study, scorer: Scorer, row: Row, seed: int, plan: dict[str, Any], log: Callable
 ) -> dict[str, Arrays]:
     """Train and score a row; also its backbone, where that is a row of the table.
 
@@ -134,12 +134,12 @@ def _one(
     file = recorded.path(study, row, seed, steps, scorer.name)
     before = recorded.read(file)
     if before is not None and not study.folder(row.name, seed).exists():
-        say(f"{row.name}, training seed {seed}: its scores are recorded in {file.parent}")
+        log(f"{row.name}, training seed {seed}: its scores are recorded in {file.parent}")
         return before
     others = [] if before else sorted(file.parent.glob(f"seed{seed}-{row.name}-????????????.npz"))
     if others:
-        say(f"{others[0]} is of other settings, data, weights or code, and is left aside")
-    config = train(study, row, seed, steps, say)
+        log(f"{others[0]} is of other settings, data, weights or code, and is left aside")
+    config = train(study, row, seed, steps, log)
     found = {row.name: scorer.row(config, memory=row.reads)}
     if row.depth:
         first = settings(study, backbone_of(study.base, row), seed, plan[EMPTY]["steps"], start="")

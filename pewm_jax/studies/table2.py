@@ -17,7 +17,7 @@ import numpy as np
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.eval import intervals
-from pewm_jax.eval.loaded_run import Opened, open_run, remembers
+from pewm_jax.eval.loaded_run import LoadedRun, has_memory, open_run
 from pewm_jax.io import atomic
 from pewm_jax.io.progress import Meter
 from pewm_jax.planning import scores
@@ -31,7 +31,7 @@ from pewm_jax.types import Params
 WITHIN_M, WITHIN_DEG = 0.35, 45.0
 """A goal is reached this near to it, and with a heading this near to its own: one step or one turn
 of the usual 0.25 m and 30° short, and no more."""
-Say = Callable[[str], Any]
+Log = Callable[[str], Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,7 @@ def run(
     errand: Errand,
     policy: Policy,
     cost: FrameCost,
-    say: Say = print,
+    log: Log = print,
 ) -> Path:
     """Let every method decide every task, and write the table.
 
@@ -77,7 +77,7 @@ def run(
         errand: the settings.
         policy: that of their name.
         cost: that of their name.
-        say: shows a line.
+        log: shows a line.
 
     Returns:
         The path of the table in Markdown; beside it .tex, .csv, .png, videos and ``results.json``.
@@ -88,7 +88,7 @@ def run(
     """
     opened = open_run(model)
     config, params = opened.config, opened.params
-    if not remembers(opened):
+    if not has_memory(opened):
         raise UserError(f"{model} has no memory, and what a memory adds is the question.")
     if errand.plan.actions % (config.model.clip.frames - 1):
         raise UserError(
@@ -126,7 +126,7 @@ def run(
                     scores_here = _scored(goal, np.array(found["actions"]))
                     made[name].append(found | {"scores": scores_here})
                     meter.advance(1)
-    say(meter.summary())
+    log(meter.summary())
     made = next(iter(by_distance.values()))
     results = summary(made) | {
         "distances": {
@@ -149,7 +149,7 @@ ADDED = ("tasks", "videos", "policy", "proposals", "multiples", "none")
 """Settings that may change from call to call: decisions of others are found again."""
 
 
-def _folder(name: str, errand: Errand, times: int, none: Opened | None) -> str:
+def _folder(name: str, errand: Errand, times: int, none: LoadedRun | None) -> str:
     """Return the folder of a method's decisions; plans do not depend on the policy."""
     planned = name.startswith(("mpc", "loop"))
     whose = "" if planned else f"{errand.policy.replace(':', '.')}/"
@@ -158,9 +158,9 @@ def _folder(name: str, errand: Errand, times: int, none: Opened | None) -> str:
     return f"decisions/{far}{whose}{name}{own}"
 
 
-def _require_alike(none: Opened, opened: Opened, name: str, model: str | Path) -> None:
+def _require_alike(none: LoadedRun, opened: LoadedRun, name: str, model: str | Path) -> None:
     """Refuse a model without memory that has a memory, or does not fit the other."""
-    if remembers(none):
+    if has_memory(none):
         raise UserError(f"{name} was trained with a memory: name a run trained in stage 1 alone.")
     one, other = none.config.model, opened.config.model
     if (one.clip, one.actions) != (other.clip, other.actions):

@@ -183,7 +183,7 @@ def _floors(results: Mapping[str, Any]) -> str:
 
 
 def _unbeaten(results: Mapping[str, Any]) -> str:
-    """Say on which measures no trained row reaches what needs no network."""
+    """Log on which measures no trained row reaches what needs no network."""
     said = []
     for rival in ("reproject", "copy"):
         theirs = results["rows"].get(rival, {"measures": {}})["measures"]

@@ -25,7 +25,7 @@ from pewm_jax.config import ModelConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.io import atomic
 from pewm_jax.studies.rows import Row
-from pewm_jax.studies.trainings import Say, Study, backbone_of, settings
+from pewm_jax.studies.trainings import Log, Study, backbone_of, settings
 from pewm_jax.train import sharding
 from pewm_jax.train.step import compile_step, initial_state, noise_key
 from pewm_jax.worlds.pewm.world import STAGES
@@ -38,7 +38,7 @@ UNREAD = "weights that are not read"
 Times = dict[str, float]
 
 
-def planned(study: Study, rows: Sequence[Row], say: Say) -> dict[str, Any]:
+def planned(study: Study, rows: Sequence[Row], log: Log) -> dict[str, Any]:
     """Return how many steps each row and its backbone get; measured once.
 
     Trainings that are timed later are timed beside one that was timed before, and scaled by it.
@@ -53,7 +53,7 @@ def planned(study: Study, rows: Sequence[Row], say: Say) -> dict[str, Any]:
     names = {name: _model(study, row) for name, row in everything.items()}
     seconds: Times = {}
     if study.steps is None:
-        seconds = _timed(study, {names[name]: row for name, row in everything.items()}, say)
+        seconds = _timed(study, {names[name]: row for name, row in everything.items()}, log)
     plan = {}
     for name, row in everything.items():
         second = not name.startswith("backbone")
@@ -65,7 +65,7 @@ def planned(study: Study, rows: Sequence[Row], say: Say) -> dict[str, Any]:
     return plan
 
 
-def _timed(study: Study, models: dict[str, Row], say: Say) -> Times:
+def _timed(study: Study, models: dict[str, Row], log: Log) -> Times:
     """Return the seconds of a step for each model, from ``plan.json`` or measured now."""
     path = study.out / PLAN
     kept = _kept(path)
@@ -74,7 +74,7 @@ def _timed(study: Study, models: dict[str, Row], say: Say) -> Times:
         return kept
     known = {model: row for model, row in models.items() if model in kept}
     beside = dict(list(known.items())[-1:])  # a row rather than a backbone, where one is known
-    found = _measure(study, {**beside, **missing}, say)
+    found = _measure(study, {**beside, **missing}, log)
     scale = next((kept[model] / found[model] for model in beside), 1.0)
     kept = _kept(path) | kept | {model: scale * found[model] for model in missing}
     study.out.mkdir(parents=True, exist_ok=True)
@@ -108,10 +108,10 @@ def clock() -> Callable[[], float]:
     return time.process_time if jax.default_backend() == "cpu" else time.perf_counter
 
 
-def _measure(study: Study, models: dict[str, Row], say: Say) -> Times:
+def _measure(study: Study, models: dict[str, Row], log: Log) -> Times:
     """Return the time of a step of each model, seconds: medians, the models in turn."""
-    say(f"timing a step of {len(models)} trainings …")
-    steps = {model: _compiled(study, row, say) for model, row in models.items()}
+    log(f"timing a step of {len(models)} trainings …")
+    steps = {model: _compiled(study, row, log) for model, row in models.items()}
     taken: dict[str, list[float]] = {model: [] for model in steps}
     now = clock()
     for number in range(ROUNDS + 1):
@@ -123,13 +123,13 @@ def _measure(study: Study, models: dict[str, Row], say: Say) -> Times:
     found = {model: statistics.median(each) for model, each in taken.items()}
     for model, seconds in found.items():
         spread = f"{min(taken[model]):.3f} to {max(taken[model]):.3f}"
-        say(f"  {models[model].name}: {seconds:.3f} s a step ({spread})")
+        log(f"  {models[model].name}: {seconds:.3f} s a step ({spread})")
     del steps
     gc.collect()
     return found
 
 
-def _compiled(study: Study, row: Row, say: Say) -> Callable[[], None]:
+def _compiled(study: Study, row: Row, log: Log) -> Callable[[], None]:
     """Compile a row's training step; returns a function that does one step, on random weights."""
     config = settings(study, row, 0, 1, start=UNREAD)
     stage, mesh = STAGES[1 if row.reads else 0], sharding.make_mesh(arranged=config.train.mesh)
@@ -142,7 +142,7 @@ def _compiled(study: Study, row: Row, say: Say) -> Callable[[], None]:
     clip = jax.device_put(jax.device_get(batch), sharding.of_batch(mesh))
     began = time.monotonic()
     compiled = compile_step(config, stage, mesh, clip)
-    say(f"  {row.name}: compiled in {time.monotonic() - began:.0f} s")
+    log(f"  {row.name}: compiled in {time.monotonic() - began:.0f} s")
 
     def step() -> None:
         held[0], metrics = compiled(held[0], clip, key)

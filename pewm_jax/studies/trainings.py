@@ -21,8 +21,8 @@ from pewm_jax import shipped
 from pewm_jax.config import Config, NoMemoryConfig, StageConfig, UserError
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.errors import require
-from pewm_jax.eval.protocol import file_hash
 from pewm_jax.io import atomic, weights
+from pewm_jax.io.store import file_hash
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.studies.rows import Row
 from pewm_jax.train import loop
@@ -30,7 +30,7 @@ from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.worlds.pewm.world import STAGES
 
 CODEC, MADE_FROM = "codec", "made_from.json"
-Say = Callable[[str], Any]
+Log = Callable[[str], Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +114,7 @@ def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Co
     return dataclasses.replace(config, train=train)
 
 
-def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], say: Say) -> Config:
+def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], log: Log) -> Config:
     """Train a row, after its backbone, or find them trained.
 
     Args:
@@ -122,7 +122,7 @@ def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], say: Say)
         row: what to train.
         seed: of the training.
         steps: from ``planned``: name of a row or backbone → steps.
-        say: shows a line.
+        log: shows a line.
 
     Returns:
         The settings of the row's training, whose folder is ``train.run``.
@@ -136,9 +136,9 @@ def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], say: Say)
     for which in (before, row):
         where = start if which is before else str(_start_of(study, row, before, seed))
         config = settings(study, which, seed, steps[which.name], start=where)
-        say(f"{which.name}, training seed {seed}: {steps[which.name]} steps")
+        log(f"{which.name}, training seed {seed}: {steps[which.name]} steps")
         _require_same(config)
-        loop.train(config, say=say)
+        loop.train(config, say=log)
         shutil.rmtree(study.folder(which.name, seed) / "checkpoints", ignore_errors=True)
         gc.collect()  # arrays, and programs that no other row needs
     return config

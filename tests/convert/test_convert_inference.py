@@ -13,8 +13,8 @@ from pewm_jax import worlds
 from pewm_jax.config import ClipConfig, UserError
 from pewm_jax.convert import inference
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.eval.protocol import file_hash
 from pewm_jax.io import tree, weights
+from pewm_jax.io.store import file_hash
 from pewm_jax.report.labels import MASK_NAMES, METHOD_NAMES, METRIC_NAMES
 from pewm_jax.train import runs
 from pewm_jax.worlds import world_model

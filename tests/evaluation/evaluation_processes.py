@@ -19,23 +19,24 @@ from pewm_jax.config import command_line as cli
 def score(folder, devices):
     """Return all scores of a model that knows the room, as arrays by name."""
     from pewm_jax.data.dataset import EpisodeSource
-    from pewm_jax.eval import imagine
+    from pewm_jax.eval import runner
     from pewm_jax.eval.long_rollouts import roll_long
-    from pewm_jax.eval.methods import Methods
-    from pewm_jax.eval.partial import Partials
     from pewm_jax.eval.reproject import ReprojectSettings
+    from pewm_jax.eval.runner import Methods, workers
     from pewm_jax.eval.scoring import score_table
-    from pewm_jax.eval.shares import first_alone
+    from pewm_jax.io.store import ResultCache
 
     config = tiny(folder, batch=4, clips=6)
     episodes = EpisodeSource(folder / "data" / "revisit")
-    imagine.rollout = knowing_rollout
+    runner.rollout = knowing_rollout
     params = {"offset": np.float32(0)}
     context = config.data.context
-    model = imagine.Imagination(config, params, 4, context, lambda _: None, devices=devices)
+    model = runner.ModelRunner(config, params, 4, context, lambda _: None, devices=devices)
     methods = Methods(model, ReprojectSettings())
     place = folder / f"partial-{len(devices)}"
-    partials = first_alone(lambda: Partials(place, "e" * 64, "f" * 64), "folder")
+    partials = workers().first_alone(
+        lambda: ResultCache.for_weights(place, "e" * 64, "f" * 64), "folder"
+    )
     scored = score_table(config, episodes, methods, partials)
     long = roll_long(config, episodes, methods, partials)
     found = {f"table/{name}": array for name, array in scored.sums.items()}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import Config, PersistTrainConfig, UserError
-from pewm_jax.eval import edit_trials
+from pewm_jax.eval import voxel_trials
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.types import Camera, Frames, WorldState
 from pewm_jax.worlds.persist import world as persist
@@ -71,8 +71,10 @@ def test_in_a_world_where_nothing_happens_all_of_a_block_stays(standing, cell):
     config = Config(model=world(cell), train=PersistTrainConfig())
     there = np.zeros((8, 8), bool)
     there[:, :4] = True
-    standing.setattr(edit_trials, "_sight", lambda *_: (jnp.asarray(there), jnp.array(True)))
-    found = edit_trials.run(config, {}, [walk(), walk()], batch=2, chunk=3)
+    standing.setattr(
+        voxel_trials, "_rays_on_block", lambda *_: (jnp.asarray(there), jnp.array(True))
+    )
+    found = voxel_trials.run(config, {}, [walk(), walk()], batch=2, chunk=3)
     np.testing.assert_array_equal(found.kept_N, 1)
     assert (found.asked, found.frames, found.within) == (2, 2 * FRAMES, 2 * FRAMES)
     assert found.shown == found.visible == 2 * FRAMES  # of both chunks
@@ -80,10 +82,12 @@ def test_in_a_world_where_nothing_happens_all_of_a_block_stays(standing, cell):
 
 def test_enough_trials_are_enough(standing):
     config = Config(model=world(0.25), train=PersistTrainConfig())
-    standing.setattr(edit_trials, "_sight", lambda *_: (jnp.zeros((8, 8), bool), jnp.array(True)))
+    standing.setattr(
+        voxel_trials, "_rays_on_block", lambda *_: (jnp.zeros((8, 8), bool), jnp.array(True))
+    )
     boxes = iter([None, np.array([[1, 0, 0], [1.25, 0.25, 0.25]], np.float32)])
-    standing.setattr(edit_trials, "room", lambda *_: next(boxes))
-    found = edit_trials.run(config, {}, [walk(), walk(), walk()], batch=1, chunk=8, count=1)
+    standing.setattr(voxel_trials, "room", lambda *_: next(boxes))
+    found = voxel_trials.run(config, {}, [walk(), walk(), walk()], batch=1, chunk=8, count=1)
     assert (len(found.kept_N), found.asked) == (1, 2)
     assert found.facts()["without_room"] == 1
 
@@ -93,11 +97,11 @@ def test_what_a_camera_sees_of_a_block_and_whether_it_is_in_the_window(standing)
     camera = jax.tree.map(lambda x: x[0][None], cameras(1))
     grid = ClassGrid(jnp.zeros(model.memory.cells, jnp.int16), jnp.array([-6.0, -6.0, 0.0]))
     ahead = jnp.array([[1.0, -0.5, 0.5], [1.5, 0.5, 1.5]])
-    there, within = edit_trials._sight(model, grid, camera, ahead)
+    there, within = voxel_trials._rays_on_block(model, grid, camera, ahead)
     assert there.any()
     assert within
     for box in (ahead - jnp.array([3.0, 0, 0]), ahead + jnp.array([4.0, 0, 0])):
-        there, within = edit_trials._sight(model, grid, camera, box)
+        there, within = voxel_trials._rays_on_block(model, grid, camera, box)
         assert not there.any()
     assert not within  # farther than half a window
 
@@ -106,17 +110,17 @@ def test_a_picture_is_changed_where_the_block_is_or_not():
     there = np.zeros((4, 4), bool)
     there[1:3, 1:3] = True
     change = np.full((18, 18), 0.1)
-    assert edit_trials.judged(there, change) == (True, False)
+    assert voxel_trials.block_visibility(there, change) == (True, False)
     change[6:12, 6:12] = 0.5
-    assert edit_trials.judged(there, change) == (True, True)
-    assert edit_trials.judged(np.ones((4, 4), bool), change) == (False, False)
-    assert edit_trials.judged(there & False, change) == (False, False)
+    assert voxel_trials.block_visibility(there, change) == (True, True)
+    assert voxel_trials.block_visibility(np.ones((4, 4), bool), change) == (False, False)
+    assert voxel_trials.block_visibility(there & False, change) == (False, False)
 
 
 def test_what_cannot_be_tried_is_refused():
     config = Config(model=world(0.25), train=PersistTrainConfig())
-    assert edit_trials.class_of(config, [walk()]) > 0
+    assert voxel_trials.block_class(config, [walk()]) > 0
     with pytest.raises(UserError, match="no voxels"):
-        edit_trials.class_of(config, [types.SimpleNamespace(first=None)])
+        voxel_trials.block_class(config, [types.SimpleNamespace(first=None)])
     with pytest.raises(UserError, match="furniture/nothing"):
-        edit_trials.class_of(config, [walk()], "furniture/nothing")
+        voxel_trials.block_class(config, [walk()], "furniture/nothing")

@@ -17,10 +17,11 @@ from pewm_jax import config as configs
 from pewm_jax.cli import compare as command
 from pewm_jax.config import UserError
 from pewm_jax.config import command_line as cli
-from pewm_jax.eval import compare, protocol_file, samples
-from pewm_jax.eval.fixed import ClipKey, EpisodeKey, Protocol
+from pewm_jax.eval import compare, results
+from pewm_jax.eval import protocol as protocols
+from pewm_jax.eval.clips import ClipChoice
 from pewm_jax.eval.long_rollouts import LongRollouts
-from pewm_jax.eval.protocol import ClipChoice
+from pewm_jax.eval.protocol import ClipKey, EpisodeKey, Protocol
 from pewm_jax.eval.scoring import Scored
 
 CLIPS, FRAMES, LONG = 12, 4, 8
@@ -70,8 +71,8 @@ def report(folder, errors_SCT, *, chosen=None, seed=0, weights="w", pictures=2, 
     said |= {"sampler": "ddim", "sampling_steps": steps}
     where = folder / "report"
     (where / "rows").mkdir(parents=True)
-    samples.save(where, samples.gather(Scored(choices, sums), long, **facts))
-    protocol_file.save(where / "protocol.json", chosen, {})
+    results.save_samples(where, results.gather_samples(Scored(choices, sums), long, **facts))
+    protocols.save_protocol(where / "protocol.json", chosen, {})
     (where / "metrics.json").write_text(json.dumps({"schema": 1, "protocol": said}))
     for index in range(pictures):
         for name in ("truth", "memory"):
@@ -94,7 +95,7 @@ def test_the_difference_is_paired_and_the_page_needs_no_other_file(tmp_path, err
     a = report(tmp_path / "a", errors / 10**0.1)
     b = report(tmp_path / "b", errors, weights="v", pictures=1)
     said = []
-    page = compare.compare(a, b, say=said.append)
+    page = compare.compare(a, b, log=said.append)
     assert page == a / "compare-b" / "index.html"
     found = content(page)
     gain = found["differences"]["clips"]["seen"]["psnr"]
@@ -113,9 +114,9 @@ def test_the_difference_is_paired_and_the_page_needs_no_other_file(tmp_path, err
     assert len(re.findall("<figure><img", text)) == 1  # the rollout that both show
     assert text.count("data:image/png") == 1 + 2 * 8  # and charts, in light and dark
     assert not re.search(r"https?://|url\(|@import|<script|<link", text)
-    back = content(compare.compare(b, a, out=tmp_path / "out", say=said.append))
+    back = content(compare.compare(b, a, out=tmp_path / "out", log=said.append))
     assert back["differences"]["clips"]["all"]["psnr"]["mean"] == pytest.approx(-1)
-    same = content(compare.compare(a, a, out=tmp_path / "same", say=said.append))
+    same = content(compare.compare(a, a, out=tmp_path / "same", log=said.append))
     assert same["differences"]["clips"]["all"]["ssim"]["high"] == 0
     assert "no clear difference" in said[-2]
     assert said[-1] == "a and b are the same weights."
@@ -139,7 +140,7 @@ def test_training_seeds_are_apart_from_houses(tmp_path, errors):
             names["b"][0],
             also_one=names["a"][1:],
             also_two=names["b"][1:],
-            say=lambda _: None,
+            log=lambda _: None,
         )
     )
     houses = found["differences"]["clips"]["seen"]["psnr"]
@@ -187,7 +188,7 @@ def test_what_is_no_pair_of_reports_is_refused(tmp_path, errors, capsys):
         flipped[place] ^= 0xFF
         (where / "samples.npz").write_bytes(flipped)
         with contextlib.suppress(UserError):
-            samples.load(where)
+            results.load_samples(where)
     (where / "samples.npz").write_bytes(whole[:200])
     with pytest.raises(UserError, match=r"samples\.npz is damaged"):
         compare.compare(a, b)
@@ -201,24 +202,26 @@ def test_what_is_no_pair_of_reports_is_refused(tmp_path, errors, capsys):
 def test_lpips_of_different_networks_is_left_out(tmp_path, errors):
     for name, net in (("a", "alex"), ("b", "vgg")):
         folder = report(tmp_path / name, errors)
-        read = samples.load(folder / "report")
+        read = results.load_samples(folder / "report")
         lpips = {
             f"{part}/memory/all/lpips": read.arrays[f"{part}/memory/all/psnr"] / 100
-            for part in samples.PARTS
+            for part in results.PARTS
         }
-        samples.save(folder / "report", samples.Samples(read.about, {**read.arrays, **lpips}))
+        results.save_samples(
+            folder / "report", results.Samples(read.about, {**read.arrays, **lpips})
+        )
         path = folder / "report" / "metrics.json"
         metrics = json.loads(path.read_text())
         metrics["protocol"]["lpips_weights_sha256"] = net
         path.write_text(json.dumps(metrics))
-    apart = compare.compare(tmp_path / "a", tmp_path / "b", say=lambda _: None)
+    apart = compare.compare(tmp_path / "a", tmp_path / "b", log=lambda _: None)
     assert content(apart)["left_out"] == ["lpips"]
     assert "lpips" not in content(apart)["differences"]["clips"]["all"]
     assert "different networks" in apart.read_text()
-    same = compare.compare(tmp_path / "a", tmp_path / "a", say=lambda _: None)
+    same = compare.compare(tmp_path / "a", tmp_path / "a", log=lambda _: None)
     assert content(same)["differences"]["clips"]["all"]["lpips"]["mean"] == 0
     report(tmp_path / "c", errors)
-    one = compare.compare(tmp_path / "a", tmp_path / "c", say=lambda _: None)
+    one = compare.compare(tmp_path / "a", tmp_path / "c", log=lambda _: None)
     assert content(one)["measured_by_one"] == ["lpips"]
     assert "only one of the two was measured with it" in one.read_text()
 
@@ -227,19 +230,19 @@ def test_sides_that_sample_differently_are_told_apart(tmp_path, errors):
     said = []
     for name, steps in (("a", 4), ("b", 2), ("c", 4)):
         report(tmp_path / name, errors, steps=steps)
-    page = compare.compare(tmp_path / "a", tmp_path / "b", say=said.append)
+    page = compare.compare(tmp_path / "a", tmp_path / "b", log=said.append)
     words = "a imagines in 4 sampling steps (ddim), b imagines in 2 sampling steps (ddim)."
     assert said[-1] == words
     assert words in page.read_text()
     said.clear()
-    compare.compare(tmp_path / "a", tmp_path / "c", say=said.append)
+    compare.compare(tmp_path / "a", tmp_path / "c", log=said.append)
     assert not any("sampling steps" in line for line in said)
 
 
 def test_samples_give_back_what_was_kept(tmp_path, errors):
     errors[0, 3] = 0.5
     folder = report(tmp_path / "a", errors) / "report"
-    found = samples.load(folder)
+    found = results.load_samples(folder)
     assert found.table("clips", "memory")["seen"]["psnr"].shape == (2, CLIPS)
     assert found.table("frames", "empty")["all"]["depth_mae"].shape == (2, CLIPS, FRAMES)
     np.testing.assert_allclose(found.table("frames", "memory")["seen"]["psnr"][0, 3], 3.0103, 1e-4)

@@ -8,7 +8,12 @@ from scipy.linalg import sqrtm
 from pewm_jax.config import UserError
 from pewm_jax.eval import metrics
 from pewm_jax.eval.metrics import videos
-from pewm_jax.eval.metrics.distributions import against, floor, frechet, kernel
+from pewm_jax.eval.metrics.videos import (
+    distance_floor,
+    distance_of_halves,
+    frechet,
+    kernel,
+)
 from pewm_jax.io import tree, weights
 from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
@@ -64,21 +69,23 @@ def test_the_floor_of_fvd_falls_with_the_number_and_that_of_kvd_is_0_at_every():
     rng = np.random.default_rng(0)
     spectrum = 1 / np.arange(1, 401)
     truth = rng.standard_normal((480, 400)) * np.sqrt(spectrum)
-    shares = [floor(frechet, truth, n, splits=3).mean / spectrum.sum() for n in (50, 100, 240)]
+    shares = [
+        distance_floor(frechet, truth, n, splits=3).mean / spectrum.sum() for n in (50, 100, 240)
+    ]
     assert shares[1] == pytest.approx(0.60, abs=0.05)  # a known bias of the measure
     assert (np.diff(shares) < -0.1).all()
     assert frechet(truth[:240], truth[240:]) == pytest.approx(shares[2] * spectrum.sum(), rel=0.1)
     shifted = np.sqrt(spectrum) * (rng.standard_normal((480, 400)) + 0.5)
     for n in (50, 240):
-        assert abs(floor(kernel, truth, n).mean) < 0.1 * kernel(shifted, truth)
+        assert abs(distance_floor(kernel, truth, n).mean) < 0.1 * kernel(shifted, truth)
 
 
 def test_the_same_clips_are_drawn_for_a_score_and_its_floor():
     truth, guess = draw(30), draw(30, seed=3, shift=3)
-    assert against(frechet, truth, truth) == floor(frechet, truth)
-    assert floor(frechet, truth) == floor(frechet, truth, 15, splits=10, seed=0)
-    assert floor(frechet, truth, seed=1) != floor(frechet, truth)
-    assert against(frechet, guess, truth).mean > floor(frechet, truth).mean
+    assert distance_of_halves(frechet, truth, truth) == distance_floor(frechet, truth)
+    assert distance_floor(frechet, truth) == distance_floor(frechet, truth, 15, splits=10, seed=0)
+    assert distance_floor(frechet, truth, seed=1) != distance_floor(frechet, truth)
+    assert distance_of_halves(frechet, guess, truth).mean > distance_floor(frechet, truth).mean
 
 
 def test_sets_that_cannot_be_compared_are_refused():
@@ -93,9 +100,9 @@ def test_sets_that_cannot_be_compared_are_refused():
     with pytest.raises(UserError, match="10 and 9 vectors have no kernel distance"):
         kernel(truth, truth[:9])
     with pytest.raises(UserError, match="two sets of 6 clips cannot be drawn from 10"):
-        floor(frechet, truth, 6)
+        distance_floor(frechet, truth, 6)
     with pytest.raises(UserError, match="9 imagined and 10 true clips are not partners"):
-        against(frechet, truth[:9], truth)
+        distance_of_halves(frechet, truth[:9], truth)
 
 
 @pytest.fixture(scope="module")

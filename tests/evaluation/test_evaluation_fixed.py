@@ -12,8 +12,8 @@ from evaluation_scene import record, tiny, write_split
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.eval import fixed, protocol_file
-from pewm_jax.eval.protocol import choose, long_choices
+from pewm_jax.eval import protocol as protocols
+from pewm_jax.eval.clips import choose, long_choices
 
 
 @pytest.fixture(scope="module")
@@ -23,19 +23,19 @@ def episodes(tmp_path_factory):
 
 
 def protocol(config, episodes):
-    return fixed.fix(config, episodes, *fixed.chosen(config, episodes))
+    return protocols.make_protocol(config, episodes, *protocols.choose_clips(config, episodes))
 
 
 def test_it_finds_the_clips_that_it_was_made_of(episodes, tmp_path):
     config = tiny(tmp_path)
     made = protocol(config, episodes)
-    clips, rollouts = fixed.find(made, episodes, "data")
+    clips, rollouts = protocols.find_clips(made, episodes, "data")
     assert clips == choose(config, episodes, 4, 1)
     assert rollouts == long_choices(config, episodes)
     assert (made.horizon, made.long_horizon, made.control) == (4, 8, "actions")
     # In another order and among others, the same clips of the same episodes.
     mixed = [read_episode(record(7)), *(episodes[i] for i in (2, 0, 1))]
-    moved, _ = fixed.find(made, mixed, "data")
+    moved, _ = protocols.find_clips(made, mixed, "data")
     assert [clip.name for clip in moved] == [clip.name for clip in clips]
     assert [mixed[clip.episode].name for clip in moved] == [clip.name for clip in clips]
 
@@ -67,7 +67,7 @@ def test_every_choice_changes_the_hash(episodes, tmp_path):
         dataclasses.replace(base, scoring=base.scoring + 1),
     ]
     assert len({item.sha256 for item in (base, *others)}) == 1 + len(others)
-    assert all(fixed.difference(base, other) for other in others)
+    assert all(protocols.difference(base, other) for other in others)
     assert {item.pieces_sha256 for item in (base, others[1])} == {base.pieces_sha256}
     assert others[0].pieces_sha256 != base.pieces_sha256
 
@@ -75,11 +75,13 @@ def test_every_choice_changes_the_hash(episodes, tmp_path):
 def test_rollouts_shorter_than_asked_are_said(episodes, tmp_path):
     config = tiny(tmp_path)
     made = protocol(config, episodes)
-    assert fixed.shortened(config, made) == ""
+    assert protocols.describe_shortened(config, made) == ""
     more = dataclasses.replace(config.evaluate, video_clips=1000)
     asked = dataclasses.replace(config, evaluate=more)
     again = protocol(asked, episodes)
-    assert f"have {again.long_horizon} frames, and not the " in fixed.shortened(asked, again)
+    assert f"have {again.long_horizon} frames, and not the " in protocols.describe_shortened(
+        asked, again
+    )
 
 
 def test_what_is_not_chosen_does_not_change_the_hash(episodes, tmp_path):
@@ -90,7 +92,7 @@ def test_what_is_not_chosen_does_not_change_the_hash(episodes, tmp_path):
     )
     copy = [episodes[index] for index in range(3)]
     assert protocol(other, copy).sha256 == protocol(config, episodes).sha256
-    assert fixed.difference(protocol(other, copy), protocol(config, episodes)) == ""
+    assert protocols.difference(protocol(other, copy), protocol(config, episodes)) == ""
 
 
 def test_the_content_of_an_episode_is_part_of_it(episodes, tmp_path):
@@ -101,35 +103,37 @@ def test_the_content_of_an_episode_is_part_of_it(episodes, tmp_path):
     changed[2] = last
     assert protocol(config, changed).sha256 != made.sha256
     with pytest.raises(UserError, match="holds another one of that name"):
-        fixed.find(made, changed, "data/mine")
+        protocols.find_clips(made, changed, "data/mine")
     with pytest.raises(UserError, match=r"room-0/revisit .*does not hold it; name the folder"):
-        fixed.find(made, changed[1:], "data/mine")
+        protocols.find_clips(made, changed[1:], "data/mine")
 
 
 def test_motion_is_that_between_start_and_targets(episodes, tmp_path):
     choice = choose(tiny(tmp_path), episodes, 1, 1)[0]
     episode = episodes[choice.episode]
-    base = fixed.motion_hash(episode, choice)
+    base = protocols.motion_hash(episode, choice)
     for where, same in ((choice.start, False), (choice.targets_N[-1], True), (0, True)):
         actions = episode.actions.copy()
         actions[where] += 0.01
         moved = dataclasses.replace(episode, actions=actions)
-        assert (fixed.motion_hash(moved, choice) == base) == same
+        assert (protocols.motion_hash(moved, choice) == base) == same
     poses = np.array(episode.world_from_camera)
     poses[choice.targets_N[1], 0, 3] += 0.01
-    assert fixed.motion_hash(dataclasses.replace(episode, world_from_camera=poses), choice) != base
+    assert (
+        protocols.motion_hash(dataclasses.replace(episode, world_from_camera=poses), choice) != base
+    )
 
 
 def test_a_file_gives_back_what_was_written(episodes, tmp_path):
     made = protocol(tiny(tmp_path), episodes)
     path = tmp_path / "kept" / "protocol.json"
-    protocol_file.save(path, made, {"data": "somewhere"})
-    assert protocol_file.load(path) == made
-    assert protocol_file.load(path).sha256 == json.loads(path.read_text())["sha256"]
+    protocols.save_protocol(path, made, {"data": "somewhere"})
+    assert protocols.load_protocol(path) == made
+    assert protocols.load_protocol(path).sha256 == json.loads(path.read_text())["sha256"]
     value = json.loads(path.read_text())
     value["notes"] = {}
     path.write_text(json.dumps(dict(reversed(value.items()))))
-    assert protocol_file.load(path).sha256 == made.sha256
+    assert protocols.load_protocol(path).sha256 == made.sha256
 
 
 @pytest.mark.parametrize(
@@ -146,47 +150,47 @@ def test_a_file_gives_back_what_was_written(episodes, tmp_path):
 )
 def test_a_file_that_cannot_be_trusted_is_refused(episodes, tmp_path, change, said):
     path = tmp_path / "protocol.json"
-    protocol_file.save(path, protocol(tiny(tmp_path), episodes), {})
+    protocols.save_protocol(path, protocol(tiny(tmp_path), episodes), {})
     value = json.loads(path.read_text())
     change(value)
     path.write_text(json.dumps(value))
     with pytest.raises(UserError, match=said):
-        protocol_file.load(path)
+        protocols.load_protocol(path)
 
 
 def test_a_file_that_is_absent_or_no_json_is_refused(tmp_path):
     with pytest.raises(UserError, match="cannot be read"):
-        protocol_file.load(tmp_path / "gone.json")
+        protocols.load_protocol(tmp_path / "gone.json")
     (tmp_path / "x.json").write_text("{")
     with pytest.raises(UserError, match="is not JSON"):
-        protocol_file.load(tmp_path / "x.json")
+        protocols.load_protocol(tmp_path / "x.json")
 
 
 def test_it_stands_above_the_settings(episodes, tmp_path):
     made = protocol(tiny(tmp_path, seeds=(3, 4), chain=2, clips=3), episodes)
     path = tmp_path / "protocol.json"
-    protocol_file.save(path, made, {})
+    protocols.save_protocol(path, made, {})
     plain = tiny(tmp_path)
     named = dataclasses.replace(
         plain, evaluate=dataclasses.replace(plain.evaluate, protocol=str(path))
     )
-    config, found = protocol_file.given(named, {"clips": None})
+    config, found = protocols.apply_protocol_file(named, {"clips": None})
     assert found == made
     settings = config.evaluate
     assert (settings.seeds, settings.chain, settings.clips) == ((3, 4), 2, 3)
     assert protocol(config, episodes) == made
-    assert protocol_file.given(named, {"split": "theirs"})[0].evaluate.split == "theirs"
-    assert protocol_file.given(plain, {}) == (plain, None)
+    assert protocols.apply_protocol_file(named, {"split": "theirs"})[0].evaluate.split == "theirs"
+    assert protocols.apply_protocol_file(plain, {}) == (plain, None)
     off = dataclasses.replace(plain, evaluate=dataclasses.replace(plain.evaluate, protocol="off"))
-    assert protocol_file.given(off, {"clips": 2})[1] is None
+    assert protocols.apply_protocol_file(off, {"clips": 2})[1] is None
     with pytest.raises(ConfigError, match="--clips and --seeds cannot be chosen beside"):
-        protocol_file.given(named, {"clips": 2, "seeds": (1,)})
+        protocols.apply_protocol_file(named, {"clips": 2, "seeds": (1,)})
     longer = named.with_model(clip=dataclasses.replace(plain.model.clip, frames=13))
     with pytest.raises(UserError, match="8 imagined frames and this model imagines 12 at once"):
-        protocol_file.given(longer, {})
+        protocols.apply_protocol_file(longer, {})
     taller = named.with_model(clip=dataclasses.replace(plain.model.clip, height=32))
     with pytest.raises(UserError, match="16×16 and this model makes 32×16"):
-        protocol_file.given(taller, {})
+        protocols.apply_protocol_file(taller, {})
 
 
 def test_another_protocol_is_not_written_over(episodes, tmp_path):
@@ -195,12 +199,12 @@ def test_another_protocol_is_not_written_over(episodes, tmp_path):
         config, data=dataclasses.replace(config.data, path=str(episodes.path.parent))
     )
     path, said = tmp_path / "protocol.json", []
-    made = protocol_file.write(config, path, said.append)
+    made = protocols.write_protocol(config, path, said.append)
     assert made.sha256 in said[-1]
     before = path.stat().st_mtime_ns
-    protocol_file.write(config, path, said.append)
+    protocols.write_protocol(config, path, said.append)
     assert path.stat().st_mtime_ns == before
     assert "holds this protocol already" in said[-2]
     fewer = dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, clips=2))
     with pytest.raises(UserError, match=r"another protocol \(4 and 2 clips\)"):
-        protocol_file.write(fewer, path, said.append)
+        protocols.write_protocol(fewer, path, said.append)

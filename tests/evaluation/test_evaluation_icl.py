@@ -13,7 +13,7 @@ from pewm_jax import config as configs
 from pewm_jax import worlds
 from pewm_jax.cli.data import main
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.eval import report
+from pewm_jax.eval import evaluate as report
 from pewm_jax.io import weights
 
 RECORDING = Path(__file__).parents[3] / "shared" / "data" / "icl_livingroom"
@@ -53,5 +53,5 @@ def test_it_is_scored_along_its_own_cameras(data, tmp_path):
     run.mkdir()
     configs.save(config, run / "config.json")
     weights.save(run / "weights.safetensors", worlds.init(config.model, jax.random.key(0)))
-    page = report.evaluate(run, say=lambda _line: None, split="train")
+    page = report.evaluate(run, log=lambda _line: None, split="train")
     assert "six degrees of freedom" in page.read_text()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.eval.images import (
+from pewm_jax.eval.metrics.images import (
     MASKS,
     PSNR_CEILING,
     SUMS,

@@ -9,8 +9,8 @@ import pytest
 
 from pewm_jax.config import UserError
 from pewm_jax.eval import metrics
-from pewm_jax.eval.images import MASKS, SUMS, with_lpips
 from pewm_jax.eval.metrics import perceptual
+from pewm_jax.eval.metrics.images import MASKS, SUMS, with_lpips
 from pewm_jax.eval.statistics import margins, per_frame, table
 from pewm_jax.io import weights
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -108,7 +108,7 @@ def test_a_clips_number_does_not_depend_on_the_batch(name, files):
 
 def test_few_pictures_at_once_give_the_same_distances(files, monkeypatch):
     metric = metrics.load("lpips_alex", files["lpips_alex"])
-    assert isinstance(metric, metrics.Perceptual)
+    assert isinstance(metric, metrics.LPIPS)
     truth = clips(3)
     guess = np.roll(truth, 1, 0)
     whole = np.asarray(metric.frames(guess, truth))
@@ -128,7 +128,7 @@ def test_a_truth_that_passed_the_network_before_gives_the_same_distances(files, 
     """And where its features would take too much room, they are made again."""
     monkeypatch.setattr(perceptual, "KEPT", kept)
     metric = metrics.load("lpips_alex", files["lpips_alex"])
-    assert isinstance(metric, metrics.Perceptual)
+    assert isinstance(metric, metrics.LPIPS)
     truth = clips(3)
     codes = np.rint(127.5 * (truth + 1)).astype(np.uint8)
     for given in (truth, codes):
@@ -143,7 +143,9 @@ def test_a_truth_that_passed_the_network_before_gives_the_same_distances(files, 
 
 
 def test_what_cannot_work_is_refused_in_a_sentence(files, tmp_path, monkeypatch):
-    with pytest.raises(UserError, match="no metric 'fid'; there is psnr, ssim, lpips_alex, lpips_"):
+    with pytest.raises(
+        UserError, match="no metric 'fid'; choose one of psnr, ssim, lpips_alex, lpips_"
+    ):
         metrics.load("fid")
     with pytest.raises(UserError, match="psnr is no network and takes no weights"):
         metrics.load("psnr", files["lpips_alex"])

@@ -11,16 +11,15 @@ from evaluation_scene import knowing_rollout, tiny, write_split
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.eval import imagine, measure, mirror
-from pewm_jax.eval.imagine import Imagination
+from pewm_jax.eval import mirror, results, runner
+from pewm_jax.eval.clips import long_choices
 from pewm_jax.eval.long_rollouts import LongRollouts
-from pewm_jax.eval.methods import Methods
-from pewm_jax.eval.metrics import VideoDistance, chosen
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import long_choices
+from pewm_jax.eval.metrics import VideoDistance, selection
 from pewm_jax.eval.reproject import ReprojectSettings
+from pewm_jax.eval.runner import Methods, ModelRunner
 from pewm_jax.eval.scoring import Scored, score_table
 from pewm_jax.geometry.actions import integrate
+from pewm_jax.io.store import ResultCache
 from pewm_jax.models.i3d import convert as i3d_weights
 
 SAMPLED = {"memory", "empty"}
@@ -33,17 +32,20 @@ def scene(tmp_path_factory):
     config = tiny(folder, mirror=8, clips=4)
     episodes = EpisodeSource(write_split(folder / "data" / "revisit", episodes=3))
     params = {"offset": np.float32(0)}
-    model = Imagination(config, params, 2, config.data.context, lambda _: None)
+    model = ModelRunner(config, params, 2, config.data.context, lambda _: None)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(imagine, "rollout", knowing_rollout)
+        patch.setattr(runner, "rollout", knowing_rollout)
         model.prepare([True, False])
     return config, episodes, Methods(model, ReprojectSettings())
 
 
 def test_who_knows_the_way_comes_back_to_what_was_left(scene, tmp_path, monkeypatch):
     config, episodes, methods = scene
-    partials, rollouts = Partials(tmp_path, "e" * 64, "f" * 64), long_choices(config, episodes)
-    visits = chosen.revisits(("off",), None, 16, 16)[0]
+    partials, rollouts = (
+        ResultCache.for_weights(tmp_path, "e" * 64, "f" * 64),
+        long_choices(config, episodes),
+    )
+    visits = selection.select_revisits(("off",), None, 16, 16)[0]
     back = mirror.look_back(config, episodes, methods, partials, rollouts, visits, print)
     assert back.distances == [2, 4, 6, 8, 10, 12, 14, 16]
     assert set(back.pairs) == SAMPLED
@@ -63,7 +65,7 @@ def test_who_knows_the_way_comes_back_to_what_was_left(scene, tmp_path, monkeypa
     assert len(found["by_distance"]["memory"]["again"]["mean"]) == 8
     assert found["margins"]["empty"]["again"]["low"][0] > 20
     assert found["ceiling"]["mirror[psnr]"]["mean"] == pytest.approx(100)
-    monkeypatch.setattr(Imagination, "run", None)
+    monkeypatch.setattr(ModelRunner, "run", None)
     again = mirror.look_back(config, episodes, methods, partials, rollouts, visits, print)
     assert mirror.facts(again) == found
 
@@ -115,12 +117,15 @@ class Colours(VideoDistance):
 
 def test_videos_are_compared_as_wholes_and_their_features_kept(scene, tmp_path, monkeypatch):
     config, episodes, methods = scene
-    i3d, partials = Colours("fvd", {}, "c" * 64), Partials(tmp_path, "e" * 64, "f" * 64)
+    i3d, partials = (
+        Colours("fvd", {}, "c" * 64),
+        ResultCache.for_weights(tmp_path, "e" * 64, "f" * 64),
+    )
     plain = score_table(config, episodes, methods, partials, print)
     assert plain.features == {}
-    calls, run = [], Imagination.run
+    calls, run = [], ModelRunner.run
     monkeypatch.setattr(
-        Imagination, "run", lambda *args, **named: calls.append(1) or run(*args, **named)
+        ModelRunner, "run", lambda *args, **named: calls.append(1) or run(*args, **named)
     )
     scored = score_table(config, episodes, methods, partials, print, i3d=i3d)
     assert len(calls) == 2 * 2  # the first seed again, of two batches
@@ -131,18 +136,18 @@ def test_videos_are_compared_as_wholes_and_their_features_kept(scene, tmp_path, 
     np.testing.assert_allclose(scored.features["memory"], scored.features["truth"], atol=5e-3)
     for method in plain.sums:
         np.testing.assert_array_equal(plain.sums[method], scored.sums[method])
-    monkeypatch.setattr(Imagination, "run", None)
+    monkeypatch.setattr(ModelRunner, "run", None)
     monkeypatch.setattr(Colours, "features", None)
     again = score_table(config, episodes, methods, partials, print, i3d=i3d)
 
-    found = measure.videos(config, again, i3d)
+    found = results.videos(config, again, i3d)
     assert found["names"] == {"fvd": "FVD-5f@4", "kvd": "KVD-5f@4"}
     values = {method: found["results"][method]["fvd"]["value"] for method in methods.names}
     assert values["memory"] < 1e-3 < values["empty"]
     assert found["results"]["copy"]["fvd"]["floor"]["mean"] > 0
     one = Scored(again.choices[:1], {n: x[:1] for n, x in again.features.items()})
     one = Scored(one.choices, {}, {n: x[:1] for n, x in again.features.items()})
-    assert measure.videos(config, one, i3d) is None
+    assert results.videos(config, one, i3d) is None
 
 
 def test_the_map_grows_by_what_is_counted(scene):
@@ -150,24 +155,24 @@ def test_the_map_grows_by_what_is_counted(scene):
     choices = long_choices(config, episodes)
     held = np.array([[10, 14, 18], [20, 20, 28], [0, 8, 8]])
     long = LongRollouts(Scored(choices, {}), 2, 1, {"memory": {"occupied": held}})
-    found = measure.growth(config, long)
+    found = results.growth(config, long)
     assert found["frames"] == [0, 4, 8]
     assert found["occupied"]["mean"] == pytest.approx([10, 14, 18])
     assert found["per_frame"]["mean"] == pytest.approx(1)
     assert found["capacity"] == 256
-    assert measure.growth(config, dataclasses.replace(long, kept={"model": {}})) is None
+    assert results.growth(config, dataclasses.replace(long, kept={"model": {}})) is None
 
 
 def test_measures_that_cost_are_left_out_in_a_sentence(monkeypatch):
     monkeypatch.setattr(i3d_weights, "installed", lambda: None)
-    assert "no weights of I3D are installed" in chosen.video("", 9, accelerator=True)[1]
+    assert "no weights of I3D are installed" in selection.select_fvd("", 9, accelerator=True)[1]
     monkeypatch.setattr(i3d_weights, "installed", lambda: "there")
-    assert "I3D needs 9 frames and a clip has 5" in chosen.video("", 5, accelerator=True)[1]
-    assert "--fvd on asks for them" in chosen.video("", 9, accelerator=False)[1]
-    assert chosen.video("off", 9, accelerator=True)[0] is None
+    assert "I3D needs 9 frames and a clip has 5" in selection.select_fvd("", 5, accelerator=True)[1]
+    assert "--fvd on asks for them" in selection.select_fvd("", 9, accelerator=False)[1]
+    assert selection.select_fvd("off", 9, accelerator=True)[0] is None
     with pytest.raises(UserError, match="too short for I3D"):
-        chosen.video("on", 5, accelerator=True)
-    assert set(chosen.revisits((), None, 10, 64)[0]) == {"mirror[psnr]"}
-    assert "no encoder" in chosen.revisits((), None, 64, 64)[1]
+        selection.select_fvd("on", 5, accelerator=True)
+    assert set(selection.select_revisits((), None, 10, 64)[0]) == {"mirror[psnr]"}
+    assert "no encoder" in selection.select_revisits((), None, 64, 64)[1]
     with pytest.raises(UserError, match="alex needs pictures of 31 pixels"):
-        chosen.revisits(("alex",), None, 16, 16)
+        selection.select_revisits(("alex",), None, 16, 16)

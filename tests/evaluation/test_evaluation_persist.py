@@ -14,7 +14,7 @@ from pewm_jax.config import Config, DataConfig, EvalConfig, PersistTrainConfig
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
 from pewm_jax.data.voxels import VoxelsConfig
-from pewm_jax.eval import report
+from pewm_jax.eval import evaluate as report
 from pewm_jax.io import weights
 from tests.persist_world import MODEL
 
@@ -45,7 +45,7 @@ def run(tmp_path_factory):
 
 
 def test_a_world_of_voxels_has_the_report_that_every_world_has(run):
-    page = Path(report.evaluate(run, say=lambda _: None))
+    page = Path(report.evaluate(run, log=lambda _: None))
     assert page.exists()
     metrics = json.loads((page.parent / "metrics.json").read_text())
     assert {"memory", "empty", "reproject"} <= set(metrics["results"])

@@ -13,7 +13,7 @@ import pytest
 from evaluation_processes import score
 from evaluation_scene import write_split
 
-from pewm_jax.eval import imagine, shares
+from pewm_jax.eval import runner
 
 HERE = Path(__file__).parent
 SCRIPT = str(HERE / "evaluation_processes.py")
@@ -22,11 +22,11 @@ PATIENCE_S = 300
 
 def test_every_piece_is_done_once_and_light_ones_are_shared_apart(monkeypatch):
     keys = [(name, number) for number in range(3) for name in ("a", "b", "light")]
-    monkeypatch.setattr(shares.jax, "process_count", lambda: 2)
+    monkeypatch.setattr(runner.jax, "process_count", lambda: 2)
     parts = []
     for index in range(2):
-        monkeypatch.setattr(shares.jax, "process_index", lambda index=index: index)
-        parts.append(shares.share(keys, lambda key: key[0] == "light"))
+        monkeypatch.setattr(runner.jax, "process_index", lambda index=index: index)
+        parts.append(runner.workers().assign_work(keys, lambda key: key[0] == "light"))
     assert sorted(parts[0] + parts[1]) == sorted(keys)
     assert [sum(key[0] != "light" for key in part) for part in parts] == [3, 3]
     assert [sum(key[0] == "light" for key in part) for part in parts] == [2, 1]
@@ -34,8 +34,8 @@ def test_every_piece_is_done_once_and_light_ones_are_shared_apart(monkeypatch):
 
 @pytest.mark.parametrize(("devices", "batch", "used"), [(4, 8, 4), (4, 6, 3), (4, 5, 1), (1, 8, 1)])
 def test_as_many_devices_are_used_as_divide_a_batch(devices, batch, used, monkeypatch):
-    monkeypatch.setattr(imagine.jax, "make_mesh", lambda shape, *_, devices: (shape, devices))
-    made = imagine.mesh_of(list("abcd")[:devices], batch)
+    monkeypatch.setattr(runner.jax, "make_mesh", lambda shape, *_, devices: (shape, devices))
+    made = runner.mesh_of(list("abcd")[:devices], batch)
     assert made == (None if used == 1 else ((used,), list("abcd")[:used]))
 
 
@@ -64,7 +64,7 @@ def test_two_processes_of_four_devices_find_what_one_finds(tmp_path, monkeypatch
             for index in range(2)
         ]
         try:
-            monkeypatch.setattr(imagine, "rollout", imagine.rollout)  # put back in the end
+            monkeypatch.setattr(runner, "rollout", runner.rollout)  # put back in the end
             alone = score(tmp_path, ())
             said = [process.communicate(timeout=PATIENCE_S) for process in running]
         finally:

@@ -23,7 +23,7 @@ from pewm_jax.config import (
 )
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.eval.protocol import (
+from pewm_jax.eval.clips import (
     choose,
     context_frames,
     file_hash,

@@ -26,10 +26,10 @@ from pewm_jax import config as configs
 from pewm_jax.cli import protocol as protocol_command
 from pewm_jax.config import StageConfig, TrainConfig, UserError
 from pewm_jax.config import command_line as cli
-from pewm_jax.eval import compare, imagine, preview, report
+from pewm_jax.eval import compare, preview, runner
+from pewm_jax.eval import evaluate as report
 from pewm_jax.eval import loaded_run as runs
-from pewm_jax.eval.imagine import Imagination
-from pewm_jax.eval.methods import Methods
+from pewm_jax.eval.runner import Methods, ModelRunner
 from pewm_jax.io import tree, weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.report.evaluation_page import introduction
@@ -65,8 +65,8 @@ def compile_once():
         return compiled[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        original = imagine._compile
-        patch.setattr(imagine, "_compile", cached)
+        original = runner._compile
+        patch.setattr(runner, "_compile", cached)
         yield
 
 
@@ -85,7 +85,7 @@ def run(tmp_path_factory, compile_once):
         jax.random.key(0)
     )
     weights.save(folder / "weights.safetensors", params)
-    report.evaluate(folder, say=lambda _: None)
+    report.evaluate(folder, log=lambda _: None)
     return folder
 
 
@@ -156,10 +156,10 @@ def test_things_are_followed_where_the_episodes_have_instance_ids(run, copied, t
     assert protocol["scs"].startswith("SCS is left out, since the episodes have no instance ids")
     assert protocol["scs_segmenter"] is None
     with pytest.raises(UserError, match=r"evaluate\.scs is flow, and .* collect them with --ids"):
-        report.evaluate(copied, say=lambda _: None, scs="flow")
+        report.evaluate(copied, log=lambda _: None, scs="flow")
     write_split(tmp_path / "data" / "revisit", episodes=2, ids=True)
     said = []
-    page = report.evaluate(copied, say=said.append, data=tmp_path / "data", lpips="off")
+    page = report.evaluate(copied, log=said.append, data=tmp_path / "data", lpips="off")
     metrics = json.loads((page.parent / "metrics.json").read_text())
     found = metrics["scs"]
     assert (found["name"], found["clips"], found["seed"]) == ("SCS[flow]", 4, 0)
@@ -172,7 +172,7 @@ def test_things_are_followed_where_the_episodes_have_instance_ids(run, copied, t
     assert page.read_text().count("SCS[flow]") >= 3  # the table, the sentence, the protocol
     assert any(line.startswith("SCS[flow], higher is better: ") for line in said)
     fingerprint = metrics["protocol"]["fingerprint"]
-    page = report.evaluate(copied, say=said.append, data=tmp_path / "data", lpips="off", scs="off")
+    page = report.evaluate(copied, log=said.append, data=tmp_path / "data", lpips="off", scs="off")
     metrics = json.loads((page.parent / "metrics.json").read_text())
     assert metrics["scs"] is None
     assert metrics["protocol"]["scs"] == "SCS is left out, as evaluate.scs says."
@@ -209,14 +209,14 @@ def test_the_protocol_of_a_report_scores_another_run_which_is_compared(run, copi
     assert other["results"]["memory"] != metrics["results"]["memory"]
 
     said = []
-    page = compare.compare(copied, run, say=said.append)
+    page = compare.compare(copied, run, log=said.append)
     found = json.loads(page.with_name("comparison.json").read_text())
     both = [m["houses"]["results"]["memory"]["seen"]["psnr"] for m in (other, metrics)]
     assert [found[side]["clips"]["seen"]["psnr"] for side in "ab"] == both
     difference = found["differences"]["clips"]["seen"]["psnr"]["mean"]
     assert difference == pytest.approx(both[0]["mean"] - both[1]["mean"])
     assert len(re.findall("<figure><img", page.read_text())) == 1
-    report.evaluate(copied, say=lambda _: None, clips=3)
+    report.evaluate(copied, log=lambda _: None, clips=3)
     with pytest.raises(UserError, match="3 and 4 clips"):
         compare.compare(copied, run)
 
@@ -232,12 +232,12 @@ def test_a_protocol_is_written_before_training_and_followed(run, copied, tmp_pat
     settings = json.loads((copied / "config.json").read_text())
     settings["evaluate"]["protocol"] = str(other)
     (copied / "config.json").write_text(json.dumps(settings))
-    report.evaluate(copied, say=lambda _: None)
+    report.evaluate(copied, log=lambda _: None)
     followed = json.loads((copied / "report" / "metrics.json").read_text())["protocol"]
     assert (followed["clips"], followed["seeds"]) == (3, [5])
     with pytest.raises(UserError, match="--clips cannot be chosen beside"):
-        report.evaluate(copied, say=lambda _: None, clips=2)
-    report.evaluate(copied, say=lambda _: None, protocol="off")
+        report.evaluate(copied, log=lambda _: None, clips=2)
+    report.evaluate(copied, log=lambda _: None, protocol="off")
     own = json.loads((copied / "report" / "metrics.json").read_text())["protocol"]
     assert own["protocol_sha256"] == metrics["protocol"]["protocol_sha256"]
     assert cli.run(protocol_command.main, ["nothing"]) == 2
@@ -290,7 +290,7 @@ def test_strip_is_a_picture(run):
 
 
 def test_a_complete_report_is_left_alone(run, command, capsys, monkeypatch):
-    monkeypatch.setattr(Imagination, "prepare", None)
+    monkeypatch.setattr(ModelRunner, "prepare", None)
     before = (run / "report" / "metrics.json").stat().st_mtime_ns
     assert command([str(run), "--seeds", "0", "1", "--clips", "4"]) == 0
     said = capsys.readouterr().out
@@ -300,11 +300,11 @@ def test_a_complete_report_is_left_alone(run, command, capsys, monkeypatch):
 
 
 def test_a_damaged_page_is_drawn_again_without_imagining(copied, monkeypatch):
-    monkeypatch.setattr(Imagination, "run", None)
+    monkeypatch.setattr(ModelRunner, "run", None)
     page = copied / "report" / "index.html"
     whole = page.read_bytes()
     page.write_bytes(whole[:1000])
-    report.evaluate(copied, say=lambda _: None)
+    report.evaluate(copied, log=lambda _: None)
     assert page.read_bytes() == whole
 
 
@@ -313,18 +313,18 @@ def test_a_report_with_another_validation_split_is_not_complete(run, tmp_path):
     base = tmp_path / "copy"
     shutil.copytree(run.parent, base)
     data, folder = base / "data", base / "run"
-    report.evaluate(folder, data=data, out=tmp_path / "report", say=lambda _: None)
+    report.evaluate(folder, data=data, out=tmp_path / "report", log=lambda _: None)
     before = json.loads((tmp_path / "report" / "metrics.json").read_text())
     shutil.rmtree(data / "validation")
     write_split(data / "validation", episodes=1)
     said = []
-    report.evaluate(folder, data=data, out=tmp_path / "report", say=said.append)
+    report.evaluate(folder, data=data, out=tmp_path / "report", log=said.append)
     assert not any("nothing to do" in line for line in said)
     after = json.loads((tmp_path / "report" / "metrics.json").read_text())
     hashes = [each["protocol"]["reproject"]["dataset_sha256"] for each in (before, after)]
     assert hashes[0] != hashes[1]
     assert hashes[1] == report.file_hash(data / "validation" / report.MANIFEST)
-    report.evaluate(folder, data=data, out=tmp_path / "report", say=said.append)
+    report.evaluate(folder, data=data, out=tmp_path / "report", log=said.append)
     assert "nothing to do" in said[-1]
 
 
@@ -340,7 +340,7 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
     path = tmp_path / "vgg.safetensors"  # AlexNet takes no pictures this small
     weights.save(path, jax.jit(lambda key: lpips.init("vgg", key))(jax.random.key(0)))
     said = []
-    report.evaluate(copied, say=said.append, clips=3, seeds=(0,), lpips=path)
+    report.evaluate(copied, log=said.append, clips=3, seeds=(0,), lpips=path)
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     found = {name: masks["all"]["lpips"] for name, masks in metrics["results"].items()}
     assert set(found) == {"memory", "empty", "reproject", "copy"}
@@ -355,13 +355,13 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
     assert "not resized" in page
     assert any(line.startswith(f"{name} of whole pictures, lower is better") for line in said)
     said.clear()
-    report.evaluate(copied, say=said.append, clips=3, seeds=(0,), lpips=path)
+    report.evaluate(copied, log=said.append, clips=3, seeds=(0,), lpips=path)
     assert "nothing to do" in said[-1]
 
 
 def test_more_seeds_keep_what_was_scored(copied):
     said = []
-    report.evaluate(copied, say=said.append, seeds=(0, 1, 2))
+    report.evaluate(copied, log=said.append, seeds=(0, 1, 2))
     assert any("12 of 16 pieces were scored before" in line for line in said)
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     assert metrics["protocol"]["seeds"] == [0, 1, 2]
@@ -370,10 +370,10 @@ def test_more_seeds_keep_what_was_scored(copied):
 def test_a_quick_look_does_not_cost_the_full_scores(copied, monkeypatch):
     page = copied / "report" / "index.html"
     whole = page.read_bytes()
-    report.evaluate(copied, say=lambda _: None, clips=2)
+    report.evaluate(copied, log=lambda _: None, clips=2)
     assert page.read_bytes() != whole
-    monkeypatch.setattr(Imagination, "run", None)
-    report.evaluate(copied, say=lambda _: None)
+    monkeypatch.setattr(ModelRunner, "run", None)
+    report.evaluate(copied, log=lambda _: None)
     assert page.read_bytes() == whole
 
 
@@ -382,7 +382,7 @@ def test_other_weights_start_anew(copied):
     changed = jax.tree.map(lambda leaf: leaf * np.float32(1.01), params)
     weights.save(copied / "weights.safetensors", changed)
     said = []
-    report.evaluate(copied, say=said.append)
+    report.evaluate(copied, log=said.append)
     assert not any("scored before" in line for line in said)
     assert len(list((copied / "report" / "partial").iterdir())) == 1
 
@@ -406,7 +406,7 @@ def rival(run, folder, *, steps, **changes):
 def test_a_model_without_a_memory_gets_a_row(copied, tmp_path):
     none = rival(copied, tmp_path / "none", steps=1000)
     said = []
-    report.evaluate(copied, say=said.append, none=none)
+    report.evaluate(copied, log=said.append, none=none)
     assert any("12 of 16 pieces were scored before" in line for line in said)
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     assert set(metrics["results"]) == {"memory", "empty", "none", "reproject", "copy"}
@@ -415,9 +415,9 @@ def test_a_model_without_a_memory_gets_a_row(copied, tmp_path):
     assert metrics["protocol"]["none"]["steps"] == 1000
     assert any("trained as long without a memory" in line for line in said)
     said.clear()
-    report.evaluate(copied, say=said.append, none=none)
+    report.evaluate(copied, log=said.append, none=none)
     assert "nothing to do" in said[-1]
-    report.evaluate(copied, say=said.append)
+    report.evaluate(copied, log=said.append)
     assert any("--none" in line for line in said)  # how to get the row
 
 
@@ -434,7 +434,7 @@ def test_a_rival_that_cannot_be_compared_is_refused(copied, command, capsys, tmp
 
 def test_a_run_without_a_memory_is_scored_and_compared_under_its_own_name(run, tmp_path, command):
     own, said = rival(run, tmp_path / "own", steps=3), []
-    report.evaluate(own, say=said.append, protocol=run / "report" / "protocol.json")
+    report.evaluate(own, log=said.append, protocol=run / "report" / "protocol.json")
     metrics = json.loads((own / "report" / "metrics.json").read_text())
     assert set(metrics["results"]) == {"model", "reproject", "copy"}
     assert set(metrics["margins"]) == {"reproject", "copy"}
@@ -446,7 +446,7 @@ def test_a_run_without_a_memory_is_scored_and_compared_under_its_own_name(run, t
     assert not re.search("with its map|empty map<|for each seed|from above", page)
     assert (own / "report" / "rows" / "00-model.png").is_file()
 
-    found = compare.compare(run, own, say=said.append)
+    found = compare.compare(run, own, log=said.append)
     content = json.loads(found.with_name("comparison.json").read_text())
     assert [content[side]["runs"][0]["method"] for side in "ab"] == ["memory", "model"]
     theirs = json.loads((run / "report" / "metrics.json").read_text())
@@ -466,10 +466,10 @@ def test_a_memory_of_kind_none_is_no_memory_and_its_blocks_are_used(run, tmp_pat
     params = weights.load(run / "weights.safetensors")
     weights.save(tmp_path / "none" / "weights.safetensors", params, {"stage": "2", "step": "1000"})
     opened = runs.open_run(tmp_path / "none")
-    assert not runs.remembers(opened)
+    assert not runs.has_memory(opened)
     backbone = {name: part for name, part in params.items() if name != "memory"}
     with pytest.raises(UserError, match="no memory blocks yet"):
-        runs.remembers(
+        runs.has_memory(
             dataclasses.replace(opened, params=backbone)
         )  # of stage 2, which was asked for
     ran = []
@@ -483,20 +483,20 @@ def test_a_training_without_a_memory_that_is_not_finished_is_refused(run, tmp_pa
     params = weights.load(short / "weights.safetensors")
     weights.save(short / "weights.safetensors", params, {"stage": "1", "step": "2"})
     with pytest.raises(UserError, match="step 2 and 3 of stage1"):
-        report.evaluate(short, say=lambda _: None)
+        report.evaluate(short, log=lambda _: None)
 
 
 def test_other_data_get_a_report_of_their_own(copied, tmp_path):
     own = (copied / "report" / "metrics.json").read_bytes()
     write_split(tmp_path / "walks" / "revisit", episodes=1, scene="theirs")
-    page = report.evaluate(copied, say=lambda _: None, data=tmp_path / "walks", clips=2)
+    page = report.evaluate(copied, log=lambda _: None, data=tmp_path / "walks", clips=2)
     assert page == copied / "report-walks" / "index.html"
     metrics = json.loads(page.with_name("metrics.json").read_text())
     assert set(metrics["results"]) == {"memory", "empty", "reproject", "copy"}
     assert metrics["protocol"]["reproject"]["split"] is None  # nothing there to choose settings on
     assert "nothing was tried" in page.read_text()
     named = report.evaluate(
-        copied, say=lambda _: None, split="validation", clips=2, out=tmp_path / "out"
+        copied, log=lambda _: None, split="validation", clips=2, out=tmp_path / "out"
     )
     assert named == tmp_path / "out" / "index.html"
     assert (copied / "report" / "metrics.json").read_bytes() == own
@@ -570,7 +570,7 @@ def test_an_interruption_is_said_and_has_its_own_exit_code(copied, command, caps
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Imagination, "run", interrupted)
+    monkeypatch.setattr(ModelRunner, "run", interrupted)
     assert command([str(copied), "--stride", "2"]) == 130
     assert "go on" in capsys.readouterr().err
 
@@ -580,7 +580,7 @@ def test_weights_that_diverged_are_refused(copied):
     broken = jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), params)
     weights.save(copied / "weights.safetensors", broken)
     with pytest.raises(UserError, match="not finite"):
-        report.evaluate(copied, say=lambda _: None)
+        report.evaluate(copied, log=lambda _: None)
 
 
 @pytest.mark.parametrize(("stage", "rows"), [(STAGES[0], 2), (STAGES[1], 3)])
@@ -588,9 +588,9 @@ def test_previews_show_each_method(run, tmp_path, stage, rows, monkeypatch):
     monkeypatch.setattr(preview, "CLIPS", 2)  # the batch that was compiled for the report
     config = configs.load(run / "config.json")
     compiled = []
-    prepare = Imagination.prepare
+    prepare = ModelRunner.prepare
     monkeypatch.setattr(
-        Imagination, "prepare", lambda self, m: (compiled.append(self), prepare(self, m))[1]
+        ModelRunner, "prepare", lambda self, m: (compiled.append(self), prepare(self, m))[1]
     )
     params = weights.load(run / "weights.safetensors")
     if not stage.memory:
@@ -634,7 +634,7 @@ def test_previews_measure_what_is_shown(run, tmp_path, monkeypatch):
         rgb = np.stack([f.rgb_THWC for f in frames]) if memory else rgb
         return None, None, Frames(rgb, np.stack([f.depth_THW for f in frames]), None)
 
-    monkeypatch.setattr(Imagination, "run", imagined)
+    monkeypatch.setattr(ModelRunner, "run", imagined)
     made = preview.make_preview(config, tmp_path)({}, STAGES[1], 3)
     truth = np.stack([clip[1].rgb_THWC for clip in true]).astype(float)
     wrong = np.where(truth > 99, truth - 16, 99)

@@ -12,12 +12,11 @@ from evaluation_scene import look, record, tiny, write_split
 from pewm_jax.config import ConfigError
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.eval import reproject_choice
-from pewm_jax.eval.images import unit_colours
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import file_hash
+from pewm_jax.eval import reproject as baseline
+from pewm_jax.eval.metrics.images import unit_colours
 from pewm_jax.eval.reproject import CANDIDATES, ReprojectSettings, draw, reproject, reproject_batch
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+from pewm_jax.io.store import ResultCache, file_hash
 from pewm_jax.types import Camera, Frames
 
 
@@ -108,29 +107,29 @@ def test_settings_have_distinct_names_and_are_checked():
 def test_the_best_on_validation_is_taken_and_kept(tmp_path, monkeypatch):
     config = tiny(tmp_path)
     write_split(tmp_path / "data" / "validation", episodes=2)
-    partials, said = Partials(tmp_path / "partial", "e" * 64, "f" * 64), []
-    found = reproject_choice.choose_settings(config, partials, said.append)
+    partials, said = ResultCache.for_weights(tmp_path / "partial", "e" * 64, "f" * 64), []
+    found = baseline.choose_settings(config, partials, said.append)
     assert len(said) == 1, found.why
     assert found.scores[found.settings.name] == max(found.scores.values())
     assert len(found.scores) == len(CANDIDATES)
-    assert found.clips == reproject_choice.CLIPS
+    assert found.clips == baseline.CLIPS
     facts = found.facts()
     assert facts["split"] == "validation"
     assert facts["chosen"] in [item["settings"] for item in facts["candidates"]]
     assert facts["dataset_sha256"] == file_hash(tmp_path / "data" / "validation" / MANIFEST)
-    monkeypatch.setattr(reproject_choice, "_score", None)
-    assert reproject_choice.choose_settings(config, partials, said.append) == found
+    monkeypatch.setattr(baseline, "_score", None)
+    assert baseline.choose_settings(config, partials, said.append) == found
     assert len(said) == 1
 
 
 def test_without_fitting_validation_data_the_default_is_taken_and_said(tmp_path):
-    partials = Partials(tmp_path / "partial", "e" * 64, "f" * 64)
-    found = reproject_choice.choose_settings(tiny(tmp_path), partials, print)
+    partials = ResultCache.for_weights(tmp_path / "partial", "e" * 64, "f" * 64)
+    found = baseline.choose_settings(tiny(tmp_path), partials, print)
     assert found.settings == ReprojectSettings()
     assert "does not exist" in found.why
     assert (found.facts()["split"], found.facts()["dataset_sha256"]) == (None, "")
     write_split(tmp_path / "data" / "validation", episodes=1, size=24)
-    found = reproject_choice.choose_settings(tiny(tmp_path), partials, print)
+    found = baseline.choose_settings(tiny(tmp_path), partials, print)
     assert (found.settings, found.scores) == (ReprojectSettings(), {})
     assert "24×24" in found.why
 
@@ -138,5 +137,5 @@ def test_without_fitting_validation_data_the_default_is_taken_and_said(tmp_path)
 def test_other_clips_are_other_scores(tmp_path):
     config = tiny(tmp_path)
     more = dataclasses.replace(config, data=dataclasses.replace(config.data, context=7))
-    assert reproject_choice._piece(config, "a") != reproject_choice._piece(config, "b")
-    assert reproject_choice._piece(config, "a") != reproject_choice._piece(more, "a")
+    assert baseline._piece(config, "a") != baseline._piece(config, "b")
+    assert baseline._piece(config, "a") != baseline._piece(more, "a")

@@ -7,7 +7,7 @@ import pytest
 from pewm_jax.config import UserError
 from pewm_jax.convert import dinov2 as convert
 from pewm_jax.eval import metrics
-from pewm_jax.eval.metrics import revisits, similarity
+from pewm_jax.eval.metrics import revisits
 from pewm_jax.io import tree, weights
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config, published, size_name
@@ -89,7 +89,7 @@ def test_a_score_carries_its_encoders_name(files):
 
 def test_the_cosine_is_of_directions():
     a, b = np.array([[3.0, 0], [1, 1], [0, 0]]), np.array([[5.0, 0], [-2, 2], [1, 0]])
-    np.testing.assert_allclose(similarity.cosine(a, b), [100, 0, 0], atol=1e-4)
+    np.testing.assert_allclose(revisits.cosine(a, b), [100, 0, 0], atol=1e-4)
 
 
 def test_what_cannot_work_is_refused_in_a_sentence(files, monkeypatch, tmp_path):
@@ -108,7 +108,7 @@ def test_what_cannot_work_is_refused_in_a_sentence(files, monkeypatch, tmp_path)
     with pytest.raises(UserError, match="holds no DINOv2"):
         metrics.load("src", tmp_path)
     with pytest.raises(UserError, match="no encoder 'clip'; there is dinov2, alex, vgg"):
-        similarity.read("clip")
+        revisits.read_encoder("clip")
     with pytest.raises(UserError, match=r"no metric 'mirror\[fvd\]'"):
         metrics.load("mirror[fvd]")
     with pytest.raises(UserError, match="psnr is no network and takes no weights"):

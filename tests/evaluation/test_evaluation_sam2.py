@@ -9,7 +9,7 @@ import torch
 import transformers
 
 from pewm_jax.config import UserError
-from pewm_jax.eval.metrics import chosen, sam2
+from pewm_jax.eval.metrics import sam2, selection
 from pewm_jax.eval.metrics.structure import structural_consistency
 
 SIDE, WIDTH = 64, 128
@@ -114,7 +114,7 @@ def test_it_scores_a_clip(folder):
 
 
 def test_a_report_measures_scs_with_it_where_it_is_named(folder):
-    measure, about = chosen.structure(str(folder), ids=True)
+    measure, about = selection.select_scs(str(folder), ids=True)
     assert measure is not None
     assert measure.name == "SCS[sam2]"
     assert len(measure.sha256) == 64
@@ -123,7 +123,7 @@ def test_a_report_measures_scs_with_it_where_it_is_named(folder):
     true = np.repeat(first[:, None], len(video), 1)
     assert measure(video, true, np.ones(len(video), bool)).shape == (2, len(video) - 1)
     with pytest.raises(UserError, match="no instance ids"):
-        chosen.structure(str(folder), ids=False)
+        selection.select_scs(str(folder), ids=False)
 
 
 def test_what_is_no_sam_2_is_refused(folder, tmp_path, monkeypatch):

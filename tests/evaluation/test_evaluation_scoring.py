@@ -11,15 +11,14 @@ from evaluation_scene import knowing_rollout, record, tiny, write_split
 
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
-from pewm_jax.eval import imagine, long_rollouts, scoring
-from pewm_jax.eval.imagine import Imagination
-from pewm_jax.eval.measure import structure
-from pewm_jax.eval.methods import Methods
+from pewm_jax.eval import long_rollouts, runner, scoring
+from pewm_jax.eval.clips import choose
 from pewm_jax.eval.metrics.structure import Consistency, average, first_visible, overlaps
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import choose
 from pewm_jax.eval.reproject import ReprojectSettings
+from pewm_jax.eval.results import structure
+from pewm_jax.eval.runner import Methods, ModelRunner
 from pewm_jax.eval.statistics import margin, table
+from pewm_jax.io.store import ResultCache
 
 PARAMS = {"offset": np.float32(0)}
 
@@ -37,9 +36,9 @@ def knowing_model(tmp_path_factory):
     @functools.cache
     def make(batch=2, late=0):
         config = tiny(tmp_path_factory.getbasetemp(), batch=batch)
-        model = Imagination(config, PARAMS, batch, config.data.context, lambda _: None)
+        model = ModelRunner(config, PARAMS, batch, config.data.context, lambda _: None)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(imagine, "rollout", functools.partial(knowing_rollout, late=late))
+            patch.setattr(runner, "rollout", functools.partial(knowing_rollout, late=late))
             model.prepare([True, False])
         return Methods(model, ReprojectSettings())
 
@@ -50,7 +49,7 @@ def test_a_model_that_remembers_wins_by_a_mile(knowing_model, episodes, tmp_path
     config = tiny(tmp_path, clips=3)
     model = knowing_model()
     scored = scoring.score_table(
-        config, episodes, model, Partials(tmp_path, "e" * 64, "f" * 64), print
+        config, episodes, model, ResultCache.for_weights(tmp_path, "e" * 64, "f" * 64), print
     )
     assert scored.sums["memory"].shape == (2, 3, 4, 3, 9)
     assert scored.sums["copy"].shape == (1, 3, 4, 3, 9)
@@ -75,7 +74,7 @@ def test_a_model_that_is_one_frame_late_is_noticed(knowing_model, episodes, tmp_
     config = tiny(tmp_path, clips=2)
     model = knowing_model(late=1)
     scored = scoring.score_table(
-        config, episodes, model, Partials(tmp_path, "e" * 64, "f" * 64), print
+        config, episodes, model, ResultCache.for_weights(tmp_path, "e" * 64, "f" * 64), print
     )
     assert table(scored.sums, scored.clusters)["memory"]["all"]["psnr"]["mean"] < 25
 
@@ -85,7 +84,7 @@ def test_batches_do_not_change_the_numbers(knowing_model, episodes, tmp_path):
     for batch in (2, 3):
         config = tiny(tmp_path, clips=3, batch=batch)
         model = knowing_model(batch)
-        partials = Partials(tmp_path / str(batch), "e" * 64, "f" * 64)
+        partials = ResultCache.for_weights(tmp_path / str(batch), "e" * 64, "f" * 64)
         sums.append(scoring.score_table(config, episodes, model, partials, print).sums)
     for method in sums[0]:
         np.testing.assert_allclose(sums[0][method], sums[1][method], rtol=1e-4, atol=1e-4)
@@ -95,10 +94,10 @@ def test_scored_pieces_are_not_done_again(monkeypatch, knowing_model, episodes, 
     config = tiny(tmp_path, clips=4, chain=2)
     model = knowing_model()
     whole = scoring.score_table(
-        config, episodes, model, Partials(tmp_path / "a", "e" * 64, "f" * 64), print
+        config, episodes, model, ResultCache.for_weights(tmp_path / "a", "e" * 64, "f" * 64), print
     )
 
-    calls, run = [], Imagination.run
+    calls, run = [], ModelRunner.run
 
     def failing(self, *args, **kwargs):
         calls.append(1)
@@ -106,18 +105,26 @@ def test_scored_pieces_are_not_done_again(monkeypatch, knowing_model, episodes, 
             raise KeyboardInterrupt
         return run(self, *args, **kwargs)
 
-    monkeypatch.setattr(Imagination, "run", failing)
+    monkeypatch.setattr(ModelRunner, "run", failing)
     with pytest.raises(KeyboardInterrupt):
         scoring.score_table(
-            config, episodes, model, Partials(tmp_path / "b", "e" * 64, "f" * 64), print
+            config,
+            episodes,
+            model,
+            ResultCache.for_weights(tmp_path / "b", "e" * 64, "f" * 64),
+            print,
         )
     said = []
     resumed = scoring.score_table(
-        config, episodes, model, Partials(tmp_path / "b", "e" * 64, "f" * 64), said.append
+        config,
+        episodes,
+        model,
+        ResultCache.for_weights(tmp_path / "b", "e" * 64, "f" * 64),
+        said.append,
     )
     # Two batches × two seeds × two sampled methods, each imagined exactly once (plus the cut one).
     assert len(calls) == 8 + 1
-    assert "scored before" in said[0]
+    assert "computed before" in said[0]
     for method in whole.sums:
         np.testing.assert_array_equal(whole.sums[method], resumed.sums[method])
 
@@ -133,7 +140,7 @@ def test_things_are_followed_through_the_clips_of_the_first_seed(
         return first[:, None] & (video.mean(-1) > 100)
 
     measure = Consistency(bright, "bright", "1234")
-    partials = Partials(tmp_path / "partial", "e" * 64, "f" * 64)
+    partials = ResultCache.for_weights(tmp_path / "partial", "e" * 64, "f" * 64)
     args = config, episodes, model, partials, print
     scored = scoring.score_table(*args, structure=measure)
     assert set(scored.structure) == {"memory", "empty", "reproject", "copy", "truth"}
@@ -180,31 +187,31 @@ def test_clips_of_one_scene_are_one_cluster(tmp_path):
 
 
 def test_pieces_of_other_weights_are_dropped_and_broken_ones_ignored(tmp_path):
-    old = Partials(tmp_path, "a" * 64, "f" * 64)
-    old.put("piece", x=np.arange(3))
+    old = ResultCache.for_weights(tmp_path, "a" * 64, "f" * 64)
+    old.put("piece", {"x": np.arange(3)})
     assert old.get("piece")["x"].tolist() == [0, 1, 2]
     path = old.folder / "piece.npz"
     path.write_bytes(path.read_bytes()[:-30])
     assert old.get("piece") is None
-    new = Partials(tmp_path, "b" * 64, "f" * 64)
+    new = ResultCache.for_weights(tmp_path, "b" * 64, "f" * 64)
     assert new.get("piece") is None
     assert not old.folder.exists()
 
 
 def test_pieces_of_another_protocol_stay_and_stay_apart(tmp_path):
-    full = Partials(tmp_path, "a" * 64, "f" * 64)
-    full.put("piece", x=np.arange(3))
-    quick = Partials(tmp_path, "a" * 64, "c" * 64)
+    full = ResultCache.for_weights(tmp_path, "a" * 64, "f" * 64)
+    full.put("piece", {"x": np.arange(3)})
+    quick = ResultCache.for_weights(tmp_path, "a" * 64, "c" * 64)
     assert quick.get("piece") is None
-    quick.put("piece", x=np.zeros(1))
-    again = Partials(tmp_path, "a" * 64, "f" * 64)
+    quick.put("piece", {"x": np.zeros(1)})
+    again = ResultCache.for_weights(tmp_path, "a" * 64, "f" * 64)
     assert again.get("piece")["x"].tolist() == [0, 1, 2]
 
 
 def test_long_rollouts_keep_pictures_and_the_map(monkeypatch, knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, video_clips=9)
     model = knowing_model()
-    partials = Partials(tmp_path, "e" * 64, "f" * 64)
+    partials = ResultCache.for_weights(tmp_path, "e" * 64, "f" * 64)
     long = long_rollouts.roll_long(config, episodes, model, partials, print)
     assert long.chain == 5  # 5 × 4 frames after a start fit into 24 frames; 6 do not
     assert long.shown == 1
@@ -214,14 +221,14 @@ def test_long_rollouts_keep_pictures_and_the_map(monkeypatch, knowing_model, epi
     truth = episode.frames(list(long.scored.choices[0].targets_N))
     off = truth.rgb_THWC.astype(int) - long.kept["memory"]["rgb"][0]
     assert np.abs(off).max() <= 3
-    monkeypatch.setattr(Imagination, "run", None)
+    monkeypatch.setattr(ModelRunner, "run", None)
     again = long_rollouts.roll_long(config, episodes, model, partials, print)
     np.testing.assert_array_equal(again.kept["empty"]["rgb"], long.kept["empty"]["rgb"])
 
 
 def test_equal_seeds_draw_equal_noise_whatever_the_batch():
     seeds = np.array([[0, 0], [0, 1], [1, 0]], np.uint32)
-    data = jax.random.key_data(imagine.clip_keys(seeds))
-    one = jax.random.key_data(imagine.clip_keys(seeds[1:2]))
+    data = jax.random.key_data(runner.clip_keys(seeds))
+    one = jax.random.key_data(runner.clip_keys(seeds[1:2]))
     np.testing.assert_array_equal(data[1], one[0])
     assert len({tuple(row) for row in np.asarray(data).tolist()}) == 3

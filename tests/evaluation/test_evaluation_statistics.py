@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.eval.images import MASKS, SUMS
+from pewm_jax.eval.metrics.images import MASKS, SUMS
 from pewm_jax.eval.statistics import (
     METRICS,
     drift,

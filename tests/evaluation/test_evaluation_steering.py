@@ -9,11 +9,11 @@ import pytest
 
 from pewm_jax.config import Config, EgoWMConfig, EgoWMTrainConfig, UserError
 from pewm_jax.eval import steering
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import choose
+from pewm_jax.eval.clips import choose
 from pewm_jax.eval.steering import Walks, choose_walks, different_steps, forward_steps
 from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT, discrete_table, integrate
 from pewm_jax.geometry.cameras import pose_from_yaw
+from pewm_jax.io.store import ResultCache
 from pewm_jax.report import evaluation_page
 from pewm_jax.report.labels import ACTIONS_NAMES, format_steering
 from pewm_jax.report.page import render
@@ -74,7 +74,7 @@ def test_true_actions_are_compared_with_those_of_another_house_with_none_and_wit
 def test_a_report_keeps_its_pieces_and_says_what_came_out(obeying, monkeypatch, tmp_path):
     choices = obeying("aabbc", [2, 2, 4, 4, 0])
     config = dataclasses.replace(CONFIG, evaluate=dataclasses.replace(CONFIG.evaluate, batch=2))
-    partials = Partials(tmp_path, "weights", "fingerprint")
+    partials = ResultCache.for_weights(tmp_path, "weights", "fingerprint")
     said = []
     found, about = steering.score(config, PARAMS, [], choices, partials, said.append)
     whole = steering.measure(config, PARAMS, [], 5)
@@ -95,7 +95,7 @@ def test_a_report_keeps_its_pieces_and_says_what_came_out(obeying, monkeypatch, 
 
 def test_what_was_not_measured_is_said(obeying, monkeypatch, tmp_path):
     choices, said = obeying("ab", [1, 0]), []
-    partials = Partials(tmp_path, "weights", "fingerprint")
+    partials = ResultCache.for_weights(tmp_path, "weights", "fingerprint")
     unsteered = steering.score(tiny_config(), {}, [], choices, partials, said.append)
     assert unsteered == (None, None)
     monkeypatch.setattr(steering, "choose_walks", choose_walks)

@@ -8,7 +8,7 @@ import pytest
 from pewm_jax.cli import horizon as command
 from pewm_jax.config import UserError
 from pewm_jax.config.command_line import ConfigError
-from pewm_jax.eval import edit_trials, horizon, voxel_score
+from pewm_jax.eval import horizon, voxel_trials
 from pewm_jax.models.persist import voxel_vae
 from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.report import horizon_page
@@ -47,7 +47,7 @@ def test_walks_that_do_not_lie_in_an_episode_are_refused():
         (3, 4, 2, "no planar actions"),
     ):
         with pytest.raises(UserError, match=says):
-            horizon.walk_of(Episode(), start, frames, context)  # type: ignore[arg-type]
+            horizon.read_walk(Episode(), start, frames, context)  # type: ignore[arg-type]
 
 
 def test_the_report_says_what_was_measured(tmp_path):
@@ -56,7 +56,7 @@ def test_the_report_says_what_was_measured(tmp_path):
         name: rng.integers(0, 255, (1, 20, 16, 16, 3)).astype(np.uint8)
         for name in ("truth", "world", "bound")
     }
-    trials = edit_trials.Trials(np.array([1.0, 0.4]), 7, 5, 30, 40, 3, 2.0)
+    trials = voxel_trials.Trials(np.array([1.0, 0.4]), 7, 5, 30, 40, 3, 2.0)
     score = {"fvd": {"value": 12.0, "clips": 4}, "kvd": {"value": 0.5, "clips": 4}}
     facts = {
         "psnr": {"world": [12.0, 11.5], "bound": [20.0, 19.0]},
@@ -88,7 +88,7 @@ def test_the_report_says_what_was_measured(tmp_path):
 
 def test_cells_are_given_back_with_their_class_or_count_as_wrong(monkeypatch):
     model = SimpleNamespace(backbone=SimpleNamespace(voxel_vae=VoxelVAEConfig(side=4, classes=5)))
-    grids = np.zeros((voxel_score.EVERY + 1, 6, 6, 6), np.int16)
+    grids = np.zeros((voxel_trials.EVERY + 1, 6, 6, 6), np.int16)
     grids[:, 1:3, 1:5, 1:5] = 3  # within the middle: 32 of 64 cells
     grids[:, 0] = 4  # outside of it
     grids[1:-1] = 1  # frames that are not looked at
@@ -96,7 +96,7 @@ def test_cells_are_given_back_with_their_class_or_count_as_wrong(monkeypatch):
 
     def share(decode):
         monkeypatch.setattr(voxel_vae, "decode", lambda _config, _params, grid: decode(grid))
-        return voxel_score.given_back(model, {"voxel_vae": {}}, [grids])  # type: ignore[arg-type]
+        return voxel_trials.reconstruction_shares(model, {"voxel_vae": {}}, [grids])  # type: ignore[arg-type]
 
     whole = {"grids": 2, "occupied": 1.0, "filled": 1.0, "empty": 1.0}
     assert share(lambda grid: grid) == whole

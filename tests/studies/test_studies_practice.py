@@ -70,7 +70,7 @@ def made(tmp_path_factory, world):
     )
     configuration.save(policy, folder / "policy" / "config.json")
     page = study.run(
-        folder / "world", folder / "policy", folder / "out", ERRAND, say=lambda _: None
+        folder / "world", folder / "policy", folder / "out", ERRAND, log=lambda _: None
     )
     return folder, page
 
@@ -92,7 +92,7 @@ def test_the_whole_study_is_made_kept_and_goes_on(made):
     pieces = sorted((folder / "out").glob("house*/*/scores.json"))
     assert len(pieces) == len(ROWS)
     before = [file.stat().st_mtime_ns for file in pieces]
-    study.run(folder / "world", folder / "policy", folder / "out", ERRAND, say=lambda _: None)
+    study.run(folder / "world", folder / "policy", folder / "out", ERRAND, log=lambda _: None)
     assert [file.stat().st_mtime_ns for file in pieces] == before
     runs = [
         (folder / "out" / "house0000" / f"{how}-seed0" / "run" / "weights.safetensors")
@@ -103,11 +103,11 @@ def test_the_whole_study_is_made_kept_and_goes_on(made):
     undisturbed = pieces[0].read_bytes(), pieces[-1].read_bytes()
     pieces[0].unlink()  # as if killed: the walks are there, the training is made anew
     pieces[-1].unlink()
-    study.run(folder / "world", folder / "policy", folder / "out", ERRAND, say=lambda _: None)
+    study.run(folder / "world", folder / "policy", folder / "out", ERRAND, log=lambda _: None)
     assert (pieces[0].read_bytes(), pieces[-1].read_bytes()) == undisturbed
     other = dataclasses.replace(ERRAND, steps=2)
     with pytest.raises(UserError, match=r"holds pieces of other settings \(steps\)"):
-        study.run(folder / "world", folder / "policy", folder / "out", other, say=lambda _: None)
+        study.run(folder / "world", folder / "policy", folder / "out", other, log=lambda _: None)
 
 
 def test_what_it_learns_from_are_whole_walks_of_its_own_actions(made):
@@ -145,10 +145,10 @@ def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
         (folder / "policy" / "weights.safetensors").read_bytes()
     )
     with pytest.raises(UserError, match="takes other steps than"):
-        study.run(folder / "world", tmp_path, tmp_path / "out", ERRAND, say=lambda _: None)
+        study.run(folder / "world", tmp_path, tmp_path / "out", ERRAND, log=lambda _: None)
     short = dataclasses.replace(ERRAND, practice=Practice(walks=1, blocks=1))
     with pytest.raises(UserError, match="use more --blocks"):
-        study.run(folder / "world", folder / "policy", tmp_path / "o", short, say=lambda _: None)
+        study.run(folder / "world", folder / "policy", tmp_path / "o", short, log=lambda _: None)
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="is a file: name a folder"):
         study.run(folder / "world", folder / "policy", tmp_path / "file", ERRAND)

@@ -20,7 +20,7 @@ from pewm_jax.cli.data import main as data_command
 from pewm_jax.config import AttentionConfig, UserError
 from pewm_jax.convert import dinov2 as convert
 from pewm_jax.eval import metrics
-from pewm_jax.eval.images import MASKS, SUMS
+from pewm_jax.eval.metrics.images import MASKS, SUMS
 from pewm_jax.geometry.actions import integrate, there_and_back
 from pewm_jax.geometry.cameras import pose_from_yaw
 from pewm_jax.io import tree, weights
@@ -174,7 +174,7 @@ def test_the_features_of_a_network_can_be_tried(made):
         seeds=[0],
         ablation="features",
         values=values,
-        say=said.append,
+        log=said.append,
     )
     results = json.loads((page.parent / "table1-features-results.json").read_text())
     name = "voxel-attend-features_dinov2_small"

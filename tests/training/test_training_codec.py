@@ -28,7 +28,8 @@ from pewm_jax.config import (
 from pewm_jax.data import abstract, loader
 from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
-from pewm_jax.eval import codec_score, report
+from pewm_jax.eval import codec_score
+from pewm_jax.eval import evaluate as report
 from pewm_jax.io import tree, weights
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
@@ -342,7 +343,7 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
     made = codec_score.measures(config.model, params["codec"], worse)
     assert not np.allclose(found["psnr"], made["psnr"])
 
-    blind = codec_score.score(run, data=data, split="blind", say=lambda _line: None)
+    blind = codec_score.score(run, data=data, split="blind", log=lambda _line: None)
     assert json.loads(blind.read_text())["numbers"]["depth_cm"] == {"mean": None, "error": None}
     longer = dataclasses.replace(config.train.statistics, steps=3)
     half = dataclasses.replace(config.train, statistics=longer)

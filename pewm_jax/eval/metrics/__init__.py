@@ -1,10 +1,10 @@
-"""Measures of imagined frames against true ones, by name.
+"""Metrics of imagined frames against true ones, and the registry of their names.
 
     metric = metrics.load("lpips_alex")
     each_B = metric(imagined_BTHWC, truth_BTHWC)
 
-Every metric takes clips of one shape, colours as floats in [−1, 1] (what exceeds that is clipped)
-or uint8, and returns one number per clip, whatever else is in the batch; ``fvd`` and ``kvd`` return
+Every metric takes clips of one shape, colours as uint8 or as floats in [−1, 1] (values outside are
+clipped), and returns one number per clip, whatever else is in the batch; ``fvd`` and ``kvd`` return
 one per set.
 
 ================ ====== ===========================================================================
@@ -12,7 +12,7 @@ psnr             higher decibels, of the mean squared error of all pixels of a c
 ssim             higher structural similarity, 11 × 11 Gaussian windows, averaged over a clip
 lpips_alex       lower  LPIPS with AlexNet, averaged over a clip's frames; pictures are not resized
 lpips_vgg        lower  LPIPS with VGG16, the same
-depth_mae        lower  mean error of depth, m; it takes depths (B, T, H, W) in the place of colours
+depth_mae        lower  mean error of depth, m; it takes depths (B, T, H, W) instead of colours
 depth_rel        lower  the same, divided by the true depth
 dreamsim         lower  DreamSim (0.2, ensemble), averaged over a clip's frames
 fvd              lower  Fréchet distance of the 400 logits of I3D; 9 frames or more; with its floor
@@ -20,38 +20,36 @@ kvd              lower  kernel distance of the same: no bias by the number of cl
 src              higher clips that go and come back: cosine × 100 of DINOv2's features of both
                         visits of a place, of the imagined clip alone (of the truth only the shape
                         counts); with its floor and ceiling
-src[alex]        higher the same with LPIPS's AlexNet for an encoder; and src[vgg]
+src[alex]        higher the same with LPIPS's AlexNet as the encoder; and src[vgg]
 mirror[METRIC]   as     clips that go and come back: the way back against the way out by ``psnr``,
                  METRIC ``ssim``, ``lpips_alex`` or ``lpips_vgg``; with its floor and ceiling
 ================ ====== ===========================================================================
 
-Errors over seen and over unseen pixels are in ``evaluation.images.error_sums``.
+Where each is defined: ``images`` (PSNR, SSIM, depth, and errors over seen and unseen pixels,
+``error_sums``), ``perceptual`` (LPIPS, DreamSim), ``videos`` (FVD, KVD), ``revisits`` (SRC, the
+mirror test), ``structure`` (SCS). ``selection`` chooses those of a report.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import TypeAlias
 
 from pewm_jax.config import UserError
-from pewm_jax.eval.metrics import dreams, similarity, videos
-from pewm_jax.eval.metrics.dreams import DreamSim
-from pewm_jax.eval.metrics.perceptual import Perceptual
-from pewm_jax.eval.metrics.perceptual import read as read_lpips
-from pewm_jax.eval.metrics.pictures import DEPTHS, PLAIN, Metric
-from pewm_jax.eval.metrics.revisits import Revisit, RevisitScore
-from pewm_jax.eval.metrics.similarity import Similarity
-from pewm_jax.eval.metrics.videos import SetScore, VideoDistance
+from pewm_jax.eval.metrics.images import DEPTHS, PLAIN, Metric
+from pewm_jax.eval.metrics.perceptual import LPIPS, DreamSim, read_dreamsim, read_lpips
+from pewm_jax.eval.metrics.revisits import Revisit, RevisitScore, Similarity, read_encoder
+from pewm_jax.eval.metrics.videos import DISTANCES, SetScore, VideoDistance, read_i3d
 from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips.model import Net
 
 __all__ = [
+    "LPIPS",
     "NAMES",
     "DreamSim",
     "Metric",
-    "Perceptual",
     "Revisit",
     "RevisitScore",
     "SetScore",
@@ -61,51 +59,68 @@ __all__ = [
     "load_all",
 ]
 
-_NETS: dict[str, Net] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
-_ENCODERS = {"src": "dinov2", "src[alex]": "alex", "src[vgg]": "vgg"}
-_PICTURES = (*PLAIN, *_NETS)
-_COLOURS = (
-    *_PICTURES,
-    "dreamsim",
-    *videos.DISTANCES,
-    *_ENCODERS,
-    *(f"mirror[{name}]" for name in _PICTURES),
-)
+Weights: TypeAlias = str | Path | None
+"""A file or folder of weights, or None for those of the installed package."""
+
+
+def _lpips(net: Net) -> Callable[[Weights], Metric]:
+    return lambda weights: read_lpips(lpips_weights.find(net, weights), net)
+
+
+def _src(encoder: str) -> Callable[[Weights], Metric]:
+    def read(weights: Weights) -> Metric:
+        compare = read_encoder(encoder, weights)
+        return Revisit(f"src[{compare.encoder}]", compare)
+
+    return read
+
+
+def _mirror(name: str) -> Callable[[Weights], Metric]:
+    def read(weights: Weights) -> Metric:
+        compare = load(name, weights)
+        inside = f"lpips_{compare.encoder}" if isinstance(compare, LPIPS) else name
+        return Revisit(f"mirror[{inside}]", compare)
+
+    return read
+
+
+_NETWORKS: dict[str, Callable[[Weights], Metric]] = {
+    "lpips_alex": _lpips("alex"),
+    "lpips_vgg": _lpips("vgg"),
+    "dreamsim": read_dreamsim,
+    **{
+        kind: lambda weights, kind=kind: read_i3d(i3d_weights.find(weights), kind)
+        for kind in DISTANCES
+    },
+    "src": _src("dinov2"),
+    "src[alex]": _src("alex"),
+    "src[vgg]": _src("vgg"),
+}
+_MIRRORS = {f"mirror[{name}]": _mirror(name) for name in (*PLAIN, "lpips_alex", "lpips_vgg")}
+_COLOURS = (*PLAIN, *_NETWORKS, *_MIRRORS)
 NAMES = (*_COLOURS, *DEPTHS)
-_MIRROR = re.compile(r"mirror\[(.+)\]")
+"""The names of all metrics."""
 
 
-def load(name: str, weights: str | Path | None = None) -> Metric:
+def load(name: str, weights: Weights = None) -> Metric:
     """Return a metric.
 
     Args:
         name: one of ``NAMES``.
-        weights: a file of weights for a metric that is a network (``models.lpips_weights`` and
-            ``models.i3d.convert`` say of which kinds; for ``src`` a folder of DINOv2); by default
+        weights: a file of weights for a metric that is a network (``models.lpips.convert`` and
+            ``models.i3d.convert`` list the formats; for ``src`` a folder of DINOv2); by default
             those of the installed package.
 
     Raises:
         UserError: there is no such metric, it takes no weights, or it needs some and has none.
     """
     if weights is not None and not str(weights):
-        raise UserError(f"the weights of {name} are named by no letters: name a file, or leave it.")
+        raise UserError(f"the name of the weights of {name} is empty: name a file, or leave it.")
     if name not in NAMES:
-        raise UserError(f"there is no metric {name!r}; there is {', '.join(NAMES)}.")
-    mirrored = _MIRROR.fullmatch(name)
-    if mirrored:
-        inside = load(mirrored[1], weights)
-        lpips = isinstance(inside, Perceptual)
-        return Revisit(f"mirror[lpips_{inside.encoder}]" if lpips else name, inside)
-    if name in _ENCODERS:
-        compare = similarity.read(_ENCODERS[name], weights)
-        return Revisit(f"src[{compare.encoder}]", compare)
-    if name == "dreamsim":
-        return dreams.read(weights)
-    if name in _NETS:
-        return read_lpips(lpips_weights.find(_NETS[name], weights), _NETS[name])
-    for kind in videos.DISTANCES:
-        if name == kind:
-            return videos.read(i3d_weights.find(weights), kind)
+        raise UserError(f"there is no metric {name!r}; choose one of {', '.join(NAMES)}.")
+    reader = _NETWORKS.get(name) or _MIRRORS.get(name)
+    if reader is not None:
+        return reader(weights)
     if weights is not None:
         raise UserError(f"the metric {name} is no network and takes no weights, got {weights}.")
     return (PLAIN | DEPTHS)[name]
@@ -114,7 +129,7 @@ def load(name: str, weights: str | Path | None = None) -> Metric:
 def load_all(
     names: Iterable[str] = _COLOURS, weights: Mapping[str, str | Path] | None = None
 ) -> tuple[dict[str, Metric], dict[str, str]]:
-    """Return the metrics whose weights are at hand, and why the others are left out.
+    """Return the metrics whose weights are available, and why the others are left out.
 
     Args:
         names: some of ``NAMES``; by default all that take colours.
@@ -130,7 +145,7 @@ def load_all(
     names = tuple(names)
     strange = sorted(set(weights or {}) - set(names))
     if strange:
-        raise UserError(f"weights are named of {', '.join(strange)}, which are not asked for.")
+        raise UserError(f"weights are given for {', '.join(strange)}, which are not asked for.")
     found: dict[str, Metric] = {}
     left_out: dict[str, str] = {}
     for name in names:

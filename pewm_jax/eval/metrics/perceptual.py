@@ -1,4 +1,4 @@
-"""LPIPS of clips: frame by frame, a bounded number of pictures at once."""
+"""LPIPS and DreamSim of clips: frame by frame, a bounded number of pictures at once."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from pathlib import Path
 
 import jax
 
-from pewm_jax.eval.metrics.pictures import colours, marked
+from pewm_jax.config import UserError
+from pewm_jax.eval.metrics.images import colours, marked
+from pewm_jax.models.dreamsim import convert as dreamsim_weights
+from pewm_jax.models.dreamsim import model as dreamsim
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.models.lpips.model import LEAST, NAMES, Net
@@ -19,7 +22,7 @@ from pewm_jax.types import Array, Params
 PIXELS = 2**17
 """Pixels of imagined pictures that are in the network at once, or one picture if it has more."""
 KEPT = 2**28
-"""Bytes of the truth's features that are kept; where there are more, they are made each time."""
+"""Bytes of the truth's features that are cached; if there are more, they are computed each time."""
 OFF = "off"
 """The setting that leaves LPIPS out."""
 PACKAGED: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
@@ -27,7 +30,7 @@ PACKAGED: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
 
 
 @dataclasses.dataclass(frozen=True)
-class Perceptual:
+class LPIPS:
     """LPIPS with its weights; a ``Metric``.
 
     Attributes:
@@ -136,7 +139,7 @@ def _at_once(pictures_NHWC: Array) -> int:
     return max(1, PIXELS // (pictures_NHWC.shape[1] * pictures_NHWC.shape[2]))
 
 
-def read(path: Path, net: Net | None = None) -> Perceptual:
+def read_lpips(path: Path, net: Net | None = None) -> LPIPS:
     """Read LPIPS from a file of weights.
 
     Args:
@@ -150,10 +153,10 @@ def read(path: Path, net: Net | None = None) -> Perceptual:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     name = marked(found, params, lpips_weights.PUBLISHED[found])
-    return Perceptual(found, jax.device_put(params), digest, name)
+    return LPIPS(found, jax.device_put(params), digest, name)
 
 
-def chosen(setting: str, height: int, width: int) -> tuple[Perceptual | None, str]:
+def select_lpips(setting: str, height: int, width: int) -> tuple[LPIPS | None, str]:
     """Return the LPIPS that a setting asks for, and a sentence on it or on why there is none.
 
     Args:
@@ -168,7 +171,7 @@ def chosen(setting: str, height: int, width: int) -> tuple[Perceptual | None, st
         return None, "LPIPS is left out, as evaluate.lpips says."
     if setting:
         net = PACKAGED.get(setting)
-        metric = read(lpips_weights.find(net) if net else Path(setting), net)
+        metric = read_lpips(lpips_weights.find(net) if net else Path(setting), net)
         lpips.require_size(metric.net, height, width)
         return metric, metric.about
     path = lpips_weights.installed("alex")
@@ -182,5 +185,65 @@ def chosen(setting: str, height: int, width: int) -> tuple[Perceptual | None, st
             f"LPIPS is left out: its {NAMES['alex']} needs pictures of {LEAST['alex']} pixels each "
             f"way and these have {width} × {height}; --lpips vgg takes smaller ones."
         )
-    metric = read(path, "alex")
+    metric = read_lpips(path, "alex")
     return metric, metric.about
+
+
+PICTURES = 8
+"""Pairs of pictures in the networks of DreamSim at once."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DreamSim:
+    """DreamSim's distance, averaged over a clip's frames; a ``Metric``, lower is better.
+
+    Attributes:
+        params: parameters of the three encoders.
+        sha256: hash of them.
+    """
+
+    params: Params = dataclasses.field(repr=False)
+    sha256: str = ""
+
+    def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
+        """Return (B,) distances; 0 for equal clips. See ``Metric``."""
+        imagined, truth = colours(imagined_BTHWC, truth_BTHWC)
+        return _dreamsim_distances(self.params, imagined, truth)
+
+    @property
+    def about(self) -> str:
+        """What is measured, for the protocol."""
+        return (
+            "DreamSim 0.2, the ensemble of DINO, CLIP and OpenCLIP; pictures resized to 224 × 224 "
+            "(bicubic, antialiased); lower is better"
+        )
+
+
+@jax.jit
+def _dreamsim_distances(params: Params, a_BTHWC: Array, b_BTHWC: Array) -> Array:
+    clips, frames, *size = a_BTHWC.shape
+    pairs = tuple(x.reshape(clips * frames, *size) for x in (a_BTHWC, b_BTHWC))
+
+    def one(pair: tuple[Array, Array]) -> Array:
+        a, b = (picture[None] for picture in pair)
+        return dreamsim.distance(params, a, b)[0]
+
+    return jax.lax.map(one, pairs, batch_size=PICTURES).reshape(clips, frames).mean(1)
+
+
+def read_dreamsim(folder: str | Path | None) -> DreamSim:
+    """Read DreamSim from a folder; see ``models.dreamsim.convert``.
+
+    Raises:
+        UserError: none is named, or it is absent or damaged.
+    """
+    if folder is None:
+        raise UserError(
+            "DreamSim needs weights, which come with no package: name the folder that the package "
+            "dreamsim 0.2 keeps them in."
+        )
+    params = dreamsim_weights.read(Path(folder))
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(jax.device_get(params)):
+        digest.update(leaf.tobytes())
+    return DreamSim(params, digest.hexdigest())

@@ -1,8 +1,9 @@
 """FVD and KVD: how far imagined clips, as a set, are from true ones, seen by I3D.
 
-The Fréchet and the kernel distance (``metrics.distributions``) between the logits of I3D
-(``models.i3d``), as in Unterthiner et al. 2018. FVD falls with the number of clips even where there
-is no difference at all: its floor, truth against truth at the same number, stands beside it.
+The Fréchet and the kernel distance between the logits of I3D (``models.i3d``), as in Unterthiner et
+al. 2018. The Fréchet distance is biased: two sets of n vectors of one distribution differ by an
+amount that depends on n. Its floor, truth against truth at the same number of clips, is reported
+beside it. The kernel distance is unbiased. Both are computed in float64 on the host.
 """
 
 from __future__ import annotations
@@ -10,26 +11,182 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
 import numpy as np
 
-from pewm_jax.eval.metrics import distributions
-from pewm_jax.eval.metrics.distributions import Distance, Spread
-from pewm_jax.eval.metrics.pictures import colours, marked
+from pewm_jax.config import UserError
+from pewm_jax.eval.metrics.images import colours, marked
 from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
 from pewm_jax.types import Array, Params
+
+SPLITS = 10
+"""Random halves that a floor is averaged over."""
+Distance = Callable[[np.ndarray, np.ndarray], float]
+"""Compares two sets (N, F) of features."""
+
+
+def frechet(a_NF: np.ndarray, b_MF: np.ndarray) -> float:
+    """Return the squared Fréchet distance between Gaussians fitted to two sets; 0 for equal ones.
+
+    |μa − μb|² + tr Σa + tr Σb − 2 tr (Σa Σb)^½, covariances over n − 1 (Dowson and Landau 1982;
+    Heusel et al. 2017, Eq. 6). With Σ = RᵀR, R of the QR decomposition of the centred vectors, the
+    last trace is the sum of the singular values of Ra Rbᵀ: no root of a matrix is taken, and sets
+    smaller than F are no special case.
+
+    Args:
+        a_NF: N ≥ 2 vectors.
+        b_MF: M ≥ 2 vectors.
+
+    Raises:
+        UserError: the sets are too small, of different widths, or not finite.
+    """
+    a, b = _sets(a_NF, b_MF)
+    roots = [_root(x) for x in (a, b)]
+    apart = np.square(a.mean(0) - b.mean(0)).sum()
+    spread = sum(np.square(root).sum() for root in roots)
+    shared = np.linalg.svd(roots[0] @ roots[1].T, compute_uv=False).sum()
+    return float(max(apart + spread - 2 * shared, 0))
+
+
+def kernel(a_NF: np.ndarray, b_NF: np.ndarray) -> float:
+    """Return the squared maximum mean discrepancy under a cubic kernel; 0 for equal sets.
+
+    The kernel is (xᵀy / F + 1)³ (Bińkowski et al. 2018). The estimate leaves out every pair of a
+    vector with itself and with its partner of the same number (Gretton et al. 2012, Eq. 4), so that
+    it has no bias also where partners belong together, as an imagined clip and its truth do. It may
+    be negative.
+
+    Args:
+        a_NF: N ≥ 2 vectors.
+        b_NF: as many.
+
+    Raises:
+        UserError: the sets are too small, of different sizes or widths, or not finite.
+    """
+    a, b = _sets(a_NF, b_NF)
+    if len(a) != len(b):
+        raise UserError(
+            f"sets of {len(a)} and {len(b)} vectors have no kernel distance: give as many of both."
+        )
+    inside = _cubic(a, a) + _cubic(b, b)
+    across = _cubic(a, b)
+    pairs = inside - across - across.T
+    return float((pairs.sum() - np.trace(pairs)) / (len(a) * (len(a) - 1)))
+
+
+def _cubic(a_NF: np.ndarray, b_MF: np.ndarray) -> np.ndarray:
+    return (a_NF @ b_MF.T / a_NF.shape[1] + 1) ** 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """A mean over random splits, and its standard deviation over them."""
+
+    mean: float
+    std: float
+
+
+def distance_floor(
+    distance: Distance,
+    truth_NF: np.ndarray,
+    n: int | None = None,
+    *,
+    splits: int = SPLITS,
+    seed: int = 0,
+) -> Spread:
+    """Return what a distance says of two sets of n true clips that have no clip in common.
+
+    Args:
+        distance: ``frechet`` or ``kernel``.
+        truth_NF: features of true clips.
+        n: vectors in each set; by default half of them.
+        splits: how often sets are drawn.
+        seed: of the drawing.
+
+    Raises:
+        UserError: there are fewer than 2 n vectors, or n is below 2.
+    """
+    return distance_of_halves(distance, truth_NF, truth_NF, n, splits=splits, seed=seed)
+
+
+def distance_of_halves(
+    distance: Distance,
+    imagined_NF: np.ndarray,
+    truth_NF: np.ndarray,
+    n: int | None = None,
+    *,
+    splits: int = SPLITS,
+    seed: int = 0,
+) -> Spread:
+    """Return what a distance says of n imagined clips against the truth of n others.
+
+    With equal arguments the same clips are drawn as in ``distance_floor``, so that the two can be
+    compared.
+
+    Args:
+        distance: ``frechet`` or ``kernel``.
+        imagined_NF: features of imagined clips.
+        truth_NF: of their truth, in the same order.
+        n: vectors in each set; by default half of them.
+        splits: how often sets are drawn.
+        seed: of the drawing.
+
+    Raises:
+        UserError: see ``distance_floor``.
+    """
+    count = len(truth_NF)
+    n = count // 2 if n is None else n
+    if len(imagined_NF) != count:
+        raise UserError(f"{len(imagined_NF)} imagined and {count} true clips are not partners.")
+    if n < 2 or 2 * n > count:
+        raise UserError(
+            f"two sets of {n} clips cannot be drawn from {count}: each needs at least 2, and none "
+            "in common."
+        )
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(splits):
+        order = rng.permutation(count)
+        found.append(distance(imagined_NF[order[:n]], truth_NF[order[n : 2 * n]]))
+    return Spread(float(np.mean(found)), float(np.std(found)))
+
+
+def _root(x_NF: np.ndarray) -> np.ndarray:
+    """Return R, (K, F), of which RᵀR is the covariance."""
+    scaled = (x_NF - x_NF.mean(0)) / np.sqrt(len(x_NF) - 1)
+    return np.asarray(np.linalg.qr(scaled, mode="r"))
+
+
+def _sets(a_NF: np.ndarray, b_MF: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return both sets in float64.
+
+    Raises:
+        UserError: they are no sets that can be compared.
+    """
+    a, b = (np.asarray(x, np.float64) for x in (a_NF, b_MF))
+    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
+        raise UserError(
+            f"features of shapes {a.shape} and {b.shape} cannot be compared: give (N, F) of one F."
+        )
+    if min(len(a), len(b)) < 2:
+        raise UserError(
+            f"sets of {len(a)} and {len(b)} clips have no spread: give at least 2 of each."
+        )
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise UserError("features that are not finite cannot be compared: look at the clips.")
+    return a, b
+
 
 FRAMES = 32
 """Frames that are in the network at once, or one clip if it has more."""
 NAME = "i3d"
 """The network; a distance by its published weights goes without it."""
 Kind = Literal["fvd", "kvd"]
-DISTANCES: Mapping[Kind, Distance] = {"fvd": distributions.frechet, "kvd": distributions.kernel}
+DISTANCES: Mapping[Kind, Distance] = {"fvd": frechet, "kvd": kernel}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,8 +275,8 @@ class VideoDistance:
         half = floor = None
         count = len(truth_NF)
         if count >= 4:
-            half = distributions.against(self.distance, imagined_NF, truth_NF, seed=seed)
-            floor = distributions.floor(self.distance, truth_NF, seed=seed)
+            half = distance_of_halves(self.distance, imagined_NF, truth_NF, seed=seed)
+            floor = distance_floor(self.distance, truth_NF, seed=seed)
         value = self.distance(imagined_NF, truth_NF)
         return SetScore(value, count, half, floor, count // 2)
 
@@ -156,7 +313,7 @@ def _of_one(params: Params, video_THWC: Array) -> Array:
     return i3d.apply(params, video_THWC[None])[0]
 
 
-def read(path: Path, kind: Kind) -> VideoDistance:
+def read_i3d(path: Path, kind: Kind) -> VideoDistance:
     """Read FVD or KVD from a file with the weights of I3D.
 
     Raises:

@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import Config, PersistConfig, UserError
-from pewm_jax.eval.horizon import Walk
+from pewm_jax.eval.horizon import RecordedWalk
 from pewm_jax.geometry.actions import heading
 from pewm_jax.io.progress import Meter
 from pewm_jax.memory import class_edit, class_grid
 from pewm_jax.memory.class_grid import ClassGrid
-from pewm_jax.models.persist import voxel_renderer
+from pewm_jax.models.persist import voxel_renderer, voxel_vae
+from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.types import Array, Params, WorldState
 from pewm_jax.worlds.persist import windows
 from pewm_jax.worlds.persist import world as persist
@@ -96,7 +97,7 @@ def room(model: PersistConfig, state: WorldState, floor_z: float) -> np.ndarray 
     return None
 
 
-def class_of(config: Config, walks: Sequence[Walk], name: str = "") -> int:
+def block_class(config: Config, walks: Sequence[RecordedWalk], name: str = "") -> int:
     """Return the id of the class that blocks are made of.
 
     Args:
@@ -117,7 +118,7 @@ def class_of(config: Config, walks: Sequence[Walk], name: str = "") -> int:
 def run(
     config: Config,
     params: Params,
-    walks: Sequence[Walk],
+    walks: Sequence[RecordedWalk],
     name: str = "",
     batch: int = 8,
     chunk: int = 16,
@@ -129,20 +130,20 @@ def run(
         config: an experiment of a ``persist`` world.
         params: its weights.
         walks: one for each trial, of one length, with voxels.
-        name: class of the blocks; see ``class_of``.
+        name: class of the blocks; see ``block_class``.
         batch: walks imagined at once.
         chunk: frames imagined by one call.
         count: trials that are enough: walks after these are not looked at; None for all.
 
     Raises:
-        UserError: see ``class_of``.
+        UserError: see ``block_class``.
     """
     model: PersistConfig = config.model
-    number = class_of(config, walks, name)
+    number = block_class(config, walks, name)
     start = jax.jit(functools.partial(persist.start_in, model))
     imagine = functools.partial(persist.imagine, model)
     imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
-    look = jax.jit(functools.partial(_sight, model))
+    look = jax.jit(functools.partial(_rays_on_block, model))
     ready: list[_Trial] = []
     looked = 0
     for walk in walks:
@@ -177,7 +178,7 @@ def run(
                     for t in range(change.shape[1]):
                         camera = jax.tree.map(lambda x, k=k, t=t: x[k, t][None], made.camera)
                         there, within = look(grid, camera, jnp.asarray(trial.box_23))
-                        seen += [*judged(np.asarray(there), change[k, t]), bool(within)]
+                        seen += [*block_visibility(np.asarray(there), change[k, t]), bool(within)]
             for k, trial in enumerate(some):
                 grid = jax.tree.map(lambda x, k=k: x[k], edited.map)
                 kept.append(_cells(model, grid, trial.box_23, number) / trial.cells)
@@ -187,7 +188,7 @@ def run(
     return Trials(np.array(kept), shown, visible, within, frames, looked, model.hold)
 
 
-def judged(there_hw: np.ndarray, change_HW: np.ndarray) -> tuple[bool, bool]:
+def block_visibility(there_hw: np.ndarray, change_HW: np.ndarray) -> tuple[bool, bool]:
     """Return whether a block is in sight, and whether the picture is changed more there.
 
     Args:
@@ -220,7 +221,9 @@ def _cells(model: PersistConfig, grid: ClassGrid, box_23: np.ndarray, number: in
     return int((held.classes_XYZ == number).sum())
 
 
-def _sight(model: PersistConfig, grid: ClassGrid, camera: Any, box_23: Any) -> tuple[Array, Array]:
+def _rays_on_block(
+    model: PersistConfig, grid: ClassGrid, camera: Any, box_23: Any
+) -> tuple[Array, Array]:
     """Return which rays of a camera first meet a cell of a box, and whether its window has some.
 
     Returns:
@@ -251,3 +254,48 @@ def _sight(model: PersistConfig, grid: ClassGrid, camera: Any, box_23: Any) -> t
 
 def _stacked(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(part) for part in x]), *trees)
+
+
+EVERY = 40
+"""Of a walk, frames from one grid that is looked at to the next."""
+
+
+def reconstruction_shares(
+    model: PersistConfig, params: Params, grids: Sequence[np.ndarray]
+) -> dict[str, float]:
+    """Return shares of the cells whose class the autoencoder gives back.
+
+    Args:
+        model: the world.
+        params: its parameters.
+        grids: (T, X, Y, Z) class ids of each walk's frames, 0 where there is nothing; of larger
+            grids than the autoencoder's the middle is taken.
+
+    Returns:
+        ``grids``: how many were looked at; ``occupied``: the share of occupied cells that come back
+        with their class; ``filled``: of these, those that come back as occupied at all; ``empty``:
+        the share of empty cells that come back empty.
+    """
+    config = model.backbone.voxel_vae  # type: ignore[attr-defined]
+    again = jax.jit(functools.partial(_again, config))
+    right = filled = occupied = clear = empty = count = 0
+    for walk in grids:
+        low = [(size - config.side) // 2 for size in walk.shape[1:]]
+        x, y, z = (slice(at, at + config.side) for at in low)
+        for grid in walk[::EVERY, x, y, z].astype(np.int32):
+            back, there = np.asarray(again(params["voxel_vae"], grid[None])[0]), grid > 0
+            right += int((back == grid)[there].sum())
+            filled += int((back > 0)[there].sum())
+            clear += int((back == 0)[~there].sum())
+            occupied, empty = occupied + int(there.sum()), empty + int((~there).sum())
+            count += 1
+    return {
+        "grids": count,
+        "occupied": right / max(occupied, 1),
+        "filled": filled / max(occupied, 1),
+        "empty": clear / max(empty, 1),
+    }
+
+
+def _again(config: VoxelVAEConfig, params: Params, grid_BXYZ: Array) -> Array:
+    return voxel_vae.decode(config, params, voxel_vae.encode(config, params, grid_BXYZ))

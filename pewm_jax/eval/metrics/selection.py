@@ -8,17 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from pewm_jax.config import Config, UserError
-from pewm_jax.eval.images import WINDOW
 from pewm_jax.eval.metrics import sam2, videos
-from pewm_jax.eval.metrics.perceptual import PACKAGED, Perceptual
-from pewm_jax.eval.metrics.perceptual import chosen as choose_lpips
-from pewm_jax.eval.metrics.pictures import PLAIN
-from pewm_jax.eval.metrics.revisits import Revisit
-from pewm_jax.eval.metrics.similarity import Similarity
-from pewm_jax.eval.metrics.similarity import read as read_encoder
+from pewm_jax.eval.metrics.images import PLAIN, WINDOW
+from pewm_jax.eval.metrics.perceptual import LPIPS, PACKAGED, select_lpips
+from pewm_jax.eval.metrics.revisits import Revisit, Similarity, read_encoder
 from pewm_jax.eval.metrics.structure import Consistency, follow_by_flow
 from pewm_jax.eval.metrics.videos import VideoDistance
-from pewm_jax.eval.protocol import file_hash
+from pewm_jax.io.store import file_hash
 from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -31,7 +27,7 @@ OFF, ON = "off", "on"
 
 
 @dataclasses.dataclass(frozen=True)
-class Chosen:
+class ReportMetrics:
     """The measures of a report that can be left out.
 
     Attributes:
@@ -42,7 +38,7 @@ class Chosen:
         about: ``lpips``, ``fvd``, ``src`` and ``scs``: what is measured, or why it is not.
     """
 
-    lpips: Perceptual | None
+    lpips: LPIPS | None
     i3d: VideoDistance | None
     visits: dict[str, Revisit]
     structure: Consistency | None
@@ -68,7 +64,7 @@ class Chosen:
         }
 
 
-def choose(config: Config, *, accelerator: bool, ids: bool = False) -> Chosen:
+def select_metrics(config: Config, *, accelerator: bool, ids: bool = False) -> ReportMetrics:
     """Return the measures that an experiment's settings ask for.
 
     Args:
@@ -80,16 +76,16 @@ def choose(config: Config, *, accelerator: bool, ids: bool = False) -> Chosen:
         UserError: what is asked for by name is not there, is damaged, or cannot take such pictures.
     """
     clip, settings = config.model.clip, config.evaluate
-    lpips, about_lpips = choose_lpips(settings.lpips, clip.height, clip.width)
+    lpips, about_lpips = select_lpips(settings.lpips, clip.height, clip.width)
     frames = settings.chain * (clip.frames - 1) + 1
-    distance, about_fvd = video(settings.fvd, frames, accelerator=accelerator)
-    visits, about_src = revisits(settings.src, lpips, clip.height, clip.width)
-    consistency, about_scs = structure(settings.scs, ids=ids)
+    distance, about_fvd = select_fvd(settings.fvd, frames, accelerator=accelerator)
+    visits, about_src = select_revisits(settings.src, lpips, clip.height, clip.width)
+    consistency, about_scs = select_scs(settings.scs, ids=ids)
     about = {"lpips": about_lpips, "fvd": about_fvd, "src": about_src, "scs": about_scs}
-    return Chosen(lpips, distance, visits, consistency, about)
+    return ReportMetrics(lpips, distance, visits, consistency, about)
 
 
-def structure(setting: str, *, ids: bool) -> tuple[Consistency | None, str]:
+def select_scs(setting: str, *, ids: bool) -> tuple[Consistency | None, str]:
     """Return SCS with the segmenter that a setting names, and a sentence on it or on why not.
 
     Args:
@@ -120,7 +116,7 @@ def structure(setting: str, *, ids: bool) -> tuple[Consistency | None, str]:
     return measure, f"{measure.name}: {exact}; SAM 2 of {setting} follows the masks."
 
 
-def video(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDistance | None, str]:
+def select_fvd(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDistance | None, str]:
     """Return the I3D that a setting asks for, and a sentence on it or on why there is none.
 
     Args:
@@ -135,7 +131,7 @@ def video(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDistanc
         return None, "FVD and KVD are left out, as evaluate.fvd says."
     if setting:
         i3d.require_frames(1, frames, i3d.SIDE, i3d.SIDE, 3)
-        metric = videos.read(i3d_weights.find(None if setting == ON else setting), "fvd")
+        metric = videos.read_i3d(i3d_weights.find(None if setting == ON else setting), "fvd")
         return metric, metric.about
     path = i3d_weights.installed()
     if path is None:
@@ -153,12 +149,12 @@ def video(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDistanc
             "FVD and KVD are left out: without an accelerator I3D takes longer than imagining the "
             "clips; --fvd on asks for them."
         )
-    metric = videos.read(path, "fvd")
+    metric = videos.read_i3d(path, "fvd")
     return metric, metric.about
 
 
-def revisits(
-    settings: Sequence[str], lpips: Perceptual | None, height: int, width: int
+def select_revisits(
+    settings: Sequence[str], lpips: LPIPS | None, height: int, width: int
 ) -> tuple[dict[str, Revisit], str]:
     """Return the measures of the mirror test, and a sentence on SRC.
 

@@ -1,7 +1,20 @@
-"""Run the model on batches of chosen clips, compiled ahead of time, on one device or several."""
+"""Who imagines: batches of clips through a compiled model, and the baselines beside it.
+
+============= ====================================================================================
+memory        the model with its map
+empty         the same weights with an empty map
+model         instead of both, a model that was trained without a memory
+none          another model, trained for as many steps without a memory (if one is given)
+reproject     no network: what was observed, moved to the present camera
+copy          no network: the last observed frame, repeated
+============= ====================================================================================
+
+``ModelRunner`` compiles ahead of time and uses one device or several.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -13,11 +26,22 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import Config
+from pewm_jax.config import Config, UserError
 from pewm_jax.data import abstract
+from pewm_jax.eval.reproject import ReprojectSettings, reproject_batch
+from pewm_jax.io.store import Workers
+from pewm_jax.report.labels import OWN_METHODS
+from pewm_jax.train import processes
 from pewm_jax.types import Array, Camera, Frames, Params, WorldState
 from pewm_jax.worlds import start
 from pewm_jax.worlds.rollouts import rollout
+
+
+def workers() -> Workers:
+    """Return the processes of this job, which share the work of an evaluation."""
+    return Workers(
+        jax.process_count(), jax.process_index(), lambda what: processes.meet(f"evaluate: {what}")
+    )
 
 
 def print_now(line: str) -> None:
@@ -25,7 +49,7 @@ def print_now(line: str) -> None:
     print(line, flush=True)
 
 
-class Imagination:
+class ModelRunner:
     """A model that imagines batches of clips of one size; functions are compiled when first needed.
 
     Args:
@@ -36,7 +60,7 @@ class Imagination:
         cameras: whether clips are driven by cameras (six degrees of freedom) instead of actions.
         devices: of this process, which each imagine an equal part of a batch, as many of them as
             divide it; by default one.
-        say: shows a line: what is being compiled, and how long it took.
+        log: shows a line: what is being compiled, and how long it took.
     """
 
     def __init__(
@@ -45,7 +69,7 @@ class Imagination:
         params: Params,
         batch: int,
         context: int,
-        say: Callable[[str], Any] = print_now,
+        log: Callable[[str], Any] = print_now,
         *,
         cameras: bool = False,
         devices: Sequence[Any] = (),
@@ -54,7 +78,7 @@ class Imagination:
         self.config, self.batch, self.context = config, batch, context
         self.mesh = mesh_of(devices, batch)
         self.params = self._everywhere(params)
-        self._say = say
+        self._log = log
         self._begin: Callable[..., WorldState] | None = None
         self._clip: dict[bool, Callable[..., tuple[WorldState, Frames]]] = {}
 
@@ -87,7 +111,7 @@ class Imagination:
                     3,
                 ),
                 (self.params, *self._placed((states, control, keys))),
-                self._say,
+                self._log,
             )
 
     def begin(self, context: Frames) -> WorldState:
@@ -146,7 +170,7 @@ class Imagination:
                 f"the start from {self.context} frames",
                 self._split(self._start_batch, 1),
                 (self.params, self._placed(self._abstract_context())),
-                self._say,
+                self._log,
             )
         return begin
 
@@ -209,9 +233,105 @@ def copy_last(context: Frames, count: int) -> Frames:
     return jax.tree.map(lambda array: np.repeat(np.asarray(array)[:, -1:], count, 1), context)
 
 
-def _compile(name: str, function: Callable, arguments: tuple, say: Callable[[str], Any]) -> Any:
-    say(f"compiling {name} …")
+def _compile(name: str, function: Callable, arguments: tuple, log: Callable[[str], Any]) -> Any:
+    log(f"compiling {name} …")
     began = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()
-    say(f"compiled {name} in {time.perf_counter() - began:.1f} s")
+    log(f"compiled {name} in {time.perf_counter() - began:.1f} s")
     return compiled
+
+
+METHODS = ("memory", "empty", "model", "none", "reproject", "copy")
+"""All methods, in the order of the tables."""
+SAMPLED = ("memory", "empty", "model", "none")
+"""Those that draw noise, and so are scored with every seed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Methods:
+    """The methods of one evaluation.
+
+    Attributes:
+        model: the model that is scored.
+        reproject: settings of the reprojection.
+        none: a model trained without a memory, or None.
+        none_weights: hash of its weights.
+        remembers: whether the model that is scored has a memory.
+    """
+
+    model: ModelRunner
+    reproject: ReprojectSettings
+    none: ModelRunner | None = None
+    none_weights: str = ""
+    remembers: bool = True
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The methods that there are."""
+        left_out = {"model"} if self.remembers else {"memory", "empty"}
+        left_out |= {"none"} if self.none is None else set()
+        return tuple(name for name in METHODS if name not in left_out)
+
+    @property
+    def own(self) -> str:
+        """The method that is the model itself: ``memory``, or ``model`` if it has none."""
+        return "memory" if self.remembers else "model"
+
+    def piece(self, method: str) -> str:
+        """Return the method's name in partial results: with all that only its scores depend on."""
+        extra = {"none": self.none_weights[:16], "reproject": self.reproject.name}
+        return "-".join(filter(None, (method, extra.get(method))))
+
+    def seeds(self, method: str, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the sampling seeds that a method is scored with."""
+        return seeds if method in SAMPLED else (0,)
+
+    def prepare(self, methods: Iterable[str]) -> None:
+        """Compile what some methods need."""
+        methods = set(methods)
+        known = ("empty", "memory", "model")
+        self.model.prepare([name in OWN_METHODS for name in known if name in methods])
+        if self.none is not None and "none" in methods:
+            self.none.prepare([False])
+
+    def imagine(
+        self,
+        method: str,
+        context: Frames,
+        control: Array | Camera,
+        camera: Camera,
+        seeds_B2: np.ndarray,
+        watch: Callable[[Any], Any] | None = None,
+    ) -> tuple[Any, Any, Frames]:
+        """Imagine N frames for every clip of a batch.
+
+        Args:
+            method: one of ``names``.
+            context: (B, S) observed frames, the present last, colours uint8.
+            control: what drives the model, see ``ModelRunner.run``.
+            camera: (B, N) the cameras of the frames to imagine, where the control leads.
+            seeds_B2: sampling seed and clip number.
+            watch: of a network, see ``ModelRunner.run``.
+
+        Returns:
+            ``(first, last, frames)``: the states before and after, None without a network, and
+            (B, N) frames.
+
+        Raises:
+            UserError: the model's output is not finite.
+        """
+        if method == "copy":
+            return None, None, copy_last(context, camera.intrinsics_4.shape[1])
+        if method == "reproject":
+            return None, None, reproject_batch(self.reproject, context, camera)
+        given: dict[str, Any] = {} if watch is None else {"watch": watch}
+        model = self.none if method == "none" and self.none is not None else self.model
+        first, last, frames = model.run(
+            context, control, seeds_B2, memory=method in OWN_METHODS, **given
+        )
+        if not all(np.isfinite(leaf).all() for leaf in (frames.rgb_THWC, frames.depth_THW)):
+            raise UserError(
+                "the model imagines values that are not finite: its weights are damaged or its "
+                "training diverged; train it again."
+            )
+        return first, last, frames

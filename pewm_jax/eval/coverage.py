@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -13,11 +13,10 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import Config, World
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval.imagine import Imagination, print_now
-from pewm_jax.eval.partial import Partials
-from pewm_jax.eval.protocol import ClipChoice, choose
+from pewm_jax.eval.clips import ClipChoice, choose
+from pewm_jax.eval.runner import ModelRunner, print_now, workers
 from pewm_jax.eval.scoring import Batch, load_batch
-from pewm_jax.eval.shares import gathered, share
+from pewm_jax.io.store import ResultCache, map_resumable
 from pewm_jax.types import Array, Frames, Params, WorldState
 
 NAMES = ("seen", "held", "chosen", "attended", "rendered", "looked_at")
@@ -27,12 +26,12 @@ NAMES = ("seen", "held", "chosen", "attended", "rendered", "looked_at")
 def score_coverage(
     config: Config,
     episodes: Sequence[Episode],
-    model: Imagination,
-    partials: Partials,
-    say: Callable[[str], Any] = print_now,
+    model: ModelRunner,
+    cache: ResultCache,
+    log: Callable[[str], Any] = print_now,
     choices: Sequence[ClipChoice] | None = None,
 ) -> dict[str, float] | None:
-    """Count over the first clip of every chain that is scored; kept with the partial results.
+    """Count over the first clip of every chain that is scored; stored in ``cache``.
 
     Without ``choices`` they are those of ``choose``.
 
@@ -46,23 +45,29 @@ def score_coverage(
     if choices is None:
         choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
     starts = range(0, len(choices), config.evaluate.batch)
-    names = {first: f"coverage2-clip{first:04d}" for first in starts}
-    known = {first: piece for first in starts if (piece := partials.get(names[first])) is not None}
-    todo = [first for first in share(starts) if first not in known]
-    if todo:
-        say("counting what the map covers …")
-    for first in todo:
-        chosen = choices[first : first + config.evaluate.batch]
-        batch = load_batch(config, episodes, chosen, first, cameras=model.cameras)
-        known[first] = partials.put(names[first], counts=_count(config.model, model, batch))
-    found = gathered(partials, names, known, "coverage")
+
+    def work(todo: list[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        log("counting what the map covers …")
+        for first in todo:
+            some = choices[first : first + config.evaluate.batch]
+            batch = load_batch(config, episodes, some, first, cameras=model.cameras)
+            yield first, {"counts": _count(config.model, model, batch)}
+
+    found = map_resumable(
+        starts,
+        lambda first: f"coverage2-clip{first:04d}",
+        work,
+        cache=cache,
+        what="coverage",
+        workers=workers(),
+    )
     counts = [found[first]["counts"].sum(0) for first in starts]
     total = dict(zip(NAMES, np.sum(counts, 0).astype(float), strict=True))
     seen = total.pop("seen")
     return {name: count / seen for name, count in total.items()} if seen else None
 
 
-def _count(config: World, model: Imagination, batch: Batch) -> np.ndarray:
+def _count(config: World, model: ModelRunner, batch: Batch) -> np.ndarray:
     """Return (clips, 6) pixels, in the order of ``NAMES``."""
     state, length = model.begin(batch.context), config.clip.frames - 1
     targets, seen = jax.tree.map(lambda x: x[:, :length], (batch.targets, batch.seen))

@@ -1,0 +1,267 @@
+"""The evaluation protocol: which clips are scored, with what context and which actions.
+
+Nothing here is random. Clips start on the way back of every held-out episode, where the agent sees
+places again. Their context is thinned in the same way for every method, and the recorded motion
+drives the model. Equal ``fingerprint`` of protocol and weights means equal scores.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import TypeVar
+
+import jax
+import numpy as np
+
+from pewm_jax.config import Config, UserError, to_dict
+from pewm_jax.data.clips import choose_context
+from pewm_jax.data.episodes import Episode
+from pewm_jax.geometry.actions import PLANAR, actions_between, continuous, integrate
+from pewm_jax.types import Array, Camera, Frames
+
+VERSION = 2
+"""Increase it whenever the same settings would give other scores."""
+POSE_TOLERANCE = 2e-3
+"""Largest difference between integrated and recorded poses (metres, matrix entries)."""
+ROLLOUTS = 16
+"""The most long rollouts, one per episode."""
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipChoice:
+    """One clip to imagine.
+
+    Attributes:
+        episode: index of the episode.
+        name: its name.
+        scene: where it was recorded.
+        start: the present frame; all earlier ones may be context.
+        context_S: (S,) frames given to ``worlds.start``, oldest first, the present last. If an
+            episode has fewer, the oldest is repeated as padding; ``load_clip`` gives padding no
+            depth, so that nothing of it is remembered twice.
+        targets_N: (N,) frames to imagine.
+    """
+
+    episode: int
+    name: str
+    scene: str
+    start: int
+    context_S: tuple[int, ...]
+    targets_N: tuple[int, ...]
+
+
+def context_frames(start: int, count: int) -> tuple[int, ...]:
+    """Return ``count`` frames spread over the past as in training, with ``start`` last."""
+    spread = choose_context(start, count)
+    padded = np.concatenate([np.repeat(spread[:1], count - len(spread)), spread])
+    return tuple(int(index) for index in padded)
+
+
+def way_back(episode: Episode) -> int:
+    """Return the frame where the way back begins: the recorded one, or else the middle."""
+    frame = episode.info.get("return_frame")
+    return episode.length // 2 if frame is None else int(frame)
+
+
+def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) -> list[ClipChoice]:
+    """Choose the clips to imagine: starts spread evenly over every episode's way back.
+
+    Args:
+        config: gives ``clip.frames``, ``data.context`` and ``evaluate.stride``.
+        episodes: held-out episodes.
+        clips: the most clips to choose; fewer if the episodes have fewer distinct starts.
+        chain: clips generated one after the other from each start.
+
+    Returns:
+        The choices: the first start of every episode, then every second start, and so on. Any
+        leading part of the list thus covers as many episodes as possible.
+
+    Raises:
+        UserError: no episode is long enough.
+    """
+    length = chain * (config.model.clip.frames - 1) * config.evaluate.stride
+    per_episode = -(-clips // max(len(episodes), 1))
+    ranked: list[tuple[int, ClipChoice]] = []
+    longest = 0
+    for index in range(len(episodes)):
+        episode = episodes[index]
+        longest = max(longest, episode.length)
+        last = episode.length - 1 - length
+        if last < 0:
+            continue
+        first = min(way_back(episode), last)
+        starts = np.unique(np.round(np.linspace(first, last, per_episode)).astype(int))
+        for rank, start in enumerate(starts):
+            count = length // config.evaluate.stride
+            ranked.append((rank, choice_of(config, episode, index, int(start), count)))
+    if not ranked:
+        raise UserError(
+            f"no episode of {config.data.path}/{config.evaluate.split} is long enough: "
+            f"{chain} clips need {length + 1} frames and the longest has {longest}; collect "
+            "longer episodes or lower evaluate.chain, video_clips or stride."
+        )
+    ranked.sort(key=lambda item: item[0])
+    return [choice for _, choice in ranked[:clips]]
+
+
+def choice_of(config: Config, episode: Episode, index: int, start: int, count: int) -> ClipChoice:
+    """Return the clip of an episode that begins at a frame.
+
+    Args:
+        config: gives ``data.context`` and ``evaluate.stride``.
+        episode: the episode.
+        index: its place among the episodes.
+        start: the present frame.
+        count: frames to imagine.
+    """
+    targets = start + config.evaluate.stride * np.arange(1, count + 1)
+    return ClipChoice(
+        episode=index,
+        name=episode.name,
+        scene=episode.scene,
+        start=start,
+        context_S=context_frames(start, config.data.context),
+        targets_N=tuple(int(target) for target in targets),
+    )
+
+
+def long_choices(config: Config, episodes: Sequence[Episode]) -> list[ClipChoice]:
+    """Choose one long rollout per episode, from the start of its way back.
+
+    Returns:
+        At most ``ROLLOUTS`` of ``evaluate.video_clips`` clips, or of fewer if the episodes are too
+        short.
+
+    Raises:
+        UserError: no episode is long enough for one clip.
+    """
+    count = min(ROLLOUTS, len(episodes))
+    for chain in range(config.evaluate.video_clips, 1, -1):
+        try:
+            return choose(config, episodes, count, chain)
+        except UserError:
+            continue
+    return choose(config, episodes, count, 1)
+
+
+def needs_cameras(episodes: Sequence[Episode], choices: Sequence[ClipChoice]) -> bool:
+    """Tell whether clips must be driven by cameras: some motion is not upright (by hand, log)."""
+    for choice in choices:
+        episode = episodes[choice.episode]
+        poses = episode.world_from_camera[[choice.start, *choice.targets_N]]
+        replayed = np.asarray(integrate(poses[0], np.asarray(actions_between(poses))))
+        if np.abs(replayed - poses).max() > POSE_TOLERANCE:
+            return True
+    return False
+
+
+def load_clip(
+    config: Config, episodes: Sequence[Episode], choice: ClipChoice, *, cameras: bool = False
+) -> tuple[Frames, Frames, Array | Camera]:
+    """Read one chosen clip.
+
+    Args:
+        config: the experiment.
+        episodes: held-out episodes.
+        choice: the clip.
+        cameras: whether it is driven by the recorded cameras, in six degrees of freedom, and not
+            by actions (``needs_cameras``).
+
+    Returns:
+        ``(context, targets, control)``: S context frames, N true frames, and what leads from the
+        present through them: (N, 3) actions composed from the recorded poses, or (N,) cameras.
+        Frames that pad the context have a depth of 0 (not measured) everywhere.
+
+    Raises:
+        UserError: the recorded actions or the upright motion of poses do not lead to the
+            recorded poses, or the frames have another size than the model's.
+    """
+    episode = episodes[choice.episode]
+    context = _without_padding(episode.frames(list(choice.context_S)), choice.context_S)
+    targets = episode.frames(list(choice.targets_N))
+    size = (config.model.clip.height, config.model.clip.width)
+    if targets.rgb_THWC.shape[1:3] != size:
+        height, width = targets.rgb_THWC.shape[1:3]
+        raise UserError(
+            f"episode {choice.name} has frames of {height}×{width} and this model was trained on "
+            f"{size[0]}×{size[1]}: collect or import the data at the model's size."
+        )
+    if cameras:
+        return context, targets, targets.camera
+    poses = np.concatenate(
+        [context.camera.world_from_camera[-1:], targets.camera.world_from_camera]
+    )
+    actions_N3 = np.asarray(actions_between(poses))
+    _check_motion(np.asarray(_followed(poses[0], actions_N3)), poses, choice, "upright motion")
+    if episode.actions is not None and episode.actions.shape[1] == PLANAR:
+        recorded = np.asarray(continuous(config.model.actions, episode.actions))
+        steps = recorded[choice.start : choice.targets_N[-1]]
+        every = np.asarray(_followed(poses[0], steps))
+        taken = every[[index - choice.start for index in (choice.start, *choice.targets_N)]]
+        _check_motion(taken, poses, choice, "recorded actions")
+    return context, targets, actions_N3
+
+
+def _without_padding(context: Frames, context_S: Sequence[int]) -> Frames:
+    """Return a context in which frames that are repeated have depth in the last copy alone."""
+    repeated = np.append(np.diff(context_S) == 0, False)
+    depth = np.where(repeated[:, None, None], 0, context.depth_THW).astype(np.float32)
+    return dataclasses.replace(context, depth_THW=depth)
+
+
+_followed = jax.jit(integrate)
+"""``integrate``, compiled once for each length and not for each clip."""
+
+
+def _check_motion(integrated: np.ndarray, poses: np.ndarray, choice: ClipChoice, what: str) -> None:
+    error = np.abs(integrated - poses).max((1, 2))
+    if error.max() > POSE_TOLERANCE:
+        worst = int(error.argmax())
+        frame = (choice.start, *choice.targets_N)[worst]
+        raise UserError(
+            f"episode {choice.name}: at frame {frame} the {what} and the recorded pose disagree "
+            f"by {error[worst]:.3g}; run `python -m pewm_jax.data validate` on the data."
+        )
+
+
+def stack(trees: list[T], size: int) -> T:
+    """Stack pytrees along a new leading axis, repeating the last one up to ``size``."""
+    padded = trees + [trees[-1]] * (size - len(trees))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
+
+
+def fingerprint(
+    config: Config,
+    weights: str,
+    dataset: str,
+    lpips: str = "",
+    protocol: str = "",
+    baseline: str = "",
+) -> str:
+    """Return a hash of all that scores depend on, but the choice of seeds, rivals and measures.
+
+    Args:
+        config: the run's configuration, with overrides for the evaluation.
+        weights: sha256 of the weights.
+        dataset: sha256 of the data set's index.
+        lpips: sha256 of the weights of LPIPS; "" if it is left out.
+        protocol: hash of the choices in a protocol's file, except for seeds; "" if clips are chosen
+            by the settings.
+        baseline: with a protocol, sha256 of the index of the split that chooses the reprojection's
+            settings; "" if there is none.
+    """
+    settings = to_dict(config)
+    for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src", "scs"):
+        settings["evaluate"].pop(key)
+    for key in ("train", "data"):
+        settings.pop(key)
+    settings["context"] = config.data.context
+    content = {"version": VERSION, "settings": settings, "weights": weights, "data": dataset}
+    content["lpips"] = lpips
+    if protocol:
+        content |= {"protocol": protocol, "data": baseline}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,437 @@
+"""Evaluate a trained run: write ``report/`` with metrics.json, index.html and its pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from pewm_jax.config import Config, UserError
+from pewm_jax.data.dataset import MANIFEST, EpisodeSource
+from pewm_jax.eval import loaded_run as runs
+from pewm_jax.eval import reproject, results, steering
+from pewm_jax.eval.clips import ClipChoice, fingerprint
+from pewm_jax.eval.coverage import score_coverage
+from pewm_jax.eval.gallery import make_gallery
+from pewm_jax.eval.long_rollouts import LongRollouts, roll_long
+from pewm_jax.eval.metrics.selection import ReportMetrics, select_metrics
+from pewm_jax.eval.mirror import Mirror, mirror_test, way_out
+from pewm_jax.eval.protocol import (
+    Protocol,
+    apply_protocol_file,
+    describe_shortened,
+    resolve_clips,
+    save_protocol,
+)
+from pewm_jax.eval.reproject import ReprojectChoice, choose_settings
+from pewm_jax.eval.results import compute_metrics
+from pewm_jax.eval.runner import Methods, ModelRunner, print_now, workers
+from pewm_jax.eval.scoring import Scored, score_table
+from pewm_jax.io import atomic
+from pewm_jax.io.store import ResultCache, file_hash
+from pewm_jax.report.evaluation_page import Gallery, evaluation_page
+from pewm_jax.report.labels import score_lines, summary_lines
+from pewm_jax.report.pictures import ROWS, save_png
+from pewm_jax.train import processes
+
+TRAINED_ON = "train"
+"""The split that training reads."""
+REPORT_VERSION = 11
+"""Increase it whenever the same scores would give another report."""
+PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
+PROTOCOL = "protocol.json"
+"""The protocol of a report, in its folder; another run can be scored by it."""
+
+
+def override(config: Config, **changes: Any) -> Config:
+    """Return the configuration with some of the evaluation's settings changed.
+
+    Args:
+        config: the run's configuration.
+        changes: fields of ``EvalConfig``, ``steps`` (of the sampler) and ``data`` (folder of the
+            data set). None keeps a setting.
+
+    Raises:
+        ConfigError: a value cannot work.
+    """
+    changes = {key: value for key, value in changes.items() if value is not None}
+    steps, data = changes.pop("steps", None), changes.pop("data", None)
+    for name in ("none", "lpips", "protocol", "fvd", "scs"):
+        if name in changes:
+            changes[name] = str(changes[name])
+    if steps is not None:
+        if not config.model.sample_steps:
+            raise UserError(
+                f"--steps is {steps}, and this world has no sampler whose steps could be chosen: "
+                "leave it out."
+            )
+        config = dataclasses.replace(config, model=config.model.with_sample_steps(steps))
+    if data is not None:
+        config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))
+    return dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, **changes))
+
+
+def evaluate(
+    run: str | Path,
+    *,
+    out: str | Path | None = None,
+    log: Callable[[str], Any] = print_now,
+    **changes: Any,
+) -> Path:
+    """Score a trained run and write its report.
+
+    Several processes (``train.processes``) share the work, and several devices of one process its
+    batches; the first process writes the report.
+
+    After an interruption, finished scores are reused. A report that is complete for these weights
+    and this protocol is not written again.
+
+    Args:
+        run: a run folder made by ``train.py``.
+        out: the folder to write; by default ``RUN/report``, or ``RUN/report-NAME`` for other data
+            or another split than the run's own.
+        log: shows a progress line.
+        changes: as for ``override``; beside a protocol's file not what it fixes.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        UserError: the run, its weights or the data are absent, damaged, or do not fit together.
+    """
+    loaded = runs.open_run(run)
+    job = _open_job(loaded, changes)
+    config, folder = job.config, Path(out) if out else runs.report_folder(loaded, job.config)
+    processes.meet("evaluate: begin")
+    complete = is_complete(
+        folder, config, job.fingerprint, job.none_weights, job.metrics.hashes, job.validation
+    )
+    processes.meet("evaluate: decided")  # nobody writes before all have looked
+    if complete:
+        log("the report is complete for these weights and this protocol; nothing to do")
+        return folder / PAGE
+    make_folder(folder)
+    cache = workers().first_alone(
+        lambda: ResultCache.for_weights(folder / "partial", loaded.weights_hash, job.fingerprint),
+        "folder",
+    )
+    if job.metrics.lpips is None:
+        log(job.metrics.about["lpips"])
+    choice = workers().first_alone(lambda: choose_settings(config, cache, log), "reprojection")
+    log(f"reprojection: {choice.why}")
+    protocol, clips, rollouts = resolve_clips(config, job.episodes, job.protocol, str(job.split))
+    log(f"protocol {protocol.sha256[:12]}: {len(clips)} clips, {len(rollouts)} long rollouts")
+    if not job.protocol and (short := describe_shortened(config, protocol)):
+        log(short)
+    methods = _methods(job, choice, log, cameras=protocol.control == "cameras")
+    measured = _measure(job, methods, cache, clips, rollouts, log)
+    if not processes.is_primary():
+        processes.meet("evaluate: report")  # devices that wait for one another would give up
+        return folder / PAGE
+    log("drawing the report …")
+    metrics = _metrics(job, measured, protocol, choice)
+    save_protocol(folder / PROTOCOL, protocol, {"data": str(job.split)})
+    gallery = make_gallery(config, job.episodes, measured.long)
+    _write(folder, metrics, gallery, measured.scored, measured.long)
+    processes.meet("evaluate: report")
+    for line in [*score_lines(metrics), *summary_lines(metrics)]:
+        log(line)
+    return folder / PAGE
+
+
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    """What is evaluated, and by which settings.
+
+    Attributes:
+        loaded: the run.
+        has_memory: whether it has a memory.
+        none: a run without a memory to compare with, or None.
+        config: the run's configuration with overrides, under the protocol's file.
+        protocol: the protocol of the file that the settings name, or None.
+        episodes: held-out episodes.
+        metrics: the metrics that the settings ask for.
+        validation: sha256 of the index of the split that chooses the reprojection's settings.
+        data_hash: sha256 of the index of the episodes.
+        fingerprint: hash of all that scores depend on.
+        trained_on: folder of the split that the run was trained on.
+    """
+
+    loaded: runs.LoadedRun
+    has_memory: bool
+    none: runs.LoadedRun | None
+    config: Config
+    protocol: Protocol | None
+    episodes: EpisodeSource
+    metrics: ReportMetrics
+    validation: str
+    data_hash: str
+    fingerprint: str
+    trained_on: Path
+
+    @property
+    def split(self) -> Path:
+        """The folder of the episodes."""
+        return Path(self.config.data.path) / self.config.evaluate.split
+
+    @property
+    def none_weights(self) -> str:
+        """The hash of the weights of ``none``; "" if there is none."""
+        return self.none.weights_hash if self.none else ""
+
+
+def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
+    """Read the data, the metrics and the rival that an evaluation needs.
+
+    Raises:
+        UserError: something is absent, or does not fit the run.
+    """
+    has_memory = runs.has_memory(loaded)
+    config, protocol = apply_protocol_file(override(loaded.config, **changes), changes)
+    split = Path(config.data.path) / config.evaluate.split
+    episodes = EpisodeSource(split)
+    none = runs.open_none(loaded, config)
+    data_hash = file_hash(split / MANIFEST)
+    metrics = select_metrics(
+        config,
+        accelerator=jax.default_backend() != "cpu",
+        ids=all(episodes[index].has_ids for index in range(len(episodes))),
+    )
+    validation = reproject.data_hash(config)
+    name = fingerprint(
+        config,
+        loaded.weights_hash,
+        data_hash,
+        metrics.lpips.sha256 if metrics.lpips else "",
+        protocol.pieces_sha256 if protocol else "",
+        validation if protocol else "",
+    )
+    trained_on = Path(loaded.config.data.path) / TRAINED_ON
+    return _Job(
+        loaded,
+        has_memory,
+        none,
+        config,
+        protocol,
+        episodes,
+        metrics,
+        validation,
+        data_hash,
+        name,
+        trained_on,
+    )
+
+
+def _methods(
+    job: _Job, choice: ReprojectChoice, log: Callable[[str], Any], *, cameras: bool
+) -> Methods:
+    """Return who imagines."""
+
+    def runner(run: runs.LoadedRun, config: Config) -> ModelRunner:
+        return ModelRunner(
+            config,
+            run.params,
+            job.config.evaluate.batch,
+            job.config.data.context,
+            log,
+            cameras=cameras,
+            devices=jax.local_devices(),
+        )
+
+    return Methods(
+        runner(job.loaded, job.config),
+        choice.settings,
+        runner(job.none, job.none.config) if job.none else None,
+        job.none_weights,
+        job.has_memory,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Measured:
+    """All measurements of an evaluation.
+
+    Attributes:
+        scored: errors of the clips.
+        long: errors of the long rollouts.
+        mirror: the mirror test, or None.
+        coverage: shares of the pixels that the map covers, or None.
+        steered: PSNR with true, shuffled and no actions, or None.
+        about: sentences on the mirror test and on steering, for the protocol.
+        cameras: whether cameras drive the model.
+    """
+
+    scored: Scored
+    long: LongRollouts
+    mirror: Mirror | None
+    coverage: dict[str, float] | None
+    steered: steering.Steered | None
+    about: dict[str, str | None]
+    cameras: bool
+
+
+def _measure(
+    job: _Job,
+    methods: Methods,
+    cache: ResultCache,
+    clips: list[ClipChoice],
+    rollouts: list[ClipChoice],
+    log: Callable[[str], Any],
+) -> _Measured:
+    """Imagine and measure everything; results in ``cache`` are reused."""
+    config, episodes, metrics = job.config, job.episodes, job.metrics
+    scored = score_table(
+        config, episodes, methods, cache, log, metrics.lpips, clips, metrics.i3d, metrics.structure
+    )
+    long = roll_long(config, episodes, methods, cache, log, metrics.lpips, rollouts)
+    mirrored = mirror_test(config, episodes, methods, cache, rollouts, metrics.visits, log)
+    covered = steered = about_steering = None
+    if methods.remembers and config.model.capabilities.coverage:
+        covered = score_coverage(config, episodes, methods.model, cache, log, clips)
+    if not methods.model.cameras:
+        params = job.loaded.params
+        steered, about_steering = steering.score(config, params, episodes, clips, cache, log)
+    about = {"mirror": way_out(config, rollouts)[1], "steering": about_steering}
+    return _Measured(scored, long, mirrored, covered, steered, about, methods.model.cameras)
+
+
+def _metrics(
+    job: _Job, measured: _Measured, protocol: Protocol, choice: ReprojectChoice
+) -> dict[str, Any]:
+    """Return the content of ``metrics.json``."""
+    metrics = compute_metrics(
+        job.config,
+        measured.scored,
+        measured.long,
+        measured.mirror,
+        job.metrics.i3d,
+        job.metrics.structure,
+    )
+    metrics |= {
+        "coverage": measured.coverage,
+        "steering": measured.steered and measured.steered.facts(),
+    }
+    if measured.cameras:
+        metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
+    metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], job.trained_on) | {
+        "reproject": choice.facts(),
+        "none": runs.none_facts(job.none, job.loaded) if job.none else None,
+        **job.metrics.about,
+        "lpips_name": job.metrics.lpips_name,
+        **measured.about,
+        **job.metrics.hashes,
+        "weights_sha256": job.loaded.weights_hash,
+        "dataset_sha256": job.data_hash,
+        "protocol_sha256": protocol.sha256,
+        "protocol_file": job.config.evaluate.protocol if job.protocol else None,
+        "fingerprint": job.fingerprint,
+        "report_version": REPORT_VERSION,
+    }
+    return metrics
+
+
+def _write(
+    folder: Path,
+    metrics: dict[str, Any],
+    gallery: Gallery,
+    scored: Scored,
+    long: LongRollouts,
+) -> None:
+    """Write all files of a report but its protocol; ``metrics.json``, which says so, at the end."""
+    (folder / METRICS).unlink(missing_ok=True)
+    names = ("protocol_sha256", "weights_sha256", "lpips_weights_sha256", "seeds")
+    facts = {name: metrics["protocol"][name] for name in names}
+    results.save_samples(folder, results.gather_samples(scored, long, **facts))
+    _save_pictures(folder, gallery)
+    page = evaluation_page(metrics, gallery)
+    atomic.write_text(folder / PAGE, page)
+    metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()
+    atomic.write_text(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")
+
+
+def _save_pictures(folder: Path, gallery: Gallery) -> None:
+    """Write the strip, still and moving, and the frames of each long rollout and method."""
+    save_png(folder / STRIP, gallery.strip)
+    (folder / MOVING).write_bytes(gallery.moving)
+    atomic.remove(folder / ROWS)
+    for index, row in enumerate(gallery.rows):
+        for name, picture in row.items():
+            save_png(folder / ROWS / f"{index:02d}-{name}.png", picture)
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of a report.
+
+    Raises:
+        UserError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"{folder} cannot be made ({error.strerror}); choose another folder with --out."
+        ) from None
+
+
+def is_complete(
+    folder: Path,
+    config: Config,
+    name: str,
+    none_weights: str = "",
+    extras: Mapping[str, Any] | None = None,
+    validation: str = "",
+) -> bool:
+    """Tell whether a folder holds the complete report for a fingerprint, seeds, videos and rival.
+
+    Args:
+        folder: the report's.
+        config: the run's configuration, with overrides for the evaluation.
+        name: the fingerprint of weights and protocol.
+        none_weights: sha256 of the weights of the model without a memory; "" if there is none.
+        extras: entries of the protocol on measures that can be left out.
+        validation: sha256 of the index of the split that chooses the reprojection's settings; ""
+            if there is none. Reports of version 0.1 do not state it and are not complete: their
+            partial scores are kept, and the report is written again.
+    """
+    try:
+        metrics = json.loads((folder / METRICS).read_text("utf-8"))
+        protocol = metrics["protocol"]
+        return (
+            protocol["fingerprint"] == name
+            and protocol["report_version"] == REPORT_VERSION
+            and protocol["seeds"] == list(config.evaluate.seeds)
+            and (protocol["none"] or {}).get("weights_sha256", "") == none_weights
+            and protocol["reproject"]["dataset_sha256"] == validation
+            and protocol["config"]["evaluate"]["videos"] == config.evaluate.videos
+            and protocol["config"]["evaluate"]["mirror"] == config.evaluate.mirror
+            and {key: protocol[key] for key in extras or {}} == (extras or {})
+            and metrics["page_sha256"] == file_hash(folder / PAGE)
+            and all((folder / file).is_file() for file in (STRIP, PROTOCOL, results.SAMPLES))
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def held_out(scenes: Sequence[str], trained_on: Path) -> dict[str, Any]:
+    """Tell whether the model was trained in the scenes it is scored in; compares names.
+
+    Args:
+        scenes: names of the scenes scored.
+        trained_on: folder of the split the run was trained on.
+
+    Returns:
+        ``held_out``: True if no scene is shared, False if some are, None if the training data is
+        not available; ``trained_scenes``: the scored scenes that are shared.
+    """
+    try:
+        source = EpisodeSource(trained_on)
+        known = {source[index].scene for index in range(len(source))}
+    except UserError:
+        return {"held_out": None, "trained_scenes": []}
+    shared = sorted(known & set(scenes))
+    return {"held_out": not shared, "trained_scenes": shared}
