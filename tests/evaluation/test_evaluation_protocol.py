@@ -26,7 +26,6 @@ from pewm_jax.data.episodes import read_episode
 from pewm_jax.eval.clips import (
     choose,
     context_frames,
-    file_hash,
     fingerprint,
     load_clip,
     stack,
@@ -34,6 +33,7 @@ from pewm_jax.eval.clips import (
 )
 from pewm_jax.eval.reproject import CANDIDATES, reproject
 from pewm_jax.geometry.actions import integrate
+from pewm_jax.io.store import file_hash
 
 
 @pytest.fixture(scope="module")
