@@ -43,8 +43,9 @@ def spelled_out(flags: Sequence[str], default: Any) -> list[str]:
         for old, new in RENAMED_FLAGS:
             if name == old or (old.endswith((".", "_")) and name.startswith(old)):
                 return f"--{new}{name.removeprefix(old)}{equals}{value}"
-        first = name.partition(".")[0].removeprefix("no_")
-        return f"--model.{name}{equals}{value}" if first in short else given
+        first = name.partition(".")[0]
+        ours = first in short or first.removeprefix("no_") in short
+        return f"--model.{name}{equals}{value}" if ours else given
 
     return [full(flag) for flag in flags]
 

@@ -72,12 +72,12 @@ class WorldModelEnv(gymnasium.Env):
             raise UserError(f"the world has no render_mode {render_mode!r}; there is 'rgb_array'.")
         self._model, self._params = model, params
         world = worlds.model_of(model)
-        clip, actions = (getattr(world, name, None) for name in ("clip", "actions"))
-        if clip is None or actions is None:
+        if not (isinstance(world, World) and world.capabilities.actions):
             raise UserError(
                 f"a {type(world).__name__} is no world to walk in: it has no actions; give one "
                 "that imagines, such as pewm_jax.load('small')."
             )
+        clip, actions = world.clip, world.actions
         self.config = dataclasses.replace(
             house or HouseConfig(),
             height=clip.height,

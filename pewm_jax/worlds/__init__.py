@@ -35,7 +35,7 @@ from jax.sharding import PartitionSpec
 
 from pewm_jax.config import Config, Task, UserError, World, functions
 from pewm_jax.types import Array, Frames, Params, WorldState
-from pewm_jax.worlds import checks
+from pewm_jax.worlds import checks, forms
 from pewm_jax.worlds.stages import Stage
 
 
@@ -238,7 +238,7 @@ def _start(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    return act(model, params, checks.in_metres(frames, depth_scale))
+    return act(model, forms.own(model, params), checks.in_metres(frames, depth_scale))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
@@ -250,7 +250,7 @@ def _observe(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    after = act(model, params, state, checks.in_metres(frames, depth_scale))
+    after = act(model, forms.own(model, params), state, checks.in_metres(frames, depth_scale))
     ok = checks.valid((), state.frame.camera)
     return WorldState(checks.poisoned(ok, after.frame), checks.kept(ok, after.map, state.map))
 
@@ -270,7 +270,8 @@ def _imagine(
     memory: bool,
 ) -> tuple[WorldState, Frames]:
     """Imagine; without ``remember`` the state has no memory: the caller's is not copied."""
-    after, frames = act(model, params, state, control, key, remember=remember, memory=memory)
+    own = forms.own(model, params)
+    after, frames = act(model, own, state, control, key, remember=remember, memory=memory)
     ok = checks.valid(control, state.frame.camera)
     kept = checks.kept(ok, after.map, state.map) if remember else None
     return WorldState(checks.poisoned(ok, after.frame), kept), checks.poisoned(ok, frames)
@@ -291,7 +292,8 @@ def _imagine_many(
 ) -> tuple[Frames, Frames]:
     """Return (K, 1) present frames, and (K, n) imagined ones or the last of them."""
     shown = {} if views is None else {"views": views}
-    after, frames = act(model, params, state, controls, keys, memory=memory, last=last, **shown)
+    own = forms.own(model, params)
+    after, frames = act(model, own, state, controls, keys, memory=memory, last=last, **shown)
     ok = checks.valid(controls, state.frame.camera, leading=1)
     return checks.poisoned(ok, after.frame), checks.poisoned(ok, frames)
 
@@ -312,7 +314,7 @@ def views(model: Config | Task, params: Params, state: WorldState) -> Callable[[
     that candidates are compared from.
     """
     model = require_world(model_of(model), "views()")
-    return function(model, "views")(model, params, state)
+    return function(model, "views")(model, forms.own(model, params), state)
 
 
 def init(model: Config | Task, key: Array) -> Params:
@@ -324,7 +326,8 @@ def init(model: Config | Task, key: Array) -> Params:
 def stages(model: Config | Task) -> tuple[Stage, ...]:
     """Return the stages of a world's training, in order."""
     model = model_of(model)
-    return function(model, "stages")(model)
+    found = function(model, "stages")(model)
+    return tuple(forms.with_dictionaries(model, stage) for stage in found)
 
 
 def sharding(model: Config | Task) -> tuple[tuple[str, Any], ...]:
@@ -402,7 +405,7 @@ def memory_points(
 def erase(model: Config | Task, params: Params, state: WorldState, box_23: Array) -> WorldState:
     """Return a world that forgot what is in a box; see ``World.erase``."""
     model = require_world(model_of(model), "erase()")
-    return function(model, "erase")(model, params, state, box_23)
+    return function(model, "erase")(model, forms.own(model, params), state, box_23)
 
 
 def move(
@@ -416,7 +419,8 @@ def move(
 ) -> WorldState:
     """Return a world in which what is in a box was moved; see ``World.move``."""
     model = require_world(model_of(model), "move()")
-    return function(model, "move")(model, params, state, box_23, transform, leave=leave)
+    own = forms.own(model, params)
+    return function(model, "move")(model, own, state, box_23, transform, leave=leave)
 
 
 def coverage(
@@ -424,4 +428,5 @@ def coverage(
 ) -> dict[str, Array]:
     """Return how many pixels seen before the memory holds; see ``World.coverage``."""
     model = require_world(model_of(model), "coverage()")
-    return function(model, "coverage")(model, params, state, frames, seen_THW)
+    own = forms.own(model, params)
+    return function(model, "coverage")(model, own, state, frames, seen_THW)
