@@ -195,7 +195,8 @@ def test_the_cache_of_a_rollout_is_that_of_its_frames_at_once(params, state):
     inputs, times = clean.precondition(latents, times)
     _, cache = voxel_dit.apply(
         config, params["voxel_dit"], inputs, times, actions, told,
-        camera_BTN=camera if config.camera_numbers else None, cache=voxel_dit.no_frames(config, 1),
+        camera_BTN=camera if config.camera_numbers else None,
+        cache=voxel_dit.empty_cache(config, 1),
     )  # fmt: skip
     found = present.map.history.voxels
     np.testing.assert_allclose(found.keys_LBSNKd, cache.keys_LBSNKd, atol=1e-4)

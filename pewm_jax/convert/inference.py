@@ -14,6 +14,7 @@ the networks compute in ``model.dtype`` all the same, because every layer casts 
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -24,20 +25,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax import __version__
+from pewm_jax import __version__, worlds
 from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
-from pewm_jax.config import Config, UserError
-from pewm_jax.convert import card, output
+from pewm_jax.config import Config, UserError, World
+from pewm_jax.convert import output
+from pewm_jax.data.dataset import read_manifest
 from pewm_jax.eval.evaluate import METRICS
 from pewm_jax.io import sources, tensor_files, tree, weights
 from pewm_jax.io.store import file_hash
+from pewm_jax.report.labels import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, heading, number
 from pewm_jax.train import runs
 from pewm_jax.types import Params
 from pewm_jax.worlds import rollouts
 
 CARD = "README.md"
 REPORT = Path("report") / METRICS
+TRAINED_ON = "train"
+"""The split that training reads."""
 
 
 def export(
@@ -72,7 +77,7 @@ def export(
             )
         origin = _base(run, config)
         metadata = weights.metadata(run / runs.WEIGHTS)
-        facts = card.Facts(
+        facts = CardFacts(
             name=dst.name,
             version=__version__,
             config=config,
@@ -88,7 +93,7 @@ def export(
         configuration.save(config, folder / runs.CONFIG)
         if origin:
             shutil.copyfile(origin, folder / runs.BASE)
-        (folder / CARD).write_text(card.write(facts), encoding="utf-8")
+        (folder / CARD).write_text(write_card(facts), encoding="utf-8")
     say(f"{dst} is ready: pewm_jax.load({str(dst)!r})")
     return dst
 
@@ -145,3 +150,199 @@ def _metrics(run: Path) -> dict[str, Any] | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return found if scored == file_hash(run / runs.WEIGHTS) else None
+
+
+@dataclasses.dataclass(frozen=True)
+class CardFacts:
+    """What a card is written from.
+
+    Attributes:
+        name: its heading.
+        version: of this library.
+        config: the run's settings.
+        params: its weights.
+        stage: number of the last finished stage, "0" for converted weights before any training.
+        step: steps of that stage.
+        base: what ``base.json`` says of the checkpoint the run started from, if it did.
+        metrics: what the report of these weights says, if there is one.
+    """
+
+    name: str
+    version: str
+    config: Config
+    params: Params
+    stage: str | None
+    step: str | None
+    base: Mapping[str, Any] | None
+    metrics: Mapping[str, Any] | None
+
+
+def write_card(facts: CardFacts) -> str:
+    """Return the card in Markdown."""
+    sections = [
+        f"# {facts.name}",
+        _what(facts),
+        _use(facts),
+        _data(facts),
+        _training(facts),
+        _scores(facts.metrics),
+        _licence(facts),
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def _what(facts: CardFacts) -> str:
+    config, clip = facts.config, facts.config.model.clip
+    counts = {
+        part: sum(np.size(leaf) for leaf in jax.tree.leaves(tree))
+        for part, tree in facts.params.items()
+    }
+    rows = [f"| {part} | {count / 1e6:.2f} |" for part, count in counts.items()]
+    table = "\n".join(["| part | million parameters |", "|---|---:|", *rows])
+    if not isinstance(config.model, World):
+        return f"{config.model.CARD[0]} pewm_jax {facts.version}.\n\n{table}".lstrip()
+    parts, can = config.model.facts, config.model.capabilities
+    memory = "no memory"
+    if can.memory:
+        memory = (
+            f"a memory of kind `{parts.memory}`" if parts.memory else "a memory of its own kind"
+        )
+    if can.memory_parameters and can.memory_parameters not in facts.params:
+        memory = "no memory (only its first stage is trained)"
+    made_of = [f"image features `{parts.encoder}`"] * bool(parts.encoder)
+    made_of += [f"codec `{parts.codec}`"] * bool(parts.codec)
+    made_of = ", ".join(["", " and ".join(made_of)]) if made_of else ""
+    size = f"{clip.frames} frames of {clip.width} × {clip.height} pixels"
+    seen = "colour and depth" if can.depth else "in colour"
+    return (
+        "A persistent embodied world model: given posed RGB-D frames and an agent's actions, it "
+        f"imagines what the agent will see, {seen}, in clips of {size}, with {memory}{made_of}."
+        f"\n\n{table}\n\n"
+        "Weights are the moving average of training where it trained and the unchanged base "
+        f"elsewhere, rounded to 16 bits; they compute in {config.model.dtype}. Written by "
+        f"pewm_jax {facts.version}."
+    )
+
+
+def _use(facts: CardFacts) -> str:
+    model = facts.config.model
+    if not isinstance(model, World):
+        return f"## Use\n\n{model.CARD[1].format(name=facts.name)}"
+    clip, actions = facts.config.model.clip, facts.config.model.actions
+    length = clip.frames - 1
+    return f"""## Use
+
+```python
+import jax
+import pewm_jax
+
+config, params = pewm_jax.load("{facts.name}")
+state = pewm_jax.start(config, params, frames)  # pewm_jax.Frames, {clip.height} × {clip.width}
+state, imagined = pewm_jax.rollout(config, params, state, [0] * {length}, jax.random.key(0))
+```
+
+Actions: 0 forward {actions.step_m:g} m, 1 left and 2 right {actions.turn_deg:g}°, or floats
+(dx, dy, dyaw); {length} a clip.{_sampler(model)}"""
+
+
+def _sampler(model: World) -> str:
+    """Return a sentence on the sampler, with the noise; nothing of a world without one."""
+    names = " ".join(filter(None, (model.facts.noise, model.facts.sampler)))
+    return f" Sampling: {names}, {model.sample_steps} steps." if names else ""
+
+
+def _data(facts: CardFacts) -> str:
+    config = facts.config
+    if facts.stage == "0":
+        return "## Data\n\nNone here: see what the original was trained on."
+    name = Path(config.data.path).name
+    try:
+        manifest = read_manifest(Path(config.data.path) / TRAINED_ON, check_files=False)
+    except UserError:
+        size = "which is not there any more to be counted"
+    else:
+        made = manifest.settings.get("made_by")
+        how = f", made by `{made}`" if made else ""
+        size = f"split `{TRAINED_ON}`: {manifest.records} episodes, {manifest.frames} frames{how}"
+    return (
+        f"## Data\n\n`{name}`, {size}. Clips take every {config.data.stride_min} to "
+        f"{config.data.stride_max} actions a frame, with up to {config.data.context} earlier "
+        "frames as context."
+    )
+
+
+def _training(facts: CardFacts) -> str:
+    train = facts.config.train
+    head = "## Training\n\n"
+    if facts.stage == "0":
+        return head + "None: these are converted weights, before any training."
+    rows = ["| stage | steps | batch | learning rate | what learns |", "|---|---:|---:|---:|---|"]
+    for number_, stage, what in (
+        (str(stage.number), stage.settings(facts.config), ", ".join(stage.trained))
+        for stage in worlds.stages(facts.config.model)
+    ):
+        if stage.steps == 0:
+            done = "–"
+        elif number_ == facts.stage and facts.step is not None:
+            done = facts.step
+        else:
+            done = str(stage.steps) if number_ < (facts.stage or "") else f"0 of {stage.steps}"
+        rows.append(f"| {number_} | {done} | {stage.batch} | {stage.learning_rate:g} | {what} |")
+    tail = f"\n\nMoving average {train.ema:g}, seed {train.seed}"
+    if facts.config.model.facts.noise:
+        tail += f", noise {facts.config.model.facts.noise}"
+    tail += f". It started from `{train.start}`." if train.start else "."
+    return head + "\n".join(rows) + tail
+
+
+def _scores(metrics: Mapping[str, Any] | None) -> str:
+    head = "## Scores\n\n"
+    if metrics is None:
+        return head + "None: these weights have no report; `python evaluate.py RUN` makes one."
+    protocol = metrics["protocol"]
+    shown = {
+        metric: (heading(metric, protocol), digits)
+        for metric, (_, digits) in METRIC_NAMES.items()
+        if any(
+            metric in scores for masks in metrics["results"].values() for scores in masks.values()
+        )
+    }
+    rows = [
+        "| pixels | method | " + " | ".join(name for name, _ in shown.values()) + " |",
+        "|---|---|" + "---:|" * len(shown),
+    ]
+    for mask, where in MASK_NAMES.items():
+        for method, label in METHOD_NAMES.items():
+            if method not in metrics["results"]:
+                continue
+            scores = metrics["results"][method][mask]
+            cells = [
+                number(scores[m], digits) if m in scores else "–"
+                for m, (_, digits) in shown.items()
+            ]
+            rows.append(f"| {where} | {label} | " + " | ".join(cells) + " |")
+    new = {True: "none of which", False: "some of which", None: "of which it is not known which"}
+    said = (
+        f"\n\nMeasured before rounding: {protocol['clips']} clips in {protocol['scenes']} scenes, "
+        f"{new[protocol['held_out']]} it was trained in, seeds "
+        f"{', '.join(map(str, protocol['seeds']))}, {protocol['sampling_steps']} sampling steps, "
+        f"protocol {protocol['fingerprint'][:12]}."
+    )
+    return head + "\n".join(rows) + said
+
+
+def _licence(facts: CardFacts) -> str:
+    head = "## Licence\n\n"
+    if "encoder" in facts.params:
+        head += "The image encoder is a converted DINOv2: its weights keep their own licence.\n\n"
+    if facts.base is None:
+        return head + (
+            "Trained from random weights: whoever trained them chooses a licence, and answers for "
+            "the data."
+        )
+    name = facts.base.get("name", "a converted checkpoint")
+    said = facts.base.get("licence", "not stated")
+    return head + (
+        f"Made from `{name}`, whose licence is: {said}. It binds what is made from it, these "
+        "weights included."
+    )

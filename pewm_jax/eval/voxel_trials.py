@@ -234,7 +234,7 @@ def _rays_on_block(
     marked = class_edit.place(model.memory, grid, box_23, 1)
     unmarked = class_edit.place(model.memory, grid, box_23, 0)
     both = [
-        voxel_renderer.look(
+        voxel_renderer.cast_rays(
             model.backbone.renderer,  # type: ignore[attr-defined]
             jnp.maximum(windows.window(model, one.classes_XYZ, first), 0)[None],
             (grid.low_3 + first * windows.cell_m(model))[None],

@@ -140,7 +140,7 @@ def perceptual(
     """Return LPIPS as a cost, with weights from a file or the installed package.
 
     Args:
-        path: a file of weights (``models.lpips_weights``), or None for the package's.
+        path: a file of weights (``models.lpips.convert``), or None for the package's.
         net: the network.
         weights: see ``_OfPictures``.
 

@@ -99,7 +99,7 @@ def net(request):
 
 def test_frame_by_frame_with_a_cache_is_all_at_once(net):
     module, config, run, params, inputs, whole = net
-    cache = module.no_frames(config, 2)
+    cache = module.empty_cache(config, 2)
     made = []
     for t in range(FRAMES):
         one = jax.tree.map(lambda x, t=t: x[:, t : t + 1], inputs)
@@ -152,7 +152,7 @@ def test_later_frames_do_not_read_unknown_tokens():
     assert bool((whole[:, 1, 2] != other[:, 1, 2]).any())  # a token always reads itself
     np.testing.assert_array_equal(whole.at[:, 1, 2].set(0), other.at[:, 1, 2].set(0))
     assert bool((run(x, jnp.ones_like(known))[0][:, 2, 2] != whole[:, 2, 2]).any())
-    cache = frame_blocks.no_frames(BLOCKS, 2, 5)
+    cache = frame_blocks.empty_cache(BLOCKS, 2, 5)
     half = FRAMES // 2
     first, cache = run(x[:, :half], known[:, :half], cache)
     np.testing.assert_allclose(first, whole[:, :half], atol=1e-5)
@@ -227,7 +227,7 @@ def test_published_sizes_run_in_bfloat16_with_a_cache(name):
         "renderer": lambda: (array(36, 64, 16), array(), array(36, 64, 752)),
     }[name]()
     options = {"dtype": half} if name == "camera_model" else {}
-    cache = jax.eval_shape(lambda: module.no_frames(config, 1, half))
+    cache = jax.eval_shape(lambda: module.empty_cache(config, 1, half))
     made, after = jax.eval_shape(
         lambda p, x, c: module.apply(config, p, *x, cache=c, **options), params, inputs, cache
     )

@@ -86,7 +86,7 @@ def test_each_frame_looks_into_its_own_grid_through_the_middle_of_latents():
     poses = np.stack([cameras.pose_from_yaw(low[i] + 1.75, 0.0) for i in range(2)])
     fine = Camera(np.tile(cameras.intrinsics_from_fov(24, 32, 60), (2, 1)), poses)
     look = jax.jit(
-        lambda camera, size: voxel_renderer.look(CONFIG, grids, low, 0.5, camera, size),
+        lambda camera, size: voxel_renderer.cast_rays(CONFIG, grids, low, 0.5, camera, size),
         static_argnums=1,
     )
     made = look(fine, (24, 32))

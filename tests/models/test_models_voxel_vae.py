@@ -12,7 +12,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.io import tree
-from pewm_jax.models.persist import voxel_vae, voxel_vae_shapes
+from pewm_jax.models.persist import costs, voxel_vae
 from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.nn.costs import Share
 from tests.persist_nets import weights
@@ -196,7 +196,7 @@ def test_fitted_latents_have_mean_0_and_variance_1_and_decode_the_same():
         return latents, voxel_vae.logits(config, p, latents)
 
     before, scores = both(params)
-    fitted = voxel_vae.fitted(params, before.mean(axes), before.std(axes))
+    fitted = voxel_vae.with_statistics(params, before.mean(axes), before.std(axes))
     after, same = both(fitted)
     np.testing.assert_allclose(after.mean(axes), 0, atol=1e-4)
     np.testing.assert_allclose(after.std(axes), 1, atol=1e-4)
@@ -272,7 +272,7 @@ def test_published_size_sharding_and_costs():
         lambda p, x, k: voxel_vae.loss(slabs, p, x, k, jnp.bfloat16), params, grids, key
     )
     assert (loss.shape, loss.dtype) == ((), jnp.float32)
-    specs = tree.assign(voxel_vae_shapes.SHARDING, {"voxel_vae": params})
+    specs = tree.assign(voxel_vae.SHARDING, {"voxel_vae": params})
     assert any(spec != P() for spec in jax.tree.leaves(specs, is_leaf=lambda x: isinstance(x, P)))
     for small in (LIKE_PUBLISHED, dataclasses.replace(FOLDED, convolution="xla")):
         weights = jax.eval_shape(lambda c=small: voxel_vae.init(c, jax.random.key(0)))
@@ -280,7 +280,7 @@ def test_published_size_sharding_and_costs():
         ran = jax.jit(
             lambda p, x, c=small: voxel_vae.logits(c, p, voxel_vae.encode(c, p, x))
         ).lower(weights, ids)
-        (product,) = voxel_vae_shapes.costs(small, Share(), 1, trained=True).products
+        (product,) = costs.voxel_vae_costs(small, Share(), 1, trained=True).products
         assert product.macs > 0
         assert abs(ran.cost_analysis()["flops"] / (2 * product.macs) - 1) < 0.5
 

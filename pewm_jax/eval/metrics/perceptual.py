@@ -147,7 +147,7 @@ def read_lpips(path: Path, net: Net | None = None) -> LPIPS:
         net: the network that it must be of; by default whichever it is.
 
     Raises:
-        UserError: see ``models.lpips_weights.read``.
+        UserError: see ``models.lpips.convert.read``.
     """
     found, params = lpips_weights.read(path, net)
     with path.open("rb") as file:

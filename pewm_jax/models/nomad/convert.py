@@ -20,7 +20,7 @@ from pewm_jax.config import UserError
 from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.io import tree, weights
 from pewm_jax.io.published import CONV, LINEAR, Entry, Transform
-from pewm_jax.models.nomad import efficientnet, unet1d
+from pewm_jax.models.nomad import efficientnet
 from pewm_jax.models.nomad import model as nomad
 from pewm_jax.types import Params
 
@@ -140,7 +140,7 @@ def _denoiser(config: NomadConfig) -> Iterator[Entry]:
     places = [(f"down_{n}", f"{net}.down_modules.{n}") for n in range(steps)]
     places.append(("middle", f"{net}.mid_modules"))
     places += [(f"up_{n}", f"{net}.up_modules.{steps - 1 - n}") for n in range(1, steps)]
-    there = unet1d.shapes(config)
+    there = nomad.denoiser_shapes(config)
     for ours, theirs in places:
         for letter, number in (("a", 0), ("b", 1)):
             here, module = f"denoiser/{ours}/{letter}", f"{theirs}.{number}"

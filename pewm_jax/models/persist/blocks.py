@@ -67,7 +67,7 @@ class FrameCache:
     count: Array
 
 
-def no_frames(
+def empty_cache(
     config: BlocksConfig, batch: int, tokens: int, dtype: Any = jnp.float32
 ) -> FrameCache:
     """Return the cache before the first frame, for ``tokens`` tokens in a frame."""
@@ -160,7 +160,7 @@ def run(
     x_BTND: Array,
     condition_BTD: Array,
     *,
-    given_BTMD: Array | None = None,
+    context_BTMD: Array | None = None,
     known_BTN: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
@@ -173,7 +173,7 @@ def run(
         x_BTND: (B, T, N, D) tokens of T frames, those after the cache's; their dtype is the dtype
             of the computation.
         condition_BTD: each frame's condition, from which its modulation is made.
-        given_BTMD: (B, T, M, D) the tokens that ``cross`` attends to, each frame to its own.
+        context_BTMD: (B, T, M, D) the tokens that ``cross`` attends to, each frame to its own.
         known_BTN: bool, which tokens later frames may read; None for all.
         cache: the frames before; None if there are none and none are to be kept.
 
@@ -202,7 +202,7 @@ def run(
             if part == "time":
                 mixed, kept = _over_time(config, inside, normed, angles_TR, allowed, kept)
             else:
-                context = normed if part == "space" else given_BTMD
+                context = normed if part == "space" else context_BTMD
                 mixed = _in_frame(config, inside, normed, context)
             x = x + gate * mixed
             shift, scale, gate = after

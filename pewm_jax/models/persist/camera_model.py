@@ -48,9 +48,9 @@ def init(config: CameraModelConfig, key: Array) -> Params:
     return params
 
 
-def no_frames(config: CameraModelConfig, batch: int, dtype: Any = jnp.float32) -> FrameCache:
+def empty_cache(config: CameraModelConfig, batch: int, dtype: Any = jnp.float32) -> FrameCache:
     """Return the cache before the first frame."""
-    return frame_blocks.no_frames(config.blocks, batch, 1, dtype)
+    return frame_blocks.empty_cache(config.blocks, batch, 1, dtype)
 
 
 def innermost(config: CameraModelConfig, classes_XYZ: Array) -> Array:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+
 from pewm_jax.models.persist.blocks import Parts
-from pewm_jax.models.persist.config import BlocksConfig
+from pewm_jax.models.persist.config import BlocksConfig, VoxelVAEConfig
+from pewm_jax.models.persist.voxel_vae import kernels
 from pewm_jax.nn.costs import SPLIT, Costs, Product, Share
 
 
@@ -74,3 +78,49 @@ def costs(
         gathered=2 * config.layers * part * (share.context > 1),
         scattered=2 * config.layers * part * (share.context > 1) * trained,
     )
+
+
+def voxel_vae_costs(config: VoxelVAEConfig, share: Share, grids: int, *, trained: bool) -> Costs:
+    """Return the costs of encoding ``grids`` grids of a clip, and in training of decoding them.
+
+    Args:
+        config: the network.
+        share: one device's share of the step.
+        grids: of a clip.
+        trained: whether it learns; else it is frozen, and only encodes.
+    """
+    if trained and config.cube:
+        grids *= config.cubes
+        config = dataclasses.replace(config, side=config.cube, cube=0)
+    macs, kept, largest = 0.0, 0.0, 0.0
+    for path, shape in kernels(config).items():
+        if not trained and path.startswith("decoder"):
+            continue
+        places = _places(config, path) ** 3
+        look_up = path == "encoder/embed"
+        if path == "decoder/scores" and config.compared:
+            places = config.compared
+        macs += 0 if look_up else places * math.prod(shape)
+        values = places * (shape[-1] if path != "decoder/scores" or not config.slab else 0)
+        kept, largest = kept + values, max(largest, values)
+    bytes_of = share.clips * grids * share.activation_bytes
+    return Costs(
+        (Product("voxel_vae", "convolution", macs * grids, 2.0 * trained),),
+        kept=3 * kept * bytes_of * trained,  # a norm's, an activation's and a kernel's input
+        held=0.0 if trained else 3 * largest * bytes_of,
+        streamed=(9 if trained else 3) * kept * bytes_of,
+    )
+
+
+def _places(config: VoxelVAEConfig, path: str) -> int:
+    """Return the places along an axis at which a layer computes."""
+    if path in ("encoder/embed", "decoder/scores"):
+        return config.side
+    finest = config.side // config.patch
+    if path in ("encoder/into", "decoder/out"):
+        return finest
+    if "level_" not in path:
+        return config.latent_side
+    level = int(path.split("level_")[1].partition("/")[0])
+    level += {"down": 1, "up": -1}.get(path.rpartition("/")[2], 0)
+    return finest // 2**level

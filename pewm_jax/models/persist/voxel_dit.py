@@ -56,9 +56,9 @@ def init(config: VoxelDiTConfig, key: Array) -> Params:
     return frame_blocks.init(config.blocks, PARTS, ends(config), key)
 
 
-def no_frames(config: VoxelDiTConfig, batch: int, dtype: Any = jnp.float32) -> FrameCache:
+def empty_cache(config: VoxelDiTConfig, batch: int, dtype: Any = jnp.float32) -> FrameCache:
     """Return the cache before the first frame."""
-    return frame_blocks.no_frames(config.blocks, batch, config.tokens, dtype)
+    return frame_blocks.empty_cache(config.blocks, batch, config.tokens, dtype)
 
 
 def apply(
@@ -131,7 +131,7 @@ def apply(
         params["blocks"],
         x,
         condition,
-        given_BTMD=given,
+        context_BTMD=given,
         known_BTN=known_BTxyz,
         cache=cache,
     )

@@ -65,12 +65,12 @@ def init(config: VoxelRendererConfig, key: Array) -> Params:
     return params
 
 
-def no_frames(config: VoxelRendererConfig, batch: int, dtype: Any = jnp.float32) -> FrameCache:
+def empty_cache(config: VoxelRendererConfig, batch: int, dtype: Any = jnp.float32) -> FrameCache:
     """Return the cache before the first frame."""
-    return frame_blocks.no_frames(config.blocks, batch, config.tokens, dtype)
+    return frame_blocks.empty_cache(config.blocks, batch, config.tokens, dtype)
 
 
-def look(
+def cast_rays(
     config: VoxelRendererConfig,
     classes_TXYZ: Array,
     low_T3: Array,
@@ -120,7 +120,7 @@ def features(
     Args:
         config: the network.
         params: its parameters.
-        layers: what rays meet, from ``look``.
+        layers: what rays meet, from ``cast_rays``.
         dtype: of the computation.
         drawn_hwC: (..., h, w, C) latents of the voxels drawn in the colours of their classes,
             where the network takes them (``config.drawn``); they are the last channels.

@@ -6,7 +6,7 @@ divergence from a normal distribution. One-hot ids through a linear layer are a 
 vectors, and that is how they are read here.
 
 Latents leave with mean 0 and variance 1 per channel once ``latent_mean_C`` and ``latent_scale_C``
-are set (``fitted``).
+are set (``with_statistics``).
 
 Parameters: ``encoder/embed, into (patch > 1), level_i/block_k, level_i/down, middle_k, norm, out``;
 the decoder's are the mirror image, and end in ``scores``.
@@ -21,10 +21,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import UserError
 from pewm_jax.models.persist.config import VoxelVAEConfig
-from pewm_jax.models.persist.voxel_vae_shapes import follows, shapes
 from pewm_jax.nn import placement
 from pewm_jax.nn.convolution import convolve_grid, halve_grid
 from pewm_jax.nn.layers import layer_norm, linear
@@ -32,8 +32,87 @@ from pewm_jax.nn.parameters import draw
 from pewm_jax.nn.tokens import patchify, unpatchify
 from pewm_jax.types import Array, Params
 
+SHARDING = (
+    (r"voxel_vae/.*/kernel", P(None, "fsdp")),
+    (r"voxel_vae/.*/(bias|scale)", P()),
+    (r"voxel_vae/latent_(mean|scale)_C", P()),
+)
+"""Sharding rules: weights are gathered when they are used, each device has its own grids."""
+Kernels = dict[str, tuple[int, ...]]
 FIRST_DEVIATION = 0.05
 """Standard deviation of the latents around their means before anything is learned."""
+
+
+def kernels(config: VoxelVAEConfig) -> Kernels:
+    """Return the shape of each kernel by path; those of convolutions have five axes."""
+    return {**_encoder_kernels(config), **_decoder_kernels(config)}
+
+
+def _encoder_kernels(config: VoxelVAEConfig) -> Kernels:
+    inside, last, around = config.widths[0], config.widths[-1], config.middle_kernel
+    made: Kernels = {"encoder/embed": (config.classes, config.embed)}
+    if config.patch > 1:
+        made["encoder/into"] = (config.embed * config.patch**3, inside)
+    for level, width in enumerate(config.widths):
+        for number in range(config.blocks):
+            made |= _block_kernels(
+                f"encoder/level_{level}/block_{number}", inside, width, config.kernel
+            )
+            inside = width
+        if is_followed(config, level):
+            made[f"encoder/level_{level}/down"] = (3, 3, 3, width, width)
+    for number in range(config.middle):
+        made |= _block_kernels(f"encoder/middle_{number}", last, last, around)
+    made["encoder/out"] = (around, around, around, last, 2 * config.latent_channels)
+    return made
+
+
+def _decoder_kernels(config: VoxelVAEConfig) -> Kernels:
+    inside, around = config.widths[-1], config.middle_kernel
+    made: Kernels = {"decoder/into": (around, around, around, config.latent_channels, inside)}
+    for number in range(config.middle):
+        made |= _block_kernels(f"decoder/middle_{number}", inside, inside, around)
+    for level, width in reversed(list(enumerate(config.widths))):
+        for number in range(config.blocks + 1):
+            made |= _block_kernels(
+                f"decoder/level_{level}/block_{number}", inside, width, config.kernel
+            )
+            inside = width
+        if level:
+            made[f"decoder/level_{level}/up"] = (3, 3, 3, width, width)
+    if config.patch > 1:
+        made["decoder/out"] = (inside, config.embed * config.patch**3)
+    made["decoder/scores"] = (config.embed, config.classes)
+    return made
+
+
+def _block_kernels(where: str, inward: int, outward: int, side: int) -> Kernels:
+    """Return the kernels of a residual block; the last one leads past it where widths differ."""
+    made: Kernels = {
+        f"{where}/one": (side, side, side, inward, outward),
+        f"{where}/two": (side, side, side, outward, outward),
+    }
+    return made if inward == outward else {**made, f"{where}/past": (inward, outward)}
+
+
+def is_followed(config: VoxelVAEConfig, level: int) -> bool:
+    """Tell whether a coarser level comes after this one."""
+    return level + 1 < len(config.widths)
+
+
+def shapes(config: VoxelVAEConfig) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each parameter by path."""
+    made: dict[str, tuple[int, ...]] = {}
+    for path, shape in kernels(config).items():
+        made[f"{path}/kernel"] = shape
+        if path != "encoder/embed":
+            made[f"{path}/bias"] = shape[-1:]
+        where, _, name = path.rpartition("/")
+        if name in ("one", "two"):  # a norm over what goes in
+            made[f"{where}/norm_{name}/scale"] = made[f"{where}/norm_{name}/bias"] = shape[-2:-1]
+    for name, width in (("encoder", config.widths[-1]), ("decoder", config.widths[0])):
+        made[f"{name}/norm/scale"] = made[f"{name}/norm/bias"] = (width,)
+    return made
 
 
 def init(config: VoxelVAEConfig, key: Array) -> Params:
@@ -57,7 +136,7 @@ def init(config: VoxelVAEConfig, key: Array) -> Params:
     return params
 
 
-def fitted(params: Params, mean_C: Array, scale_C: Array) -> Params:
+def with_statistics(params: Params, mean_C: Array, scale_C: Array) -> Params:
     """Return parameters by which latents of this mean and deviation leave as mean 0, variance 1.
 
     Args:
@@ -98,7 +177,7 @@ def moments(
         inside = part[f"level_{level}"]
         for number in range(config.blocks):
             x = _block(config, inside[f"block_{number}"], x)
-        if follows(config, level):
+        if is_followed(config, level):
             kernel = inside["down"]["kernel"].astype(x.dtype)
             x = halve_grid(x, kernel, config.convolution) + inside["down"]["bias"].astype(x.dtype)
     for number in range(config.middle):
@@ -191,7 +270,7 @@ def loss(
     full = (ids != 0).astype(jnp.float32)
     weight = 1 + (config.occupied_weight - 1) * full
     if config.compared:
-        cells = drawn(weight.reshape(len(ids), -1), config.compared, cells_key)
+        cells = sample_cells(weight.reshape(len(ids), -1), config.compared, cells_key)
         ids, full = (jnp.take_along_axis(x.reshape(len(x), -1), cells, 1) for x in (ids, full))
         flat = seen.reshape(len(seen), -1, config.embed)
         missed, right = compare(jnp.take_along_axis(flat, cells[..., None], 1), ids)
@@ -218,7 +297,7 @@ def cubes(config: VoxelVAEConfig, classes_BXYZ: Array, key: Array) -> Array:
     ids = jnp.asarray(classes_BXYZ)
     full = (ids != 0).astype(jnp.float32).reshape(len(ids), -1)
     cells_key, off_key = jax.random.split(key)
-    cells = drawn(full, config.cubes, cells_key)
+    cells = sample_cells(full, config.cubes, cells_key)
     place = jnp.stack(jnp.unravel_index(cells, ids.shape[1:]), -1)
     low = place - jax.random.randint(off_key, place.shape, 0, config.cube)
     low = jnp.clip(low // config.factor * config.factor, 0, config.side - config.cube)
@@ -232,7 +311,7 @@ def cubes(config: VoxelVAEConfig, classes_BXYZ: Array, key: Array) -> Array:
     return made.reshape(-1, *made.shape[2:])
 
 
-def drawn(weight_BN: Array, count: int, key: Array) -> Array:
+def sample_cells(weight_BN: Array, count: int, key: Array) -> Array:
     """Draw (B, count) places of each row with a probability in proportion to their weight."""
     share_BN = jnp.cumsum(weight_BN, 1)
     at = jax.random.uniform(key, (len(share_BN), count)) * share_BN[:, -1:]

@@ -189,7 +189,7 @@ def renderer(
         noise: times and noise.
         params: the network's parameters; the folding of the layers learns with the rest.
         latents_BThwC: latents of pictures.
-        layers: (B, T, h, w, L) what their rays meet, from ``voxel_renderer.look``.
+        layers: (B, T, h, w, L) what their rays meet, from ``voxel_renderer.cast_rays``.
         key: randomness of times and noise.
         actions_BTA: the action that leads to each frame, where the network takes one.
         drawn_BThwC: latents of the drawn voxels, where the network takes them.

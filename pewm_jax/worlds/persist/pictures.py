@@ -77,7 +77,7 @@ def features(
     config = model.backbone.renderer  # type: ignore[attr-defined]
     camera = jax.lax.stop_gradient(camera)
     corner = low_3 + start_3 * windows.cell_m(model)
-    layers = voxel_renderer.look(
+    layers = voxel_renderer.cast_rays(
         config,
         jnp.maximum(classes_XYZ, 0)[None],
         corner[None],

@@ -167,7 +167,7 @@ def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
 
     def look(one: tuple[Array, Array, Camera]) -> RayHits:
         grid, low, seen = one
-        return voxel_renderer.look(model.backbone.renderer, grid, low, size, seen, pixels)  # type: ignore[attr-defined]
+        return voxel_renderer.cast_rays(model.backbone.renderer, grid, low, size, seen, pixels)  # type: ignore[attr-defined]
 
     layers = jax.lax.map(look, (classes, corner, camera))
     made = {

@@ -17,7 +17,7 @@ from pewm_jax.config import Config, PersistConfig, PersistTrainConfig, TrainSett
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.models.persist import nets as persist_nets
-from pewm_jax.models.persist.voxel_vae_shapes import costs as vae_costs
+from pewm_jax.models.persist.costs import voxel_vae_costs as vae_costs
 from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.persist import classes as persist_classes

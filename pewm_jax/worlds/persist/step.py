@@ -48,9 +48,9 @@ def begin(
     dtype = jnp.dtype(model.dtype)
     start = windows.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
     history = History(
-        voxel_dit.no_frames(nets.world_frames, 1, dtype),  # type: ignore[attr-defined]
-        camera_model.no_frames(nets.camera_model, 1, dtype),  # type: ignore[attr-defined]
-        voxel_renderer.no_frames(nets.renderer, 1, dtype),  # type: ignore[attr-defined]
+        voxel_dit.empty_cache(nets.world_frames, 1, dtype),  # type: ignore[attr-defined]
+        camera_model.empty_cache(nets.camera_model, 1, dtype),  # type: ignore[attr-defined]
+        voxel_renderer.empty_cache(nets.renderer, 1, dtype),  # type: ignore[attr-defined]
         jnp.zeros((model.control.actions,)),
         shown,
         start,
