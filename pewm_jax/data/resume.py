@@ -133,7 +133,7 @@ def examine(folder: Path, settings: Mapping[str, Any], *, overwrite: bool = Fals
         name = differ[0]
         raise ConfigError(
             f"{folder} was made with other settings ({name.replace('_', '-')} was "
-            f"{found.get(name)}, is now {settings.get(name)}); choose another folder, or replace "
+            f"{found.get(name)}, now {settings.get(name)}); choose another folder, or replace "
             "it with --overwrite."
         )
     if differ:

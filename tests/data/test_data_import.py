@@ -346,7 +346,7 @@ WRONG = {
     "intrinsics of a larger image": (
         keep,
         {"intrinsics": (525.0, 525.0, 319.5, 239.5)},
-        "images of another size",
+        "another image size",
     ),
 }
 

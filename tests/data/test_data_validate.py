@@ -66,9 +66,9 @@ WRONG = {
         {"intrinsics_4": lambda k: k * 4},
         None,
         "intrinsics",
-        "images of another size",
+        "another image size",
     ),
-    "no camera": ({"intrinsics_4": put(0, np.nan)}, None, "intrinsics", "no camera"),
+    "no camera": ({"intrinsics_4": put(0, np.nan)}, None, "intrinsics", "must be finite"),
     "NaN pose": (
         {"world_from_camera": put((17, 0, 3), np.nan)},
         17,

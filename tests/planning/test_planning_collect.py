@@ -170,19 +170,22 @@ def test_episodes_that_end_early_keep_their_length(tmp_path):
     ("options", "says"),
     [
         *(
-            ({"env_args": json.dumps({"lacks": [name]})}, f"shows no {name}: provide rgb (H, W, 3)")
+            (
+                {"env_args": json.dumps({"lacks": [name]})},
+                f"provides no {name}: provide rgb (H, W, 3)",
+            )
             for name in ("rgb", "depth", "pose", "intrinsics")
         ),
-        ({"env_args": '{"depth": [[1.0, 2.0]]}'}, "shows rgb (12, 16, 3) uint8: provide"),
-        ({"env_args": '{"pose": [0, 0, 0]}'}, "shows pose (3,) int64: provide"),
+        ({"env_args": '{"depth": [[1.0, 2.0]]}'}, "provides rgb (12, 16, 3) uint8: provide"),
+        ({"env_args": '{"pose": [0, 0, 0]}'}, "provides pose (3,) int64: provide"),
         ({"env_args": '{"scale": 1000.0}'}, "the unit is wrong"),
         ({"env_args": '{"scale": 0.0}'}, "have no depth"),
         ({"env": f"{__name__}:short"}, "ended 20 episodes in a row after at most 4 frames"),
-        ({"env": f"{__name__}:bare"}, "gives a object without reset"),
-        ({"env": f"{__name__}:broken"}, "cannot be made (RuntimeError: no such robot)"),
+        ({"env": f"{__name__}:bare"}, "returns a object without reset"),
+        ({"env": f"{__name__}:broken"}, "cannot be created (RuntimeError: no such robot)"),
         ({"env": f"{__name__}:nothing"}, "the module has no 'nothing'"),
         ({"env": "no_such_module:make"}, "the module no_such_module cannot be imported"),
-        ({"policy": f"{__name__}:ENV"}, "there is no function ENV"),
+        ({"policy": f"{__name__}:ENV"}, "has no function ENV"),
     ],
 )
 def test_what_is_no_source_of_episodes_is_refused_and_nothing_is_written(tmp_path, options, says):

@@ -181,7 +181,7 @@ def test_a_box_without_inside_is_refused(box):
 def test_a_memory_without_places_is_refused_an_edit_and_a_codec_a_drive():
     images = dataclasses.replace(MODEL, memory=ImagesConfig())
     model = dataclasses.replace(an_engine(), config=Config(model=images))
-    with pytest.raises(UserError, match="keeps no places"):
+    with pytest.raises(UserError, match="cannot be edited"):
         session.apply(model, a_session(), session.Erase(((0, 0, 0), (1, 1, 1))))
     with pytest.raises(UserError, match="no world"):
         engine.open_engine("codec", CODEC, {})
@@ -198,7 +198,7 @@ def test_a_world_that_is_kept_comes_back_bit_for_bit(tmp_path):
     assert not resumed.observed
     other = dataclasses.replace(MODEL, clip=dataclasses.replace(MODEL.clip, far_m=9.0))
     stranger = dataclasses.replace(model, config=Config(model=other))
-    with pytest.raises(UserError, match="another memory"):
+    with pytest.raises(UserError, match="images or memory differ"):
         saved.load(stranger, now.world, tmp_path / "worlds", "my world")
     with pytest.raises(UserError, match="no world"):
         saved.load(model, now.world, tmp_path, "none yet")
