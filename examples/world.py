@@ -39,8 +39,7 @@ class Keyframes(World):
         return {name: jax.random.normal(key, (5, 5, *n)) / 50 for name, n in shapes.items()}
 
     def stages(self):
-        rules = ((".*", TRAIN),)
-        return (Stage("fit", 1, rules, Keyframes.init, Keyframes.loss, memory=True),)
+        return (Stage("fit", 1, ((".*", TRAIN),), Keyframes.init, Keyframes.loss, memory=True),)
 
     def image(self, frames):  # (..., H, W, 4): colour, and depth in [-1, 1]
         depth = signal_from_depth(self.clip, frames.depth_THW)[..., None]
@@ -48,12 +47,11 @@ class Keyframes(World):
 
     def insert(self, memory, *new):  # images and poses; unused slots are far away
         empty = jnp.zeros((self.slots, *new[0].shape[1:])), jnp.full((self.slots, 4, 4), 1e9)
-        pairs = zip(memory or empty, new, strict=True)
-        return tuple(jnp.concatenate(pair)[-self.slots :] for pair in pairs)
+        return [jnp.concatenate(x)[-self.slots :] for x in zip(memory or empty, new, strict=True)]
 
     def next(self, params, memory, image, move, pose):
-        moved = jnp.broadcast_to(move, (*image.shape[:2], 3))
-        x = convolve(jnp.concatenate([image, moved], -1)[None], params["first"])
+        x = jnp.concatenate([image, jnp.broadcast_to(move, (*image.shape[:2], 3))], -1)
+        x = convolve(x[None], params["first"])
         if memory is not None:
             nearest = jnp.square(memory[1] - pose).sum((1, 2)).argmin()
             x += convolve(memory[0][nearest][None], params["recalled"])
@@ -63,9 +61,9 @@ class Keyframes(World):
         def one(frames, context, valid):
             past = jnp.where(valid[:, None, None], context.camera.world_from_camera, 1e9)
             memory = self.insert(None, self.image(context), past)
-            image, poses = self.image(frames), jnp.asarray(frames.camera.world_from_camera)
-            step = jax.vmap(self.next, (None, None, 0, 0, 0))
-            made = step(params, memory, image[:-1], actions_between(poses), poses[1:])
+            image, poses = self.image(frames), frames.camera.world_from_camera
+            to = actions_between(poses), poses[1:]
+            made = jax.vmap(self.next, (None, None, 0, 0, 0))(params, memory, image[:-1], *to)
             return jnp.square(made - image[1:])
 
         loss = jax.vmap(one)(clip.frames, clip.context, clip.context_valid_S).mean()
@@ -73,7 +71,7 @@ class Keyframes(World):
 
     def observe(self, params, state, frames):
         last = jax.tree.map(lambda x: jnp.asarray(x)[-1:], as_signal(frames))
-        poses = jnp.asarray(frames.camera.world_from_camera)
+        poses = frames.camera.world_from_camera
         return WorldState(last, self.insert(state.map, self.image(frames), poses))
 
     def imagine(self, params, state, control, key, *, remember=True, memory=True):

@@ -102,7 +102,9 @@ def _samplers(content: Mapping[str, Any]) -> list[str]:
     for side in ("a", "b"):
         ways = [(run["sampling_steps"], run["sampler"]) for run in content[side]["runs"]]
         steps.append(ways)
-        said.append(f"{side} imagines in {ways[0][0]} sampling steps ({ways[0][1]})")
+        count, sampler = ways[0]
+        how = f"in {count} sampling steps ({sampler})" if count else "without a sampler"
+        said.append(f"{side} imagines {how}")
     return [] if len({way for ways in steps for way in ways}) == 1 else [f"{', '.join(said)}."]
 
 
