@@ -49,7 +49,7 @@ HOMES = {
     "embreex": {"data/shading", "data/scenes"},
     "evo": set(),
     "flatbuffers": set(),
-    "flax": {"models", "nn", "codecs"},
+    "flax": {"codecs", "models", "nn", "readers"},
     "grain": {"data"},
     "gymnasium": {"data/collect_env", "planning/extra", "planning/__init__"},
     "jinja2": {"report/page"},

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax.config import UserError
 from pewm_jax.convert import output, pipeline
+from pewm_jax.errors import UserError
 from pewm_jax.io import sources, tree, weights
 from pewm_jax.io.sources import Source
 from pewm_jax.models.dinov2 import model as dinov2

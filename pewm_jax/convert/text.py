@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pewm_jax.config import UserError
 from pewm_jax.convert import output
+from pewm_jax.errors import UserError
 from pewm_jax.io import sources, tree
 
 

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.nn import tokens
 from pewm_jax.types import Array, Params

@@ -20,7 +20,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 
 Tensors = dict[str, Any]
 """Nested tables of arrays."""

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 import safetensors
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import atomic, tree
 from pewm_jax.types import Array
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import pickles as pickled_tensors
 from pewm_jax.io import tensor_files, tree
 from pewm_jax.types import Array, Params

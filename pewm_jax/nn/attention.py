@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.nn import placement
 from pewm_jax.nn.layers import linear, merge_heads, split_heads
 from pewm_jax.types import Array, Params

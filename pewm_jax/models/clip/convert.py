@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io.published import LINEAR, SAME, Entry, Network, Transform
 from pewm_jax.models.clip import model
 from pewm_jax.models.clip.config import CLIPVisionConfig

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.clip.config import CLIPVisionConfig
 from pewm_jax.models.dinov2.model import resize_matrix
 from pewm_jax.nn.attention import multi_head_attention

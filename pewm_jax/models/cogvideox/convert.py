@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import published
 from pewm_jax.io.published import CONV, LINEAR, SAME, Entry, Network, Transform, rename
 from pewm_jax.models.cogvideox import model, vae

@@ -19,7 +19,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.cogvideox import positions
 from pewm_jax.models.cogvideox.config import DiTConfig
 from pewm_jax.nn import attention as blocked_attention

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.cogvideox import vae_layers as layers
 from pewm_jax.models.cogvideox.config import VAEConfig
 from pewm_jax.models.cogvideox.vae_layers import layout

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.cosmos import block as cosmos_block
 from pewm_jax.models.cosmos.block import Time
 from pewm_jax.models.cosmos.config import CosmosConfig

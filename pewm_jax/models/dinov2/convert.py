@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import tree
 from pewm_jax.io.published import LINEAR, SAME, Entry, Transform
 from pewm_jax.io.sources import Renamed, Source

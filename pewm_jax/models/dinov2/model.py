@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import weights
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.nn import attention as blocked_attention

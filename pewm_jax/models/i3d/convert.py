@@ -23,7 +23,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import tree, weights
 from pewm_jax.models.i3d.model import shapes
 from pewm_jax.types import Params

@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import tree, weights
 from pewm_jax.models.lpips.model import NAMES, Net, shapes
 from pewm_jax.types import Params

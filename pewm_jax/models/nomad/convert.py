@@ -16,8 +16,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pewm_jax.config import UserError
 from pewm_jax.config.nomad import NomadConfig
+from pewm_jax.errors import UserError
 from pewm_jax.io import tree, weights
 from pewm_jax.io.published import CONV, LINEAR, Entry, Transform
 from pewm_jax.models.nomad import efficientnet

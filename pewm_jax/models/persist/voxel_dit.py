@@ -18,7 +18,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache

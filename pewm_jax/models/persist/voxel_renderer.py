@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import resize_intrinsics
 from pewm_jax.geometry.march import RayHits

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.nn import placement
 from pewm_jax.nn.convolution import convolve_grid, halve_grid

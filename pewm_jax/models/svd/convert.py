@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import published
 from pewm_jax.io.published import (
     CONV,

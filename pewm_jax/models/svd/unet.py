@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.svd import layers as svd_layers
 from pewm_jax.models.svd.config import SVDUNetConfig
 from pewm_jax.nn import layers, placement

@@ -15,7 +15,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.svd import layers as svd_layers
 from pewm_jax.models.svd.config import SVDVAEConfig
 from pewm_jax.models.svd.layers import resnet_2d_leaves, resnet_leaves

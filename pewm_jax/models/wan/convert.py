@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.io import published
 from pewm_jax.io.published import (
     CONV,

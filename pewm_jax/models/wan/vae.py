@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
-from pewm_jax.config import UserError
+from pewm_jax.errors import UserError
 from pewm_jax.models.wan.config import WanVAEConfig
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn.layers import linear
