@@ -47,7 +47,7 @@ PIPELINES = (
 BASE = "base.json"
 """What converted weights were made from, beside ``config.json`` or the networks' folders."""
 PARTS = ("transformer", "vae", "scheduler")
-UNSTATED = "not stated in the folder it came from; ask where you got it before you pass it on"
+UNSTATED = "not stated in the original folder; ask its source before you redistribute it"
 _CARD = re.compile(r"^(license|license_name|license_link):\s*(\S.*)$", re.MULTILINE)
 _TEXT = ("text_encoder", "tokenizer")
 """Parts that are not converted, only copied."""
@@ -76,7 +76,7 @@ def read_scheduler(folder: str | Path) -> DDPMConfig:
 
 
 def require_pipeline(src: Path) -> None:
-    """Insist that a folder holds a CogVideoX pipeline, and no weights that would not be read.
+    """Check that a folder holds a CogVideoX pipeline, and no weights that would not be read.
 
     Raises:
         UserError: another pipeline, or weights beside those of its parts (such as a LoRA).
@@ -90,7 +90,7 @@ def require_pipeline(src: Path) -> None:
     unused = [str(path.relative_to(src)) for path in found if path.parent.name not in known]
     if unused:
         raise UserError(
-            f"{src} holds weights that are of no use here: {tree.listing(unused)}; merge a LoRA "
+            f"{src} holds weights that cannot be used: {tree.listing(unused)}; merge a LoRA "
             "into the transformer first, and move away the rest."
         )
 
@@ -138,10 +138,10 @@ def import_pipeline(
 
     Args:
         src: a diffusers pipeline's folder.
-        dst: the folder to make, not there yet.
+        dst: the folder to make; it must not exist.
         dtype: of the weights; by default the stored one.
         prompts: their tokens (L, text_dim) by prompt; empty without a text encoder.
-        record: what ``base.json`` shall hold.
+        record: the content of ``base.json``.
     """
     with output.new_folder(dst) as folder:
         for network in (TRANSFORMER, VAE):
@@ -161,13 +161,13 @@ def describe_base(
     prompts: Sequence[str],
     dtype: str | None,
 ) -> dict[str, Any]:
-    """Return what ``base.json`` shall hold.
+    """Return the content of ``base.json``.
 
     Args:
         src: the pipeline's folder.
         settings: the original settings of ``PARTS``.
         prompts: the prompts that were encoded, in the order in which they are stored.
-        dtype: the dtype that was asked for, None for the stored one.
+        dtype: the requested dtype, None for the stored one.
     """
     index = src / "model_index.json"
     return {
@@ -181,7 +181,7 @@ def describe_base(
 
 
 def licence(src: Path) -> str:
-    """Return what the folder's card or licence file says, in one line."""
+    """Return the licence that the folder's card or licence file states, in one line."""
     card = src / "README.md"
     if card.is_file():
         head = card.read_text(encoding="utf-8", errors="replace").split("\n---", 1)[0]
@@ -208,7 +208,7 @@ def load_base(folder: Path) -> dict[str, Any]:
     path = folder / BASE
     if not path.is_file():
         raise UserError(
-            f"{path} does not exist, so what these weights were made from is unknown; name the "
+            f"{path} does not exist, so the origin of these weights is unknown; name the "
             "imported folder with --base."
         )
     values = sources.read_json(path)
@@ -261,7 +261,7 @@ def export(
 
 
 def _origin(src: Path) -> Path:
-    """Return the folder with ``base.json``: a training run names where it started from."""
+    """Return the folder with ``base.json``: a training run names the folder it started from."""
     seen: list[Path] = []
     here = src
     while not (here / BASE).is_file() and (here / CONFIG).is_file() and here not in seen:

@@ -1,6 +1,6 @@
 """A CogVideoX checkpoint as a world model that ``pewm_jax.load`` reads, before any training.
 
-The folder is written part by part, so that no more than one network is in memory at a time.
+The folder is written part by part, so at most one network is in memory at a time.
 """
 
 from __future__ import annotations
@@ -73,10 +73,10 @@ def config_of(
 
 
 def require_size(config: Config) -> None:
-    """Insist that the transformer's positions can be given to a clip.
+    """Check that the transformer's positions cover a clip.
 
     Raises:
-        UserError: they are learned for another size, or do not go so far.
+        UserError: they are learned for another size, or end before it.
     """
     frames, height, width = config.model.latent_shape
     frames += -frames % config.model.backbone.patch_t
@@ -110,7 +110,7 @@ def import_world(
         dst: the folder to make.
         config: the world model, from ``config_of``.
         prompt_LC: (L, text_dim) tokens of the prompt, None without a text encoder.
-        record: what ``base.json`` shall hold.
+        record: the content of ``base.json``.
         memory: add memory blocks.
         encoder: parameters of the map's image encoder, if the settings name one that has any.
         dtype: of the weights; by default the stored one, and float32 for memory blocks.

@@ -1,4 +1,4 @@
-"""What each command of ``pewm-jax convert`` does with its flags, which are in ``options``."""
+"""The commands of ``pewm-jax convert``; their settings are in ``options``."""
 
 from __future__ import annotations
 
@@ -163,9 +163,9 @@ def import_cosmos2(options: ImportCosmos2) -> None:
     size = options.frames, options.height, options.width
     texts = options.prompt, options.negative
     encoded = cosmos.import_world(options.src, options.dst, options.dtype, size, texts)
-    told = "prompts encoded" if encoded else "no prompt (there is no text_encoder/)"
-    said = cogvideox.licence(options.src)
-    print(f"{options.dst}: a world model, {told}; licence of the original: {said}")
+    prompts = "prompts encoded" if encoded else "no prompt (there is no text_encoder/)"
+    licence = cogvideox.licence(options.src)
+    print(f"{options.dst}: a world model, {prompts}; licence of the original: {licence}")
 
 
 def export_diffusers(options: ExportDiffusers) -> None:

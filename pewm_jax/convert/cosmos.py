@@ -1,10 +1,10 @@
 """Cosmos-Predict2: read its networks, write them back, and import it as a world model.
 
 A pipeline's folder has ``transformer/``, ``vae/`` and ``scheduler/``. Every tensor of a folder must
-be used. The text encoder (T5) is not read; it encodes two prompts once, where there is one: the
-prompt that videos are made with, and the one that guidance pushes away from. The world model has
+be used. The text encoder (T5) is not converted. If there is one, two prompts are encoded with it:
+the prompt of the videos, and the one that guidance pushes away from. The world model has
 the settings of the preset ``egowm_cosmos2b`` around the checkpoint's networks, and fresh layers for
-the actions, which change nothing yet.
+the actions, which have no effect until they are trained.
 """
 
 from __future__ import annotations

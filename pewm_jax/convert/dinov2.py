@@ -70,7 +70,7 @@ def convert(
     src: Path | str,
     dst: Path | str,
     dtype: str | None = None,
-    say: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
 ) -> None:
     """Import DINOv2: ``read`` and ``write``.
 
@@ -78,7 +78,7 @@ def convert(
         src: see ``read``.
         dst: the folder to be made.
         dtype: of the stored parameters; by default the source's.
-        say: receives a line about what was imported.
+        log: called with a line about what was imported.
 
     Raises:
         UserError: ``src`` cannot be read, or ``dst`` exists.
@@ -89,7 +89,7 @@ def convert(
     leaves = jax.tree.leaves(params)
     count = sum(leaf.size for leaf in leaves)
     registers = f", {config.registers} registers" * bool(config.registers)
-    say(
+    log(
         f"{dst}: DINOv2, {config.layers} layers of width {config.width}, patches of "
         f"{config.patch} pixels{registers}, {count / 1e6:.1f} M parameters in {leaves[0].dtype}"
     )
@@ -100,7 +100,7 @@ def _like(config: DINOv2Config) -> Params:
 
 
 def open_source(src: Path) -> Source:
-    """Open a file or a folder, whatever it holds."""
+    """Open a file or a folder of any supported kind."""
     if src.is_dir():
         if any(src.glob("*.safetensors")):
             return sources.open_folder(src)
@@ -118,7 +118,7 @@ def open_source(src: Path) -> Source:
 
 
 def _unpickled(path: Path) -> Source:
-    """Read a state dict that torch saved; nothing in it is executed."""
+    """Read a state dict that torch saved; no code in it is executed."""
     try:
         import torch  # noqa: PLC0415 - an extra: only these files need it
     except ImportError:

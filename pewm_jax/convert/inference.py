@@ -1,4 +1,4 @@
-"""A training run → a folder for inference: averaged weights in 16 bits, settings, and a card.
+"""A training run → a folder for inference: averaged weights in 16 bits, settings, and a model card.
 
 ::
 
@@ -46,18 +46,18 @@ TRAINED_ON = "train"
 
 
 def export(
-    run: Path, dst: Path, dtype: str = "bfloat16", *, say: Callable[[str], Any] = print
+    run: Path, dst: Path, dtype: str = "bfloat16", *, log: Callable[[str], Any] = print
 ) -> Path:
     """Write what inference needs of a training run into a new folder.
 
     The run's weights file already holds the moving average where the run trained and the frozen
-    weights elsewhere. The folder is written aside and renamed when it is complete.
+    weights elsewhere. The folder is written under a temporary name and renamed when it is complete.
 
     Args:
         run: a run folder made by ``train.py`` (or a converted checkpoint in the same form).
         dst: the folder to make.
         dtype: ``bfloat16`` or ``float16``.
-        say: called with a line on each step.
+        log: called with a line on each step.
 
     Returns:
         ``dst``.
@@ -68,11 +68,11 @@ def export(
     if not run.is_dir():
         raise UserError(f"{run} is not a folder; name a run made by train.py.")
     with output.new_folder(dst) as folder:
-        say(f"reading {run} …")
+        log(f"reading {run} …")
         config, params = rollouts.load_finished(run)
         if not config.model.EXPORTED:
             raise UserError(
-                f"{run} holds a {kinds.of(config.model).name}, of which no smaller form is written:"
+                f"{run} holds a {kinds.of(config.model).name}, which has no smaller form:"
                 " its config.json and weights.safetensors are what pewm_jax.load reads, copy those."
             )
         origin = _base(run, config)
@@ -88,13 +88,13 @@ def export(
             metrics=_metrics(run),
         )
         total = sum(np.size(leaf) for leaf in jax.tree.leaves(params))
-        say(f"writing {total / 1e6:.1f} million parameters in {dtype} …")
+        log(f"writing {total / 1e6:.1f} million parameters in {dtype} …")
         _write(folder / runs.WEIGHTS, params, {**metadata, "dtype": dtype}, jnp.dtype(dtype))
         configuration.save(config, folder / runs.CONFIG)
         if origin:
             shutil.copyfile(origin, folder / runs.BASE)
         (folder / CARD).write_text(write_card(facts), encoding="utf-8")
-    say(f"{dst} is ready: pewm_jax.load({str(dst)!r})")
+    log(f"{dst} is ready: pewm_jax.load({str(dst)!r})")
     return dst
 
 
@@ -140,7 +140,7 @@ def _base(run: Path, config: Config) -> Path | None:
 
 
 def _metrics(run: Path) -> dict[str, Any] | None:
-    """Return the metrics of the run's report, if there is one and it is of these weights."""
+    """Return the metrics of the run's report, if it exists and evaluates these weights."""
     path = run / REPORT
     if not path.is_file():
         return None
@@ -163,8 +163,8 @@ class CardFacts:
         params: its weights.
         stage: number of the last finished stage, "0" for converted weights before any training.
         step: steps of that stage.
-        base: what ``base.json`` says of the checkpoint the run started from, if it did.
-        metrics: what the report of these weights says, if there is one.
+        base: the ``base.json`` of the checkpoint that the run started from, if there is one.
+        metrics: the report of these weights, if there is one.
     """
 
     name: str
@@ -246,7 +246,7 @@ Actions: 0 forward {actions.step_m:g} m, 1 left and 2 right {actions.turn_deg:g}
 
 
 def _sampler(model: World) -> str:
-    """Return a sentence on the sampler, with the noise; nothing of a world without one."""
+    """Return a sentence on the sampler, with the noise; empty for a world without one."""
     names = " ".join(filter(None, (model.facts.noise, model.facts.sampler)))
     return f" Sampling: {names}, {model.sample_steps} steps." if names else ""
 
@@ -254,12 +254,12 @@ def _sampler(model: World) -> str:
 def _data(facts: CardFacts) -> str:
     config = facts.config
     if facts.stage == "0":
-        return "## Data\n\nNone here: see what the original was trained on."
+        return "## Data\n\nNone here: see the data of the original."
     name = Path(config.data.path).name
     try:
         manifest = read_manifest(Path(config.data.path) / TRAINED_ON, check_files=False)
     except UserError:
-        size = "which is not there any more to be counted"
+        size = "which no longer exists, so its size is unknown"
     else:
         made = manifest.settings.get("made_by")
         how = f", made by `{made}`" if made else ""
@@ -337,12 +337,12 @@ def _licence(facts: CardFacts) -> str:
         head += "The image encoder is a converted DINOv2: its weights keep their own licence.\n\n"
     if facts.base is None:
         return head + (
-            "Trained from random weights: whoever trained them chooses a licence, and answers for "
-            "the data."
+            "Trained from random weights: whoever trained them chooses a licence and is "
+            "responsible for the data."
         )
     name = facts.base.get("name", "a converted checkpoint")
     said = facts.base.get("licence", "not stated")
     return head + (
-        f"Made from `{name}`, whose licence is: {said}. It binds what is made from it, these "
-        "weights included."
+        f"Made from `{name}`, whose licence is: {said}. It applies to everything "
+        "derived from it, including these weights."
     )

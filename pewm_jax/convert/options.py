@@ -1,4 +1,4 @@
-"""The flags of ``pewm-jax convert``: what each command can be told."""
+"""The settings of each command of ``pewm-jax convert``."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class ImportCogVideoX:
     depth, the observed frame and the camera come in, depth comes out; --memory adds the blocks
     that read the map. The result is a folder that `pewm_jax.load` reads and that is trained by its
     name (`pewm-jax train DST`), with the settings of the presets pewm_2b and pewm_5b. Until then
-    the colours it makes are those of the original. Without these flags the networks are only
-    brought into our layout.
+    it predicts the colours of the original. Without these flags the networks are only
+    converted to our layout.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -37,11 +37,11 @@ class ImportCogVideoX:
     prompt: tuple[str, ...] = ("",)
     """Prompts to encode and store, by default the empty one; a world model takes one."""
     rgbd: bool = False
-    """Widen for depth; goes with --camera."""
+    """Widen for depth; needs --camera."""
     camera: bool = False
-    """Widen for the camera; goes with --rgbd."""
+    """Widen for the camera; needs --rgbd."""
     memory: bool = False
-    """Add memory blocks, which change nothing until they are trained."""
+    """Add memory blocks; they have no effect until they are trained."""
     frames: int | None = None
     """Frames of the world model's clips: 8k + 1; by default 9, or the size of learned positions."""
     positions: Learned | None = None
@@ -53,7 +53,8 @@ class ImportCogVideoX:
     width: int | None = None
     """Width of its images in pixels; by default 512, or the size of learned positions."""
     encoder: Path | None = None
-    """Folder of `import dinov2`: the image encoder behind the map; by default patches' colours."""
+    """Folder of `import dinov2`, the encoder of the map's image features; by default the colours of
+    patches."""
     config: Path | None = None
     """JSON file of other settings of the world model, such as {"memory": {"tokens": 1024}}."""
     seed: int = 0
@@ -84,7 +85,7 @@ class ImportCogVideoX:
 
 @dataclasses.dataclass(frozen=True)
 class ImportDINOv2:
-    """Import DINOv2, the image encoder behind the map."""
+    """Import DINOv2, the encoder of the map's image features."""
 
     src: Annotated[Path, tyro.conf.Positional]
     """A folder of transformers (config.json, model.safetensors), or the original repository's
@@ -100,7 +101,7 @@ class ImportSVD:
     """Import a checkpoint of Stable Video Diffusion as a world model steered by actions.
 
     The result is a folder that `pewm_jax.load` reads and that is trained by its name (`pewm-jax
-    train DST`), with the settings of the preset egowm_svd. Until then actions change nothing.
+    train DST`), with the settings of the preset egowm_svd. Until then actions have no effect.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -120,7 +121,7 @@ class ImportCosmos2:
     """Import a checkpoint of Cosmos-Predict2 for video as a world model steered by actions.
 
     The result is a folder that `pewm_jax.load` reads and that is trained by its name (`pewm-jax
-    train DST`), with the settings of the preset egowm_cosmos2b. Until then actions change nothing.
+    train DST`), with the settings of the preset egowm_cosmos2b. Until then actions have no effect.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -147,8 +148,8 @@ class ImportCosmos2:
 class ExportDiffusers:
     """Write a folder that the from_pretrained of diffusers loads.
 
-    Of a world model the video model inside is written: memory blocks and the channels of depth
-    and camera stay behind. Text encoder and tokenizer are copied from the original pipeline, or
+    Of a world model only the video model is written: memory blocks and the channels of depth
+    and camera are left out. Text encoder and tokenizer are copied from the original pipeline, or
     left out.
     """
 
@@ -167,10 +168,10 @@ class ExportDiffusers:
 
 @dataclasses.dataclass(frozen=True)
 class ExportInference:
-    """Write what inference needs of a training run: averaged weights in 16 bits, settings, a card.
+    """Export a training run for inference: averaged weights in 16 bits, settings, a model card.
 
-    The folder is read by `pewm_jax.load`; the card says what it is, what it was trained on and how
-    long, and the licence of the weights that the training started from.
+    The folder is read by `pewm_jax.load`; the card states what it is, its training data and
+    steps, and the licence of the weights that the training started from.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -178,12 +179,12 @@ class ExportInference:
     dst: Annotated[Path, tyro.conf.Positional]
     """Folder to make."""
     dtype: Literal["bfloat16", "float16"] = "bfloat16"
-    """Precision of the weights: float16 rounds less, bfloat16 reaches farther."""
+    """Precision of the weights: float16 has smaller rounding errors, bfloat16 a larger range."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportStableHLO:
-    """Write the world model as programs that need jax and NumPy, and none of this library's code.
+    """Export the world model as programs that need jax and NumPy but not this library.
 
     They are checked by running them in a fresh process.
     """
@@ -193,12 +194,12 @@ class ExportStableHLO:
     dst: Annotated[Path, tyro.conf.Positional]
     """Folder to make."""
     what: Literal["rollout", "denoise"] = "rollout"
-    """`rollout`: begin a world and imagine clips; `denoise`: one step of the denoiser."""
+    """`rollout`: start a world and imagine clips; `denoise`: one step of the denoiser."""
     clips: int = 1
     """Clips that one call of the rollout imagines."""
     frames: int | None = None
-    """Observed frames that a world begins with; by default data.context."""
+    """Observed frames that a world starts from; by default data.context."""
     platforms: tuple[str, ...] = stablehlo.PLATFORMS
-    """Where the programs shall run."""
+    """Platforms that the programs are lowered for."""
     check: bool = True
     """Run the programs on the CPU afterwards and compare; for a large model this takes long."""

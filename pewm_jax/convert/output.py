@@ -1,4 +1,4 @@
-"""Folders that are made whole or not at all, progress, and libraries that only conversion needs."""
+"""Atomic folders, progress in megabytes, and libraries that only conversion needs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def refuse_existing(dst: Path) -> None:
 
 @contextlib.contextmanager
 def new_folder(dst: Path) -> Iterator[Path]:
-    """Make a folder aside and rename it when it is complete; nothing stays of a failure.
+    """Write a folder under a temporary name and rename it when it is complete.
+
+    If writing fails, no folder is left.
 
     Raises:
         UserError: ``dst`` exists.

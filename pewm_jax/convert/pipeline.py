@@ -73,7 +73,7 @@ def read_config(network: Network, folder: str | Path) -> Any:
 
 
 def published_config(network: Network, folder: Path) -> dict[str, Any]:
-    """Read the settings of a network as they were published, and insist on its class."""
+    """Read the settings of a network as they were published, and check its class."""
     path = sources.component(folder, network.folder) / CONFIG
     return sources.read_config(path, [network.class_name], network.class_key)
 
@@ -153,7 +153,7 @@ def _used(network: Network, files: sources.Files) -> Source:
 
 
 def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...]]:
-    """Return the published names and shapes that the entries ask for, nothing allocated.
+    """Return the published names and shapes that the entries ask for, without allocating memory.
 
     Args:
         entries: the converter's table.
@@ -184,7 +184,7 @@ def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...
 
 
 def require(entries: Sequence[Entry], source: Source, like: Params) -> None:
-    """Insist that a source holds exactly the tensors that the entries name, of the right shapes.
+    """Check that a source holds exactly the tensors that the entries name, of the right shapes.
 
     Raises:
         UserError: with the list of tensors that are missing, left over or of another shape.
@@ -367,7 +367,7 @@ def write_world(
 
 
 def fresh_actions(config: Config, dtype: str | None) -> Part:
-    """Return fresh layers for the control's actions, which change nothing yet.
+    """Return fresh layers for the control's actions, which have no effect until they are trained.
 
     Args:
         config: the settings.

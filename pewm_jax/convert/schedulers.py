@@ -9,7 +9,7 @@ the published models use. References, all of diffusers:
   ``sigma_data`` 1 and the opposite sign.
 - Cosmos-Predict2: ``FlowMatchEulerDiscreteScheduler`` with Karras' levels, as
   ``Cosmos2VideoToWorldPipeline`` uses it. The pipeline sets the range of levels itself, from 80 to
-  0.002, whatever the file says; it repeats the last level instead of ending at 0, and prepares the
+  0.002, regardless of the file; it repeats the last level instead of ending at 0, and prepares the
   network's input and output. This is EDM with the target ``flow``.
 """
 
@@ -67,7 +67,7 @@ COGVIDEOX_CLASSES = {"CogVideoXDDIMScheduler": "ddim", "CogVideoXDPMScheduler": 
 TARGETS = {"epsilon": "eps", "sample": "x0", "v_prediction": "v"}
 """Their prediction types and our targets."""
 COGVIDEOX_STEPS = 50
-"""Steps of an imported scheduler: the default of CogVideoX's pipelines; no file says it."""
+"""Steps of an imported scheduler: the default of CogVideoX's pipelines; no file states it."""
 
 _COGVIDEOX_DEFAULTS: dict[str, Any] = {
     "num_train_timesteps": 1000,
@@ -88,7 +88,7 @@ _COGVIDEOX_WITHOUT_EFFECT = {
     "clip_sample_range": 1.0,
     "sample_max_value": 1.0,
 }
-"""Settings that the reference accepts and its steps never read."""
+"""Settings that the reference accepts and never reads."""
 _KINDS = {
     "num_train_timesteps": int,
     "steps_offset": int,
@@ -108,7 +108,7 @@ def cogvideox_from_diffusers(values: Mapping[str, Any]) -> DDPMConfig:
 
     Returns:
         The sampler of equal steps: ``stride`` is ``fixed`` and ``sample_steps`` 50, as in
-        CogVideoX's pipelines; what the file does not speak of has our defaults.
+        CogVideoX's pipelines; settings that are not in the file have our defaults.
 
     Raises:
         UserError: another class, a setting that does not exist, or a value that is not supported.
@@ -146,8 +146,8 @@ def cogvideox_from_diffusers(values: Mapping[str, Any]) -> DDPMConfig:
 def cogvideox_to_diffusers(config: DDPMConfig) -> dict[str, Any]:
     """Write the settings as ``scheduler_config.json`` has them, the inverse of reading.
 
-    What diffusers has no name for stays behind: the number of steps and the guidance, which its
-    pipelines take as arguments, and what only training needs.
+    Settings without an equivalent are left out: the number of steps and the guidance, which
+    diffusers' pipelines take as arguments, and those that only training needs.
     """
     names = {ours: theirs for theirs, ours in COGVIDEOX_CLASSES.items()}
     targets = {ours: theirs for theirs, ours in TARGETS.items()}
@@ -168,7 +168,7 @@ def cogvideox_to_diffusers(config: DDPMConfig) -> dict[str, Any]:
 
 
 def _require_supported(given: Mapping[str, Any]) -> None:
-    """Refuse values that do not exist, or that the reference knows and we do not."""
+    """Refuse values that the reference or this library does not support."""
     for key, value in _COGVIDEOX_FIXED.items():
         if given[key] != value:
             raise UserError(
@@ -196,7 +196,7 @@ def _require_supported(given: Mapping[str, Any]) -> None:
 SVD_CLASS = "EulerDiscreteScheduler"
 """The reference's class."""
 SVD_STEPS = 25
-"""Steps of an imported scheduler: the default of the pipeline; no file says it."""
+"""Steps of an imported scheduler: the default of the pipeline; no file states it."""
 RHO = 7.0
 """Exponent of the levels; the reference has no setting for it."""
 _SVD_ONLY: dict[str, tuple[Any, Any]] = {
@@ -208,7 +208,7 @@ _SVD_ONLY: dict[str, tuple[Any, Any]] = {
     "use_beta_sigmas": (False, False),
     "final_sigmas_type": ("zero", "zero"),
 }
-"""Settings of which one value is supported: that value, and what diffusers takes if none stands."""
+"""Settings of which one value is supported: that value, and diffusers' default."""
 _SVD_WITHOUT_EFFECT = {
     "num_train_timesteps": 1000,
     "beta_start": 0.00085,
@@ -231,7 +231,7 @@ def svd_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
         values: the file's content.
 
     Returns:
-        The sampler of equal steps, 25 of them; what the file does not speak of, such as the noise
+        The sampler of equal steps, 25 of them; settings that are not in the file, such as the noise
         in training, has our defaults.
 
     Raises:
@@ -265,8 +265,8 @@ def svd_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
 def svd_to_diffusers(config: EDMConfig) -> dict[str, Any]:
     """Write the settings as ``scheduler_config.json`` has them, the inverse of reading.
 
-    The number of steps, the guidance and the noise in training stay behind: diffusers has no names
-    for them.
+    The number of steps, the guidance and the noise in training are left out: diffusers has no
+    settings for them.
 
     Raises:
         UserError: a setting that the reference does not have.
@@ -275,8 +275,7 @@ def svd_to_diffusers(config: EDMConfig) -> dict[str, Any]:
     for key, only in wanted.items():
         if getattr(config, key) != only:
             raise UserError(
-                f"noise.{key} is {getattr(config, key)!r}; {SVD_CLASS} has {only!r} and nothing "
-                "else."
+                f"noise.{key} is {getattr(config, key)!r}; {SVD_CLASS} supports only {only!r}."
             )
     return {
         "_class_name": SVD_CLASS,
@@ -291,7 +290,7 @@ COSMOS_CLASS = "FlowMatchEulerDiscreteScheduler"
 """The reference's class."""
 WHAT = "The scheduler"
 COSMOS_STEPS = 35
-"""Steps of an imported scheduler: the default of the pipeline; no file says it."""
+"""Steps of an imported scheduler: the default of the pipeline; no file states it."""
 _COSMOS_OURS: dict[str, Any] = {
     "target": "flow",
     "sigma_data": 1.0,
@@ -300,7 +299,7 @@ _COSMOS_OURS: dict[str, Any] = {
     "rho": 7.0,
     "ends": "sigma_min",
 }
-"""What the pipeline does, in our settings."""
+"""The pipeline's behaviour, in our settings."""
 _COSMOS_ONLY: dict[str, tuple[Any, Any]] = {
     "use_karras_sigmas": (True, False),
     "use_exponential_sigmas": (False, False),
@@ -314,7 +313,7 @@ _COSMOS_ONLY: dict[str, tuple[Any, Any]] = {
     "sigma_data": (1.0, 1.0),
     "final_sigmas_type": ("sigma_min", "sigma_min"),
 }
-"""Settings of which one value is supported: that value, and what stands for an absent one."""
+"""Settings of which one value is supported: that value, and the default of an absent one."""
 _COSMOS_WITHOUT_EFFECT: dict[str, Any] = {
     "num_train_timesteps": 1000,
     "shift": 1.0,
@@ -334,7 +333,7 @@ def cosmos_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
         values: the file's content.
 
     Returns:
-        The sampler of equal steps, 35 of them; what the file does not speak of, such as the noise
+        The sampler of equal steps, 35 of them; settings that are not in the file, such as the noise
         in training, has our defaults. The pipeline's ``guidance_scale`` g is ``guidance`` 1 + g.
 
     Raises:
@@ -349,8 +348,8 @@ def cosmos_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
 def cosmos_to_diffusers(config: EDMConfig) -> dict[str, Any]:
     """Write the settings as ``scheduler_config.json`` has them, the inverse of reading.
 
-    The number of steps, the guidance and the noise in training stay behind: diffusers has no names
-    for them.
+    The number of steps, the guidance and the noise in training are left out: diffusers has no
+    settings for them.
 
     Raises:
         UserError: a setting that the pipeline does not have.
@@ -358,8 +357,7 @@ def cosmos_to_diffusers(config: EDMConfig) -> dict[str, Any]:
     for key, only in {**_COSMOS_OURS, "sampler": "euler"}.items():
         if getattr(config, key) != only:
             raise UserError(
-                f"noise.{key} is {getattr(config, key)!r}; Cosmos-Predict2 has {only!r} and "
-                "nothing else."
+                f"noise.{key} is {getattr(config, key)!r}; Cosmos-Predict2 supports only {only!r}."
             )
     return {
         "_class_name": COSMOS_CLASS,

@@ -6,13 +6,13 @@
         rollout.jaxexport     state, actions, key → state, frames    (with what = rollout)
         denoise.jaxexport     one evaluation of the denoiser         (with what = denoise)
         weights.safetensors   the run's weights, as they are
-        signature.json        names, shapes and dtypes of all that goes in and out
+        signature.json        names, shapes and dtypes of all inputs and outputs
         run.py, README.md     how to call them, with jax and three small packages
 
-Weights are arguments and not constants: the programs stay small, two of them share one file of
-weights, and weights trained further fit the same programs. Attention is lowered in its plain form,
-which runs anywhere; cuDNN's is of one platform, and its calls are not promised to stay. State,
-frames and cameras travel as flat named arrays, so that no class of ours is needed.
+Weights are arguments, not constants: the programs stay small, both share one file of weights, and
+weights that were trained further fit the same programs. Attention is lowered in its plain form,
+which runs on every platform; cuDNN's kernel exists on one platform and its custom calls are not
+stable. State, frames and cameras are flat named arrays, so no class of this library is needed.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ from pewm_jax.types import Params
 from pewm_jax.worlds import rollouts
 
 PLATFORMS = ("cpu", "cuda", "tpu")
-"""Where a program shall run, if it can be lowered for all."""
+"""The platforms that a program is lowered for, as far as it can be."""
 SIGNATURE, SCRIPT = "signature.json", "run.py"
 TOLERANCE = {"float32": 1e-3, "bfloat16": 3e-2}
-"""How far, relative to the largest value, a program may be from the library, by model.dtype."""
+"""Largest difference from the library, relative to the largest value, by model.dtype."""
 
 
 def export(
@@ -65,7 +65,7 @@ def export(
     frames: int | None = None,
     platforms: Sequence[str] = PLATFORMS,
     check: bool = True,
-    say: Callable[[str], Any] = print,
+    log: Callable[[str], Any] = print,
 ) -> Path:
     """Write programs that run without this library into a new folder.
 
@@ -73,14 +73,14 @@ def export(
         run: a run's folder with ``weights.safetensors``, or that of ``export inference``, which has
             the smaller weights.
         dst: the folder to make.
-        what: ``rollout``, with the beginning of a world from frames; or one evaluation of the
+        what: ``rollout``, which also starts a world from frames; or one evaluation of the
             denoiser.
         clips: clips that one call of the rollout imagines.
-        frames: observed frames that a world begins with; by default ``data.context``.
-        platforms: of ``PLATFORMS``; those that a program cannot be lowered for are left out.
+        frames: observed frames that a world starts from; by default ``data.context``.
+        platforms: from ``PLATFORMS``; those that a program cannot be lowered for are left out.
         check: run the programs on the CPU, in a fresh process from which this library cannot be
             imported, and compare with the library. For a large model this takes long.
-        say: called with a line on each step.
+        log: called with a line on each step.
 
     Returns:
         ``dst``.
@@ -91,7 +91,7 @@ def export(
     """
     _require_sensible(run, clips, frames, platforms)
     with output.new_folder(dst) as folder:
-        say(f"reading {run} …")
+        log(f"reading {run} …")
         config, params = rollouts.load_finished(run)
         backbone = getattr(config.model, "backbone", None)
         if isinstance(backbone, DiTBackbone):
@@ -104,11 +104,11 @@ def export(
         weights = tree.flatten(params)
         entries = {}
         for name, program in programs.items():
-            say(f"lowering {name} for {', '.join(platforms)} …")
+            log(f"lowering {name} for {', '.join(platforms)} …")
             exported = lower(program, weights, platforms)
             left_out = [p for p in platforms if p not in exported.platforms]
             if left_out:
-                say(f"{name} cannot be lowered for {', '.join(left_out)}: left out.")
+                log(f"{name} cannot be lowered for {', '.join(left_out)}: left out.")
             (folder / f"{name}.jaxexport").write_bytes(_serialize(exported))
             entries[name] = _entry(name, program, exported)
         shutil.copyfile(run / runs.WEIGHTS, folder / runs.WEIGHTS)
@@ -122,10 +122,10 @@ def export(
         shutil.copyfile(Path(standalone.__file__), folder / SCRIPT)
         (folder / "README.md").write_text(_readme(dst.name, signature), encoding="utf-8")
         if check and "cpu" in platforms:
-            say("checking in a fresh process, without this library …")
+            log("checking in a fresh process, without this library …")
             worst = verify(folder, programs, params, TOLERANCE[config.model.dtype])
-            say(f"largest difference from the library, of the largest value: {worst:.1e}")
-    say(f"{dst} is ready: python {dst / SCRIPT}")
+            log(f"largest difference from the library, of the largest value: {worst:.1e}")
+    log(f"{dst} is ready: python {dst / SCRIPT}")
     return dst
 
 
@@ -248,8 +248,8 @@ def _readme(name: str, signature: dict[str, Any]) -> str:
     )
     return f"""# {name}
 
-A world model as StableHLO programs, written by {signature["made_by"]}. To run it takes
-`pip install jax numpy safetensors flatbuffers`, and nothing of the library that made it:
+A world model as StableHLO programs, written by {signature["made_by"]}. It needs
+`pip install jax numpy safetensors flatbuffers`, but not the library that wrote it:
 
 ```
 python run.py
@@ -257,8 +257,8 @@ python run.py
 
 {programs}
 
-`signature.json` names every array that goes in and out, with shape and dtype; weights are arguments
-of the programs, in `{signature["weights"]}`. `run.py` is short and meant to be read. By hand:
+`signature.json` lists every input and output with shape and dtype; weights are arguments of the
+programs, in `{signature["weights"]}`. `run.py` is short and meant to be read. By hand:
 
 ```python
 import jax, jax.export

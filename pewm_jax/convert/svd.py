@@ -2,7 +2,8 @@
 
 A pipeline's folder has ``unet/``, ``vae/``, ``image_encoder/`` and ``scheduler/``. Every tensor of
 a folder must be used. The world model has the settings of the preset ``egowm_svd`` around the
-checkpoint's networks, and fresh layers for the actions, which change nothing yet.
+checkpoint's networks, and fresh layers for the actions, which have no effect until they are
+trained.
 """
 
 from __future__ import annotations

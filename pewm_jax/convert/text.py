@@ -1,4 +1,4 @@
-"""Prompts through a pipeline's text encoder, once, at conversion: T5 is not run afterwards.
+"""Encode prompts with a pipeline's text encoder, once, at conversion: T5 is not run afterwards.
 
 As the reference pipelines do: padded with the pad token to the text length and cut there. For
 CogVideoX no mask is given to the encoder; for Cosmos one is, and the tokens of padding are zeros.
@@ -41,14 +41,14 @@ def encode(
         return {}
     if not all(there):
         lone, other = (encoder, tokenizer) if there[0] else (tokenizer, encoder)
-        raise UserError(f"{lone} is there and {other} is not; copy both, or neither of them.")
+        raise UserError(f"{lone} exists and {other} does not; copy both or neither.")
     values = sources.read_config(encoder / "config.json", ["t5"], "model_type")
     if values.get("d_model") != width:
         raise UserError(
-            f"{encoder}/config.json says d_model {values.get('d_model')} and the transformer takes "
+            f"{encoder}/config.json has d_model {values.get('d_model')} and the transformer takes "
             f"text of {width} channels; they are not of the same pipeline."
         )
-    sources.open_folder(encoder)  # complete and whole, or a sentence
+    sources.open_folder(encoder)  # refuses an incomplete or damaged folder
     return _encode(encoder, tokenizer, prompts, length, masked=masked)
 
 
@@ -69,7 +69,7 @@ def _encode(
     wrong = {*report["missing_keys"], *report["unexpected_keys"]}
     if wrong:
         raise UserError(
-            f"{encoder} does not hold a T5 encoder: missing or of no use are "
+            f"{encoder} does not hold a T5 encoder: missing or unused are "
             f"{tree.listing(map(str, wrong))}."
         )
     out: dict[str, np.ndarray] = {}

@@ -1,9 +1,9 @@
 """From a video model to a world model: more channels at both ends of the transformer, and back.
 
 The paper extends the patch embedding to accept depth, the observed frame and the camera, and the
-output layer to give depth. Old weights are copied and new inputs weigh nothing, so that the
-colours that come out are those of the original network whatever the new inputs hold. New outputs
-start at nothing too. Channels of the world model, in order: noisy colour, noisy depth, observed
+output layer to give depth. Old weights are copied and the weights of new inputs are zero, so the
+network predicts the original's colours for any value of the new inputs. New outputs
+start at zero too. Channels of the world model, in order: noisy colour, noisy depth, observed
 colour, observed depth, camera; an image-to-video model's image channels become the observed
 colour.
 """
@@ -23,7 +23,7 @@ from pewm_jax.types import Array, Params
 
 @dataclasses.dataclass(frozen=True)
 class Widening:
-    """Where the channels of a video model stand in its world model.
+    """The positions of a video model's channels in its world model.
 
     Attributes:
         old: the video model's transformer.
@@ -39,7 +39,7 @@ class Widening:
 
 
 def plan(old: DiTBackbone, latents: int, camera: int) -> Widening:
-    """Say where each channel goes.
+    """Map each channel of the video model to one of the world model.
 
     Args:
         old: the video model's transformer.
@@ -81,7 +81,7 @@ def widen(plan: Widening, params: Params) -> Params:
 def narrow(plan: Widening, params: Params) -> Params:
     """Return the video model within a world model's backbone: the inverse of ``widen``.
 
-    After training, what the network has learnt to read from depth and camera is left behind.
+    After training, what the network has learnt about depth and camera is lost.
     """
     old, new = plan.old, plan.new
     rows = _rows(new, new.in_channels, old.in_channels, plan.inputs)

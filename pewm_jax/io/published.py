@@ -1,4 +1,4 @@
-"""Published checkpoints: which tensor goes where, and strict reading of their settings.
+"""Published checkpoints: tables of tensor names, and strict reading of settings.
 
 Each network that can be converted has a ``Network`` in ``models/<family>/convert.py``. Its table is
 a list of ``Entry``: one per published tensor, with the path of our leaf and the transform between
@@ -70,7 +70,7 @@ class Entry:
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """How a network stands in published checkpoints.
+    """The form of a network in published checkpoints.
 
     Attributes:
         folder: its folder in a pipeline, theirs and ours.
@@ -97,7 +97,7 @@ class Network:
     weights_file: str = "diffusion_pytorch_model.safetensors"
 
     def like(self, config: Any) -> Params:
-        """Return the abstract parameters, nothing allocated."""
+        """Return the abstract parameters, without allocating memory."""
         return jax.eval_shape(lambda key: self.init(config, key), jax.random.key(0))
 
     def config(self, values: dict[str, Any], where: str) -> Any:
@@ -124,7 +124,7 @@ def rename(path: str, rules: Sequence[tuple[str, Any]]) -> str:
 
 
 def require_class(values: Mapping[str, Any], what: str, name: str) -> None:
-    """Insist that settings name a class, or none.
+    """Check that settings name a class, or none.
 
     Args:
         values: the JSON object.
@@ -140,7 +140,7 @@ def require_class(values: Mapping[str, Any], what: str, name: str) -> None:
 
 
 def require_known(values: Mapping[str, Any], what: str, known: Collection[str]) -> None:
-    """Insist that every setting is known; those that begin with ``_`` are the writer's own notes.
+    """Check that every setting is known; those that begin with ``_`` are notes of the writer.
 
     Raises:
         UserError: with the list of those that are not.
@@ -167,7 +167,7 @@ def read_settings(
         what: what they describe, for messages.
         name: the class that can be read.
         defaults: the settings that matter, and what the class takes for absent ones.
-        without_effect: settings that may stand there and change nothing.
+        without_effect: settings that are allowed and have no effect.
 
     Raises:
         UserError: another class, or a setting that is not known.
@@ -178,7 +178,7 @@ def read_settings(
 
 
 def require_only(given: Mapping[str, Any], what: str, only: Mapping[str, Any]) -> None:
-    """Insist on the values of settings of which only one is supported.
+    """Check settings of which only one value is supported.
 
     Raises:
         UserError: another value.
@@ -189,19 +189,17 @@ def require_only(given: Mapping[str, Any], what: str, only: Mapping[str, Any]) -
 
 
 def require_kinds(given: Mapping[str, Any], what: str, examples: Mapping[str, Any]) -> None:
-    """Insist that settings are of the kinds of examples.
+    """Check that settings have the types of examples.
 
-    A whole number will do for a number; a list must be as long as a tuple in the examples, and of
-    any length for a list.
+    A whole number is accepted for a number. A list must be as long as a tuple in the examples; for
+    a list in the examples it may have any length.
 
     Raises:
         UserError: a setting of another kind.
     """
     for key, example in examples.items():
         if not _alike(given[key], example):
-            raise UserError(
-                f"{what}'s {key} is {given[key]!r}; one like {example!r} belongs there."
-            )
+            raise UserError(f"{what}'s {key} is {given[key]!r}; give a value like {example!r}.")
 
 
 def _plain(value: Any) -> Any:

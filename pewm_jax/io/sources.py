@@ -1,7 +1,7 @@
-"""Where foreign tensors are read from: one safetensors file, shards with an index, or memory.
+"""Sources of published tensors: one safetensors file, shards with an index, or memory.
 
 Headers are read at once and checked against the files' sizes; tensors are read one by one, when
-asked for, so that nothing holds more than one of them.
+asked for, so at most one of them is in memory.
 """
 
 from __future__ import annotations
@@ -165,14 +165,14 @@ def open_folder(folder: Path) -> Files:
     beside = [p.name for p in files if p not in used and _precision(p) == _precision(chosen)]
     if beside:
         raise UserError(
-            f"{folder} holds {tree.listing(beside)} besides what {chosen.name} stands for; move "
+            f"{folder} holds {tree.listing(beside)} besides the weights of {chosen.name}; move "
             "away what is not of this network."
         )
     return source
 
 
 def _without_weights(folder: Path, shards: Sequence[Path]) -> UserError:
-    """Return what to say of a folder without an index or a whole file."""
+    """Return the error for a folder without an index or a whole file."""
     if shards:
         return UserError(
             f"{folder} holds shards such as {min(shards).name} but no *.safetensors.index.json "
@@ -203,8 +203,7 @@ def _open_shards(folder: Path, index: Path) -> Files:
     absent = [name for name in shards if not (folder / name).is_file()]
     if absent:
         raise UserError(
-            f"{index} names files that are not there: {tree.listing(absent)}; copy them to "
-            f"{folder}."
+            f"{index} names files that do not exist: {tree.listing(absent)}; copy them to {folder}."
         )
     places: dict[str, tuple[Path, tensor_files.Place]] = {}
     for shard in shards:
@@ -239,12 +238,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_config(path: Path, classes: Sequence[str], key: str = "_class_name") -> dict[str, Any]:
-    """Read the settings of a network and insist on its class.
+    """Read the settings of a network and check its class.
 
     Args:
         path: ``config.json``, ``scheduler_config.json`` or ``model_index.json``.
         classes: the class names that can be read.
-        key: where the class name stands.
+        key: the setting that names the class.
 
     Returns:
         The settings as they are in the file, the class name included.
@@ -256,7 +255,7 @@ def read_config(path: Path, classes: Sequence[str], key: str = "_class_name") ->
     name = values.get(key)
     if name not in classes:
         raise UserError(
-            f"{path} is of class {name!r} ({key}); this can read {' and '.join(classes)} only."
+            f"{path} is of class {name!r} ({key}); only {' and '.join(classes)} can be read."
         )
     return values
 
@@ -280,7 +279,7 @@ def component(folder: Path, name: str) -> Path:
 
 
 def _precision(path: Path) -> str:
-    """Return the part of a file's name that says its precision, or nothing.
+    """Return the part of a file's name that states its precision, or an empty string.
 
     It is ``fp16`` in ``model.fp16.safetensors``, ``model.fp16-00001-of-00002.safetensors`` and
     ``model.safetensors.index.fp16.json``.

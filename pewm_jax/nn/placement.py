@@ -1,4 +1,4 @@
-"""How activations are sharded: from names of array axes to axes of the mesh.
+"""Sharding of activations: names of array axes → axes of the mesh.
 
 Networks name the axes of their arrays (``batch``, ``tokens``, ``heads``, ``hidden``). The table
 below says over which mesh axes each name is split. The mesh is the current one (``jax.set_mesh``).
@@ -57,7 +57,7 @@ def _split(name: str | None, size: int) -> tuple[str, ...] | None:
 
 
 def constrain(x: Array, *names: str | None) -> Array:
-    """Constrain an array's sharding to what the names of its axes say.
+    """Constrain an array's sharding by the names of its axes.
 
     Args:
         x: any array.

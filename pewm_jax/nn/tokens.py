@@ -1,4 +1,6 @@
-"""The order of a clip's tokens: text, then video; split over devices, a share of both per device.
+"""Tokens of a clip: patches of latents, and the order of text and video tokens.
+
+Text comes first, then video. Over several devices each gets a part of both.
 
 Attention does not depend on the order of tokens. If the mesh splits tokens into X parts, each part
 gets 1/X of the text and 1/X of *every* latent frame:
@@ -6,7 +8,7 @@ gets 1/X of the text and 1/X of *every* latent frame:
     one part     text                          frame 0          frame 1 …
     X parts      text[0] frame 0[0] frame 1[0] … | text[1] frame 0[1] frame 1[1] … | …
 
-So text and video, and single frames, can be taken apart without moving a token between devices. If
+So text and video, and single frames, can be separated without moving a token between devices. If
 X does not divide a count, it is padded with zero tokens. They are masked in attention (``real``)
 and dropped at the end.
 """

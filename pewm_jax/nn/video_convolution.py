@@ -24,10 +24,10 @@ import numpy as np
 from pewm_jax.types import Array, Params
 
 POINTS = (0.0, 1.0, -1.0, 0.5, -2.0)
-"""Points, besides infinity, at which minimal filtering evaluates polynomials. Small numbers that
-lie apart keep rounding errors small."""
+"""Points, besides infinity, at which minimal filtering evaluates polynomials. Small, well
+separated numbers keep rounding errors small."""
 WORTHWHILE = 256
-"""Fewest output pixels of all frames for which ``winograd`` saves more than it costs."""
+"""Fewest output pixels of all frames for which ``winograd`` is faster."""
 SAME = ((1, 1), (1, 1))
 """Padding by one row or column of zeros on every side."""
 
@@ -110,7 +110,7 @@ def convolve_upsampled(params: Params, x_BTHWC: Array) -> Array:
 def form(config: Settings, dtype: jnp.dtype) -> str:
     """Return the form of the 3D convolutions: ``taps``, ``winograd`` or ``volume``.
 
-    ``auto`` looks at JAX's default backend while tracing.
+    ``auto`` depends on JAX's default backend while tracing.
     """
     if config.convolution != "auto":
         return config.convolution

@@ -65,7 +65,7 @@ def test_shards_are_read_like_one_file(folder, params):
 
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
 def test_a_dtype_can_be_asked_for(folder, params, dtype, tmp_path):
-    dinov2.convert(folder, tmp_path / "ours", dtype, say=lambda _: None)
+    dinov2.convert(folder, tmp_path / "ours", dtype, log=lambda _: None)
     _, loaded = model.load(tmp_path / "ours")
     want = jax.tree.map(lambda leaf: np.asarray(leaf.astype(dtype)), params)
     jax.tree.map(np.testing.assert_array_equal, loaded, want)
@@ -154,7 +154,7 @@ def test_nothing_is_overwritten_and_nothing_half_written_stays(folder, tmp_path)
 
 
 def test_a_folder_of_ours_is_checked_when_it_is_loaded(folder, tmp_path):
-    dinov2.convert(folder, tmp_path / "ours", say=lambda _: None)
+    dinov2.convert(folder, tmp_path / "ours", log=lambda _: None)
     settings = json.loads((tmp_path / "ours" / "config.json").read_text())
     (tmp_path / "ours" / "config.json").write_text(json.dumps({**settings, "layers": 1}))
     with pytest.raises(UserError, match="does not fit this configuration"):

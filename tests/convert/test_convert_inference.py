@@ -60,7 +60,7 @@ def run(params, tmp_path):
 
 def export(run, dst):
     said = []
-    assert inference.export(run, dst, say=said.append) == dst
+    assert inference.export(run, dst, log=said.append) == dst
     assert any(str(dst) in line for line in said)
     return (dst / "README.md").read_text(encoding="utf-8")
 
@@ -130,8 +130,8 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(run, tmp_path):
     cases.append((run, tmp_path / "x", "does not exist"))
     for source, target, sentence in cases:
         with pytest.raises(UserError, match=sentence):
-            inference.export(source, target, say=lambda _: None)
+            inference.export(source, target, log=lambda _: None)
     (run / runs.WEIGHTS).write_bytes((run / "away").read_bytes()[:-5])
     with pytest.raises(UserError, match="cut short"):
-        inference.export(run, tmp_path / "x", say=lambda _: None)
+        inference.export(run, tmp_path / "x", log=lambda _: None)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["runs", "there"]

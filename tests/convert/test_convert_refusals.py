@@ -159,7 +159,7 @@ def class_of(part, file, name):
 
 
 FAULTS = {
-    "missing shard": (drop_shard, "names files that are not there: diffusion_pytorch_model-00001"),
+    "missing shard": (drop_shard, "names files that do not exist: diffusion_pytorch_model-00001"),
     "truncated": (cut_short, "is damaged or cut short (incomplete metadata, file not"),
     "truncated in its header": (cut_header, "invalid header length"),
     "no safetensors": (not_safetensors, "invalid JSON in header"),
@@ -169,7 +169,7 @@ FAULTS = {
     "index names a tensor that is not there": (index_of_other_tensors, "lacks proj_out.other"),
     "index leads out of its folder": (index_leads_away, "../vae/config.json"),
     "a shard too many": (orphan_shard, "00099-of-00099.safetensors besides what"),
-    "an adapter": (adapter, "of no use here: pytorch_lora_weights.safetensors"),
+    "an adapter": (adapter, "cannot be used: pytorch_lora_weights.safetensors"),
     "another pipeline": (class_of("", "model_index.json", "WanPipeline"), "'WanPipeline'"),
     "a tensor too many": (extra_tensor, "1 tensors of no use (lora.down)"),
     "tensors too few": (deeper, "lacks 24 tensors (transformer_blocks.2.attn1.norm_k.bias"),

@@ -69,7 +69,7 @@ def alone(folder, *flags):
 @serialises
 def test_a_rollout_runs_without_the_library_and_equals_it(run, params, tmp_path):
     dst, said = tmp_path / "program", []
-    stablehlo.export(run, dst, clips=2, frames=3, check=False, say=said.append)
+    stablehlo.export(run, dst, clips=2, frames=3, check=False, log=said.append)
     assert not any("left out" in line for line in said)
     signature = json.loads((dst / "signature.json").read_text())
     for entry in signature["programs"].values():
@@ -99,13 +99,13 @@ def test_a_rollout_runs_without_the_library_and_equals_it(run, params, tmp_path)
     refused = alone(dst, "--inputs", tmp_path / "out.npz")
     assert "frames/rgb_THWC (3, 16, 16, 3) uint8 is not given" in refused.stderr
     with pytest.raises(UserError, match="exists already"):
-        stablehlo.export(run, dst, say=said.append)
+        stablehlo.export(run, dst, log=said.append)
 
 
 @serialises
 def test_a_denoise_step_is_checked_in_a_fresh_process(run, params, tmp_path):
     said = []
-    stablehlo.export(run, tmp_path / "step", what="denoise", platforms=["cpu"], say=said.append)
+    stablehlo.export(run, tmp_path / "step", what="denoise", platforms=["cpu"], log=said.append)
     assert any("largest difference" in line for line in said)
     program = stablehlo_programs.denoise_program(CONFIG, params)
     assert {"noisy_BthwC", "timesteps_B", "tokens/valid_M"} <= program.inputs.keys()
@@ -131,9 +131,9 @@ def test_a_denoise_step_is_checked_in_a_fresh_process(run, params, tmp_path):
 )
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(run, tmp_path, options, sentence):
     with pytest.raises(UserError, match=sentence):
-        stablehlo.export(run, tmp_path / "x", **options, say=lambda _: None)
+        stablehlo.export(run, tmp_path / "x", **options, log=lambda _: None)
     with pytest.raises(UserError, match="not a folder"):
-        stablehlo.export(tmp_path / "none", tmp_path / "x", say=lambda _: None)
+        stablehlo.export(tmp_path / "none", tmp_path / "x", log=lambda _: None)
     assert list(tmp_path.iterdir()) == []
 
 

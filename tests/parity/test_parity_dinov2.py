@@ -223,7 +223,7 @@ def test_an_image_classifier_is_read_by_its_body(pair, tmp_path):
 def test_our_folder_holds_what_was_read(pair, tmp_path):
     _, folder, (config, params) = pair
     lines = []
-    dinov2.convert(folder, tmp_path / "ours", say=lines.append)
+    dinov2.convert(folder, tmp_path / "ours", log=lines.append)
     again, loaded = model.load(tmp_path / "ours")
     assert again == config
     jax.tree.map(np.testing.assert_array_equal, loaded, params)
