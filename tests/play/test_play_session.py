@@ -98,7 +98,7 @@ def test_the_commands_of_the_documentation_can_be_read_and_its_buttons_are_there
     for flag in set(re.findall(r"`(--[\w-]+)", PAGE)):
         value = {"--host": ["0.0.0.0"], "--frames": ["8"], "--worlds": ["here"]}.get(flag, [])
         cli.parse(play.Settings, [flag, *value], default=play.Settings(), prog="pewm-jax play")
-    files = ("page.py", "files_panel.py")
+    files = ("page.py", "panels.py")
     code = "".join((ROOT / "pewm_jax" / "play" / name).read_text() for name in files)
     for button in re.findall(r"(?<!\*)\*([A-Z][^*\n]+)\*(?!\*)", PAGE):
         assert f'"{button}"' in code, button
@@ -183,7 +183,7 @@ def test_a_memory_without_places_is_refused_an_edit_and_a_codec_a_drive():
     model = dataclasses.replace(an_engine(), config=Config(model=images))
     with pytest.raises(UserError, match="cannot be edited"):
         session.apply(model, a_session(), session.Erase(((0, 0, 0), (1, 1, 1))))
-    with pytest.raises(UserError, match="no world"):
+    with pytest.raises(UserError, match="needs a world model"):
         engine.open_engine("codec", CODEC, {})
 
 
