@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from pewm_jax.config import UserError
 from pewm_jax.config import command_line as cli
 
 USAGE = """usage: {prog} COMMAND …
@@ -41,9 +40,6 @@ def _main(argv: Sequence[str], prog: str) -> int:
     command, flags = cli.choose(argv[0], COMMANDS, "command"), argv[1:]
     try:
         return _run(command, flags, f"{prog} {command}")
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        raise UserError(f"{where}{error.strerror or error}.") from None
     except KeyboardInterrupt:
         again = "; run the same command again to resume" if command == "collect" else ""
         raise KeyboardInterrupt(f"Interrupted{again}.") from None

@@ -417,6 +417,9 @@ def load_protocol(path: Path) -> Protocol:
         UserError: it is absent, no protocol, of another version, or was changed since it was
             written.
     """
+    if path.exists() and not path.is_file():  # a device may have no end
+        kind = "a folder" if path.is_dir() else "no regular file"
+        raise UserError(f"the protocol {path} is {kind}; name a file that ends in .json.")
     try:
         value = json.loads(path.read_text("utf-8"))
     except OSError as error:

@@ -21,14 +21,20 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Yields:
         A path beside it, ending in ``.partial``, where nothing exists yet.
+
+    Raises:
+        OSError: writing failed; the error names ``path`` if it names no other file (that of a full
+            disk names none).
     """
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     remove(partial)  # left by a process of the same number that was killed
     try:
         yield partial
         partial.replace(path)
-    except BaseException:
+    except BaseException as error:
         remove(partial)
+        if isinstance(error, OSError) and error.filename in (None, str(partial)):
+            error.filename = str(path)
         raise
 
 

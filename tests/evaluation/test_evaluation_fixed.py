@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -164,6 +165,16 @@ def test_a_file_that_is_absent_or_no_json_is_refused(tmp_path):
     (tmp_path / "x.json").write_text("{")
     with pytest.raises(UserError, match="is not JSON"):
         protocols.load_protocol(tmp_path / "x.json")
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [("/dev/zero", "is no regular file"), ("/dev/full", "is no regular"), (".", "a folder")],
+)
+def test_what_is_no_file_is_refused_unread(path, said):
+    """A device may have no end."""
+    with pytest.raises(UserError, match=said):
+        protocols.load_protocol(Path(path))
 
 
 def test_it_stands_above_the_settings(episodes, tmp_path):

@@ -1,5 +1,7 @@
 """Nothing half-written is ever taken for whole."""
 
+import errno
+
 import pytest
 
 from pewm_jax.io import atomic
@@ -35,3 +37,13 @@ def test_a_folder_appears_whole(tmp_path):
         (partial / "b").write_text("c")
         assert not path.exists()
     assert (path / "b").read_text() == "c"
+
+
+@pytest.mark.parametrize("named", [None, "partial", "other"])
+def test_an_error_of_the_disk_names_the_file_that_was_to_be_written(tmp_path, named):
+    """The error of a full disk names no file, and the name of a partial file helps nobody."""
+    path = tmp_path / "a.txt"
+    with pytest.raises(OSError, match="No space left") as caught, atomic.replacing(path) as partial:  # noqa: PT012
+        names = {None: (), "partial": (str(partial),), "other": ("b.txt",)}[named]
+        raise OSError(errno.ENOSPC, "No space left on device", *names)
+    assert caught.value.filename == ("b.txt" if named == "other" else str(path))
