@@ -177,6 +177,72 @@ def test_unknown_actions_are_refused_where_they_are_known(kind, control, says):
         assert "\n" not in str(caught.value)
 
 
+def arguments(who):
+    """Return a world function and arguments that it takes, by name, all but the model."""
+    _, params, state = made("pewm")
+    keys = jnp.stack([KEY] * 2)
+    found = {
+        "start": (worlds.start, {"frames": seen()}),
+        "observe": (worlds.observe, {"state": state, "frames": seen()}),
+        "imagine": (worlds.imagine, {"state": state, "control": GOOD, "key": KEY}),
+        "imagine_many": (
+            worlds.imagine_many,
+            {"state": state, "controls": [GOOD, GOOD], "keys": keys},
+        ),
+    }
+    function, given = found[who]
+    return function, {"model": MODELS["pewm"], "params": params} | given
+
+
+@pytest.mark.parametrize("who", ["start", "observe", "imagine", "imagine_many"])
+@pytest.mark.parametrize(
+    ("argument", "value", "says"),
+    [
+        ("model", None, "a model of type NoneType; give .* pewm_jax.load"),
+        ("model", "small", "a model of type str"),
+        ("params", None, "params of type NoneType; give .* pewm_jax.load"),
+        ("params", [1, 2], "params of type list"),
+        ("state", None, "a state of type NoneType"),
+        ("state", "persist", r"a state whose frame is \(1, 16, 16, 3\).*16, 24, 3.* of this model"),
+        ("key", 0, r"a key of type int; give jax.random.key\(0\)"),
+        ("key", None, "a key of type NoneType"),
+        ("key", np.zeros(2), "a key of type ndarray"),
+        ("key", "two", r"keys of shape \(2,\); give one key"),
+        ("keys", 0, r"keys of type int; give jax.random.split\(jax.random.key\(0\), 2\)"),
+        ("keys", KEY, r"keys of shape \(\); give 2 keys, one for each candidate"),
+        ("keys", "three", r"keys of shape \(3,\); give 2 keys"),
+        ("controls", GOOD, r"actions of shape \(5,\); give .* leading axis K"),
+        ("controls", np.zeros((2, 3, 3, 3)), r"actions of shape \(2, 3, 3, 3\)"),
+        ("controls", 0, r"actions of shape \(\)"),
+        ("controls", np.zeros((0, 3), int), r"actions of shape \(0, 3\)"),
+        ("controls", "cameras", r"cameras with poses \(2, 4, 4\); give .* leading axis K"),
+    ],
+)
+def test_what_is_no_model_weights_state_or_key_is_refused_in_a_sentence(who, argument, value, says):
+    function, given = arguments(who)
+    if argument not in given:
+        pytest.skip(f"{who} has no such argument")
+    made_of = {
+        "persist": lambda: made("persist")[2],
+        "two": lambda: jnp.stack([KEY] * 2),
+        "three": lambda: jnp.stack([KEY] * 3),
+        "cameras": lambda: seen().camera,
+    }
+    wrong = made_of[value]() if isinstance(value, str) and value in made_of else value
+    with pytest.raises(UserError, match=says) as caught:
+        function(**given | {argument: wrong})
+    assert str(caught.value).startswith(f"{who}() got ")
+    assert "\n" not in str(caught.value)
+
+
+def test_keys_of_the_old_kind_are_taken():
+    model, params, state = made("pewm")
+    old, new = jax.random.PRNGKey(0), KEY
+    equal(*(worlds.imagine(model, params, state, GOOD, key) for key in (old, new)))
+    many = (worlds.imagine_many(model, params, state, [GOOD], key[None]) for key in (old, new))
+    equal(*many)
+
+
 def test_cameras_to_imagine_are_rigid_and_finite():
     model, params, state = made("pewm")
     camera = seen(count=3).camera

@@ -95,7 +95,7 @@ def start(
             unknown unit, poses that are not finite or not rigid, intrinsics of another image size.
             Values are not checked under jit, vmap and grad.
     """
-    model = require_world(model_of(model), "start()")
+    model = _world_of(model, params, "start")
     frames = checks.check_frames(frames, "start", depth_scale)
     return _start(function(model, "start"), model, params, frames, depth_scale)
 
@@ -123,8 +123,8 @@ def observe(
     Raises:
         UserError: as for ``start``.
     """
-    model = require_world(model_of(model), "observe()")
-    _require_state(state, "observe")
+    model = _world_of(model, params, "observe")
+    checks.check_state(state, model, "observe")
     frames = checks.check_frames(frames, "observe", depth_scale)
     return _observe(function(model, "observe"), model, params, state, frames, depth_scale)
 
@@ -165,13 +165,15 @@ def imagine(
         imagined from that state is NaN, too.
 
     Raises:
-        UserError: the control is empty or has none of these forms; or, outside of jit, vmap and
-            grad, it has an unknown discrete action, a number that is not finite, or a camera that
-            is not rigid.
+        UserError: the control is empty or has none of these forms; model, params, state or key
+            have another type, or the state's frame another size than the model's; or, outside of
+            jit, vmap and grad, the control has an unknown discrete action, a number that is not
+            finite, or a camera that is not rigid.
     """
-    model = require_world(model_of(model), "imagine()")
-    _require_state(state, "imagine")
+    model = _world_of(model, params, "imagine")
+    checks.check_state(state, model, "imagine")
     control = checks.check_control(control, "imagine")
+    checks.check_key(key, "imagine")
     act = function(model, "imagine")
     after, frames = _imagine(
         act, model, params, state, control, key, remember=remember, memory=memory
@@ -208,11 +210,12 @@ def imagine_many(
         action are NaN, as for ``imagine``; the other candidates are not affected.
 
     Raises:
-        UserError: as for ``imagine``.
+        UserError: as for ``imagine``, or the number of keys is not that of the candidates.
     """
-    model = require_world(model_of(model), "imagine_many()")
-    _require_state(state, "imagine_many")
+    model = _world_of(model, params, "imagine_many")
+    checks.check_state(state, model, "imagine_many")
     controls = checks.check_control(controls, "imagine_many")
+    checks.check_key(keys, "imagine_many", checks.candidates_of(controls, "imagine_many"))
     act = function(model, "imagine_many")
     frame, frames = _imagine_many(
         act, model, params, state, controls, keys, views, memory=memory, last=last
@@ -220,12 +223,13 @@ def imagine_many(
     return WorldState(frame, state.map), frames
 
 
-def _require_state(state: Any, who: str) -> None:
-    if not isinstance(state, WorldState):
-        raise UserError(
-            f"{who}() got a state of type {type(state).__name__}; give the WorldState that start() "
-            "or an earlier call returned."
-        )
+def _world_of(model: Config | Task, params: Params, who: str) -> World:
+    """Return the settings of a world, after checking that these are settings and parameters."""
+    model = model_of(model)
+    checks.check_model(model, who)
+    world = require_world(model, f"{who}()")
+    checks.check_params(params, who)
+    return world
 
 
 # One program for each world, model and set of shapes. They are inlined under a caller's own jit, so

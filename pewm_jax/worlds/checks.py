@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ from jax.core import Tracer
 
 from pewm_jax.config import UserError
 from pewm_jax.geometry import actions as action_geometry
-from pewm_jax.types import Array, Camera, Control, Frames
+from pewm_jax.types import Array, Camera, Control, Frames, WorldState
 
 COLOR_TOLERANCE = 1e-3
 """Float colours may exceed [−1, 1] by this much, which is rounding."""
@@ -66,6 +67,113 @@ def check_frames(frames: Any, who: str, depth_scale: float | None = None) -> Fra
         with jax.ensure_compile_time_eval():
             _check_values(frames, who)
     return frames
+
+
+def check_model(model: Any, who: str) -> None:
+    """Refuse what are no settings.
+
+    Raises:
+        UserError: this is no model.
+    """
+    if not dataclasses.is_dataclass(model) or isinstance(model, type):
+        raise UserError(
+            f"{who}() got a model of type {type(model).__name__}; give the settings that "
+            "pewm_jax.load returned, or their model."
+        )
+
+
+def check_params(params: Any, who: str) -> None:
+    """Refuse values that cannot be parameters; which ones a world needs is not checked.
+
+    Parameters are nested dictionaries, or another pytree of arrays that the world's ``init`` made.
+
+    Raises:
+        UserError: this is neither.
+    """
+    leaves = jax.tree.leaves(params)
+    if isinstance(params, Mapping) or (leaves and all(hasattr(leaf, "dtype") for leaf in leaves)):
+        return
+    raise UserError(
+        f"{who}() got params of type {type(params).__name__}; give the parameters that "
+        "pewm_jax.load returned."
+    )
+
+
+def check_state(state: Any, model: Any, who: str) -> None:
+    """Refuse what is no state, or one whose frame is not of the model's size.
+
+    Raises:
+        UserError: this is no state of such a model.
+    """
+    if not isinstance(state, WorldState):
+        raise UserError(
+            f"{who}() got a state of type {type(state).__name__}; give the WorldState that start() "
+            "or an earlier call returned."
+        )
+    clip = getattr(model, "clip", None)
+    shape, wanted = jnp.shape(state.frame.rgb_THWC), None
+    if clip is not None:
+        wanted = (1, clip.height, clip.width, 3)
+    if wanted is not None and shape != wanted:
+        raise UserError(
+            f"{who}() got a state whose frame is {shape} and not {wanted}; give a state that "
+            "start() made of this model."
+        )
+
+
+def check_key(key: Any, who: str, candidates: int | None = None) -> None:
+    """Refuse what is no PRNG key, or another number of keys.
+
+    Args:
+        key: a key, or ``candidates`` keys; new typed keys, or the old ones of uint32.
+        who: the function that was called, for the message.
+        candidates: the number of keys; None for one without an axis.
+
+    Raises:
+        UserError: this is no key, or there are more or fewer.
+    """
+    one = candidates is None
+    shape = found = getattr(key, "shape", None)
+    dtype = getattr(key, "dtype", None)
+    if dtype is not None and dtype == np.uint32 and found:
+        shape = found[:-1]  # the words of an old key
+    elif dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        shape = None
+    what = "a key" if one else "keys"
+    if shape is None:
+        example = "jax.random.key(0)"
+        example = example if one else f"jax.random.split({example}, {candidates})"
+        raise UserError(f"{who}() got {what} of type {type(key).__name__}; give {example}.")
+    if shape != (() if one else (candidates,)):
+        wanted = "one key" if one else f"{candidates} keys, one for each candidate"
+        raise UserError(f"{who}() got keys of shape {shape}; give {wanted}.")
+
+
+def candidates_of(controls: Any, who: str) -> int:
+    """Return K, the number of candidates.
+
+    Args:
+        controls: from ``check_control``, with a leading axis K.
+        who: the function that was called, for the message.
+
+    Raises:
+        UserError: they have no such axis, or it is empty.
+    """
+    camera = controls.camera if isinstance(controls, Control) else controls
+    if isinstance(camera, Camera):
+        poses, intrinsics = (jnp.shape(x) for x in (camera.world_from_camera, camera.intrinsics_4))
+        fits = len(poses) == 4 and len(intrinsics) == 3 and poses[0] == intrinsics[0]
+        found, wanted = f"cameras with poses {poses}", "(K, n, 4, 4) and intrinsics (K, n, 4)"
+        shape = poses
+    else:
+        shape = jnp.shape(controls)
+        fits = len(shape) in (2, 3)
+        found, wanted = f"actions of shape {shape}", "(K, n) integers or (K, n, 3) floats"
+    if not fits or shape[0] == 0:
+        raise UserError(
+            f"{who}() got {found}; give {wanted}, with a leading axis K ≥ 1 of candidates."
+        )
+    return shape[0]
 
 
 def in_metres(frames: Frames, depth_scale: Array | float | None) -> Frames:
