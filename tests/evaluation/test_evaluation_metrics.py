@@ -149,7 +149,7 @@ def test_what_cannot_work_is_refused_in_a_sentence(files, tmp_path, monkeypatch)
         metrics.load("fid")
     with pytest.raises(UserError, match="psnr is no network and takes no weights"):
         metrics.load("psnr", files["lpips_alex"])
-    with pytest.raises(UserError, match="weights of AlexNet, and not of VGG16"):
+    with pytest.raises(UserError, match="weights of AlexNet, not of VGG16"):
         metrics.load("lpips_vgg", files["lpips_alex"])
     with pytest.raises(UserError, match="gone does not exist"):
         metrics.load("lpips_alex", tmp_path / "gone")

@@ -152,7 +152,7 @@ def test_clips_are_measured_frame_by_frame_at_any_size(made):
 def test_other_files_are_refused_in_a_sentence(made, tmp_path):
     import shutil
 
-    with pytest.raises(UserError, match="is no folder: DreamSim's weights come with no package"):
+    with pytest.raises(UserError, match="is not a folder: no package contains DreamSim's weights"):
         metrics.load("dreamsim", tmp_path / "nothing")
     folder = tmp_path / "copy"
     shutil.copytree(made[0], folder)

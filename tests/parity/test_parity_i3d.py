@@ -229,5 +229,5 @@ def test_videos_that_cannot_be_taken_are_refused():
     params = jax.tree.map(lambda x: np.zeros(x.shape), jax.eval_shape(i3d.init, jax.random.key(0)))
     with pytest.raises(UserError, match=r"clips of 8 frames are too short for I3D.*at least 9"):
         i3d.apply(params, np.zeros((1, 8, 64, 64, 3), np.float32))
-    with pytest.raises(UserError, match=r"a video of shape \(9, 64, 64, 3\) is not known to I3D"):
+    with pytest.raises(UserError, match=r"I3D cannot take a video of shape \(9, 64, 64, 3\)"):
         i3d.apply(params, np.zeros((9, 64, 64, 3), np.float32))

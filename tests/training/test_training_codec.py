@@ -228,7 +228,7 @@ def test_lpips_without_weights_is_refused_before_anything_is_written(tmp_path, m
     gone = {"lpips_weight": 1.0, "lpips_file": "gone"}
     with pytest.raises(UserError, match="gone does not exist"):
         loop.train(experiment(tmp_path / "run", **gone))
-    with pytest.raises(UserError, match="weights of AlexNet, and not of VGG16"):
+    with pytest.raises(UserError, match="weights of AlexNet, not of VGG16"):
         loop.train(perceptual(tmp_path, lpips_net="vgg"))
     assert not (tmp_path / "run").exists()
     with pytest.raises(ConfigError, match=r"train\.lpips_weight is -1: use 0 or more"):

@@ -18,7 +18,7 @@ from pewm_jax.models.clip.config import CLIPVisionConfig
 CLASS = "CLIPVisionModelWithProjection"
 """The reference's class."""
 UNUSED = ("vision_model.embeddings.position_ids",)
-"""Tensors that older files hold and no network reads: they count positions."""
+"""Position indices in older files, which no network reads."""
 _DEFAULTS: dict[str, Any] = {
     "num_hidden_layers": 12,
     "num_attention_heads": 12,
@@ -102,9 +102,7 @@ def config_from_transformers(
     given = {key: values.get(key, default) for key, default in _DEFAULTS.items()}
     for key, default in _DEFAULTS.items():
         if type(given[key]) is not type(default):
-            raise UserError(
-                f"{where} has {key} {given[key]!r}, where one like {default!r} belongs."
-            )
+            raise UserError(f"{where} has {key} {given[key]!r}, give a value like {default!r}.")
     if given["hidden_act"] not in ("gelu", "quick_gelu"):
         raise UserError(
             f"{where} has hidden_act {given['hidden_act']!r}; only gelu and quick_gelu are known."
@@ -123,7 +121,7 @@ def config_to_transformers(config: CLIPVisionConfig) -> dict[str, Any]:
 
 
 def entries(config: CLIPVisionConfig) -> list[Entry]:
-    """List every tensor of the reference and where it goes in our tree."""
+    """List every tensor of the reference and its path in our tree."""
     p, body = config.patch, "vision_model"
     patch = Transform(
         lambda x: np.moveaxis(x, (1, 0), (2, 3)).reshape(p * p * 3, -1),

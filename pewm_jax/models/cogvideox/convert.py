@@ -51,9 +51,9 @@ FIXED: dict[str, Any] = {
     "norm_elementwise_affine": True,
     "norm_eps": 1e-5,
 }
-"""Settings that are alike in every published network; other values are not supported."""
+"""Settings that are equal in every published network; other values are not supported."""
 IGNORED = ("dropout",)
-"""Settings that do not touch inference."""
+"""Settings without effect on inference."""
 
 
 def transformer_config_from_diffusers(values: dict[str, Any]) -> DiTBackbone:
@@ -138,9 +138,7 @@ def transformer_config_to_diffusers(config: DiTBackbone) -> dict[str, Any]:
         UserError: a setting that CogVideoX does not have.
     """
     if config.mlp_ratio != 4:
-        raise UserError(
-            f"backbone.mlp_ratio is {config.mlp_ratio}; CogVideoX has 4 and nothing else."
-        )
+        raise UserError(f"backbone.mlp_ratio is {config.mlp_ratio}; CogVideoX supports only 4.")
     newer = config.positions == "rope_integer"
     return {
         "_class_name": TRANSFORMER_CLASS,
@@ -250,7 +248,7 @@ _VAE_FIXED: dict[str, tuple[Any, ...]] = {
     "use_post_quant_conv": (False,),
     "force_upcast": (True, False),
 }
-"""Settings that change nothing here, and the values that may stand there; the first is written."""
+"""Settings without effect here, and their allowed values; the first is written."""
 _VAE_FORMER = frozenset(["sample_size"])
 """Settings of the reference's first release, which it does not have any more."""
 _VAE_BLOCKS = {
@@ -357,7 +355,7 @@ def _checked(key: str, value: Any) -> Any:
         fits, as_type = number, float
     if not fits:
         raise UserError(
-            f"the VAE's config.json has {key} = {value!r}, where a value like {default!r} belongs."
+            f"the VAE's config.json has {key} = {value!r}, give a value like {default!r}."
         )
     return as_type(value)
 

@@ -1,8 +1,8 @@
 """Cosmos' transformer as a backbone: its functions, sharding rules and costs.
 
-Observed frames are held, as in the reference's pipeline: the network gets their clean latents in
-the place of noisy ones, a time of almost no noise for them, and a channel that marks them; what is
-sampled there is what was given. Frames per second stretch the positions in time. A control that
+Observed frames are kept, as in the reference's pipeline: the network gets their clean latents in
+the place of noisy ones, a time of almost no noise for them, and a channel that marks them; sampling
+returns them unchanged. Frames per second stretch the positions in time. A control that
 modulates adds to the time embedding of each latent frame (arXiv 2601.15284, Eq. 5). A memory is
 read after every block.
 """
@@ -25,8 +25,8 @@ from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn.costs import FLOAT, SPLIT, Costs, Product, Share, video_tokens
 from pewm_jax.types import Array, Params
 
-GIVEN_SIGMA = 1e-4
-"""The noise σ that the network is told of observed frames; of the reference's pipeline."""
+KNOWN_SIGMA = 1e-4
+"""The noise level σ of observed frames in the network's input, as in the reference's pipeline."""
 STREAMS = (24, 60)
 """How often element-wise work reads or writes a block's tokens: forward, backward."""
 
@@ -62,7 +62,7 @@ class CosmosBackbone(CosmosConfig, Backbone):
         return self.heads
 
     def shown_channels(self, model: Any) -> int:
-        """Return 1: a mask marks observed frames, whose latents stand where noisy ones would."""
+        """Return 1: a mask marks observed frames, whose latents replace noisy ones."""
         del model
         return 1
 
@@ -71,13 +71,13 @@ class CosmosBackbone(CosmosConfig, Backbone):
         super().check(model)
         require(
             model.noise.velocity_in_unit_time,
-            "this backbone (cosmos) is told times from 0 to 1 and predicts velocities: use "
+            "this backbone (cosmos) takes times from 0 to 1 and predicts velocities: use "
             "noise.kind edm with noise.target flow, or noise.kind flow with noise.scale 1.",
         )
         require(
             self.patch_t == 1,
-            f"backbone.patch_t is {self.patch_t}: in a world model observed frames have a time of "
-            "their own, so a token is of one latent frame; use 1.",
+            f"backbone.patch_t is {self.patch_t}: in a world model observed frames have their "
+            "own time, so a token covers one latent frame; use 1.",
         )
 
     def init(self, key: Array, in_channels: int, out_channels: int) -> Params:
@@ -86,7 +86,7 @@ class CosmosBackbone(CosmosConfig, Backbone):
         return cosmos.init(sized, key)
 
     def observed(self, model: Any, params: Params, seen: Observed) -> Conditioning:
-        """Hold the observed frames at their latents, and mark them."""
+        """Keep the observed frames at their latents, and mark them."""
         del params
         first = seen.latents_BthwC
         frames, height, width = model.latent_shape
@@ -109,14 +109,14 @@ class CosmosBackbone(CosmosConfig, Backbone):
         conditioning: Conditioning,
         readers: Readers,
     ) -> Array:
-        """Predict from noisy latents. For known frames it means nothing.
+        """Predict from noisy latents. The prediction of known frames has no meaning.
 
         Raises:
-            UserError: it is not said which frames are known.
+            UserError: ``known_Bt`` is missing.
         """
         if conditioning.known_Bt is None:
             raise UserError(
-                "this backbone (cosmos) needs to know which frames are given: make its "
+                "this backbone (cosmos) needs to know which frames are known: make its "
                 "conditioning by worlds.world_model.condition."
             )
         dtype = x_BthwC.dtype
@@ -136,7 +136,7 @@ class CosmosBackbone(CosmosConfig, Backbone):
             sized,
             params,
             latents,
-            jnp.where(known_Bt, GIVEN_SIGMA / (1 + GIVEN_SIGMA), times_Bt),
+            jnp.where(known_Bt, KNOWN_SIGMA / (1 + KNOWN_SIGMA), times_Bt),
             text,
             conditioning.joined_BthwC,
             fps=conditioning.fps,

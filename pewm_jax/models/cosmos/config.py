@@ -39,7 +39,7 @@ class CosmosConfig:
     """Which text tokens: `zeros`, or the embeddings of a prompt, and of another one for guidance,
     that are `stored` with the weights."""
     fps: float = 16.0
-    """Frames per second that a world model tells the network."""
+    """Frames per second in the network's conditioning."""
     lora_dim: int = 256
     """Channels of the bottleneck in each block's modulation by the time."""
     patch: int = 2

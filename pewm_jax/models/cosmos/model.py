@@ -1,7 +1,7 @@
 """Cosmos' diffusion transformer, equal to ``CosmosTransformer3DModel`` of diffusers.
 
 Video tokens attend to each other and to the text. The noise level modulates every block, and may
-differ from one latent frame to the next: frames that are given have nearly none. A further
+differ from one latent frame to the next: known frames have nearly none. A further
 embedding per latent frame can be added to the time embedding wherever that one modulates the
 network. This is how actions steer it (arXiv 2601.15284, Eq. 5).
 
@@ -111,7 +111,7 @@ def apply(
         padding_BHWC: (B or 1, H, W, 1) 1 where a pixel is padding, of any size; None for none.
         fps: frames per second, one number; None for an image, and to count frames.
         modulation_BtE: (B, t', width) added to the time embedding of each token in time, from
-            which every block and the output layer make their modulation; None for nothing.
+            which every block and the output layer compute their modulation; None for none.
         expert: a function of the video tokens that runs after every block (the memory block);
             tokens are in the order of ``layout_of``.
         expert_params: the experts' parameters, stacked over layers.
@@ -271,7 +271,7 @@ def _grid(config: CosmosConfig, shape: tuple[int, ...]) -> tuple[int, int, int]:
 def _require_shape(
     name: str, value: Array | None, forms: tuple[tuple[int | str, ...], ...]
 ) -> None:
-    """Refuse an array of none of these shapes; a letter stands for any size."""
+    """Refuse an array of none of these shapes; a letter means any size."""
     if value is None:
         return
     for form in forms:

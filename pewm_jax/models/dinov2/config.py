@@ -1,4 +1,4 @@
-"""DINOv2, the image encoder behind the map."""
+"""Settings of DINOv2, the encoder of the map's image features."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class DINOv2Config:
     swiglu: bool = False
     """Gated feed-forward, as in ViT-g."""
     registers: int = 0
-    """Register tokens beside the class token: 0, or 4 in the models with registers."""
+    """Register tokens besides the class token: 0, or 4 in the models with registers."""
     antialias: bool = False
     """Whether interpolating position embeddings to fewer patches uses antialiasing, as the
     reference does in its models with registers only."""
@@ -98,7 +98,7 @@ def published(
         registers: the variant with four register tokens.
 
     Raises:
-        ConfigError: there is no such size.
+        ConfigError: the size does not exist.
     """
     if size not in _SIZES:
         raise ConfigError(f"There is no DINOv2 {size!r}; there is {', '.join(_SIZES)}.")

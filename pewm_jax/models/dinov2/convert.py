@@ -24,7 +24,7 @@ from pewm_jax.io.published import LINEAR, SAME, Entry, Transform
 from pewm_jax.io.sources import Renamed, Source
 from pewm_jax.models.dinov2.config import HEAD_DIM, DINOv2Config
 
-_LEFT_BEHIND = re.compile(r"(embeddings\.)?mask_token|classifier\.(weight|bias)")
+_UNUSED = re.compile(r"(embeddings\.)?mask_token|classifier\.(weight|bias)")
 _BODY = re.compile(r"^(dinov2|dinov2_with_registers)\.")
 _HUB = (
     (r"cls_token|register_tokens|mask_token", r"embeddings.\g<0>"),
@@ -92,7 +92,7 @@ _READ = frozenset(
 
 
 def entries(config: DINOv2Config) -> list[Entry]:
-    """List every tensor of ``transformers``' network and where it goes in our tree."""
+    """List every tensor of ``transformers``' network and its path in our tree."""
     p = config.patch
     patch = Transform(
         lambda x: np.moveaxis(x, (1, 0), (2, 3)).reshape(p * p * 3, -1),
@@ -231,11 +231,11 @@ def _number(values: Mapping[str, Any], name: str, default: int, where: str) -> i
 
 
 def with_transformers_names(source: Source) -> Source:
-    """Return DINOv2's tensors under ``transformers``' names, without those left behind."""
+    """Return DINOv2's tensors under ``transformers``' names, without those that are not used."""
     views: dict[str, tuple[str, int, int]] = {}
     for theirs in source.names():
         name = _BODY.sub("", theirs)
-        if _LEFT_BEHIND.fullmatch(name):
+        if _UNUSED.fullmatch(name):
             continue
         if qkv := _HUB_QKV.fullmatch(name):
             stem = f"encoder.layer.{qkv[1]}.attention.attention"

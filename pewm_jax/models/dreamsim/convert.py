@@ -4,9 +4,9 @@
     clip_vitb16_pretrain.pth.tar, open_clip_vitb16_pretrain.pth.tar
     checkpoints/dino_vitbase16_pretrain.pth (or beside the others)
 
-What it learned are additions of low rank (LoRA) to queries, keys and values; they are added here
-once. Files are read as data (``pickled_tensors``), and every tensor is used, or the file is
-refused.
+DreamSim's training gave low-rank updates (LoRA) of queries, keys and values; they are merged into
+the weights here. Files are read as data (``pickled_tensors``), and every tensor is used, or the
+file is refused.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ _AROUND: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
 
 
 def read(folder: Path) -> Params:
-    """Read all encoders, with what DreamSim learned added.
+    """Read all encoders, with DreamSim's updates merged.
 
     Args:
         folder: see above.
@@ -76,12 +76,12 @@ def read(folder: Path) -> Params:
         ``{encoder: parameters}`` as ``models.dreamsim.encode`` takes them, float32.
 
     Raises:
-        UserError: a file is absent or damaged, or holds other tensors than it must.
+        UserError: a file is absent or damaged, or holds other tensors than expected.
     """
     if not folder.is_dir():
         raise UserError(
-            f"{folder} is no folder: DreamSim's weights come with no package; name the folder that "
-            "the package dreamsim 0.2 keeps them in."
+            f"{folder} is not a folder: no package contains DreamSim's weights; name the folder "
+            "that the package dreamsim 0.2 downloads them to."
         )
     config = folder / LORA / "adapter_config.json"
     try:
@@ -99,7 +99,7 @@ def read(folder: Path) -> Params:
         path = _first(folder, files)
         params[name] = _encoder(name, path, added.pop(number, {}), scale)
     if added:
-        raise UserError(f"{folder / LORA} adds to encoders {sorted(added)}, and there are three.")
+        raise UserError(f"{folder / LORA} adds to encoders {sorted(added)}, but there are three.")
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
 
 
@@ -116,14 +116,14 @@ def _added(path: Path) -> dict[int, dict[int, Tensors]]:
     for name, tensor in weights.read_others(path, "DreamSim").items():
         match = _ADDED.fullmatch(name.replace("/", "."))
         if match is None:
-            raise UserError(f"{path} holds {name}, which is no part of DreamSim's ensemble.")
+            raise UserError(f"{path} holds {name}, which does not belong to DreamSim's ensemble.")
         layers = found.setdefault(int(match["which"]), {})
         layers.setdefault(int(match["layer"]), {})[match["part"]] = tensor
     return found
 
 
 def _encoder(name: Encoder, path: Path, added: dict[int, Tensors], scale: float) -> Params:
-    """Read one encoder and add what was learned."""
+    """Read one encoder and merge its updates."""
     theirs = {
         key.replace("/", ".").removeprefix("state_dict."): np.asarray(tensor, np.float32)
         for key, tensor in weights.read_others(path, f"DreamSim's {name}").items()
@@ -146,7 +146,7 @@ def _encoder(name: Encoder, path: Path, added: dict[int, Tensors], scale: float)
     depth = len(layers["qkv/kernel"])
     whole = all(set(pair) == {"A", "B"} for pair in added.values())
     if sorted(added) != list(range(depth)) or not whole:
-        raise UserError(f"DreamSim's additions to {name} are not complete; get them again.")
+        raise UserError(f"DreamSim's additions to {name} are incomplete; download them again.")
     for layer, pair in added.items():
         addition = scale * (pair["B"].astype(np.float32) @ pair["A"].astype(np.float32))
         layers["qkv/kernel"][layer] = layers["qkv/kernel"][layer] + addition.T
@@ -162,7 +162,7 @@ def _require_whole(
     layers: dict[str, dict[int, np.ndarray]],
     unknown: list[str],
 ) -> None:
-    """Refuse a file that lacks something, or has something beside what it must have."""
+    """Refuse a file that lacks tensors or has unexpected ones."""
     expected = {"patch_embed/kernel", "patch_embed/bias", "cls_token", "position_embed"}
     if KINDS[name].embeds:
         expected = {ours for ours, _ in _AROUND.values()}
@@ -171,6 +171,6 @@ def _require_whole(
     wrong = [*sorted(expected ^ flat.keys()), *broken, *unknown]
     if wrong or flat["cls_token"].shape[0] % HEAD:
         raise UserError(
-            f"{path} is no {name} of DreamSim: it lacks, or has beside it, "
+            f"{path} is not DreamSim's {name}: missing or unexpected are "
             f"{', '.join(wrong[:6]) or 'heads of 64 channels'}."
         )

@@ -1,9 +1,9 @@
-"""DreamSim (Fu et al. 2023, arXiv 2306.09344): how alike people find two pictures.
+"""DreamSim (Fu et al. 2023, arXiv 2306.09344): a distance that follows human similarity judgements.
 
-Three vision transformers (DINO, CLIP and OpenCLIP, ViT-B/16 each), adapted to people's judgements,
-see both pictures; the distance is one minus the cosine between their joined, centred features. The
-reference is ``dreamsim`` 0.2, kind ``ensemble``: of DINO the class token of the last block, before
-the last norm; of both CLIPs the embedding. Its weights come with no package: see
+Three vision transformers (DINO, CLIP and OpenCLIP, ViT-B/16 each), adapted to human judgements,
+embed both pictures; the distance is one minus the cosine between their joined, centred features.
+The reference is ``dreamsim`` 0.2, kind ``ensemble``: of DINO the class token of the last block,
+before the last norm; of both CLIPs the embedding. No package contains its weights: see
 ``models.dreamsim.convert``.
 """
 
@@ -25,7 +25,7 @@ from pewm_jax.types import Array, Params
 
 Encoder = Literal["dino_vitb16", "clip_vitb16", "open_clip_vitb16"]
 ENCODERS: tuple[Encoder, ...] = ("dino_vitb16", "clip_vitb16", "open_clip_vitb16")
-"""In the order in which their features are joined."""
+"""The encoders in the order in which their features are concatenated."""
 HEAD = 64
 """Channels of an attention head."""
 QUICK = 1.702
@@ -63,7 +63,7 @@ def distance(params: Params, a_BHWC: Array, b_BHWC: Array) -> Array:
 
     Args:
         params: from ``convert.read``: a vision transformer for each encoder.
-        a_BHWC: (B, H, W, 3) colours in [0, 1]; resized as ``resized`` says.
+        a_BHWC: (B, H, W, 3) colours in [0, 1]; resized by ``resized``.
         b_BHWC: the same shape.
     """
     a, b = embed(params, a_BHWC), embed(params, b_BHWC)
@@ -101,7 +101,7 @@ def side(params: Params) -> int:
 
 
 def encode(name: Encoder, params: Params, images_BHWC: Array) -> Array:
-    """Return what one encoder makes of pictures, (B, F) float32.
+    """Return one encoder's features of pictures, (B, F) float32.
 
     Args:
         name: of the encoder.

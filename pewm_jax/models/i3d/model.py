@@ -1,12 +1,12 @@
-"""I3D: what a network that was trained to name human actions says of a video.
+"""I3D: features of a video from a network that was trained to classify human actions.
 
 Inception-v1 with its kernels inflated to three dimensions (Carreira and Zisserman 2017), trained on
 Kinetics-400. Its 400 logits, averaged over time, are the features of FVD (Unterthiner et al. 2018).
-The references are ``i3d.py`` of deepmind/kinetics-i3d and its port piergiovanni/pytorch-i3d. Zeros
-and windows lie as TensorFlow lays them ("same": the odd one at the end). Batch norms become part of
+The references are ``i3d.py`` of deepmind/kinetics-i3d and its port piergiovanni/pytorch-i3d.
+Padding and windows are TensorFlow's ("same": the odd one at the end). Batch norms become part of
 kernels and biases where the weights are read (``models.i3d.convert``).
 
-Pictures are resized to 224 × 224 linearly **with antialiasing**, whole, whatever their shape. The
+Pictures are resized to 224 × 224 linearly **with antialiasing**, without cropping. The
 first implementation of FVD resized without antialiasing, which is another measure for pictures that
 are larger.
 """
@@ -27,12 +27,12 @@ from pewm_jax.types import Array, Params
 SIDE = 224
 """Height and width, pixels, of what the network is given."""
 LEAST = 9
-"""The fewest frames of which the last layer has anything left."""
+"""The fewest frames for which the last layer has an output."""
 LOGITS = 400
 """Actions of Kinetics-400, and so numbers per clip."""
 HIGHEST = jax.lax.Precision.HIGHEST
 FEW = 8
-"""At most so many channels are convolved over several frames at once."""
+"""Up to this number of channels, several frames are convolved at once."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,10 +57,9 @@ class Pool:
 class Mixed:
     """Four branches side by side, an inception module.
 
-    Attributes:
-        name: of the module.
-        widths: channels out of ``b0``, ``b1a``, ``b1b``, ``b2a``, ``b2b`` and ``b3b``: b0 sees one
-            place, b1b and b2b 3 × 3 × 3 of what b1a and b2a see, b3b the largest of 3 × 3 × 3.
+    Attributes: name: of the module. widths: channels out of ``b0``, ``b1a``, ``b1b``, ``b2a``,
+        ``b2b`` and ``b3b``: b0 has a kernel of 1, b1b and b2b of 3 × 3 × 3 after b1a and b2a, b3b
+        follows a maximum over 3 × 3 × 3.
     """
 
     name: str
@@ -124,7 +123,7 @@ def shapes() -> dict[str, tuple[int, ...]]:
 
 
 def init(key: Array) -> Params:
-    """Return random parameters: features that have learnt nothing, for tests."""
+    """Return random parameters: untrained features, for tests."""
     drawn = {}
     for number, (path, shape) in enumerate(shapes().items()):
         x = jax.random.normal(jax.random.fold_in(key, number), shape)
@@ -141,7 +140,7 @@ def apply(params: Params, video_BTHWC: Array) -> Array:
         video_BTHWC: (B, T, H, W, 3) floats in [−1, 1], T at least 9, of any height and width.
 
     Raises:
-        UserError: there are too few frames, or these are no colours.
+        UserError: there are too few frames, or the last axis is not colour.
     """
     video = jnp.asarray(video_BTHWC)
     require_frames(*video.shape)
@@ -155,15 +154,13 @@ def apply(params: Params, video_BTHWC: Array) -> Array:
 
 
 def require_frames(*shape: int) -> None:
-    """Refuse what is no batch of clips that I3D can take.
+    """Refuse arrays that are not a batch of clips for I3D.
 
     Raises:
-        UserError: it is not; with what to do.
+        UserError: wrong shape or too few frames.
     """
     if len(shape) != 5 or shape[-1] != 3:
-        raise UserError(
-            f"a video of shape {shape} is not known to I3D: give it as (B, T, H, W, 3)."
-        )
+        raise UserError(f"I3D cannot take a video of shape {shape}: give it as (B, T, H, W, 3).")
     if shape[1] < LEAST:
         raise UserError(
             f"clips of {shape[1]} frames are too short for I3D, which needs at least {LEAST}: add "
@@ -178,7 +175,7 @@ def resize(video_BTHWC: Array) -> Array:
 
 
 def trunk(params: Params, x_BTHWC: Array) -> Array:
-    """Return what the last module makes of videos of any size, (B, T/8, H/32, W/32, 1024)."""
+    """Return the last module's output for videos of any size, (B, T/8, H/32, W/32, 1024)."""
     x = x_BTHWC
     for part in PARTS:
         if isinstance(part, Conv):
@@ -205,10 +202,10 @@ def macs(frames: int) -> float:
 
 
 def _conv(part: Params, x_BTHWC: Array, stride: int = 1) -> Array:
-    """Convolve, add the bias, and cut below 0.
+    """Convolve, add the bias, apply ReLU.
 
-    Frames are convolved as pictures, which on a CPU is faster than XLA's convolution over three
-    axes: all frames under the kernel at once where channels are few, and else frame by frame.
+    Frames are convolved as images, which on a CPU is faster than XLA's 3D convolution: all frames
+    under the kernel at once if there are few channels, else frame by frame.
     """
     kernel = part["kernel"].astype(x_BTHWC.dtype)
     frames, height, width, inward, outward = kernel.shape
@@ -229,7 +226,7 @@ def _conv(part: Params, x_BTHWC: Array, stride: int = 1) -> Array:
             (stride, stride),
             "SAME",
             dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision=HIGHEST,  # TensorFloat-32 would show in the third digit
+            precision=HIGHEST,  # TensorFloat-32 changes the third digit
         )
         for pictures, weights in zip(under, kernels, strict=True)
     )
@@ -238,7 +235,7 @@ def _conv(part: Params, x_BTHWC: Array, stride: int = 1) -> Array:
 
 
 def _pool(x_BTHWC: Array, window: tuple[int, ...], stride: tuple[int, ...]) -> Array:
-    """Take the largest of every window, axis by axis."""
+    """Compute the maximum of every window, axis by axis."""
     x = x_BTHWC
     for axis, (size, step) in enumerate(zip(window, stride, strict=True), 1):
         sizes, steps = ([n if at == axis else 1 for at in range(5)] for n in (size, step))

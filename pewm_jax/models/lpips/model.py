@@ -1,11 +1,10 @@
 """LPIPS, a learned distance between pictures (Zhang et al. 2018, version 0.1).
 
 Both pictures go through a network trained on ImageNet, AlexNet (``alex``) or VGG16 (``vgg``), up to
-five layers. There the features of each place are brought to length 1; the squared differences,
-weighted per channel, are averaged over places and summed over the layers. Pictures are in [−1, 1]
-and are **not resized**, whatever their size: distances at 64 × 64 and at 256 × 256 pixels are
-different measures. The reference is ``lpips/lpips.py`` and ``pretrained_networks.py`` of
-richzhang/PerceptualSimilarity.
+five layers. The features at each position are normalised to length 1; the squared differences,
+weighted per channel, are averaged over positions and summed over the layers. Pictures are in [−1,
+1] and are **not resized**: distances at 64 × 64 and at 256 × 256 pixels are different measures. The
+reference is ``lpips/lpips.py`` and ``pretrained_networks.py`` of richzhang/PerceptualSimilarity.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ Net = Literal["alex", "vgg"]
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 """Subtracted from the colours of a picture in [−1, 1]."""
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
-"""By which they are divided then."""
+"""Divides the shifted colours."""
 SMALL = 1e-10
 """Added to the length of a feature."""
 
@@ -38,7 +37,7 @@ class Layers:
     Attributes:
         widths: channels out of each convolution.
         side: pixels of each kernel, each way.
-        stride: pixels between the places of each.
+        stride: pixels between the positions of each kernel.
         pad: zeros around the picture.
         pool: pixels each way of the maximum that is taken before, every two pixels; 0 for none.
     """
@@ -69,7 +68,7 @@ NETS: dict[Net, tuple[Layers, ...]] = {
 """The networks, from the picture on."""
 NAMES: dict[Net, str] = {"alex": "AlexNet", "vgg": "VGG16"}
 LEAST: dict[Net, int] = {"alex": 31, "vgg": 16}
-"""The smallest height and width, pixels, of which the last layer has anything left."""
+"""The smallest height and width, in pixels, for which the last layer has an output."""
 
 
 def shapes(net: Net) -> dict[str, tuple[int, ...]]:
@@ -90,7 +89,7 @@ def shapes(net: Net) -> dict[str, tuple[int, ...]]:
 
 
 def init(net: Net, key: Array) -> Params:
-    """Return random parameters: a measure that has learnt nothing, for tests."""
+    """Return random parameters: an untrained distance, for tests."""
     drawn = {}
     for number, (path, shape) in enumerate(shapes(net).items()):
         x = jax.random.normal(jax.random.fold_in(key, number), shape)
@@ -104,7 +103,7 @@ def init(net: Net, key: Array) -> Params:
 def apply(net: Net, params: Params, a_NHWC: Array, b_NHWC: Array) -> Array:
     """Return the distance of each pair of pictures, (N,) float32; 0 for equal ones.
 
-    It can be differentiated: where all features of a place are 0, so is the gradient.
+    It can be differentiated: where all features of a position are 0, so is the gradient.
 
     Args:
         net: the network.
@@ -113,7 +112,7 @@ def apply(net: Net, params: Params, a_NHWC: Array, b_NHWC: Array) -> Array:
         b_NHWC: the same shape.
 
     Raises:
-        UserError: the pictures are smaller than the network takes, or not alike.
+        UserError: the pictures are smaller than the network takes, or of different shapes.
     """
     a, b = jnp.asarray(a_NHWC), jnp.asarray(b_NHWC)
     if a.shape != b.shape or a.ndim != 4 or a.shape[-1] != 3:
@@ -128,12 +127,12 @@ def apply(net: Net, params: Params, a_NHWC: Array, b_NHWC: Array) -> Array:
 
 
 def describe(net: Net, params: Params, x_NHWC: Array) -> tuple[Array, ...]:
-    """Return what pictures are compared by: the layers' features, of length 1 at each place.
+    """Return the layers' features of pictures, of length 1 at each position.
 
     Args:
         net: the network.
         params: its parameters.
-        x_NHWC: (N, H, W, 3) floats in [−1, 1], as large as ``require_size`` asks.
+        x_NHWC: (N, H, W, 3) floats in [−1, 1], at least as large as ``require_size`` requires.
 
     Returns:
         Of each layer (N, h, w, C) float32.
@@ -143,7 +142,7 @@ def describe(net: Net, params: Params, x_NHWC: Array) -> tuple[Array, ...]:
 
 
 def distance(params: Params, a: Sequence[Array], b: Sequence[Array]) -> Array:
-    """Return the distance of pictures by their descriptions, (N,); one may have length 1."""
+    """Return the distances of described pictures, (N,); one of the two may have a batch of 1."""
     total = jnp.zeros(())
     for k, (one, other) in enumerate(zip(a, b, strict=True)):
         weights_C = params["lin"][f"layer_{k}"].astype(jnp.float32)
@@ -165,7 +164,7 @@ def require_size(net: Net, height: int, width: int) -> None:
 
 
 def features(net: Net, params: Params, x_NHWC: Array) -> list[Array]:
-    """Return what the five layers make of pictures in [−1, 1]."""
+    """Return the outputs of the five layers for pictures in [−1, 1]."""
     x, number, found = (x_NHWC - SHIFT) / SCALE, 0, []
     for layers in NETS[net]:
         if layers.pool:
@@ -179,7 +178,7 @@ def features(net: Net, params: Params, x_NHWC: Array) -> list[Array]:
                 (layers.stride, layers.stride),
                 ((layers.pad, layers.pad),) * 2,
                 dimension_numbers=("NHWC", "HWIO", "NHWC"),
-                precision="highest",  # TensorFloat-32 would show in the third digit
+                precision="highest",  # TensorFloat-32 changes the third digit
             )
             x = jax.nn.relu(x + part["bias"].astype(x.dtype))
             number += 1

@@ -1,7 +1,7 @@
-"""The published weights of NoMaD (``nomad.pth`` of ``visualnav-transformer``) in our layout.
+"""NoMaD's published weights (``nomad.pth`` of ``visualnav-transformer``): names and layouts.
 
 The file is a table of tensors that torch wrote; it is read as data, torch is not needed. Every
-tensor is used, but for those that the original never uses: the classifiers of its EfficientNets,
+tensor is used, except those that the original never uses: the classifiers of its EfficientNets,
 the layer from which its transformer's layers were copied, and the table of positions, which is
 computed.
 """

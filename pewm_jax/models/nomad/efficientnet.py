@@ -1,9 +1,9 @@
-"""EfficientNet with group norms: the feature vector of a picture.
+"""EfficientNet with group norms: the feature vector of an image.
 
-Tan and Le 2019 (arXiv 1905.11946), B0 and networks as many times as wide and deep, with each batch
-norm replaced by a group norm of 16 channels to a group, as NoMaD does. The zeros around a picture
-are those of ``efficientnet_pytorch`` 0.7.1 for its own size of 224: before strides of 2, one row
-more below and right than above and left, whatever the size of the picture.
+Tan and Le 2019 (arXiv 1905.11946), B0 and networks scaled in width and depth, with each batch norm
+replaced by a group norm of 16 channels per group, as in NoMaD. The padding is that of
+``efficientnet_pytorch`` 0.7.1 for its own size of 224: before strides of 2, one row more below and
+right than above and left, for any size of image.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ STAGES = (
 """Blocks, kernel, stride of the first block, expansion, channels in and out, of B0's stages."""
 STEM, HEAD = 32, 1280
 SQUEEZE = 4
-"""Channels of a block's input for one channel of its squeezed description."""
+"""Channels of a block's input per channel of its squeeze layer."""
 GROUP = 16
 """Channels of a group of the norms, at least."""
 STEP = 8
-"""Numbers of channels are multiples of this."""
+"""Numbers of channels are multiples of this number."""
 LETTERS = ("NHWC", "HWIO", "NHWC")
 
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """One inverted bottleneck: expand, filter each channel by itself, weigh channels, project."""
+    """One inverted bottleneck: expand, depthwise convolution, squeeze and excitation, project."""
 
     kernel: int
     stride: int
@@ -51,7 +51,7 @@ class Block:
 
 
 def blocks(width: float = 1.0, depth: float = 1.0, stages: int = len(STAGES)) -> list[Block]:
-    """Return the blocks of the first stages of a network so many times as wide and deep as B0."""
+    """Return the blocks of the first stages of a network scaled in width and depth from B0."""
     found = []
     for count, kernel, stride, expansion, inward, outward in STAGES[:stages]:
         before, after = scaled(inward, width), scaled(outward, width)
@@ -78,7 +78,7 @@ def features(width: float = 1.0) -> int:
 def shapes(
     colours: int, width: float = 1.0, depth: float = 1.0, stages: int = len(STAGES)
 ) -> dict[str, tuple[int, ...]]:
-    """Return the shape of each parameter by path, for pictures of so many colours."""
+    """Return the shape of each parameter by path, for images of this number of channels."""
     made: dict[str, tuple[int, ...]] = {}
 
     def add(name: str, *kernel: int, bias: bool = False) -> None:
@@ -163,7 +163,7 @@ def _normed(
 
 
 def _convolved(part: Params, x_BHWC: Array, side: int = 1, stride: int = 1) -> Array:
-    """Convolve; a kernel for one channel in filters each channel by itself."""
+    """Convolve; a kernel with one input channel is a depthwise convolution."""
     kernel, inward = part["kernel"].astype(x_BHWC.dtype), x_BHWC.shape[-1]
     if side == 1:
         x = x_BHWC @ kernel[0, 0]
@@ -182,9 +182,9 @@ def _convolved(part: Params, x_BHWC: Array, side: int = 1, stride: int = 1) -> A
 
 
 def _filtered(x_BHWC: Array, kernel: Array, stride: int, pad: tuple[int, int]) -> Array:
-    """Filter each channel by itself: a sum of shifted pictures, one for each place of the kernel.
+    """Compute a depthwise convolution as a sum of shifted images, one per kernel position.
 
-    XLA's convolution by groups compiles for minutes on processors, and is slower there.
+    XLA's grouped convolution takes minutes to compile on CPUs and is slower there.
     """
     x = jnp.pad(x_BHWC, ((0, 0), pad, pad, (0, 0)))
     side = kernel.shape[0]

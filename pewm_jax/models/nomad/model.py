@@ -32,7 +32,7 @@ WIDER = 4
 """Hidden width of the feed-forward layers, as a multiple of the tokens'."""
 COLOURS = 3
 LAST_GROUPS = 8
-"""Groups of the denoiser's last norm, whatever ``groups`` says, as in the reference."""
+"""Groups of the denoiser's last norm, independent of ``groups``, as in the reference."""
 SEQUENCE = ("NWC", "WIO", "NWC")
 
 
@@ -106,7 +106,7 @@ def init(config: NomadConfig, key: Array) -> Params:
 
 
 def preprocess(config: NomadConfig, rgb_BHWC: Array) -> Array:
-    """Turn colours in [−1, 1] into what ``encode`` takes: resized, normalised as ImageNet's."""
+    """Turn colours in [−1, 1] into the input of ``encode``: resized, normalised as ImageNet's."""
     return dinov2.preprocess(rgb_BHWC, (config.height, config.width), 1)
 
 
@@ -124,7 +124,7 @@ def encode(
         params: its parameters.
         observations_BTHWC: (B, context + 1, H, W, 3) floats from ``preprocess``, the present last;
             their dtype is the computation's.
-        goal_BHWC: (B, H, W, 3) what is seen at the goal, anything where it is hidden.
+        goal_BHWC: (B, H, W, 3) the goal image; any values where it is masked.
         goal_masked_B: (B,) bool, True hides the goal.
 
     Returns:
@@ -136,7 +136,7 @@ def encode(
     batch, count, *size = observations_BTHWC.shape
     if count != config.context + 1:
         raise UserError(
-            f"encode() got {count} pictures: this policy sees {config.context} earlier ones and "
+            f"encode() got {count} pictures: this policy takes {config.context} earlier ones and "
             f"the present one, give {config.context + 1}."
         )
     seen = efficientnet.apply(
@@ -194,7 +194,7 @@ def denoise(
 
 
 def distance(config: NomadConfig, params: Params, condition_BD: Array) -> Array:
-    """Return how many steps the goal is away, (B,)."""
+    """Return the number of steps to the goal, (B,)."""
     del config
     x = condition_BD
     for number in range(2):
@@ -245,7 +245,7 @@ def _size(config: NomadConfig) -> tuple[float, float, int]:
 
 
 def _layer(config: NomadConfig, part: Params, x_BND: Array, shown_BN: Array) -> Array:
-    """Attend to what is shown, then feed forward; both after a norm."""
+    """Attend to the unmasked tokens, then feed forward; both after a norm."""
     qkv = linear(part["to_qkv"], layer_norm(part["norm_1"], x_BND))
     q, k, v = (split_heads(each, config.heads) for each in jnp.split(qkv, 3, -1))
     logits = jnp.einsum("bknd,bkmd->bknm", q, k, preferred_element_type=jnp.float32)
@@ -292,7 +292,7 @@ def _filtered(part: Params, name: str, x: Array, groups: int) -> Array:
 def _convolved(
     part: Params, x: Array, pad: tuple[int, int], *, stride: int = 1, spread: int = 1
 ) -> Array:
-    """Convolve; ``spread`` puts so many points in the place of one, with zeros between."""
+    """Convolve; ``spread`` dilates the input: so many points per point, with zeros between."""
     x = jax.lax.conv_general_dilated(
         x, part["kernel"].astype(x.dtype), (stride,), (pad,), (spread,), None, SEQUENCE
     )

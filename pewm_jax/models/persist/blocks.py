@@ -1,14 +1,14 @@
-"""Transformer blocks over frames, which PERSIST's networks have in common.
+"""Transformer blocks over frames, shared by PERSIST's networks.
 
 A block has up to three parts: attention inside of each frame (``space``), attention of each token
-to the same place in earlier frames (``time``: causal, rotary), and attention to given tokens of the
-frame's own (``cross``). Each is followed by a feed-forward layer, and both lie between a norm that
-the frame's condition scales and shifts, and a gate (adaLN-zero, arXiv 2212.09748). Queries and keys
-are divided by their root mean square. Nothing in a frame depends on later frames.
+to the same place in earlier frames (``time``: causal, rotary), and attention to context tokens of
+the same frame (``cross``). Each is followed by a feed-forward layer, and both lie between a norm
+that the frame's condition scales and shifts, and a gate (adaLN-zero, arXiv 2212.09748). Queries and
+keys are divided by their root mean square. Nothing in a frame depends on later frames.
 
-Over time a frame sees itself and ``context`` − 1 frames before it. A ``FrameCache`` holds the keys
-and values of those, so that frames may come one after the other; the result is that of all frames
-at once. With several layers, what a frame sees indirectly goes back farther, either way.
+Over time a frame attends to itself and the ``context`` − 1 frames before it. A ``FrameCache`` holds
+the keys and values of those, so frames can be processed one by one with the same result as all at
+once. With several layers the receptive field is longer, with and without the cache.
 
 The blocks are scanned, so compile time does not grow with depth.
 """
@@ -46,19 +46,19 @@ SHARDING = (
     (r"(space|time|cross)/(to_out|down)/bias", P()),
     (r"(space|time|cross)/norm_[qk]/scale", P()),
 )
-"""Rules over the paths inside of one block; ``rules`` gives them a place."""
+"""Rules over the paths inside of one block; ``rules`` adds a prefix."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class FrameCache:
-    """What the attention over time keeps of the last frames.
+    """Keys and values of the last frames, for the attention over time.
 
     Attributes:
         keys_LBSNKd: (layers, B, context − 1, N, heads, head_dim) rotated keys, the last one last.
         values_LBSNKd: the values.
         known_BSN: bool, which of those tokens may be read.
-        count: () int32, frames that have passed so far; slots before the first frame are not read.
+        count: () int32, frames processed so far; slots before the first frame are not read.
     """
 
     keys_LBSNKd: Array
@@ -77,7 +77,7 @@ def empty_cache(
 
 
 def rules(where: str) -> tuple[tuple[str, Any], ...]:
-    """Return the sharding rules of blocks and ends whose paths begin with ``where``."""
+    """Return the sharding rules of blocks and end layers whose paths begin with ``where``."""
     return (
         *((rf"{where}/blocks/{path}", spec) for path, spec in SHARDING),
         (rf"{where}/modulate_out/kernel", P("fsdp", "tensor")),
@@ -126,7 +126,7 @@ def init(
 ) -> Params:
     """Return random parameters: blocks stacked over layers, and ends of the given shapes.
 
-    The layers of the modulation and the last layer begin at zero, gates as ``config.gates`` says.
+    The layers of the modulation and the last layer are zero, the gates follow ``config.gates``.
     """
     ends_key, blocks_key = jax.random.split(key)
     params = draw(ends, ends_key)
@@ -175,10 +175,10 @@ def run(
         condition_BTD: each frame's condition, from which its modulation is made.
         context_BTMD: (B, T, M, D) the tokens that ``cross`` attends to, each frame to its own.
         known_BTN: bool, which tokens later frames may read; None for all.
-        cache: the frames before; None if there are none and none are to be kept.
+        cache: the frames before; None if there are none and none are kept.
 
     Returns:
-        ``(x_BTND, cache)``: the updated tokens, and the cache with these frames too, or None.
+        ``(x_BTND, cache)``: the updated tokens, and the cache including these frames, or None.
     """
     frames = x_BTND.shape[1]
     past = 0 if cache is None else config.context - 1
@@ -235,7 +235,7 @@ def norm(x: Array) -> Array:
 
 
 def times_of(config: BlocksConfig, first: Array, frames: int, past: int) -> tuple[Array, Array]:
-    """Return rotary angles (T, head_dim/2) of frames, and which of past and present they see.
+    """Return rotary angles (T, head_dim/2) of frames, and the attention mask over past and present.
 
     Args:
         config: the blocks.
@@ -253,7 +253,7 @@ def times_of(config: BlocksConfig, first: Array, frames: int, past: int) -> tupl
 
 
 def positions(sides: tuple[int, ...], width: int) -> np.ndarray:
-    """Return (N, D) fixed sinusoids of the places of a grid, the channels shared by its axes.
+    """Return (N, D) fixed sinusoids of a grid's positions, the channels divided among its axes.
 
     Channels that are left over, where ``width`` is no multiple of twice the axes, are 0.
     """
@@ -289,7 +289,7 @@ def _over_time(
     allowed: Array,
     kept: tuple[Array, Array] | None,
 ) -> tuple[Array, tuple[Array, Array] | None]:
-    """Attend to the same place in earlier frames; returns also the keys and values to keep."""
+    """Attend to the same place in earlier frames; also return the keys and values to keep."""
     split = (*x_BTND.shape[:3], config.heads, config.head_dim)
     q, k, v = (linear(part[f"to_{n}"], x_BTND).reshape(split) for n in "qkv")
     q, k = (

@@ -1,8 +1,8 @@
-"""The camera model of PERSIST: where an action leads, given the voxels around the agent.
+"""The camera model of PERSIST: the camera step of an action, given the voxels around the agent.
 
 A frame is one token: the classes of the innermost voxels and the camera before the action. The
-action modulates the blocks, which look back over time. What comes out is the step to the next
-camera (``geometry.actions``); it learns by mean squared error (arXiv 2603.03482).
+action modulates the blocks, which attend over time. The output is the step to the next camera
+(``geometry.actions``); it learns by mean squared error (arXiv 2603.03482).
 
 Parameters: ``classes, voxels, camera, action, blocks (stacked over layers), modulate_out,
 proj_out``.
@@ -44,7 +44,7 @@ def ends(config: CameraModelConfig) -> dict[str, tuple[int, ...]]:
 def init(config: CameraModelConfig, key: Array) -> Params:
     """Return random parameters, float32; the camera stays where it is at first."""
     params = frame_blocks.init(config.blocks, PARTS, ends(config), key)
-    params["classes"]["kernel"] *= config.classes**0.5  # a row is looked up, not all of them
+    params["classes"]["kernel"] *= config.classes**0.5  # only one row is looked up
     return params
 
 
@@ -54,15 +54,15 @@ def empty_cache(config: CameraModelConfig, batch: int, dtype: Any = jnp.float32)
 
 
 def innermost(config: CameraModelConfig, classes_XYZ: Array) -> Array:
-    """Return the voxels around the middle of grids (..., X, Y, Z).
+    """Return the central voxels of grids (..., X, Y, Z).
 
     Raises:
-        UserError: a grid is smaller than that.
+        UserError: a grid is smaller than ``config.inner``.
     """
     cut, whole = config.inner, classes_XYZ.shape[-3:]
     if min(whole) < cut:
         raise UserError(
-            f"The voxels have shape {classes_XYZ.shape}: the camera model sees the innermost "
+            f"The voxels have shape {classes_XYZ.shape}: the camera model takes the innermost "
             f"{cut} along each axis (camera_model.inner)."
         )
     x, y, z = ((size - cut) // 2 for size in whole)

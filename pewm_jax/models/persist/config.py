@@ -10,21 +10,21 @@ from pewm_jax.errors import require, require_positive
 
 @dataclasses.dataclass(frozen=True)
 class BlocksConfig:
-    """The blocks that PERSIST's networks have in common; by default as published."""
+    """The blocks shared by PERSIST's networks; by default as published."""
 
     layers: int = 12
     """Transformer blocks."""
     heads: int = 16
     """Attention heads."""
     head_dim: int = 64
-    """Width of a head; even, the rotary embedding of time turns pairs of channels."""
+    """Width of a head; even, the rotary embedding of time rotates pairs of channels."""
     mlp_ratio: int = 4
     """Feed-forward width over model width."""
     context: int = 8
     """Frames that a frame attends to over time: itself and those before it."""
     gates: Literal["zero", "open"] = "zero"
-    """Where the gates of the modulation begin. `zero`: every block begins as the identity, as
-    published. `open`: at 1, with which small networks learn sooner."""
+    """Initial values of the modulation's gates. `zero`: every block is the identity, as
+    published. `open`: 1, with which small networks learn faster."""
     attention: Literal["auto", "xla", "cudnn"] = "auto"
     """The kernel of attention inside of a frame and to pixels: `cudnn` is flash attention on NVIDIA
     GPUs in 16 bits, `xla` runs anywhere, `auto` uses cudnn if it can."""
@@ -42,7 +42,7 @@ class BlocksConfig:
         require(
             self.head_dim % 2 == 0,
             f"blocks.head_dim is {self.head_dim}: use an even number, the rotary embedding of time "
-            "turns pairs of channels.",
+            "rotates pairs of channels.",
         )
         require(
             self.width % 4 == 0,
@@ -60,7 +60,7 @@ class VoxelVAEConfig:
     """Class ids, 0 … classes − 1, of which 0 is an empty cell."""
     patch: int = 1
     """Cells, along each axis, that are folded into the channels before the first level. Small
-    networks fold 4, which leaves them few places to compute at."""
+    networks fold 4, which leaves fewer positions to compute at."""
     embed: int = 32
     """Channels of the learned vector of a class. With patch 1 it is the first level's width."""
     widths: tuple[int, ...] = (32, 128, 512)
@@ -70,25 +70,25 @@ class VoxelVAEConfig:
     middle: int = 2
     """Residual blocks between the levels and the latents, in the encoder and in the decoder."""
     kernel: int = 3
-    """Places along an axis under a kernel of the levels' residual blocks: 3, or 1 for blocks that
-    see one place each."""
+    """Places along an axis under a kernel of the levels' residual blocks: 3, or 1 for blocks of
+    linear layers."""
     middle_kernel: int = 3
     """Places along an axis under a kernel next to the latents: of the blocks in the middle, of the
     encoder's last convolution and of the decoder's first. With 1 here and in ``kernel``, and one
-    level, a latent tells of its own patch alone."""
+    level, a latent depends on its own patch alone."""
     latent_channels: int = 48
     """Channels of a latent."""
     kl: float = 1e-6
     """Weight of the Kullback-Leibler divergence from a standard normal distribution, per latent
     number."""
     occupied_weight: float = 1.0
-    """Weight of the error at an occupied cell, where an empty one weighs 1."""
+    """Weight of the error at an occupied cell, where that of an empty cell is 1."""
     convolution: Literal["auto", "xla", "products"] = "auto"
     """How 3D convolutions are computed. `xla`: by XLA. `products`: as matrix products of shifted
     copies. `auto`: products on a CPU, else XLA."""
     cube: int = 0
-    """Cells along an axis of the cubes, cut out around occupied cells, from which training learns;
-    0 for whole grids, most of which is air."""
+    """Cells along an axis of the cubes, cut out around occupied cells, on which it is trained;
+    0 for whole grids, most of which is empty."""
     cubes: int = 16
     """Cubes cut out of each grid at every step, where ``cube`` is not 0."""
     compared: int = 0
@@ -207,12 +207,12 @@ class VoxelDiTConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CameraModelConfig:
-    """The transformer that says where the camera goes; by default as published."""
+    """The transformer that predicts the camera; by default as published."""
 
     classes: int = 2138
     """Class ids of the voxels."""
     inner: int = 4
-    """Voxels along each axis, around the middle of the grid, that it sees."""
+    """Voxels along each axis, around the middle of the grid, in its input."""
     embed: int = 32
     """Channels of the learned vector of a class."""
     actions: int = 23
@@ -225,7 +225,7 @@ class CameraModelConfig:
         1.0,
         1.0,
     )
-    """What counts as 1 in each number of a step: forward, left and up in metres; pitch, yaw and
+    """The unit of each number of a step: forward, left and up in metres; pitch, yaw and
     field of view in radians."""
     blocks: BlocksConfig = BlocksConfig()
     """The transformer blocks; a frame is one token."""
@@ -245,21 +245,21 @@ class CameraModelConfig:
 
 @dataclasses.dataclass(frozen=True)
 class VoxelRendererConfig:
-    """The diffusion transformer that makes pictures of voxels; by default as published."""
+    """The diffusion transformer that renders images of voxels; by default as published."""
 
     classes: int = 2138
     """Class ids of the voxels."""
     height: int = 36
-    """Rows of the picture's latents; a ray goes through the middle of each."""
+    """Rows of the picture's latents; a ray is cast through the centre of each."""
     width: int = 64
     """Columns of the picture's latents."""
     latent_channels: int = 16
     """Channels of the picture's latents."""
     rays: int = 1
     """Rays through each latent, along its rows and along its columns; 1 as published, more where a
-    latent stands for many pixels."""
+    latent covers many pixels."""
     layers: int = 192
-    """Occupied voxels along a ray that are seen, nearest first."""
+    """Occupied voxels along a ray that are used, nearest first."""
     embed: int = 32
     """Channels of the learned vector of a class, and of the sinusoids of its depth."""
     shortest_m: float = 0.5
@@ -267,7 +267,7 @@ class VoxelRendererConfig:
     longest_m: float = 100.0
     """Wavelength of the slowest sinusoid of depth, metres."""
     sides: bool = False
-    """Whether it also sees by which of a voxel's faces the ray enters."""
+    """Whether its input includes the face of a voxel through which the ray enters."""
     kernel: int = 6
     """Layers under the convolution that folds them."""
     stride: int = 4
@@ -275,12 +275,12 @@ class VoxelRendererConfig:
     fold: int = 16
     """Channels of that convolution; published networks have 47 places of 16, which are 752."""
     drawn: int = 0
-    """Channels of the latents of the voxels drawn in the colours of their classes, which join what
-    rays meet; 0 for none, as published. Small networks learn colours slowly without."""
+    """Channels of the latents of the voxels drawn in the colours of their classes, appended to the
+    rays' hits; 0 for none, as published. Small networks learn colours slowly without."""
     patch: int = 2
     """Latents along each axis for one token."""
     actions: int = 0
-    """Numbers of an action, which voxels and camera have in them already; 0 for none."""
+    """Numbers of an action, whose effect voxels and camera contain already; 0 for none."""
     blocks: BlocksConfig = BlocksConfig(context=16)
     """The transformer blocks."""
 
@@ -325,7 +325,7 @@ class VoxelRendererConfig:
 
     @property
     def features(self) -> int:
-        """Channels that the renderer is told of the voxels."""
+        """Channels of the voxels in the renderer's input."""
         return self.folded + self.drawn
 
     @property

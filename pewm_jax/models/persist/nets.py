@@ -1,6 +1,6 @@
 """PERSIST's four networks together, as the backbone of its world.
 
-They are a backbone in that a model names their settings there; each runs by functions of its own
+A model names their settings in the place of a backbone; the world calls each by its own functions
 (``voxel_vae``, ``voxel_dit``, ``camera_model``, ``voxel_renderer``).
 """
 
@@ -10,7 +10,6 @@ import dataclasses
 from typing import Any, ClassVar
 
 import jax
-from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config.parts import Backbone, Rules
 from pewm_jax.errors import require
@@ -24,7 +23,7 @@ from pewm_jax.models.persist.config import (
 from pewm_jax.types import Array, Params
 
 NETWORKS = ("voxel_vae", "voxel_dit", "camera_model", "renderer")
-"""The networks, as their parameters are named, in the order in which they learn."""
+"""The networks, as their parameters are named, in the order of their training."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,20 +34,18 @@ class PersistNetsConfig(Backbone):
         *voxel_dit.SHARDING,
         *camera_model.SHARDING,
         *voxel_renderer.SHARDING,
-        (r"voxel_vae/.*/kernel", P(None, "fsdp")),
-        (r"voxel_vae/.*/(bias|scale)", P()),
-        (r"voxel_vae/latent_(mean|scale)_C", P()),
+        *voxel_vae.SHARDING,
     )
     """Rules over the paths of all their parameters."""
 
     voxel_vae: VoxelVAEConfig = VoxelVAEConfig()
     """The autoencoder of voxels."""
     world_frames: VoxelDiTConfig = VoxelDiTConfig()
-    """The transformer that makes the next voxel frame."""
+    """The transformer that predicts the next voxel frame."""
     camera_model: CameraModelConfig = CameraModelConfig()
-    """The transformer that says where the camera goes."""
+    """The transformer that predicts the camera."""
     renderer: VoxelRendererConfig = VoxelRendererConfig()
-    """The transformer that makes pictures of voxels."""
+    """The transformer that renders images of voxels."""
 
     @property
     def places(self) -> None:  # type: ignore[override]

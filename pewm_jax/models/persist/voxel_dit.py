@@ -1,12 +1,12 @@
-"""The world-frame transformer of PERSIST: how a voxel frame comes out of those before it.
+"""The world-frame transformer of PERSIST: it predicts a voxel frame from those before it.
 
 A frame is a cube of latents of ``voxel_vae``. Each of its tokens attends to the others of the
-frame, to its own place in earlier frames, and to patches of a picture's latents. Each frame has a
-time of its own (diffusion forcing), an action, and perhaps the camera of its picture; together they
+frame, to the same position in earlier frames, and to patches of an image's latents. Each frame has
+its own time (diffusion forcing), an action, and optionally the camera of its image; together they
 modulate the frame's tokens (arXiv 2603.03482).
 
-The grid lies along the world's axes and goes where the agent goes, so a place in the grid is not a
-place in the world: the network has to move what it remembers.
+The grid is aligned with the world's axes and moves with the agent, so a grid position is not a
+world position: the network has to shift its memory.
 
 Parameters: ``patch_embed, pixel_embed, no_pixels, time_embed, action, camera, blocks (stacked over
 layers), modulate_out, proj_out``.
@@ -52,7 +52,7 @@ def ends(config: VoxelDiTConfig) -> dict[str, tuple[int, ...]]:
 
 
 def init(config: VoxelDiTConfig, key: Array) -> Params:
-    """Return random parameters, float32; the prediction is 0 at first."""
+    """Return random parameters, float32; the prediction is 0 at initialization."""
     return frame_blocks.init(config.blocks, PARTS, ends(config), key)
 
 
@@ -74,27 +74,21 @@ def apply(
     known_BTxyz: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Predict from noisy frames what the noise asks for.
+    """Predict the target of the noise from noisy frames.
 
-    Args:
-        config: the network.
-        params: its parameters.
-        latents_BTxyzC: (B, T, side, side, side, C) noisy latents of T frames; their dtype is the
-            dtype of the computation.
-        times_BT: each frame's time, in the network's units.
-        actions_BTA: the action that leads *to* each frame; zeros for the first of a walk.
-        pixels_BThwC: latents of the picture that each frame is shown: the one before it, or for
-            the first frame of a walk its own. Channels may hold more, such as rays.
-        camera_BTN: numbers of that picture's camera; see ``geometry.actions.camera_numbers``.
-        shown_BT: bool, whether a frame is shown its picture; None means all are.
-        known_BTxyz: bool, which latents are known; tokens of others are not read by later frames.
-            None means all are.
-        cache: the frames before these; see ``frame_blocks``.
+    Args: config: the network. params: its parameters. latents_BTxyzC: (B, T, side, side, side, C)
+        noisy latents of T frames; their dtype is the dtype of the computation. times_BT: each
+        frame's time, in the network's units. actions_BTA: the action that leads *to* each frame;
+        zeros for the first frame of an episode. pixels_BThwC: latents of each frame's image: of the
+        frame before it, or for the first frame of an episode its own. Further channels, such as
+        rays, may be appended. camera_BTN: numbers of that image's camera; see
+        ``geometry.actions.camera_numbers``. shown_BT: bool, whether a frame has its image; None
+        means all have. known_BTxyz: bool, which latents are known; tokens of others are not read by
+        later frames. None means all are. cache: the frames before these; see ``frame_blocks``.
 
-    Returns:
-        ``(prediction, cache)``: the prediction in the shape of the latents, and the cache with
-        these frames, or None. While a frame is denoised the cache from before it is used again and
-        again; the one to go on with is made from the frame as it came out.
+    Returns: ``(prediction, cache)``: the prediction in the shape of the latents, and the cache with
+        these frames, or None. All denoising steps of a frame use the cache from before it; the
+        cache for the next frame is computed from the denoised frame.
 
     Raises:
         UserError: an argument of another shape, or cameras where the network takes none.

@@ -1,10 +1,10 @@
-"""The renderer of PERSIST: pictures of voxels, seen from given cameras.
+"""The renderer of PERSIST: it predicts images of voxels for given cameras.
 
-A ray goes through the middle of each latent of the picture, and meets occupied voxels in order
-(``geometry.march``). Of each there are a learned vector of its class and sinusoids of its depth; a
-convolution along the ray folds these layers into channels that lie where the picture's latents lie.
-Joined to the noisy latents, they go through a transformer with attention in and between frames,
-whose blocks are those of ``voxel_dit`` without attention to pictures (arXiv 2603.03482).
+A ray is cast through the centre of each latent of the image and hits occupied voxels in order
+(``geometry.march``). Each hit has a learned vector of its class and sinusoids of its depth. A
+convolution along the ray folds these hits into channels at the positions of the image's latents.
+Concatenated to the noisy latents, they are the input of a transformer with attention in and between
+frames, whose blocks are those of ``voxel_dit`` without attention to images (arXiv 2603.03482).
 
 Parameters: ``classes, fold, patch_embed, time_embed, blocks (stacked over layers), modulate_out,
 proj_out``, and ``faces`` and ``action`` where a variant has them.
@@ -35,7 +35,7 @@ PARTS = ("space", "time")
 SHARDING = frame_blocks.rules("renderer")
 """Rules over the paths of its parameters under ``renderer``."""
 FACES = 4
-"""Ways into a voxel: by one of three axes, or none."""
+"""Axes along which a ray can enter a voxel: three, or none."""
 
 
 def ends(config: VoxelRendererConfig) -> dict[str, tuple[int, ...]]:
@@ -57,10 +57,10 @@ def ends(config: VoxelRendererConfig) -> dict[str, tuple[int, ...]]:
 
 
 def init(config: VoxelRendererConfig, key: Array) -> Params:
-    """Return random parameters, float32; the prediction is 0 at first."""
+    """Return random parameters, float32; the prediction is 0 at initialization."""
     params = frame_blocks.init(config.blocks, PARTS, ends(config), key)
     for name, rows in (("classes", config.classes), ("faces", FACES)):
-        if name in params:  # a row is looked up, not all of them
+        if name in params:  # only one row is looked up
             params[name]["kernel"] *= rows**0.5
     return params
 
@@ -78,7 +78,7 @@ def cast_rays(
     camera: Camera,
     size: tuple[int, int],
 ) -> RayHits:
-    """Return what the rays of T cameras meet in T grids, (T, h, w, L); distances are depths.
+    """Return the hits (T, h, w, L) of the rays of T cameras in T grids; distances are depths.
 
     With ``rays`` r above 1 the shape is (T, h·r, w·r, L).
 
@@ -100,7 +100,7 @@ def cast_rays(
         found = march.through_pixels(ids, low, cell_m, seen, height, width, config.layers)
         return jax.tree.map(lambda x: x[0], found)
 
-    # One after the other: the march ends when its rays have left the grid, and not each frame's do.
+    # One frame at a time: a march ends when all its rays have left the grid.
     frames = classes_TXYZ, low_T3, intrinsics, camera.world_from_camera
     return jax.lax.map(one, tuple(jnp.asarray(x) for x in frames))
 
@@ -113,14 +113,14 @@ def features(
     *,
     drawn_hwC: Array | None = None,
 ) -> Array:
-    """Fold layers (..., h, w, L) into channels (..., h, w, F): first all of the nearest place.
+    """Fold layers (..., h, w, L) into channels (..., h, w, F): first all of the nearest.
 
-    Of several rays of one latent, first all of the first ray.
+    With several rays per latent, first all of the first ray.
 
     Args:
         config: the network.
         params: its parameters.
-        layers: what rays meet, from ``cast_rays``.
+        layers: the hits of the rays, from ``cast_rays``.
         dtype: of the computation.
         drawn_hwC: (..., h, w, C) latents of the voxels drawn in the colours of their classes,
             where the network takes them (``config.drawn``); they are the last channels.
@@ -175,7 +175,7 @@ def apply(
     actions_BTA: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Predict from noisy latents of pictures what the noise asks for.
+    """Predict the target of the noise from noisy latents of images.
 
     Args:
         config: the network.
@@ -183,7 +183,7 @@ def apply(
         latents_BThwC: (B, T, h, w, C) noisy latents of T frames; their dtype is the dtype of the
             computation.
         times_BT: each frame's time, in the network's units.
-        features_BThwF: what each frame's camera sees of the voxels, from ``features``.
+        features_BThwF: the voxels as each frame's camera sees them, from ``features``.
         actions_BTA: the action that leads to each frame, where the network takes one.
         cache: the frames before these; see ``frame_blocks``.
 

@@ -1,11 +1,11 @@
 """The autoencoder of voxels: a grid of class ids to a small grid of latents, and back.
 
-PERSIST (arXiv 2603.03482): residual blocks of 3D convolutions at three widths, each level half as
-fine as the one before; layer norms over channels, SiLU; trained by cross-entropy and a little
-divergence from a normal distribution. One-hot ids through a linear layer are a look-up of learned
-vectors, and that is how they are read here.
+PERSIST (arXiv 2603.03482): residual blocks of 3D convolutions at three widths, each level with half
+the resolution of the one before; layer norms over channels, SiLU; trained by cross-entropy and a
+small KL divergence from a normal distribution. A linear layer on one-hot ids is an embedding table,
+which is how ids are read here.
 
-Latents leave with mean 0 and variance 1 per channel once ``latent_mean_C`` and ``latent_scale_C``
+Latents have mean 0 and variance 1 per channel once ``latent_mean_C`` and ``latent_scale_C``
 are set (``with_statistics``).
 
 Parameters: ``encoder/embed, into (patch > 1), level_i/block_k, level_i/down, middle_k, norm, out``;
@@ -40,7 +40,7 @@ SHARDING = (
 """Sharding rules: weights are gathered when they are used, each device has its own grids."""
 Kernels = dict[str, tuple[int, ...]]
 FIRST_DEVIATION = 0.05
-"""Standard deviation of the latents around their means before anything is learned."""
+"""Standard deviation of the latents around their means at initialization."""
 
 
 def kernels(config: VoxelVAEConfig) -> Kernels:
@@ -87,7 +87,7 @@ def _decoder_kernels(config: VoxelVAEConfig) -> Kernels:
 
 
 def _block_kernels(where: str, inward: int, outward: int, side: int) -> Kernels:
-    """Return the kernels of a residual block; the last one leads past it where widths differ."""
+    """Return the kernels of a residual block; the last one is the shortcut where widths differ."""
     made: Kernels = {
         f"{where}/one": (side, side, side, inward, outward),
         f"{where}/two": (side, side, side, outward, outward),
@@ -96,7 +96,7 @@ def _block_kernels(where: str, inward: int, outward: int, side: int) -> Kernels:
 
 
 def is_followed(config: VoxelVAEConfig, level: int) -> bool:
-    """Tell whether a coarser level comes after this one."""
+    """Tell whether a coarser level follows."""
     return level + 1 < len(config.widths)
 
 
@@ -108,7 +108,7 @@ def shapes(config: VoxelVAEConfig) -> dict[str, tuple[int, ...]]:
         if path != "encoder/embed":
             made[f"{path}/bias"] = shape[-1:]
         where, _, name = path.rpartition("/")
-        if name in ("one", "two"):  # a norm over what goes in
+        if name in ("one", "two"):  # a norm over the input
             made[f"{where}/norm_{name}/scale"] = made[f"{where}/norm_{name}/bias"] = shape[-2:-1]
     for name, width in (("encoder", config.widths[-1]), ("decoder", config.widths[0])):
         made[f"{name}/norm/scale"] = made[f"{name}/norm/bias"] = (width,)
@@ -118,8 +118,8 @@ def shapes(config: VoxelVAEConfig) -> dict[str, tuple[int, ...]]:
 def init(config: VoxelVAEConfig, key: Array) -> Params:
     """Return random parameters, float32.
 
-    Residual blocks change nothing at first, and latents vary by no more than ``FIRST_DEVIATION``:
-    as long as they were mostly noise, the decoder would learn nothing from them.
+    Residual blocks are the identity, and the latents' deviation is ``FIRST_DEVIATION``: from
+    latents that were mostly noise the decoder would learn nothing.
     """
     params = draw(shapes(config), key)
     for part in ("encoder", "decoder"):
@@ -128,7 +128,7 @@ def init(config: VoxelVAEConfig, key: Array) -> Params:
                 if name.startswith(("block_", "middle_")):
                     leaf["two"]["kernel"] = jnp.zeros_like(leaf["two"]["kernel"])
     embed = params["encoder"]["embed"]
-    embed["kernel"] = embed["kernel"] * jnp.sqrt(float(config.classes))  # one row, not all of them
+    embed["kernel"] = embed["kernel"] * jnp.sqrt(float(config.classes))  # only one row is looked up
     out = params["encoder"]["out"]
     out["bias"] = out["bias"].at[config.latent_channels :].set(2 * math.log(FIRST_DEVIATION))
     params["latent_mean_C"] = jnp.zeros((config.latent_channels,))
@@ -137,11 +137,11 @@ def init(config: VoxelVAEConfig, key: Array) -> Params:
 
 
 def with_statistics(params: Params, mean_C: Array, scale_C: Array) -> Params:
-    """Return parameters by which latents of this mean and deviation leave as mean 0, variance 1.
+    """Return parameters that normalise latents of this mean and deviation to mean 0, variance 1.
 
     Args:
         params: this network's.
-        mean_C: (C,) mean of each channel of the latents as they leave with ``params``.
+        mean_C: (C,) mean of each channel of the latents that ``params`` give.
         scale_C: (C,) their standard deviation.
     """
     before = params["latent_scale_C"]
@@ -198,7 +198,7 @@ def encode(
 def features(
     config: VoxelVAEConfig, params: Params, latents_BxyzC: Array, dtype: jnp.dtype = jnp.float32
 ) -> Array:
-    """Return what the scores of the finest places are made from, (B, X, Y, Z, embed).
+    """Return the input of the layer that scores classes, (B, X, Y, Z, embed).
 
     Args:
         config: the network.
@@ -218,9 +218,9 @@ def logits(config: VoxelVAEConfig, params: Params, latents_BxyzC: Array) -> Arra
 def decode(
     config: VoxelVAEConfig, params: Params, latents_BxyzC: Array, dtype: jnp.dtype = jnp.float32
 ) -> Array:
-    """Return the likeliest class id of every cell, (B, X, Y, Z) int32.
+    """Return the most likely class id of every cell, (B, X, Y, Z) int32.
 
-    The scores of ``config.slab`` layers of cells are held at a time.
+    The scores of ``config.slab`` layers of cells are in memory at a time.
     """
     part = params["decoder"]["scores"]
     seen = features(config, params, latents_BxyzC, dtype)
@@ -247,7 +247,7 @@ def loss(
         ``(loss, measured)``: ``cross_entropy`` per compared cell (occupied ones weigh
         ``occupied_weight``), ``divergence`` summed over a grid's latents and divided by its cells,
         ``occupied_right`` and ``empty_right``, the shares of such cells whose class is the
-        likeliest one.
+        most likely one.
     """
     if config.cube:
         require_grids(config, classes_BXYZ)
@@ -292,7 +292,7 @@ def loss(
 def cubes(config: VoxelVAEConfig, classes_BXYZ: Array, key: Array) -> Array:
     """Return ``config.cubes`` cubes of each grid, (B · cubes, cube, cube, cube).
 
-    Each holds an occupied cell, drawn at random, if its grid has any, and begins at a whole latent.
+    Each holds an occupied cell, drawn at random, if its grid has one, and starts at a whole latent.
     """
     ids = jnp.asarray(classes_BXYZ)
     full = (ids != 0).astype(jnp.float32).reshape(len(ids), -1)
@@ -312,7 +312,7 @@ def cubes(config: VoxelVAEConfig, classes_BXYZ: Array, key: Array) -> Array:
 
 
 def sample_cells(weight_BN: Array, count: int, key: Array) -> Array:
-    """Draw (B, count) places of each row with a probability in proportion to their weight."""
+    """Draw (B, count) positions of each row with probabilities proportional to their weights."""
     share_BN = jnp.cumsum(weight_BN, 1)
     at = jax.random.uniform(key, (len(share_BN), count)) * share_BN[:, -1:]
     places = jax.vmap(lambda share, at: jnp.searchsorted(share, at, side="right"))(share_BN, at)
@@ -323,7 +323,7 @@ def require_grids(config: VoxelVAEConfig, classes_BXYZ: Array) -> None:
     """Refuse grids that are not the network's.
 
     Raises:
-        UserError: another size, or no integers.
+        UserError: another size, or not integers.
     """
     shape, side = jnp.shape(classes_BXYZ), config.side
     if len(shape) != 4 or shape[1:] != (side,) * 3:
@@ -332,7 +332,7 @@ def require_grids(config: VoxelVAEConfig, classes_BXYZ: Array) -> None:
             "(voxel_vae.side)."
         )
     if not jnp.issubdtype(jnp.asarray(classes_BXYZ).dtype, jnp.integer):
-        raise UserError("The voxels are no integers: give class ids, 0 for an empty cell.")
+        raise UserError("The voxels are not integers: give class ids, 0 for an empty cell.")
 
 
 def _features(config: VoxelVAEConfig, part: Params, latents_BxyzC: Array) -> Array:
@@ -357,7 +357,7 @@ def _features(config: VoxelVAEConfig, part: Params, latents_BxyzC: Array) -> Arr
 
 
 def _block(config: VoxelVAEConfig, part: Params, x: Array) -> Array:
-    """Norm, SiLU and convolution, twice, beside the way past them."""
+    """Residual block: norm, SiLU and convolution, twice."""
     inner = jax.nn.silu(layer_norm(part["norm_one"], x))
     inner = _convolved(config, part["one"], inner)
     inner = jax.nn.silu(layer_norm(part["norm_two"], inner))
@@ -373,7 +373,7 @@ def _convolved(config: VoxelVAEConfig, part: Params, x: Array) -> Array:
 
 
 def _by_slab(config: VoxelVAEConfig, function: Callable[..., Any], *grids_BXYZ: Array) -> Any:
-    """Run a function on some layers of cells at a time, all along the first axis of the grid."""
+    """Run a function on a few layers of cells at a time, along the first axis of the grid."""
     if not config.slab or config.slab == config.side:
         return function(*grids_BXYZ)
 

@@ -1,10 +1,10 @@
 """Stable Video Diffusion's U-Net as a backbone: its functions, sharding rules and costs.
 
 The observed image reaches it in three ways, as in the reference's pipeline: its latents are joined
-to those of every frame, its embedding (CLIP's) is attended to, and a scalar tells how much noise it
-got before it was encoded. Two more scalars, frames per second and how much motion there is, are
-settings. A control that modulates adds to the time embedding of each frame (arXiv 2601.15284,
-Eq. 5). It has no place where a memory could be read.
+to those of every frame, its embedding (CLIP's) is attended to, and a scalar states the noise that
+was added before it was encoded. Two more scalars, frames per second and the amount of motion, are
+settings. A control that modulates adds to the time embedding of each frame (arXiv 2601.15284, Eq.
+5). It has no place where a memory could be read.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class SVDUNetBackbone(SVDUNetConfig, Backbone):
     """Weights are stored split and gathered for use; each device computes its own clips."""
 
     def check(self, model: Any) -> None:
-        """Refuse a model around it that gives it what it cannot take; any size will do."""
+        """Refuse a model that does not fit the network; any size of frames does."""
         require(
             self.added == 3,
             f"backbone.added is {self.added}: a world model gives three scalars, frames per "
@@ -85,9 +85,9 @@ class SVDUNetBackbone(SVDUNetConfig, Backbone):
         return clip_vision.init(self.image, key)
 
     def observed(self, model: Any, params: Params, seen: Observed) -> Conditioning:
-        """Show the observed image: its latents in every frame, its embedding, and the scalars.
+        """Condition on the observed image: its latents in every frame, its embedding, scalars.
 
-        The embedding is that of the colours before they got noise.
+        The embedding is that of the colours before noise was added.
 
         Raises:
             UserError: more than one frame was observed.
@@ -95,18 +95,18 @@ class SVDUNetBackbone(SVDUNetConfig, Backbone):
         first = seen.latents_BthwC
         if first.shape[1] != 1:
             raise UserError(
-                f"{first.shape[1]} frames were observed, and this backbone (svd_unet) is shown "
+                f"{first.shape[1]} frames were observed, and this backbone (svd_unet) takes "
                 "one: use history 1."
             )
         batch, frames = len(first), model.latent_shape[0]
         rgb = clip_vision.preprocess(seen.rgb_BTHWC[:, 0], self.image.image_size)
         embedding = clip_vision.apply(self.image, params["image"], rgb.astype(model.dtype))
-        told = jnp.asarray([self.fps - 1, self.motion_bucket], jnp.float32)
-        told = jnp.broadcast_to(told, (batch, 2))
+        scalars = jnp.asarray([self.fps - 1, self.motion_bucket], jnp.float32)
+        scalars = jnp.broadcast_to(scalars, (batch, 2))
         return Conditioning(
             joined_BthwC=jnp.repeat(first, frames, 1),
             image_BMD=embedding[:, None],
-            scalars_BK=jnp.concatenate([told, seen.noise_B[:, None]], 1),
+            scalars_BK=jnp.concatenate([scalars, seen.noise_B[:, None]], 1),
         )
 
     def apply(

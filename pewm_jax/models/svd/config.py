@@ -37,16 +37,16 @@ class SVDUNetConfig:
     image_dim: int = 1024
     """Channels of the image embedding."""
     added: int = 3
-    """Scalars beside the noise level: frames per second, motion bucket, noise of the image."""
+    """Scalars besides the noise level: frames per second, motion bucket, noise of the image."""
     added_dim: int = 256
     """Channels of the sinusoid of each of these scalars; even."""
     image: CLIPVisionConfig = CLIPVisionConfig()
     """The encoder of the image that is attended to; frozen. Its embedding has `image_dim`
     channels."""
     fps: float = 7.0
-    """Frames per second that the network is told."""
+    """Frames per second in the network's conditioning."""
     motion_bucket: float = 127.0
-    """How much motion the network is told that there is."""
+    """The amount of motion in the network's conditioning."""
     remat: bool = False
     """Recompute the activations of each residual block and attention in the backward pass: less
     memory, more work."""

@@ -108,7 +108,7 @@ def resnet(
         time_BTE: (B, T or 1, E) SiLU of the time embedding, or None.
         eps: added to the variances.
         temporal_eps: the same over time, if it differs.
-        switched: whether ``mix`` speaks of the temporal branch, as in the autoencoder.
+        switched: whether ``mix`` weighs the temporal branch, as in the autoencoder.
     """
     x = resnet_2d(params["spatial"], x_BTHWC, time_BTE, eps)
     inside = params["temporal"]
@@ -117,12 +117,12 @@ def resnet(
     if time_BTE is not None:
         h = h + linear(inside["time"], time_BTE)[:, :, None, None]
     h = convolve_time(inside["conv2"], active(inside["norm2"], h, eps, over_time=True))
-    # A mixture of x and x + h is x and a share of h.
-    return x + _share(params, x.dtype, of_time=switched) * h
+    # Mixing x and x + h is x plus a weighted h.
+    return x + _temporal_weight(params, x.dtype, of_time=switched) * h
 
 
-def _share(params: Params, dtype: jnp.dtype, *, of_time: bool) -> Array:
-    """Return the share of the temporal branch."""
+def _temporal_weight(params: Params, dtype: jnp.dtype, *, of_time: bool) -> Array:
+    """Return the weight of the temporal branch."""
     logit = params["mix"].astype(jnp.float32)
     return jax.nn.sigmoid(logit if of_time else -logit).astype(dtype)
 
@@ -162,7 +162,7 @@ def attend(params: Params, x_BTHWC: Array, image_BMD: Array, heads: int, layers_
         x = _spatial(params[f"spatial_{k}"], flat, context, heads, frames)
         x = x.reshape(batch, frames, pixels, channels)
         moved = _temporal(params[f"temporal_{k}"], x + number, image_BMD, heads)
-        x = x + _share(params, dtype, of_time=False) * (moved - x)
+        x = x + _temporal_weight(params, dtype, of_time=False) * (moved - x)
     x = linear(params["proj_out"], x).reshape(x_BTHWC.shape)
     return x + x_BTHWC
 
@@ -189,7 +189,7 @@ def _temporal(params: Params, x_BTPC: Array, image_BMD: Array, heads: int) -> Ar
 def _attend_image(params: Params, x_NPC: Array, context: Array, heads: int, repeats: int) -> Array:
     """Attend to the image's embedding.
 
-    All weight goes to a single token whatever the query is, so queries and keys are not computed.
+    A single token gets all weight for any query, so queries and keys are not computed.
     """
     inside = params["attn2"]
     context = context.astype(x_NPC.dtype)

@@ -116,7 +116,7 @@ def apply(
 
 
 def _run(config: SVDUNetConfig, layer: Callable[..., Array], *arguments: Array | Params) -> Array:
-    """Run a layer, again in the backward pass if the settings say so; each device its own clips."""
+    """Run a layer, with rematerialization if the settings ask for it; each device its own clips."""
     layer = jax.checkpoint(layer) if config.remat else layer
     return placement.constrain(layer(*arguments), "batch")
 
