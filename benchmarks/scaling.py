@@ -19,12 +19,10 @@ from record import machine, record, table
 
 from pewm_jax import presets as configs
 from pewm_jax.config import ClipConfig, Config, MeshConfig
-from pewm_jax.plan import plan, suggest
-from pewm_jax.plan.footprint import MeshSizes
-from pewm_jax.plan.text import arranged, rate, size, work
+from pewm_jax.plan.measure import MeshSizes, virtual
+from pewm_jax.plan.plan import StagePlan, arranged, flop, plan_stage, rate, size
 from pewm_jax.train import chips, stages
 from pewm_jax.train.log import duration
-from pewm_jax.train.stages import Stage
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
 DEVICES = (8, 64, 256)
@@ -33,10 +31,10 @@ HEAD = (
     "stage",
     "devices",
     "mesh",
-    "memory by the formula, and raised as the verdict takes it",
-    "CPU program (formula for it)",
+    "memory of a device",
+    "CPU program",
     "fits",
-    "work of a device (program)",
+    "work of a device (CPU program)",
     "step",
     "MFU",
     "clips/s",
@@ -68,28 +66,23 @@ def cases(quick: bool) -> Iterator[tuple[str, Config, int]]:
     yield "pewm_5b, 49 × 480 × 720, 16 clips", long_clip(), 64
 
 
-def row(label: str, config: Config, stage: Stage, count: int, chip: chips.Chip) -> list[str]:
-    """Plan one case; returns its line of the table."""
-    print(f"{label}, stage {stage.number}, {count} × {chip.name}: compiling …", flush=True)
-    compiled = plan.compile_stage(config, stage, plan.virtual(count))
-    mesh = MeshSizes(*config.train.mesh.shape(count))
-    choice = suggest.assess(config, stage, mesh, chip)
-    best = suggest.rank(config, stage, count, chip)
-    one = plan.Plan(config, stage, chip, choice, compiled, tuple(best[:1]))
-    print(f"  compiled in {compiled.seconds:.0f} s: {size(one.peak)}", flush=True)
+def row(label: str, plan: StagePlan) -> list[str]:
+    """Return a plan's line of the table."""
+    choice, compiled, best = plan.choice, plan.compiled, plan.best[0]
+    assert compiled is not None
     return [
         label,
-        str(stage.number),
-        f"{count} × {chip.name}",
+        str(plan.stage.number),
+        f"{choice.mesh.devices} × {plan.chip.name}",
         arranged(choice),
-        f"{size(choice.footprint.peak)}, {size(one.peak)}",
-        f"{size(compiled.peak)} ({size(compiled.expected.peak)})",
-        "yes" if one.fits else "**no**",
-        f"{work(choice.time.hardware_flops)} ({work(compiled.program.flops)})",
+        size(choice.memory.peak),
+        size(compiled.peak),
+        "yes" if choice.fits else "**no**",
+        f"{flop(choice.time.executed_flops)} ({flop(compiled.program.flops)})",
         duration(choice.time.step_s),
         f"{choice.time.mfu:.0%}",
         rate(choice.time.clips_per_s),
-        f"{arranged(best[0])}: {duration(best[0].time.step_s)}",
+        f"{arranged(best)}: {duration(best.time.step_s)}",
     ]
 
 
@@ -103,13 +96,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     chip = chips.named(options.chip)
     found = list(cases(options.quick))
-    plan.virtual(max(count for *_, count in found))
+    virtual(max(count for *_, count in found))
     wanted = [(*case, stage) for case in found for stage in stages.planned(case[1])]
     rows: dict[int, list[str]] = {}
     # The largest first: what is written after each is then never without them.
     for index in sorted(range(len(wanted)), key=lambda k: "5b" not in wanted[k][0]):
         label, config, count, stage = wanted[index]
-        rows[index] = row(label, config, stage, count, chip)
+        print(f"{label}, stage {stage.number}, {count} × {chip.name}: compiling …", flush=True)
+        sizes = MeshSizes(*config.train.mesh.shape(count))
+        rows[index] = row(label, plan_stage(config, stage, sizes, chip))
         source = f"{chip.name}: {chip.source}. Compiled with {machine('jax')}."
         text = f"{table(HEAD, [rows[k] for k in sorted(rows)])}\n\n{source}"
         if options.record:

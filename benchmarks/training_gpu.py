@@ -34,17 +34,16 @@ from pewm_jax.config import Config, MeshConfig, UserError
 from pewm_jax.config import command_line as cli
 from pewm_jax.data import abstract
 from pewm_jax.io import atomic
-from pewm_jax.plan import suggest
-from pewm_jax.plan.footprint import MeshSizes
-from pewm_jax.train import chips, sharding, stages, step
+from pewm_jax.plan import plan
+from pewm_jax.plan.measure import MeshSizes
+from pewm_jax.train import chips, flops, sharding, stages, step
 from pewm_jax.types import Clip
-from pewm_jax.worlds import costs
 from pewm_jax.worlds.pewm.world import STAGES
 
 NAME = "training_gpu"
 BATCHES = (1, 2, 4, 8, 16, 32)
 HEADER = ("stage, clips a step", "step, ms", "predicted", "clips/s", "MFU", "predicted")
-HEADER += ("peak memory, GB", "predicted", "compile, s")
+HEADER += ("peak memory, GB", "of that state and gradients", "compile, s")
 FULL = "out of memory"
 
 
@@ -77,12 +76,12 @@ def random_clip(config: Config, stage: stages.Stage) -> Clip:
 
 
 def predicted(config: Config, stage: stages.Stage, chip: chips.Chip) -> dict[str, float]:
-    """Return what the sums on paper, which ``--plan`` prints, say of one device."""
-    choice = suggest.assess(config, stage, MeshSizes(), chip)
+    """Return what ``--plan --compiled off`` says of one device."""
+    found = plan.plan_stage(config, stage, MeshSizes(), chip, compiles=False).choice
     return {
-        "predicted_s": choice.time.step_s,
-        "predicted_mfu": choice.time.mfu,
-        "predicted_gb": choice.footprint.peak / 1e9,
+        "predicted_s": found.time.step_s,
+        "predicted_mfu": found.time.mfu,
+        "held_gb": found.memory.peak / 1e9,
     }
 
 
@@ -108,9 +107,9 @@ def measure(preset: str, number: int, batch: int, repeats: int) -> dict[str, Any
     if not np.isfinite(float(metrics["loss"])):
         raise UserError(f"stage {number}, {batch} clips: the loss is {float(metrics['loss'])}.")
     peak = (device.memory_stats() or {}).get("peak_bytes_in_use", 0)
-    flops = batch * costs.flops_per_clip(config, stage)
+    needed = flops.of_stage(config, stage, clip).total
     taken = statistics.median(seconds)
-    return {**found, "s": taken, "mfu": flops / taken / chip.flops, "peak_gb": peak / 1e9}
+    return {**found, "s": taken, "mfu": needed / taken / chip.flops, "peak_gb": peak / 1e9}
 
 
 def report(done: dict[str, dict[str, Any]]) -> str:
@@ -118,12 +117,12 @@ def report(done: dict[str, dict[str, Any]]) -> str:
     rows = []
     for name, found in done.items():
         if FULL in found:
-            guess = f"{found['predicted_gb']:.1f}"
+            guess = f"{found['held_gb']:.1f}"
             rows.append((name, FULL, "", "", "", "", "", guess, ""))
             continue
         times = f"{found['s'] * 1e3:.0f}", f"{found['predicted_s'] * 1e3:.0f}"
         shares = f"{found['mfu']:.1%}", f"{found['predicted_mfu']:.1%}"
-        sizes = f"{found['peak_gb']:.1f}", f"{found['predicted_gb']:.1f}"
+        sizes = f"{found['peak_gb']:.1f}", f"{found['held_gb']:.1f}"
         rate = f"{found['batch'] / found['s']:.2f}"
         rows.append((name, *times, rate, *shares, *sizes, f"{found['compile_s']:.0f}"))
     return record.table(HEADER, rows)

@@ -82,12 +82,6 @@ def apply(params: Params, decoded_NHWC: Array, rendered_NHWC: Array, seen_NHW: A
     return decoded_NHWC + seen * (weight * difference + out[..., 2:])
 
 
-def macs(width: int, height: int, across: int) -> float:
-    """Return the multiply-adds of one picture."""
-    pixels = height * across // FOLD**2
-    return float(sum(9 * inward * outward * pixels for inward, outward in layout(width).values()))
-
-
 def _convolve(weights: Params, x_NHWC: Array) -> Array:
     kernel, bias = (weights[name].astype(x_NHWC.dtype) for name in ("kernel", "bias"))
     return convolve(x_NHWC, kernel) + bias

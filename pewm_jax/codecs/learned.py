@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,6 @@ from pewm_jax.codecs import gates
 from pewm_jax.config.parts import Codec, Rules
 from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.nn.convolution import convolve
-from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.types import Array, Params
 
 PATCH = 4
@@ -195,28 +194,6 @@ class LearnedCodecConfig(Codec):
             **blocks("decoder", "fine", self.fine_blocks, a, PATCH),
             "decoder/out": ((3, a, pixels), PATCH),
         }
-
-    def macs(self, part: str, height: int, width: int) -> float:
-        """Return the multiply-adds of one frame through the ``encoder`` or the ``decoder``."""
-        return float(
-            sum(
-                side * side * inward * outward * (height // cell) * (width // cell)
-                for path, ((side, inward, outward), cell) in self.layout().items()
-                if path.startswith(f"{part}/")
-            )
-        )
-
-    def costs(self, model: Any, share: Share) -> Costs:
-        """Return what encoding colour and depth costs, of the clip and of its first frame."""
-        clip = model.clip
-        frames = 2 * (clip.frames + 1)
-        widest = clip.height * clip.width // PATCH**2 * self.fine * share.activation_bytes
-        work = frames * self.macs("encoder", clip.height, clip.width)
-        return Costs(
-            products=(Product("codec", "convolution", work),),
-            streamed=PASSES * share.clips * frames * widest,
-            held=4 * 2 * clip.frames * widest,  # colour and depth, of one clip
-        )
 
 
 def with_statistics(params: Params, mean_C: Array, scale_C: Array) -> Params:

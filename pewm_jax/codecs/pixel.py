@@ -7,7 +7,7 @@ rule: q·k + 1 frames become k + 1 latent frames, the first of which holds q cop
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from pewm_jax.config.parts import Codec
 from pewm_jax.errors import require_positive
 from pewm_jax.geometry.plucker import fold_frames
-from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params
 
 
@@ -68,11 +67,6 @@ class PixelConfig(Codec):
         video = grid.reshape(batch, latent_frames, q, h * s, w * s, -1)
         rest = video[:, 1:].reshape(batch, -1, *video.shape[3:])
         return jnp.concatenate([video[:, :1].mean(2), rest], 1)
-
-    def costs(self, model: Any, share: Share) -> Costs:
-        """Return the costs, which are negligible."""
-        del model, share
-        return Costs()
 
 
 def fold(video_BTHWC: Array, spatial: int, temporal: int) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -14,7 +13,6 @@ from pewm_jax.codecs.signals import depth_from_signal, signal_from_depth
 from pewm_jax.config import ModelConfig
 from pewm_jax.geometry import depth_images
 from pewm_jax.nn import placement
-from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params, View
 
 
@@ -139,20 +137,3 @@ def measured(model: ModelConfig, depth_BTHW: Array) -> Array:
     valid = (depth_BTHW > 0).astype(jnp.float32)[..., None]
     share = fold(valid, model.codec.spatial, model.codec.temporal)
     return share if model.codec.PIXELWISE else share.mean(-1, keepdims=True)
-
-
-def costs_of_images(model: ModelConfig, share: Share, images: int, part: str) -> Costs:
-    """Return what it costs to encode so many more images of a clip's size.
-
-    A codec's own costs are those of T + 1 images of colour and of as many of depth.
-
-    Args:
-        model: the model.
-        share: one device's share of the step.
-        images: images that are encoded.
-        part: the part of the model that they are encoded for.
-    """
-    whole = model.codec.costs(model, share)
-    times = images / (2 * (model.clip.frames + 1))
-    products = (dataclasses.replace(x, part=part, macs=x.macs * times) for x in whole.products)
-    return Costs(tuple(products), streamed=whole.streamed * times, held=whole.held * times)

@@ -129,10 +129,6 @@ class Backbone(Settings):
         """Return the number of input channels that show the observed frames: their latents'."""
         return model.codec.channels
 
-    def costs(self, model: Any, share: Any, *, trained: bool) -> Any:
-        """Return its ``nn.costs.Costs`` in one step of training."""
-        raise NotImplementedError
-
     def check(self, model: Any) -> None:
         """Refuse latents that do not split into the backbone's patches.
 
@@ -240,10 +236,6 @@ class Codec(Settings):
         del depth_BTHW
         return None
 
-    def costs(self, model: Any, share: Any) -> Any:
-        """Return the ``nn.costs.Costs`` of encoding a clip and its first frame."""
-        raise NotImplementedError
-
     def check(self, model: Any) -> None:
         """Refuse clips that cannot be folded, and depth that is not encoded."""
         clip, q, s = model.clip, self.temporal, self.spatial
@@ -308,10 +300,6 @@ class Conditioner(Settings):
         Returns:
             Input channels, modulation per latent frame, tokens: what the control provides.
         """
-        raise NotImplementedError
-
-    def costs(self, model: Any, share: Any, *, trained: bool) -> Any:
-        """Return its ``nn.costs.Costs`` in one step of training."""
         raise NotImplementedError
 
 
@@ -394,10 +382,6 @@ class Encoder(Settings):
         found = centred @ axes[:3].T
         return np.tanh(found / np.maximum(found.std(0), 1e-6))
 
-    def costs(self, model: Any, share: Any, frames: int) -> Any:
-        """Return the ``nn.costs.Costs`` of encoding this many context frames of a clip."""
-        raise NotImplementedError
-
 
 class Reader(Settings):
     """How the denoiser reads the memory.
@@ -438,10 +422,6 @@ class Reader(Settings):
         Returns:
             The ``models.interface.Readers`` that the backbone calls.
         """
-        raise NotImplementedError
-
-    def costs(self, model: Any, share: Any) -> Any:
-        """Return its ``nn.costs.Costs`` in a stage that trains it."""
         raise NotImplementedError
 
 

@@ -25,7 +25,6 @@ from pewm_jax.config.parts import Conditioner, Rules
 from pewm_jax.controls import camera
 from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.nn.layers import linear
 from pewm_jax.types import Array, Control, Frames, Params
 
@@ -187,24 +186,6 @@ class ModulationConfig(Conditioner):
                 kernels[f"conv_{number}"] = (max(TAPS, step), width, width)
             state = {"state_1": (self.actions, width)}
         return {**kernels, **({**state, "state_2": (width, width)} if self.state else {})}
-
-    def costs(self, model: Any, share: Share, *, trained: bool) -> Costs:
-        """Return the costs: each kernel, times what it is applied to."""
-        del share
-        clip = model.clip
-        actions, latents = clip.frames - 1, model.latent_shape[0] - 1
-        first, _ = strides(model.codec.temporal)
-        times = {"conv_1": actions // first, "conv_2": latents, "state_1": 1, "state_2": 1}
-        whole = latents if self.projection == "sinusoid" else actions
-        work = {False: 0.0, True: 0.0}  # of layers whose input is data, and of the others
-        for name, shape in self.layout(model).items():
-            work[name not in ("linear_1", "state_1")] += math.prod(shape) * times.get(name, whole)
-        return Costs(
-            tuple(
-                Product("control", "linear", macs, (1.0 + inside) * trained)
-                for inside, macs in work.items()
-            )
-        )
 
     def _waves(self, x_A: Array) -> Array:
         """Return (..., A · features) cosines and sines of numbers."""

@@ -10,7 +10,6 @@ import jax
 from pewm_jax.config.parts import Conditioner
 from pewm_jax.geometry.plucker import camera_latents
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Camera, Control, Frames, Params
 
 
@@ -28,11 +27,6 @@ class CameraConfig(Conditioner):
         """Return the cameras' rays as input channels."""
         del params, observed
         return Conditioning(joined_BthwC=rays(model, control.camera))
-
-    def costs(self, model: Any, share: Share, *, trained: bool) -> Costs:
-        """Return the costs, which are negligible."""
-        del model, share, trained
-        return Costs()
 
 
 def rays(model: Any, camera: Camera) -> Array:

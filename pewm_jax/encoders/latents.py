@@ -11,10 +11,8 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from pewm_jax.codecs import rgbd
 from pewm_jax.config.parts import Encoder
 from pewm_jax.errors import require, require_positive
-from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params
 
 
@@ -63,7 +61,3 @@ class LatentsConfig(Encoder):
         video = rgb_THWC[None].astype(jnp.dtype(model.dtype))
         latents = model.codec.encode(params.get("codec", {}), video)
         return latents[0].astype(jnp.float32)
-
-    def costs(self, model: Any, share: Share, frames: int) -> Costs:
-        """Return the costs of encoding the colours of all context frames."""
-        return rgbd.costs_of_images(model, share, frames, "encoder")

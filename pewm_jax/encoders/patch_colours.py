@@ -14,7 +14,6 @@ import numpy as np
 
 from pewm_jax.config.parts import Encoder
 from pewm_jax.errors import require, require_positive
-from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params
 
 
@@ -57,11 +56,6 @@ class PatchColoursConfig(Encoder):
         """Return the middle of each cell's range of colours."""
         values = np.asarray(features_VF, np.float32)
         return (values[..., :3] - values[..., 3:6]) / 2
-
-    def costs(self, model: Any, share: Share, frames: int) -> Costs:
-        """Return the costs, which are negligible."""
-        del model, share, frames
-        return Costs()
 
 
 def patch_colours(rgb_THWC: Array, patch: int) -> Array:

@@ -20,6 +20,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
+from pewm_jax.config import ModelConfig
 from pewm_jax.nn import placement
 from pewm_jax.types import Array
 
@@ -64,6 +65,22 @@ def patchify_images(images_BHWC: Array, patch: int) -> Array:
     batch, height, width, channels = images_BHWC.shape
     grid = images_BHWC.reshape(batch, height // patch, patch, width // patch, patch, channels)
     return grid.transpose(0, 1, 3, 2, 4, 5).reshape(batch, -1, patch * patch * channels)
+
+
+def video_tokens(model: ModelConfig) -> tuple[int, int]:
+    """Return the video tokens of a clip: (tokens in time, tokens at each time).
+
+    If a backbone names no places, its tokens are the latent cells.
+    """
+    (t, h, w), places = model.latent_shape, model.backbone.places
+    if places is None:
+        return t, h * w
+    return -(-t // places.patch_t), (h // places.patch) * (w // places.patch)
+
+
+def text_tokens(model: ModelConfig) -> int:
+    """Return the number of text tokens of a clip."""
+    return model.backbone.text_shape[0] if model.backbone.text_shape else 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,8 +13,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 
-from pewm_jax.plan import hlo_text
-from pewm_jax.plan.hlo_text import Line
+import numpy as np
 
 KINDS = ("all-gather", "reduce-scatter", "all-reduce", "all-to-all", "collective-permute")
 """The kinds of collective communication."""
@@ -25,6 +24,44 @@ _CALLED = re.compile(r"\b(?:calls|to_apply|body)=%?([\w.$-]+)")
 _BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
 _EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
 _TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
+BITS = {"pred": 8, "s4": 4, "u4": 4, "bf16": 16, "c64": 64, "c128": 128}
+"""Bits of the types whose name does not tell."""
+
+_COMPUTATION = re.compile(r"^(?:ENTRY )?%?([\w.$-]+) .*\{$")
+_NAME = re.compile(r"^\s+(?:ROOT )?%?([\w.$-]+) = ")
+_OPCODE = re.compile(r"\s*([\w-]+)\(")
+_ARRAY = re.compile(r"([a-z]+\d*(?:e\dm\d\w*)?)\[([\d,<=]*)\]")
+_LISTED = re.compile(r"replica_groups=\{(\{[\d,{} ]*\})\}")
+_COUNTED = re.compile(r"replica_groups=\[([\d,]+)\]<=\[([\d,]+)\](?:T\(([\d,]+)\))?")
+_MESH = re.compile(
+    r"replica_groups=mesh\[([^\]]*)\](?:, device_ids=\(([^()]*(?:\([\d,]+\))?)\))? ?\{([^}]*)\}"
+)
+_ORDER = re.compile(r"\[([\d,]+)\](?:T\(([\d,]+)\))?")
+_PAIRS = re.compile(r"source_target_pairs=\{\{(\d+),(\d+)\}")
+_LABEL = re.compile(r'op_name="([^"]*)"')
+
+
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """An instruction.
+
+    Attributes:
+        shape: its type, such as ``f32[2,3]{1,0}``.
+        opcode: what it does, such as ``dot``.
+        operands: names of the instructions whose results it takes.
+        rest: its attributes, as text.
+    """
+
+    shape: str
+    opcode: str
+    operands: tuple[str, ...]
+    rest: str
+
+    @property
+    def label(self) -> str:
+        """JAX's name for its place in the program, or nothing."""
+        found = _LABEL.search(self.rest)
+        return found[1] if found else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +125,8 @@ def read(text: str) -> Program:
     Args:
         text: ``compiled.as_text()``.
     """
-    computations, entry = hlo_text.split(text)
-    users = {name: hlo_text.users(lines) for name, lines in computations.items()}
+    computations, entry = split(text)
+    users = {name: _users(lines) for name, lines in computations.items()}
     unknown: list[str] = []
 
     def only_sliced(
@@ -161,10 +198,10 @@ def _flops(line: Line, lines: dict[str, Line]) -> float:
     matmul = line.opcode == "custom-call" and "matmul" in line.rest
     if line.opcode not in ("dot", "convolution") and not matmul:
         return 0.0
-    shapes = [hlo_text.dims(lines[name].shape) for name in line.operands[:2]]
-    out = math.prod(hlo_text.dims(line.shape))
+    shapes = [dims(lines[name].shape) for name in line.operands[:2]]
+    out = math.prod(dims(line.shape))
     if line.opcode == "dot":
-        axes = hlo_text.numbers(line, "lhs_contracting_dims")
+        axes = numbers(line, "lhs_contracting_dims")
         summed = math.prod(shapes[0][axis] for axis in axes)
     elif matmul:
         summed = shapes[0][-1]
@@ -182,11 +219,11 @@ def _collectives(
 
     An all-reduce whose result is only sliced counts as a reduce-scatter.
     """
-    kind, group = line.opcode.removesuffix("-start"), hlo_text.group(line)
+    kind, group = line.opcode.removesuffix("-start"), _first_group(line)
     ring = (len(group) - 1) / max(len(group), 1)
     own = next((name for name, other in lines.items() if other is line), "")
     for index, operand in enumerate(line.operands):
-        taken = hlo_text.size(lines[operand].shape) if operand in lines else 0.0
+        taken = size(lines[operand].shape) if operand in lines else 0.0
         effective = kind
         if kind == "all-reduce" and only_sliced(_element(own, index, lines)):
             effective = "reduce-scatter"
@@ -224,3 +261,120 @@ def _parameters(
     for inner, other in computations.get(called[1], {}).items():
         if other.opcode == "parameter" and other.operands[0] in places:
             yield called[1], inner
+
+
+def split(text: str) -> tuple[dict[str, dict[str, Line]], str]:
+    """Split a program into its computations, each its instructions by their names.
+
+    Returns:
+        The computations by their names, and the name of the one that the program begins with.
+    """
+    computations: dict[str, dict[str, Line]] = {}
+    entry, lines = "", {}
+    for row in text.splitlines():
+        if row.endswith("{") and (found := _COMPUTATION.match(row)):
+            lines = computations.setdefault(found[1], {})
+            entry = found[1] if row.startswith("ENTRY") else entry
+        elif found := _NAME.match(row):
+            lines[found[1]] = _parse(row[found.end() :])
+    return computations, entry
+
+
+def _parse(text: str) -> Line:
+    """Parse an instruction: ``TYPE opcode(operands), attributes``."""
+    end = _close(text, 0) if text.startswith("(") else text.find(" ")
+    shape, text = text[:end], text[end:]
+    found = _OPCODE.match(text)
+    if found is None:
+        return Line(shape, "", (), text)
+    close = _close(text, found.end() - 1)
+    inside = re.sub(r"/\*.*?\*/", "", text[found.end() : close - 1])
+    operands = tuple(part.strip().split(" ")[-1].lstrip("%") for part in inside.split(", "))
+    return Line(shape, found[1], operands, text[close:])
+
+
+def _close(text: str, start: int) -> int:
+    """Return the index after the parenthesis that closes the one at ``start``."""
+    depth = 0
+    for place in range(start, len(text)):
+        depth += (text[place] == "(") - (text[place] == ")")
+        if depth == 0:
+            return place + 1
+    return len(text)
+
+
+def dims(shape: str) -> tuple[int, ...]:
+    """Return the dimensions of an array type; of a tuple type those of its first array."""
+    found = _ARRAY.search(shape)
+    return tuple(int(n) for n in found[2].split(",") if n) if found else ()
+
+
+def size(shape: str) -> float:
+    """Return the bytes of an array or tuple type such as ``(f32[2,3]{1,0}, s32[])``."""
+    total = 0.0
+    for kind, dims in _ARRAY.findall(shape):
+        digits = re.search(r"\d+", kind)
+        bits = BITS.get(kind, int(digits[0]) if digits else 0)
+        total += bits / 8 * math.prod(int(n) for n in dims.split(",") if n)
+    return total
+
+
+def numbers(line: Line, name: str) -> list[int]:
+    """Return the numbers of an attribute such as ``dimensions={0,2}``, or none."""
+    found = re.search(name + r"=\{([\d,]*)\}", line.rest)
+    return [int(n) for n in found[1].split(",") if n] if found else []
+
+
+def _users(lines: dict[str, Line]) -> dict[str, list[tuple[str, Line]]]:
+    """Return, for each name, the instructions that use it as an operand."""
+    found: dict[str, list[tuple[str, Line]]] = {}
+    for name, line in lines.items():
+        for operand in set(line.operands):
+            found.setdefault(operand, []).append((name, line))
+    return found
+
+
+def _first_group(line: Line) -> tuple[int, ...]:
+    """Return the first group of devices that communicate."""
+    if counted := _COUNTED.search(line.rest):
+        shape, dims = ([int(n) for n in counted[k].split(",")] for k in (1, 2))
+        devices = np.arange(math.prod(dims)).reshape(dims)
+        if counted[3]:
+            devices = devices.transpose([int(n) for n in counted[3].split(",")])
+        return tuple(int(n) for n in devices.reshape(shape)[0])
+    if mesh := _MESH.search(line.rest):
+        return _along(mesh[1], mesh[3], mesh[2] or "")
+    if listed := _LISTED.search(line.rest):
+        first = listed[1].split("}")[0].strip("{ ")
+        return tuple(int(n) for n in first.split(",") if n.strip())
+    if pairs := _PAIRS.search(line.rest):
+        return int(pairs[1]), int(pairs[2])
+    return ()
+
+
+def _along(mesh: str, axes: str, order: str) -> tuple[int, ...]:
+    """Return the first group along mesh axes, or along parts of them.
+
+    Args:
+        mesh: sizes, such as ``'a'=4,'b'=2``.
+        axes: such as ``'a'``, or ``'a':(2)2`` for a sub-axis of size 2 after one of size 2.
+        order: device order if it is not 0, 1, 2 …: ``[4,2]T(1,0)`` or ``0,2,4,6``.
+    """
+    sizes = {name: int(count) for name, count in re.findall(r"'([^']*)'=(\d+)", mesh)}
+    strides, stride = {}, 1
+    for name in reversed(sizes):
+        strides[name], stride = stride, stride * sizes[name]
+    group = np.zeros(1, int)
+    for name, before, count in re.findall(r"'([^']*)'(?::\((\d+)\)(\d+))?", axes):
+        steps = int(count) if count else sizes[name]
+        inner = sizes[name] // (int(before) * steps) if count else 1
+        places = np.arange(steps) * inner * strides[name]
+        group = (group[:, None] + places).ravel()
+    devices = np.arange(stride)
+    if turned := _ORDER.fullmatch(order):
+        devices = devices.reshape([int(n) for n in turned[1].split(",")])
+        if turned[2]:
+            devices = devices.transpose([int(n) for n in turned[2].split(",")])
+    elif order:
+        devices = np.array([int(n) for n in order.split(",")])
+    return tuple(int(n) for n in devices.ravel()[group])

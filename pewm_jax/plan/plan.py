@@ -1,50 +1,73 @@
 """Plan a training for hardware that is not present: ``python train.py PRESET --plan``.
 
-The real step is compiled ahead of time for the requested number of virtual CPU devices, from shapes
-alone: no data is read, no weights are created, no folder is written. The compiled program tells how
-much is computed and communicated. The formulas (``costs``, ``footprint``, ``predict``), which it
-confirms, tell what this means on the chip. A network without scanned blocks makes so long a program
-that compiling it takes far longer than a plan is worth; then the formulas stand alone.
+The real step is traced and compiled for the requested number of virtual CPU devices, from shapes
+alone: no data is read, no weights are created, no folder is written. ``measure`` says what the step
+computes, needs and sends, ``suggest`` what that means on the chip. A network without scanned blocks
+makes so long a program that compiling it takes far longer than a plan is worth; then temporary
+memory is left out.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import jax
 
-from pewm_jax.config import Config, Launch, UserError
-from pewm_jax.data import abstract
+from pewm_jax.config import Config, Launch
 from pewm_jax.io import tree
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
-from pewm_jax.models.wan.codec import WanVAECodec
-from pewm_jax.plan import hlo, suggest
-from pewm_jax.plan import text as plan_text
-from pewm_jax.plan.footprint import MeshSizes, footprint
-from pewm_jax.plan.stage import Compiled, Plan
-from pewm_jax.train import chips, sharding, stages, step
+from pewm_jax.plan import hlo, measure, suggest
+from pewm_jax.plan.measure import Compiled, MeshSizes, virtual
+from pewm_jax.plan.suggest import Arrangement
+from pewm_jax.train import chips, sharding, stages
+from pewm_jax.train.chips import Chip
+from pewm_jax.train.log import duration
 from pewm_jax.train.stages import Stage
-
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-"""Compiler options that save time. They affect only machine code, which is never run."""
 
 MOST_ARRAYS = 1000
 """Trained arrays of parameters above which `--compiled auto` does not compile. Each has operations
 of its own, forward, backward and in the optimizer: with Stable Video Diffusion's 1,432, XLA holds
 216,000 of them, and many of its passes take seconds each."""
+MEMORY = (
+    ("trained weights, float32", "trained"),
+    ("frozen weights", "frozen"),
+    ("moving average", "average"),
+    ("optimizer state", "moments"),
+    ("batch", "batch"),
+    ("gradients", "gradients"),
+    ("activations and other temporary memory", "temporary"),
+)
+"""Label and ``Memory`` field of each line in the table of memory."""
 
 
-def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> list[Plan]:
+@dataclasses.dataclass(frozen=True)
+class StagePlan:
+    """One stage on one kind of device.
+
+    Attributes:
+        config: the experiment.
+        stage: the stage.
+        chip: the kind of device.
+        choice: the requested arrangement, with its memory and time.
+        compiled: the compiler's report; None where the step was not compiled.
+        best: the best arrangements.
+    """
+
+    config: Config
+    stage: Stage
+    chip: Chip
+    choice: Arrangement
+    compiled: Compiled | None
+    best: tuple[Arrangement, ...]
+
+
+def show(config: Config, launch: Launch, log: Callable[[str], None] = print) -> list[StagePlan]:
     """Plan all stages that have steps, and print the plans.
 
     Args:
         config: the experiment.
         launch: number and kind of devices.
-        say: prints a line.
+        log: prints a line.
 
     Raises:
         ConfigError: the chip is not known, or the devices cannot form the mesh or share the batch.
@@ -54,30 +77,49 @@ def show(config: Config, launch: Launch, say: Callable[[str], None] = print) -> 
     sizes = MeshSizes(*config.train.mesh.shape(launch.devices))
     planned = stages.planned(config)
     for stage in planned:
-        sharding.require_divisible(config, stage, _abstract_mesh(sizes))
-    devices = virtual(launch.devices)
+        sharding.require_divisible(config, stage, sizes.abstract)
+    virtual(launch.devices)
     plans = []
     for stage in planned:
-        compiled = None
-        if _wanted(config, stage, launch):
-            say(f"{stage.title}: compiling the real step for {launch.devices} devices …")
-            compiled = compile_stage(config, stage, devices)
-            say(f"{stage.title}: compiled in {compiled.seconds:.0f} s")
+        wanted = _wanted(config, stage, launch)
+        if wanted:
+            log(f"{stage.title}: compiling the real step for {launch.devices} devices …")
+        plan = plan_stage(config, stage, sizes, chip, compiles=wanted)
+        if plan.compiled is not None:
+            log(f"{stage.title}: compiled in {plan.compiled.seconds:.0f} s")
         else:
-            say(f"{stage.title}: not compiled, all numbers are the formulas' ({_why(launch)})")
-        best = suggest.rank(config, stage, launch.devices, chip)[:3]
-        choice = suggest.assess(config, stage, sizes, chip)
-        plans.append(Plan(config, stage, chip, choice, compiled, tuple(best)))
-        for line in plan_text.lines(plans[-1]):
-            say(line)
+            log(f"{stage.title}: not compiled, so temporary memory is unknown ({_why(launch)})")
+        plans.append(plan)
+        for line in lines(plan):
+            log(line)
     return plans
+
+
+def plan_stage(
+    config: Config, stage: Stage, sizes: MeshSizes, chip: Chip, *, compiles: bool = True
+) -> StagePlan:
+    """Plan one stage.
+
+    Args:
+        config: the experiment.
+        stage: the stage.
+        sizes: the requested mesh.
+        chip: the kind of device.
+        compiles: whether the step is compiled, which tells temporary memory and communication.
+    """
+    traced = measure.trace(config, stage, virtual(sizes.devices))
+    compiled = measure.compile_traced(traced, sizes) if compiles else None
+    work = measure.work_of(config, stage, traced, chip)
+    choice = suggest.assess(config, stage, sizes, chip, work, compiled)
+    best = suggest.rank(config, stage, sizes, chip, work, compiled)[:3]
+    return StagePlan(config, stage, chip, choice, compiled, tuple(best))
 
 
 def _wanted(config: Config, stage: Stage, launch: Launch) -> bool:
     """Tell whether a stage's step is to be compiled."""
     if launch.compiled != "auto":
         return launch.compiled == "on"
-    params = jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
+    params = suggest.abstract_state(config, stage).params
     return len(jax.tree.leaves(tree.select(params, stage.trained))) <= MOST_ARRAYS
 
 
@@ -90,59 +132,85 @@ def _why(launch: Launch) -> str:
     )
 
 
-def virtual(count: int) -> Sequence[Any]:
-    """Return virtual CPU devices; call it before JAX uses any device.
-
-    Raises:
-        UserError: JAX already uses devices, and too few.
-    """
-    try:
-        jax.config.update("jax_platforms", "cpu")
-        jax.config.update("jax_num_cpu_devices", count)
-    except RuntimeError:
-        pass  # JAX already uses devices; they may suffice
-    devices = jax.devices("cpu")
-    if len(devices) < count:
-        raise UserError(
-            f"A plan for {count} devices needs a process of its own, in which JAX has not used its "
-            f"{len(devices)} yet: run `python train.py … --plan`."
+def lines(plan: StagePlan) -> Iterator[str]:
+    """Yield the lines of a stage's plan, for the terminal."""
+    choice, compiled, time = plan.choice, plan.compiled, plan.choice.time
+    clips = plan.stage.settings(plan.config).batch
+    yield ""
+    yield (
+        f"{plan.stage.title.capitalize()} on {choice.mesh.devices} × {plan.chip.name}: "
+        f"{arranged(choice)}; {clips} clips a step, {clips / choice.mesh.batch:g} a device"
+    )
+    yield "  memory of a device"
+    for label, name in MEMORY:
+        value = getattr(choice.memory, name)
+        yield f"    {label:<42}{'unknown' if value is None else size(value):>10}"
+    peak = "peak" if compiled else "peak, without temporary memory"
+    yield f"    {peak:<42}{size(choice.memory.peak):>10}"
+    if compiled is not None:
+        yield (
+            f"    the program compiled for a CPU, which widens bfloat16 to float32: "
+            f"{size(compiled.arguments)} of state and batch + {size(compiled.temporary)} = "
+            f"{size(compiled.peak)}"
         )
-    return devices[:count]
-
-
-def compile_stage(config: Config, stage: Stage, devices: Sequence[Any]) -> Compiled:
-    """Compile a stage's real step from shapes alone, and count what it does."""
-    began = time.monotonic()
-    mesh = sharding.make_mesh(devices, config.train.mesh)
-    on_chip = _as_on_chips(config)
-    lowered = step.lower_step(
-        on_chip,
-        stage,
-        mesh,
-        abstract.clip(config, stage.settings(config).batch, features=stage.memory),
+    verdict = "fits" if choice.fits else "does not fit"
+    yield (
+        f"    {verdict}: {size(choice.memory.peak)} of {size(plan.chip.memory)}, of which "
+        f"{suggest.MARGIN:.0%} may be filled ({size(suggest.MARGIN * plan.chip.memory)})"
     )
-    compiled = lowered.compile(compiler_options=QUICK)
-    memory, text = compiled.memory_analysis(), compiled.as_text()
-    if memory is None or text is None:
-        raise UserError("This JAX does not say what a compiled program needs; use 0.10 or newer.")
-    outputs = memory.output_size_in_bytes - memory.alias_size_in_bytes
-    return Compiled(
-        program=hlo.read(text),
-        arguments=float(memory.argument_size_in_bytes),
-        temporary=float(memory.temp_size_in_bytes + outputs),
-        expected=footprint(config, stage, MeshSizes.of(mesh), activation_bytes=4, flash=False),
-        seconds=time.monotonic() - began,
+    yield "  work of a step"
+    yield f"    {'needed, all devices':<42}{flop(time.needed_flops):>12}"
+    done = f"    {'executed by a device, with recomputation':<42}{flop(time.executed_flops):>12}"
+    yield done if compiled is None else f"{done} (compiled program: {flop(compiled.program.flops)})"
+    sent = "  sent by a device in a step"
+    yield sent if compiled is None else f"{sent} (compiled program, in 32 bits)"
+    for kind in hlo.KINDS:
+        expected = time.sent_of(kind)
+        counted = 0.0 if compiled is None else compiled.program.sent(kind)
+        if expected or counted:
+            beside = "" if compiled is None else f" ({size(counted)})"
+            yield f"    {kind:<42}{size(expected):>10}{beside}"
+    yield "  predicted"
+    yield (
+        f"    a step {duration(time.step_s)}: products {duration(time.products_s)}, reading and "
+        f"writing {duration(time.streaming_s)}, waiting for other devices "
+        f"{duration(time.waiting_s)}"
     )
+    yield f"    MFU {time.mfu:.1%}, {rate(time.clips_per_s)} clips/s"
+    yield "  best arrangements"
+    for best in plan.best:
+        fits = "fits" if best.fits else "does not fit"
+        yield (
+            f"    {duration(best.time.step_s)}/step, {size(best.memory.peak)}, {fits}: {best.flags}"
+        )
 
 
-def _as_on_chips(config: Config) -> Config:
-    """Choose the form of the VAE's convolutions that accelerators use."""
-    codec = getattr(config.model, "codec", None)  # a policy has none
-    if not isinstance(codec, VAECodec | WanVAECodec) or codec.convolution != "auto":
-        return config
-    return config.with_model(codec=dataclasses.replace(codec, convolution="volume"))
+def arranged(choice: Arrangement) -> str:
+    """Format an arrangement: ``data 8 × fsdp 8 × tensor 1 × context 1``."""
+    return " × ".join(f"{name} {count}" for name, count in choice.mesh.sizes.items())
 
 
-def _abstract_mesh(mesh: MeshSizes) -> Any:
-    """Return a mesh without devices."""
-    return jax.sharding.AbstractMesh(tuple(mesh.sizes.values()), tuple(mesh.sizes))
+def size(count: float) -> str:
+    """Format a number of bytes."""
+    for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= factor:
+            return f"{_short(count / factor)} {unit}"
+    return f"{count:.0f} B"
+
+
+def flop(count: float) -> str:
+    """Format a number of FLOPs."""
+    for unit, factor in (("EFLOP", 1e18), ("PFLOP", 1e15), ("TFLOP", 1e12), ("GFLOP", 1e9)):
+        if count >= factor:
+            return f"{_short(count / factor)} {unit}"
+    return f"{_short(count / 1e6)} MFLOP"
+
+
+def rate(count: float) -> str:
+    """Format a rate with three digits and no exponent."""
+    return f"{count:,.0f}" if count >= 1000 else f"{count:.3g}"
+
+
+def _short(value: float) -> str:
+    """Format a number with three digits, or with all digits before the point."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

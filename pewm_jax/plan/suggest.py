@@ -1,19 +1,108 @@
-"""Rank all device meshes for a stage by the formulas for memory and time."""
+"""Memory and time of a stage on a mesh of one kind of device, and the meshes that suit best.
+
+State and communication of the weights follow from the shapes and the sharding rules. Temporary
+memory is that of the program compiled for the requested mesh, scaled to others. Time is a
+prediction from the chip's data sheet, not a measurement: the share of the peak that each kind of
+work reaches is assumed (``REACHED``), and communication that no computation waits for is assumed to
+overlap with computation.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import functools
+import math
+from collections.abc import Iterator, Mapping
+
+import jax
+import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config
-from pewm_jax.plan.footprint import Footprint, MeshSizes, footprint
-from pewm_jax.plan.predict import Prediction, predict
+from pewm_jax.config import AXES, Config
+from pewm_jax.data import abstract
+from pewm_jax.io import tree
+from pewm_jax.plan.measure import Compiled, MeshSizes, StepWork, in_bfloat16
+from pewm_jax.train import sharding
 from pewm_jax.train.chips import Chip
 from pewm_jax.train.stages import Stage
+from pewm_jax.train.state import TrainState, create
 
 MARGIN = 0.9
 """Share of the memory that a plan may fill; the runtime and fragmentation need the rest."""
+REACHED = {"linear": 0.65, "attention": 0.4, "convolution": 0.4}
+"""Assumed shares of the peak FLOPs that large products reach, from published kernel benchmarks."""
+STREAMED = 0.8
+"""Assumed share of the memory bandwidth that reading and writing arrays reaches."""
+OPTIMIZER = 10
+"""How often clipping, Adam and the average read or write each trained parameter (4 bytes)."""
+FLOAT = 4
+"""Bytes of a float32."""
+SPLIT = ("tensor", "context")
+"""The mesh axes that split the work of a layer: its communication cannot overlap with its work."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Memory:
+    """Memory of one device in bytes.
+
+    Attributes:
+        trained: trained weights.
+        frozen: frozen weights.
+        average: moving average of the trained weights.
+        moments: the optimizer's state.
+        batch: the device's clips.
+        gradients: gradients of the trained weights in float32.
+        temporary: the other temporary memory of a step; None if it was not measured.
+    """
+
+    trained: float
+    frozen: float
+    average: float
+    moments: float
+    batch: float
+    gradients: float
+    temporary: float | None = None
+
+    @property
+    def state(self) -> float:
+        """Memory of the training state and the batch."""
+        return self.trained + self.frozen + self.average + self.moments + self.batch
+
+    @property
+    def peak(self) -> float:
+        """Peak memory; without what was not measured."""
+        return self.state + self.gradients + (self.temporary or 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Prediction:
+    """The predicted time, traffic and throughput of a step.
+
+    Attributes:
+        products_s: seconds of matrix products and convolutions.
+        streaming_s: seconds of reading and writing arrays.
+        sent: bytes that a device sends, by (kind, axis of the mesh).
+        waiting_s: seconds of communication that does not overlap with computation.
+        step_s: seconds of a step.
+        needed_flops: FLOPs that a step needs, all devices together.
+        executed_flops: FLOPs that one device executes, with what is recomputed.
+        mfu: model FLOPs utilization: needed FLOPs over the peak FLOPs of all devices in that time.
+        clips_per_s: clips per second.
+    """
+
+    products_s: float
+    streaming_s: float
+    sent: dict[tuple[str, str], float]
+    waiting_s: float
+    step_s: float
+    needed_flops: float
+    executed_flops: float
+    mfu: float
+    clips_per_s: float
+
+    def sent_of(self, kind: str) -> float:
+        """Return the bytes of one kind of communication."""
+        return sum(size for (sent_kind, _), size in self.sent.items() if sent_kind == kind)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,13 +111,13 @@ class Arrangement:
 
     Attributes:
         mesh: the number of devices along each axis.
-        footprint: memory of one device.
+        memory: memory of one device.
         time: predicted time of a step.
-        fits: whether the memory suffices.
+        fits: whether the memory suffices, as far as it is known.
     """
 
     mesh: MeshSizes
-    footprint: Footprint
+    memory: Memory
     time: Prediction
     fits: bool
 
@@ -38,58 +127,262 @@ class Arrangement:
         return " ".join(f"--train.mesh.{name} {n}" for name, n in self.mesh.sizes.items())
 
 
-def has_flash(config: Config, chip: Chip) -> bool:
-    """Tell whether attention can use cuDNN's fused kernel, which stores no logits."""
-    gpu = "NVIDIA" in chip.device_kind
-    return (
-        gpu
-        and config.model.dtype == "bfloat16"
-        and getattr(getattr(config.model, "backbone", None), "attention", "xla") != "xla"
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """Counts of parameters, grouped by the mesh axes that split them."""
+
+    split: tuple[tuple[tuple[str, ...], int], ...]
+
+    @property
+    def count(self) -> int:
+        """The number of all parameters."""
+        return sum(count for _, count in self.split)
+
+    def on(self, mesh: MeshSizes) -> float:
+        """Return the number of parameters on one device."""
+        sizes = mesh.sizes
+        return sum(count / math.prod(sizes[axis] for axis in axes) for axes, count in self.split)
+
+
+@functools.cache
+def abstract_state(config: Config, stage: Stage) -> TrainState:
+    """Return the shapes of a stage's state."""
+    return jax.eval_shape(functools.partial(create, config, stage), jax.random.key(0))
+
+
+@functools.cache
+def counts(config: Config, stage: Stage) -> dict[str, Weights]:
+    """Count the parameters of a stage: trained ones, frozen ones, and frozen encoders.
+
+    The encoders are what prepares clips (``Stage.prepares_by``): no gradient passes through them.
+    """
+    params = abstract_state(config, stage).params
+    specs = tree.flatten(tree.assign(worlds.sharding(config.model), params, "sharding rules"))
+    trained = tree.flatten(tree.split(params, stage.trained)[0])
+    found: dict[str, dict[tuple[str, ...], int]] = {"trained": {}, "frozen": {}, "encoders": {}}
+    for path, leaf in tree.flatten(params).items():
+        part = "encoders" if path.split("/")[0] in stage.prepares_by else "frozen"
+        group = found["trained" if path in trained else part]
+        axes = tuple(axis for axis in specs[path] if axis)
+        group[axes] = group.get(axes, 0) + leaf.size
+    return {name: Weights(tuple(split.items())) for name, split in found.items()}
+
+
+def memory_of(
+    config: Config, stage: Stage, mesh: MeshSizes, compiled: Compiled | None = None
+) -> Memory:
+    """Return the memory of one device.
+
+    Temporary memory beyond the gradients is that of the compiled program, in proportion to the
+    share of the batch, heads and tokens that a device has. In bfloat16 it is half of what the CPU,
+    which computes in float32, needs.
+
+    Args:
+        config: the experiment.
+        stage: the stage.
+        mesh: the device mesh.
+        compiled: the program compiled for a mesh, which may be another one.
+    """
+    shapes = abstract_state(config, stage)
+    placed = sharding.of_state(config.model, mesh.abstract, shapes)
+
+    def size(part: object, where: object) -> float:
+        leaves = zip(jax.tree.leaves(part), jax.tree.leaves(where), strict=True)
+        return math.fsum(_on_device(leaf, sharded, mesh) for leaf, sharded in leaves)
+
+    trained, frozen = (
+        size(one, where)
+        for one, where in zip(
+            tree.split(shapes.params, stage.trained),
+            tree.split(placed.params, stage.trained),
+            strict=True,
+        )
+    )
+    clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
+    batch = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(clip))
+    gradients = FLOAT * counts(config, stage)["trained"].on(mesh)
+    rest = None
+    if compiled is not None:
+        measured = compiled.temporary - FLOAT * counts(config, stage)["trained"].on(compiled.mesh)
+        share = compiled.mesh.batch * compiled.mesh.tensor * compiled.mesh.context
+        share /= mesh.batch * mesh.tensor * mesh.context
+        rest = in_bfloat16(config, {"": max(measured, 0.0) * share})[""]
+    return Memory(
+        trained=trained,
+        frozen=frozen,
+        average=size(shapes.ema, placed.ema),
+        moments=size(shapes.opt_state, placed.opt_state),
+        batch=batch / mesh.batch,
+        gradients=gradients,
+        temporary=rest,
     )
 
 
-def assess(config: Config, stage: Stage, mesh: MeshSizes, chip: Chip) -> Arrangement:
-    """Compute a stage's memory and time on a mesh of one kind of device."""
-    activation_bytes = 2 if config.model.dtype == "bfloat16" else 4
-    needed = footprint(
-        config, stage, mesh, activation_bytes=activation_bytes, flash=has_flash(config, chip)
+def _on_device(leaf: jax.ShapeDtypeStruct, where: jax.sharding.NamedSharding, mesh: MeshSizes):
+    ways = math.prod(mesh.sizes[axis] for axis in where.spec if axis)
+    return leaf.size * leaf.dtype.itemsize / ways
+
+
+def predict(
+    config: Config,
+    stage: Stage,
+    mesh: MeshSizes,
+    chip: Chip,
+    work: StepWork,
+    compiled: Compiled | None = None,
+) -> Prediction:
+    """Predict the time of a stage's step on a chip; arguments as for ``assess``."""
+    clips, done = stage.settings(config).batch, work.on_device(mesh)
+    peak = chip.flops if config.model.dtype == "bfloat16" else chip.flops / 2
+    products_s = sum(flops / (peak * REACHED[kind]) for kind, flops in done.items())
+    streamed = work.traffic_on_device(mesh)
+    streamed += OPTIMIZER * FLOAT * counts(config, stage)["trained"].on(mesh)
+    streaming_s = streamed / (chip.bandwidth * STREAMED)
+    sent = traffic(config, stage, mesh, work, compiled)
+    seconds = {key: size / _rate(mesh, key[1], chip) for key, size in sent.items()}
+    blocking = sum(s for (_, axis), s in seconds.items() if axis in SPLIT)
+    overlapping = sum(s for (_, axis), s in seconds.items() if axis not in SPLIT)
+    busy = products_s + streaming_s
+    waiting_s = blocking + max(0.0, overlapping - busy)
+    step_s = busy + waiting_s
+    return Prediction(
+        products_s=products_s,
+        streaming_s=streaming_s,
+        sent=sent,
+        waiting_s=waiting_s,
+        step_s=step_s,
+        needed_flops=work.needed.total,
+        executed_flops=sum(done.values()),
+        mfu=work.needed.total / (step_s * chip.flops * mesh.devices),
+        clips_per_s=clips / step_s,
     )
-    time = predict(config, stage, mesh, chip)
-    return Arrangement(mesh, needed, time, needed.peak <= MARGIN * chip.memory)
 
 
-def arrangements(config: Config, stage: Stage, devices: int) -> Iterator[MeshSizes]:
+def traffic(
+    config: Config,
+    stage: Stage,
+    mesh: MeshSizes,
+    work: StepWork,
+    compiled: Compiled | None = None,
+) -> dict[tuple[str, str], float]:
+    """Return the bytes that a device sends in a step, by kind and axis of the mesh.
+
+    Once per step weights are gathered for the forward pass and for the backward pass (``fsdp``),
+    and once more if the backward pass recomputes the forward pass in 16 bits, because XLA then does
+    not merge the two gathers. Gradients are reduce-scattered (``fsdp``) and summed over copies of
+    the weights (``data``, ``context``). In every pass the results of products whose contracted
+    dimension is sharded are summed over ``tensor``. What layers send along ``context`` is what the
+    compiled program sends, in proportion to a device's clips; 0 without such a program.
+    """
+    c = counts(config, stage)
+    wide = 2 if config.model.dtype == "bfloat16" else FLOAT
+    parameters = (c["trained"].on(mesh) + c["frozen"].on(mesh)) * mesh.fsdp * wide
+    gradients = c["trained"].on(mesh) * mesh.fsdp * wide
+    gathered = 2 + (work.recomputes and wide < FLOAT)
+    summed = (2 + work.recomputes) * work.needed.summed / (mesh.batch * mesh.context)
+    sent = {
+        ("all-gather", "fsdp"): (gathered * parameters + c["encoders"].count * wide)
+        * _ring(mesh.fsdp),
+        ("reduce-scatter", "fsdp"): gradients * _ring(mesh.fsdp),
+        ("all-reduce", "data"): 2 * gradients / mesh.fsdp * _ring(mesh.data),
+        ("all-reduce", "tensor"): 2 * summed * _ring(mesh.tensor),
+        ("all-reduce", "context"): 2 * gradients / mesh.fsdp * _ring(mesh.context),
+    }
+    if compiled is not None and mesh.context > 1:
+        share = compiled.mesh.batch * compiled.mesh.tensor / (mesh.batch * mesh.tensor)
+        along = in_bfloat16(config, compiled.sent_along("context"))
+        for kind, size in along.items():
+            sent[kind, "context"] = max(sent.get((kind, "context"), 0.0), share * size)
+    return {key: size for key, size in sent.items() if size > 0}
+
+
+def _ring(devices: int) -> float:
+    return (devices - 1) / devices
+
+
+def _rate(mesh: MeshSizes, axis: str, chip: Chip) -> float:
+    """Return the bytes/s at which a device sends along an axis of the mesh."""
+    places = np.arange(mesh.devices).reshape(tuple(mesh.sizes.values()))
+    group = np.moveaxis(places, AXES.index(axis), -1).reshape(-1, mesh.sizes[axis])[0]
+    return rate(tuple(group.tolist()), chip)
+
+
+def rate(group: tuple[int, ...], chip: Chip) -> float:
+    """Return the bytes/s at which each of a group of devices sends.
+
+    Within an island (devices joined by the fast link) it is the link's bandwidth. Between islands,
+    the group's devices in each island share their network connections.
+    """
+    islands = {device // chip.island for device in group}
+    if len(islands) <= 1:
+        return chip.link
+    return min(chip.link, chip.network * math.ceil(len(group) / len(islands)))
+
+
+def assess(
+    config: Config,
+    stage: Stage,
+    mesh: MeshSizes,
+    chip: Chip,
+    work: StepWork,
+    compiled: Compiled | None = None,
+) -> Arrangement:
+    """Compute a stage's memory and time on a mesh of one kind of device.
+
+    Args:
+        config: the experiment.
+        stage: the stage.
+        mesh: the device mesh.
+        chip: the kind of device.
+        work: the work of a step.
+        compiled: the program compiled for the requested mesh; without it, temporary memory is
+            unknown.
+    """
+    memory = memory_of(config, stage, mesh, compiled)
+    time = predict(config, stage, mesh, chip, work, compiled)
+    return Arrangement(mesh, memory, time, memory.peak <= MARGIN * chip.memory)
+
+
+def arrangements(
+    config: Config, stage: Stage, devices: int, context: int = 1
+) -> Iterator[MeshSizes]:
     """Yield all meshes of this many devices that can share the stage's batch and heads.
 
-    ``tensor`` divides the numbers of heads, and ``context`` is at most 16.
+    ``tensor`` divides the numbers of heads; ``context`` is given.
     """
     batch = stage.settings(config).batch
-    heads = worlds.split_heads(config.model, stage).values()
-    for tensor in _divisors(devices):
-        if any(count % tensor for count in heads):
+    heads: Mapping[str, int] = worlds.split_heads(config.model, stage)
+    for tensor in _divisors(devices // context):
+        rest = devices // tensor // context
+        if any(count % tensor for count in heads.values()) or batch % rest:
             continue
-        for context in _divisors(devices // tensor):
-            if context > 16:
-                continue
-            rest = devices // tensor // context
-            if batch % rest:
-                continue
-            for fsdp in _divisors(rest):
-                yield MeshSizes(rest // fsdp, fsdp, tensor, context)
+        for fsdp in _divisors(rest):
+            yield MeshSizes(rest // fsdp, fsdp, tensor, context)
 
 
-def rank(config: Config, stage: Stage, devices: int, chip: Chip) -> list[Arrangement]:
-    """Return all arrangements: those that fit, fastest first; then the others, smallest first.
+def rank(
+    config: Config,
+    stage: Stage,
+    mesh: MeshSizes,
+    chip: Chip,
+    work: StepWork,
+    compiled: Compiled | None = None,
+) -> list[Arrangement]:
+    """Return all arrangements of as many devices: those that fit, fastest first, then the others.
 
-    If the times of two agree to two digits, the one that needs less memory comes first.
+    If the times of two agree to two digits, the one that needs less memory comes first. Of those
+    that do not fit, the smallest comes first. ``context`` stays as requested.
     """
-    choices = [assess(config, stage, mesh, chip) for mesh in arrangements(config, stage, devices)]
+    choices = [
+        assess(config, stage, other, chip, work, compiled)
+        for other in arrangements(config, stage, mesh.devices, mesh.context)
+    ]
     return sorted(choices, key=_order)
 
 
 def _order(choice: Arrangement) -> tuple[bool, float, float]:
-    seconds = float(f"{choice.time.step_s:.2g}") if choice.fits else choice.footprint.peak
-    return not choice.fits, seconds, choice.footprint.peak
+    seconds = float(f"{choice.time.step_s:.2g}") if choice.fits else choice.memory.peak
+    return not choice.fits, seconds, choice.memory.peak
 
 
 def _divisors(number: int) -> list[int]:

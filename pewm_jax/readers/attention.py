@@ -14,17 +14,7 @@ from pewm_jax.config import AttentionConfig, ModelConfig
 from pewm_jax.controls.camera import CameraConfig
 from pewm_jax.models.interface import Readers
 from pewm_jax.nn import modules
-from pewm_jax.nn.costs import (
-    FLOAT,
-    SPLIT,
-    Costs,
-    Product,
-    Share,
-    text_tokens,
-    video_times,
-    video_tokens,
-)
-from pewm_jax.nn.tokens import TokenLayout, patchify
+from pewm_jax.nn.tokens import TokenLayout, patchify, text_tokens, video_tokens
 from pewm_jax.readers.geometry import Sightings, patch_pixels, sightings, sinusoid_3d
 from pewm_jax.readers.memory_block import MemoryBlock
 from pewm_jax.types import Array, Camera, MemoryReadout, Params
@@ -151,55 +141,3 @@ def prepare(
         return block.apply({"params": layer}, video, time, looks_from, embedded, valid, sights)
 
     return Readers(read, params["blocks"])
-
-
-def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return the costs of the memory blocks, all of which are trained."""
-    config, places = _settings(model), model.backbone.places
-    frames, patches = video_tokens(model)
-    video, joint = frames * patches, frames * patches + text_tokens(model)
-    remat = bool(model.backbone.remat)
-    whole = share.clips * joint * places.width * share.activation_bytes / share.context
-    each = share.clips * video / share.context / share.tensor
-    per_channel = each * share.activation_bytes
-    tokens, inner = per_channel * places.width, per_channel * config.width
-    hidden, logits = tokens * config.mlp_ratio, each * _attended(model) * config.heads * FLOAT
-    if remat:
-        kept, block = 0.0, 5 * hidden + 4 * inner + 3.3 * logits
-    else:
-        kept = places.count * (10 * tokens + 6 * hidden + 4.5 * inner + 3.3 * logits)
-        block = 0.0
-    forward, backward = STREAMS
-    return Costs(
-        products=_products(model, video, again=float(remat)),
-        kept=kept,
-        block=block,
-        streamed=places.count * whole * (forward * (1 + remat) + backward),
-        summed=2 * places.count * (2 + remat) * whole,
-    )
-
-
-def _attended(model: ModelConfig) -> int:
-    """Return the number of map tokens that one query attends to."""
-    config, tokens = _settings(model), model.memory.tokens
-    return min(config.looks, tokens) if config.positions == "projective" else tokens
-
-
-def _products(model: ModelConfig, video: int, again: float) -> tuple[Product, ...]:
-    config, places, tokens = _settings(model), model.backbone.places, model.memory.tokens
-    depth, width, inner = places.count, places.width, config.width
-    place = 3 * config.heads if config.positions == "projective" else 0
-    camera = depth * video * width * (width + width // 2)
-    mixed = depth * video * width * (2 * inner + place + 2 * config.mlp_ratio * width)
-    keys = depth * 2 * tokens * inner * inner
-    modulation = video_times(model) * depth * places.time * (4 * width + 2 * inner)
-    attention = depth * video * _attended(model) * (2 * inner + place)
-    ends = video * _ray_channels(model) * (width // 2) + tokens * token_channels(model) * inner
-    return (
-        Product("memory", "linear", camera, 2.0, again, ("context",)),
-        Product("memory", "linear", mixed, 2.0, again, SPLIT),
-        Product("memory", "linear", keys, 2.0, again, ("tensor",)),
-        Product("memory", "linear", modulation, 1.0, again, ("tensor",)),
-        Product("memory", "attention", attention, 2.0, again, SPLIT),
-        Product("memory", "linear", ends, 1.0),
-    )

@@ -12,7 +12,6 @@ import jax
 
 from pewm_jax.config import ModelConfig
 from pewm_jax.models.interface import Readers
-from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.readers import attention as attention_reader
 from pewm_jax.readers import render as render_reader
 from pewm_jax.types import Array, Camera, MemoryReadout, Params
@@ -43,10 +42,3 @@ def prepare(
 
     stacked = {"attend": attend.params, "render": render.params}
     return Readers(read, stacked, render.added_BND)
-
-
-def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return the costs of both."""
-    one, other = attention_reader.costs(model, share), render_reader.costs(model, share)
-    names = [field.name for field in dataclasses.fields(Costs)]
-    return Costs(**{name: getattr(one, name) + getattr(other, name) for name in names})

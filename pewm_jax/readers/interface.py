@@ -5,7 +5,6 @@ A reader is a ``Reader`` and a module (or object) with
     init(model, key) -> params                          under ``memory/``; has no effect at first
     prepare(model, params, sight, camera, rays_BthwC) -> Readers
     SHARDING                                            rules over ``memory/…`` paths
-    costs(model, share) -> Costs                        in a stage that trains it
 
 ``models.attention_reader`` is an example.
 """

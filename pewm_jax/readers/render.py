@@ -20,14 +20,12 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.pixel import fold
 from pewm_jax.codecs.signals import signal_from_depth
 from pewm_jax.config import ModelConfig, RenderConfig
 from pewm_jax.models.interface import Readers
 from pewm_jax.nn import modules
-from pewm_jax.nn.costs import SPLIT, Costs, Product, Share, text_tokens, video_times, video_tokens
-from pewm_jax.nn.tokens import TokenLayout, patchify
+from pewm_jax.nn.tokens import TokenLayout, patchify, text_tokens, video_tokens
 from pewm_jax.readers.render_block import RenderBlock
 from pewm_jax.types import Array, Camera, MemoryReadout, Params, View
 
@@ -189,45 +187,3 @@ def prepare(
         return jnp.where(shown, out, video)
 
     return Readers(read, weights["blocks"], added)
-
-
-def costs(model: ModelConfig, share: Share) -> Costs:
-    """Return the costs of embedding pictures and of the blocks, and roughly of rendering.
-
-    Of latents also those of making them.
-    """
-    config, places, clip = _settings(model), model.backbone.places, model.clip
-    frames, patches = video_tokens(model)
-    video, depth, width = frames * patches, places.count * config.blocks, places.width
-    remat, inner = bool(model.backbone.remat), config.picture_width
-    hidden = config.mlp_ratio * width
-    mlp = depth * video * hidden * (2 * width + inner)
-    modulation = video_times(model) * depth * places.time * 3 * width
-    pixels = clip.frames * clip.height * clip.width
-    reduced = model.memory.rendered_channels * config.reduced * pixels * _reduces(model)
-    again = float(remat)
-    products = (
-        Product("memory", "linear", mlp, 2.0, again, SPLIT),
-        Product("memory", "linear", modulation, 1.0, again, ("tensor",)),
-        Product("memory", "linear", video * token_channels(model) * inner, 1.0 + _reduces(model)),
-        Product("memory", "linear", video * inner * (inner + width), 2.0),
-        Product("memory", "linear", reduced, 1.0),
-    )
-    each = share.clips * video / share.context * share.activation_bytes
-    tokens, part = each * width, each * hidden / share.tensor
-    drawn = share.clips * pixels * (model.memory.rendered_channels + 2) * share.activation_bytes
-    made, stays = Costs(), drawn
-    if config.READS_LATENTS:
-        made = rgbd.costs_of_images(model, share, 2 * clip.frames, "memory")
-        stays = each * token_channels(model)  # the pictures are gone when the denoiser starts
-    kept = 0.0 if remat else depth * (4 * tokens + 3 * part)
-    block = 3 * part + 2 * tokens if remat and config.blocks else 0.0
-    forward, backward = STREAMS
-    return Costs(
-        products=products + made.products,
-        kept=kept + stays,
-        block=block,
-        held=made.held,
-        streamed=depth * tokens * (forward * (1 + remat) + backward) + 8 * drawn + made.streamed,
-        summed=2 * depth * (2 + remat) * tokens,
-    )

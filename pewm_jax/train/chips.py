@@ -39,6 +39,11 @@ class Chip:
     network: float
     source: str
 
+    @property
+    def platform(self) -> str:
+        """JAX's name of its platform."""
+        return "tpu" if "TPU" in self.device_kind else "cuda"
+
 
 CHIPS = (
     Chip(

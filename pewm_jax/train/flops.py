@@ -51,6 +51,11 @@ class Work:
         traffic: bytes that linear products and convolutions read and write.
         summed: bytes of results of products whose weight is sharded along ``tensor`` in a
             contracted dimension: they are summed over those devices.
+        repeated: kind of product → those of its FLOPs that devices along ``tensor`` and ``context``
+            repeat: no weight is sharded along ``tensor`` and the input depends on nothing trained,
+            as in encoders and embeddings.
+        unsplit: kind of product → those of the others that devices along ``tensor`` repeat: no
+            weight is sharded along it.
         unknown: descriptions of loops with products whose number of iterations the jaxpr does not
             tell; they count as one iteration.
     """
@@ -58,6 +63,8 @@ class Work:
     flops: Mapping[str, float] = dataclasses.field(default_factory=dict)
     traffic: float = 0.0
     summed: float = 0.0
+    repeated: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    unsplit: Mapping[str, float] = dataclasses.field(default_factory=dict)
     unknown: tuple[str, ...] = ()
 
     @property
@@ -66,18 +73,27 @@ class Work:
         return math.fsum(self.flops.values())
 
     def __add__(self, other: Work) -> Work:
-        kinds = {**self.flops, **other.flops}
         return Work(
-            {kind: self.flops.get(kind, 0.0) + other.flops.get(kind, 0.0) for kind in kinds},
+            _sum(self.flops, other.flops),
             self.traffic + other.traffic,
             self.summed + other.summed,
+            _sum(self.repeated, other.repeated),
+            _sum(self.unsplit, other.unsplit),
             tuple(dict.fromkeys((*self.unknown, *other.unknown))),
         )
 
     def times(self, count: float) -> Work:
         """Return the work of so many repetitions."""
-        flops = {kind: count * value for kind, value in self.flops.items()}
-        return Work(flops, count * self.traffic, count * self.summed, self.unknown)
+        flops, repeated, unsplit = (
+            {kind: count * value for kind, value in part.items()}
+            for part in (self.flops, self.repeated, self.unsplit)
+        )
+        traffic, summed = count * self.traffic, count * self.summed
+        return Work(flops, traffic, summed, repeated, unsplit, self.unknown)
+
+
+def _sum(one: Mapping[str, float], other: Mapping[str, float]) -> dict[str, float]:
+    return {kind: one.get(kind, 0.0) + other.get(kind, 0.0) for kind in {**one, **other}}
 
 
 def executed(step: Any, platform: str = "cpu") -> Work:
@@ -101,7 +117,7 @@ def needed(loss: Any, trained: Sequence[bool], axes: Sequence[Axes | None] | Non
         axes: for each input the mesh axes of its dimensions, where it is a sharded weight.
     """
     axes = [None] * len(trained) if axes is None else axes
-    marks = [_Mark(*both) for both in zip(trained, axes, strict=True)]
+    marks = [_Mark(*each) for each in zip(trained, axes, strict=True)]
     wanted = [k == 0 for k in range(len(loss.jaxpr.outvars))]
     return _Walk(gradients=True).jaxpr(loss.jaxpr, marks, wanted)[0]
 
@@ -115,9 +131,12 @@ def of_stage(config: Config, stage: Stage, clip: Any, given: Params | None = Non
         clip: the batch, or its shapes.
         given: weights that only the loss needs, see ``Stage.given``.
     """
+    clip, given = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (clip, given or {})
+    )
     state = jax.eval_shape(functools.partial(create, config, stage), jax.random.key(0))
     params, key = state.params, jax.eval_shape(jax.random.key, 0)
-    args = (params, clip, key, given or {})
+    args = (params, clip, key, given)
 
     def loss(params: Params, clip: Any, key: Any, given: Params) -> Any:
         return stage.loss(config.model, config.train, tree.merge(params, given), clip, key)
@@ -125,11 +144,15 @@ def of_stage(config: Config, stage: Stage, clip: Any, given: Params | None = Non
     jaxpr = jax.make_jaxpr(loss)(*args)
     trained = tree.flatten(tree.split(params, stage.trained)[0])
     specs = tree.flatten(tree.assign(worlds.sharding(config.model), params, "sharding rules"))
-    paths = list(tree.flatten(params))
-    others = len(jax.tree.leaves(args)) - len(paths)
-    marks = [path in trained for path in paths] + [False] * others
-    axes = [tuple(specs[path]) for path in paths] + [None] * others
-    return needed(jaxpr, marks, axes)
+    leaves = tree.flatten(params)
+    others = len(jax.tree.leaves(args)) - len(leaves)
+    marks = [path in trained for path in leaves] + [False] * others
+    # Rules name the mesh axes of a leaf's last dimensions.
+    axes: list[Axes | None] = [
+        (None,) * (leaf.ndim - len(specs[path])) + tuple(specs[path])
+        for path, leaf in leaves.items()
+    ]
+    return needed(jaxpr, marks, axes + [None] * others)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,7 +249,14 @@ class _Walk:
             for mark, dims in zip(marks, contracted, strict=True):
                 if mark.axes and any(mark.axes[dim] == "tensor" for dim in dims):
                     summed = _bytes(eqn.outvars[0])
-        return Work({kind: flops * passes}, traffic * passes, summed)
+        flops *= passes
+        found, nothing = {kind: flops}, dict[str, float]()
+        split = kind == ATTENTION or any("tensor" in (mark.axes or ()) for mark in marks)
+        first = not any(mark.trained for mark in marks[:2] if mark.axes is None)
+        repeated, unsplit = (found, nothing) if first else (nothing, found)
+        if split:
+            repeated = unsplit = nothing
+        return Work(found, traffic * passes, summed, repeated, unsplit)
 
     def _scan(
         self, params: Mapping[str, Any], marks: list[_Mark], wanted: list[bool]
@@ -382,12 +412,22 @@ def _jaxprs(params: Mapping[str, Any]) -> Iterator[Any]:
                 yield item
 
 
+def _names(part: Any) -> tuple[str, ...]:
+    """Return the mesh axes in a part of a ``PartitionSpec``."""
+    return part if isinstance(part, tuple) else (part,) if part else ()
+
+
 def _copies(eqn: Any) -> int:
-    """Return how often an equation runs what it calls: on each device, or at each grid point."""
+    """Return in how many parts an equation does what it calls: devices, or points of a grid.
+
+    Along axes of the mesh that split neither inputs nor results, devices repeat the same work,
+    which counts once.
+    """
     name, params = eqn.primitive.name, eqn.params
     if name == "shard_map":
-        mesh = params["mesh"].shape
-        return math.prod(mesh[axis] for axis in params.get("manual_axes", mesh))
+        mesh, specs = params["mesh"].shape, (*params["in_specs"], *params["out_specs"])
+        named = {axis for spec in specs for part in spec for axis in _names(part)}
+        return math.prod(mesh[axis] for axis in named)
     if name == "pallas_call":
         return math.prod(n for n in params["grid_mapping"].grid if isinstance(n, int))
     return 1
@@ -452,7 +492,6 @@ def _moved(eqn: Any, axes: Axes | None) -> Axes | None:
     if axes is None:
         return None
     before, after = eqn.invars[0].aval.shape, eqn.outvars[0].aval.shape
-    axes = (*axes, *([None] * (len(before) - len(axes))))
     if name in _SAME or (name in _SLICES and len(before) == len(after)):
         return axes
     if name == "transpose":

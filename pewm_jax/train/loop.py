@@ -22,7 +22,16 @@ from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.loader import BadRecords
 from pewm_jax.memory import feature_cache
-from pewm_jax.train import prepared, processes, runs, sharding, stages, starting, wandb_log
+from pewm_jax.train import (
+    flops,
+    prepared,
+    processes,
+    runs,
+    sharding,
+    stages,
+    starting,
+    wandb_log,
+)
 from pewm_jax.train.checkpoint import Checkpoints
 from pewm_jax.train.feed import Feed, rows_of
 from pewm_jax.train.log import LiveView, MetricsLog, Pace, duration
@@ -31,7 +40,14 @@ from pewm_jax.train.samples import Preview, Samples
 from pewm_jax.train.signals import Stop
 from pewm_jax.train.stages import Stage
 from pewm_jax.train.state import TrainState, inference_params
-from pewm_jax.train.step import Metrics, abstract_state, compile_step, initial_state, noise_key
+from pewm_jax.train.step import (
+    Metrics,
+    abstract_state,
+    compile_step,
+    given_weights,
+    initial_state,
+    noise_key,
+)
 from pewm_jax.train.watch import Watch
 from pewm_jax.types import Clip, Params
 
@@ -269,7 +285,9 @@ class _Worker:
         self.view.say(f"{self.stage.title}: compiling the training step …")
         began = time.monotonic()
         state = self._make_state(done) if state is None else state
-        step_fn = compile_step(self.config, self.stage, self.mesh, clip)
+        given = given_weights(self.config, self.stage, self.mesh)
+        step_fn = compile_step(self.config, self.stage, self.mesh, clip, given)
+        self.watch.flops = flops.of_stage(self.config, self.stage, clip, given).total
         took = duration(time.monotonic() - began)
         self.view.say(f"{self.stage.title}: compiled the training step in {took}")
         return state, step_fn

@@ -174,13 +174,8 @@ def trace_step(
         return step.trace(state, batch, abstract_key, *extra)
 
 
-def lower_step(config: Config, stage: Stage, mesh: Mesh, clip: Any) -> jax.stages.Lowered:
-    """Trace and lower ``train_step`` for one batch shape; arguments as for ``compile_step``."""
-    return trace_step(config, stage, mesh, clip, given_weights(config, stage, mesh)).lower()
-
-
 def compile_step(
-    config: Config, stage: Stage, mesh: Mesh, clip: Any
+    config: Config, stage: Stage, mesh: Mesh, clip: Any, given: Params | None = None
 ) -> Callable[[TrainState, Clip, Array], tuple[TrainState, Metrics]]:
     """Compile ``train_step`` ahead of time for one batch shape.
 
@@ -189,12 +184,13 @@ def compile_step(
         stage: what is trained.
         mesh: the devices.
         clip: a batch, or the shapes of one.
+        given: from ``given_weights``, which is called here if this is None.
 
     Returns:
         The compiled ``(state, clip, key) -> (state, metrics)``; it consumes the state it is given
         (its buffers are donated) and wants clip and key placed as ``sharding`` says.
     """
-    given = given_weights(config, stage, mesh)
+    given = given_weights(config, stage, mesh) if given is None else given
     compiled = trace_step(config, stage, mesh, clip, given).lower().compile()
     if given is None:
         return compiled

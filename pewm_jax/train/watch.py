@@ -21,7 +21,6 @@ from pewm_jax.train import chips, prepared, processes
 from pewm_jax.train.log import LiveView, MetricsLog, Pace, drop_after
 from pewm_jax.train.stages import Stage
 from pewm_jax.train.step import Metrics
-from pewm_jax.worlds import costs
 
 SKIPPED = "nonfinite.jsonl"
 """In the run's folder: a line for every update that was skipped."""
@@ -39,7 +38,12 @@ class Watch:
         view: shows the metrics.
         log: writes them to files.
         bad: the records that do not decode.
+
+    Attributes:
+        flops: FLOPs that a step needs (``train.flops``), set when the first batch is known.
     """
+
+    flops = 0.0
 
     def __init__(
         self,
@@ -58,7 +62,6 @@ class Watch:
         self.view, self.log, self.bad = view, log, bad
         self.pace = Pace(time.monotonic())
         self._devices, self._chip = devices, chips.find(jax.devices()[0].device_kind)
-        self._flops = self.settings.batch * costs.flops_per_clip(config, stage)
         self._skipped = self._skipped_before(done)
 
     def read(self, step: int, metrics: Metrics, kept: Callable[[], str]) -> dict[str, float]:
@@ -77,7 +80,7 @@ class Watch:
         if not (math.isfinite(values["loss"]) and math.isfinite(values["grad_norm"])):
             self._not_finite(step, values, skipped, kept)
         seconds = self.pace.tick(time.monotonic())
-        rate = self._flops / seconds / self._devices
+        rate = self.flops / seconds / self._devices
         values |= {
             "step_seconds": seconds,
             "clips_per_second": self.settings.batch / seconds,

@@ -383,17 +383,11 @@ def _no_views(model: World, params: Params, state: WorldState) -> None:
     del model, params, state
 
 
-def _no_costs(config: Config, stage: Stage, share: Any) -> dict[str, Any]:
-    del config, stage, share
-    return {}
-
-
 DEFAULTS: dict[str, Callable[..., Any]] = {
     "start": _start_by_observing,
     "imagine_many": _imagine_each,
     "to_compare": _same_state,
     "views": _no_views,
-    "costs": _no_costs,
 }
 """The optional functions of a world; see ``config.World``."""
 

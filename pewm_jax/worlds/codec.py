@@ -15,13 +15,12 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
-from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, TrainSettings
+from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, TrainSettings
 from pewm_jax.geometry import depth_images
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
-from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.types import Array, Clip, Params
-from pewm_jax.worlds.codec_gate import macs, mix
+from pewm_jax.worlds.codec_gate import mix
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 SMALL = 1e-4
@@ -181,25 +180,3 @@ def stages(model: CodecWorldConfig) -> tuple[Stage, ...]:
 def sharding(model: CodecWorldConfig) -> tuple[tuple[str, Any], ...]:
     """Return the codec's rules."""
     return model.codec.SHARDING
-
-
-def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
-    """Return the costs of one device: of one clip, the frames' colour and depth."""
-    del share
-    model, trained = config.model, stage is STAGES[0]
-    size, frames = (model.clip.height, model.clip.width), 2 * model.clip.frames
-    parts = {"encoder": 2.0 * trained}
-    if stage is not STAGES[1]:
-        parts["decoder"] = 2.0 * trained
-    products = [
-        Product("codec", "convolution", frames * model.codec.macs(part, *size), backward)
-        for part, backward in parts.items()
-    ]
-    train = config.train
-    if trained and isinstance(train, CodecTrainConfig) and train.lpips_weight:
-        # Colours, those given back and the true ones; only the former have a gradient.
-        work = frames * lpips.macs(train.lpips_net, *size)
-        products.append(Product("lpips", "convolution", work, 0.5))
-    if stage is STAGES[2]:
-        products.append(Product("codec", "convolution", model.clip.frames * macs(model), 2.0))
-    return {"codec": Costs(tuple(products))}

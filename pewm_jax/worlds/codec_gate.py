@@ -135,8 +135,3 @@ def _psnr(made: Array, truth: Array, where: Array) -> Array:
     """Return the PSNR of colour in decibels, of the pixels where ``where`` is 1."""
     squared = (jnp.square(made - truth)[..., :3] * where).sum() / jnp.maximum(3 * where.sum(), 1)
     return -10 * jnp.log10(jnp.maximum(squared / 4, 1e-10))
-
-
-def macs(model: CodecWorldConfig) -> float:
-    """Return the gate's multiply-adds for one frame."""
-    return gates.macs(model.codec.gate, model.clip.height, model.clip.width)  # type: ignore[attr-defined]

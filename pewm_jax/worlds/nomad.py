@@ -13,7 +13,6 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import (
-    Config,
     NomadTrainConfig,
     NomadWorldConfig,
     TrainSettings,
@@ -21,7 +20,6 @@ from pewm_jax.config import (
 from pewm_jax.diffusion import squared_cosine
 from pewm_jax.geometry import actions, cameras
 from pewm_jax.models.nomad import model as nomad
-from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.stages import TRAIN, Stage
 
@@ -105,10 +103,3 @@ def stages(model: NomadWorldConfig) -> tuple[Stage, ...]:
     """Return the one stage."""
     del model
     return STAGES
-
-
-def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
-    """Return the costs of one device."""
-    del stage, share
-    work = nomad.macs(config.model.policy)
-    return {"policy": Costs((Product("policy", "convolution", work, 2.0),))}

@@ -93,11 +93,6 @@ def test_the_default_has_at_most_three_million_parameters_as_its_layout_says():
     shapes = jax.eval_shape(lambda: config.init(jax.random.key(0)))
     count = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     assert 1e6 < count <= 3e6
-    done = jax.jit(LearnedCodecConfig.encode_raw, static_argnums=0)
-    video = jax.ShapeDtypeStruct((1, 1, 64, 64, 3), jnp.float32)
-    flops = done.lower(config, shapes, video).cost_analysis()["flops"]
-    # XLA leaves out what multiplies the zeros around the frame.
-    assert flops == pytest.approx(2 * config.macs("encoder", 64, 64), rel=0.15)
 
 
 def model():

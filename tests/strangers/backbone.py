@@ -10,7 +10,6 @@ from jax.sharding import PartitionSpec as P
 from pewm_jax.config.parts import Backbone, InjectionPoints
 from pewm_jax.models.interface import joined
 from pewm_jax.nn import layers
-from pewm_jax.nn.costs import Costs, Product, video_tokens
 from pewm_jax.registry import register
 
 
@@ -48,11 +47,3 @@ class PerceptronConfig(Backbone):
 
         tokens, _ = jax.lax.scan(block, tokens, (params["blocks"], readers.params))
         return (tokens @ params["out"]).reshape(*x.shape[:-1], -1)
-
-    def costs(self, model, share, *, trained):
-        (t, n), d, once = video_tokens(model), self.width, float(trained)
-        into = Product("backbone", "linear", t * n * d * model.in_channels, once)
-        macs = self.depth * 2 * t * n * d * d
-        blocks = Product("backbone", "linear", macs, 1 + once, 0, ("tensor",))
-        out = Product("backbone", "linear", t * n * d * model.codec.channels, 1 + once)
-        return Costs(products=(into, blocks, out))

@@ -9,7 +9,6 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.codecs.pixel import fold
 from pewm_jax.config.parts import Codec
-from pewm_jax.nn.costs import Costs, Product
 from pewm_jax.registry import register
 
 
@@ -44,8 +43,3 @@ class TurnConfig(Codec):
         b, t, h, w, _ = grid.shape
         pixels = grid.reshape(b, t, h, w, s, s, -1).transpose(0, 1, 2, 4, 3, 5, 6)
         return pixels.reshape(b, t, h * s, w * s, -1)
-
-    def costs(self, model, share):
-        t, h, w = model.latent_shape
-        macs = (t + 1) * h * w * (self.rgb_channels**2 + self.depth_channels**2)
-        return Costs(products=(Product("codec", "linear", macs),))

@@ -9,7 +9,6 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config.parts import Conditioner
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.nn.costs import Costs, Product
 from pewm_jax.registry import register
 
 
@@ -32,8 +31,3 @@ class PushConfig(Conditioner):
         actions = control.actions_TA.reshape(len(control.actions_TA), t - 1, -1)
         led = actions @ params["project"]
         return Conditioning(modulation_BtE=jnp.pad(led, ((0, 0), (1, 0), (0, 0))))
-
-    def costs(self, model, share, *, trained):
-        steps = (model.latent_shape[0] - 1) * model.codec.temporal
-        macs = steps * self.width * model.backbone.places.time
-        return Costs(products=(Product("control", "linear", macs, float(trained)),))

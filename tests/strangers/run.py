@@ -19,9 +19,8 @@ from pewm_jax.config import (
     TrainConfig,
 )
 from pewm_jax.data import abstract
-from pewm_jax.plan import plan
+from pewm_jax.plan import measure
 from pewm_jax.train import sharding, step
-from pewm_jax.worlds import costs
 from tests.helpers import random_frames
 from tests.strangers.backbone import PerceptronConfig
 from tests.strangers.codec import TurnConfig
@@ -98,18 +97,18 @@ def losses(mesh, devices):
 
 
 def counted(number, devices):
-    """Return the FLOPs of a compiled step, and what the strangers say they are."""
+    """Return the FLOPs of a compiled step, and those of its jaxpr."""
     config = experiment(batch=8, width=64)
     stage = worlds.stages(config.model)[number - 1]
-    compiled = plan.compile_stage(config, stage, devices)
-    sizes = {"data": len(devices), "fsdp": 1, "tensor": 1, "context": 1}
-    clips = stage.settings(config).batch
-    done = [costs.flops_of_device(p, sizes, clips) for p in costs.products(config, stage)]
-    return compiled.program.flops, math.fsum(done)
+    sizes = measure.MeshSizes(data=len(devices))
+    traced = measure.trace(config, stage, devices)
+    work = measure.work_of(config, stage, traced, None)
+    counted = math.fsum(work.on_device(sizes).values())
+    return measure.compile_traced(traced, sizes).program.flops, counted
 
 
 def main():
-    devices = plan.virtual(8)
+    devices = measure.virtual(8)
     one, _ = losses(MeshConfig(), devices[:1])
     eight, split = losses(MeshConfig(fsdp=4, tensor=2), devices)
     measured = {"one": one, "eight": eight, "split": split}

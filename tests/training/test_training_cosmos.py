@@ -24,14 +24,15 @@ from pewm_jax.config import (
     TrainConfig,
 )
 from pewm_jax.controls.actions import ModulationConfig
+from pewm_jax.data import abstract
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.wan.codec import WanVAECodec
 from pewm_jax.plan import hlo
-from pewm_jax.plan.plan import QUICK
-from pewm_jax.train import sharding, state
-from pewm_jax.worlds import costs, world_model
+from pewm_jax.plan.measure import QUICK
+from pewm_jax.train import flops, sharding, state
+from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, random_frames, randomise, with_reader
 
 COSMOS = CosmosBackbone(
@@ -58,7 +59,6 @@ MODEL = EgoWMConfig(
     noise=NOISE,
 )
 STAGE = StageConfig(steps=4, batch=2, warmup=0, learning_rate=1e-3)
-ONE = {"data": 1, "fsdp": 1, "tensor": 1, "context": 1}
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +79,8 @@ def test_the_transformer_learns_with_actions_and_the_codec_stands_still(stepped)
 
 def test_its_sums_are_those_of_the_compiled_step(stepped):
     config, stage, *_, text = stepped
-    expected = sum(costs.flops_of_device(p, ONE, 2) for p in costs.products(config, stage))
-    assert expected == pytest.approx(hlo.read(text).flops, rel=0.02)
+    needed = flops.of_stage(config, stage, abstract.clip(config, 2)).total
+    assert needed == pytest.approx(hlo.read(text).flops, rel=0.02)
 
 
 def test_every_leaf_has_its_place_on_many_devices():

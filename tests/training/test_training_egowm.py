@@ -22,6 +22,7 @@ from pewm_jax.config import (
     TrainConfig,
 )
 from pewm_jax.controls.actions import ModulationConfig
+from pewm_jax.data import abstract
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
@@ -30,9 +31,8 @@ from pewm_jax.models.interface import Conditioning
 from pewm_jax.models.svd.backbone import SVDUNetBackbone
 from pewm_jax.models.svd.vae_codec import SVDVAECodec
 from pewm_jax.plan import hlo
-from pewm_jax.plan.plan import QUICK
-from pewm_jax.train import sharding, state, step
-from pewm_jax.worlds import costs
+from pewm_jax.plan.measure import QUICK
+from pewm_jax.train import flops, sharding, state, step
 from tests.helpers import TINY, randomise, with_reader
 
 IMAGE = CLIPVisionConfig(
@@ -64,7 +64,7 @@ def trained(config, stage, steps=3, start=None):
     batch = jax.device_put(fakes.clip(config, 2, 0), sharding.of_batch(mesh))
     moves = np.random.default_rng(0).normal(0, 0.3, batch.actions_TA.shape).astype(np.float32)
     batch = dataclasses.replace(batch, actions_TA=jax.device_put(moves, sharding.of_batch(mesh)))
-    compiled = step.lower_step(config, stage, mesh, batch).compile(compiler_options=QUICK)
+    compiled = step.trace_step(config, stage, mesh, batch).lower().compile(compiler_options=QUICK)
     now = step.initial_state(config, stage, mesh, start)
     first = jax.tree.map(np.array, now.params)
     key, losses = step.noise_key(config, stage), []
@@ -113,9 +113,8 @@ def test_a_video_model_is_made_first_where_there_is_none_and_the_control_waits(s
 
 def test_its_sums_are_those_of_the_compiled_step(svd):
     config, stage, *_, text = svd
-    ways = {"data": 1, "fsdp": 1, "tensor": 1, "context": 1}
-    expected = sum(costs.flops_of_device(p, ways, 2) for p in costs.products(config, stage))
-    assert expected == pytest.approx(hlo.read(text).flops, rel=0.02)
+    needed = flops.of_stage(config, stage, abstract.clip(config, 2)).total
+    assert needed == pytest.approx(hlo.read(text).flops, rel=0.02)
 
 
 def test_every_leaf_has_its_place_on_many_devices():

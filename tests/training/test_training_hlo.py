@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.plan import hlo, hlo_text
+from pewm_jax.plan import hlo
 
 
 def program(function, *shapes):
@@ -156,8 +156,8 @@ def test_a_sum_may_be_converted_before_it_is_cut(last, kind):
 
 
 def test_sizes_of_types_are_in_bytes():
-    assert hlo_text.size("(f32[2,3]{1,0}, s32[], bf16[4]{0}, pred[5]{0})") == 24 + 4 + 8 + 5
-    assert hlo_text.size("f8e4m3fn[16]{0}") == 16
+    assert hlo.size("(f32[2,3]{1,0}, s32[], bf16[4]{0}, pred[5]{0})") == 24 + 4 + 8 + 5
+    assert hlo.size("f8e4m3fn[16]{0}") == 16
 
 
 def test_the_figures_do_not_depend_on_how_the_compiler_fuses():

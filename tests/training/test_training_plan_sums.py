@@ -1,4 +1,4 @@
-"""The sums on paper agree with compiled small steps: FLOPs 2 %, memory 15 %, traffic 10 %."""
+"""Counts from jaxprs and shapes agree with compiled steps: FLOPs and state 2 %, traffic 10 %."""
 
 import json
 import os
@@ -31,7 +31,6 @@ def test_the_sums_agree_with_the_compiled_step(measured, name):
     assert one["unknown"] == []
     assert one["flops_expected"] == pytest.approx(one["flops"], rel=0.02)
     assert one["state_expected"] == pytest.approx(one["state"], rel=0.02)
-    assert one["peak_expected"] == pytest.approx(one["peak"], rel=0.15)
 
 
 @pytest.mark.parametrize("kind", ["all-gather", "reduce-scatter"])

@@ -48,7 +48,7 @@ def parameters(config):
 
 
 def compiled(stage):
-    lowered = step.lower_step(CONFIG, stage, one_device(), CLIP)
+    lowered = step.trace_step(CONFIG, stage, one_device(), CLIP).lower()
     return lowered.compile()
 
 

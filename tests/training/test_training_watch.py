@@ -16,10 +16,9 @@ import training_fakes as fakes
 from pewm_jax.config import UserError
 from pewm_jax.data import loader
 from pewm_jax.io import weights
-from pewm_jax.train import chips, loop, optimizer, samples, step, watch
+from pewm_jax.train import chips, flops, loop, optimizer, samples, step, watch
 from pewm_jax.train.sharding import make_mesh
 from pewm_jax.train.signals import Interrupted
-from pewm_jax.worlds import costs
 
 BAD = 5
 """The step whose batch makes everything NaN."""
@@ -138,7 +137,9 @@ def test_utilisation_is_told_where_the_chip_is_known(fake_model, tmp_path, monke
         rate = entry["tflops_per_second_per_device"] * 1e12
         assert entry["mfu"] == pytest.approx(rate / chips.CHIPS[0].flops)
         per_step = rate * entry["step_seconds"] * jax.device_count()
-        assert per_step == pytest.approx(8 * costs.flops_per_clip(fakes.config(), fakes.STAGES[0]))
+        clip = fakes.clip(fakes.config(), 8, 0)
+        needed = flops.of_stage(fakes.config(), fakes.STAGES[0], clip).total
+        assert per_step == pytest.approx(needed)
         assert entry["clips_per_second"] == pytest.approx(8 / entry["step_seconds"])
 
 

@@ -18,7 +18,6 @@ from pewm_jax import registry as kinds
 from pewm_jax.config import Config, ConfigError, StageConfig, TrainSettings, World, register
 from pewm_jax.data import loader
 from pewm_jax.io import tree
-from pewm_jax.nn.costs import Costs, Product
 from pewm_jax.train import loop, samples, stages
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -74,9 +73,6 @@ def line(monkeypatch):
         stages=line_stages,
         sharding=lambda model: (("slope", P("fsdp")), ("offset", P())),
         split_heads=lambda model, stage: {},
-        costs=lambda config, stage, share: {
-            "slope": Costs((Product("slope", "linear", config.model.width, 1.0),))
-        },
     )
     monkeypatch.setattr(kinds, "_KINDS", dict(kinds._KINDS))
     monkeypatch.setattr(loader, "clips", clips)

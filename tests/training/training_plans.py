@@ -1,6 +1,7 @@
 """Run on eight virtual devices by ``test_training_plan_sums``: compiles small steps that could run.
 
-Prints, for each, what the compiled program does and needs and what the sums on paper say, as JSON.
+Prints as JSON, for each, what the compiled program does and needs, and what is expected of it from
+jaxpr and shapes.
 """
 
 import json
@@ -25,9 +26,8 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
-from pewm_jax.plan import hlo, plan, predict
-from pewm_jax.plan.footprint import MeshSizes
-from pewm_jax.worlds import costs
+from pewm_jax.plan import hlo, measure, suggest
+from pewm_jax.plan.measure import MeshSizes
 from pewm_jax.worlds.pewm.world import STAGES
 
 DINOV2 = DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56)
@@ -94,36 +94,34 @@ def experiment(
     )
 
 
-def measure(number, settings, devices):
+def compare(number, settings, devices):
     """Compile a variant; returns what was counted and what was expected."""
     config = experiment(**settings)
     stage = STAGES[number - 1]
     used = devices if "mesh" in settings else devices[:1]
-    compiled = plan.compile_stage(config, stage, used)
     mesh = MeshSizes(*config.train.mesh.shape(len(used)))
-    clips = stage.settings(config).batch
-    sent = predict.traffic(config, stage, mesh)
-    done = [costs.flops_of_device(p, mesh.sizes, clips) for p in costs.products(config, stage)]
+    traced = measure.trace(config, stage, used)
+    compiled = measure.compile_traced(traced, mesh)
+    work = measure.work_of(config, stage, traced, None)
+    sent = suggest.traffic(config, stage, mesh, work, compiled)
     return {
         "flops": compiled.program.flops,
-        "flops_expected": sum(done),
+        "flops_expected": sum(work.on_device(mesh).values()),
         "sent": {kind: compiled.program.sent(kind) for kind in hlo.KINDS},
         "sent_expected": {
             kind: sum(size for (one, _), size in sent.items() if one == kind) for kind in hlo.KINDS
         },
         "unknown": compiled.program.unknown,
         "state": compiled.arguments,
-        "state_expected": compiled.expected.state,
-        "peak": compiled.peak,
-        "peak_expected": compiled.expected.peak,
+        "state_expected": suggest.memory_of(config, stage, mesh).state,
     }
 
 
 def main(names):
-    devices = plan.virtual(8)
+    devices = measure.virtual(8)
     chosen = {name: VARIANTS[name] for name in names or VARIANTS}
     measured = {
-        name: measure(number, dict(settings), devices)
+        name: compare(number, dict(settings), devices)
         for name, (number, settings) in chosen.items()
     }
     print(json.dumps(measured))

@@ -1,4 +1,4 @@
-"""Cosmos' transformer as a backbone: its functions, sharding rules and costs.
+"""Cosmos' transformer as a backbone: its functions and sharding rules.
 
 Observed frames are kept, as in the reference's pipeline: the network gets their clean latents in
 the place of noisy ones, a time of almost no noise for them, and a channel that marks them; sampling
@@ -21,8 +21,6 @@ from pewm_jax.models import interface as backbones
 from pewm_jax.models.cosmos import model as cosmos
 from pewm_jax.models.cosmos.config import CosmosConfig
 from pewm_jax.models.interface import Conditioning, Observed, Readers
-from pewm_jax.nn import attention as blocked_attention
-from pewm_jax.nn.costs import FLOAT, SPLIT, Costs, Product, Share, video_tokens
 from pewm_jax.types import Array, Params
 
 KNOWN_SIGMA = 1e-4
@@ -146,75 +144,8 @@ class CosmosBackbone(CosmosConfig, Backbone):
             added_BND=readers.added_BND,
         )
 
-    def costs(self, model: Any, share: Share, *, trained: bool) -> Costs:
-        """Return the transformer's costs, trained or frozen.
-
-        Every latent frame has a time embedding of its own. Tokens here are those of the video; keys
-        and values of the text are counted once a clip.
-        """
-        frames, patches = video_tokens(model)
-        tokens, depth, width = frames * patches, self.layers, self.width
-        whole = share.clips * tokens * width * share.activation_bytes / share.context
-        part = whole / share.tensor
-        hidden = part * self.mlp_ratio
-        logits = _logits(self, tokens, share)
-        kept = depth * whole if self.remat else depth * (9 * whole + 9 * part + 2 * hidden)
-        block = 18 * whole + 18 * part + (5 if self.remat else 1) * hidden
-        forward, backward = STREAMS
-        again = float(self.remat)
-        passes = 2 + self.remat
-        return Costs(
-            products=_products(self, model, trained=trained),
-            kept=kept,
-            block=block + 4 * FLOAT * logits + 2 * part * (share.context - 1),
-            streamed=depth * whole * (forward * (1 + again) + backward),
-            summed=3 * depth * passes * whole,
-            gathered=(1 + again) * depth * 2 * whole / share.tensor,
-            scattered=depth * 2 * whole / share.tensor,
-        )
-
 
 COSMOS_2B = CosmosBackbone()
 """Cosmos-Predict2-2B-Video2World."""
 COSMOS_14B = CosmosBackbone(layers=36, heads=40, rope_scale=(20 / 24, 2.0, 2.0))
 """Cosmos-Predict2-14B-Video2World."""
-
-
-def _logits(config: CosmosConfig, tokens: int, share: Share) -> float:
-    """Return the number of logits of self-attention that exist at once."""
-    if share.flash:
-        return 0.0
-    logits = share.clips * config.heads / share.tensor * tokens**2 / share.context
-    on_cpu = share.activation_bytes == FLOAT
-    if on_cpu and logits > blocked_attention.LOGITS:  # blocks of one head
-        return min(share.clips * tokens**2 / share.context, blocked_attention.LOGITS)
-    return logits
-
-
-def _products(config: CosmosConfig, model: Any, *, trained: bool) -> tuple[Product, ...]:
-    depth, width, lora = config.layers, config.width, config.lora_dim
-    frames, patches = video_tokens(model)
-    tokens, (length, raw) = frames * patches, config.text_shape
-    cell = config.patch_t * config.patch**2
-    again, weights = float(config.remat), float(trained)
-    backward = 1.0 + weights
-    per_token = (6 * width + 2 * config.hidden) * width
-    text = length * 2 * config.text_dim * width
-    attention = 2 * tokens * (tokens + length) * width
-    modulation = frames * 3 * 4 * lora * width
-    inputs = model.in_channels + config.padding_mask
-    out = tokens * cell * model.codec.channels * width
-    linear = ("backbone", "linear")
-    of_times = 2 * weights if trained else 0.0
-    raw_text = length * raw * config.text_dim if config.raw_text_dim else 0.0
-    return (
-        Product(*linear, depth * tokens * per_token, backward, again, SPLIT),
-        Product(*linear, depth * text, backward if raw_text else weights, again, ("tensor",)),
-        Product("backbone", "attention", depth * attention, 2.0, again + 0.5, SPLIT),
-        Product(*linear, depth * modulation, of_times, again, ("tensor",)),
-        Product(*linear, frames * 3 * lora * width, of_times, 0.0, ("tensor",)),
-        Product(*linear, tokens * cell * inputs * width + raw_text, weights, 0.0, ("context",)),
-        Product(*linear, frames * width * width, weights),
-        Product(*linear, frames * 3 * width * width, 2 * weights),
-        Product(*linear, out, backward, 0.0, ("context",)),
-    )

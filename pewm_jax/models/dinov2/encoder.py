@@ -12,7 +12,6 @@ from pewm_jax.config.parts import Encoder, Rules
 from pewm_jax.errors import require, require_positive
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config
-from pewm_jax.nn.costs import FLOAT, Costs, Product, Share
 from pewm_jax.types import Array, Params
 
 
@@ -76,23 +75,3 @@ class DINOv2EncoderConfig(Encoder):
                 "std": list(dinov2.STD_3),
             },
         }
-
-    def costs(self, model: Any, share: Share, frames: int) -> Costs:
-        """Return the costs of encoding all context frames, including their resizing."""
-        del share
-        clip, network, side = model.clip, self.network, self.size
-        tokens, width = 1 + network.registers + (side // network.patch) ** 2, network.width
-        count = frames * tokens
-        forward = (3 if network.swiglu else 2) * network.hidden * width
-        patches = frames * (side // network.patch) ** 2 * 3 * network.patch**2 * width
-        resized = frames * 3 * side * clip.width * (clip.height + side)
-        linear = network.layers * count * (4 * width * width + forward)
-        logits = frames * network.heads * tokens**2
-        return Costs(
-            products=(
-                Product("encoder", "linear", linear),
-                Product("encoder", "attention", network.layers * count * 2 * tokens * width),
-                Product("encoder", "linear", patches + resized),
-            ),
-            held=FLOAT * (2 * logits + 12 * count * width),
-        )

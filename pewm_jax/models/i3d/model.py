@@ -187,20 +187,6 @@ def trunk(params: Params, x_BTHWC: Array) -> Array:
     return x
 
 
-def macs(frames: int) -> float:
-    """Return the multiply-adds of one clip through the network."""
-    total, size, units = 0, [frames, SIDE, SIDE], {path: rest for path, *rest in _units()}
-    for part in PARTS:
-        if isinstance(part, Mixed):
-            inside = [rest for path, rest in units.items() if path.startswith(f"{part.name}/")]
-        else:
-            strides = part.stride if isinstance(part, Pool) else (part.stride,) * 3
-            size = [-(-n // stride) for n, stride in zip(size, strides, strict=True)]
-            inside = [units[part.name]] if isinstance(part, Conv) else []
-        total += sum(side**3 * one * other for side, one, other in inside) * int(np.prod(size))
-    return float(total)
-
-
 def _conv(part: Params, x_BTHWC: Array, stride: int = 1) -> Array:
     """Convolve, add the bias, apply ReLU.
 

@@ -186,21 +186,6 @@ def features(net: Net, params: Params, x_NHWC: Array) -> list[Array]:
     return found
 
 
-def macs(net: Net, height: int, width: int) -> float:
-    """Return the multiply-adds of one picture through a network."""
-    total, inward = 0, 3
-    for layers in NETS[net]:
-        if layers.pool:
-            height, width = ((n - layers.pool) // 2 + 1 for n in (height, width))
-        for out in layers.widths:
-            height, width = (
-                (n + 2 * layers.pad - layers.side) // layers.stride + 1 for n in (height, width)
-            )
-            total += layers.side**2 * inward * out * height * width
-            inward = out
-    return float(total)
-
-
 def _of_length_one(x_NHWC: Array) -> Array:
     """Divide features by their length; those that are all 0 stay 0, and so does their gradient."""
     squares = jnp.square(x_NHWC).sum(-1, keepdims=True)

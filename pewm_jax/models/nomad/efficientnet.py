@@ -129,19 +129,6 @@ def groups(channels: int) -> int:
     return count
 
 
-def macs(colours: int, width: float, depth: float, stages: int, rows: int, columns: int) -> float:
-    """Return the multiply-adds of the convolutions for one picture."""
-    at = [-(-rows // 2), -(-columns // 2)]
-    total = 9 * colours * scaled(STEM, width) * at[0] * at[1]
-    found = blocks(width, depth, stages)
-    for block in found:
-        total += block.inward * block.hidden * at[0] * at[1] * (block.hidden != block.inward)
-        at = [-(-side // block.stride) for side in at]
-        each = block.kernel**2 * block.hidden + block.hidden * block.outward
-        total += each * at[0] * at[1]
-    return float(total + found[-1].outward * features(width) * at[0] * at[1])
-
-
 def _block(block: Block, part: Params, x_BHWC: Array) -> Array:
     x = x_BHWC
     if block.hidden != block.inward:

@@ -217,29 +217,6 @@ def waypoints(config: NomadConfig, steps_BN2: Array) -> Array:
     return jnp.cumsum(steps, -2) * config.spacing_m
 
 
-def macs(config: NomadConfig) -> float:
-    """Return the multiply-adds for one history, one goal and one denoising step."""
-    size, tokens = (config.height, config.width), config.context + 2
-    trunks = sum(
-        count * efficientnet.macs(colours, *_size(config), *size)
-        for count, colours in ((config.context + 1, COLOURS), (1, 2 * COLOURS))
-    )
-    mixing = config.layers * tokens * config.dim**2 * (4 + 2 * WIDER)
-    return trunks + mixing + _denoiser_macs(config)
-
-
-def _denoiser_macs(config: NomadConfig) -> float:
-    """Return the multiply-adds for one sequence."""
-    total, points = 0.0, config.waypoints
-    for path, shape in denoiser_shapes(config).items():
-        if path.endswith("/kernel"):
-            level = path.removeprefix("down_").removeprefix("up_").split("/")[0]
-            halved = int(level) if level.isdigit() else len(config.channels) - 1
-            halved = 0 if path.startswith(("last", "out")) else halved
-            total += float(np.prod(shape)) * (points >> halved if len(shape) == 3 else 1)
-    return total
-
-
 def _size(config: NomadConfig) -> tuple[float, float, int]:
     return config.trunk_width, config.trunk_depth, config.trunk_stages
 

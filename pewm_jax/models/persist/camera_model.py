@@ -17,10 +17,8 @@ import jax.numpy as jnp
 from pewm_jax.errors import UserError
 from pewm_jax.geometry.actions import CAMERA_NUMBERS, CAMERA_STEP_NUMBERS
 from pewm_jax.models.persist import blocks as frame_blocks
-from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.models.persist.config import CameraModelConfig
-from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.types import Array, Params
 
 PARTS = ("time",)
@@ -114,21 +112,3 @@ def apply(
     )
     out = frame_blocks.project(params, x, condition)[:, :, 0].astype(jnp.float32)
     return out * jnp.asarray(config.units), cache
-
-
-def costs(config: CameraModelConfig, share: Share, frames: int, *, trained: bool) -> Costs:
-    """Return the costs of T frames."""
-    inward = (
-        config.inner**3 * config.embed + CAMERA_NUMBERS + config.actions + 3 * config.blocks.width
-    )
-    ends_in = (inward + CAMERA_STEP_NUMBERS) * config.blocks.width
-    return frame_costs.costs(
-        config.blocks,
-        PARTS,
-        share,
-        "camera_model",
-        frames,
-        1,
-        ends=ends_in,
-        trained=trained,
-    )

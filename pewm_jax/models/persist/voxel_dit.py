@@ -20,10 +20,8 @@ import jax.numpy as jnp
 
 from pewm_jax.errors import UserError
 from pewm_jax.models.persist import blocks as frame_blocks
-from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.models.persist.config import VoxelDiTConfig
-from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.nn.layers import linear
 from pewm_jax.nn.tokens import patchify, unpatchify
 from pewm_jax.types import Array, Params
@@ -132,26 +130,6 @@ def apply(
     out = frame_blocks.project(params, x, condition).reshape(batch * frames, config.tokens, -1)
     out = _cube(config, out)
     return out.reshape(latents_BTxyzC.shape), cache
-
-
-def costs(
-    config: VoxelDiTConfig, share: Share, frames: int, pixels: int, *, trained: bool
-) -> Costs:
-    """Return the costs of T frames, each of which is shown ``pixels`` latents of a picture."""
-    given = pixels // config.pixel_patch**2
-    ends_in = config.tokens * 2 * config.latent_channels * config.patch**3
-    ends_in += given * config.pixel_channels * config.pixel_patch**2
-    return frame_costs.costs(
-        config.blocks,
-        PARTS,
-        share,
-        "voxel_dit",
-        frames,
-        config.tokens,
-        given=given,
-        ends=ends_in * config.blocks.width,
-        trained=trained,
-    )
 
 
 def _cube(config: VoxelDiTConfig, tokens_BNC: Array) -> Array:

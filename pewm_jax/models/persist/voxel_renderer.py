@@ -23,10 +23,8 @@ from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import resize_intrinsics
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import blocks as frame_blocks
-from pewm_jax.models.persist import costs as frame_costs
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.models.persist.config import VoxelRendererConfig
-from pewm_jax.nn.costs import Costs, Share
 from pewm_jax.nn.layers import linear
 from pewm_jax.nn.tokens import patchify, unpatchify
 from pewm_jax.types import Array, Camera, Params
@@ -221,20 +219,3 @@ def apply(
     x, cache = frame_blocks.run(config.blocks, PARTS, params["blocks"], x, condition, cache=cache)
     out = frame_blocks.project(params, x, condition).reshape(batch, frames * config.tokens, -1)
     return unpatchify(out, frames, *place, config.patch), cache
-
-
-def costs(config: VoxelRendererConfig, share: Share, frames: int, *, trained: bool) -> Costs:
-    """Return the costs of T frames, without the march of the rays."""
-    cells = config.patch**2 * (2 * config.latent_channels + config.features)
-    rays = config.height * config.width * config.rays**2 * config.places
-    folding = rays * config.kernel * config.embed * config.fold
-    return frame_costs.costs(
-        config.blocks,
-        PARTS,
-        share,
-        "renderer",
-        frames,
-        config.tokens,
-        ends=config.tokens * cells * config.blocks.width + folding,
-        trained=trained,
-    )

@@ -7,15 +7,13 @@ not, as in the reference's pipeline.
 from __future__ import annotations
 
 import dataclasses
-import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config.parts import Codec, Rules
 from pewm_jax.models.svd import vae as svd_vae
 from pewm_jax.models.svd.config import SVDVAEConfig
-from pewm_jax.nn.costs import Costs, Product, Share
 from pewm_jax.types import Array, Params
 
 PASSES = 60
@@ -63,38 +61,3 @@ class SVDVAECodec(SVDVAEConfig, Codec):
     def decode(self, params: Params, latents_BthwC: Array) -> Array:
         """Decode scaled latents to as many frames, all of a clip together."""
         return svd_vae.decode(self, params, latents_BthwC / self.scaling_factor)
-
-    def costs(self, model: Any, share: Share) -> Costs:
-        """Return the costs of encoding the clip and its first frame, and depth with ``depth``."""
-        clip = model.clip
-        kinds = 1 + self.depth
-        frames = kinds * (clip.frames + 1)
-        widest = clip.height * clip.width * self.widths[0] * share.activation_bytes
-        cells = clip.height * clip.width // self.spatial**2
-        attention = frames * 2 * cells**2 * self.widths[-1]
-        return Costs(
-            products=(
-                Product(
-                    "codec", "convolution", frames * _encode_macs(self, clip.height, clip.width)
-                ),
-                Product("codec", "attention", attention),
-            ),
-            streamed=PASSES * share.clips * frames * widest,
-            held=HELD * kinds * clip.frames * widest,
-        )
-
-
-def _encode_macs(config: SVDVAEConfig, height: int, width: int) -> float:
-    """Return the multiply-adds of the encoder's convolutions and linear layers, of one frame."""
-    total = 0.0
-    last = len(config.widths) - 1
-    for path, shape in svd_vae.layout(config).items():
-        if not (path.startswith("encoder/") and path.endswith("kernel")):
-            continue
-        name = path.split("/")[1]
-        level = int(name.removeprefix("down_")) if name.startswith("down_") else last
-        if name == "conv_in":
-            level = 0
-        halved = level + ("resample" in path)
-        total += (height >> halved) * (width >> halved) * math.prod(shape)
-    return total

@@ -24,7 +24,6 @@ from pewm_jax.config import EgoWMConfig, EgoWMTrainConfig, TrainSettings
 from pewm_jax.types import Array, Clip, Control, Frames, Params, WorldState
 from pewm_jax.worlds import chunks, objective, sampling, world_model
 from pewm_jax.worlds.control import control_of
-from pewm_jax.worlds.pewm import costs as pewm_costs
 from pewm_jax.worlds.pewm import world as pewm
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -32,7 +31,6 @@ memory_points, point_colours = pewm.memory_points, pewm.point_colours
 init = functools.partial(world_model.init, memory=False)
 sharding = pewm.sharding
 split_heads = pewm.split_heads
-costs = pewm_costs.costs
 
 
 def loss(

@@ -12,13 +12,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import rgbd
-from pewm_jax.config import Config, PersistConfig, PersistTrainConfig, TrainSettings
+from pewm_jax.config import PersistConfig, PersistTrainConfig, TrainSettings
 from pewm_jax.geometry.march import RayHits
-from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.models.persist import nets as persist_nets
-from pewm_jax.models.persist.costs import voxel_vae_costs as vae_costs
-from pewm_jax.nn.costs import Costs, Share
+from pewm_jax.models.persist import voxel_vae
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.persist import classes as persist_classes
 from pewm_jax.worlds.persist import losses
@@ -181,25 +178,3 @@ STAGES = (
 )
 """The stages, in order. The codec of pictures is given (``train.start``): the world ``codec``
 trains it."""
-
-
-def costs(config: Config, stage: Stage, share: Share) -> dict[str, Costs]:
-    """Return the costs of one device by network."""
-    model = config.model
-    nets, frames = model.backbone, model.clip.frames
-    if stage.number <= 2:
-        made = vae_costs(nets.voxel_vae, share, GRIDS, trained=stage.number == 1)
-        return {"voxel_vae": made}
-    if stage.name == "camera":
-        return {"camera_model": camera_model.costs(nets.camera_model, share, frames, trained=True)}
-    found = {"codec": model.codec.costs(model, share)}
-    if stage.name == "renderer":
-        made = voxel_renderer.costs(nets.renderer, share, frames, trained=True)
-        if nets.renderer.drawn:  # the drawn voxels are encoded, too
-            found["drawn"] = rgbd.costs_of_images(model, share, 2 * frames, "codec")
-        return found | {"renderer": made}
-    pixels = nets.renderer.height * nets.renderer.width
-    return found | {
-        "voxel_vae": vae_costs(nets.voxel_vae, share, frames, trained=False),
-        "voxel_dit": voxel_dit.costs(nets.world_frames, share, frames, pixels, trained=True),
-    }

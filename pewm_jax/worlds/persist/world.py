@@ -37,7 +37,6 @@ from pewm_jax.worlds.stages import Stage
 memory_points, point_colours = pewm.memory_points, pewm.point_colours
 erase, move = pewm.erase, pewm.move
 init = persist_stages.init
-costs = persist_stages.costs
 START = 0
 """Seed of the noise from which the voxels of real frames are made."""
 

@@ -24,7 +24,6 @@ from pewm_jax.memory import views as memory_views
 from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, WorldState
 from pewm_jax.worlds import chunks, objective, sampling, world_model
 from pewm_jax.worlds.control import control_of
-from pewm_jax.worlds.pewm import costs as pewm_costs
 from pewm_jax.worlds.pewm import gate as pewm_gate
 from pewm_jax.worlds.pewm import many as pewm_many
 from pewm_jax.worlds.pewm import views as pewm_views
@@ -35,7 +34,6 @@ sample = sampling.sample
 imagine_many = pewm_many.imagine_many
 to_compare = pewm_many.to_compare
 views = pewm_views.views
-costs = pewm_costs.costs
 
 STAGES = (
     Stage(
