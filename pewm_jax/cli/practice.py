@@ -58,9 +58,9 @@ def main(argv: Sequence[str], prog: str = "pewm-jax practice") -> int:
     # Imported here and not above: help and refusals come at once.
     from pewm_jax.planning.practice import Practice
     from pewm_jax.studies import practice
-    from pewm_jax.studies.practice_piece import Errand
+    from pewm_jax.studies.practice_piece import PracticeConfig
 
-    errand = Errand(
+    errand = PracticeConfig(
         houses=settings.houses,
         tasks=settings.tasks,
         practice=Practice(walks=settings.walks, blocks=settings.blocks),

@@ -93,7 +93,7 @@ def main(argv: Sequence[str], prog: str = "pewm-jax table2") -> int:
     shared = ("tasks", "houses", "proposals", "policy", "cost", "videos", "multiples", "none")
     chosen = {name: getattr(settings, name) for name in shared}
     chosen["policy"], policy = _policy(settings.policy)
-    errand = table2.Errand(plan=plan, **chosen)
+    errand = table2.Table2Config(plan=plan, **chosen)
     cost = costs.perceptual() if settings.cost == "lpips" else costs.Pixels()
     cli.cache_compilation(settings.out)
     page = table2.run(settings.model, settings.out, errand, policy, cost)
@@ -103,12 +103,12 @@ def main(argv: Sequence[str], prog: str = "pewm-jax table2") -> int:
 
 def _policy(name: str) -> tuple[str, Callable[..., Any]]:
     """Return what the decisions of a policy are kept under, and the policy."""
-    from pewm_jax.studies import deciders, policies
+    from pewm_jax.studies import deciders
 
     if name in deciders.POLICIES:
         return name, deciders.POLICIES[name]
-    if policies.is_run(name):
-        opened = policies.open_policy(name)
+    if deciders.is_run(name):
+        opened = deciders.open_policy(name)
         propose = deciders.nomad(opened.config.model.policy, opened.weights, opened.motion)
         return f"{Path(name).name}-{opened.digest[:8]}", propose
     module, _, function = name.partition(":")

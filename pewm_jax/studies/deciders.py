@@ -1,50 +1,57 @@
-"""How Table 2 decides: a policy alone, its proposals ranked, one plan, and plans in a closed loop.
+"""The methods of Table 2: a policy alone, its proposals ranked, one plan, and closed-loop planning.
 
-Each but the first needs a predictor of what would be seen:
+All but the first need a predictor of future observations:
 
 * ``empty``: the model with an empty memory;
-* ``none``: a model that was trained without memory, if one is given;
-* ``reproject``: no network, the pixels observed before moved to where the camera would look;
+* ``none``: a model that was trained without memory, if there is one;
+* ``reproject``: no network, observed pixels moved to the future camera;
 * ``memory``: the model with its memory;
-* ``truth``: the renderer itself, which bounds what any model can reach.
+* ``truth``: the renderer itself, an upper bound of any model.
 
-``mpc-…`` is one plan that is carried out whole (open loop; the name is that of decisions kept by
-earlier versions). ``loop-…`` is model predictive control: after each clip's actions the agent
-observes what is really seen, remembers it, and plans the rest anew.
+``mpc-…`` is one plan that is executed completely (open loop; decisions stored by earlier versions
+have this name). ``loop-…`` is model predictive control: after each clip's actions the agent
+observes the real frames, adds them to its memory, and plans the rest anew.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
+import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pewm_jax import config as configuration
 from pewm_jax import worlds
-from pewm_jax.config import ActionConfig, Config, UserError
+from pewm_jax.config import ActionConfig, Config, NomadWorldConfig, UserError
 from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.eval.reproject import ReprojectSettings, reproject
 from pewm_jax.geometry.actions import continuous, integrate
+from pewm_jax.io.store import file_hash
 from pewm_jax.planning import nomad_policy
 from pewm_jax.planning.candidates import Imagination, Judged, Rollout
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.plan import plan
 from pewm_jax.planning.ranking import rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig
-from pewm_jax.studies.goals import Asked, Goal, wander
+from pewm_jax.studies.goals import Goal, TaskInput, wander
+from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.types import Camera, Frames, Params
+from pewm_jax.worlds.rollouts import load_finished
 
-MINDS = ("empty", "reproject", "memory", "truth")
+PREDICTORS = ("empty", "reproject", "memory", "truth")
 NONE = "none"
 REPROJECTION = ReprojectSettings(footprint=2)
 """How ``reproject`` draws: what ``pewm-jax evaluate small`` chose on the validation split of its
 data."""
-Policy: TypeAlias = Callable[[Asked, int], np.ndarray]
-"""``policy(asked, count) -> (count, N)`` discrete actions: proposals, the policy's own choice
+Policy: TypeAlias = Callable[[TaskInput, int], np.ndarray]
+"""``policy(task, count) -> (count, N)`` discrete actions: proposals, the policy's own choice
 first."""
 
 
@@ -64,7 +71,7 @@ class Decision:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Minds:
+class Predictors:
     """The model under test, and the truth.
 
     Attributes:
@@ -79,38 +86,38 @@ class Minds:
     none: tuple[Config, Params] | None = dataclasses.field(default=None, repr=False)
 
     @property
-    def predictors(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:
         """The predictors, worst first as one would expect."""
-        return (MINDS[0], NONE, *MINDS[1:]) if self.none else MINDS
+        return (PREDICTORS[0], NONE, *PREDICTORS[1:]) if self.none else PREDICTORS
 
-    def rollout(self, mind: str, goal: Goal) -> Rollout:
+    def rollout(self, predictor: str, goal: Goal) -> Rollout:
         """Return what a predictor rolls candidates out with, from a task's start."""
-        return self.rollout_from(mind, self.begin(mind, goal), goal, goal.walk_T3[0])
+        return self.rollout_from(predictor, self.begin(predictor, goal), goal, goal.walk_T3[0])
 
-    def begin(self, mind: str, goal: Goal) -> Any:
+    def begin(self, predictor: str, goal: Goal) -> Any:
         """Return a predictor's state after a task's context was observed."""
-        if mind in ("truth", "reproject"):
+        if predictor in ("truth", "reproject"):
             return goal.context
-        return worlds.start(*self._model(mind), goal.context)
+        return worlds.start(*self._model(predictor), goal.context)
 
-    def observe(self, mind: str, state: Any, frames: Frames) -> Any:
+    def observe(self, predictor: str, state: Any, frames: Frames) -> Any:
         """Return a predictor's state after more real frames."""
-        if mind in ("truth", "reproject"):
+        if predictor in ("truth", "reproject"):
             return jax.tree.map(lambda *x: np.concatenate(x), state, frames)
-        return worlds.observe(*self._model(mind), state, frames)
+        return worlds.observe(*self._model(predictor), state, frames)
 
-    def rollout_from(self, mind: str, state: Any, goal: Goal, planar_3: np.ndarray) -> Rollout:
+    def rollout_from(self, predictor: str, state: Any, goal: Goal, planar_3: np.ndarray) -> Rollout:
         """Return what a predictor rolls candidates out with, from a place."""
-        if mind == "truth":
+        if predictor == "truth":
             return functools.partial(goal.seen, start_3=planar_3)
-        if mind == "reproject":
+        if predictor == "reproject":
             return Reprojection(self.config.model.actions, REPROJECTION, state)
-        config, params = self._model(mind)
+        config, params = self._model(predictor)
         key = jax.random.key(goal.number)
-        return Imagination(config, params, state, key, self.batch, memory=mind == "memory")
+        return Imagination(config, params, state, key, self.batch, memory=predictor == "memory")
 
-    def _model(self, mind: str) -> tuple[Config, Params]:
-        if mind != NONE:
+    def _model(self, predictor: str) -> tuple[Config, Params]:
+        if predictor != NONE:
             return self.config, self.params
         assert self.none is not None
         return self.none
@@ -147,27 +154,34 @@ def _reprojected(settings: ReprojectSettings, observed: Frames, moves_KN3: Any) 
     return jax.lax.map(one, moves_KN3)
 
 
-def names(proposals: tuple[int, ...], minds: tuple[str, ...] = MINDS) -> tuple[str, ...]:
+def method_names(
+    proposals: tuple[int, ...], predictors: tuple[str, ...] = PREDICTORS
+) -> tuple[str, ...]:
     """Return the methods of the table.
 
     Args:
         proposals: numbers of proposals that are ranked.
-        minds: the predictors.
+        predictors: the predictors.
     """
-    ranked = (f"rank{count}-{mind}" for count in proposals for mind in minds)
-    plans = (f"{what}-{mind}" for what in ("mpc", "loop") for mind in minds)
+    ranked = (f"rank{count}-{predictor}" for count in proposals for predictor in predictors)
+    plans = (f"{what}-{predictor}" for what in ("mpc", "loop") for predictor in predictors)
     return ("policy", *ranked, *plans)
 
 
 def decide(
-    name: str, goal: Goal, minds: Minds, policy: Policy, cost: FrameCost, config: PlanConfig
+    name: str,
+    goal: Goal,
+    predictors: Predictors,
+    policy: Policy,
+    cost: FrameCost,
+    config: PlanConfig,
 ) -> Decision:
     """Choose actions for a task.
 
     Args:
-        name: of ``names``.
+        name: of ``method_names``.
         goal: the task.
-        minds: what would be seen.
+        predictors: what would be seen.
         policy: makes proposals.
         cost: how far that is from the goal.
         config: of plans.
@@ -175,12 +189,12 @@ def decide(
     Raises:
         UserError: a cost is no number.
     """
-    what, _, mind = name.partition("-")
+    what, _, predictor = name.partition("-")
     if what == "policy":
         return Decision(proposed(policy, goal, 1)[0])
     if what == "loop":
-        return _closed_loop(mind, goal, minds, cost, config)
-    rollout = minds.rollout(mind, goal)
+        return _closed_loop(predictor, goal, predictors, cost, config)
+    rollout = predictors.rollout(predictor, goal)
     if what.startswith("rank"):
         proposals = proposed(policy, goal, int(what.removeprefix("rank")))
         ranking = rank_by(rollout, proposals, cost, goal.frame)
@@ -192,7 +206,7 @@ def decide(
 
 
 def _closed_loop(
-    mind: str, goal: Goal, minds: Minds, cost: FrameCost, config: PlanConfig
+    predictor: str, goal: Goal, predictors: Predictors, cost: FrameCost, config: PlanConfig
 ) -> Decision:
     """Plan, carry out one clip's actions, observe, and plan the rest anew.
 
@@ -200,14 +214,14 @@ def _closed_loop(
     correct once more, by one clip, if that is foreseen to cost less than what is seen now. It is
     never told whether it is at the goal.
     """
-    clip = minds.config.model.clip.frames - 1
-    state, planar = minds.begin(mind, goal), goal.walk_T3[0]
+    clip = predictors.config.model.clip.frames - 1
+    state, planar = predictors.begin(predictor, goal), goal.walk_T3[0]
     total, done, foreseen = len(goal.expert_N), list[int](), float("nan")
     present = jax.tree.map(lambda x: x[-1:], goal.context)
     while len(done) < total + clip:
         here = float(np.asarray(cost(jax.tree.map(lambda x: x[None], present), goal.frame))[0])
         horizon = max(total - len(done), clip)
-        judged = Judged(minds.rollout_from(mind, state, goal, planar), cost, goal.frame)
+        judged = Judged(predictors.rollout_from(predictor, state, goal, planar), cost, goal.frame)
         key = jax.random.fold_in(jax.random.key(goal.number), len(done))
         found = plan(
             CEM(),
@@ -222,7 +236,7 @@ def _closed_loop(
         chosen = np.asarray(found.actions)[:clip]
         walk = goal.walked(chosen, planar)
         seen = goal.simulator.frames(walk[1:])
-        state, planar = minds.observe(mind, state, seen), walk[-1]
+        state, planar = predictors.observe(predictor, state, seen), walk[-1]
         present = jax.tree.map(lambda x: x[-1:], seen)
         done += [int(action) for action in chosen]
     return Decision(np.array(done), foreseen)
@@ -251,21 +265,21 @@ def proposed(policy: Policy, goal: Goal, count: int) -> np.ndarray:
     Raises:
         UserError: they have another shape, or are no discrete actions.
     """
-    asked = goal.asked
-    proposals = np.asarray(policy(asked, count))
-    known = proposals.dtype.kind in "iu" and proposals.shape == (count, asked.actions)
+    task = goal.input
+    proposals = np.asarray(policy(task, count))
+    known = proposals.dtype.kind in "iu" and proposals.shape == (count, task.actions)
     if not known or not ((proposals >= 0) & (proposals < len(goal.table_A3))).all():
         raise UserError(
             f"the policy proposed {proposals.dtype} of shape {proposals.shape} for {goal.house}: "
-            f"give ({count}, {asked.actions}) whole numbers below {len(goal.table_A3)}."
+            f"give ({count}, {task.actions}) whole numbers below {len(goal.table_A3)}."
         )
     return proposals
 
 
-def wanderer(asked: Asked, count: int, *, seed: int = 0) -> np.ndarray:
+def wanderer(task: TaskInput, count: int, *, seed: int = 0) -> np.ndarray:
     """Propose walks that know nothing; see ``goals.wander``. A ``Policy``."""
-    rng = np.random.default_rng((seed, asked.number))
-    return np.stack([wander(rng, asked.actions) for _ in range(count)])
+    rng = np.random.default_rng((seed, task.number))
+    return np.stack([wander(rng, task.actions) for _ in range(count)])
 
 
 def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Policy:
@@ -277,20 +291,74 @@ def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Policy:
         motion: what an action does.
     """
 
-    def propose(asked: Asked, count: int) -> np.ndarray:
-        if asked.actions > config.waypoints:
+    def propose(task: TaskInput, count: int) -> np.ndarray:
+        if task.actions > config.waypoints:
             raise UserError(
-                f"NoMaD proposes {config.waypoints} waypoints, and {asked.actions} actions are "
+                f"NoMaD proposes {config.waypoints} waypoints, and {task.actions} actions are "
                 "asked for: use a shorter --horizon."
             )
-        seen = nomad_policy.history(config, np.asarray(asked.context.rgb_THWC))
-        key = jax.random.key(asked.number)
-        goal = np.asarray(asked.frame.rgb_THWC)[0]
+        seen = nomad_policy.history(config, np.asarray(task.context.rgb_THWC))
+        key = jax.random.key(task.number)
+        goal = np.asarray(task.frame.rgb_THWC)[0]
         ways = nomad_policy.propose(config, params, seen, goal, key, count)
-        return nomad_policy.discrete(motion, np.asarray(ways)[:, : asked.actions])
+        return nomad_policy.discrete(motion, np.asarray(ways)[:, : task.actions])
 
     return propose
 
 
 POLICIES: Mapping[str, Policy] = {"wander": functools.partial(wanderer)}
 """Policies by name; another is named MODULE:FUNCTION, or by the folder of a trained NoMaD."""
+
+
+SETTINGS = "config.json"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LoadedPolicy:
+    """A trained NoMaD.
+
+    Attributes:
+        folder: of its run.
+        config: of its training.
+        weights: the policy's parameters.
+        digest: of weights and settings, see ``model_digest``.
+    """
+
+    folder: Path
+    config: Config
+    weights: Params = dataclasses.field(repr=False)
+    digest: str
+
+    @property
+    def motion(self) -> ActionConfig:
+        """What an action of its walks does."""
+        return self.config.model.actions
+
+
+def model_digest(weights_hash: str, config: Config) -> str:
+    """Return a hash of all that what a model does depends on: its weights and its settings."""
+    settings = json.dumps(configuration.to_dict(config.model), sort_keys=True)
+    return hashlib.sha256((weights_hash + settings).encode()).hexdigest()
+
+
+def is_run(name: str | Path) -> bool:
+    """Tell whether a name is a folder with settings of a training."""
+    return (Path(name) / SETTINGS).is_file()
+
+
+def open_policy(name: str | Path) -> LoadedPolicy:
+    """Open the run of a NoMaD.
+
+    Raises:
+        UserError: there is no such run, it is damaged or not finished, or it trained another kind
+            of model.
+    """
+    folder = Path(name)
+    if not is_run(folder):
+        raise UserError(f"{folder} holds no run: train a policy first (pewm-jax train nomad).")
+    config, params = load_finished(folder)
+    if not isinstance(config.model, NomadWorldConfig):
+        raise UserError(f"{folder} trained no policy: name the run of one (pewm-jax train nomad).")
+    return LoadedPolicy(
+        folder, config, params["policy"], model_digest(file_hash(folder / WEIGHTS), config)
+    )

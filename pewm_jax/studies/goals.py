@@ -29,8 +29,8 @@ TEST = 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Asked:
-    """What a policy is told of a task.
+class TaskInput:
+    """What a policy knows of a task.
 
     Attributes:
         number: of the task, to draw from.
@@ -75,9 +75,9 @@ class Goal:
         return self.simulator.scene.name
 
     @property
-    def asked(self) -> Asked:
-        """What a policy may know of it."""
-        return Asked(self.number, len(self.expert_N), self.context, self.frame)
+    def input(self) -> TaskInput:
+        """What a policy knows of it."""
+        return TaskInput(self.number, len(self.expert_N), self.context, self.frame)
 
     def walked(self, actions_N: np.ndarray, start_3: np.ndarray | None = None) -> np.ndarray:
         """Return the poses (N + 1, 3) that actions lead through, from the start; walls hold."""

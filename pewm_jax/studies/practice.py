@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,14 @@ from pewm_jax.eval import intervals
 from pewm_jax.eval.loaded_run import LoadedRun, has_memory, open_run
 from pewm_jax.io import atomic
 from pewm_jax.io.progress import Meter
+from pewm_jax.io.store import TABLE, ResultCache, require_same_inputs
 from pewm_jax.planning import practice
 from pewm_jax.planning.practice import Place, Walk
-from pewm_jax.studies import kept, policies, practice_page, practice_piece
+from pewm_jax.report import pictures
+from pewm_jax.report.table import Cell, Table
+from pewm_jax.studies import practice_piece
+from pewm_jax.studies.deciders import LoadedPolicy, model_digest, open_policy
 from pewm_jax.studies.goals import Goal
-from pewm_jax.studies.policies import OpenedPolicy, open_policy
 from pewm_jax.studies.practice_piece import (
     BEFORE,
     CHANCE,
@@ -35,26 +38,46 @@ from pewm_jax.studies.practice_piece import (
     ROWS,
     WITHIN_DEG,
     WITHIN_M,
-    Errand,
+    PracticeConfig,
     act_of,
     open_home,
     place_of,
 )
+from pewm_jax.studies.table2_page import score_cells
 
 Log = Callable[[str], Any]
 DECIDED_BY, LEVEL = "success", 0.01
 """The score by which practice in the house itself has to beat chance before worlds are compared,
 and the level of that test."""
+COLUMNS: Mapping[str, tuple[str, int]] = {
+    "success": ("success, %", 1),
+    "spl": ("SPL, %", 1),
+    "nearest": ("nearest to the goal, m", 2),
+    "sim": ("SIM at the end, %", 1),
+}
+"""Score → heading, decimals."""
+LABELS = {
+    "chance": "walking without looking",
+    "before": "before practice",
+    "memory": "practised in the world, with its memory",
+    "empty": "practised in the world, empty memory",
+    "real": "practised in the house itself",
+}
+SHOWN_PLACES = {"real": "the house itself", "memory": "with its memory", "empty": "empty memory"}
+SHOWN = 11
+"""Pictures of a walk."""
 
 
-def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, log: Log = print) -> Path:
+def run(
+    model: str | Path, policy: str | Path, out: Path, study: PracticeConfig, log: Log = print
+) -> Path:
     """Let a policy practise in every house, and measure it before and after.
 
     Args:
         model: a run folder, or the name of weights that come with the library.
         policy: the run of a NoMaD.
         out: the folder that everything is kept in; the same call goes on.
-        errand: the settings.
+        study: the settings.
         log: shows a line.
 
     Returns:
@@ -65,27 +88,28 @@ def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, log: L
             folder holds pieces of other settings.
     """
     world, begun = open_run(model), open_policy(policy)
-    _require_fit(world, begun, errand, model, policy)
-    about = dataclasses.asdict(errand) | {
-        "weights": policies.digest(world.weights_hash, world.config),
+    _require_fit(world, begun, study, model, policy)
+    about = dataclasses.asdict(study) | {
+        "weights": model_digest(world.weights_hash, world.config),
         "policy": begun.digest,
     }
-    kept.require_same(out, about, ("houses", "seeds", "shown"), "pieces")
+    require_same_inputs(out, about, "pieces", ("houses", "seeds", "shown"))
+    cache = ResultCache(out, TABLE)
     pieces = [
-        (house, seed, how)
-        for house in range(errand.houses)
-        for seed in errand.seeds
-        for how in ROWS
+        (house, seed, how) for house in range(study.houses) for seed in study.seeds for how in ROWS
     ]
     made: dict[str, list[dict[str, Any]]] = {how: [] for how in ROWS}
     with Meter("practising", len(pieces), "pieces") as meter:
         for house, seed, how in pieces:
-            folder = out / f"house{house:04d}" / f"{how}-seed{seed}"
-            piece = kept.read(folder / "scores.json")
-            if piece is None:
-                home = open_home(errand, world.config, house)
-                piece = practice_piece.make(world, begun, home, errand, how, seed, folder)
-                kept.write(folder / "scores.json", piece)
+            name = f"house{house:04d}/{how}-seed{seed}"
+
+            def make(
+                house: int = house, seed: int = seed, how: str = how, name: str = name
+            ) -> dict[str, Any]:
+                home = open_home(study, world.config, house)
+                return practice_piece.make(world, begun, home, study, how, seed, out / name)
+
+            piece = cache.compute(f"{name}/scores", make)
             made[how].append(piece)
             meter.advance(1)
     log(meter.summary())
@@ -97,15 +121,19 @@ def run(model: str | Path, policy: str | Path, out: Path, errand: Errand, log: L
     atomic.write_text(out / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
     page = out / "practice.md"
     shown = [
-        (home.house, {how: _first_walk(place, home, begun, errand) for how, place in there.items()})
-        for home, there in _places_shown(world, errand)
+        (home.house, {how: _first_walk(place, home, begun, study) for how, place in there.items()})
+        for home, there in _places_shown(world, study)
     ]
-    practice_page.write(results, page, shown)
+    write_page(results, page, shown)
     return page
 
 
 def _require_fit(
-    world: LoadedRun, begun: OpenedPolicy, errand: Errand, model: str | Path, policy: str | Path
+    world: LoadedRun,
+    begun: LoadedPolicy,
+    study: PracticeConfig,
+    model: str | Path,
+    policy: str | Path,
 ) -> None:
     """Refuse what would end later, and in words that do not help."""
     if not has_memory(world):
@@ -124,24 +152,26 @@ def _require_fit(
             f"{policy} takes other steps than {model} imagines ({begun.motion} and "
             f"{world.config.model.actions}): train one of them with the other's actions."
         )
-    frames = 1 + errand.practice.blocks * begun.config.model.policy.waypoints
+    frames = 1 + study.practice.blocks * begun.config.model.policy.waypoints
     if frames < own.frames:
         raise UserError(
-            f"walks of {errand.practice.blocks} blocks have {frames} frames, and {policy} learns "
+            f"walks of {study.practice.blocks} blocks have {frames} frames, and {policy} learns "
             f"from clips of {own.frames}: use more --blocks."
         )
 
 
-def _places_shown(world: LoadedRun, errand: Errand) -> Iterator[tuple[Goal, dict[str, Place]]]:
-    for house in range(min(errand.shown, errand.houses)):
-        home = open_home(errand, world.config, house)
+def _places_shown(
+    world: LoadedRun, study: PracticeConfig
+) -> Iterator[tuple[Goal, dict[str, Place]]]:
+    for house in range(min(study.shown, study.houses)):
+        home = open_home(study, world.config, house)
         motion = world.config.model.actions
         yield home, {how: place_of(world, home, motion, how) for how in (REAL, MEMORY, EMPTY)}
 
 
-def _first_walk(place: Place, home: Goal, begun: OpenedPolicy, errand: Errand) -> Walk:
-    seed = errand.seeds[0]
-    return next(practice.walks(place, home.context, act_of(begun), errand.practice, seed))
+def _first_walk(place: Place, home: Goal, begun: LoadedPolicy, study: PracticeConfig) -> Walk:
+    seed = study.seeds[0]
+    return next(practice.walks(place, home.context, act_of(begun), study.practice, seed))
 
 
 def power(practised_C: np.ndarray, chance_C: np.ndarray, houses_C: np.ndarray) -> float | None:
@@ -214,3 +244,92 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
         "houses": len(set(houses.tolist())),
         "tasks": len(houses),
     }
+
+
+def write_page(
+    results: Mapping[str, Any], page: Path, shown: Sequence[tuple[str, Mapping[str, Walk]]]
+) -> None:
+    """Write the table as ``page`` (Markdown), and its picture beside it."""
+    atomic.write_text(page, markdown(results, page.stem if shown else ""))
+    if shown:
+        pictures.save_png(page.with_suffix(".png"), picture(shown))
+
+
+def markdown(results: Mapping[str, Any], stem: str) -> str:
+    """Return the page."""
+    headings = [heading for heading, _ in COLUMNS.values()]
+    rows = [[LABELS[how], *score_cells(COLUMNS, row)] for how, row in results["rows"].items()]
+    gains = [
+        [f"{LABELS[one]} − {LABELS[other]}", *score_cells(COLUMNS, entries, sign=True)]
+        for (one, other), entries in (
+            (name.split(" - "), entries) for name, entries in results["differences"].items()
+        )
+    ]
+    walked = [
+        [LABELS[how], Cell(found["forward"], 1), Cell(found["through_walls"], 1)]
+        for how, found in results["walked"].items()
+    ]
+    about = results["about"]
+    drill = about["practice"]
+    how = (
+        f"{about['model']}; NoMaD; {results['houses']} held-out houses, {about['tasks']} goals in "
+        f"each, {len(about['seeds'])} seed(s). In each house the policy begins with the same few "
+        f"pictures, walks {drill['walks']} times ({drill['blocks']} proposals each) and learns "
+        f"{about['steps']} steps from these walks alone. Then it is sent to goals "
+        f"{about['actions']} actions away, and may take {about['most']}; it is stopped at the "
+        f"first moment within {about['within_m']:g} m and {about['within_deg']:g}° of the goal, "
+        "which is success (it need not know that it is there). Means over houses; ± is half of "
+        f"the 95 % interval (bootstrap over houses). {about['date']}."
+    )
+    parts = [
+        "# Practice in imagination",
+        how,
+        _power(results),
+        Table.of(["", *headings], rows).markdown(),
+    ]
+    if results.get("power", {}).get("compares", False):
+        table = Table.of(["", *headings], gains).markdown()
+        parts.append(f"## Differences\n\nPaired by goal and seed.\n\n{table}")
+    table = Table.of(["", "forward", "through walls"], walked).markdown()
+    parts.append(
+        "## What it learned from\n\nOf the actions of its walks in per cent, how many went "
+        f"forward, and of these how many through real walls.\n\n{table}"
+    )
+    if stem:
+        parts.append(f"## What it saw\n\n![Walks in the house and in the world]({stem}.png)")
+    return "\n\n".join(parts) + "\n"
+
+
+def _power(results: Mapping[str, Any]) -> str:
+    """Return whether the task can tell worlds apart, or that it was not tested."""
+    test = results.get("power")
+    if test is None:  # results of version 0.1, which holds no score of each goal
+        one, other = (results["rows"][how]["success"]["mean"] for how in ("real", "chance"))
+        return (
+            f"**Practice in the house itself reaches {one:.1f} % of the goals, walking without "
+            f"looking {other:.1f} %. That one beats the other was not tested, and no comparison "
+            "between worlds is drawn.**"
+        )
+    if test["p"] is None:
+        return "One house gives no p value: no comparison is drawn."
+    words = (
+        f"Practice in the house itself against walking without looking: p = {test['p']:.2g} "
+        f"(one-sided, {COLUMNS[test['metric']][0]}, bootstrap over houses)."
+    )
+    if test["compares"]:
+        return f"{words} Below {test['level']:g}: the task can tell worlds apart."
+    return (
+        f"**{words} Not below {test['level']:g}: the task has no power, since even practice in the "
+        "house itself does not beat chance. No comparison between worlds is drawn from it.**"
+    )
+
+
+def picture(shown: Sequence[tuple[str, Mapping[str, Walk]]]) -> np.ndarray:
+    """Return the first walk of each house, seen in each place, as rows; (H, W, 3) uint8."""
+    rows = []
+    for house, walks in shown:
+        for how, words in SHOWN_PLACES.items():
+            rgb = np.asarray(walks[how].frames.rgb_THWC)
+            picked = np.linspace(0, len(rgb) - 1, min(SHOWN, len(rgb))).round().astype(int)
+            rows.append((f"{house}, {words}", list(rgb[picked])))
+    return pictures.grid(rows, [""] * len(rows[0][1]))

@@ -27,8 +27,8 @@ from pewm_jax.geometry.actions import FORWARD, discrete_table
 from pewm_jax.planning import practice, scores
 from pewm_jax.planning.practice import Act, Imagined, Place, Practice, Real, Walk
 from pewm_jax.studies import goals
+from pewm_jax.studies.deciders import LoadedPolicy, open_policy
 from pewm_jax.studies.goals import Goal
-from pewm_jax.studies.policies import OpenedPolicy, open_policy
 from pewm_jax.train import loop
 
 CHANCE, BEFORE, REAL, MEMORY, EMPTY = "chance", "before", "real", "memory", "empty"
@@ -40,7 +40,7 @@ ROWS = (CHANCE, BEFORE, *LEARNED)
 
 
 @dataclasses.dataclass(frozen=True)
-class Errand:
+class PracticeConfig:
     """The settings of the study.
 
     Attributes:
@@ -86,9 +86,9 @@ class Errand:
 
 def make(
     world: LoadedRun,
-    begun: OpenedPolicy,
+    begun: LoadedPolicy,
     home: Goal,
-    errand: Errand,
+    study: PracticeConfig,
     how: str,
     seed: int,
     folder: Path,
@@ -99,7 +99,7 @@ def make(
         world: the world that imagines the house.
         begun: the policy before it practises.
         home: the house, and what was seen of it.
-        errand: the settings.
+        study: the settings.
         how: one of ``ROWS``.
         seed: of practice and training.
         folder: where its walks and its training are kept.
@@ -112,9 +112,9 @@ def make(
     if how == CHANCE:
         act = _by_chance(begun.config.model.policy.waypoints)
     elif how != BEFORE:
-        act = act_of(_learned(world, begun, home, errand, how, seed, folder))
+        act = act_of(_learned(world, begun, home, study, how, seed, folder))
         piece["walked"] = _walked(folder / "data" / "train", home)
-    return piece | {"tasks": _measured(home, act, errand, seed)}
+    return piece | {"tasks": _measured(home, act, study, seed)}
 
 
 def _by_chance(count: int) -> Act:
@@ -144,12 +144,12 @@ def _walked(folder: Path, home: Goal) -> dict[str, float]:
     }
 
 
-def open_home(errand: Errand, config: Config, house: int) -> Goal:
+def open_home(study: PracticeConfig, config: Config, house: int) -> Goal:
     """Return the first task of a house, whose context is what the agent has seen of it."""
     return goals.open_goal(
         house,
-        houses=errand.houses,
-        actions=errand.actions,
+        houses=study.houses,
+        actions=study.actions,
         context=config.data.context,
         motion=config.model.actions,
         size=config.model.clip.height,
@@ -163,29 +163,29 @@ def place_of(world: LoadedRun, home: Goal, motion: ActionConfig, how: str) -> Pl
     return Imagined(world.config, world.params, home.context, memory=how == MEMORY)
 
 
-def act_of(policy: OpenedPolicy) -> Act:
+def act_of(policy: LoadedPolicy) -> Act:
     """Return a policy as practice and goals ask it."""
     return practice.nomad(policy.config.model.policy, policy.weights, policy.motion)
 
 
 def _learned(
     world: LoadedRun,
-    begun: OpenedPolicy,
+    begun: LoadedPolicy,
     home: Goal,
-    errand: Errand,
+    study: PracticeConfig,
     how: str,
     seed: int,
     folder: Path,
-) -> OpenedPolicy:
+) -> LoadedPolicy:
     """Let the policy practise, and return what it has become."""
     place = place_of(world, home, begun.motion, how)
-    _collect(folder / "data" / "train", place, home, begun, errand, seed)
+    _collect(folder / "data" / "train", place, home, begun, study, seed)
     config = begun.config
     stage = dataclasses.replace(
         config.train.policy,  # type: ignore[attr-defined]
-        steps=errand.steps,
-        learning_rate=errand.learning_rate,
-        warmup=min(config.train.policy.warmup, errand.steps // 10),  # type: ignore[attr-defined]
+        steps=study.steps,
+        learning_rate=study.learning_rate,
+        warmup=min(config.train.policy.warmup, study.steps // 10),  # type: ignore[attr-defined]
     )
     shutil.rmtree(folder / "run", ignore_errors=True)  # half a training is begun anew: it is short
     train = dataclasses.replace(
@@ -198,19 +198,19 @@ def _learned(
 
 
 def _collect(
-    folder: Path, place: Place, home: Goal, begun: OpenedPolicy, errand: Errand, seed: int
+    folder: Path, place: Place, home: Goal, begun: LoadedPolicy, study: PracticeConfig, seed: int
 ) -> None:
     """Write the walks of a practice as a dataset, or find them written."""
-    settings = {"made_by": "practice", "seed": seed, **dataclasses.asdict(errand.practice)}
+    settings = {"made_by": "practice", "seed": seed, **dataclasses.asdict(study.practice)}
     state = resume.examine(folder, settings)
     if state == "complete":
         return
     path = folder / "shard-00000-of-00001.array_record"
-    done = resume.prepare(folder, settings, state, {path: errand.practice.walks})
+    done = resume.prepare(folder, settings, state, {path: study.practice.walks})
     table = discrete_table(begun.motion)
 
     def records() -> Iterator[bytes]:
-        walks = practice.walks(place, home.context, act_of(begun), errand.practice, seed)
+        walks = practice.walks(place, home.context, act_of(begun), study.practice, seed)
         for number, walk in enumerate(walks):
             yield _record(walk, table, f"{home.house}-{number:04d}", home.house)
 
@@ -233,22 +233,22 @@ def _record(walk: Walk, table_A3: np.ndarray, name: str, house: str) -> bytes:
     return write_episode(arrays, name, house, {"policy": "practice"})
 
 
-def _measured(home: Goal, act: Act, errand: Errand, seed: int) -> list[dict[str, float]]:
+def _measured(home: Goal, act: Act, study: PracticeConfig, seed: int) -> list[dict[str, float]]:
     """Send a policy to goals near the places that were seen, in the real house.
 
     It is stopped at the first moment within reach of the goal: it need not know that it is there.
     """
     scored = []
-    for task in goals.near(home, errand.tasks, errand.actions):
+    for task in goals.near(home, study.tasks, study.actions):
         walked = [task.walk_T3[0]]
         pictures = [task.context.rgb_THWC[-1:]]
         key = jax.random.fold_in(jax.random.key(seed), task.number)
         reached, waiting = False, np.zeros(0, int)
-        for number in range(errand.most):
+        for number in range(study.most):
             if not len(waiting):
                 seen = np.concatenate(pictures)
                 goal = np.asarray(task.frame.rgb_THWC)[0]
-                waiting = act(seen, goal, jax.random.fold_in(key, number))[: errand.replan]
+                waiting = act(seen, goal, jax.random.fold_in(key, number))[: study.replan]
             step = goals.walked(task.simulator, task.table_A3, walked[-1], waiting[:1])[-1]
             waiting = waiting[1:]
             walked.append(step)

@@ -1,7 +1,7 @@
-"""Table 1 by one command: which memory works? Everything is kept, and found again.
+"""Table 1 by one command: which memory works? Every finished piece is stored and reused.
 
-The order is: fix what is scored, time the trainings, then seed by seed train and score every row;
-after each seed the table is written, so that it is there early and grows more certain.
+The command fixes the protocol, times the trainings, and then trains and scores every row, seed by
+seed. It writes the table after each seed.
 """
 
 from __future__ import annotations
@@ -18,12 +18,18 @@ from typing import Any
 from pewm_jax.config import Config, ModelConfig, UserError
 from pewm_jax.eval import intervals
 from pewm_jax.io import atomic
-from pewm_jax.studies import recorded, table, table_page, timing
-from pewm_jax.studies import rows as table_rows
-from pewm_jax.studies.rows import Row
-from pewm_jax.studies.scorer import BASELINES, Arrays, Scorer, open_scorer
-from pewm_jax.studies.timing import planned
-from pewm_jax.studies.trainings import Study, backbone_of, settings, train
+from pewm_jax.studies import table1_numbers, table1_page, table1_rows, table1_training
+from pewm_jax.studies.table1_rows import Row
+from pewm_jax.studies.table1_scoring import (
+    BASELINES,
+    Arrays,
+    Scorer,
+    open_scorer,
+    read_recorded,
+    recorded_path,
+    write_recorded,
+)
+from pewm_jax.studies.table1_training import Study, backbone_of, planned, settings, train
 from pewm_jax.worlds.pewm.world import STAGES
 
 RESULTS, HOURS = "results.json", "hours.json"
@@ -91,12 +97,14 @@ def run(
                 group = pieces.setdefault(name, [])
                 if len(group) == number:
                     group.append(arrays)
-        numbers = table.summary(pieces, truth, scorer.house_of_clip, scorer.nets, scorer.frames)
+        numbers = table1_numbers.summary(
+            pieces, truth, scorer.house_of_clip, scorer.nets, scorer.frames
+        )
         facts = _facts(study, scorer, chosen, plan, seeds[: number + 1], ablation)
         results = {"schema": SCHEMA, "about": facts, **numbers}
         text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
         atomic.write_text(out / f"{title}-{RESULTS}", text + "\n")
-        table_page.write(results, page)
+        table1_page.write(results, page)
         log(f"{number + 1} of {len(seeds)} training seeds: {page}")
     return page
 
@@ -112,10 +120,10 @@ def _rows(
     if ablation and only:
         raise UserError("rows are of the table, and not of an ablation: leave them out.")
     if ablation:
-        return table_rows.ablated(base, ablation, values)
+        return table1_rows.ablated(base, ablation, values)
     if values:
         raise UserError("values are of an ablation: name one, or leave them out.")
-    every = table_rows.main_rows(base)
+    every = table1_rows.main_rows(base)
     unknown = sorted(set(only) - {row.name for row in every})
     if unknown:
         names = ", ".join(row.name for row in every)
@@ -131,8 +139,8 @@ def _one(
     What was recorded of it on another machine is taken, where nothing of it is here.
     """
     steps = {name: entry["steps"] for name, entry in plan.items()}
-    file = recorded.path(study, row, seed, steps, scorer.name)
-    before = recorded.read(file)
+    file = recorded_path(study, row, seed, steps, scorer.name)
+    before = read_recorded(file)
     if before is not None and not study.folder(row.name, seed).exists():
         log(f"{row.name}, training seed {seed}: its scores are recorded in {file.parent}")
         return before
@@ -144,7 +152,7 @@ def _one(
     if row.depth:
         first = settings(study, backbone_of(study.base, row), seed, plan[EMPTY]["steps"], start="")
         found[EMPTY] = scorer.row(first, memory=False)
-    recorded.write(file, found)
+    write_recorded(file, found)
     return found
 
 
@@ -188,7 +196,7 @@ def _facts(
             "paper": row.paper,
             "depth": row.depth,
             "times": row.times,
-            "parameters": table_rows.parameters(study.base, row.memory) if row.reads else 0,
+            "parameters": table1_rows.parameters(study.base, row.memory) if row.reads else 0,
             "settings": dataclasses.asdict(row.memory),
         }
         for row in rows
@@ -206,7 +214,7 @@ def _facts(
         "house": scorer.house,
         "frames": scorer.frames,
         "pixels": [study.base.model.clip.height, study.base.model.clip.width],
-        "clock": "processor" if timing.clock() is time.process_time else "wall",
+        "clock": "processor" if table1_training.clock() is time.process_time else "wall",
         "context": scorer.config.data.context,
         "batch": STAGES[0].settings(study.base).batch,
         "left_out": dict(scorer.left_out),

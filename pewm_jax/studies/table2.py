@@ -1,12 +1,13 @@
 """Table 2 by one command: does a world model help to decide, and does its memory?
 
-Every method meets the same tasks. A finished decision is a file; the same command goes on.
+Every method gets the same tasks. Every decision is a file, so the same command resumes.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+import functools
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -20,11 +21,12 @@ from pewm_jax.eval import intervals
 from pewm_jax.eval.loaded_run import LoadedRun, has_memory, open_run
 from pewm_jax.io import atomic
 from pewm_jax.io.progress import Meter
+from pewm_jax.io.store import TABLE, ResultCache, require_same_inputs
 from pewm_jax.planning import scores
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.settings import PlanConfig
-from pewm_jax.studies import deciders, kept, policies, table2_page
-from pewm_jax.studies.deciders import Minds, Policy
+from pewm_jax.studies import deciders, table2_page
+from pewm_jax.studies.deciders import Policy, Predictors
 from pewm_jax.studies.goals import Goal, open_goal
 from pewm_jax.types import Params
 
@@ -35,7 +37,7 @@ Log = Callable[[str], Any]
 
 
 @dataclasses.dataclass(frozen=True)
-class Errand:
+class Table2Config:
     """The settings of a table.
 
     Attributes:
@@ -64,7 +66,7 @@ class Errand:
 def run(
     model: str | Path,
     out: Path,
-    errand: Errand,
+    study: Table2Config,
     policy: Policy,
     cost: FrameCost,
     log: Log = print,
@@ -74,7 +76,7 @@ def run(
     Args:
         model: a run folder, or the name of weights that come with the library.
         out: the folder that everything is kept in.
-        errand: the settings.
+        study: the settings.
         policy: that of their name.
         cost: that of their name.
         log: shows a line.
@@ -90,39 +92,42 @@ def run(
     config, params = opened.config, opened.params
     if not has_memory(opened):
         raise UserError(f"{model} has no memory, and what a memory adds is the question.")
-    if errand.plan.actions % (config.model.clip.frames - 1):
+    if study.plan.actions % (config.model.clip.frames - 1):
         raise UserError(
-            f"plans have {errand.plan.actions} actions, and {model} imagines "
+            f"plans have {study.plan.actions} actions, and {model} imagines "
             f"{config.model.clip.frames - 1} frames at once: use a multiple."
         )
-    about = dataclasses.asdict(errand) | {"weights": policies.digest(opened.weights_hash, config)}
+    about = dataclasses.asdict(study) | {
+        "weights": deciders.model_digest(opened.weights_hash, config)
+    }
     if config.model.clip.height != config.model.clip.width:
         size = f"{config.model.clip.width}×{config.model.clip.height}"
         raise UserError(f"{model} imagines pictures of {size}, and Table 2 needs square ones.")
-    kept.require_same(out, about, ADDED, "decisions")
-    none = open_run(errand.none) if errand.none else None
+    require_same_inputs(out, about, "decisions", ADDED)
+    cache = ResultCache(out, TABLE)
+    none = open_run(study.none) if study.none else None
     if none is not None:
-        _require_alike(none, opened, errand.none, model)
-    minds = Minds(config, params, none=(none.config, none.params) if none else None)
-    methods = deciders.names(errand.proposals, minds.predictors)
-    count = len(errand.multiples) * errand.tasks * len(methods)
+        _require_alike(none, opened, study.none, model)
+    predictors = Predictors(config, params, none=(none.config, none.params) if none else None)
+    methods = deciders.method_names(study.proposals, predictors.names)
+    count = len(study.multiples) * study.tasks * len(methods)
     by_distance: dict[int, dict[str, list[dict[str, Any]]]] = {}
     with Meter("deciding", count, "decisions") as meter:
-        for times in errand.multiples:
+        for times in study.multiples:
             made: dict[str, list[dict[str, Any]]] = {name: [] for name in methods}
-            by_distance[times * errand.plan.actions] = made
-            for number in range(errand.tasks):
+            by_distance[times * study.plan.actions] = made
+            for number in range(study.tasks):
                 goal: Goal | None = None
                 for name in methods:
                     if name == "policy" and times > 1:
                         meter.advance(1)
                         continue
-                    file = out / _folder(name, errand, times, none) / f"{number:04d}.json"
-                    found = kept.read(file)
-                    goal = goal or _goal(errand, config, number, times)
-                    if found is None:
-                        found = _decided(name, goal, minds, policy, cost, errand)
-                        kept.write(file, found)
+                    goal = goal or _goal(study, config, number, times)
+                    decide = functools.partial(
+                        _decided, name, goal, predictors, policy, cost, study
+                    )
+                    piece = f"{_folder(name, study, times, none)}/{number:04d}"
+                    found = cache.compute(piece, decide)
                     scores_here = _scored(goal, np.array(found["actions"]))
                     made[name].append(found | {"scores": scores_here})
                     meter.advance(1)
@@ -139,21 +144,21 @@ def run(
     }
     text = json.dumps(results, indent=1, allow_nan=False)
     atomic.write_text(out / "results.json", text + "\n")
-    videos = _videos(out, errand, config, params, made)
+    videos = _videos(out, study, config, params, made)
     page = out / "table2.md"
     table2_page.write(results, page, videos)
     return page
 
 
 ADDED = ("tasks", "videos", "policy", "proposals", "multiples", "none")
-"""Settings that may change from call to call: decisions of others are found again."""
+"""Settings that may change between calls: decisions do not depend on them, or name them."""
 
 
-def _folder(name: str, errand: Errand, times: int, none: LoadedRun | None) -> str:
+def _folder(name: str, study: Table2Config, times: int, none: LoadedRun | None) -> str:
     """Return the folder of a method's decisions; plans do not depend on the policy."""
     planned = name.startswith(("mpc", "loop"))
-    whose = "" if planned else f"{errand.policy.replace(':', '.')}/"
-    far = f"{times * errand.plan.actions}-actions/" if times > 1 else ""
+    whose = "" if planned else f"{study.policy.replace(':', '.')}/"
+    far = f"{times * study.plan.actions}-actions/" if times > 1 else ""
     own = f"-{none.weights_hash[:8]}" if none and name.endswith("-none") else ""
     return f"decisions/{far}{whose}{name}{own}"
 
@@ -170,11 +175,11 @@ def _require_alike(none: LoadedRun, opened: LoadedRun, name: str, model: str | P
         )
 
 
-def _goal(errand: Errand, config: Config, number: int, times: int = 1) -> Goal:
+def _goal(study: Table2Config, config: Config, number: int, times: int = 1) -> Goal:
     return open_goal(
         number,
-        houses=errand.houses,
-        actions=times * errand.plan.actions,
+        houses=study.houses,
+        actions=times * study.plan.actions,
         context=config.data.context,
         motion=config.model.actions,
         size=config.model.clip.height,
@@ -182,13 +187,18 @@ def _goal(errand: Errand, config: Config, number: int, times: int = 1) -> Goal:
 
 
 def _decided(
-    name: str, goal: Goal, minds: Minds, policy: Policy, cost: FrameCost, errand: Errand
+    name: str,
+    goal: Goal,
+    predictors: Predictors,
+    policy: Policy,
+    cost: FrameCost,
+    study: Table2Config,
 ) -> dict[str, Any]:
     """Return what a method chose, where it led, and how good that is."""
     began = time.perf_counter()
-    blocks = len(goal.expert_N) // errand.plan.action_block
-    config = dataclasses.replace(errand.plan, horizon=blocks)
-    choice = deciders.decide(name, goal, minds, policy, cost, config)
+    blocks = len(goal.expert_N) // study.plan.action_block
+    config = dataclasses.replace(study.plan, horizon=blocks)
+    choice = deciders.decide(name, goal, predictors, policy, cost, config)
     seconds = time.perf_counter() - began
     curve = {str(n): _scored(goal, actions)["sim"] for n, actions in choice.found.items()}
     return {
@@ -227,8 +237,8 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
     }
     memory = {}
     for name in made:
-        what, _, mind = name.partition("-")
-        if mind == "memory":
+        what, _, predictor = name.partition("-")
+        if predictor == "memory":
             other = values[f"{what}-empty"]
             memory[what] = {
                 m: intervals.entry(values[name][m] - other[m], houses) for m in values[name]
@@ -255,18 +265,18 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
 
 def _videos(
     out: Path,
-    errand: Errand,
+    study: Table2Config,
     config: Config,
     params: Params,
     made: Mapping[str, list[dict[str, Any]]],
 ) -> list[Path]:
     """Write videos of what was planned and what happened, side by side."""
     files = []
-    for number in range(min(errand.videos, errand.tasks)):
+    for number in range(min(study.videos, study.tasks)):
         actions = np.array(made["mpc-memory"][number]["actions"])
         file = out / f"plan{number}.mp4"
         if not file.exists():
-            goal = _goal(errand, config, number)
+            goal = _goal(study, config, number)
             table2_page.video(file, goal, config, params, actions)
         files.append(file)
     return files

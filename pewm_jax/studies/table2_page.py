@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from PIL import Image, ImageDraw
 
 from pewm_jax import worlds
 from pewm_jax.config import Config
 from pewm_jax.io import atomic
-from pewm_jax.report import pictures
+from pewm_jax.report.charts import METHOD_COLOURS, Line, LineChart
+from pewm_jax.report.table import Cell, Table, with_half_width
 from pewm_jax.report.video import encode_h264, side_by_side
 from pewm_jax.studies.goals import Goal
 from pewm_jax.types import Params
@@ -45,21 +42,15 @@ NOT_COMPARABLE = (
     "The paper does not say how far its goals are, nor what its SIM is; its policy is a NoMaD "
     "trained on its own walks. Only the order of the rows can be compared."
 )
-COLOURS = {
-    "empty": (232, 115, 26),
-    "none": (176, 60, 60),
-    "reproject": (46, 139, 87),
-    "memory": (31, 111, 235),
-    "truth": (90, 96, 105),
-}
 
 
 def write(results: Mapping[str, Any], page: Path, videos: Sequence[Path]) -> None:
     """Write the table as ``page`` (Markdown) and, beside it, .tex, .csv and .png."""
     atomic.write_text(page, markdown(results, page.stem, videos))
-    atomic.write_text(page.with_suffix(".tex"), latex(results))
-    atomic.write_text(page.with_suffix(".csv"), as_csv(results))
-    pictures.save_png(page.with_suffix(".png"), plot(results))
+    atomic.write_text(page.with_suffix(".tex"), scores_table(results).latex())
+    atomic.write_text(page.with_suffix(".csv"), numbers_table(results).csv())
+    with atomic.replacing(page.with_suffix(".png")) as partial:
+        partial.write_bytes(chart(results).png())
 
 
 def label(name: str) -> str:
@@ -81,30 +72,43 @@ def label(name: str) -> str:
     return f"ranking × {what.removeprefix('rank')} · {words[mind]}"
 
 
-def cell(entry: Mapping[str, Any], decimals: int, *, signed: bool = False) -> str:
-    """Return a mean with half of its interval, where there is one."""
-    sign = "+" if signed else ""
-    mean = f"{entry['mean']:{sign}.{decimals}f}"
-    if entry["low"] is None:
-        return mean
-    return f"{mean} ± {(entry['high'] - entry['low']) / 2:.{decimals}f}"
+def scores_table(results: Mapping[str, Any], *, seconds: bool = False) -> Table:
+    """Return the scores of one distance.
+
+    Args:
+        results: ``rows`` of the content of ``results.json``.
+        seconds: whether a column shows how long a decision takes.
+    """
+    header = ["method", *(heading for heading, _ in COLUMNS.values())]
+    rows = [
+        [
+            label(name),
+            *score_cells(COLUMNS, found),
+            *([Cell(found["seconds"])] if seconds else []),
+        ]
+        for name, found in results["rows"].items()
+    ]
+    return Table.of([*header, *(["seconds"] if seconds else [])], rows)
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table in Markdown."""
-    return "\n".join(f"| {' | '.join(x)} |" for x in (header, ["---"] * len(header), *rows))
+def score_cells(
+    columns: Mapping[str, tuple[str, int]], entries: Mapping[str, Any], *, sign: bool = False
+) -> list[Cell]:
+    """Return the cells of scores: score → heading, decimals."""
+    return [
+        with_half_width(entries[score], digits, sign=sign) for score, (_, digits) in columns.items()
+    ]
 
 
 def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> str:
     """Return the page."""
     headings = [heading for heading, _ in COLUMNS.values()]
-    rows = _rows(results)
     gains = [
         [
             label(f"{what}-memory").split(" · ", maxsplit=1)[0],
-            *(cell(by[m], digits, signed=True) for m, (_, digits) in COLUMNS.items()),
+            *score_cells(COLUMNS, entries, sign=True),
         ]
-        for what, by in results["memory_minus_empty"].items()
+        for what, entries in results["memory_minus_empty"].items()
     ]
     theirs = [
         [name, *("–" if value is None else f"{value:g}" for value in values)]
@@ -113,13 +117,13 @@ def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> s
     parts = [
         "# Table 2: does a world model help to decide, and does its memory?",
         _how(results),
-        table(["method", *headings, "seconds"], rows),
+        scores_table(results, seconds=True).markdown(),
         *_farther(results),
         "## What the memory adds\n\nWith memory minus empty, paired by task, 95 % intervals over "
-        "houses; of errors less is better.\n\n" + table(["method", *headings], gains),
+        "houses; of errors less is better.\n\n" + Table.of(["method", *headings], gains).markdown(),
         f"## The curve of planning\n\n![SIM against samples]({stem}.png)",
         "## Beside the paper\n\n"
-        + table(["", "ATE", "RPE", "SIM"], theirs)
+        + Table.of(["", "ATE", "RPE", "SIM"], theirs).markdown()
         + f"\n\n{NOT_COMPARABLE}",
     ]
     if videos:
@@ -128,23 +132,10 @@ def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> s
     return "\n\n".join(parts) + "\n"
 
 
-def _rows(results: Mapping[str, Any]) -> list[list[str]]:
-    """Return the rows of one distance."""
-    return [
-        [
-            label(name),
-            *(cell(row[m], digits) for m, (_, digits) in COLUMNS.items()),
-            f"{row['seconds']:.2f}",
-        ]
-        for name, row in results["rows"].items()
-    ]
-
-
 def _farther(results: Mapping[str, Any]) -> list[str]:
     """Return a section for each distance but the first."""
-    header = ["method", *(heading for heading, _ in COLUMNS.values()), "seconds"]
     return [
-        f"## Goals {actions} actions away\n\n{table(header, _rows(found))}"
+        f"## Goals {actions} actions away\n\n{scores_table(found, seconds=True).markdown()}"
         for actions, found in list(results.get("distances", {}).items())[1:]
     ]
 
@@ -166,92 +157,35 @@ def _how(results: Mapping[str, Any]) -> str:
     )
 
 
-def latex(results: Mapping[str, Any]) -> str:
-    """Return the table for LaTeX, with booktabs."""
-    heads = [heading.replace("%", r"\%") for heading, _ in COLUMNS.values()]
-    lines = [
-        r"\begin{tabular}{l" + "r" * len(COLUMNS) + "}",
-        r"\toprule",
-        " & ".join(["method", *heads]) + r" \\",
-        r"\midrule",
-    ]
-    for name, row in results["rows"].items():
-        cells = [cell(row[m], digits) for m, (_, digits) in COLUMNS.items()]
-        words = label(name).replace("·", "--").replace("×", r"$\times$")
-        lines.append(" & ".join([words, *(c.replace("±", r"$\pm$") for c in cells)]) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
-
-
-def as_csv(results: Mapping[str, Any]) -> str:
+def numbers_table(results: Mapping[str, Any]) -> Table:
     """Return every number, a line for each method and score."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["method", "score", "mean", "low", "high"])
-    for name, row in results["rows"].items():
+    rows = []
+    for name, found in results["rows"].items():
         for score in COLUMNS:
-            ends = (row[score][end] for end in ("mean", "low", "high"))
-            shown = ["" if value is None else f"{value:.6g}" for value in ends]
-            writer.writerow([name, score, *shown])
-    return file.getvalue()
+            ends = (found[score][end] for end in ("mean", "low", "high"))
+            rows.append([name, score, *("" if end is None else f"{end:.6g}" for end in ends)])
+    return Table.of(["method", "score", "mean", "low", "high"], rows)
 
 
-SHARP = 4
-"""Lines are drawn so many times as large, then made smaller, so that they are smooth."""
-APART = 15
-"""Least pixels between the names of two curves."""
-
-
-def plot(results: Mapping[str, Any]) -> np.ndarray:
-    """Draw SIM against samples for each mind, with 95 % intervals; (H, W, 3) uint8."""
-    wide, tall, left, top, bottom = 760, 400, 70, 60, 60
+def chart(results: Mapping[str, Any]) -> LineChart:
+    """Return SIM against samples for each predictor, with 95 % intervals."""
     curves = results["curves"]
-    most = max(int(count) for curve in curves.values() for count in curve)
-    means = [entry["mean"] for curve in curves.values() for entry in curve.values()]
-    low, high = 10 * math.floor(min(means) / 10 - 0.5), 100
-
-    def place(count: float, value: float) -> tuple[float, float]:
-        x = left + count / most * (wide - left - 190)
-        return x, tall - bottom - (value - low) / (high - low) * (tall - top - bottom)
-
-    large = Image.new("RGB", (SHARP * wide, SHARP * tall), (255, 255, 255))
-    lines = ImageDraw.Draw(large, "RGBA")
-
-    def at(points: Iterable[tuple[str, float]]) -> list[tuple[float, float]]:
-        placed = (place(int(count), min(max(value, low), high)) for count, value in points)
-        return [(SHARP * x, SHARP * y) for x, y in placed]
-
-    for tick in range(low, high + 1, 10):
-        lines.line(at([("0", tick), (str(most), tick)]), fill=(228, 228, 228), width=SHARP)
+    samples = sorted({int(count) for curve in curves.values() for count in curve})
+    lines = []
     for name, curve in curves.items():
-        colour = COLOURS[name.partition("-")[2]]
-        if all(entry["low"] is not None for entry in curve.values()):
-            under = at((count, entry["low"]) for count, entry in curve.items())
-            over = at((count, entry["high"]) for count, entry in curve.items())
-            if len(curve) > 1:
-                lines.polygon([*under, *reversed(over)], fill=(*colour, 34))
-        lines.line(
-            at((count, entry["mean"]) for count, entry in curve.items()),
-            fill=colour,
-            width=3 * SHARP,
-            joint="curve",
-        )
-    canvas = large.resize((wide, tall), Image.Resampling.LANCZOS)
-    draw = ImageDraw.Draw(canvas)
-    pictures.write(draw, (16, 22), "SIM of the best plan so far, %", size=17)
-    for tick in range(low, high + 1, 10):
-        pictures.write(draw, (left - 12, place(0, tick)[1]), str(tick), anchor="rm")
-    for count in sorted({int(c) for curve in curves.values() for c in curve}):
-        x = place(count, low)[0]
-        pictures.write(draw, (x, tall - bottom + 14), str(count), size=11, anchor="mm")
-    pictures.write(draw, (place(most / 2, low)[0], tall - 18), "samples", anchor="mm")
-    ends = {name: place(most, list(curve.values())[-1]["mean"]) for name, curve in curves.items()}
-    lowest = -float(APART)
-    for name, (x, y) in sorted(ends.items(), key=lambda end: end[1][1]):
-        lowest = max(y, lowest + APART)
-        mind = name.partition("-")[2]
-        words = label(name).split(" · ", maxsplit=1)[1]
-        pictures.write(draw, (x + 10, lowest), words, size=13, colour=COLOURS[mind])
-    return np.asarray(canvas)
+        entries = [curve.get(str(count), {}) for count in samples]
+        mean, low, high = ([e.get(end) for e in entries] for end in ("mean", "low", "high"))
+        predictor = name.partition("-")[2]
+        text = label(name).split(" · ", maxsplit=1)[1]
+        lines.append(Line(text, METHOD_COLOURS[predictor], mean, low, high))
+    return LineChart(
+        "SIM of the best plan so far, %",
+        "samples",
+        lines,
+        x=samples,
+        label_lines=True,
+        size=(7.6, 4.0),
+    )
 
 
 def video(file: Path, goal: Goal, config: Config, params: Params, actions_N: np.ndarray) -> None:

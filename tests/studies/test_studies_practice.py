@@ -18,10 +18,10 @@ from pewm_jax.io import weights
 from pewm_jax.planning import practice
 from pewm_jax.planning.floor_map import FloorMap
 from pewm_jax.planning.practice import Imagined, Practice, Real
-from pewm_jax.studies import deciders, goals, policies, practice_page
+from pewm_jax.studies import deciders, goals
 from pewm_jax.studies import practice as study
-from pewm_jax.studies.practice_page import COLUMNS
-from pewm_jax.studies.practice_piece import LEARNED, ROWS, Errand
+from pewm_jax.studies.practice import COLUMNS
+from pewm_jax.studies.practice_piece import LEARNED, ROWS, PracticeConfig
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import nomad as nomad_world
 from tests.helpers import init_world, randomise
@@ -29,7 +29,7 @@ from tests.planning.planning_page import blocks
 from tests.training.test_training_nomad import experiment
 
 MOTION = ActionConfig()
-ERRAND = Errand(
+ERRAND = PracticeConfig(
     houses=1,
     tasks=2,
     actions=4,
@@ -127,7 +127,7 @@ def test_what_it_learns_from_are_whole_walks_of_its_own_actions(made):
 def test_the_page_runs_as_it_is_written(made, world, home):
     folder, _ = made
     config, params = world
-    opened = policies.open_policy(folder / "policy")
+    opened = deciders.open_policy(folder / "policy")
     given = {"config": config, "params": params, "frames": home.context}
     given |= {"policy": opened.config.model.policy, "weights": opened.weights}
     exec(compile(blocks("Practice in imagination", "python"), "docs/planning.md", "exec"), given)
@@ -153,9 +153,9 @@ def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
     with pytest.raises(UserError, match="is a file: name a folder"):
         study.run(folder / "world", folder / "policy", tmp_path / "file", ERRAND)
     with pytest.raises(UserError, match="trained no policy"):
-        policies.open_policy(folder / "world")
+        deciders.open_policy(folder / "world")
     with pytest.raises(UserError, match="train a policy first"):
-        policies.open_policy(tmp_path / "nothing")
+        deciders.open_policy(tmp_path / "nothing")
     with pytest.raises(ConfigError, match="nor the folder of a trained NoMaD"):
         table2_command.main(["--policy", str(tmp_path / "nothing")])
 
@@ -168,7 +168,7 @@ def test_a_trained_nomad_proposes_for_table_2(made, home):
     assert first.shape == (3, 4)
     np.testing.assert_array_equal(first, deciders.proposed(policy, home, 3))
     with pytest.raises(UserError, match="use a shorter --horizon"):
-        policy(dataclasses.replace(home.asked, actions=9), 1)
+        policy(dataclasses.replace(home.input, actions=9), 1)
 
 
 def test_differences_are_paired_and_over_houses():
@@ -291,7 +291,7 @@ def test_a_policy_that_gives_no_actions_is_refused(home, wrong):
 )
 def test_a_bad_errand_is_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        Errand(**wrong)
+        PracticeConfig(**wrong)
 
 
 @pytest.mark.parametrize("wrong", [{"walks": 0}, {"blocks": 0}, {"with_goal": 1.5}])
@@ -335,6 +335,6 @@ def test_worlds_are_compared_only_where_the_house_itself_beats_chance(better):
         "within_deg": 45.0,
         "date": "today",
     }
-    text = practice_page.markdown(found | {"about": about}, "")
+    text = study.markdown(found | {"about": about}, "")
     assert ("## Differences" in text) == better
     assert ("No comparison between worlds is drawn" in text) == (not better)

@@ -28,15 +28,12 @@ from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.studies import (
-    recorded,
-    rows,
-    scorer,
-    table,
     table1,
-    table_cells,
-    table_page,
-    timing,
-    trainings,
+    table1_numbers,
+    table1_page,
+    table1_rows,
+    table1_scoring,
+    table1_training,
 )
 from pewm_jax.train import prepared
 from pewm_jax.worlds.pewm.world import STAGES
@@ -44,7 +41,7 @@ from pewm_jax.worlds.pewm.world import STAGES
 SIZE = ["--size", "16", "--frames", "30"]
 
 
-ROWS = tuple(row.name for row in rows.main_rows(presets.load("table1")))
+ROWS = tuple(row.name for row in table1_rows.main_rows(presets.load("table1")))
 
 
 def small(data):
@@ -84,7 +81,7 @@ def test_the_whole_table_is_made(made):
     results = json.loads((page.parent / "table1-results.json").read_text())
     assert set(results["rows"]) == {*ROWS, "backbone", "reproject", "copy"}
     for name in results["rows"]:
-        assert f"\n| {table_page.label(results, name)} | " in text
+        assert f"\n| {table1_page.label(results, name)} | " in text
         assert np.isfinite(results["rows"][name]["measures"]["psnr/all"]["mean"])
     assert "512 × 512 pictures of scanned houses" in text  # what is not comparable
     assert "lpips_alex is left out: " in text
@@ -93,7 +90,7 @@ def test_the_whole_table_is_made(made):
     assert blind.endswith("| – |")
     with page.with_suffix(".csv").open() as file:
         lines = list(csv.DictReader(file))
-    assert {line["row"] for line in lines} <= {*results["rows"], table_cells.TRUTH}
+    assert {line["row"] for line in lines} <= {*results["rows"], table1_page.TRUTH}
     assert {line["row"] for line in lines} >= set(results["rows"])
     tex = page.with_suffix(".tex").read_text()
     assert tex.count(r"\\") == len(results["rows"]) + 3  # a heading, the truth itself, two places
@@ -104,7 +101,7 @@ def test_the_whole_table_is_made(made):
 def whole(folder, say, out=None):
     """Make the table, as the command does."""
     base, out = small(folder / "data"), out or folder / "out"
-    return table1.run(base, out, minutes=(1, 1), steps=(2, 2), seeds=[0], say=say)
+    return table1.run(base, out, minutes=(1, 1), steps=(2, 2), seeds=[0], log=say)
 
 
 def test_what_is_done_is_not_done_again(made):
@@ -134,18 +131,18 @@ def test_scores_outlive_the_weights(made):
     assert [line for line in again.read_text().splitlines() if line.startswith("| ")] == numbers
     file = min((out / "recorded").iterdir())
     file.write_bytes(file.read_bytes()[:100])
-    assert recorded.read(file) is None
-    base, row = small(folder / "data"), rows.main_rows(small(folder / "data"))[0]
-    study = trainings.Study(base, out, (1, 1), (2, 2))
+    assert table1_scoring.read_recorded(file) is None
+    base, row = small(folder / "data"), table1_rows.main_rows(small(folder / "data"))[0]
+    study = table1_training.Study(base, out, (1, 1), (2, 2))
     steps = {"none": 2, "backbone": 2}
-    path = recorded.path(study, row, 0, steps, "x")
-    assert path != recorded.path(study, row, 0, steps | {"backbone": 3}, "x")
-    assert path != recorded.path(study, row, 0, steps, "y")
-    assert path != recorded.path(study, row, 1, steps, "x")
+    path = table1_scoring.recorded_path(study, row, 0, steps, "x")
+    assert path != table1_scoring.recorded_path(study, row, 0, steps | {"backbone": 3}, "x")
+    assert path != table1_scoring.recorded_path(study, row, 0, steps, "y")
+    assert path != table1_scoring.recorded_path(study, row, 1, steps, "x")
     from_codec = dataclasses.replace(
         study, base=dataclasses.replace(base, train=dataclasses.replace(base.train, start="codec"))
     )
-    assert path != recorded.path(from_codec, row, 0, steps, "x")
+    assert path != table1_scoring.recorded_path(from_codec, row, 0, steps, "x")
 
 
 def test_all_rows_start_from_one_backbone_and_keep_it(made):
@@ -186,17 +183,17 @@ def test_the_features_of_a_network_can_be_tried(made):
         np.testing.assert_array_equal(kept[leaf], value)
     assert not any(line.startswith("stage 1") for line in said)  # the backbone was there
     with pytest.raises(UserError, match="holds no DINOv2"):
-        rows.ablated(base, "features", ("dinov2=nowhere",))
+        table1_rows.ablated(base, "features", ("dinov2=nowhere",))
     with pytest.raises(UserError, match="there are no features 'hog'; choose colours, "):
-        rows.ablated(base, "features", ("hog",))
+        table1_rows.ablated(base, "features", ("hog",))
 
 
 def test_a_step_is_timed(made):
     folder = made[0]
-    study = trainings.Study(small(folder / "data"), folder / "timed", (1, 1))
+    study = table1_training.Study(small(folder / "data"), folder / "timed", (1, 1))
     said = []
-    kinds = [row for row in rows.main_rows(study.base) if row.name == "none"]
-    plan = timing.planned(study, kinds, said.append)
+    kinds = [row for row in table1_rows.main_rows(study.base) if row.name == "none"]
+    plan = table1_training.planned(study, kinds, said.append)
     assert plan["backbone"]["seconds"] == plan["none"]["seconds"] > 0
     assert plan["none"]["steps"] == round(60 / plan["none"]["seconds"])
     assert any(": compiled in " in line for line in said)
@@ -204,7 +201,7 @@ def test_a_step_is_timed(made):
 
 def test_what_was_made_from_other_weights_is_refused(made):
     folder = made[0]
-    mark = folder / "out" / "seed0" / "surfels-render" / trainings.MADE_FROM
+    mark = folder / "out" / "seed0" / "surfels-render" / table1_training.MADE_FROM
     before = mark.read_text()
     mark.write_text(before.replace('"start": "', '"start": "0'))
     with pytest.raises(UserError, match="was made from other weights or data"):
@@ -218,10 +215,10 @@ def test_the_memory_is_what_differs_from_an_empty_one(made):
     folder = made[0]
     out, run = folder / "random", folder / "out" / "seed0" / "surfels-render"
     base = small(folder / "data")
-    judge = scorer.open_scorer(base, out, print)
-    row = next(row for row in rows.main_rows(base) if row.name == "surfels-render")
-    study = trainings.Study(base, folder / "out", (1, 1))
-    config = trainings.settings(study, row, 0, 2, start="x")
+    judge = table1_scoring.open_scorer(base, out, print)
+    row = next(row for row in table1_rows.main_rows(base) if row.name == "surfels-render")
+    study = table1_training.Study(base, folder / "out", (1, 1))
+    config = table1_training.settings(study, row, 0, 2, start="x")
     params = randomise(weights.load(run / "weights.safetensors"), scale=0.3)
     weights.save(out / "run" / "weights.safetensors", params)
     configuration.save(config, out / "run" / "config.json")
@@ -234,30 +231,30 @@ def test_the_memory_is_what_differs_from_an_empty_one(made):
 
 def test_rows_have_about_the_same_parameters_and_the_same_extent():
     base = presets.load("table1")
-    every = rows.main_rows(base)
-    counts = {row.name: rows.parameters(base, row.memory) for row in every if row.reads}
+    every = table1_rows.main_rows(base)
+    counts = {row.name: table1_rows.parameters(base, row.memory) for row in every if row.reads}
     assert max(counts.values()) <= 1.07 * min(counts.values()), counts
     for row in every:
         size = np.multiply(row.memory.cell_m, row.memory.cells)
         np.testing.assert_allclose(size, (32, 32, 16), atol=0.1)
-    assert {row.paper for row in every if row.paper} == set(table_page.PAPER)
-    assert set(table.CHAIN) <= {row.name for row in every}
+    assert {row.paper for row in every if row.paper} == set(table1_page.PAPER)
+    assert set(table1_numbers.CHAIN) <= {row.name for row in every}
 
 
-@pytest.mark.parametrize("name", rows.ABLATIONS)
+@pytest.mark.parametrize("name", table1_rows.ABLATIONS)
 def test_an_ablation_varies_what_it_says_and_nothing_else(name):
     base = presets.load("table1")
-    found = rows.ablated(base, name)
-    plain = {row.name: row for row in rows.main_rows(base)}
+    found = table1_rows.ablated(base, name)
+    plain = {row.name: row for row in table1_rows.main_rows(base)}
     if name == "time":
         once, nothing, longer, nothing_longer = found
-        assert once == dataclasses.replace(plain[rows.PAPER_FORM], paper="")
-        assert nothing == plain[rows.CONTROL]
+        assert once == dataclasses.replace(plain[table1_rows.PAPER_FORM], paper="")
+        assert nothing == plain[table1_rows.CONTROL]
         for row, first in ((longer, once), (nothing_longer, nothing)):
             assert dataclasses.replace(row, name=first.name, times=1) == first
             assert row.times == 4
         return
-    assert len(found) == len(rows.ABLATIONS[name].values) == len({row.name for row in found})
+    assert len(found) == len(table1_rows.ABLATIONS[name].values) == len({row.name for row in found})
     voxel = plain["voxel-attend"].memory
     varied = {"cell": {"cell_m", "cells"}, "extent": {"cells"}, "tokens": {"tokens"}}
     for row in found:
@@ -271,8 +268,8 @@ def test_an_ablation_varies_what_it_says_and_nothing_else(name):
 
 def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
     base = presets.load("table1")
-    chosen = [row for row in rows.main_rows(base) if row.name in ("none", "voxel-attend")]
-    chosen += rows.ablated(base, "time", ("4",))
+    chosen = [row for row in table1_rows.main_rows(base) if row.name in ("none", "voxel-attend")]
+    chosen += table1_rows.ablated(base, "time", ("4",))
     seconds = {"backbone": 0.5, "none": 0.5, "voxel-attend": 1.0, "map2d-attend": 2.0}
     seconds |= {"voxel-attend-sinusoid-time_4": 1.0, "none-attend-time_4": 0.8}
     asked, pace = [], 1.0
@@ -281,29 +278,36 @@ def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
         asked.extend(row.name for row in which.values())
         return {model: pace * seconds[row.name] for model, row in which.items()}
 
-    monkeypatch.setattr(timing, "_measure", measured)
-    study = trainings.Study(base, tmp_path, (2, 1))
-    plan = timing.planned(study, chosen, print)
+    monkeypatch.setattr(table1_training, "_measure", measured)
+    study = table1_training.Study(base, tmp_path, (2, 1))
+    plan = table1_training.planned(study, chosen, print)
     steps = {name: entry["steps"] for name, entry in plan.items()}
     assert steps["backbone"] == 2 * 60 / 0.5
     assert (steps["none"], steps["voxel-attend"]) == (120, 60)
     assert steps["voxel-attend-sinusoid-time_4"] == 240
     assert steps["none-attend-time_4"] == 300  # the control gets the same minutes
-    assert timing.planned(study, chosen, print) == plan
+    assert table1_training.planned(study, chosen, print) == plan
     assert len(asked) == 4  # each once; the row without a memory trains what the backbone does
     longer = dataclasses.replace(study, minutes=(2, 2))
-    assert timing.planned(longer, chosen[:1], print)["none"]["steps"] == 240
-    assert timing.planned(study, chosen, print) == plan  # other minutes have changed nothing
+    assert table1_training.planned(longer, chosen[:1], print)["none"]["steps"] == 240
+    assert (
+        table1_training.planned(study, chosen, print) == plan
+    )  # other minutes have changed nothing
     pace = 3.0  # what is timed on a busier machine is scaled by what was timed before
-    late = [row for row in rows.main_rows(base) if row.name == "map2d-attend"]
-    assert timing.planned(study, late, print)["map2d-attend"]["steps"] == 30
+    late = [row for row in table1_rows.main_rows(base) if row.name == "map2d-attend"]
+    assert table1_training.planned(study, late, print)["map2d-attend"]["steps"] == 30
     before = len(asked)  # readers are scaled by one, and not by a backbone
-    more = [row for row in rows.main_rows(base) if row.name in ("voxel-attend", "images-attend")]
+    more = [
+        row for row in table1_rows.main_rows(base) if row.name in ("voxel-attend", "images-attend")
+    ]
     seconds["images-attend"] = 1.5
-    assert timing.planned(study, more, print)["images-attend"]["steps"] == 40
+    assert table1_training.planned(study, more, print)["images-attend"]["steps"] == 40
     assert asked[before:] == ["voxel-attend", "images-attend"]
     equal = dataclasses.replace(study, steps=(7, 5))
-    steps = {name: entry["steps"] for name, entry in timing.planned(equal, chosen, print).items()}
+    steps = {
+        name: entry["steps"]
+        for name, entry in table1_training.planned(equal, chosen, print).items()
+    }
     assert steps == {
         "backbone": 7,
         "none": 5,
@@ -313,7 +317,7 @@ def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
     }
     (tmp_path / "plan.json").write_text("{")
     with pytest.raises(UserError, match=r"plan\.json is damaged"):
-        timing.planned(study, chosen, print)
+        table1_training.planned(study, chosen, print)
 
 
 def test_differences_are_paired_by_clip_and_seeds_are_averaged_first():
@@ -326,20 +330,20 @@ def test_differences_are_paired_by_clip_and_seeds_are_averaged_first():
 
     noise = rng.normal(size=6)
     pieces = {"none": [arrays(1.0), arrays(1.1)], "images-attend": [arrays(1.2), arrays(1.3)]}
-    found = table.summary(pieces, {}, houses, {})
+    found = table1_numbers.summary(pieces, {}, houses, {})
     gain = found["differences"]["none"]["images-attend"]["psnr/all"]
     assert gain["mean"] == pytest.approx(2)
     assert gain["low"] == pytest.approx(2)  # the same noise in both: paired away
     assert found["rows"]["none"]["measures"]["psnr/all"]["per_seed"][1] == pytest.approx(
         found["rows"]["none"]["measures"]["psnr/all"]["per_seed"][0] + 1
     )
-    assert table_page.mark_of(gain) == "*"  # both seeds gain as much
-    apart = table.summary(
+    assert table1_page.mark_of(gain) == "*"  # both seeds gain as much
+    apart = table1_numbers.summary(
         {"none": pieces["none"], "voxel-attend": [arrays(0.9), arrays(2.2)]}, {}, houses, {}
     )
     unsure = apart["differences"]["none"]["voxel-attend"]["psnr/all"]
     assert unsure["low"] > 0 > unsure["over_seeds"]["low"]  # one seed loses, the other gains more
-    assert table_page.mark_of(unsure) == "°"
+    assert table1_page.mark_of(unsure) == "°"
     (step,) = found["order"]
     assert (step["worse"], step["better"]) == ("none", "images-attend")
     assert step["differences"]["psnr/all"]["over_seeds"]["mean"] == pytest.approx(2)
@@ -368,7 +372,7 @@ def measured(tmp_path_factory):
     weights.save(alex, lpips.init("alex", jax.random.key(0)))
     nets = {
         "lpips_alex": metrics.load("lpips_alex", alex),
-        scorer.SRC: metrics.load("src[alex]", alex),
+        table1_scoring.SRC: metrics.load("src[alex]", alex),
     }
     nets |= {kind: Patches(kind, {}) for kind in ("fvd", "kvd")}
     base = small(folder / "data")
@@ -376,8 +380,8 @@ def measured(tmp_path_factory):
     evaluate = dataclasses.replace(base.evaluate, clips=9, batch=4)
     base = dataclasses.replace(base.with_model(clip=clip), evaluate=evaluate)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(scorer, "_measures", lambda *_: (nets, {}))
-        return base, scorer.open_scorer(base, folder / "out", print), folder / "out"
+        patched.setattr(table1_scoring, "_measures", lambda *_: (nets, {}))
+        return base, table1_scoring.open_scorer(base, folder / "out", print), folder / "out"
 
 
 def test_every_measure_of_the_table_stands_beside_what_it_can_be(measured):
@@ -394,7 +398,7 @@ def test_every_measure_of_the_table_stands_beside_what_it_can_be(measured):
 
     pieces = {name: [copied, copied] for name in ("none", "none-attend", "voxel-attend")}
     pieces |= {"copy": [copied]}
-    results = table.summary(pieces, truth, judge.house_of_clip, judge.nets, judge.frames)
+    results = table1_numbers.summary(pieces, truth, judge.house_of_clip, judge.nets, judge.frames)
     row = results["rows"]["none"]["measures"]
     net = judge.nets["fvd"]
     assert row["fvd"]["mean"] == pytest.approx(net.distance(copied["logits"], truth["logits"]))
@@ -407,12 +411,12 @@ def test_every_measure_of_the_table_stands_beside_what_it_can_be(measured):
     apart = results["differences"]["none"]["copy"]["fvd_half"]
     assert apart["over_seeds"] == {"mean": 0, "low": 0, "high": 0}
     assert apart["p_seeds"] == apart["p_seeds_holm"] == 1
-    assert table_page.mark_of(apart) == ""
+    assert table1_page.mark_of(apart) == ""
 
-    study = trainings.Study(base, out, (1, 1))
-    chosen = [row for row in rows.main_rows(base) if row.name in pieces]
+    study = table1_training.Study(base, out, (1, 1))
+    chosen = [row for row in table1_rows.main_rows(base) if row.name in pieces]
     facts = table1._facts(study, judge, chosen, {}, [0, 1], "")
-    table_page.write({"about": facts, **results}, out / "page.md")
+    table1_page.write({"about": facts, **results}, out / "page.md")
     text = (out / "page.md").read_text()
     assert f"| FVD-9f@{count // 2} | KVD-9f@{count // 2} |" in text
     assert f"the truth against itself | – | – | – | – | – | {score.floor.mean:.0f} |" in text
@@ -455,27 +459,27 @@ def test_what_needs_no_network_and_is_better_is_named():
         "floors": {},
         "rows": {"none": row(), "copy": row(**{"lpips/all": 0.2, "src": 100.0})},
     }
-    assert table_page._unbeaten(results) == (
+    assert table1_page._unbeaten(results) == (
         "Without a network, and better than every trained row: copying the last frame is better in "
         "LPIPS[alex]."
     )
     results["rows"]["copy"] = row(**{"psnr/all": 9.0})
-    assert table_page._unbeaten(results) == ""
+    assert table1_page._unbeaten(results) == ""
 
 
 def test_a_row_without_a_memory_learns_from_the_clips_that_readers_learn_from():
     base = presets.load("table1")
-    every = {row.name: row for row in rows.main_rows(base)}
-    study = trainings.Study(base, Path("x"), (1, 1))
+    every = {row.name: row for row in table1_rows.main_rows(base)}
+    study = table1_training.Study(base, Path("x"), (1, 1))
 
     def drawn(row):
         stage = STAGES[1 if row.reads else 0]
-        config = trainings.settings(study, row, 3, 10, start="x")
+        config = table1_training.settings(study, row, 3, 10, start="x")
         return prepared.seed(config, stage), stage.data_seed(config)
 
     alike = {drawn(row) for row in every.values()}
     assert len(alike) == 1
-    assert drawn(trainings.backbone_of(base, every["none"])) not in alike
+    assert drawn(table1_training.backbone_of(base, every["none"])) not in alike
 
 
 def test_the_walk_back_passes_the_same_cameras():
@@ -483,7 +487,7 @@ def test_the_walk_back_passes_the_same_cameras():
     start = pose_from_yaw(np.zeros(3), 0.4)
     out = np.asarray(integrate(start, actions))[None]
     walk = np.asarray(integrate(start, there_and_back(actions)))
-    np.testing.assert_allclose(walk, scorer._there_and_back(out, 4)[0], atol=1e-5)
+    np.testing.assert_allclose(walk, table1_scoring._there_and_back(out, 4)[0], atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -520,22 +524,22 @@ def test_marks_are_corrected_for_the_comparisons_of_a_column():
         ]
 
     alone = family()[1:2]
-    table.adjust(alone)
-    assert table_page.mark_of(alone[0]["psnr/seen"]) == "*"
+    table1_numbers.adjust(alone)
+    assert table1_page.mark_of(alone[0]["psnr/seen"]) == "*"
     together = family()
-    table.adjust(together)
+    table1_numbers.adjust(together)
     found = [each["psnr/seen"]["p_holm"] for each in together]
     assert found == pytest.approx([0.04, 0.06, 0.06, 0.2])
-    assert [table_page.mark_of(each["psnr/seen"]) for each in together] == ["*", "", "", ""]
+    assert [table1_page.mark_of(each["psnr/seen"]) for each in together] == ["*", "", "", ""]
     assert {each["src"]["p_holm"] for each in together} == {1.0}
-    assert "Holm's correction for the comparisons of a column" in table_page.PAIRED
+    assert "Holm's correction for the comparisons of a column" in table1_page.PAIRED
 
 
 def test_the_names_of_recorded_scores_do_not_change_with_settings_that_came_later():
     """``docs/table1/recorded`` holds scores of 36 trainings; their files must be found again."""
     base = presets.load("table1")
-    assert recorded._settings(base)["version"] == 3
-    assert not recorded._settings(base).keys() & recorded.ADDED.keys()
+    assert table1_scoring._settings(base)["version"] == 3
+    assert not table1_scoring._settings(base).keys() & table1_scoring.ADDED.keys()
     if hasattr(base.train, "beta2"):
         other = dataclasses.replace(base, train=dataclasses.replace(base.train, beta2=0.95))
-        assert recorded._settings(other)["train.beta2"] == 0.95
+        assert table1_scoring._settings(other)["train.beta2"] == 0.95

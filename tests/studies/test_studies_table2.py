@@ -21,7 +21,7 @@ from tests.helpers import init_world, randomise
 
 MOTION = ActionConfig()
 PLAN = PlanConfig(horizon=4, candidates=6, elites=2, rounds=2)
-ERRAND = table2.Errand(
+ERRAND = table2.Table2Config(
     tasks=3,
     houses=2,
     proposals=(2,),
@@ -53,7 +53,7 @@ def made(tmp_path_factory):
 def test_the_whole_table_is_made(made):
     _, page = made
     results = json.loads((page.parent / "results.json").read_text())
-    names = deciders.names((2,))
+    names = deciders.method_names((2,))
     assert tuple(results["rows"]) == names
     assert set(results["memory_minus_empty"]) == {"rank2", "mpc", "loop"}
     assert set(results["distances"]) == {"4", "8"}
@@ -75,7 +75,7 @@ def test_what_is_decided_is_kept_and_more_can_be_added(made):
     folder, page = made
     files = sorted((folder / "out").glob("decisions/**/*.json"))
     before = [file.stat().st_mtime_ns for file in files]
-    assert len(files) == 3 * (2 * len(deciders.names((2,))) - 1)
+    assert len(files) == 3 * (2 * len(deciders.method_names((2,))) - 1)
 
     def other(asked, count):
         return deciders.wanderer(asked, count, seed=1)
@@ -117,15 +117,17 @@ def test_a_step_or_a_turn_short_is_there_and_two_are_not():
 
 def test_only_the_mind_with_a_memory_sees_the_past():
     config = presets.load("tiny")
-    minds = deciders.Minds(config, randomise(init_world(config, jax.random.key(0)), scale=0.3))
+    predictors = deciders.Predictors(
+        config, randomise(init_world(config, jax.random.key(0)), scale=0.3)
+    )
     goal = task(0, actions=4)
     blind = dataclasses.replace(
         goal,
         context=jax.tree.map(lambda x: np.concatenate([x[-1:]] * len(x)), goal.context),
     )
-    walks = deciders.wanderer(goal.asked, 3)
+    walks = deciders.wanderer(goal.input, 3)
     seen = {
-        (mind, name): np.asarray(minds.rollout(mind, which)(walks).rgb_THWC)
+        (mind, name): np.asarray(predictors.rollout(mind, which)(walks).rgb_THWC)
         for mind in ("empty", "memory")
         for name, which in (("whole", goal), ("present", blind))
     }
@@ -195,18 +197,18 @@ def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):
 
 def test_reprojection_predicts_what_was_observed_where_nothing_moved():
     goal = task(0, actions=4)
-    minds = deciders.Minds(presets.load("tiny"), {})
+    predictors = deciders.Predictors(presets.load("tiny"), {})
     there_and_back = np.array([[1, 2, 1, 2], [1, 1, 2, 2]])  # turns that cancel each other
-    seen = np.asarray(minds.rollout("reproject", goal)(there_and_back).rgb_THWC)
+    seen = np.asarray(predictors.rollout("reproject", goal)(there_and_back).rgb_THWC)
     present = np.asarray(goal.context.rgb_THWC[-1], np.float32) / 127.5 - 1
     assert seen.shape == (2, 1, *present.shape)
     for one in seen[:, 0]:
         assert np.mean((one - present) ** 2) < 0.02
-    away = np.asarray(minds.rollout("reproject", goal)(np.array([[1, 1, 1, 1]])).rgb_THWC)
+    away = np.asarray(predictors.rollout("reproject", goal)(np.array([[1, 1, 1, 1]])).rgb_THWC)
     assert np.mean((away[0, 0] - present) ** 2) > 0.05
 
 
-class _Spied(deciders.Minds):
+class _Spied(deciders.Predictors):
     """Predictors that note what they observe."""
 
     def observe(self, mind, state, frames):
@@ -217,15 +219,15 @@ class _Spied(deciders.Minds):
 @pytest.mark.parametrize("mind", ["truth", "reproject", "memory"])
 def test_a_closed_loop_observes_what_is_really_seen_after_each_clip(mind):
     config = presets.load("tiny")  # 4 actions at once
-    minds = _Spied(config, randomise(init_world(config, jax.random.key(0)), scale=0.3))
-    object.__setattr__(minds, "seen", [])
+    predictors = _Spied(config, randomise(init_world(config, jax.random.key(0)), scale=0.3))
+    object.__setattr__(predictors, "seen", [])
     goal = task(1, actions=8)
     one = dataclasses.replace(PLAN, horizon=8, rounds=1)
-    found = deciders.decide(f"loop-{mind}", goal, minds, None, costs.Pixels(), one)
+    found = deciders.decide(f"loop-{mind}", goal, predictors, None, costs.Pixels(), one)
     assert len(found.actions_N) in (8, 12)  # and one clip to correct, where that promises more
     walk = goal.walked(found.actions_N)
-    assert len(minds.seen) == len(found.actions_N) // 4
-    for number, frames in enumerate(minds.seen):
+    assert len(predictors.seen) == len(found.actions_N) // 4
+    for number, frames in enumerate(predictors.seen):
         real = goal.simulator.frames(walk[1 + 4 * number : 5 + 4 * number])
         np.testing.assert_array_equal(frames.rgb_THWC, real.rgb_THWC)
         np.testing.assert_allclose(
@@ -235,10 +237,10 @@ def test_a_closed_loop_observes_what_is_really_seen_after_each_clip(mind):
 
 def test_a_closed_loop_with_the_truth_and_a_true_cost_comes_to_the_goal():
     goal = task(2, actions=8)
-    minds = deciders.Minds(presets.load("tiny"), {})
+    predictors = deciders.Predictors(presets.load("tiny"), {})
     plan = dataclasses.replace(PLAN, horizon=8, candidates=40, elites=10, rounds=6)
     reached = deciders.decide(
-        "loop-truth", goal, minds, None, costs.Distance(costs.straight), plan
+        "loop-truth", goal, predictors, None, costs.Distance(costs.straight), plan
     ).actions_N
     before = scores.position_error(goal.walk_T3[0], goal.walk_T3[-1])
     after = scores.position_error(goal.walked(reached)[-1], goal.walk_T3[-1])

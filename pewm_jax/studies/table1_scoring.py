@@ -1,8 +1,13 @@
-"""Scores of Table 1: one set of held-out clips, the same for every row, every seed and no network.
+"""Scores of Table 1: one set of held-out clips for every row, every seed and the baselines.
 
-Of each clip: PSNR, SSIM, LPIPS and errors of depth over pixels seen before, never seen and all; the
-logits of I3D, of the observed frame and those imagined, for FVD and KVD; and of a walk half as far
-and back, SRC. Each row's numbers are a file beside its weights.
+Per clip: PSNR, SSIM, LPIPS and depth errors over pixels seen before, never seen and all; the logits
+of I3D of the observed and imagined frames, for FVD and KVD; and SRC of a walk half as far and back.
+Each row's numbers are a file beside its weights.
+
+Scores can also be *recorded*: small files that a repository can hold, so a row that was trained and
+scored on one machine need not be trained again on another. The name of such a file contains a hash
+of the settings of the row's training and of its backbone's, of the data and the weights they start
+from, and of what is scored. If a row's own folder exists, that is used instead.
 """
 
 from __future__ import annotations
@@ -15,8 +20,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from pewm_jax import shipped
 from pewm_jax.config import Config, to_dict
-from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.eval import protocol as protocols
 from pewm_jax.eval.metrics import load_all
 from pewm_jax.eval.metrics.revisits import ways
@@ -26,14 +32,16 @@ from pewm_jax.eval.runner import ModelRunner, copy_last
 from pewm_jax.eval.scoring import Batch, load_batch
 from pewm_jax.geometry.actions import there_and_back
 from pewm_jax.io.progress import Meter
-from pewm_jax.io.store import ResultCache, file_hash, inputs_hash
+from pewm_jax.io.store import COMPRESSED, ResultCache, file_hash, inputs_hash
 from pewm_jax.models.lpips.model import LEAST
-from pewm_jax.train.runs import WEIGHTS
+from pewm_jax.studies.table1_rows import Row
+from pewm_jax.studies.table1_training import Study, backbone_of, settings
+from pewm_jax.train.runs import WEIGHTS, identity
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds.rollouts import load_finished
 
 NETWORKS = ("lpips_alex", "fvd", "kvd", "src[alex]", "dreamsim")
-"""Measures that need weights; those that are not at hand are left out, and said."""
+"""Measures that need weights; those without weights are left out and reported."""
 SRC = "src[alex]"
 SHORTEST = 9
 """Frames of the shortest clip that I3D takes."""
@@ -283,3 +291,88 @@ def _there_and_back(x_BT: Any, half: int) -> np.ndarray:
     """Return frames 0 … half and back to 0 again, (B, 2 half + 1, …)."""
     x = np.asarray(x_BT)
     return np.concatenate([x[:, : half + 1], x[:, :half][:, ::-1]], 1)
+
+
+FOLDER = "recorded"
+VERSION = 1
+"""Raise it when the code changes what is learnt or scored: older scores are then left aside."""
+ELSEWHERE = ("train.start", "data.path")
+"""Folders, which may lie anywhere, in the settings of a training."""
+ADDED: Mapping[str, Any] = {
+    "train.noise_key": "weights",
+    "train.beta1": 0.9,
+    "train.beta2": 0.999,
+    "train.epsilon": 1e-8,
+}
+"""Settings that came later, with the values that stand for what was done before; with these they
+are left out of the name."""
+
+
+def recorded_path(study: Study, row: Row, seed: int, steps: Mapping[str, int], scored: str) -> Path:
+    """Return the file of a row's scores.
+
+    Args:
+        study: what all rows share.
+        row: the row.
+        seed: of its training.
+        steps: name of a row or backbone → steps.
+        scored: hash of what is scored and how (``Scorer.name``).
+    """
+    start = study.base.train.start
+    facts: list[Any] = [
+        VERSION,
+        scored,
+        file_hash(Path(study.base.data.path) / "train" / MANIFEST),
+        file_hash(shipped.find(start) / WEIGHTS) if start else "",
+    ]
+    facts += [file_hash(Path(row.encoder) / WEIGHTS)] if row.encoder else []
+    for which in (backbone_of(study.base, row), row):
+        config = settings(study, which, seed, steps[which.name], start="x")
+        facts.append(_settings(config))
+    return study.out / FOLDER / f"seed{seed}-{row.name}-{inputs_hash(facts)[:12]}.npz"
+
+
+def _settings(config: Config) -> dict[str, Any]:
+    """Return the settings that name a training's scores, as version 3 of the settings has them."""
+    found = identity(config) | {"version": 3}
+    return {
+        name: value
+        for name, value in found.items()
+        if name not in ELSEWHERE and not (name in ADDED and value == ADDED[name])
+    }
+
+
+def read_recorded(file: Path) -> dict[str, Arrays] | None:
+    """Return the scores in a file by name, or None if there is no whole one."""
+    flat = ResultCache(file.parent, COMPRESSED).get(file.stem)
+    if flat is None:
+        return None
+    found: dict[str, Arrays] = {}
+    for key, values in flat.items():
+        name, _, measure = key.rpartition(":")
+        found.setdefault(name, {})[measure] = values
+    return found
+
+
+def write_recorded(file: Path, found: Mapping[str, Arrays]) -> None:
+    """Write scores, name of a row → measure → numbers, unless the file holds them."""
+    if _equal(read_recorded(file), found):
+        return
+    flat = {
+        f"{name}:{measure}": values
+        for name, arrays in found.items()
+        for measure, values in arrays.items()
+    }
+    ResultCache(file.parent, COMPRESSED).put(file.stem, flat)
+
+
+def _equal(stored: Mapping[str, Arrays] | None, found: Mapping[str, Arrays]) -> bool:
+    if stored is None or stored.keys() != found.keys():
+        return False
+    return all(
+        stored[name].keys() == found[name].keys()
+        and all(
+            np.array_equal(stored[name][k], found[name][k], equal_nan=True) for k in found[name]
+        )
+        for name in found
+    )

@@ -11,8 +11,8 @@ import numpy as np
 from pewm_jax.eval import intervals
 from pewm_jax.eval.metrics.images import MASKS
 from pewm_jax.eval.statistics import scores
-from pewm_jax.studies.rows import CONTROL, PAPER_FORM
-from pewm_jax.studies.scorer import SRC, Arrays
+from pewm_jax.studies.table1_rows import CONTROL, PAPER_FORM
+from pewm_jax.studies.table1_scoring import SRC, Arrays
 
 SETS = ("fvd", "kvd")
 """Measures of whole sets of clips, which have no number per clip."""

@@ -1,32 +1,44 @@
-"""What Table 1 trains: a backbone for each seed, and from it every row.
+"""The trainings of Table 1: a backbone for each seed, and from it every row, in equal time.
 
-A row with a memory trains its reader alone (stage 2). The row without one goes on training its
-backbone. ``made_from.json`` beside a row's weights names the weights and the data that it was made
-from; what was made from others is refused.
+A row with a memory trains its reader alone (stage 2). The row without one continues the training of
+its backbone. ``made_from.json`` beside a row's weights names the weights and the data that it was
+made from; a row that was made from others is refused.
+
+Each training gets as many steps as its time allows. On a processor that is processor time, measured
+before the first training with all rows in turn, so that other jobs slow all of them alike; on an
+accelerator it is wall-clock time. Preparing clips, compiling and scoring do not count. The
+measurements are stored in ``plan.json`` by the settings they hold for, and are not repeated.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import gc
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from pewm_jax import config as configuration
 from pewm_jax import shipped
-from pewm_jax.config import Config, NoMemoryConfig, StageConfig, UserError
+from pewm_jax.config import Config, ModelConfig, NoMemoryConfig, StageConfig, UserError
+from pewm_jax.data import loader
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.errors import require
 from pewm_jax.io import atomic, weights
-from pewm_jax.io.store import file_hash
+from pewm_jax.io.store import file_hash, inputs_hash, make_once
 from pewm_jax.models.dinov2 import model as dinov2
-from pewm_jax.studies.rows import Row
-from pewm_jax.train import loop
+from pewm_jax.studies.table1_rows import Row
+from pewm_jax.train import loop, sharding
 from pewm_jax.train.runs import WEIGHTS
+from pewm_jax.train.step import compile_step, initial_state, noise_key
 from pewm_jax.worlds.pewm.world import STAGES
 
 CODEC, MADE_FROM = "codec", "made_from.json"
@@ -150,14 +162,15 @@ def _start_of(study: Study, row: Row, before: Row, seed: int) -> Path:
     if not row.encoder:
         return backbone
     source, folder = Path(row.encoder), study.folder(f"{row.name}-start", seed)
-    mark, digest = folder / MADE_FROM, [file_hash(run / WEIGHTS) for run in (backbone, source)]
-    if not mark.is_file() or json.loads(mark.read_text("utf-8")) != digest:
+
+    def make() -> None:
         config = configuration.load(backbone / "config.json")
         memory = dataclasses.replace(config.model.memory, encoder=row.memory.encoder)
         params = weights.load(backbone / WEIGHTS) | {"encoder": dinov2.load(source)[1]}
         weights.save(folder / WEIGHTS, params, weights.metadata(backbone / WEIGHTS))
         configuration.save(config.with_model(memory=memory), folder / "config.json")
-        atomic.write_text(mark, json.dumps(digest) + "\n")
+
+    make_once(folder / MADE_FROM, [file_hash(run / WEIGHTS) for run in (backbone, source)], make)
     return folder
 
 
@@ -188,8 +201,8 @@ def _start(study: Study) -> Path:
     source, folder = shipped.find(study.base.train.start), study.out / CODEC
     if getattr(study.base.model.codec, "gate", 0):
         return source
-    mark, digest = folder / MADE_FROM, file_hash(source / WEIGHTS)
-    if not mark.is_file() or json.loads(mark.read_text("utf-8")) != digest:
+
+    def make() -> None:
         config = configuration.load(source / "config.json")
         params = weights.load(source / WEIGHTS)
         params["codec"].pop("gate", None)
@@ -198,5 +211,127 @@ def _start(study: Study) -> Path:
         facts = weights.metadata(source / WEIGHTS)
         weights.save(folder / WEIGHTS, params, facts)
         configuration.save(dataclasses.replace(config, model=model), folder / "config.json")
-        atomic.write_text(mark, json.dumps(digest) + "\n")
+
+    make_once(folder / MADE_FROM, file_hash(source / WEIGHTS), make)
     return folder
+
+
+ROUNDS = 7
+"""Steps of each training that are timed, in turn; one more before them is not."""
+PLAN = "plan.json"
+UNREAD = "weights that are not read"
+"""Stands for the weights to start from where settings are only looked at."""
+Times = dict[str, float]
+
+
+def planned(study: Study, rows: Sequence[Row], log: Log) -> dict[str, Any]:
+    """Return how many steps each row and its backbone get; measured once.
+
+    Trainings that are timed later are timed beside one that was timed before, and scaled by it.
+
+    Returns:
+        By name: ``seconds`` that a step takes, None where steps are equal; and ``steps``.
+
+    Raises:
+        UserError: ``plan.json`` is damaged.
+    """
+    everything = {row.name: row for row in (*(backbone_of(study.base, row) for row in rows), *rows)}
+    names = {name: _model(study, row) for name, row in everything.items()}
+    seconds: Times = {}
+    if study.steps is None:
+        seconds = _timed(study, {names[name]: row for name, row in everything.items()}, log)
+    plan = {}
+    for name, row in everything.items():
+        second = not name.startswith("backbone")
+        if study.steps is not None:
+            steps = study.steps[second] * row.times
+        else:
+            steps = 60 * study.minutes[second] * row.times / seconds[names[name]]
+        plan[name] = {"seconds": seconds.get(names[name]), "steps": max(round(steps), 1)}
+    return plan
+
+
+def _timed(study: Study, models: dict[str, Row], log: Log) -> Times:
+    """Return the seconds of a step for each model, from ``plan.json`` or measured now."""
+    path = study.out / PLAN
+    kept = _kept(path)
+    missing = {model: row for model, row in models.items() if model not in kept}
+    if not missing:
+        return kept
+    known = {model: row for model, row in models.items() if model in kept}
+    beside = dict(list(known.items())[-1:])  # a row rather than a backbone, where one is known
+    found = _measure(study, {**beside, **missing}, log)
+    scale = next((kept[model] / found[model] for model in beside), 1.0)
+    kept = _kept(path) | kept | {model: scale * found[model] for model in missing}
+    study.out.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(path, json.dumps(kept, indent=1) + "\n")
+    return kept
+
+
+def _kept(path: Path) -> Times:
+    try:
+        kept = json.loads(path.read_text("utf-8"))
+        return {str(model): float(seconds) for model, seconds in kept.items()}
+    except FileNotFoundError:
+        return {}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} is damaged ({error}): it says how long trainings are; restore it, or take "
+            "another folder by --out."
+        ) from None
+
+
+def _model(study: Study, row: Row) -> str:
+    """Return a hash of what the time of a row's step depends on."""
+    config = settings(study, row, 0, 1, start=UNREAD)
+    assert isinstance(config.model, ModelConfig)
+    facts = [configuration.to_dict(config.model), STAGES[0].settings(config).batch, row.reads]
+    return inputs_hash(facts)[:16]
+
+
+def clock() -> Callable[[], float]:
+    """Return the clock that counts: the processor's, or on an accelerator the one on the wall."""
+    return time.process_time if jax.default_backend() == "cpu" else time.perf_counter
+
+
+def _measure(study: Study, models: dict[str, Row], log: Log) -> Times:
+    """Return the time of a step of each model, seconds: medians, the models in turn."""
+    log(f"timing a step of {len(models)} trainings …")
+    steps = {model: _compiled(study, row, log) for model, row in models.items()}
+    taken: dict[str, list[float]] = {model: [] for model in steps}
+    now = clock()
+    for number in range(ROUNDS + 1):
+        for model, step in steps.items():
+            began = now()
+            step()
+            if number:
+                taken[model].append(now() - began)
+    found = {model: statistics.median(each) for model, each in taken.items()}
+    for model, seconds in found.items():
+        spread = f"{min(taken[model]):.3f} to {max(taken[model]):.3f}"
+        log(f"  {models[model].name}: {seconds:.3f} s a step ({spread})")
+    del steps
+    gc.collect()
+    return found
+
+
+def _compiled(study: Study, row: Row, log: Log) -> Callable[[], None]:
+    """Compile a row's training step; returns a function that does one step, on random weights."""
+    config = settings(study, row, 0, 1, start=UNREAD)
+    stage, mesh = STAGES[1 if row.reads else 0], sharding.make_mesh(arranged=config.train.mesh)
+    batch = next(iter(loader.clips(config, "train", seed=0, batch=stage.settings(config).batch)))
+    key = jax.device_put(noise_key(config, stage), sharding.replicated(mesh))
+    held = [initial_state(config, stage, mesh, None)]
+    if config.data.prepared:
+        assert stage.prepare is not None
+        batch = jax.jit(functools.partial(stage.prepare, config.model))(held[0].params, batch)
+    clip = jax.device_put(jax.device_get(batch), sharding.of_batch(mesh))
+    began = time.monotonic()
+    compiled = compile_step(config, stage, mesh, clip)
+    log(f"  {row.name}: compiled in {time.monotonic() - began:.0f} s")
+
+    def step() -> None:
+        held[0], metrics = compiled(held[0], clip, key)
+        jax.block_until_ready(metrics)
+
+    return step

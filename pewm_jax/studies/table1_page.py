@@ -1,30 +1,35 @@
-"""Table 1 for readers: the page in Markdown, with the paper's numbers beside ours."""
+"""Table 1 for readers: Markdown, LaTeX, CSV and a chart, with the paper's numbers beside ours."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pewm_jax.io import atomic
-from pewm_jax.report import pictures
-from pewm_jax.studies.rows import CONTROL, PAPER_FORM
-from pewm_jax.studies.table import GAP, LOWER, SETS
-from pewm_jax.studies.table_cells import (
-    PLACES,
-    TRUTH,
-    best_of,
-    blind,
-    cell,
-    columns_of,
-    floor_of,
-    heading,
-    label,
-    number_words,
-    place_floor,
-    rows_of,
-)
-from pewm_jax.studies.table_formats import as_csv, latex, plot
+from pewm_jax.report.charts import IntervalChart, IntervalRow
+from pewm_jax.report.table import Cell, Row, Table, row, with_half_width, with_interval
+from pewm_jax.studies.table1_numbers import GAP, LOWER, SETS
+from pewm_jax.studies.table1_rows import CONTROL, PAPER_FORM
+
+COLUMNS: Mapping[str, tuple[str, int]] = {
+    "psnr/seen": ("PSNR seen, dB", 2),
+    "psnr/unseen": ("PSNR unseen, dB", 2),
+    "psnr/all": ("PSNR, dB", 2),
+    "ssim/all": ("SSIM", 3),
+    "lpips/all": ("LPIPS[alex]", 3),
+    "fvd_half": ("FVD", 0),
+    "kvd_half": ("KVD", 2),
+    "dreamsim": ("DreamSim", 3),
+    "src": ("SRC[alex]", 1),
+    "depth_mae/all": ("depth, m", 3),
+}
+"""Measure → heading, decimals; FVD and KVD of halves, which have a floor of as many clips."""
+TRUTH = "the truth against itself"
+PLACES = "two different places"
+"""Rows beside the trained ones: what the truth gets, and what says nothing at all (SRC)."""
+
 
 PAPER: Mapping[str, tuple[float, ...]] = {
     "NWM": (17.479, 0.657, 0.308, 194.0, 0.247, 63.4),
@@ -90,32 +95,177 @@ PAPER_ABLATIONS: Mapping[str, str] = {
 def write(results: Mapping[str, Any], page: Path) -> None:
     """Write the table as ``page`` (Markdown) and, beside it, .tex, .csv and .png."""
     atomic.write_text(page, markdown(results, page.stem))
-    atomic.write_text(page.with_suffix(".tex"), latex(results))
-    atomic.write_text(page.with_suffix(".csv"), as_csv(results))
-    pictures.save_png(page.with_suffix(".png"), plot(results))
+    atomic.write_text(page.with_suffix(".tex"), scores_table(results, arrows=True).latex())
+    atomic.write_text(page.with_suffix(".csv"), numbers_table(results).csv())
+    with atomic.replacing(page.with_suffix(".png")) as partial:
+        partial.write_bytes(chart(results).png())
+
+
+def rows_of(results: Mapping[str, Any]) -> list[str]:
+    """Return the rows: those of the table as listed, then the backbone, then without a network."""
+    listed = list(results["about"]["rows"])
+    return [*listed, *(name for name in results["rows"] if name not in listed)]
+
+
+def columns_of(results: Mapping[str, Any]) -> list[str]:
+    """Return the measures that any row has, as listed."""
+    rows = results["rows"].values()
+    return [name for name in COLUMNS if any(name in row["measures"] for row in rows)]
+
+
+def heading(results: Mapping[str, Any], measure: str) -> str:
+    """Return the heading of a measure; of a distance of sets the name with its number of clips."""
+    floor = results["floors"].get(measure.removesuffix("_half"), {})
+    return floor.get("name") or COLUMNS[measure][0]
+
+
+def label(results: Mapping[str, Any], name: str) -> str:
+    """Return a row's name for people."""
+    known = {
+        "backbone": "(the backbone that the others start from)",
+        "reproject": "reprojection, no network",
+        "copy": "copying the last frame",
+    }
+    described = results["about"]["rows"].get(name)
+    return described["label"].replace("_", " ") if described else known.get(name, name)
+
+
+def lacks_depth(results: Mapping[str, Any], name: str, measure: str) -> bool:
+    """Return whether a measure is of depth and the row's model imagines none."""
+    about = results["about"]["rows"].get(name, {})
+    return measure.startswith("depth") and about.get("depth") is False
+
+
+def cell(results: Mapping[str, Any], name: str, measure: str) -> Cell:
+    """Return a number with half of its interval; a dash if there is none."""
+    entry = results["rows"][name]["measures"].get(measure)
+    if entry is None or lacks_depth(results, name, measure):
+        return Cell()
+    over = entry if "low" in entry else entry["over_seeds"]
+    return with_half_width({**over, "mean": entry["mean"]}, COLUMNS[measure][1])
+
+
+def best_of(results: Mapping[str, Any], names: Sequence[str], measure: str) -> str:
+    """Return the row with the best number among the trained ones."""
+    known = [
+        (results["rows"][name]["measures"][measure]["mean"], name)
+        for name in names
+        if name in results["about"]["rows"] and cell(results, name, measure).value is not None
+    ]
+    if not known or measure == "src":  # a model that always shows one picture is consistent too
+        return ""
+    lower = measure.split("/", 1)[0] in LOWER
+    return (min if lower else max)(known)[1]
+
+
+def floor_of(results: Mapping[str, Any], measure: str) -> float | None:
+    """Return what the truth itself gets; None where that is not measured."""
+    floors = results["floors"]
+    if measure == "src" and "src[alex]" in floors:
+        return floors["src[alex]"]["ceiling"]
+    found = floors.get(measure.removesuffix("_half"), {}).get("floor")
+    return found["mean"] if found else None
+
+
+def place_floor(results: Mapping[str, Any], measure: str) -> float | None:
+    """Return what pictures of two different places get; None but for SRC."""
+    floors = results["floors"]
+    return floors["src[alex]"]["floor"] if measure == "src" and "src[alex]" in floors else None
+
+
+def scores_table(results: Mapping[str, Any], *, arrows: bool = False) -> Table:
+    """Return the table of scores.
+
+    Args:
+        results: the content of ``results.json``.
+        arrows: whether headings show by an arrow which direction is better.
+    """
+    names, columns = rows_of(results), columns_of(results)
+    best = {measure: best_of(results, names, measure) for measure in columns}
+    lines: list[Row] = []
+    for name in names:
+        cells = [
+            dataclasses.replace(cell(results, name, measure), best=best[measure] == name)
+            for measure in columns
+        ]
+        lines.append(row(label(results, name), *cells))
+    lines.append(_bound(results, TRUTH, floor_of, rule=True))
+    if "src" in columns:
+        lines.append(_bound(results, PLACES, place_floor))
+    heads = [heading(results, measure) for measure in columns]
+    if not arrows:
+        return Table(["memory · reader", *heads], lines)
+    shown = ["↓" if measure.split("/")[0] in LOWER else "↑" for measure in columns]
+    pairs = zip(heads, shown, strict=True)
+    return Table(["memory, reader", *(" ".join(pair) for pair in pairs)], lines)
+
+
+def _bound(
+    results: Mapping[str, Any],
+    name: str,
+    number_of: Callable[[Mapping[str, Any], str], float | None],
+    *,
+    rule: bool = False,
+) -> Row:
+    """Return a row of what the truth, or two different places, get."""
+    cells = [
+        Cell(number_of(results, measure), COLUMNS[measure][1]) for measure in columns_of(results)
+    ]
+    return row(name, *cells, rule=rule)
+
+
+def numbers_table(results: Mapping[str, Any]) -> Table:
+    """Return every number of the table, a line for each row and measure."""
+    lines = []
+    for name in rows_of(results):
+        found = results["rows"][name]
+        for measure, entry in found["measures"].items():
+            over = entry if "low" in entry else entry["over_seeds"]
+            kind = results["about"]["house"] + "s" if over is entry else "seeds"
+            seeds = " ".join(f"{value:.6g}" for value in entry.get("per_seed", ()))
+            ends = (entry["mean"], over["low"], over["high"])
+            shown = ["" if value is None else f"{value:.6g}" for value in ends]
+            lines.append([name, measure, *shown, kind, str(found["seeds"]), seeds])
+    for measure in columns_of(results):
+        for name, number_of in ((TRUTH, floor_of), (PLACES, place_floor)):
+            number = number_of(results, measure)
+            if number is not None:
+                lines.append([name, measure, f"{number:.6g}", "", "", "", "", ""])
+    header = ["row", "measure", "mean", "low", "high", "interval_over", "seeds", "per_seed"]
+    return Table.of(header, lines)
+
+
+def chart(results: Mapping[str, Any], measure: str = "psnr/seen") -> IntervalChart:
+    """Return the chart of a measure of every row with its interval."""
+    known = {name: results["rows"][name]["measures"][measure] for name in rows_of(results)}
+    if all(entry["mean"] is None for entry in known.values()):
+        measure = "psnr/all"  # nothing was seen before
+        known = {name: results["rows"][name]["measures"][measure] for name in rows_of(results)}
+    rows = [
+        IntervalRow(
+            label(results, name),
+            entry["mean"],
+            entry["low"],
+            entry["high"],
+            entry.get("per_seed", ()),
+            quiet=name not in results["about"]["rows"],
+        )
+        for name, entry in known.items()
+        if entry["mean"] is not None
+    ]
+    which = "pixels seen before" if measure == "psnr/seen" else "all pixels"
+    house = results["about"]["house"]
+    caption = f"95 % intervals over {house}s; small dots are training seeds"
+    return IntervalChart(f"PSNR over {which}, dB", caption, rows)
 
 
 def markdown(results: Mapping[str, Any], stem: str) -> str:
     """Return the page."""
-    about, names, columns = results["about"], rows_of(results), columns_of(results)
-    best = {measure: best_of(results, names, measure) for measure in columns}
-    lines = []
-    for name in names:
-        cells = []
-        for measure in columns:
-            mean, half = cell(results, name, measure)
-            text = f"{mean} ± {half}" if half else mean
-            cells.append(f"**{text}**" if best[measure] == name else text)
-        lines.append([label(results, name), *cells])
-    lines.append([TRUTH, *(number_words(floor_of(results, each), each) for each in columns)])
-    if "src" in columns:
-        lines.append(
-            [PLACES, *(number_words(place_floor(results, each), each) for each in columns)]
-        )
+    about = results["about"]
     parts = [
         _title(about),
         how(results),
-        _table(["memory · reader", *(heading(results, m) for m in columns)], lines),
+        scores_table(results).markdown(),
         _floors(results),
         _unbeaten(results),
         f"![PSNR over pixels seen before, with intervals]({stem}.png)",
@@ -132,6 +282,10 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
     parts += [_trainings(about)]
     parts += [f"- {sentence}" for sentence in about["left_out"].values()]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _markdown(header: Sequence[str], rows: Sequence[Sequence[Cell | str]]) -> str:
+    return Table.of(header, rows).markdown()
 
 
 def _title(about: Mapping[str, Any]) -> str:
@@ -158,11 +312,6 @@ def how(results: Mapping[str, Any]) -> str:
         f"{about['hours']['clock']:.1f} hours on the clock, added up, {about['hours']['cpu']:.1f} "
         f"of the processor; {about['date']}."
     )
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _floors(results: Mapping[str, Any]) -> str:
@@ -210,24 +359,22 @@ def _against(results: Mapping[str, Any], rival: str) -> str:
     for name, found in results["differences"][rival].items():
         if name in results["about"]["rows"]:
             rows.append([label(results, name), *_cells_of(results, found, (name, rival))])
-    return f"## Each row minus {label(results, rival)}\n\n{PAIRED}\n\n" + _table(
+    return f"## Each row minus {label(results, rival)}\n\n{PAIRED}\n\n" + _markdown(
         ["row", *STEP_HEADINGS], rows
     )
 
 
 def _cells_of(
     results: Mapping[str, Any], differences: Mapping[str, Any], pair: tuple[str, str]
-) -> list[str]:
-    """Return the differences of two rows that count, as words."""
-    cells = []
+) -> list[Cell]:
+    """Return the differences of two rows."""
+    cells: list[Cell] = []
     for measure, decimals in STEP_MEASURES.items():
         found = differences.get(measure)
-        sees = not any(blind(results, name, measure) for name in pair)
-        cells.append(_signed(found, decimals) if found and sees else "–")
-        if found and sees:
-            cells[-1] += mark_of(found)
+        sees = not any(lacks_depth(results, name, measure) for name in pair)
+        cells.append(_difference(found, decimals) if found and sees else Cell())
     over = differences["psnr/seen"].get("over_seeds")
-    return [*cells, _signed(over, 2) if over else "–"]
+    return [*cells, with_interval(over, 2, sign=True)]
 
 
 def _order_text(results: Mapping[str, Any]) -> str:
@@ -239,7 +386,7 @@ def _order_text(results: Mapping[str, Any]) -> str:
         words = f"{label(results, step['better'])} − {label(results, step['worse'])}"
         pair = (step["better"], step["worse"])
         rows.append([words, *_cells_of(results, step["differences"], pair)])
-    text = _table(["step of the paper's order", *STEP_HEADINGS], rows)
+    text = _markdown(["step of the paper's order", *STEP_HEADINGS], rows)
     return (
         "## The paper's order\n\nThe paper has no memory < image memory < no depth < 2D map < 3D "
         "map. Each step here, paired. *None · attend* is ours: a "
@@ -261,14 +408,10 @@ def mark_of(entry: Mapping[str, Any]) -> str:
     return SIGNIFICANT if over_seeds else HOUSES_ONLY
 
 
-def _signed(entry: Mapping[str, Any], decimals: int) -> str:
-    entry = entry if "low" in entry else entry["over_seeds"]
-    if entry["mean"] is None:
-        return "–"
-    mean = f"{entry['mean']:+.{decimals}f}"
-    if entry["low"] is None:
-        return mean
-    return f"{mean} [{entry['low']:+.{decimals}f}, {entry['high']:+.{decimals}f}]"
+def _difference(entry: Mapping[str, Any], decimals: int) -> Cell:
+    """Return a difference with its interval and its mark of significance."""
+    over = entry if "low" in entry else entry["over_seeds"]
+    return dataclasses.replace(with_interval(over, decimals, sign=True), mark=mark_of(entry))
 
 
 def _paper(results: Mapping[str, Any]) -> str:
@@ -276,10 +419,10 @@ def _paper(results: Mapping[str, Any]) -> str:
     for name, described in results["about"]["rows"].items():
         if described["paper"]:
             theirs = PAPER[described["paper"]]
-            ours = [cell(results, name, measure)[0] for measure in OURS]
+            ours = [cell(results, name, measure).main for measure in OURS]
             pairs = [f"{a:g} / {b}" for a, b in zip(theirs, ours, strict=True)]
             rows.append([described["paper"], label(results, name), *pairs])
-    text = _table(["the paper's row", "ours", *PAPER_HEADINGS], rows)
+    text = _markdown(["the paper's row", "ours", *PAPER_HEADINGS], rows)
     return f"## Beside the paper\n\nThe paper's / ours.\n\n{text}\n\n{NOT_COMPARABLE}"
 
 
@@ -292,4 +435,4 @@ def _trainings(about: Mapping[str, Any]) -> str:
         count = f"{size / 1e6:.2f} M" if size else "–"
         rows.append([name, count, took, str(training["steps"])])
     header = ["training", "parameters of the reader", "seconds a step", "steps"]
-    return f"## What was trained\n\n{_table(header, rows)}"
+    return f"## What was trained\n\n{_markdown(header, rows)}"
