@@ -15,6 +15,8 @@ only renders houses does not load the networks.
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from pewm_jax import _moved
+
 if TYPE_CHECKING:
     from pewm_jax.codecs.signals import rgb_from_signal
     from pewm_jax.config import Config, ModelConfig
@@ -73,6 +75,8 @@ __all__ = [
     "rollout",
     "start",
 ]
+
+_moved.install()
 
 
 def __getattr__(name: str) -> Any:

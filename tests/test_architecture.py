@@ -11,6 +11,7 @@ import pewm_jax
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = [
+    "_moved",
     "errors",
     "types",
     "registry",
@@ -76,7 +77,14 @@ FORMER_COMMANDS = {f"{name}/__main__" for name in ("convert", "data", "memory")}
 """``python -m pewm_jax.data`` and the like: the former names of commands."""
 BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}
 """Functions whose first argument is the name of a module that they import or look for."""
-ANY_NAME = {"__init__", "registry", "presets/__init__", "convert/output"}
+ANY_NAME = {
+    "__init__",
+    "_moved",
+    "config/__init__",
+    "registry",
+    "presets/__init__",
+    "convert/output",
+}
 """Files that import by a name which is not written where it is imported."""
 FILES = sorted((ROOT / "pewm_jax").rglob("*.py"))
 PLACES = {str(path.relative_to(ROOT / "pewm_jax").with_suffix("")): path for path in FILES}

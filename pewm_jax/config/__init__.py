@@ -121,7 +121,6 @@ _MOVED = {
     "VoxelDiTConfig": "pewm_jax.models.persist.config",
     "VoxelVAEConfig": "pewm_jax.models.persist.config",
     "BlocksConfig": "pewm_jax.models.persist.config",
-    "NomadConfig": "pewm_jax.config.nomad",
     "DINOv2Config": "pewm_jax.models.dinov2.config",
     "CLIPVisionConfig": "pewm_jax.models.clip.config",
     "ModulationConfig": "pewm_jax.controls.actions",
@@ -145,7 +144,7 @@ _MOVED = {
     "NoiseSettings": "pewm_jax.config.parts:Noise",
     "Places": "pewm_jax.config.parts:InjectionPoints",
     "ReaderSettings": "pewm_jax.config.parts:Reader",
-    "WorldSettings": "pewm_jax.config.parts:World",
+    "WorldSettings": "pewm_jax.config.world:World",
 }
 """Names that version 0.1 had here → the module that has them now, and the name if it is another."""
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.models import interface as backbones
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import model as dit_block
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.interface import Conditioning, Readers
 from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.readers.memory_block import MemoryBlock
@@ -20,7 +20,7 @@ from tests.models.test_models_dit import CONFIG, inputs, random_params
 from tests.models.test_models_world_model import setup as world
 
 apply = jax.jit(dit.apply, static_argnums=0, static_argnames="expert")
-denoise = jax.jit(backbones.apply, static_argnums=0)
+denoise = jax.jit(DiTBackbone.apply, static_argnums=0)
 FRAMES, PATCHES = 3, 6
 WIDTH, TIME = CONFIG.width, CONFIG.time_dim
 TWO = dataclasses.replace(CONFIG, patch_t=2)

@@ -13,7 +13,7 @@ from pewm_jax.errors import require
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox.config import DiTConfig
-from pewm_jax.models.interface import Conditioning, Readers
+from pewm_jax.models.interface import NO_READERS, Conditioning, Readers
 from pewm_jax.types import Array, Params
 
 REPLICATED = P()
@@ -89,7 +89,7 @@ class DiTBackbone(DiTConfig, Backbone):
         x_BthwC: Array,
         time_B: Array,
         conditioning: Conditioning,
-        readers: Readers,
+        readers: Readers = NO_READERS,
     ) -> Array:
         """Predict from noisy latents.
 

@@ -20,7 +20,7 @@ from pewm_jax.errors import UserError, require
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.cosmos import model as cosmos
 from pewm_jax.models.cosmos.config import CosmosConfig
-from pewm_jax.models.interface import Conditioning, Observed, Readers
+from pewm_jax.models.interface import NO_READERS, Conditioning, Observed, Readers
 from pewm_jax.types import Array, Params
 
 KNOWN_SIGMA = 1e-4
@@ -105,7 +105,7 @@ class CosmosBackbone(CosmosConfig, Backbone):
         x_BthwC: Array,
         time_B: Array,
         conditioning: Conditioning,
-        readers: Readers,
+        readers: Readers = NO_READERS,
     ) -> Array:
         """Predict from noisy latents. The prediction of known frames has no meaning.
 

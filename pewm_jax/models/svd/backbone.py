@@ -19,7 +19,7 @@ from pewm_jax.config.parts import Backbone, Rules
 from pewm_jax.errors import UserError, require
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.clip import model as clip_vision
-from pewm_jax.models.interface import Conditioning, Observed, Readers
+from pewm_jax.models.interface import NO_READERS, Conditioning, Observed, Readers
 from pewm_jax.models.svd import unet as svd_unet
 from pewm_jax.models.svd.config import SVDUNetConfig
 from pewm_jax.types import Array, Params
@@ -111,7 +111,7 @@ class SVDUNetBackbone(SVDUNetConfig, Backbone):
         x_BthwC: Array,
         time_B: Array,
         conditioning: Conditioning,
-        readers: Readers,
+        readers: Readers = NO_READERS,
     ) -> Array:
         """Predict from noisy latents.
 

@@ -1,0 +1,102 @@
+"""Modules of the earlier version are imported by their old names, with a warning."""
+
+import importlib
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+
+from pewm_jax import _moved
+
+ROOT = Path(__file__).parents[1]
+
+
+def path_of(module):
+    return ROOT / "pewm_jax" / module.replace(".", "/")
+
+
+def exists(module):
+    path = path_of(module)
+    return path.with_suffix(".py").exists() or (path / "__init__.py").exists()
+
+
+def test_every_new_name_exists_and_no_old_one_does():
+    assert [new for new in _moved.MOVED.values() if not exists(new)] == []
+    assert [old for old in _moved.MOVED if exists(old)] == []
+
+
+def test_nothing_in_the_package_imports_an_old_name():
+    found = []
+    for path in (ROOT / "pewm_jax").rglob("*.py"):
+        if path.name == "_moved.py":
+            continue
+        text = path.read_text()
+        found += [(path.name, old) for old in _moved.MOVED if f"import pewm_jax.{old}\n" in text]
+        found += [(path.name, old) for old in _moved.MOVED if f"from pewm_jax.{old} import" in text]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("models.pixel_codec", "codecs.pixel"),
+        ("training", "train"),
+        ("training.loop", "train.loop"),
+        ("training.watch", "train.watch"),
+        ("evaluation.metrics.structure", "eval.metrics.structure"),
+        ("diffusion.schedule", "diffusion.ddpm"),
+    ],
+)
+def test_an_old_name_is_the_module_itself(old, new):
+    for name in list(sys.modules):
+        if _moved.new_name(name):
+            del sys.modules[name]
+    wanted = importlib.import_module(f"pewm_jax.{new}")
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        found = importlib.import_module(f"pewm_jax.{old}")
+    assert any(f"pewm_jax.{old} is now pewm_jax.{new};" in str(one.message) for one in seen)
+    assert found is wanted
+    assert wanted.__spec__.name == wanted.__name__ == f"pewm_jax.{new}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert importlib.import_module(f"pewm_jax.{old}") is wanted, "once is enough"
+
+
+def test_the_warning_names_the_line_that_imports(tmp_path):
+    (tmp_path / "mine.py").write_text("x = 1\nfrom pewm_jax.atomic import write_text\n")
+    done = subprocess.run(
+        [sys.executable, "-W", "always", "mine.py"],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "mine.py:2: DeprecationWarning" in done.stderr
+
+
+def test_classes_that_left_the_settings_are_found_there_with_a_warning():
+    from pewm_jax import config
+    from pewm_jax.codecs.pixel import PixelConfig
+    from pewm_jax.models.cogvideox.backbone import DiTBackbone
+
+    for name, wanted in (("PixelConfig", PixelConfig), ("DiTConfig", DiTBackbone)):
+        with pytest.warns(DeprecationWarning, match=rf"config\.{name} is deprecated: import"):
+            assert getattr(config, name) is wanted
+    for name in config._MOVED:
+        with pytest.warns(DeprecationWarning, match=rf"config\.{name} is deprecated"):
+            getattr(config, name)
+    with pytest.raises(AttributeError):
+        config.nothing  # noqa: B018
+
+
+def test_an_unknown_module_is_not_found():
+    with pytest.raises(ModuleNotFoundError, match="nowhere"):
+        importlib.import_module("pewm_jax.nowhere")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(ModuleNotFoundError, match=r"train\.nowhere"):
+            importlib.import_module("pewm_jax.training.nowhere")
