@@ -12,9 +12,9 @@ from diffusers.pipelines.stable_video_diffusion import (
 from safetensors.numpy import load_file, save_file
 from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from pewm_jax import config as configuration
 from pewm_jax.config import UserError
 from pewm_jax.convert import pipeline, svd
+from pewm_jax.models.clip import config as clip_config
 from pewm_jax.models.clip import convert as clip_convert
 from pewm_jax.models.clip import model
 from tests.parity.svd_references import distance, draw, randomise
@@ -74,7 +74,7 @@ def test_counted_positions_are_left_behind_and_nothing_else(pair, tmp_path):
 
 
 def test_the_published_size_has_the_reference_s_tensors():
-    config = configuration.CLIPVisionConfig()
+    config = clip_config.CLIPVisionConfig()
     with torch.device("meta"):
         network = reference("gelu", 32, 16, 1280, 5120, 224, 1024)
     assert clip_convert.config_from_transformers(network.config.to_dict(), "it") == config
