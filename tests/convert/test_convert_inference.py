@@ -118,7 +118,7 @@ def test_converted_weights_have_neither_data_nor_training(run, params, tmp_path)
     weights.save(run / runs.WEIGHTS, params, {"stage": "0"})
     card = export(run, tmp_path / "converted")
     assert "None: these are converted weights" in card
-    assert "see what the original was trained on" in card
+    assert "see the data of the original" in card
     assert "`demo`" not in card
 
 
