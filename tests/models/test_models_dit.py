@@ -35,7 +35,7 @@ def random_params(config=CONFIG):
     return randomise(jax.tree.map(lambda x: jnp.zeros(x.shape), shapes))
 
 
-run = jax.jit(dit.apply, static_argnums=0, static_argnames="expert")
+run = jax.jit(dit.apply, static_argnums=0, static_argnames="memory_block")
 
 
 @settings(max_examples=15, deadline=None)
@@ -108,25 +108,25 @@ def test_scan_and_remat_equal_a_plain_loop():
 
 
 def add_gate(gate, video, time):
-    """An expert whose parameter is a number."""
+    """A memory block whose parameter is a number."""
     assert video.shape == (2, 18, CONFIG.width)
     return video + gate * time.mean()
 
 
-def test_an_expert_reads_and_writes_the_video_tokens_alone():
+def test_a_memory_block_reads_and_writes_the_video_tokens_alone():
     params, given = random_params(), inputs()
     plain = run(CONFIG, params, *given)
 
     @jax.jit
     def value_and_slope(gates):
         def out(gates):
-            return dit.apply(CONFIG, params, *given, expert=add_gate, expert_params=gates)
+            return dit.apply(CONFIG, params, *given, memory_block=add_gate, memory_params=gates)
 
         return out(gates), jax.grad(lambda g: out(g).std())(gates)
 
     closed, slope = value_and_slope(jnp.zeros(CONFIG.layers))
     np.testing.assert_allclose(closed, plain, atol=1e-6)
-    assert np.all(np.abs(slope) > 0), "every layer's expert is asked"
+    assert np.all(np.abs(slope) > 0), "every layer's memory block is called"
 
 
 def test_with_closed_memory_gates_stage_2_is_stage_1_and_feels_no_map():

@@ -19,7 +19,7 @@ from tests.helpers import TINY, init_world, randomise, with_reader
 from tests.models.test_models_dit import CONFIG, inputs, random_params
 from tests.models.test_models_world_model import setup as world
 
-apply = jax.jit(dit.apply, static_argnums=0, static_argnames="expert")
+apply = jax.jit(dit.apply, static_argnums=0, static_argnames="memory_block")
 denoise = jax.jit(DiTBackbone.apply, static_argnums=0)
 FRAMES, PATCHES = 3, 6
 WIDTH, TIME = CONFIG.width, CONFIG.time_dim
@@ -55,7 +55,7 @@ def test_a_modulation_of_zero_is_none(config):
 
 
 def show_time(_, video, time):
-    """An expert after which the video tokens hold nothing but the time that it was told."""
+    """A memory block after which the video tokens hold nothing but the time that it was told."""
     told = jnp.repeat(time, video.shape[1] // time.shape[1], 1)
     return jnp.tile(told, (1, 1, WIDTH // TIME))
 

@@ -163,20 +163,26 @@ def test_modulation_is_added_per_frame_wherever_the_time_modulates(pair, per_fra
     assert distance(steered(late)[:, :1], want[:, :1]) > 0.001
 
 
-def test_experts_run_after_every_block_and_tokens_can_be_added(pair):
+def test_memory_blocks_run_after_every_block_and_tokens_can_be_added(pair):
     config, params = pair[2]
     arguments = inputs()
     plain = compiled()(config, params, *arguments, 16)
     seen = []
 
-    def expert(gain, video, time):
+    def memory_block(gain, video, time):
         seen.append((video.shape, time.shape))
         return video * gain
 
     @jax.jit
     def run(gains, added):
         return model.apply(
-            config, params, *arguments, 16, expert=expert, expert_params=gains, added_BND=added
+            config,
+            params,
+            *arguments,
+            16,
+            memory_block=memory_block,
+            memory_params=gains,
+            added_BND=added,
         )
 
     tokens = (2, 3 * 3 * 5, config.width)

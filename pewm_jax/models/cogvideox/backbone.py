@@ -118,8 +118,8 @@ class DiTBackbone(DiTConfig, Backbone):
             padded(latents),
             text,
             time_B if time_B.ndim < 2 else per_token(time_B),
-            expert=readers.block,
-            expert_params=readers.params,
+            memory_block=readers.block,
+            memory_params=readers.params,
             modulation_BtE=None if modulation is None else per_token(modulation),
             added_BND=readers.added_BND,
         )

@@ -6,6 +6,9 @@ normalised per head, and video tokens get a 3D rotary embedding. The blocks are 
 compile time does not grow with depth. Reference: ``CogVideoXTransformer3DModel`` of diffusers;
 ``pewm_jax.config.published`` has the settings of its five published networks.
 
+A memory enters the network in two places: ``memory_block`` runs after every block, and
+``added_BND`` is added to the embedded tokens (both from ``models.interface.Readers``).
+
 Parameters: ``patch_embed, text_embed, time_embed, blocks (stacked over layers), norm_final,
 norm_out, modulate_out, proj_out``, and ``positions`` or ``ofs_embed`` where a variant has them.
 """
@@ -27,8 +30,8 @@ from pewm_jax.nn import layers, modules, placement
 from pewm_jax.nn.tokens import TokenLayout, patchify, unpatchify
 from pewm_jax.types import Array, Params
 
-BlockExpert = Callable[[Any, Array, Array], Array]
-"""``expert(layer_params, video_BND, time_BE) -> video_BND``, run after a block."""
+MemoryBlock = Callable[[Any, Array, Array], Array]
+"""``memory_block(layer_params, video_BND, time_BE) -> video_BND``, run after a block."""
 
 OFS = 2.0
 """The value of the second scalar input, with which 1.5-5B-I2V was trained."""
@@ -230,8 +233,8 @@ def apply(
     timesteps_B: Array,
     ofs_B: Array | None = None,
     *,
-    expert: BlockExpert | None = None,
-    expert_params: Any = None,
+    memory_block: MemoryBlock | None = None,
+    memory_params: Any = None,
     modulation_BtE: Array | None = None,
     added_BND: Array | None = None,
 ) -> Array:
@@ -246,9 +249,9 @@ def apply(
         timesteps_B: (B,) diffusion times, 0 … train_steps − 1, or a single one; or (B, t'), one
             for each of the t' = t / ``patch_t`` tokens in time (the text gets their mean).
         ofs_B: (B,) second scalar of 1.5-5B-I2V; None means ``OFS``.
-        expert: a function of the video tokens that runs after every block (the memory block);
-            tokens are in the order of ``layout_of``.
-        expert_params: the experts' parameters, stacked over layers.
+        memory_block: function of the video tokens that runs after every block and reads the
+            memory; tokens are in the order of ``layout_of``.
+        memory_params: its parameters, stacked over layers.
         modulation_BtE: (B, t', E) added to the time embedding of each token in time, not to the
             text's.
         added_BND: (B, N, D) added to the embedded video tokens, in the order of ``layout_of``.
@@ -290,14 +293,14 @@ def apply(
 
     def body(tokens: Array, layer: tuple[Params, Any]) -> tuple[Array, None]:
         tokens = Block(config).apply({"params": layer[0]}, tokens, time, angles, layout)
-        if expert is not None:
+        if memory_block is not None:
             text, video = layout.split(tokens)
             video_time = time[:, 1:] if time.ndim == 3 else time
-            tokens = layout.join(text, expert(layer[1], video, video_time))
+            tokens = layout.join(text, memory_block(layer[1], video, video_time))
         return placement.constrain(tokens, "batch", "tokens"), None
 
     body = jax.checkpoint(body) if config.remat else body
-    tokens, _ = jax.lax.scan(body, tokens, (params["blocks"], expert_params))
+    tokens, _ = jax.lax.scan(body, tokens, (params["blocks"], memory_params))
     video = layout.split(tokens)[1]
     patches: Array = ends.apply(ends_params, video, time, layout, method="project")
     return unpatchify(layout.gather(patches), frames, height, width, patch, patch_t)

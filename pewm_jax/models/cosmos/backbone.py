@@ -139,8 +139,8 @@ class CosmosBackbone(CosmosConfig, Backbone):
             conditioning.joined_BthwC,
             fps=conditioning.fps,
             modulation_BtE=conditioning.modulation_BtE,
-            expert=readers.block,
-            expert_params=readers.params,
+            memory_block=readers.block,
+            memory_params=readers.params,
             added_BND=readers.added_BND,
         )
 

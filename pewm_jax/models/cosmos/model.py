@@ -5,9 +5,13 @@ differ from one latent frame to the next: known frames have nearly none. A furth
 embedding per latent frame can be added to the time embedding wherever that one modulates the
 network. This is how actions steer it (arXiv 2601.15284, Eq. 5).
 
-The blocks are scanned, so compile time does not grow with depth. Parameters: ``patch_embed,
-time_embed, blocks (stacked over layers), modulate_out, proj_out``, and ``text_embed`` or
-``positions`` where a variant has them.
+The blocks are scanned, so compile time does not grow with depth.
+
+A memory enters the network in two places: ``memory_block`` runs after every block, and
+``added_BND`` is added to the embedded tokens (both from ``models.interface.Readers``).
+
+Parameters: ``patch_embed, time_embed, blocks (stacked over layers), modulate_out, proj_out``, and
+``text_embed`` or ``positions`` where a variant has them.
 """
 
 from __future__ import annotations
@@ -46,8 +50,8 @@ SHARDING = (
 )
 """Rules over the paths of the parameters as a backbone; see ``models.backbones``."""
 
-Expert = Callable[[Any, Array, Array], Array]
-"""``expert(layer_params, video_BND, time_BE or time_BtE) -> video_BND``, run after a block."""
+MemoryBlock = Callable[[Any, Array, Array], Array]
+"""``memory_block(params, video_BND, time_BE or time_BtE) -> video_BND``, run after a block."""
 
 
 def layout(config: CosmosConfig) -> dict[str, tuple[int, ...]]:
@@ -92,8 +96,8 @@ def apply(
     fps: Array | float | None = None,
     *,
     modulation_BtE: Array | None = None,
-    expert: Expert | None = None,
-    expert_params: Any = None,
+    memory_block: MemoryBlock | None = None,
+    memory_params: Any = None,
     added_BND: Array | None = None,
 ) -> Array:
     """Predict from noisy latents.
@@ -112,9 +116,9 @@ def apply(
         fps: frames per second, one number; None for an image, and to count frames.
         modulation_BtE: (B, t', width) added to the time embedding of each token in time, from
             which every block and the output layer compute their modulation; None for none.
-        expert: a function of the video tokens that runs after every block (the memory block);
-            tokens are in the order of ``layout_of``.
-        expert_params: the experts' parameters, stacked over layers.
+        memory_block: function of the video tokens that runs after every block and reads the
+            memory; tokens are in the order of ``layout_of``.
+        memory_params: its parameters, stacked over layers.
         added_BND: (B, N, D) added to the embedded tokens, in the order of ``layout_of``.
 
     Returns:
@@ -163,12 +167,12 @@ def apply(
         if positions is not None:
             x = x + positions
         x = cosmos_block.run(config, layer[0], x, time, text, angles, order)
-        if expert is not None:
-            x = expert(layer[1], x, seen)
+        if memory_block is not None:
+            x = memory_block(layer[1], x, seen)
         return placement.constrain(x, "batch", "tokens"), None
 
     body = jax.checkpoint(body) if config.remat else body
-    x, _ = jax.lax.scan(body, x, (params["blocks"], expert_params))
+    x, _ = jax.lax.scan(body, x, (params["blocks"], memory_params))
     x, _ = cosmos_block.modulate(params["modulate_out"], x, time, order)
     return _unpatched(config, order.gather(linear(params["proj_out"], x)), grid)
 
