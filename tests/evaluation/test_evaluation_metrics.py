@@ -177,21 +177,21 @@ def test_what_cannot_work_is_refused_in_a_sentence(files, tmp_path, monkeypatch)
 
 def test_a_setting_chooses_weights_or_says_why_there_are_none(files, monkeypatch):
     path = files["lpips_alex"]
-    metric, said = perceptual.chosen(str(path), 64, 64)
+    metric, said = perceptual.select_lpips(str(path), 64, 64)
     assert metric is not None
     assert "not resized" in said
     assert len(metric.sha256) == 64
-    assert perceptual.chosen("off", 64, 64) == (None, "LPIPS is left out, as evaluate.lpips says.")
+    assert perceptual.select_lpips("off", 64, 64) == (None, "LPIPS is left out, as evaluate.lpips says.")
     with pytest.raises(UserError, match="too small"):
-        perceptual.chosen(str(path), 16, 64)
+        perceptual.select_lpips(str(path), 16, 64)
     monkeypatch.setattr(lpips_weights, "installed", lambda net: path if net == "alex" else None)
-    assert perceptual.chosen("", 64, 64)[0].sha256 == metric.sha256
-    assert "these have 40 × 16; --lpips vgg" in perceptual.chosen("", 16, 40)[1]
-    assert perceptual.chosen("alex", 31, 31)[0] is not None
+    assert perceptual.select_lpips("", 64, 64)[0].sha256 == metric.sha256
+    assert "these have 40 × 16; --lpips vgg" in perceptual.select_lpips("", 16, 40)[1]
+    assert perceptual.select_lpips("alex", 31, 31)[0] is not None
     with pytest.raises(UserError, match="LPIPS with VGG16 needs weights, and none are installed"):
-        perceptual.chosen("vgg", 64, 64)
+        perceptual.select_lpips("vgg", 64, 64)
     monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
-    assert "no weights of it are installed" in perceptual.chosen("", 64, 64)[1]
+    assert "no weights of it are installed" in perceptual.select_lpips("", 64, 64)[1]
 
 
 def test_tables_have_lpips_of_whole_pictures_and_only_where_it_was_measured():

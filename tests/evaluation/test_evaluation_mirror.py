@@ -46,7 +46,7 @@ def test_who_knows_the_way_comes_back_to_what_was_left(scene, tmp_path, monkeypa
         long_choices(config, episodes),
     )
     visits = selection.select_revisits(("off",), None, 16, 16)[0]
-    back = mirror.look_back(config, episodes, methods, partials, rollouts, visits, print)
+    back = mirror.mirror_test(config, episodes, methods, partials, rollouts, visits, print)
     assert back.distances == [2, 4, 6, 8, 10, 12, 14, 16]
     assert set(back.pairs) == SAMPLED
     for pair in mirror.PAIRS:
@@ -66,7 +66,7 @@ def test_who_knows_the_way_comes_back_to_what_was_left(scene, tmp_path, monkeypa
     assert found["margins"]["empty"]["again"]["low"][0] > 20
     assert found["ceiling"]["mirror[psnr]"]["mean"] == pytest.approx(100)
     monkeypatch.setattr(ModelRunner, "run", None)
-    again = mirror.look_back(config, episodes, methods, partials, rollouts, visits, print)
+    again = mirror.mirror_test(config, episodes, methods, partials, rollouts, visits, print)
     assert mirror.facts(again) == found
 
 
