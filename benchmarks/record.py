@@ -1,4 +1,4 @@
-"""The file of results: every benchmark owns the text between its two markers."""
+"""The file of results: every benchmark writes the text between its two markers."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from pewm_jax.io import atomic
+from pewm_jax.report.table import Table
 
 sys.path.append(str(Path(__file__).parents[1]))  # train.py lies beside the library
 RESULTS = Path(__file__).with_name("RESULTS.md")
@@ -22,7 +23,7 @@ by hand.
 
 
 def machine(*packages: str) -> str:
-    """Return what a number depends on: processor, cores, versions, day."""
+    """Return what a benchmark's numbers depend on: processor, cores, versions, day."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -34,8 +35,7 @@ def machine(*packages: str) -> str:
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return Table.of(header, rows).markdown()
 
 
 def record(name: str, text: str, path: Path = RESULTS) -> None:

@@ -1,7 +1,7 @@
-"""A tab without a browser: it listens to the live viewer and presses its keys.
+"""A client of the live viewer without a browser: it receives the page's messages and presses keys.
 
-`python benchmarks/tab.py URL` waits until the page is ready, drives one step and says how long that
-took. It speaks the language of the viser that is installed beside it.
+`python benchmarks/tab.py URL` waits until the page is ready, drives one step and prints how long
+that took. It uses the protocol of the installed version of viser.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ CAMERA = {
     "look_at": (0.0, 0.0, 0.0),
     "up_direction": (0.0, 1.0, 0.0),
 }
-"""What a tab says first; the server listens to none that has not said it."""
+"""The first message of a client; the server ignores clients that have not sent it."""
 AGENT = "/agent"
-"""What moves in the map at each step."""
+"""The scene node that moves at each step."""
 
 
 class Tab:
-    """What the server has told so far.
+    """A connection to the viewer, with the state that the server has sent.
 
     Attributes:
-        keys: the names of what can be done, with what the server calls them.
-        status: the line that says how things are, as HTML.
+        keys: the names of the commands, with their identifiers.
+        status: the status line, as HTML.
     """
 
     def __init__(self, connection: ClientConnection):
@@ -49,24 +49,24 @@ class Tab:
         self.status = ""
 
     def press(self, name: str) -> None:
-        """Ask for what a key does, such as ``forward (W)``."""
+        """Trigger a command, such as ``forward (W)``."""
         message = {"type": "CommandTriggerMessage", "uuid": self.keys[name]}
         self._say(message)
 
     @property
     def at_wall(self) -> bool:
         """Whether the last step was stopped by a wall."""
-        return "There is a wall" in self.status
+        return "Blocked by a wall" in self.status
 
     def begin(self) -> None:
-        """Say where this tab's camera is, as a browser does first."""
+        """Send the camera, as a browser does first."""
         self._say(CAMERA)
 
     def _say(self, message: dict) -> None:
         self._connection.send(msgspec.msgpack.encode(message))
 
     def hear(self, seconds: float) -> list[dict]:
-        """Return what is told next; nothing if nothing is within some seconds."""
+        """Return the next messages; none if none arrive within some seconds."""
         try:
             raw = self._connection.recv(timeout=max(seconds, 0.001))
         except TimeoutError:
@@ -82,29 +82,29 @@ class Tab:
         return told
 
     def step(self, name: str, patience_s: float = 600.0) -> float:
-        """Make a step; returns the seconds until the agent stands elsewhere, or at a wall."""
+        """Make a step; return the seconds until the agent has moved or is blocked by a wall."""
         begun = time.monotonic()
         self.press(name)
         while time.monotonic() - begun < patience_s:
             told = self.hear(1.0)
             if any(message.get("name") == AGENT for message in told):
                 return time.monotonic() - begun
-            if not told and self.at_wall:  # a wall that it stood at before is not told again
+            if not told and self.at_wall:  # the same status is not sent twice
                 return time.monotonic() - begun
-        raise TimeoutError(f"{name} was not answered in {patience_s} s: {self.status}")
+        raise TimeoutError(f"no answer to {name} within {patience_s} s: {self.status}")
 
     def listen(self, seconds: float) -> None:
-        """Take all that is told for some seconds."""
+        """Receive messages for some seconds."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             self.hear(left)
 
     def until(self, sentence: str, patience_s: float = 600.0) -> None:
-        """Listen until the page says something."""
+        """Receive messages until the status line contains a sentence."""
         end = time.monotonic() + patience_s
         while sentence not in self.status:
             if time.monotonic() > end:
-                raise TimeoutError(f"The page did not say {sentence!r}: {self.status}")
+                raise TimeoutError(f"the status line never contained {sentence!r}: {self.status}")
             self.hear(1.0)
 
 

@@ -84,7 +84,8 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
     join, flags = cli.take(Join, argv)
     prog = f"{prog} {run}"
     settings = cli.parse(Settings, flags, default=Settings(), prog=prog, description=about)
-    if _is_codec(Path(run)):
+    config = _read_config(Path(run))
+    if config is not None and isinstance(config.model, configuration.CodecWorldConfig):
         if join.distributed:
             raise cli.ConfigError(
                 f"{run} holds a codec: one process scores it; leave out --distributed."
@@ -96,25 +97,23 @@ def main(argv: Sequence[str], prog: str = "python evaluate.py") -> int:
 
     with processes.joined(join):
         # After joining: these imports take seconds, and JAX must not be used before it.
-        from pewm_jax.eval import evaluate as report
+        from pewm_jax.eval.evaluate import evaluate
 
         cli.cache_compilation(Path(run).parent)
         try:
             changes = {name: value for name, value in vars(settings).items() if name != "out"}
-            page = report.evaluate(run, out=settings.out, **changes)
+            page = evaluate(run, out=settings.out, config=config, **changes)
         except KeyboardInterrupt:
-            again = "Interrupted; what is scored is kept, run the same command again to go on."
+            again = "Interrupted; finished scores are kept. Run the same command again to resume."
             raise KeyboardInterrupt(again) from None
         print(f"report: {page}")
     return 0
 
 
-def _is_codec(run: Path) -> bool:
-    """Tell whether a run trained a codec alone."""
+def _read_config(run: Path) -> configuration.Config | None:
+    """Return a run's configuration; None if there is no such run."""
     file = shipped.find(run) / "config.json"
-    return file.is_file() and isinstance(
-        configuration.load(file).model, configuration.CodecWorldConfig
-    )
+    return configuration.load(file) if file.is_file() else None
 
 
 def _codec(run: str, settings: Settings) -> int:

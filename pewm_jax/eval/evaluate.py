@@ -81,6 +81,7 @@ def evaluate(
     *,
     out: str | Path | None = None,
     log: Callable[[str], Any] = print_now,
+    config: Config | None = None,
     **changes: Any,
 ) -> Path:
     """Score a trained run and write its report.
@@ -96,6 +97,7 @@ def evaluate(
         out: the folder to write; by default ``RUN/report``, or ``RUN/report-NAME`` for other data
             or another split than the run's own.
         log: shows a progress line.
+        config: the run's configuration, if it is read already.
         changes: as for ``override``; beside a protocol's file not what it fixes.
 
     Returns:
@@ -104,7 +106,7 @@ def evaluate(
     Raises:
         UserError: the run, its weights or the data are absent, damaged, or do not fit together.
     """
-    loaded = runs.open_run(run)
+    loaded = runs.open_run(run, config)
     job = _open_job(loaded, changes)
     config, folder = job.config, Path(out) if out else runs.report_folder(loaded, job.config)
     processes.meet("evaluate: begin")

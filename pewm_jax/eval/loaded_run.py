@@ -66,14 +66,18 @@ def folders(run: str | Path) -> tuple[Path, Path]:
     return folder, shipped.home(run)
 
 
-def open_run(run: str | Path) -> LoadedRun:
-    """Open a run of a world model.
+def open_run(run: str | Path, config: Config | None = None) -> LoadedRun:
+    """Load a run of a world model.
+
+    Args:
+        run: a run folder, or the name of a model that comes with the library.
+        config: its configuration, if it is read already.
 
     Raises:
         UserError: it is absent, damaged, or of a world of which there is no report.
     """
     folder, home = folders(run)
-    config, params = load_finished(folder)
+    config, params = load_finished(folder, config=config)
     require_world(config.model, f"a report of {run}")
     return LoadedRun(folder, home, config, params, file_hash(folder / WEIGHTS))
 

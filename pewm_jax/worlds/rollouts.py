@@ -28,13 +28,16 @@ from pewm_jax.io import tree, weights
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 
 
-def load_finished(path: str | Path, *, lazily: bool = False) -> tuple[Config, Params]:
+def load_finished(
+    path: str | Path, *, lazily: bool = False, config: Config | None = None
+) -> tuple[Config, Params]:
     """Load the weights of a finished training; ``training.loading.load`` also reads checkpoints.
 
     Args:
         path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``,
             or the name of weights that come with the library.
         lazily: map the file into memory, so that what is not looked at is not read.
+        config: the run's configuration, if it is read already.
 
     Returns:
         ``(config, params)``; the averaged weights that inference uses, in the dtype of the file.
@@ -43,7 +46,7 @@ def load_finished(path: str | Path, *, lazily: bool = False) -> tuple[Config, Pa
         UserError: something is absent or damaged, or the weights do not fit the configuration.
     """
     folder = shipped.find(path)
-    config = configs.load(folder / "config.json")
+    config = configs.load(folder / "config.json") if config is None else config
     params = (weights.lazy if lazily else weights.load)(folder / "weights.safetensors")
     expected = _expected(config, params)
     weights.check(params, expected, str(folder / "weights.safetensors"))

@@ -181,7 +181,10 @@ def test_a_setting_chooses_weights_or_says_why_there_are_none(files, monkeypatch
     assert metric is not None
     assert "not resized" in said
     assert len(metric.sha256) == 64
-    assert perceptual.select_lpips("off", 64, 64) == (None, "LPIPS is left out, as evaluate.lpips says.")
+    assert perceptual.select_lpips("off", 64, 64) == (
+        None,
+        "LPIPS is left out, as evaluate.lpips says.",
+    )
     with pytest.raises(UserError, match="too small"):
         perceptual.select_lpips(str(path), 16, 64)
     monkeypatch.setattr(lpips_weights, "installed", lambda net: path if net == "alex" else None)
