@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import warnings
 from collections.abc import Callable
 from importlib import metadata
 from typing import Any, ClassVar
@@ -194,6 +195,8 @@ def register(section: str, name: str, settings: type | None = None, where: Any =
     elif built_in is not None and built_in != _address(settings):
         found = built_in.partition(":")[2]
     else:
+        if where is not None and built_in is None:
+            _add_methods(section, settings)
         _KINDS[section, name] = Kind(section, name, settings, where)
         return settings
     raise ConfigError(f"There is a {section} {name!r} already ({found}); choose another name.")
@@ -203,6 +206,51 @@ def _missing(settings: type) -> list[str]:
     """Return the names of abstract methods that a class does not override."""
     every = ((name, getattr(settings, name, None)) for name in dir(settings))
     return [name for name, value in every if getattr(value, "__isabstractmethod__", False)]
+
+
+_FUNCTIONS: dict[str, dict[str, str]] = {
+    "noise": {
+        "shown": "precondition",
+        "target": "prediction_target",
+        **{name: name for name in ("draw", "corrupt", "weight", "to_x0", "levels", "sample")},
+    },
+    "codec": {name: name for name in ("init", "encode", "decode", "measured")},
+    "encoder": {name: name for name in ("init", "encode", "preprocessing")},
+    "backbone": {name: name for name in ("init", "apply", "init_image", "observed")},
+    "control": {name: name for name in ("init", "condition")},
+}
+"""Section → function of a module in version 0.1 → the method that it is now."""
+_OF_THE_MODEL = {("backbone", "observed"), ("control", "init"), ("control", "condition")}
+"""Functions whose first argument was the model and not the settings."""
+
+
+def _add_methods(section: str, settings: type) -> None:
+    """Make the functions of a module, as version 0.1 had them, methods of the settings."""
+    for function, method in _FUNCTIONS.get(section, {}).items():
+        setattr(settings, method, _method(section, settings, function, method))
+    if section in _FUNCTIONS:
+        warnings.warn(
+            f"register({section!r}, …) with a module of functions is deprecated: make them methods "
+            f"of {settings.__name__}, as pewm_jax.config.parts documents them.",
+            DeprecationWarning,
+            stacklevel=3,
+        )
+        rules = property(lambda self: getattr(functions(self), "SHARDING", ()))
+        settings.SHARDING = rules  # type: ignore[attr-defined]
+
+
+def _method(section: str, settings: type, function: str, method: str) -> Any:
+    """Return a method that calls a module's function; the inherited one if there is none."""
+    inherited = getattr(settings, method)
+
+    def call(self: Any, *args: Any, **named: Any) -> Any:
+        own = getattr(functions(self), function, None)
+        if own is None:
+            return inherited(self, *args, **named)
+        given = args if (section, function) in _OF_THE_MODEL else (self, *args)
+        return own(*given, **named)
+
+    return call
 
 
 def part(section: str, name: str, **settings: Any) -> Any:

@@ -6,6 +6,7 @@ import importlib
 import json
 import sys
 import textwrap
+import types
 
 import pytest
 
@@ -20,6 +21,7 @@ from pewm_jax.config import (
     ClipConfig,
     Config,
     ConfigError,
+    Memory,
     ModelConfig,
     Noise,
     VoxelConfig,
@@ -30,23 +32,20 @@ from pewm_jax.config import (
 from pewm_jax.config import command_line as cli
 from pewm_jax.controls.camera import CameraConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from tests.strangers import run as strangers
+from tests.examples import parts
 
 TINY = presets.load("tiny")
 PART = """
     import dataclasses
-    import sys
 
     from pewm_jax.config import Noise, register
 
 
+    @register("noise", {name!r})
     @dataclasses.dataclass(frozen=True)
     class MineConfig(Noise):
         sample_steps: int = 3
         strength: float = 1.0
-
-
-    register("noise", {name!r}, MineConfig, sys.modules[__name__])
 """
 
 
@@ -208,16 +207,46 @@ def cell(module="__main__"):
 
 def test_a_cell_that_is_run_again_takes_the_place_of_the_first():
     first, second = cell(), cell()
-    register("noise", "cell", first, "json")
+    assert register("noise", "cell", first) is first
     made = ModelConfig(noise=first())
-    register("noise", "cell", second, "math")
+    register("noise", "cell", second)
     assert kinds.named("noise", "cell").settings is second
-    assert (
-        kinds.functions(second()) is kinds.functions(made.noise) is importlib.import_module("math")
-    )
     assert configuration.to_dict(made)["noise"]["kind"] == "cell"
     with pytest.raises(ConfigError, match="a noise 'cell' already"):
-        register("noise", "cell", cell("elsewhere"), "json")
+        register("noise", "cell", cell("elsewhere"))
+
+
+def test_the_name_of_a_built_in_kind_is_taken():
+    with pytest.raises(ConfigError, match=r"a noise 'edm' already \(EDMConfig\)"):
+        register("noise", "edm", cell())
+
+
+def test_a_default_is_made_when_a_value_is_needed():
+    @dataclasses.dataclass(frozen=True)
+    class Holder:
+        noise: Noise = kinds.part("noise", "flow", sample_steps=4)
+        memory: Memory = kinds.part("memory", "none", reader=kinds.part("reader", "render"))
+
+    made = Holder()
+    assert (made.noise.sample_steps, type(made.memory.reader).__name__) == (4, "RenderConfig")
+    assert [kinds.usual(field).__name__ for field in dataclasses.fields(Holder)] == [
+        "FlowConfig",
+        "NoMemoryConfig",
+    ]
+
+
+def test_a_module_of_functions_goes_on_working_with_a_warning():
+    mine = types.SimpleNamespace(
+        shown=lambda config, x, time: (config.sample_steps * x, time),
+        target=lambda config, x0, noise, time: noise,
+    )
+    old = cell()
+    with pytest.warns(DeprecationWarning, match="make them methods of Cell"):
+        register("noise", "old", old, mine)
+    assert old().precondition(2.0, 1.0) == (6.0, 1.0)
+    assert old().prediction_target(0.0, 5.0, 1.0) == 5.0
+    with pytest.raises(NotImplementedError):
+        old().draw(None, 1, 1)
 
 
 def test_a_module_that_is_reloaded_registers_anew(tmp_path, monkeypatch):
@@ -255,7 +284,7 @@ class Thawed(Noise):
 )
 def test_what_is_no_settings_of_a_section_cannot_be_registered(settings, sentence):
     with pytest.raises(ConfigError, match=sentence) as refusal:
-        register("noise", "new", settings, "json")
+        register("noise", "new", settings)
     one_sentence(refusal)
     assert "new" not in kinds.names("noise")
 
@@ -285,7 +314,8 @@ def test_what_does_not_belong_into_a_section_is_refused(build, sentence):
 
 def test_functions_that_cannot_be_imported_are_refused_with_the_reason():
     gone = cell()
-    register("noise", "gone", gone, "no_such_module.noise")
+    with pytest.warns(DeprecationWarning, match="make them methods of Cell"):
+        register("noise", "gone", gone, "no_such_module.noise")
     with pytest.raises(ConfigError, match=r"noise of kind 'gone': .*no_such_module") as refusal:
         kinds.functions(gone())
     assert "ModuleNotFoundError" in one_sentence(refusal)
@@ -299,7 +329,7 @@ def test_functions_that_cannot_be_imported_are_refused_with_the_reason():
     ],
 )
 def test_a_kind_is_chosen_together_with_what_it_needs(words, tmp_path):
-    default = strangers.experiment()  # 4 frames, which the pixel codec cannot fold
+    default = parts.experiment()  # 4 frames, which the pixel codec cannot fold
     found = cli.parse(Config, words, default=default, prog="train.py").model
     assert (found.codec, found.clip.frames) == (PixelConfig(), 5)
     file = tmp_path / "mine.json"
@@ -317,7 +347,7 @@ class Demanding(Noise):
 
 
 def test_settings_without_a_default_are_asked_for():
-    register("noise", "demanding", Demanding, "json")
+    register("noise", "demanding", Demanding)
     found = configuration.from_dict(Noise, {"kind": "demanding", "strength": 2})
     assert found == Demanding(2.0)
     with pytest.raises(ConfigError, match="config lacks strength") as refusal:

@@ -1,4 +1,9 @@
-"""A backbone of one's own: residual perceptrons on every latent cell by itself."""
+"""A backbone in one file: residual perceptrons on every latent cell by itself.
+
+A memory is read after every layer, and actions may modulate the time embedding. ::
+
+    pewm-jax train tiny --plugin backbone.py --backbone.kind perceptron --train.run runs/mine
+"""
 
 import dataclasses
 from typing import ClassVar
@@ -37,7 +42,9 @@ class PerceptronConfig(Backbone):
         x = joined(x_BthwC, conditioning)
         tokens = x.reshape(len(x), -1, x.shape[-1]) @ params["into"].astype(x.dtype)
         tokens += 0 if readers.added_BND is None else readers.added_BND
-        time = layers.sinusoid(time_B, self.width)[:, None] + conditioning.modulation_BtE
+        shift = conditioning.modulation_BtE
+        shift = jnp.zeros((1, x.shape[1], 1)) if shift is None else shift
+        time = layers.sinusoid(time_B, self.width)[:, None] + shift
         per_token = jnp.repeat(time, tokens.shape[1] // time.shape[1], 1)
 
         def block(tokens, layer):

@@ -1,4 +1,9 @@
-"""A codec of one's own: every patch of every frame turned by a fixed orthonormal matrix."""
+"""A codec in one file: it turns every patch of every frame by a fixed orthonormal matrix.
+
+::
+
+    pewm-jax train tiny --plugin codec.py --codec.kind turn --train.run runs/mine
+"""
 
 import dataclasses
 from typing import ClassVar

@@ -1,4 +1,9 @@
-"""A noise of one's own: x_t = cos(πt/2) x0 + sin(πt/2) ε with t in (0, 1), target v."""
+"""A noise in one file: x_t = cos(πt/2) x0 + sin(πt/2) ε with t in (0, 1), target v.
+
+::
+
+    pewm-jax train tiny --plugin noise.py --noise.kind cosine --train.run runs/mine
+"""
 
 import dataclasses
 

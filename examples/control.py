@@ -1,4 +1,9 @@
-"""A control of one's own: actions added to the time embedding of the frames they lead to."""
+"""A control in one file: actions are added to the time embedding of the frames they lead to.
+
+::
+
+    pewm-jax train tiny --plugin control.py --control.kind push --train.run runs/mine
+"""
 
 import dataclasses
 from typing import ClassVar

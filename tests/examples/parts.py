@@ -7,6 +7,10 @@ import math
 import jax
 import numpy as np
 
+from examples.backbone import PerceptronConfig
+from examples.codec import TurnConfig
+from examples.control import PushConfig
+from examples.noise import CosineConfig
 from pewm_jax import worlds
 from pewm_jax.config import (
     BothConfig,
@@ -22,14 +26,10 @@ from pewm_jax.data import abstract
 from pewm_jax.plan import measure
 from pewm_jax.train import sharding, step
 from tests.helpers import random_frames
-from tests.strangers.backbone import PerceptronConfig
-from tests.strangers.codec import TurnConfig
-from tests.strangers.control import PushConfig
 from tests.strangers.memory import NewestConfig
-from tests.strangers.noise import CosineConfig
 
 
-def experiment(mesh=None, run="runs/strangers", batch=8, width=32) -> Config:
+def experiment(mesh=None, run="runs/parts", batch=8, width=32) -> Config:
     stage = StageConfig(steps=2, batch=batch, warmup=1)
     return Config(
         model=ModelConfig(

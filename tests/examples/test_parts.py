@@ -1,11 +1,9 @@
-"""Five parts that the library has never heard of, each in a file of its own, make a world model.
-
-Nothing of the package names them: they are registered where they are defined (tests/strangers/).
-"""
+"""Five parts outside the package, each in a file of its own, make a world model (``examples/``)."""
 
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,20 +20,32 @@ from pewm_jax.data import loader
 from pewm_jax.io import tree
 from pewm_jax.train import loop
 from pewm_jax.types import Control
+from tests.examples import parts
 from tests.helpers import random_camera, random_frames
-from tests.strangers import run as strangers
 
-HERE = Path(__file__).parent
-PARTS = ("backbone", "codec", "control", "memory", "noise")
+ROOT = Path(__file__).parents[2]
+PARTS = {
+    **{
+        name: ROOT / "examples" / f"{name}.py" for name in ("backbone", "codec", "control", "noise")
+    },
+    "memory": ROOT / "tests" / "strangers" / "memory.py",
+}
+CHOICES = {
+    "backbone": ["--backbone.kind", "perceptron"],
+    "codec": ["--codec.kind", "turn", "--clip.frames", "5"],
+    "control": ["--control.kind", "push"],
+    "noise": ["--noise.kind", "cosine"],
+}
+"""The flags that choose each example; the codec folds no frames."""
 init = jax.jit(worlds.init, static_argnums=0)
 
 
 @pytest.fixture(scope="module")
 def measured():
     done = subprocess.run(
-        [sys.executable, "-m", "tests.strangers.run"],
-        cwd=HERE.parent,
-        env={**os.environ, "PYTHONPATH": str(HERE.parent)},
+        [sys.executable, "-m", "tests.examples.parts"],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=False,
@@ -46,21 +56,62 @@ def measured():
 
 @pytest.mark.parametrize("part", PARTS)
 def test_each_is_a_file_of_at_most_60_lines_and_the_package_does_not_name_it(part):
-    text = (HERE / "strangers" / f"{part}.py").read_text()
+    text = PARTS[part].read_text()
     assert len(text.splitlines()) <= 60
     settings = next(line for line in text.splitlines() if line.startswith("class ")).split("(")[0]
     names = settings.removeprefix("class ")
-    for path in (HERE.parent / "pewm_jax").rglob("*.py"):
+    for path in (ROOT / "pewm_jax").rglob("*.py"):
         assert names not in path.read_text()
 
 
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    walks = ["--train", "1", "--validation", "1", "--test", "1", "--frames", "28", "--size", "16"]
+    run_command(folder, "data", "collect", "walks", *walks)
+    return folder / "walks"
+
+
+def run_command(folder, *words):
+    """Run a command of the package in a folder, as a user does; return what it prints."""
+    done = subprocess.run(
+        [sys.executable, "-m", "pewm_jax", *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.environ.get("PYTHONPATH", str(ROOT))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr + done.stdout
+    return done.stdout
+
+
+def test_a_user_trains_with_all_four_in_an_empty_folder(data, tmp_path):
+    words = ["train", "tiny", "--data.path", str(data), "--data.context", "3", "--train.run", "run"]
+    words += ["--clip.height", "16", "--clip.width", "16", "--train.preview_every", "0"]
+    for stage in ("stage1", "stage2"):
+        words += [f"--train.{stage}.steps", "1", f"--train.{stage}.batch", "2"]
+    for part, flags_ in CHOICES.items():
+        shutil.copy(PARTS[part], tmp_path)
+        words += ["--plugin", f"{part}.py", *flags_]
+    run_command(tmp_path, *words)
+    stored = json.loads((tmp_path / "run" / "config.json").read_text())["model"]
+    kinds = {part: stored[part]["kind"] for part in CHOICES}
+    assert kinds == {
+        "backbone": "perceptron",
+        "codec": "turn",
+        "control": "push",
+        "noise": "cosine",
+    }
+
+
 def test_they_train_save_load_and_imagine(tmp_path, monkeypatch):
-    config = strangers.experiment(run=str(tmp_path / "run"))
+    config = parts.experiment(run=str(tmp_path / "run"))
 
     def clips(config, split, *, seed, start_step=0, rows=None, **_):
         step = start_step
         while True:
-            batch = strangers.clip(config, 100 * seed + step)
+            batch = parts.clip(config, 100 * seed + step)
             yield jax.tree.map(lambda x: x[rows or slice(None)], batch)
             step += 1
 
@@ -87,7 +138,7 @@ def test_they_train_save_load_and_imagine(tmp_path, monkeypatch):
 
 
 def test_a_control_that_needs_actions_says_so():
-    config = strangers.experiment()
+    config = parts.experiment()
     params = init(config, jax.random.key(0))
     rng = np.random.default_rng(0)
     state = pewm_jax.start(config, params, random_frames(rng, 3, 16, 16))
@@ -97,14 +148,14 @@ def test_a_control_that_needs_actions_says_so():
     control = Control(camera, np.zeros((3, 7), np.float32))
     with pytest.raises(UserError, match="got actions of 7 numbers"):
         pewm_jax.imagine(config, params, state, control, jax.random.key(0))
-    clip = dataclasses.replace(strangers.clip(config), actions_TA=None)
+    clip = dataclasses.replace(parts.clip(config), actions_TA=None)
     stage = worlds.stages(config)[0]
     with pytest.raises(UserError, match="the loss got cameras without actions"):
         stage.loss(config.model, config.train, params, clip, jax.random.key(0))
 
 
 def test_many_candidates_share_one_memory():
-    config = strangers.experiment()
+    config = parts.experiment()
     params = init(config, jax.random.key(0))
     rng = np.random.default_rng(0)
     state = pewm_jax.start(config, params, random_frames(rng, 3, 16, 16))
@@ -130,7 +181,7 @@ def test_a_plan_counts_their_flops(measured, stage):
 
 
 def test_their_settings_travel_through_json_and_flags():
-    config = strangers.experiment()
+    config = parts.experiment()
     values = json.loads(json.dumps(configuration.to_dict(config)))
     assert values["model"]["backbone"] == {"kind": "perceptron", "depth": 2, "width": 32}
     assert configuration.from_dict(Config, values) == config
@@ -139,6 +190,6 @@ def test_their_settings_travel_through_json_and_flags():
 
 
 def test_a_parameter_that_no_rule_places_is_named():
-    rules = worlds.sharding(strangers.experiment().model)
+    rules = worlds.sharding(parts.experiment().model)
     with pytest.raises(tree.TreeError, match="backbone/extra"):
         tree.assign(rules, {"backbone": {"extra": np.zeros(1)}}, "sharding rules")
