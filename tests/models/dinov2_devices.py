@@ -1,4 +1,4 @@
-"""Run on eight simulated devices by ``test_models_dinov2``: one batch on one and on all."""
+"""Run on eight simulated devices by ``test_dinov2_model``: one batch on one and on all."""
 
 import os
 

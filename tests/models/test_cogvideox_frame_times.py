@@ -16,7 +16,7 @@ from pewm_jax.readers.memory_block import MemoryBlock
 from pewm_jax.types import MemoryReadout
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, randomise, with_reader
-from tests.models.test_models_dit import CONFIG, inputs, random_params
+from tests.models.test_cogvideox_model import CONFIG, inputs, random_params
 from tests.models.test_models_world_model import setup as world
 
 apply = jax.jit(dit.apply, static_argnums=0, static_argnames="memory_block")
