@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from pewm_jax.config import Memory, VoxelConfig
+from pewm_jax.config import Memory
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, ray_directions
 from pewm_jax.memory import voxel_frames, voxel_map
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Camera, Frames
 
 T, SIZE, PATCHES, CHANNELS = 9, 512, 37, 384

@@ -22,7 +22,8 @@ import tyro
 from pewm_jax import worlds
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.eval import voxel_trials
-from pewm_jax.memory import class_edit, class_grid, memories
+from pewm_jax.memory import class_grid
+from pewm_jax.memory import interface as memories
 from pewm_jax.report.pictures import as_bytes, grid, save_png
 from pewm_jax.types import Camera
 from pewm_jax.worlds import rollouts
@@ -93,7 +94,7 @@ def main(settings: Settings) -> None:
         print("no room for a block in front of the agent: name another --frame.")
         return
     number = class_grid.number_of(model.memory, "furniture/red")
-    edited = persist.edit(true, class_edit.place, model.memory, box, number)
+    edited = persist.edit(true, class_grid.place, model.memory, box, number)
     way = np.stack([still, *[turn] * 6, ahead, ahead, *[turn] * 6, ahead, ahead])
     after, made = imagine(model, params, edited, way, jax.random.key(1))
     _, plain = imagine(model, params, true, way, jax.random.key(1))

@@ -24,7 +24,7 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.data.collect import CollectConfig
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import make_episode
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
 from pewm_jax.planning import costs
 from pewm_jax.planning.candidates import Imagination, Judged
 from pewm_jax.planning.plan import plan

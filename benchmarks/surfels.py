@@ -29,11 +29,13 @@ from memory_peers import SIZE, T, room
 from record import machine, record, table
 
 from pewm_jax import presets
-from pewm_jax.config import Config, RenderConfig
+from pewm_jax.config import Config
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.geometry.cameras import invert_rigid, unproject
-from pewm_jax.memory import rendering, views
+from pewm_jax.memory import rendering
+from pewm_jax.memory import rendering as views
+from pewm_jax.readers.render import RenderConfig
 from pewm_jax.train import sharding
 from pewm_jax.train.step import abstract_state, compile_step, noise_key
 from pewm_jax.types import Array, Camera, Clip

@@ -24,12 +24,13 @@ import numpy as np
 from record import machine, record, table
 
 import pewm_jax
-from pewm_jax.config import AttentionConfig, Config, UserError
+from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.eval.clips import choose, load_clip
 from pewm_jax.geometry.cameras import project
 from pewm_jax.readers import attention as attention_reader
 from pewm_jax.readers import memory_block
+from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.geometry import NEAREST_M, patch_pixels
 from pewm_jax.types import Array, Params
 from pewm_jax.worlds import world_model

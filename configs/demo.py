@@ -7,13 +7,13 @@ from pewm_jax.config import (
     DataConfig,
     EvalConfig,
     ModelConfig,
-    RenderConfig,
     StageConfig,
-    SurfelConfig,
     TrainConfig,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.readers.render import RenderConfig
 
 
 def config() -> Config:

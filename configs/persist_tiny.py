@@ -8,13 +8,13 @@ from pewm_jax.config import (
     Config,
     DataConfig,
     EvalConfig,
-    GridConfig,
     PersistConfig,
     PersistTrainConfig,
     StageConfig,
 )
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.flow import FrameFlowConfig
+from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.models.persist.config import (
     BlocksConfig,
     CameraModelConfig,

@@ -4,11 +4,11 @@ from pewm_jax.config import (
     Config,
     DataConfig,
     EvalConfig,
-    GridConfig,
     PersistConfig,
     PersistTrainConfig,
     StageConfig,
 )
+from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.models.persist.config import (
     BlocksConfig,
     VoxelDiTConfig,

@@ -1,17 +1,10 @@
 """The paper's reader on plain pixels, without a codec: 48×48 pixels, minutes on two CPU cores."""
 
-from pewm_jax.config import (
-    AttentionConfig,
-    ClipConfig,
-    Config,
-    DataConfig,
-    ModelConfig,
-    StageConfig,
-    TrainConfig,
-    VoxelConfig,
-)
+from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, StageConfig, TrainConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.readers.attention import AttentionConfig
 
 
 def config() -> Config:

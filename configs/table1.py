@@ -3,15 +3,10 @@
 import dataclasses
 
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.config import (
-    AttentionConfig,
-    Config,
-    DataConfig,
-    EvalConfig,
-    StageConfig,
-    VoxelConfig,
-)
+from pewm_jax.config import Config, DataConfig, EvalConfig, StageConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.presets import demo
+from pewm_jax.readers.attention import AttentionConfig
 
 
 def config() -> Config:

@@ -1,7 +1,6 @@
 """Absurdly small: shows in seconds that everything runs, learns next to nothing; for tests."""
 
 from pewm_jax.config import (
-    AttentionConfig,
     ClipConfig,
     Config,
     DataConfig,
@@ -9,10 +8,11 @@ from pewm_jax.config import (
     ModelConfig,
     StageConfig,
     TrainConfig,
-    VoxelConfig,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.readers.attention import AttentionConfig
 
 
 def config() -> Config:

@@ -212,7 +212,7 @@ class WorldState:
     Attributes:
         frame: the last frame, T = 1, rgb float32 in [−1, 1].
         map: the memory of everything seen or imagined so far: a ``VoxelMap``, or another kind
-            (see ``pewm_jax.memory.memories``); in the world ``egowm`` the frames before the last,
+            (see ``pewm_jax.memory.interface``); in the world ``egowm`` the frames before the last,
             in ``persist`` the voxels.
     """
 

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import AttentionConfig, ClipConfig, Config, ModelConfig, VoxelConfig
+from pewm_jax.config import ClipConfig, Config, ModelConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import cameras
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import world_model
 

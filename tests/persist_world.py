@@ -1,9 +1,10 @@
 """The smallest world of PERSIST."""
 
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import ClipConfig, GridConfig, PersistConfig
+from pewm_jax.config import ClipConfig, PersistConfig
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.flow import FrameFlowConfig
+from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.models.persist.config import (
     BlocksConfig,
     CameraModelConfig,

@@ -18,19 +18,15 @@ from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     ActionConfig,
-    AttentionConfig,
     ClipConfig,
     Config,
     ConfigError,
     DataConfig,
     EvalConfig,
-    ImagesConfig,
     ModelConfig,
-    NoMemoryConfig,
     Settings,
     StageConfig,
     TrainConfig,
-    VoxelConfig,
 )
 from pewm_jax.config import command_line as cli
 from pewm_jax.diffusion.ddpm import DDPMConfig
@@ -38,10 +34,14 @@ from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
 from pewm_jax.encoders.latents import LatentsConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.memory.images import ImagesConfig
+from pewm_jax.memory.none import NoMemoryConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.readers.attention import AttentionConfig
 
 VERSION_1 = Path(__file__).parent / "version_1"
 """Settings as they were written before there were versions."""

@@ -18,11 +18,11 @@ from pewm_jax.config import (
     ConfigError,
     EgoWMConfig,
     EgoWMTrainConfig,
-    SurfelConfig,
     UserError,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import actions as action_geometry
+from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Control

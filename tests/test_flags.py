@@ -9,10 +9,11 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax import registry as kinds
-from pewm_jax.config import Config, ConfigError, ImagesConfig, flags
+from pewm_jax.config import Config, ConfigError, flags
 from pewm_jax.config import command_line as cli
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
+from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 

@@ -10,22 +10,16 @@ import pytest
 from pewm_jax import config as configs
 from pewm_jax import worlds
 from pewm_jax.codecs import rgbd, signals
-from pewm_jax.config import (
-    AttentionConfig,
-    ConfigError,
-    DataConfig,
-    StageConfig,
-    TrainConfig,
-    UserError,
-    VoxelConfig,
-)
+from pewm_jax.config import ConfigError, DataConfig, StageConfig, TrainConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree, weights
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.train import loop
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import rollouts, world_model

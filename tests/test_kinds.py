@@ -17,14 +17,12 @@ from pewm_jax.cli import evaluate, train
 from pewm_jax.cli import plugins as imports
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
-    AttentionConfig,
     ClipConfig,
     Config,
     ConfigError,
     Memory,
     ModelConfig,
     Noise,
-    VoxelConfig,
     World,
     flags,
     register,
@@ -32,6 +30,8 @@ from pewm_jax.config import (
 from pewm_jax.config import command_line as cli
 from pewm_jax.controls.camera import CameraConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.readers.attention import AttentionConfig
 from tests.examples import parts
 
 TINY = presets.load("tiny")

@@ -14,7 +14,8 @@ from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import Config, ConfigError, PersistTrainConfig, UserError
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.geometry.actions import camera_numbers
-from pewm_jax.memory import class_edit, class_grid, memories
+from pewm_jax.memory import class_grid
+from pewm_jax.memory import interface as memories
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.planning import imagined_env
@@ -134,7 +135,7 @@ def test_a_cell_changes_only_where_another_class_is_likelier_by_what_is_held(par
 
 def test_a_cell_of_which_nothing_was_known_has_air_unless_a_class_is_likelier_by_the_doubt(params):
     latents = jax.random.normal(KEY, (1, 4, 4, 4, 3))
-    unknown = jnp.full((8, 8, 8), class_edit.UNKNOWN).at[:4].set(3)
+    unknown = jnp.full((8, 8, 8), class_grid.UNKNOWN).at[:4].set(3)
     models = [dataclasses.replace(MODEL, hold=0.0, doubt=nats) for nats in (0.0, 0.5, 1e6)]
     free, doubtful, sure = (
         np.asarray(persist_voxels.held(model, params, latents, unknown)) for model in models
@@ -149,14 +150,14 @@ def test_an_edit_is_the_world_that_goes_on(params, state):
     here = np.asarray(state.frame.camera.world_from_camera[0, :3, 3])
     reach = np.array([1, 1, 0.6], np.float32)
     box = np.stack([here - reach, here + reach])
-    edited = persist.edit(state, class_edit.place, MODEL.memory, box, 5)
+    edited = persist.edit(state, class_grid.place, MODEL.memory, box, 5)
     inside = np.asarray(edited.map.classes_XYZ) == 5
     assert inside.sum() >= 16
     after, frames = imagine(MODEL, params, edited, MOVES, KEY)
     np.testing.assert_array_equal((np.asarray(after.map.classes_XYZ) == 5)[inside], True)
     _, without = imagine(MODEL, params, state, MOVES, KEY)
     assert np.abs(frames.rgb_THWC - without.rgb_THWC).max() > 1e-4
-    gone = persist.edit(after, class_edit.erase, MODEL.memory, box)
+    gone = persist.edit(after, class_grid.erase, MODEL.memory, box)
     assert not (np.asarray(gone.map.classes_XYZ)[inside]).any()
 
 
@@ -164,7 +165,7 @@ def test_the_next_voxels_depend_on_what_was_edited_elsewhere(params, state):
     free = dataclasses.replace(MODEL, hold=0.0)
     low = np.asarray(state.map.low_3) + 0.5 * np.asarray(state.map.history.start_3)
     box = np.stack([low, low + np.array([2.0, 4.0, 4.0])]).astype(np.float32)  # half of the window
-    edited = persist.edit(state, class_edit.place, MODEL.memory, box, 5)
+    edited = persist.edit(state, class_grid.place, MODEL.memory, box, 5)
     loud = {**params, "voxel_dit": jax.tree.map(lambda x: 8 * x, params["voxel_dit"])}
     still = np.zeros((1, 3), np.float32)
     one, two = (
@@ -207,12 +208,12 @@ def test_boxes_are_moved_and_copied_by_the_calls_of_the_voxel_map(state):
     here = np.round(np.asarray(state.map.low_3), 4)
     box = np.stack([here + 2.0, here + 3.0]).astype(np.float32)
     blank = dataclasses.replace(state.map, classes_XYZ=jnp.zeros((24, 24, 8), jnp.int16))
-    placed = class_edit.place(MODEL.memory, blank, box, 7)
+    placed = class_grid.place(MODEL.memory, blank, box, 7)
     assert (placed.classes_XYZ == 7).sum() == 8
     shift = np.eye(4, dtype=np.float32)
     shift[:3, 3] = 0.5, 1.0, -0.5
-    moved = memories.move(MODEL, placed, box, shift)
-    copied = memories.move(MODEL, placed, box, shift, leave=True)
+    moved = MODEL.memory.move(MODEL, placed, box, shift)
+    copied = MODEL.memory.move(MODEL, placed, box, shift, leave=True)
     assert [(x.classes_XYZ == 7).sum() for x in (moved, copied)] == [8, 16]
     np.testing.assert_array_equal(moved.classes_XYZ[5:7, 6:8, 3:5], 7)
     assert moved.history is not None
@@ -224,14 +225,14 @@ def test_boxes_are_moved_and_copied_by_the_calls_of_the_voxel_map(state):
     assert view.seen_THW[0, 8, 8]
     assert not view.seen_THW[0, 0, 0]
     np.testing.assert_allclose(view.depth_THW[0, 8, 8], 0.9, atol=1e-4)
-    points, colours, there = memories.to_points(MODEL, memories.erase(MODEL, placed, box))
+    points, colours, there = MODEL.memory.to_points(MODEL, MODEL.memory.erase(MODEL, placed, box))
     assert not there.any()
     assert points.shape == colours.shape == (24 * 24 * 8, 3)
     with pytest.raises(UserError, match="no class 'sofa'"):
         class_grid.number_of(MODEL.memory, "sofa")
     assert class_grid.names(MODEL.memory)[class_grid.number_of(MODEL.memory, "door")] == "door"
     with pytest.raises(UserError, match="takes in no pictures"):
-        class_grid.remember(MODEL, blank, None, None)
+        MODEL.memory.insert(MODEL, {}, blank, None, None)
 
 
 def test_windows_move_by_tokens_and_what_leaves_is_kept(params, walked, state):
@@ -393,7 +394,7 @@ def test_the_renderer_is_given_the_voxels_drawn_in_their_colours(params):
     camera = jax.tree.map(lambda x: jnp.asarray(x[0]), seen().camera)
     corner = np.asarray(camera.world_from_camera[:3, 3]) - 2.0
     made = persist_pictures.drawn(MODEL, params, cells, corner, camera)
-    view = class_grid.render(MODEL, class_grid.ClassGrid(cells, corner), seen().camera, 16, 16)
+    view = MODEL.memory.render(MODEL, class_grid.ClassGrid(cells, corner), seen().camera, 16, 16)
     wanted = encoded(MODEL, params, view.features_THWF[0], view.depth_THW[0])
     np.testing.assert_allclose(made, wanted, atol=1e-6)
     empty = persist_pictures.drawn(MODEL, params, 0 * cells, corner, camera)

@@ -8,7 +8,8 @@ import pytest
 from pewm_jax import worlds
 from pewm_jax.config import UserError
 from pewm_jax.geometry import actions as action_geometry
-from pewm_jax.memory import memories, voxel_map
+from pewm_jax.memory import interface as memories
+from pewm_jax.memory import voxel_map
 from pewm_jax.types import Frames
 from pewm_jax.worlds import rollouts
 from tests.helpers import init_world, random_frames, randomise, tiny_config

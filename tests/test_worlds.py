@@ -13,7 +13,7 @@ from pewm_jax import worlds
 from pewm_jax.config import Config, UserError
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import actions as action_geometry
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
 from pewm_jax.types import Camera, Control, Frames, WorldState
 from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
 from tests.memory.test_memory_rivals import KINDS, model_of
@@ -66,7 +66,7 @@ def still(moves):
 @functools.partial(jax.jit, static_argnums=0)
 def remembered(model, memory, frames):
     features = model.memory.encoder.encode({}, frames.rgb_THWC)
-    return memories.remember(model, memory, frames, features, observed=False)
+    return memories.insert(model, {}, memory, frames, features, observed=False)
 
 
 @pytest.mark.parametrize("count", [1, LENGTH - 1, LENGTH, LENGTH + 2])

@@ -35,7 +35,7 @@ def _main(argv: Sequence[str], prog: str) -> int:
         return 0 if argv else 2
     command, flags = cli.choose(argv[0], COMMANDS, "command"), argv[1:]
     # Imported late, so that help and refusals are fast.
-    from pewm_jax.memory.feature_command import CacheConfig, cache
+    from pewm_jax.memory.feature_cache import CacheConfig, cache
 
     config = cli.parse_command(CacheConfig, flags, f"{prog} {command}")
     try:

@@ -13,14 +13,6 @@ from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
 from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.launch import Join, Launch
-from pewm_jax.config.memory import (
-    ImagesConfig,
-    Map2DConfig,
-    NoMemoryConfig,
-    PointsConfig,
-    SurfelConfig,
-    VoxelConfig,
-)
 from pewm_jax.config.mesh import AXES, MeshConfig
 from pewm_jax.config.migrations import upgrade
 from pewm_jax.config.model import ModelConfig
@@ -35,8 +27,7 @@ from pewm_jax.config.parts import (
     Noise,
     Reader,
 )
-from pewm_jax.config.persist import POINT_WAVES, GridConfig, PersistConfig, PersistTrainConfig
-from pewm_jax.config.reader import AttentionConfig, BothConfig, RenderConfig
+from pewm_jax.config.persist import POINT_WAVES, PersistConfig, PersistTrainConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities, Facts, Task, World
@@ -50,10 +41,8 @@ __all__ = [
     "VERSION",
     "ActionConfig",
     "ArraySpec",
-    "AttentionConfig",
     "Backbone",
     "BatchSpec",
-    "BothConfig",
     "Capabilities",
     "ClipConfig",
     "Codec",
@@ -68,33 +57,25 @@ __all__ = [
     "Encoder",
     "EvalConfig",
     "Facts",
-    "GridConfig",
-    "ImagesConfig",
     "InjectionPoints",
     "Join",
     "Launch",
-    "Map2DConfig",
     "Memory",
     "MeshConfig",
     "ModelConfig",
-    "NoMemoryConfig",
     "Noise",
     "NomadConfig",
     "NomadTrainConfig",
     "NomadWorldConfig",
     "PersistConfig",
     "PersistTrainConfig",
-    "PointsConfig",
     "Reader",
-    "RenderConfig",
     "Settings",
     "StageConfig",
-    "SurfelConfig",
     "Task",
     "TrainConfig",
     "TrainSettings",
     "UserError",
-    "VoxelConfig",
     "World",
     "from_dict",
     "functions",
@@ -106,6 +87,16 @@ __all__ = [
 ]
 
 _MOVED = {
+    "VoxelConfig": "pewm_jax.memory.voxel_map",
+    "Map2DConfig": "pewm_jax.memory.map2d",
+    "PointsConfig": "pewm_jax.memory.points",
+    "SurfelConfig": "pewm_jax.memory.surfels",
+    "GridConfig": "pewm_jax.memory.class_grid",
+    "ImagesConfig": "pewm_jax.memory.images",
+    "NoMemoryConfig": "pewm_jax.memory.none",
+    "AttentionConfig": "pewm_jax.readers.attention",
+    "RenderConfig": "pewm_jax.readers.render",
+    "BothConfig": "pewm_jax.readers.both",
     "WanVAEConfig": "pewm_jax.models.wan.codec:WanVAECodec",
     "CosmosConfig": "pewm_jax.models.cosmos.backbone:CosmosBackbone",
     "SVDVAEConfig": "pewm_jax.models.svd.vae_codec:SVDVAECodec",

@@ -437,7 +437,10 @@ class Memory(Settings):
         REMEMBERS: whether it ever holds anything.
         READ_BY_BLOCKS: whether memory blocks read it, which are trained for that; else it is the
             state of its world.
-        TELLS_IMAGINED: whether it distinguishes observed frames from imagined ones.
+        CLASSES: whether it holds class ids of recorded voxels (``kinds``, ``colours``,
+            ``pictures``).
+        EDITABLE: whether boxes of it can be erased and moved.
+        GRID_TOLERANCE: how many cells beside its own a point may stand for in coverage.
     """
 
     SECTION: ClassVar[str] = "memory"
@@ -447,8 +450,9 @@ class Memory(Settings):
     REMEMBERS: ClassVar[bool] = True
     """Whether it ever holds anything."""
     READ_BY_BLOCKS: ClassVar[bool] = True
-    TELLS_IMAGINED: ClassVar[bool] = False
-    """Whether its ``remember`` asks, by ``observed``, if frames were observed or imagined."""
+    CLASSES: ClassVar[bool] = False
+    EDITABLE: ClassVar[bool] = False
+    GRID_TOLERANCE: ClassVar[int] = 0
 
     cell_m: tuple[float, float, float] = (0.25, 0.25, 1.0)
     """Size of a map cell along x, y, z (z is up), metres; the default is the paper's."""
@@ -486,6 +490,11 @@ class Memory(Settings):
     def rendered_channels(self) -> int:
         """Channels of the memory's pictures: the colour, or the features that are kept."""
         return self.encoder.channels if self.KEEPS_FEATURES else 3
+
+    @property
+    def grid(self) -> Memory:
+        """The settings whose cells its points stand for."""
+        return self
 
     def empty(self, model: Any, centre_3: Array) -> Any:
         """Return an empty memory.
@@ -544,6 +553,44 @@ class Memory(Settings):
         """
         del model, memory, camera, height, width
         return None
+
+    def erase(self, model: Any, memory: Any, box_23: Array) -> Any:
+        """Erase the content of a box, as if it had never been observed.
+
+        Args:
+            model: the model.
+            memory: its state.
+            box_23: (2, 3) lower and upper corner in the world, metres; upper faces are outside.
+
+        Raises:
+            UserError: the box is not a box, or this memory cannot be edited.
+        """
+        del model, memory, box_23
+        raise self._not_editable()
+
+    def move(
+        self, model: Any, memory: Any, box_23: Array, transform: Array, *, leave: bool = False
+    ) -> Any:
+        """Move the content of a box.
+
+        Args:
+            model: the model.
+            memory: its state.
+            box_23: as for ``erase``.
+            transform: (4, 4) rigid, from old to new positions, metres.
+            leave: keep the content of the box in place, too: a copy.
+
+        Raises:
+            UserError: as for ``erase``, or the transform is not a rigid 4×4.
+        """
+        del model, memory, box_23, transform, leave
+        raise self._not_editable()
+
+    def _not_editable(self) -> UserError:
+        return UserError(
+            f"the memory {type(self).__name__} cannot be edited: use a model with surfels or "
+            "voxels."
+        )
 
     def trimmed(self, memory: Any) -> Any:
         """Return a memory to look at and not to add to: smaller if it can be; not under jit."""

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.model import ModelConfig
-from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise, Reader
-from pewm_jax.config.reader import RenderConfig
+from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
 from pewm_jax.config.training import StageConfig, TrainSettings
 from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities
 from pewm_jax.errors import require
@@ -17,69 +15,6 @@ from pewm_jax.registry import named, part
 
 POINT_WAVES = 4
 """Wavelengths of the sinusoids of a place, with ``model.points``."""
-
-
-@dataclasses.dataclass(frozen=True)
-class GridConfig(Memory):
-    """The state of the world: class ids of all cells that were ever near the agent.
-
-    A frame's voxels are a window of it around the agent; what leaves the window is kept.
-    """
-
-    KEEPS_FEATURES: ClassVar[bool] = False
-    READ_BY_BLOCKS: ClassVar[bool] = False
-
-    cell_m: tuple[float, float, float] = (0.2, 0.2, 0.2)
-    """Side of a cell, three times the same, metres."""
-    cells: tuple[int, int, int] = (192, 192, 48)
-    """Cells that are kept along x, y, z; along z as many as a window has."""
-    recorded: int = 64
-    """Cells along each side of the grids in the data: those of a window, and as many more as the
-    window may lie off the agent."""
-    kinds: Literal["all", "groups"] = "all"
-    """Which classes there are, as the data were collected (`--voxels.kinds`)."""
-    colours: int = 16
-    """Colours of each kind, as the data were collected (`--voxels.colours`)."""
-    pictures: Literal["surfaces", "cells"] = "surfaces"
-    """What the data's images show, as they were collected (`--voxels.pictures`)."""
-    eye_m: float = 1.25
-    """Height of the camera above the floor, metres: where a world begins without a known grid, the
-    floor is a border between cells."""
-    reader: Reader = RenderConfig()
-    """Nothing reads it but the networks of the world."""
-
-    @property
-    def room(self) -> int:
-        """How many cells it holds."""
-        return math.prod(self.cells)
-
-    def check(self, model: Any) -> None:
-        """Refuse a grid that the networks do not fit."""
-        require(
-            isinstance(model, PersistConfig),
-            "memory.kind grid is the state of the world persist: use model.kind persist.",
-        )
-        side, token = model.backbone.voxel_vae.side, model.backbone.token_cells
-        require(
-            len(set(self.cell_m)) == 1,
-            f"memory.cell_m is {self.cell_m}: cells are cubes, name the same side three times.",
-        )
-        x, y, z = self.cells
-        require(
-            min(x, y) >= side and z == side and x % token == 0 and y % token == 0,
-            f"memory.cells is {self.cells}: use multiples of {token} from {side} on along x and "
-            f"y, and {side} along z, as a window has (backbone.voxel_vae.side).",
-        )
-        require(
-            self.recorded >= side + token and (self.recorded - side) % 2 == 0,
-            f"memory.recorded is {self.recorded}: use {side + token} or more, a window and what it "
-            "may lie off the agent, by an even number more than the window.",
-        )
-
-    def __post_init__(self):
-        """Validate."""
-        super().__post_init__()
-        require(self.eye_m > 0, f"memory.eye_m is {self.eye_m}: use a height above 0 metres.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,7 +156,7 @@ class PersistConfig(ModelConfig):
         """Validate."""
         for name, kind in (
             ("backbone", named("backbone", "persist").settings),
-            ("memory", GridConfig),
+            ("memory", named("memory", "grid").settings),
         ):
             found = getattr(self, name)
             require(

@@ -21,7 +21,6 @@ from pewm_jax.models.cogvideox import positions
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
-from pewm_jax.readers import interface as readers
 from pewm_jax.types import Params
 from pewm_jax.worlds.pewm import paper
 
@@ -124,7 +123,9 @@ def import_world(
         return widen.widen(plan, cogvideox.read_transformer(src, dtype)[1])
 
     def blocks() -> Params:
-        return jax.jit(lambda k: readers.init(config.model, k))(jax.random.key(seed))
+        return jax.jit(lambda k: config.model.memory.reader.init(config.model, k))(
+            jax.random.key(seed)
+        )
 
     wide = tree.flatten(TRANSFORMER.like(plan.new))
     stored = pipeline.specs(TRANSFORMER, src, dtype)

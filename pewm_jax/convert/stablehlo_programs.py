@@ -17,7 +17,7 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.data import abstract
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Camera, Control, MemoryReadout, Params
 from pewm_jax.worlds import world_model
 
@@ -107,7 +107,7 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
     if "memory" in params:
 
         def read(p: Params, c: Camera) -> Any:
-            return memories.look(model, memories.empty(model, jnp.zeros(3)), c, params=p)
+            return memories.readout(model, model.memory.empty(model, jnp.zeros(3)), c, params=p)
 
         sight = jax.eval_shape(jax.vmap(read, (None, 0)), params, camera)
         shown = {"tokens": sight.tokens, "view": sight.view, "encoded": sight.encoded}

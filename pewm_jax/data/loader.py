@@ -17,7 +17,7 @@ from typing import Any, cast
 import grain
 import numpy as np
 
-from pewm_jax.config import Config, ConfigError, GridConfig, UserError
+from pewm_jax.config import Config, ConfigError, UserError
 from pewm_jax.config.model import World
 from pewm_jax.data.clips import Choice, ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
@@ -388,7 +388,7 @@ def require_same_cells(world: World, episode: Episode) -> None:
         ConfigError: the episode has another table of classes, or other pictures.
     """
     memory = getattr(world, "memory", None)
-    if not isinstance(memory, GridConfig) or episode.voxel_grid is None:
+    if not getattr(memory, "CLASSES", False) or episode.voxel_grid is None:
         return
     for kinds in ("all", "groups"):
         for colours in range(1, len(PALETTE) + 1):

@@ -21,7 +21,7 @@ from pewm_jax.config import Config, PersistConfig, UserError
 from pewm_jax.eval.horizon import RecordedWalk
 from pewm_jax.geometry.actions import heading
 from pewm_jax.io.progress import Meter
-from pewm_jax.memory import class_edit, class_grid
+from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
 from pewm_jax.models.persist.config import VoxelVAEConfig
@@ -156,7 +156,7 @@ def run(
         floor = float(frames.camera.world_from_camera[0, 2, 3]) - model.memory.eye_m  # type: ignore[attr-defined]
         box = room(model, state, floor)
         if box is not None:
-            edited = persist.edit(state, class_edit.place, model.memory, box, number)
+            edited = persist.edit(state, class_grid.place, model.memory, box, number)
             cells = _cells(model, edited.map, box, number)
             ready.append(_Trial(state, edited, box, walk.actions_T3, cells))
     kept, seen = [], np.zeros(3, int)
@@ -217,7 +217,7 @@ class _Trial(NamedTuple):
 
 def _cells(model: PersistConfig, grid: ClassGrid, box_23: np.ndarray, number: int) -> int:
     """Return how many cells of a box have a class."""
-    held = class_edit.copy(model.memory, grid, jnp.asarray(box_23))
+    held = class_grid.copy(model.memory, grid, jnp.asarray(box_23))
     return int((held.classes_XYZ == number).sum())
 
 
@@ -231,8 +231,8 @@ def _rays_on_block(
     """
     place = camera.world_from_camera[0, :3, 3]
     first = windows.first_cell(model, grid.low_3, place)
-    marked = class_edit.place(model.memory, grid, box_23, 1)
-    unmarked = class_edit.place(model.memory, grid, box_23, 0)
+    marked = class_grid.place(model.memory, grid, box_23, 1)
+    unmarked = class_grid.place(model.memory, grid, box_23, 0)
     both = [
         voxel_renderer.cast_rays(
             model.backbone.renderer,  # type: ignore[attr-defined]

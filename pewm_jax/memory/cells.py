@@ -1,17 +1,25 @@
-"""Grid cells as integers, sampled pixels, and the order in which tokens are chosen.
+"""Grid cells shared by the memories: cell numbers, sorted lists of cells, boxes, choice of tokens.
 
-All memories share this grid and this order of tokens.
+A sparse map is a sorted list of cell numbers, free slots last, with one row of features per slot.
+Cells are found by binary search, so time and memory use are independent of the grid's extent. The
+layout is canonical: maps with equal cells and features are equal bit for bit, whatever their
+history.
+
+A box is (2, 3), its lower and upper corner in the world, metres; lower faces belong to it, upper
+ones do not. A transform is a rigid (4, 4) matrix from old to new positions.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
-from pewm_jax.config import Memory
+from pewm_jax.config import Memory, UserError
 from pewm_jax.geometry.cameras import project, unproject
 from pewm_jax.geometry.zbuffer import visible_first
 from pewm_jax.types import Array, Camera, Frames
@@ -44,6 +52,13 @@ def corners(config: Memory, origin_3: Array, cell_P: Array) -> Array:
     _, ny, nz = config.cells
     place = jnp.stack([cell_P // (ny * nz), cell_P // nz % ny, cell_P % nz], -1)
     return origin_3 + place.astype(jnp.float32) * np.asarray(config.cell_m, np.float32)
+
+
+def centres(config: Memory, origin_3: Array, cell_V: Array) -> Array:
+    """Return (V, 3) world centres of cell numbers (see ``keys``)."""
+    _, ny, nz = config.cells
+    grid = jnp.stack([cell_V // (ny * nz), cell_V // nz % ny, cell_V % nz], -1)
+    return origin_3 + (grid + 0.5) * np.asarray(config.cell_m, np.float32)
 
 
 def grid_of(height: int, width: int, most: int) -> tuple[int, int]:
@@ -133,3 +148,163 @@ def in_view_first(
     score = jnp.where(jnp.isfinite(depth), depth, FAR_M + distance)
     score = jnp.where(valid_P, score, jnp.inf)
     return jax.lax.top_k(-score, min(count, points_P3.shape[0]))[1]
+
+
+def nowhere(config: Memory) -> int:
+    """Return the number that stands for no cell; it sorts after all cells."""
+    return math.prod(config.cells)
+
+
+def find(cell_V: Array, cell_P: Array) -> tuple[Array, Array]:
+    """Look cells up.
+
+    Args:
+        cell_V: (V,) the cells of a map, sorted.
+        cell_P: (P,) cells to find, in any order.
+
+    Returns:
+        ``(slot_P, found_P)``; the slot is meaningless if the cell is not found.
+    """
+    slot = jnp.searchsorted(cell_V, cell_P, method="scan").astype(jnp.int32)
+    slot = jnp.minimum(slot, cell_V.shape[0] - 1)
+    return slot, cell_V[slot] == cell_P
+
+
+def admit(cell_V: Array, cell_P: Array, no_cell: int) -> tuple[Array, Array]:
+    """Add cells to a map's list while there is room.
+
+    Cells already in the map stay. New cells are admitted in the order of their numbers.
+
+    Args:
+        cell_V: (V,) the cells of a map, sorted, ``no_cell`` where a slot is free.
+        cell_P: (P,) cells seen, in any order, with repetitions, ``no_cell`` for points to ignore.
+        no_cell: the number that stands for no cell.
+
+    Returns:
+        ``(cell_V, dropped)``: the new list, and the number of distinct new cells that did not fit.
+    """
+    capacity = cell_V.shape[0]
+    ordered = jnp.sort(cell_P)
+    before = jnp.concatenate([jnp.full((1,), -1, ordered.dtype), ordered[:-1]])
+    new = (ordered != before) & (ordered < no_cell) & ~find(cell_V, ordered)[1]
+    rank = jnp.cumsum(new, dtype=jnp.int32)
+    fits = new & (rank <= capacity - (cell_V < no_cell).sum(dtype=jnp.int32))
+    fresh = jnp.full((capacity,), no_cell, cell_V.dtype)
+    fresh = fresh.at[jnp.where(fits, rank - 1, capacity)].set(ordered, mode="drop")
+    merged = jnp.sort(jnp.concatenate([cell_V, fresh]))[:capacity]
+    return merged, (new & ~fits).sum(dtype=jnp.int32)
+
+
+def relocate(old_V: Array, features_VF: Array, new_V: Array, no_cell: int) -> Array:
+    """Move rows of features to the slots of a new list of cells; −inf where a cell is new.
+
+    Args:
+        old_V: (V,) the cells the rows belong to, sorted.
+        features_VF: (V, F) features.
+        new_V: (V,) the new list, sorted.
+        no_cell: the number that stands for no cell.
+    """
+    slot, found = find(old_V, new_V)
+    held = found & (new_V < no_cell)
+    lowest = jnp.asarray(-jnp.inf, features_VF.dtype)
+    return jnp.where(held[:, None], features_VF[slot], lowest)
+
+
+def maximum_over_blocks(
+    features_VF: Array, count: Array, size: int, read: Callable[[Array, int], tuple[Array, Array]]
+) -> Array:
+    """Scatter-max ``count`` rows, block by block, so that only one block of rows exists at a time.
+
+    Args:
+        features_VF: (V, F) the rows so far.
+        count: () number of rows to read, ≤ ``size``.
+        size: the largest number of rows.
+        read: ``(start, b)`` → ``(slot_b, rows_bF)``, b rows from ``start`` on; rows with slot V are
+            ignored. A row may be requested twice, and so may rows beyond ``count``.
+
+    Returns:
+        (V, F) in the dtype of ``features_VF``. Maxima are computed in float32. Rounding preserves
+        order, so the result is the same as in the narrower dtype.
+    """
+    exact = jnp.promote_types(features_VF.dtype, jnp.float32)
+
+    def run(block: int, rows_VF: Array, count: Array) -> Array:
+        block = min(block, size)
+
+        def body(i: Array, rows_VF: Array) -> Array:
+            slot, rows = read(jnp.minimum(i * block, size - block), block)
+            return rows_VF.at[slot].max(rows.astype(exact), mode="drop")
+
+        return jax.lax.fori_loop(0, (count + block - 1) // block, body, rows_VF)
+
+    # On a CPU a block should fit into the cache; on an accelerator there should be few launches.
+    result = jax.lax.platform_dependent(
+        features_VF.astype(exact),
+        largest_of_batch(count),
+        cpu=lambda rows_VF, count: run(4096, rows_VF, count),
+        default=lambda rows_VF, count: run(65536, rows_VF, count),
+    )
+    return result.astype(features_VF.dtype)
+
+
+@jax.custom_batching.custom_vmap
+def largest_of_batch(count: Array) -> Array:
+    """Return a count unchanged; under ``vmap``, the largest count of the batch.
+
+    With a loop bound that differs within a batch, ``vmap`` copies the whole carry in every
+    iteration; with a condition that differs, it computes both branches.
+    """
+    return count
+
+
+@largest_of_batch.def_vmap
+def _(_axis_size: int, _in_batched: list[bool], count: Array) -> tuple[Array, bool]:
+    return largest_of_batch(count.max(0)), False
+
+
+def within(points_V3: Array, valid_V: Array, box_23: Array) -> Array:
+    """Return (V,) bool: which valid points lie in a box.
+
+    Args:
+        points_V3: (V, 3) world points, metres.
+        valid_V: (V,) bool.
+        box_23: (2, 3) lower and upper corner.
+
+    Raises:
+        UserError: the box is not a box.
+    """
+    box_23 = jnp.asarray(box_23, jnp.float32)
+    if box_23.shape != (2, 3):
+        raise UserError(
+            f"a box is its lower and its upper corner, shape (2, 3), in metres; got {box_23.shape}."
+        )
+    if not isinstance(box_23, Tracer) and not np.all(box_23[0] <= box_23[1]):
+        raise UserError(
+            f"the box's lower corner {box_23[0]} is not below its upper corner {box_23[1]}; give "
+            "the lower one first."
+        )
+    return valid_V & ((points_V3 >= box_23[0]) & (points_V3 < box_23[1])).all(-1)
+
+
+def rigid(transform: Array | None, who: str) -> Array:
+    """Return a (4, 4) float32 transform; None is the identity.
+
+    Args:
+        transform: rigid, from old to new positions, metres.
+        who: the function that got it, for the message.
+
+    Raises:
+        UserError: it is not a rigid 4×4 (under jit only its shape is checked).
+    """
+    found = jnp.eye(4) if transform is None else jnp.asarray(transform, jnp.float32)
+    if found.shape != (4, 4):
+        raise UserError(f"{who}() got a transform of shape {found.shape}; give a rigid 4×4.")
+    if not isinstance(found, Tracer) and not _is_rigid(np.asarray(found)):
+        raise UserError(f"{who}() got a transform that is not rigid; give a rotation and a shift.")
+    return found
+
+
+def _is_rigid(transform: np.ndarray) -> bool:
+    turn = transform[:3, :3]
+    turns = np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0
+    return bool(turns and (transform[3] == (0, 0, 0, 1)).all() and np.isfinite(transform).all())

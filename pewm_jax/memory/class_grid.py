@@ -1,25 +1,37 @@
-"""The state of the world ``persist`` as a memory: a grid of class ids, which can be edited.
+"""A grid of class ids: the state of the world ``persist`` as a memory that can be edited.
 
-A cell holds −1 where nothing is known, 0 where nothing is, else a class. Real frames do not enter
-by ``remember``: the world's networks make the cells of them (``worlds.persist``).
+A cell holds −1 if it is unknown, 0 if it is empty, else a class. The networks of the world predict
+the cells from observed frames (``worlds.persist``).
+
+Edits are in world coordinates (metres): a box is (2, 3), its lower and upper corner, and a cell
+belongs to it if its centre lies in it; a transform is a rigid 4×4 matrix from old to new positions.
+Erased cells are empty, not unknown. All functions are pure and jittable with ``config`` static.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NoReturn
+import math
+from typing import Any, ClassVar, Literal, NoReturn
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
-from pewm_jax.config import GridConfig, ModelConfig, UserError
+from pewm_jax.config import Memory, ModelConfig, Reader
 from pewm_jax.data.voxels import VoxelsConfig, table_colours
+from pewm_jax.errors import UserError, require
 from pewm_jax.geometry import march
-from pewm_jax.memory import class_edit
-from pewm_jax.types import Array, Camera, Frames, View
+from pewm_jax.geometry.cameras import invert_rigid, transform_points
+from pewm_jax.memory import cells
+from pewm_jax.registry import part
+from pewm_jax.types import Array, Camera, Frames, Params, View
 
-UNKNOWN = class_edit.UNKNOWN
+UNKNOWN = -1
+"""The id of a cell of which nothing is known."""
+EMPTY = 0
+"""The id of a cell in which nothing is."""
 
 
 @jax.tree_util.register_dataclass
@@ -36,6 +48,129 @@ class ClassGrid:
     classes_XYZ: Array
     low_3: Array
     history: Any = None
+
+
+def place(config: Memory, grid: ClassGrid, box_23: Array, number: int | Array) -> ClassGrid:
+    """Fill a box with a class.
+
+    Args:
+        config: the grid's settings.
+        grid: the grid.
+        box_23: (2, 3) lower and upper corner in the world, metres.
+        number: the class's id; see ``number_of``.
+
+    Raises:
+        UserError: the box is not a box, or the id is not of the table.
+    """
+    if not isinstance(number, Tracer):
+        given, table = np.asarray(number), VoxelsConfig(kinds=config.kinds, colours=config.colours)  # type: ignore[attr-defined]
+        count = len(table.names)
+        if np.any((given < EMPTY) | (given >= count)):
+            raise UserError(
+                f"place() got the class {number}: use an id of the table, 1 to {count - 1}, or 0 "
+                "for nothing."
+            )
+    inside = _within(config, grid, box_23)
+    return _with(grid, jnp.where(inside, jnp.asarray(number, jnp.int16), grid.classes_XYZ))
+
+
+def erase(config: Memory, grid: ClassGrid, box_23: Array) -> ClassGrid:
+    """Leave nothing in a box.
+
+    Args:
+        config: the grid's settings.
+        grid: the grid.
+        box_23: (2, 3) lower and upper corner in the world, metres.
+
+    Raises:
+        UserError: the box is not a box.
+    """
+    return place(config, grid, box_23, EMPTY)
+
+
+def copy(config: Memory, grid: ClassGrid, box_23: Array) -> ClassGrid:
+    """Return a grid of what is in a box; elsewhere nothing is known.
+
+    Args:
+        config: the grid's settings.
+        grid: the grid.
+        box_23: (2, 3) lower and upper corner in the world, metres.
+
+    Raises:
+        UserError: the box is not a box.
+    """
+    inside = _within(config, grid, box_23) & (grid.classes_XYZ > EMPTY)
+    kept = jnp.where(inside, grid.classes_XYZ, jnp.int16(UNKNOWN))
+    return dataclasses.replace(grid, classes_XYZ=kept, history=None)
+
+
+def paste(
+    config: Memory, grid: ClassGrid, piece: ClassGrid, transform: Array | None = None
+) -> ClassGrid:
+    """Put a piece into a grid; where it has something, that replaces what was there.
+
+    Each cell takes the cell of the piece that its centre comes from (inverse warping), so a rotated
+    piece has no holes. Quarter turns and shifts by whole cells are exact.
+
+    Args:
+        config: the settings of both.
+        grid: the grid.
+        piece: from ``copy``, or any grid of the same cell size.
+        transform: (4, 4) rigid, metres; None for the identity.
+
+    Raises:
+        UserError: the transform is not a rigid 4×4.
+    """
+    back = invert_rigid(cells.rigid(transform, "paste"))
+    points = centres(config, grid).reshape(-1, 3)
+    at = (transform_points(back, points) - piece.low_3) / config.cell_m[0]
+    cell_N3 = jnp.floor(at + 1e-4).astype(jnp.int32)
+    shape = jnp.asarray(piece.classes_XYZ.shape)
+    inside = ((cell_N3 >= 0) & (cell_N3 < shape)).all(-1)
+    x, y, z = jnp.where(inside[:, None], cell_N3, 0).T
+    found = jnp.where(inside, piece.classes_XYZ[x, y, z], jnp.int16(UNKNOWN))
+    found = found.reshape(grid.classes_XYZ.shape)
+    return _with(grid, jnp.where(found > EMPTY, found, grid.classes_XYZ))
+
+
+def move(
+    config: Memory,
+    grid: ClassGrid,
+    box_23: Array,
+    transform: Array,
+    *,
+    leave: bool = False,
+) -> ClassGrid:
+    """Move what is in a box: copy it, erase it, paste it elsewhere.
+
+    Args:
+        config: the grid's settings.
+        grid: the grid.
+        box_23: (2, 3) lower and upper corner in the world, metres.
+        transform: (4, 4) rigid, from old to new positions, metres.
+        leave: erase nothing: a copy.
+
+    Raises:
+        UserError: the box is not a box, or the transform not a rigid 4×4.
+    """
+    piece = copy(config, grid, box_23)
+    rest = grid if leave else erase(config, grid, box_23)
+    return paste(config, rest, piece, transform)
+
+
+def centres(config: Memory, grid: ClassGrid) -> Array:
+    """Return the (X, Y, Z, 3) centres of all cells, metres."""
+    places = np.stack(np.meshgrid(*map(np.arange, grid.classes_XYZ.shape), indexing="ij"), -1)
+    return grid.low_3 + (places.astype(np.float32) + 0.5) * config.cell_m[0]
+
+
+def _within(config: Memory, grid: ClassGrid, box_23: Array) -> Array:
+    points = centres(config, grid)
+    return cells.within(points, jnp.ones(points.shape[:3], bool), box_23)
+
+
+def _with(grid: ClassGrid, classes_XYZ: Array) -> ClassGrid:
+    return dataclasses.replace(grid, classes_XYZ=classes_XYZ)
 
 
 def names(config: GridConfig) -> tuple[str, ...]:
@@ -55,88 +190,163 @@ def number_of(config: GridConfig, name: str) -> int:
     return table.index(name)
 
 
-def empty(model: ModelConfig, centre_3: Array) -> ClassGrid:
-    """Return a grid of which nothing is known.
-
-    Args:
-        model: the model.
-        centre_3: (3,) camera around which it lies, metres; the floor, ``memory.eye_m`` below it,
-            is a border between cells, and across the ground whole multiples of a cell are.
-    """
-    config = model.memory
-    assert isinstance(config, GridConfig)
-    cell, centre = config.cell_m[0], jnp.asarray(centre_3, jnp.float32)
-    below = np.floor(config.eye_m / cell - (config.cells[2] - 1) / 2 + 1e-4)
-    low_z = centre[2] - config.eye_m + below * cell
-    middle = jnp.round(centre[:2] / cell) * cell  # on the lattice of recorded grids
-    low_xy = middle - np.asarray(config.cells[:2]) // 2 * cell
-    cells = jnp.full(config.cells, UNKNOWN, jnp.int16)
-    return ClassGrid(cells, jnp.concatenate([low_xy, low_z[None]]))
-
-
-def to_points(model: ModelConfig, grid: ClassGrid) -> tuple[Array, Array, Array]:
-    """Return centres, colours in [−1, 1] and whether anything is there, of all cells."""
-    assert isinstance(model.memory, GridConfig)
-    points = class_edit.centres(model.memory, grid).reshape(-1, 3)
-    ids = grid.classes_XYZ.reshape(-1).astype(jnp.int32)
-    return points, _colours(model.memory)[jnp.maximum(ids, 0)], ids > 0
-
-
-def render(model: ModelConfig, grid: ClassGrid, camera: Camera, height: int, width: int) -> View:
-    """Return what cameras see of the cells in the colours of their classes, by rays.
-
-    Args:
-        model: the model.
-        grid: the grid.
-        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
-        height: of the images, pixels.
-        width: of the images, pixels.
-    """
-    assert isinstance(model.memory, GridConfig)
-    ids = jnp.maximum(grid.classes_XYZ, 0).astype(jnp.int32)
-    cell = model.memory.cell_m[0]
-    seen = march.through_pixels(ids, grid.low_3, cell, camera, height, width, 1)
-    there = seen.ids_L[..., 0] > 0
-    colours = jnp.where(there[..., None], _colours(model.memory)[seen.ids_L[..., 0]], 0)
-    return View(colours, seen.distance_L[..., 0], there)
-
-
 def _colours(config: GridConfig) -> Array:
     """Return the colours (classes, 3) of the table, in [−1, 1]."""
     return jnp.asarray(table_colours(names(config)).astype(np.float32) / 127.5 - 1)
 
 
-def erase(model: ModelConfig, grid: ClassGrid, box_23: Array) -> ClassGrid:
-    """Leave nothing in a box; see ``class_edit.erase``."""
-    return class_edit.erase(model.memory, grid, box_23)
+@dataclasses.dataclass(frozen=True)
+class GridConfig(Memory):
+    """The state of the world: class ids of all cells that were ever near the agent.
 
-
-def move(
-    model: ModelConfig, grid: ClassGrid, box_23: Array, transform: Array, *, leave: bool = False
-) -> ClassGrid:
-    """Move or copy what is in a box; see ``class_edit.move``."""
-    return class_edit.move(model.memory, grid, box_23, transform, leave=leave)
-
-
-def remember(
-    model: ModelConfig, grid: ClassGrid, frames: Frames, features: Array, valid_T: Any = None
-) -> NoReturn:
-    """Refuse: cells are made by networks.
-
-    Raises:
-        UserError: always.
+    A frame's voxels are a window of it around the agent; what leaves the window is kept.
     """
-    del model, grid, frames, features, valid_T
-    raise UserError(
-        "a grid of classes takes in no pictures by itself: use pewm_jax.start and pewm_jax.observe."
-    )
 
+    KEEPS_FEATURES: ClassVar[bool] = False
+    READ_BY_BLOCKS: ClassVar[bool] = False
+    CLASSES: ClassVar[bool] = True
+    EDITABLE: ClassVar[bool] = True
 
-def tokens(model: ModelConfig, grid: ClassGrid, camera: Camera) -> NoReturn:
-    """Refuse: nothing attends to the cells.
+    cell_m: tuple[float, float, float] = (0.2, 0.2, 0.2)
+    """Side of a cell, three times the same, metres."""
+    cells: tuple[int, int, int] = (192, 192, 48)
+    """Cells that are kept along x, y, z; along z as many as a window has."""
+    recorded: int = 64
+    """Cells along each side of the grids in the data: those of a window, and as many more as the
+    window may lie off the agent."""
+    kinds: Literal["all", "groups"] = "all"
+    """Which classes there are, as the data were collected (`--voxels.kinds`)."""
+    colours: int = 16
+    """Colours of each kind, as the data were collected (`--voxels.colours`)."""
+    pictures: Literal["surfaces", "cells"] = "surfaces"
+    """What the data's images show, as they were collected (`--voxels.pictures`)."""
+    eye_m: float = 1.25
+    """Height of the camera above the floor, metres: where a world begins without a known grid, the
+    floor is a border between cells."""
+    reader: Reader = part("reader", "render")
+    """Nothing reads it but the networks of the world."""
 
-    Raises:
-        UserError: always.
-    """
-    del model, grid, camera
-    raise UserError("a grid of classes has no tokens: the world persist renders it by rays.")
+    @property
+    def room(self) -> int:
+        """How many cells it holds."""
+        return math.prod(self.cells)
+
+    def check(self, model: Any) -> None:
+        """Refuse a grid that the networks do not fit."""
+        require(
+            hasattr(model, "voxel_noise"),
+            "memory.kind grid is the state of the world persist: use model.kind persist.",
+        )
+        side, token = model.backbone.voxel_vae.side, model.backbone.token_cells
+        require(
+            len(set(self.cell_m)) == 1,
+            f"memory.cell_m is {self.cell_m}: cells are cubes, name the same side three times.",
+        )
+        x, y, z = self.cells
+        require(
+            min(x, y) >= side and z == side and x % token == 0 and y % token == 0,
+            f"memory.cells is {self.cells}: use multiples of {token} from {side} on along x and "
+            f"y, and {side} along z, as a window has (backbone.voxel_vae.side).",
+        )
+        require(
+            self.recorded >= side + token and (self.recorded - side) % 2 == 0,
+            f"memory.recorded is {self.recorded}: use {side + token} or more, a window and what it "
+            "may lie off the agent, by an even number more than the window.",
+        )
+
+    def empty(self, model: ModelConfig, centre_3: Array) -> ClassGrid:
+        """Return a grid of unknown cells.
+
+        Args:
+            model: the model.
+            centre_3: (3,) camera at its centre, metres; the floor, ``eye_m`` below it, is a border
+                between cells, and horizontally cells lie at multiples of their side.
+        """
+        del model
+        cell, centre = self.cell_m[0], jnp.asarray(centre_3, jnp.float32)
+        below = np.floor(self.eye_m / cell - (self.cells[2] - 1) / 2 + 1e-4)
+        low_z = centre[2] - self.eye_m + below * cell
+        middle = jnp.round(centre[:2] / cell) * cell  # on the lattice of recorded grids
+        low_xy = middle - np.asarray(self.cells[:2]) // 2 * cell
+        unknown = jnp.full(self.cells, UNKNOWN, jnp.int16)
+        return ClassGrid(unknown, jnp.concatenate([low_xy, low_z[None]]))
+
+    def to_points(self, model: ModelConfig, memory: ClassGrid) -> tuple[Array, Array, Array]:
+        """Return centres, colours in [−1, 1] and occupancy of all cells."""
+        del model
+        points = centres(self, memory).reshape(-1, 3)
+        ids = memory.classes_XYZ.reshape(-1).astype(jnp.int32)
+        return points, _colours(self)[jnp.maximum(ids, 0)], ids > 0
+
+    def render(
+        self, model: ModelConfig, memory: ClassGrid, camera: Camera, height: int, width: int
+    ) -> View:
+        """Render the cells in the colours of their classes, by ray marching.
+
+        Args:
+            model: the model.
+            memory: the grid.
+            camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
+            height: of the images, pixels.
+            width: of the images, pixels.
+        """
+        del model
+        ids = jnp.maximum(memory.classes_XYZ, 0).astype(jnp.int32)
+        cell = self.cell_m[0]
+        seen = march.through_pixels(ids, memory.low_3, cell, camera, height, width, 1)
+        there = seen.ids_L[..., 0] > 0
+        colours = jnp.where(there[..., None], _colours(self)[seen.ids_L[..., 0]], 0)
+        return View(colours, seen.distance_L[..., 0], there)
+
+    def insert(
+        self,
+        model: ModelConfig,
+        params: Params,
+        memory: ClassGrid,
+        frames: Frames,
+        features_ThwF: Array,
+        valid_T: Array | None = None,
+        *,
+        observed: bool = True,
+    ) -> NoReturn:
+        """Refuse: the networks of the world predict the cells.
+
+        Raises:
+            UserError: always.
+        """
+        del model, params, memory, frames, features_ThwF, valid_T, observed
+        raise UserError(
+            "A grid of classes takes no frames by itself: use pewm_jax.start and pewm_jax.observe."
+        )
+
+    def read(self, model: ModelConfig, memory: ClassGrid, camera: Camera) -> NoReturn:
+        """Refuse: nothing attends to the cells.
+
+        Raises:
+            UserError: always.
+        """
+        del model, memory, camera
+        raise UserError("A grid of classes has no tokens: the world persist renders it by rays.")
+
+    def erase(self, model: ModelConfig, memory: ClassGrid, box_23: Array) -> ClassGrid:
+        """Empty a box; see ``erase``."""
+        del model
+        return erase(self, memory, box_23)
+
+    def move(
+        self,
+        model: ModelConfig,
+        memory: ClassGrid,
+        box_23: Array,
+        transform: Array,
+        *,
+        leave: bool = False,
+    ) -> ClassGrid:
+        """Move or copy the content of a box; see ``move``."""
+        del model
+        return move(self, memory, box_23, transform, leave=leave)
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(self.eye_m > 0, f"memory.eye_m is {self.eye_m}: use a height above 0 metres.")

@@ -14,10 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import AttentionConfig, Map2DConfig, Memory, ModelConfig, SurfelConfig
+from pewm_jax.config import Memory, ModelConfig
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.plucker import fold_frames
-from pewm_jax.memory import cells, map2d, memories, rendering
+from pewm_jax.memory import cells, rendering
+from pewm_jax.memory import interface as memories
+from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.geometry import group_latents, sightings
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
@@ -62,7 +64,7 @@ def coverage(
     Args:
         model: the model.
         memory: what is remembered, of one world.
-        tokens: the clip's tokens (``memories.tokens``).
+        tokens: the clip's tokens (``Memory.read``).
         frames: T true frames of the clip, with depth.
         seen_THW: (T, H, W) bool, pixels seen before.
         reader: settings of the attention, by default the memory's reader; where that is of another
@@ -72,14 +74,14 @@ def coverage(
     _, height, width = depth.shape
     seen = jnp.asarray(seen_THW) & (depth > 0) & jnp.isfinite(depth)
     camera = jax.tree.map(jnp.asarray, frames.camera)
-    points, _, valid = memories.to_points(model, memory)
-    grid = _grid(model.memory)
+    points, _, valid = model.memory.to_points(model, memory)
+    grid = model.memory.grid
     # Memories without a grid of their own get one around their first camera.
     origin = getattr(memory, "origin_3", None)
     if origin is None:
         origin = cells.origin(grid, camera.world_from_camera[0, :3, 3])
     pixel_THW = cells.keys(grid, origin, unproject(depth, camera))
-    reach = 1 if isinstance(model.memory, SurfelConfig) else 0
+    reach = model.memory.GRID_TOLERANCE
 
     def among(cell: Array, points_V3: Array, valid_V: Array) -> Array:
         return _among(grid, cell, cells.keys(grid, origin, points_V3), valid_V, reach)
@@ -101,11 +103,6 @@ def coverage(
     read = (attended & kind.READS_TOKENS) | (agrees & kind.READS_VIEW)
     counted = (jnp.ones_like(seen), held, chosen, attended, agrees, read)
     return Coverage(*map(count, counted))
-
-
-def _grid(config: Memory) -> Memory:
-    """Return the settings whose cells the memory's points stand for."""
-    return map2d.flattened(config) if isinstance(config, Map2DConfig) else config
 
 
 def _among(config: Memory, cell: Array, cell_V: Array, valid_V: Array, reach: int) -> Array:

@@ -14,9 +14,10 @@ import math
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import ImagesConfig, ModelConfig
+from pewm_jax.config import Memory, ModelConfig
+from pewm_jax.errors import require, require_positive
 from pewm_jax.memory import cells
-from pewm_jax.types import Array, Camera, Frames, MapTokens
+from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
 
 MOST = 24 * 24
 """The most pixels of a frame, in an even grid, that determine the cells it covers."""
@@ -43,81 +44,6 @@ class Snapshots:
     cell_KC: Array
     origin_3: Array
     dropped: Array
-
-
-def _settings(model: ModelConfig) -> ImagesConfig:
-    assert isinstance(model.memory, ImagesConfig)
-    return model.memory
-
-
-def patch_grid(model: ModelConfig) -> tuple[int, int]:
-    """Return a snapshot's rows and columns of patches; K snapshots fit into ``memory.tokens``."""
-    memory, clip = _settings(model), model.clip
-    return cells.grid_of(clip.height, clip.width, memory.tokens // memory.snapshots)
-
-
-def empty(model: ModelConfig, centre_3: Array) -> Snapshots:
-    """Return an empty set of snapshots, with a grid centred on a world position."""
-    memory, channels = _settings(model), model.memory.encoder.channels
-    count, patches = memory.snapshots, math.prod(patch_grid(model))
-    covers = math.prod(cells.grid_of(model.clip.height, model.clip.width, MOST))
-    return Snapshots(
-        jnp.zeros((count, patches, channels)),
-        jnp.zeros((count, patches, 3)),
-        jnp.zeros((count, patches), bool),
-        jnp.full((count, covers), math.prod(memory.cells), jnp.int32),
-        cells.origin(memory, centre_3),
-        dropped=jnp.zeros((), jnp.int32),
-    )
-
-
-def remember(
-    model: ModelConfig,
-    snapshots: Snapshots,
-    frames: Frames,
-    features_ThwF: Array,
-    valid_T: Array | None = None,
-) -> Snapshots:
-    """Choose the best snapshots among the present ones and T new frames.
-
-    Args:
-        model: the model.
-        snapshots: the present ones; they win ties against new frames.
-        frames: T frames.
-        features_ThwF: (T, h, w, F) their patch features, pooled to the patches of a snapshot.
-        valid_T: (T,) bool; False frames are ignored.
-    """
-    memory, shape = _settings(model), features_ThwF.shape
-    rows, columns = patch_grid(model)
-    points, _, valid = cells.sample(frames, rows, columns, valid_T)
-    pooled = jax.image.resize(features_ThwF, (shape[0], rows, columns, shape[-1]), "linear")
-    pooled = pooled.reshape(shape[0], rows * columns, shape[-1])
-    covered, _, measured = cells.sample(
-        frames, *cells.grid_of(frames.depth_THW.shape[1], frames.depth_THW.shape[2], MOST)
-    )
-    if valid_T is not None:
-        measured = measured & valid_T[:, None]
-    nowhere = math.prod(memory.cells)
-    cell = jnp.where(measured, cells.keys(memory, snapshots.origin_3, covered), nowhere)
-
-    everything = Snapshots(
-        jnp.concatenate([snapshots.features_KPF, jnp.where(valid[..., None], pooled, 0)]),
-        jnp.concatenate([snapshots.points_KP3, jnp.where(valid[..., None], points, 0)]),
-        jnp.concatenate([snapshots.valid_KP, valid]),
-        jnp.concatenate([snapshots.cell_KC, cell]),
-        snapshots.origin_3,
-        snapshots.dropped,
-    )
-    chosen_K, gain_K, missed = greedy_cover(everything.cell_KC, memory.snapshots, nowhere)
-    useful = gain_K > 0
-    return Snapshots(
-        jnp.where(useful[:, None, None], everything.features_KPF[chosen_K], 0),
-        jnp.where(useful[:, None, None], everything.points_KP3[chosen_K], 0),
-        useful[:, None] & everything.valid_KP[chosen_K],
-        jnp.where(useful[:, None], everything.cell_KC[chosen_K], nowhere),
-        snapshots.origin_3,
-        dropped=snapshots.dropped + missed,
-    )
 
 
 def greedy_cover(cell_XC: Array, count: int, nowhere: int) -> tuple[Array, Array, Array]:
@@ -152,23 +78,111 @@ def greedy_cover(cell_XC: Array, count: int, nowhere: int) -> tuple[Array, Array
     return chosen, gain, left_U.sum(dtype=jnp.int32)
 
 
-def to_points(model: ModelConfig, snapshots: Snapshots) -> tuple[Array, Array, Array]:
-    """Return all patches as ``(points_world_V3, features_VF, valid_V)``."""
-    del model
-    channels = snapshots.features_KPF.shape[-1]
-    return (
-        snapshots.points_KP3.reshape(-1, 3),
-        snapshots.features_KPF.reshape(-1, channels),
-        snapshots.valid_KP.reshape(-1),
-    )
+@dataclasses.dataclass(frozen=True)
+class ImagesConfig(Memory):
+    """A few snapshots that together cover what was seen."""
 
+    snapshots: int = 8
+    """Frames that are kept; together they have at most `tokens` patches."""
 
-def tokens(model: ModelConfig, snapshots: Snapshots, camera: Camera) -> MapTokens:
-    """Return all patches of all snapshots, padded with masked tokens to ``memory.tokens``."""
-    del camera
-    parts = to_points(model, snapshots)
-    missing = model.memory.tokens - parts[2].shape[0]
-    points, features, valid = (
-        jnp.pad(part, [(0, missing)] + [(0, 0)] * (part.ndim - 1)) for part in parts
-    )
-    return MapTokens(features, points, valid)
+    def patch_grid(self, model: ModelConfig) -> tuple[int, int]:
+        """Return a snapshot's rows and columns of patches; all snapshots fit into ``tokens``."""
+        return cells.grid_of(model.clip.height, model.clip.width, self.tokens // self.snapshots)
+
+    def empty(self, model: ModelConfig, centre_3: Array) -> Snapshots:
+        """Return an empty set of snapshots, with a grid centred on a world position."""
+        count, patches = self.snapshots, math.prod(self.patch_grid(model))
+        covers = math.prod(cells.grid_of(model.clip.height, model.clip.width, MOST))
+        return Snapshots(
+            jnp.zeros((count, patches, self.encoder.channels)),
+            jnp.zeros((count, patches, 3)),
+            jnp.zeros((count, patches), bool),
+            jnp.full((count, covers), math.prod(self.cells), jnp.int32),
+            cells.origin(self, centre_3),
+            dropped=jnp.zeros((), jnp.int32),
+        )
+
+    def insert(
+        self,
+        model: ModelConfig,
+        params: Params,
+        memory: Snapshots,
+        frames: Frames,
+        features_ThwF: Array,
+        valid_T: Array | None = None,
+        *,
+        observed: bool = True,
+    ) -> Snapshots:
+        """Choose the best snapshots among the present ones and T new frames.
+
+        Args:
+            model: the model.
+            params: not used.
+            memory: the present ones; they win ties against new frames.
+            frames: T frames.
+            features_ThwF: (T, h, w, F) their patch features, pooled to the patches of a snapshot.
+            valid_T: (T,) bool; False frames are ignored.
+            observed: not used.
+        """
+        del params, observed
+        shape = features_ThwF.shape
+        rows, columns = self.patch_grid(model)
+        points, _, valid = cells.sample(frames, rows, columns, valid_T)
+        pooled = jax.image.resize(features_ThwF, (shape[0], rows, columns, shape[-1]), "linear")
+        pooled = pooled.reshape(shape[0], rows * columns, shape[-1])
+        covered, _, measured = cells.sample(
+            frames, *cells.grid_of(frames.depth_THW.shape[1], frames.depth_THW.shape[2], MOST)
+        )
+        if valid_T is not None:
+            measured = measured & valid_T[:, None]
+        nowhere = math.prod(self.cells)
+        cell = jnp.where(measured, cells.keys(self, memory.origin_3, covered), nowhere)
+
+        everything = Snapshots(
+            jnp.concatenate([memory.features_KPF, jnp.where(valid[..., None], pooled, 0)]),
+            jnp.concatenate([memory.points_KP3, jnp.where(valid[..., None], points, 0)]),
+            jnp.concatenate([memory.valid_KP, valid]),
+            jnp.concatenate([memory.cell_KC, cell]),
+            memory.origin_3,
+            memory.dropped,
+        )
+        chosen_K, gain_K, missed = greedy_cover(everything.cell_KC, self.snapshots, nowhere)
+        useful = gain_K > 0
+        return Snapshots(
+            jnp.where(useful[:, None, None], everything.features_KPF[chosen_K], 0),
+            jnp.where(useful[:, None, None], everything.points_KP3[chosen_K], 0),
+            useful[:, None] & everything.valid_KP[chosen_K],
+            jnp.where(useful[:, None], everything.cell_KC[chosen_K], nowhere),
+            memory.origin_3,
+            dropped=memory.dropped + missed,
+        )
+
+    def to_points(self, model: ModelConfig, memory: Snapshots) -> tuple[Array, Array, Array]:
+        """Return all patches as ``(points_world_V3, features_VF, valid_V)``."""
+        del model
+        channels = memory.features_KPF.shape[-1]
+        return (
+            memory.points_KP3.reshape(-1, 3),
+            memory.features_KPF.reshape(-1, channels),
+            memory.valid_KP.reshape(-1),
+        )
+
+    def read(self, model: ModelConfig, memory: Snapshots, camera: Camera) -> MapTokens:
+        """Return all patches of all snapshots, padded with masked tokens to ``tokens``."""
+        del camera
+        parts = self.to_points(model, memory)
+        missing = self.tokens - parts[2].shape[0]
+        points, features, valid = (
+            jnp.pad(part, [(0, missing)] + [(0, 0)] * (part.ndim - 1)) for part in parts
+        )
+        return MapTokens(features, points, valid)
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require_positive(self, "memory", "snapshots")
+        require(
+            self.snapshots <= self.tokens,
+            f"memory.snapshots {self.snapshots} exceeds memory.tokens {self.tokens}: every "
+            "snapshot needs at least one token; raise tokens or lower snapshots.",
+        )

@@ -1,6 +1,6 @@
 """A point cloud: positions and colours, without features.
 
-The rival "point cloud" of the paper's ablation. It is thinned as usual (voxel downsampling): each
+The baseline "point cloud" of the paper's ablation. It is thinned by voxel downsampling: each
 grid cell keeps one point, with the mean position and mean colour of all points that fell into it.
 Points are sorted by cell, so an insertion is one sort and one segmented sum.
 """
@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import Memory, ModelConfig
 from pewm_jax.memory import cells
-from pewm_jax.types import Array, Camera, Frames, MapTokens
+from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
 
 MOST = 64 * 64
 """The most pixels of a frame that are inserted, in an even grid."""
@@ -43,20 +44,6 @@ class PointCloud:
     occupied: Array
     dropped: Array
     outside: Array
-
-
-def empty(model: ModelConfig, centre_3: Array) -> PointCloud:
-    """Return a cloud without points, its grid centred on a world position."""
-    config = model.memory
-    zero = jnp.zeros((), jnp.int32)
-    return PointCloud(
-        jnp.full((config.capacity,), math.prod(config.cells), jnp.int32),
-        jnp.zeros((config.capacity, 7)),
-        cells.origin(config, centre_3),
-        occupied=zero,
-        dropped=zero,
-        outside=zero,
-    )
 
 
 def insert(
@@ -102,43 +89,65 @@ def insert(
     )
 
 
-def remember(
-    model: ModelConfig,
-    cloud: PointCloud,
-    frames: Frames,
-    features_ThwF: Array | None = None,
-    valid_T: Array | None = None,
-) -> PointCloud:
-    """Insert the pixels of posed RGB-D frames, colours in [−1, 1]; features are not used."""
-    del features_ThwF
-    rows, columns = cells.grid_of(frames.depth_THW.shape[1], frames.depth_THW.shape[2], MOST)
-    points, rgb, valid = cells.sample(frames, rows, columns, valid_T)
-    return insert(model.memory, cloud, points.reshape(-1, 3), rgb.reshape(-1, 3), valid.reshape(-1))
+@dataclasses.dataclass(frozen=True)
+class PointsConfig(Memory):
+    """Coloured points, one per cell, without features."""
 
+    KEEPS_FEATURES: ClassVar[bool] = False
 
-def to_points(model: ModelConfig, cloud: PointCloud) -> tuple[Array, Array, Array]:
-    """Return all slots as ``(points_world_V3, features_VF, valid_V)``.
+    def empty(self, model: ModelConfig, centre_3: Array) -> PointCloud:
+        """Return a cloud without points, its grid centred on a world position."""
+        del model
+        zero = jnp.zeros((), jnp.int32)
+        return PointCloud(
+            jnp.full((self.capacity,), math.prod(self.cells), jnp.int32),
+            jnp.zeros((self.capacity, 7)),
+            cells.origin(self, centre_3),
+            occupied=zero,
+            dropped=zero,
+            outside=zero,
+        )
 
-    Features are the colour and a 1, then zeros up to the encoder's number of channels; free slots
-    are all 0.
+    def insert(
+        self,
+        model: ModelConfig,
+        params: Params,
+        memory: PointCloud,
+        frames: Frames,
+        features_ThwF: Array | None = None,
+        valid_T: Array | None = None,
+        *,
+        observed: bool = True,
+    ) -> PointCloud:
+        """Insert the pixels of posed RGB-D frames, colours in [−1, 1]; features are not used."""
+        del model, params, features_ThwF, observed
+        rows, columns = cells.grid_of(frames.depth_THW.shape[1], frames.depth_THW.shape[2], MOST)
+        points, rgb, valid = cells.sample(frames, rows, columns, valid_T)
+        return insert(self, memory, points.reshape(-1, 3), rgb.reshape(-1, 3), valid.reshape(-1))
 
-    Raises:
-        ValueError: the encoder has fewer than four channels.
-    """
-    channels = model.memory.encoder.channels
-    if channels < CHANNELS:
-        raise ValueError(f"a coloured point needs {CHANNELS} channels, got {channels}.")
-    valid = cloud.sums_V7[:, 0] > 0
-    mean = cloud.sums_V7[:, 1:] / jnp.where(valid, cloud.sums_V7[:, 0], 1)[:, None]
-    points = jnp.where(valid[:, None], cloud.origin_3 + mean[:, :3], 0)
-    mark = valid[:, None].astype(jnp.float32)
-    padding = jnp.zeros((valid.shape[0], channels - CHANNELS))
-    return points, jnp.concatenate([mean[:, 3:], mark, padding], -1), valid
+    def to_points(self, model: ModelConfig, memory: PointCloud) -> tuple[Array, Array, Array]:
+        """Return all slots as ``(points_world_V3, features_VF, valid_V)``.
 
+        Features are the colour and a 1, then zeros up to the encoder's number of channels; free
+        slots are all 0.
 
-def tokens(model: ModelConfig, cloud: PointCloud, camera: Camera) -> MapTokens:
-    """Choose the points that condition one clip; see ``cells.choose``."""
-    points, features, valid = to_points(model, cloud)
-    size = (model.clip.height, model.clip.width)
-    order = cells.choose(model.memory, points, valid, camera, size)
-    return MapTokens(features[order], points[order], valid[order])
+        Raises:
+            ValueError: the encoder has fewer than four channels.
+        """
+        del model
+        channels = self.encoder.channels
+        if channels < CHANNELS:
+            raise ValueError(f"a coloured point needs {CHANNELS} channels, got {channels}.")
+        valid = memory.sums_V7[:, 0] > 0
+        mean = memory.sums_V7[:, 1:] / jnp.where(valid, memory.sums_V7[:, 0], 1)[:, None]
+        points = jnp.where(valid[:, None], memory.origin_3 + mean[:, :3], 0)
+        mark = valid[:, None].astype(jnp.float32)
+        padding = jnp.zeros((valid.shape[0], channels - CHANNELS))
+        return points, jnp.concatenate([mean[:, 3:], mark, padding], -1), valid
+
+    def read(self, model: ModelConfig, memory: PointCloud, camera: Camera) -> MapTokens:
+        """Choose the points that condition one clip; see ``cells.choose``."""
+        points, features, valid = self.to_points(model, memory)
+        size = (model.clip.height, model.clip.width)
+        order = cells.choose(self, points, valid, camera, size)
+        return MapTokens(features[order], points[order], valid[order])

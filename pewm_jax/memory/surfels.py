@@ -1,30 +1,33 @@
-"""Surfels: what was seen, at the sensor's resolution, one small coloured surface per small cell.
+"""Surfels: one small coloured surface per small cell, at the resolution of the sensor.
 
-The voxel map keeps features of cells of a quarter of a metre; this keeps colours of cells of a few
-centimetres, so that what was seen can be shown again (``render``). Each surfel stands at the mean
-position of what fell into its cell and is as wide as the cell, or as a pixel of the camera that saw
-it was there if that is wider. What was observed beats what was imagined: the first observation of
-an imagined cell replaces it and, with ``memory.protect``, imagined frames change no observed cell.
+The voxel map keeps features of cells of a quarter of a metre; this memory keeps colours of cells of
+a few centimetres, so that observed surfaces can be rendered. Each surfel lies at the mean position
+of the points in its cell. It is as wide as the cell, or as a pixel of the camera that saw it, if
+that is wider. Observed points take precedence over imagined ones: the first observation of an
+imagined cell replaces it and, with ``memory.protect``, imagined frames change no observed cell.
 Without it, a cell counts as observed as long as it holds observed points: until imagined ones
 replace them (``keep`` newest); a mean of both counts as observed.
 
-Cells are kept sorted, as the voxel map's are. Sums are added up in the order of the pixels, so that
-on a CPU equal frames make equal memories bit for bit.
+Cells are sorted, as in the voxel map. Sums are accumulated in the order of the pixels, so on a CPU
+equal frames give bit-identical memories. A moved surfel keeps its sums and its observed flag,
+replaces the surfels at its target, and surfels that arrive in one cell are merged.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import ModelConfig, SurfelConfig
-from pewm_jax.geometry.cameras import unproject
+from pewm_jax.config import Memory, ModelConfig
+from pewm_jax.errors import require, require_positive
+from pewm_jax.geometry.cameras import matmul, transform_points, unproject
 from pewm_jax.geometry.depth_images import normals
-from pewm_jax.memory import boxes, cells, rendering, surfel_edit, views, voxel_cells
-from pewm_jax.types import Array, Camera, Frames, MapTokens
+from pewm_jax.memory import cells, rendering
+from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
 
 COLUMNS = 10
 """The columns of ``sums_VC`` before features: how many points, their offsets, colours, normals."""
@@ -80,23 +83,6 @@ class Points:
     valid_P: Array
 
 
-def empty(model: ModelConfig, centre_3: Array) -> Surfels:
-    """Return a memory of no surfels, its grid centred on a world position."""
-    config = settings_of(model)
-    count, zero = config.capacity, jnp.zeros((), jnp.int32)
-    columns = COLUMNS + (config.encoder.channels if config.features else 0)
-    return Surfels(
-        jnp.full((count,), voxel_cells.nowhere(config), jnp.int32),
-        jnp.zeros((count, columns)),
-        jnp.zeros((count,)),
-        jnp.zeros((count,), bool),
-        cells.origin(config, centre_3),
-        occupied=zero,
-        dropped=zero,
-        outside=zero,
-    )
-
-
 def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool = True) -> Surfels:
     """Insert points; new cells beyond the capacity are counted, and what is there stays.
 
@@ -106,16 +92,16 @@ def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool =
         new: the points.
         observed: False where they were imagined.
     """
-    none, capacity = voxel_cells.nowhere(config), surfels.cell_V.shape[0]
+    none, capacity = cells.nowhere(config), surfels.cell_V.shape[0]
     cell_P = cells.keys(config, surfels.origin_3, new.points_P3)
     outside = (new.valid_P & (cell_P == none)).sum(dtype=jnp.int32)
     cell_P = jnp.where(new.valid_P, cell_P, none)
-    cell_V, dropped = voxel_cells.admit(surfels.cell_V, cell_P, none)
+    cell_V, dropped = cells.admit(surfels.cell_V, cell_P, none)
 
-    before, known = voxel_cells.find(surfels.cell_V, cell_V)
+    before, known = cells.find(surfels.cell_V, cell_V)
     known = known & (cell_V < none)
     was_observed = known & surfels.observed_V[before]
-    slot, found = voxel_cells.find(cell_V, cell_P)
+    slot, found = cells.find(cell_V, cell_P)
     taken = found & (cell_P < none)
     if not observed and config.protect:
         taken = taken & ~was_observed[slot]
@@ -148,123 +134,19 @@ def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool =
     )
 
 
-def remember(
-    model: ModelConfig,
-    surfels: Surfels,
-    frames: Frames,
-    features_ThwF: Array | None = None,
-    valid_T: Array | None = None,
-    observed: bool = True,
-) -> Surfels:
-    """Insert every pixel of posed RGB-D frames, colours in [−1, 1].
-
-    Args:
-        model: the model.
-        surfels: those so far.
-        frames: T frames, the newest last.
-        features_ThwF: (T, h, w, F) the encoder's; a pixel gets those of the patch it lies in. Not
-            used where features are not kept.
-        valid_T: (T,) bool, False frames are ignored.
-        observed: False where the frames were imagined.
-    """
-    config = settings_of(model)
-    depth_THW = jnp.asarray(frames.depth_THW)
-    count, height, width = depth_THW.shape
-    valid = (depth_THW > 0) & jnp.isfinite(depth_THW)
-    if valid_T is not None:
-        valid = valid & jnp.asarray(valid_T)[:, None, None]
-    camera = jax.tree.map(jnp.asarray, frames.camera)
-    values = jnp.concatenate([jnp.asarray(frames.rgb_THWC), normals(depth_THW, camera)], -1)
-    if config.features:
-        if features_ThwF is None:
-            raise ValueError("memory.features is set, but no features were given.")
-        down, across = features_ThwF.shape[1:3]
-        row = ((np.arange(height) + 0.5) * down / height).astype(int)
-        column = ((np.arange(width) + 0.5) * across / width).astype(int)
-        patches = jnp.asarray(features_ThwF)[:, row][:, :, column]
-        values = jnp.concatenate([values, patches.astype(values.dtype)], -1)
-    focal = camera.intrinsics_4[:, 0, None, None]
-    time = jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32)[:, None, None], depth_THW.shape)
-    new = Points(
-        unproject(depth_THW, camera).reshape(-1, 3),
-        values.reshape(-1, values.shape[-1]),
-        (depth_THW / focal).reshape(-1),
-        time.reshape(-1),
-        valid.reshape(-1),
-    )
-    return insert(config, surfels, new, observed)
-
-
 def means(config: SurfelConfig, surfels: Surfels) -> tuple[Array, Array, Array, Array, Array]:
     """Return ``(points_world_V3, colours_V3, normals_V3, features_VF, valid_V)``; free slots are 0.
 
     F is 0 where features are not kept.
     """
-    valid = surfels.cell_V < voxel_cells.nowhere(config)
+    valid = surfels.cell_V < cells.nowhere(config)
     mean = surfels.sums_VC[:, 1:] / jnp.where(valid, surfels.sums_VC[:, 0], 1)[:, None]
     corner = cells.corners(config, surfels.origin_3, jnp.where(valid, surfels.cell_V, 0))
     points = jnp.where(valid[:, None], corner + mean[:, :3], 0)
     return points, mean[:, 3:6], mean[:, 6:9], mean[:, 9:], valid
 
 
-def to_points(model: ModelConfig, surfels: Surfels) -> tuple[Array, Array, Array]:
-    """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0.
-
-    Without ``memory.features`` these are the colour, a 1 for being there, and zeros up to the
-    encoder's channels.
-    """
-    config = settings_of(model)
-    points, colours, _, features, valid = means(config, surfels)
-    if config.features:
-        return points, features, valid
-    there = valid[:, None].astype(jnp.float32)
-    padding = jnp.zeros((valid.shape[0], config.encoder.channels - 4))
-    return points, jnp.concatenate([colours, there, padding], -1), valid
-
-
-def trimmed(surfels: Surfels) -> Surfels:
-    """Return surfels without most of the free slots: they look the same, and are drawn faster.
-
-    The capacity is cut to the next eighth of what it was, so that few shapes are ever compiled for.
-    It is read on the host; what is inserted afterwards has that much less room.
-    """
-    capacity = len(surfels.cell_V)
-    part = -(-capacity // 8)
-    left = min(capacity, max(1, -(-int(surfels.occupied) // part)) * part)
-    names = ("cell_V", "sums_VC", "size_V", "observed_V")
-    return dataclasses.replace(surfels, **{name: getattr(surfels, name)[:left] for name in names})
-
-
-def tokens(model: ModelConfig, surfels: Surfels, camera: Camera) -> MapTokens:
-    """Choose the surfels that condition one clip; see ``cells.choose``."""
-    points, features, valid = to_points(model, surfels)
-    size = (model.clip.height, model.clip.width)
-    wide = widths(settings_of(model), surfels)
-    order = cells.choose(model.memory, points, valid, camera, size, wide)
-    return MapTokens(features[order], points[order], valid[order])
-
-
-def render(
-    model: ModelConfig, surfels: Surfels, camera: Camera, height: int, width: int
-) -> rendering.View:
-    """Return what cameras see: the features if they are kept, else the 3 colours.
-
-    See ``memories.render``.
-    """
-    config = settings_of(model)
-    which = means(config, surfels)[3 if config.features else 1]
-    return _shown(config, surfels, which, camera, height, width)
-
-
-def render_colours(
-    model: ModelConfig, surfels: Surfels, camera: Camera, height: int, width: int
-) -> rendering.View:
-    """Return what cameras see, with the 3 colours alone, in [−1, 1]."""
-    config = settings_of(model)
-    return _shown(config, surfels, means(config, surfels)[1], camera, height, width)
-
-
-def _shown(
+def _render(
     config: SurfelConfig,
     surfels: Surfels,
     features_VF: Array,
@@ -296,7 +178,7 @@ def _shown(
     imagined = valid & ~surfels.observed_V
 
     def with_imagined() -> rendering.View:
-        return views.over(observed, draw(imagined))
+        return rendering.over(observed, draw(imagined))
 
     return jax.lax.cond(imagined.any(), with_imagined, lambda: observed)
 
@@ -306,26 +188,280 @@ def widths(config: SurfelConfig, surfels: Surfels) -> Array:
     return jnp.maximum(surfels.size_V, max(config.cell_m))
 
 
-def erase(model: ModelConfig, surfels: Surfels, box_23: Array) -> Surfels:
-    """Forget a box; see ``memories.erase``."""
-    config = settings_of(model)
-    points, *_, valid = means(config, surfels)
-    return surfel_edit.erase(config, surfels, boxes.within(points, valid, box_23))
+COUNT, PLACE, COLOUR, NORMAL = slice(0, 1), slice(1, 4), slice(4, 7), slice(7, 10)
+"""Columns of ``sums_VC``; features come after them."""
 
 
-def move(
-    model: ModelConfig, surfels: Surfels, box_23: Array, transform: Array, *, leave: bool = False
+def _erase(config: SurfelConfig, surfels: Surfels, taken_V: Array) -> Surfels:
+    """Return the surfels without those that are taken.
+
+    Args:
+        config: cell size, extent, capacity.
+        surfels: those so far.
+        taken_V: (V,) bool.
+    """
+    no_cell = cells.nowhere(config)
+    cell_V = jnp.sort(jnp.where(taken_V, no_cell, surfels.cell_V))
+    return _rearranged(config, surfels, cell_V)
+
+
+def _move(
+    config: SurfelConfig,
+    surfels: Surfels,
+    points_V3: Array,
+    taken_V: Array,
+    transform: Array,
+    *,
+    leave: bool = False,
 ) -> Surfels:
-    """Move or copy what is in a box; see ``memories.move``."""
-    config, transform = settings_of(model), boxes.rigid(transform, "move")
-    points, *_, valid = means(config, surfels)
-    taken = boxes.within(points, valid, box_23)
-    return surfel_edit.move(config, surfels, points, taken, transform, leave=leave)
+    """Return the surfels after those that are taken were moved, or copied.
+
+    Args:
+        config: cell size, extent, capacity.
+        surfels: those so far.
+        points_V3: (V, 3) where they are, metres.
+        taken_V: (V,) bool, those to move.
+        transform: (4, 4) rigid, from old to new positions.
+        leave: leave them where they are, too.
+
+    Returns:
+        The surfels. Cells that do not fit are counted as dropped, surfels that leave the grid as
+        outside.
+    """
+    no_cell, capacity = cells.nowhere(config), surfels.cell_V.shape[0]
+    there = transform_points(transform, points_V3)
+    target = cells.keys(config, surfels.origin_3, there)
+    outside = (taken_V & (target == no_cell)).sum(dtype=jnp.int32)
+    target = jnp.where(taken_V, target, no_cell)
+
+    rest = surfels if leave else _erase(config, surfels, taken_V)
+    cell_V, dropped = cells.admit(rest.cell_V, target, no_cell)
+    after = _rearranged(config, rest, cell_V)
+    slot, found = cells.find(cell_V, target)
+    arrives = found & (target < no_cell)
+    slot = jnp.where(arrives, slot, capacity)
+    covered = jnp.zeros((capacity,), bool).at[slot].set(True, mode="drop")
+
+    count, turn = surfels.sums_VC[:, COUNT], transform[:3, :3]
+    corner = cells.corners(config, surfels.origin_3, jnp.where(arrives, target, 0))
+    rows = surfels.sums_VC.at[:, PLACE].set((there - corner) * count)
+    rows = rows.at[:, NORMAL].set(matmul(surfels.sums_VC[:, NORMAL], turn.T))
+    rows = jnp.where(arrives[:, None], rows, 0)
+    size = jnp.where(covered, jnp.inf, after.size_V).at[slot].min(surfels.size_V, mode="drop")
+    observed = jnp.where(covered, False, after.observed_V)
+    return dataclasses.replace(
+        after,
+        sums_VC=jnp.where(covered[:, None], 0, after.sums_VC).at[slot].add(rows, mode="drop"),
+        size_V=size,
+        observed_V=observed.at[slot].max(surfels.observed_V, mode="drop"),
+        dropped=surfels.dropped + dropped,
+        outside=surfels.outside + outside,
+    )
 
 
-def settings_of(model: ModelConfig) -> SurfelConfig:
-    """Return the settings of the memory, which must be surfels."""
-    config = model.memory
-    if not isinstance(config, SurfelConfig):
-        raise TypeError(f"surfels need a SurfelConfig, got {type(config).__name__}.")
-    return config
+def _rearranged(config: SurfelConfig, surfels: Surfels, cell_V: Array) -> Surfels:
+    """Return the surfels in the slots of a new list of cells; those of new cells are empty."""
+    no_cell = cells.nowhere(config)
+    before, known = cells.find(surfels.cell_V, cell_V)
+    known = known & (cell_V < no_cell)
+    return dataclasses.replace(
+        surfels,
+        cell_V=cell_V,
+        sums_VC=jnp.where(known[:, None], surfels.sums_VC[before], 0),
+        size_V=jnp.where(known, surfels.size_V[before], 0),
+        observed_V=known & surfels.observed_V[before],
+        occupied=(cell_V < no_cell).sum(dtype=jnp.int32),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfelConfig(Memory):
+    """Small coloured surfaces at the sensor's resolution; cells, tokens and capacity as elsewhere.
+
+    They alone know what was observed and what was imagined: see ``protect``.
+    """
+
+    EDITABLE: ClassVar[bool] = True
+    GRID_TOLERANCE: ClassVar[int] = 1
+
+    cell_m: tuple[float, float, float] = (0.04, 0.04, 0.04)
+    """Size of a cell along x, y, z, metres: of all that was seen in one, one surfel is kept."""
+    cells: tuple[int, int, int] = (1024, 1024, 128)
+    """Cells of the grid along x, y, z; the extent costs nothing."""
+    capacity: int = 65536
+    """Surfels that can be kept; what does not fit is counted."""
+    keep: Literal["mean", "newest"] = "mean"
+    """Of what was seen in one cell: the mean of all, or what the newest frame showed."""
+    protect: bool = True
+    """What was imagined never changes what was observed."""
+    features: bool = False
+    """Keep the encoder's features beside the colour, and give them to the reader."""
+    footprint: int = 3
+    """Pixels that a surfel covers at most, across and down, when the memory is rendered."""
+    sides: bool = True
+    """Show a surfel only from the side it was seen from; from behind it hides what it hides, and
+    nobody knows what it looks like: a wall of the room next door."""
+    imagined_again: bool = False
+    """Also remember imagined pixels at which the memory showed something when they were imagined;
+    else only what is new, so that a surface does not grow with every look at it. Needs a reader or
+    a gate for which the memory is rendered."""
+    observed_first: bool = True
+    """Show what was imagined only where nothing that was observed is shown."""
+
+    @property
+    def KEEPS_FEATURES(self) -> bool:  # noqa: N802  # type: ignore[override]
+        """Whether points carry the encoder's features; else the first three are their colour."""
+        return self.features
+
+    def check(self, model: Any) -> None:
+        """Refuse an encoder without room for a colour."""
+        super().check(model)
+        require(
+            self.features or self.encoder.channels >= 4,
+            f"memory.encoder has {self.encoder.channels} channels: a coloured surfel needs 4; take "
+            "an encoder with more, or set memory.features.",
+        )
+
+    def empty(self, model: ModelConfig, centre_3: Array) -> Surfels:
+        """Return a memory of no surfels, its grid centred on a world position."""
+        del model
+        count, zero = self.capacity, jnp.zeros((), jnp.int32)
+        columns = COLUMNS + (self.encoder.channels if self.features else 0)
+        return Surfels(
+            jnp.full((count,), cells.nowhere(self), jnp.int32),
+            jnp.zeros((count, columns)),
+            jnp.zeros((count,)),
+            jnp.zeros((count,), bool),
+            cells.origin(self, centre_3),
+            occupied=zero,
+            dropped=zero,
+            outside=zero,
+        )
+
+    def insert(
+        self,
+        model: ModelConfig,
+        params: Params,
+        memory: Surfels,
+        frames: Frames,
+        features_ThwF: Array | None = None,
+        valid_T: Array | None = None,
+        *,
+        observed: bool = True,
+    ) -> Surfels:
+        """Insert every pixel of posed RGB-D frames, colours in [−1, 1].
+
+        Args:
+            model: the model.
+            params: not used.
+            memory: the surfels so far.
+            frames: T frames, the newest last.
+            features_ThwF: (T, h, w, F) the encoder's; a pixel gets those of the patch it lies in.
+                Not used if features are not kept.
+            valid_T: (T,) bool, False frames are ignored.
+            observed: False if the frames were imagined.
+        """
+        del model, params
+        depth_THW = jnp.asarray(frames.depth_THW)
+        count, height, width = depth_THW.shape
+        valid = (depth_THW > 0) & jnp.isfinite(depth_THW)
+        if valid_T is not None:
+            valid = valid & jnp.asarray(valid_T)[:, None, None]
+        camera = jax.tree.map(jnp.asarray, frames.camera)
+        values = jnp.concatenate([jnp.asarray(frames.rgb_THWC), normals(depth_THW, camera)], -1)
+        if self.features:
+            if features_ThwF is None:
+                raise ValueError("memory.features is set, but no features were given.")
+            down, across = features_ThwF.shape[1:3]
+            row = ((np.arange(height) + 0.5) * down / height).astype(int)
+            column = ((np.arange(width) + 0.5) * across / width).astype(int)
+            patches = jnp.asarray(features_ThwF)[:, row][:, :, column]
+            values = jnp.concatenate([values, patches.astype(values.dtype)], -1)
+        focal = camera.intrinsics_4[:, 0, None, None]
+        time = jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32)[:, None, None], depth_THW.shape)
+        new = Points(
+            unproject(depth_THW, camera).reshape(-1, 3),
+            values.reshape(-1, values.shape[-1]),
+            (depth_THW / focal).reshape(-1),
+            time.reshape(-1),
+            valid.reshape(-1),
+        )
+        return insert(self, memory, new, observed)
+
+    def to_points(self, model: ModelConfig, memory: Surfels) -> tuple[Array, Array, Array]:
+        """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0.
+
+        Without ``features`` these are the colour, a 1 that marks a surfel, and zeros up to the
+        encoder's channels.
+        """
+        del model
+        points, colours, _, features, valid = means(self, memory)
+        if self.features:
+            return points, features, valid
+        there = valid[:, None].astype(jnp.float32)
+        padding = jnp.zeros((valid.shape[0], self.encoder.channels - 4))
+        return points, jnp.concatenate([colours, there, padding], -1), valid
+
+    def read(self, model: ModelConfig, memory: Surfels, camera: Camera) -> MapTokens:
+        """Choose the surfels that condition one clip; see ``cells.choose``."""
+        points, features, valid = self.to_points(model, memory)
+        size = (model.clip.height, model.clip.width)
+        order = cells.choose(self, points, valid, camera, size, widths(self, memory))
+        return MapTokens(features[order], points[order], valid[order])
+
+    def render(
+        self, model: ModelConfig, memory: Surfels, camera: Camera, height: int, width: int
+    ) -> rendering.View:
+        """Render the features if they are kept, else the 3 colours; see ``Memory.render``."""
+        del model
+        which = means(self, memory)[3 if self.features else 1]
+        return _render(self, memory, which, camera, height, width)
+
+    def render_colours(
+        self, memory: Surfels, camera: Camera, height: int, width: int
+    ) -> rendering.View:
+        """Render the 3 colours only, in [−1, 1]."""
+        return _render(self, memory, means(self, memory)[1], camera, height, width)
+
+    def trimmed(self, memory: Surfels) -> Surfels:
+        """Return surfels without most of the free slots: they render equally and faster.
+
+        The capacity is cut to a multiple of an eighth, so that few shapes are compiled.
+        It is read on the host; what is inserted afterwards has that much less room.
+        """
+        capacity = len(memory.cell_V)
+        part = -(-capacity // 8)
+        left = min(capacity, max(1, -(-int(memory.occupied) // part)) * part)
+        names = ("cell_V", "sums_VC", "size_V", "observed_V")
+        return dataclasses.replace(memory, **{name: getattr(memory, name)[:left] for name in names})
+
+    def erase(self, model: ModelConfig, memory: Surfels, box_23: Array) -> Surfels:
+        """Erase a box; see ``Memory.erase``."""
+        del model
+        points, *_, valid = means(self, memory)
+        return _erase(self, memory, cells.within(points, valid, box_23))
+
+    def move(
+        self,
+        model: ModelConfig,
+        memory: Surfels,
+        box_23: Array,
+        transform: Array,
+        *,
+        leave: bool = False,
+    ) -> Surfels:
+        """Move or copy the content of a box; see ``Memory.move``."""
+        del model
+        transform = cells.rigid(transform, "move")
+        points, *_, valid = means(self, memory)
+        taken = cells.within(points, valid, box_23)
+        return _move(self, memory, points, taken, transform, leave=leave)
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require_positive(self, "memory", "footprint")
+        require(
+            self.keep in ("mean", "newest"),
+            f"memory.keep is {self.keep!r}; choose mean or newest.",
+        )

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import Memory
-from pewm_jax.memory import voxel_cells
+from pewm_jax.memory import cells
 from pewm_jax.types import Array, Camera
 
 WORTH_A_BRANCH = 8192
@@ -50,7 +50,7 @@ def pixel_cells(config: Memory, origin_3: Array, depth_THW: Array, camera: Camer
         within = (place >= 0) & (place < count)
         inside = inside & within
         cell = cell * count + jnp.where(within, place, 0).astype(jnp.int32)
-    return jnp.where(inside, cell, voxel_cells.nowhere(config))
+    return jnp.where(inside, cell, cells.nowhere(config))
 
 
 def corners(cell_THW: Array, square_H: np.ndarray, square_W: np.ndarray) -> Array:
@@ -136,7 +136,7 @@ def insert(
     Returns:
         ``(cell_V, features_VF, dropped)``.
     """
-    no_cell = voxel_cells.nowhere(config)
+    no_cell = cells.nowhere(config)
     _, height, width = cell_THW.shape
     _, rows, columns, channels = features_ThwF.shape
     (square_H, down_H), (square_W, right_W) = between(height, rows), between(width, columns)
@@ -145,14 +145,14 @@ def insert(
 
     def admitted(most: int) -> tuple[Array, Array]:
         seen = flat.at[index[:most]].get(mode="fill", fill_value=no_cell)
-        return voxel_cells.admit(cell_V, seen, no_cell)
+        return cells.admit(cell_V, seen, no_cell)
 
     few = flat.shape[0] // 8
     if few < WORTH_A_BRANCH:
         new_V, dropped = admitted(flat.shape[0])
     else:
         new_V, dropped = jax.lax.cond(
-            voxel_cells.largest_of_batch(count) <= few,
+            cells.largest_of_batch(count) <= few,
             lambda: admitted(few),
             lambda: admitted(flat.shape[0]),
         )
@@ -162,7 +162,7 @@ def insert(
     def read(start: Array, block: int) -> tuple[Array, Array]:
         listed = jax.lax.dynamic_slice_in_dim(index, start, block)
         pixel = jnp.minimum(listed, flat.shape[0] - 1)
-        slot, found = voxel_cells.find(new_V, flat[pixel])
+        slot, found = cells.find(new_V, flat[pixel])
         slot = jnp.where(found & (listed < flat.shape[0]), slot, new_V.shape[0])
         frame, v, u = pixel // (height * width), pixel // width % height, pixel % width
         down, right = down_H[v], right_W[u]
@@ -181,6 +181,6 @@ def insert(
             for place, weight in zip(places, weights, strict=True)
         )
 
-    moved = voxel_cells.relocate(cell_V, features_VF, new_V, no_cell)
-    rows_VF = voxel_cells.maximum_over_blocks(moved, count, flat.shape[0], read)
+    moved = cells.relocate(cell_V, features_VF, new_V, no_cell)
+    rows_VF = cells.maximum_over_blocks(moved, count, flat.shape[0], read)
     return new_V, rows_VF, dropped

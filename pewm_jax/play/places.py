@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pewm_jax.config import GridConfig, UserError, World
+from pewm_jax.config import UserError, World
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.importer import ImportConfig, import_recording
 from pewm_jax.data.loader import require_same_cells
@@ -86,7 +86,7 @@ def require_shown(model: World, start: Start) -> None:
         UserError: the world knows pictures of blocks, and the drive begins with surfaces.
     """
     memory = getattr(model, "memory", None)
-    if not isinstance(memory, GridConfig):
+    if not getattr(memory, "CLASSES", False):
         return
     if start.episode:
         require_same_cells(model, EpisodeSource(Path(start.episode))[start.number])

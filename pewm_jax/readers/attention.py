@@ -6,12 +6,17 @@ Parameters: ``camera`` embeds the rays of each video token, ``tokens`` embeds th
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any, ClassVar, Literal
+
 import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import AttentionConfig, ModelConfig
+from pewm_jax.config import ModelConfig
+from pewm_jax.config.parts import Reader, Rules
 from pewm_jax.controls.camera import CameraConfig
+from pewm_jax.errors import require, require_positive
 from pewm_jax.models.interface import Readers
 from pewm_jax.nn import modules
 from pewm_jax.nn.tokens import TokenLayout, patchify, text_tokens, video_tokens
@@ -21,7 +26,7 @@ from pewm_jax.types import Array, Camera, MemoryReadout, Params
 
 REPLICATED = P()
 
-SHARDING = (
+_RULES = (
     (r"memory/blocks/(attention/to_[qkv]|ff/up|linear)/kernel", P("fsdp", "tensor")),
     (r"memory/blocks/(attention/to_[qkv]|ff/up|linear)/bias", P("tensor")),
     (r"memory/blocks/(to_out|ff/down)/kernel", P("tensor", "fsdp")),
@@ -34,8 +39,6 @@ SHARDING = (
     (r"memory/blocks/(attention/norm_[qk]|norm_video|norm_memory|norm2)/(scale|bias)", REPLICATED),
 )
 
-STREAMS = (14, 34)
-"""How often element-wise work reads or writes a block's tokens: forward, backward."""
 SINUSOID = 60
 """Channels of a position encoded as a sinusoid."""
 
@@ -47,9 +50,7 @@ def token_channels(model: ModelConfig) -> int:
 
 
 def _settings(model: ModelConfig) -> AttentionConfig:
-    config = model.memory.reader
-    assert isinstance(config, AttentionConfig)
-    return config
+    return model.memory.reader  # type: ignore[return-value]
 
 
 def _ray_channels(model: ModelConfig) -> int:
@@ -75,69 +76,123 @@ def _block(model: ModelConfig, layout: TokenLayout) -> MemoryBlock:
     return MemoryBlock(_settings(model), grid, layout, always=not model.memory.REMEMBERS)
 
 
-def init(model: ModelConfig, key: Array) -> Params:
-    """Return random parameters; the blocks' gates are zero."""
-    config, places = _settings(model), model.backbone.places
-    camera, tokens = _embeddings(model)
-    camera_key, tokens_key, blocks_key = jax.random.split(key, 3)
-    half = config.head_dim // 2
-    q = model.codec.temporal * places.patch_t
-    seen = None
-    if config.positions == "projective":
-        seen = Sightings(
-            jnp.zeros((1, 1, q, 1), jnp.int32),
-            jnp.zeros((1, 1, q, 1, half)),
-            jnp.zeros((1, 1, q, 1, 3)),
-            jnp.ones((1, 1, q, 1), bool),
-            jnp.zeros((1, half)),
+@dataclasses.dataclass(frozen=True)
+class AttentionConfig(Reader):
+    """Cross-attention from video tokens to map tokens, after every block of the backbone."""
+
+    SHARDING: ClassVar[Rules] = _RULES
+
+    positions: Literal["projective", "sinusoid"] = "projective"
+    """How cell positions are encoded: `projective` (image coordinates in each frame's camera) or
+    `sinusoid` (the paper's 3D sinusoid of the position)."""
+    frame: Literal["camera", "world"] = "camera"
+    """The frame of `sinusoid` positions: the clip's first camera, or the world."""
+    looks: int = 128
+    """Map tokens that each camera attends to, with projective positions."""
+    heads: int = 6
+    """Attention heads."""
+    head_dim: int = 32
+    """Width of a head; a multiple of 8."""
+    mlp_ratio: int = 4
+    """Feed-forward width over model width."""
+
+    @property
+    def split_heads(self) -> int:
+        """The number that ``train.mesh.tensor`` must divide."""
+        return self.heads
+
+    @property
+    def width(self) -> int:
+        """Channels of all heads together."""
+        return self.heads * self.head_dim
+
+    def check(self, model: Any) -> None:
+        """Refuse fewer heads than there are cameras per token."""
+        cameras = model.codec.temporal * model.backbone.places.patch_t
+        require(
+            self.positions == "sinusoid" or self.heads >= cameras,
+            f"memory.reader.heads is {self.heads}: with projective positions head k looks through "
+            f"camera k mod {cameras} (codec.temporal × backbone.patch_t) of a token's frames; use "
+            f"at least {cameras} heads, or memory.reader.positions sinusoid.",
         )
-    example = (
-        jnp.zeros((1, 1, places.width)),
-        jnp.zeros((1, places.time)),
-        jnp.zeros((1, 1, places.width // 2)),
-        jnp.zeros((1, 1, config.width)),
-        jnp.ones((1, 1), bool),
-        seen,
-    )
-    block = _block(model, TokenLayout(1, 0, 1, 1))
-    blocks = jax.vmap(lambda k: block.init(k, *example)["params"])(
-        jax.random.split(blocks_key, places.count)
-    )
-    rays, channels = jnp.zeros((1, _ray_channels(model))), jnp.zeros((1, token_channels(model)))
-    return {
-        "camera": camera.init(camera_key, rays)["params"],
-        "tokens": tokens.init(tokens_key, channels)["params"],
-        "blocks": blocks,
-    }
+
+    def init(self, model: ModelConfig, key: Array) -> Params:
+        """Return random parameters; the blocks' gates are zero."""
+        places = model.backbone.places
+        camera, tokens = _embeddings(model)
+        camera_key, tokens_key, blocks_key = jax.random.split(key, 3)
+        half = self.head_dim // 2
+        q = model.codec.temporal * places.patch_t
+        seen = None
+        if self.positions == "projective":
+            seen = Sightings(
+                jnp.zeros((1, 1, q, 1), jnp.int32),
+                jnp.zeros((1, 1, q, 1, half)),
+                jnp.zeros((1, 1, q, 1, 3)),
+                jnp.ones((1, 1, q, 1), bool),
+                jnp.zeros((1, half)),
+            )
+        example = (
+            jnp.zeros((1, 1, places.width)),
+            jnp.zeros((1, places.time)),
+            jnp.zeros((1, 1, places.width // 2)),
+            jnp.zeros((1, 1, self.width)),
+            jnp.ones((1, 1), bool),
+            seen,
+        )
+        block = _block(model, TokenLayout(1, 0, 1, 1))
+        blocks = jax.vmap(lambda k: block.init(k, *example)["params"])(
+            jax.random.split(blocks_key, places.count)
+        )
+        rays, channels = jnp.zeros((1, _ray_channels(model))), jnp.zeros((1, token_channels(model)))
+        return {
+            "camera": camera.init(camera_key, rays)["params"],
+            "tokens": tokens.init(tokens_key, channels)["params"],
+            "blocks": blocks,
+        }
+
+    def prepare(
+        self,
+        model: ModelConfig,
+        params: Params,
+        sight: MemoryReadout,
+        camera: Camera,
+        rays_BthwC: Array,
+    ) -> Readers:
+        """Embed rays and map tokens, and select the tokens each camera attends to."""
+        places, dtype = model.backbone.places, jnp.dtype(model.dtype)
+        missing = -rays_BthwC.shape[1] % places.patch_t
+        rays = jnp.concatenate([rays_BthwC[:, :1]] * missing + [rays_BthwC], 1).astype(dtype)
+        layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
+        camera_layer, token_layer = _embeddings(model)
+        patches = patchify(rays, places.patch, places.patch_t)
+        looks_from = layout.spread(camera_layer.apply({"params": params["camera"]}, patches))
+
+        seen = sight.tokens
+        assert seen is not None
+        valid, sights = seen.valid_M, None
+        points, features = (
+            jnp.where(valid[..., None], x, 0) for x in (seen.points_world_M3, seen.features_MF)
+        )
+        if self.positions == "projective":
+            sights = sightings(model, self, camera, points, valid)
+        else:
+            place = sinusoid_3d(model, self, camera, points)
+            features = jnp.concatenate([features, place], -1)
+        embedded = token_layer.apply({"params": params["tokens"]}, features.astype(dtype))
+        block = _block(model, layout)
+
+        def read(layer: Params, video: Array, time: Array) -> Array:
+            return block.apply({"params": layer}, video, time, looks_from, embedded, valid, sights)
+
+        return Readers(read, params["blocks"])
 
 
-def prepare(
-    model: ModelConfig, params: Params, sight: MemoryReadout, camera: Camera, rays_BthwC: Array
-) -> Readers:
-    """Embed rays and map tokens, and choose the tokens each camera attends to; see ``readers``."""
-    config, places, dtype = _settings(model), model.backbone.places, jnp.dtype(model.dtype)
-    missing = -rays_BthwC.shape[1] % places.patch_t
-    rays = jnp.concatenate([rays_BthwC[:, :1]] * missing + [rays_BthwC], 1).astype(dtype)
-    layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
-    camera_layer, token_layer = _embeddings(model)
-    patches = patchify(rays, places.patch, places.patch_t)
-    looks_from = layout.spread(camera_layer.apply({"params": params["camera"]}, patches))
-
-    seen = sight.tokens
-    assert seen is not None
-    valid, sights = seen.valid_M, None
-    points, features = (
-        jnp.where(valid[..., None], x, 0) for x in (seen.points_world_M3, seen.features_MF)
-    )
-    if config.positions == "projective":
-        sights = sightings(model, config, camera, points, valid)
-    else:
-        place = sinusoid_3d(model, config, camera, points)
-        features = jnp.concatenate([features, place], -1)
-    embedded = token_layer.apply({"params": params["tokens"]}, features.astype(dtype))
-    block = _block(model, layout)
-
-    def read(layer: Params, video: Array, time: Array) -> Array:
-        return block.apply({"params": layer}, video, time, looks_from, embedded, valid, sights)
-
-    return Readers(read, params["blocks"])
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "memory.reader", "looks", "heads", "head_dim", "mlp_ratio")
+        require(
+            self.head_dim % 8 == 0,
+            f"memory.reader.head_dim is {self.head_dim}: use a multiple of 8, the projective "
+            "rotary embedding splits a head in two times two halves.",
+        )

@@ -1,4 +1,4 @@
-"""Attention and rendering side by side: at every place first the one, then the other.
+"""Attention and rendering together: at every injection point first attention, then rendering.
 
 Parameters are those of the two: ``camera``, ``tokens`` and ``blocks`` of the attention, and
 ``render``.
@@ -7,38 +7,62 @@ Parameters are those of the two: ``camera``, ``tokens`` and ``blocks`` of the at
 from __future__ import annotations
 
 import dataclasses
+from typing import Any, ClassVar
 
 import jax
 
 from pewm_jax.config import ModelConfig
+from pewm_jax.config.parts import Rules
 from pewm_jax.models.interface import Readers
-from pewm_jax.readers import attention as attention_reader
-from pewm_jax.readers import render as render_reader
+from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.readers.render import RenderConfig
 from pewm_jax.types import Array, Camera, MemoryReadout, Params
 
-SHARDING = (*attention_reader.SHARDING, *render_reader.SHARDING)
+
+@dataclasses.dataclass(frozen=True)
+class BothConfig(AttentionConfig, RenderConfig):
+    """Cross-attention and rendering, one after the other at every place."""
+
+    SHARDING: ClassVar[Rules] = (*AttentionConfig.SHARDING, *RenderConfig.SHARDING)
+
+    READS_TOKENS: ClassVar[bool] = True
+    READS_VIEW: ClassVar[bool] = True
+
+    def init(self, model: ModelConfig, key: Array) -> Params:
+        """Return random parameters of both; the attention's are those that it has alone."""
+        rendering = RenderConfig.init(self, model, jax.random.fold_in(key, 1))
+        return {**AttentionConfig.init(self, model, key), **rendering}
+
+    def prepare(
+        self,
+        model: ModelConfig,
+        params: Params,
+        sight: MemoryReadout,
+        camera: Camera,
+        rays_BthwC: Array,
+    ) -> Readers:
+        """Prepare both; see ``Reader.prepare``."""
+        attend = AttentionConfig.prepare(self, model, params, sight, camera, rays_BthwC)
+        render = RenderConfig.prepare(self, model, params, sight, camera, rays_BthwC)
+        if render.block is None:
+            return dataclasses.replace(attend, added_BND=render.added_BND)
+
+        def read(layer: Params, video: Array, time: Array) -> Array:
+            assert attend.block is not None
+            assert render.block is not None
+            video = attend.block(layer["attend"], video, time)
+            return render.block(layer["render"], video, time)
+
+        stacked = {"attend": attend.params, "render": render.params}
+        return Readers(read, stacked, render.added_BND)
 
 
-def init(model: ModelConfig, key: Array) -> Params:
-    """Return random parameters of both; the attention's are those that it has alone."""
-    rendering = render_reader.init(model, jax.random.fold_in(key, 1))
-    return {**attention_reader.init(model, key), **rendering}
+    def check(self, model: Any) -> None:
+        """Refuse what either of the two refuses."""
+        AttentionConfig.check(self, model)
+        RenderConfig.check(self, model)
 
-
-def prepare(
-    model: ModelConfig, params: Params, sight: MemoryReadout, camera: Camera, rays_BthwC: Array
-) -> Readers:
-    """Prepare both; see ``readers``."""
-    attend = attention_reader.prepare(model, params, sight, camera, rays_BthwC)
-    render = render_reader.prepare(model, params, sight, camera, rays_BthwC)
-    if render.block is None:
-        return dataclasses.replace(attend, added_BND=render.added_BND)
-
-    def read(layer: Params, video: Array, time: Array) -> Array:
-        assert attend.block is not None
-        assert render.block is not None
-        video = attend.block(layer["attend"], video, time)
-        return render.block(layer["render"], video, time)
-
-    stacked = {"attend": attend.params, "render": render.params}
-    return Readers(read, stacked, render.added_BND)
+    def __post_init__(self):
+        """Validate."""
+        AttentionConfig.__post_init__(self)
+        RenderConfig.__post_init__(self)

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import AttentionConfig
+from pewm_jax.config.parts import Reader
 from pewm_jax.nn import layers, modules, placement
 from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.readers.geometry import Sightings, frequencies
@@ -188,7 +188,7 @@ def _read_seen(
 class MemoryBlock(nn.Module):
     """One memory expert block."""
 
-    config: AttentionConfig
+    config: Reader
     grid: int
     """Patches along the longer side of the image."""
     layout: TokenLayout

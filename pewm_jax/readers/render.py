@@ -14,24 +14,61 @@ Parameters, under ``render``: ``reduce`` (pictures of many channels), ``embed_1`
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from typing import Any, ClassVar, Literal
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
+from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.pixel import fold
 from pewm_jax.codecs.signals import signal_from_depth
-from pewm_jax.config import ModelConfig, RenderConfig
+from pewm_jax.config import ModelConfig
+from pewm_jax.config.parts import Reader, Rules
+from pewm_jax.errors import require, require_positive
 from pewm_jax.models.interface import Readers
-from pewm_jax.nn import modules
+from pewm_jax.nn import layers, modules, placement
 from pewm_jax.nn.tokens import TokenLayout, patchify, text_tokens, video_tokens
-from pewm_jax.readers.render_block import RenderBlock
 from pewm_jax.types import Array, Camera, MemoryReadout, Params, View
+
+
+class RenderBlock(nn.Module):
+    """Adds to video tokens what a rendered memory shows at their place; no attention."""
+
+    mlp_ratio: int
+    """Hidden channels over the tokens' width."""
+    layout: TokenLayout
+    """The order of the video tokens."""
+
+    @nn.compact
+    def __call__(self, video_BND: Array, time_BE: Array, picture_BNW: Array) -> Array:
+        """Return the updated video tokens.
+
+        Args:
+            video_BND: (B, N, D) hidden states H.
+            time_BE: (B, E) time embedding, or (B, t, E), one for each token in time.
+            picture_BNW: (B, N, W) the embedded part of the picture at each token.
+        """
+        dtype, width = video_BND.dtype, video_BND.shape[-1]
+        modulation = modules.dense(3 * width, dtype, "linear", zero=True)(nn.silu(time_BE))
+        modulation = placement.constrain(modulation, "batch")
+        if time_BE.ndim == 3:
+            modulation = self.layout.per_token(modulation)
+        shift, scale, gate = jnp.split(modulation, 3, -1)
+        normed = layers.modulate(modules.layer_norm(video_BND, "norm"), shift, scale)
+        joined = placement.constrain(jnp.concatenate([normed, picture_BNW], -1), "batch", "tokens")
+        hidden = modules.dense(self.mlp_ratio * width, dtype, "up")(joined)
+        hidden = nn.gelu(placement.constrain(hidden, "batch", "tokens", "hidden"), approximate=True)
+        mixed = modules.dense(width, dtype, "down")(hidden)
+        return placement.constrain(video_BND + layers.to_tokens(gate) * mixed, "batch", "tokens")
+
 
 REPLICATED = P()
 
-SHARDING = (
+_RULES = (
     (r"memory/render/blocks/(linear|up)/kernel", P("fsdp", "tensor")),
     (r"memory/render/blocks/(linear|up)/bias", P("tensor")),
     (r"memory/render/blocks/down/kernel", P("tensor", "fsdp")),
@@ -40,14 +77,10 @@ SHARDING = (
     (r"memory/render/(reduce/(kernel|bias)|(embed_[12]|added)/bias)", REPLICATED),
 )
 
-STREAMS = (10, 22)
-"""How often element-wise work reads or writes a block's tokens: forward, backward."""
 
 
 def _settings(model: ModelConfig) -> RenderConfig:
-    config = model.memory.reader
-    assert isinstance(config, RenderConfig)
-    return config
+    return model.memory.reader  # type: ignore[return-value]
 
 
 def _reduces(model: ModelConfig) -> bool:
@@ -83,32 +116,6 @@ def _embeddings(model: ModelConfig) -> dict[str, modules.nn.Dense]:
     if _reduces(model):
         made["reduce"] = modules.dense(config.reduced, dtype, "reduce")
     return made
-
-
-def init(model: ModelConfig, key: Array) -> Params:
-    """Return random parameters, under ``render``; gates and ``added`` are zero."""
-    config, places = _settings(model), model.backbone.places
-    widths = {
-        "embed_1": token_channels(model),
-        "embed_2": config.picture_width,
-        "added": config.picture_width,
-        "reduce": model.memory.rendered_channels,
-    }
-    params: Params = {}
-    for place, (name, layer) in enumerate(sorted(_embeddings(model).items())):
-        example = jnp.zeros((1, widths[name]))
-        params[name] = layer.init(jax.random.fold_in(key, place), example)["params"]
-    if config.blocks:
-        example = (
-            jnp.zeros((1, 1, places.width)),
-            jnp.zeros((1, places.time)),
-            jnp.zeros((1, 1, config.picture_width)),
-        )
-        block = RenderBlock(config.mlp_ratio, TokenLayout(1, 0, 1, 1))
-        params["blocks"] = jax.vmap(lambda k: block.init(k, *example)["params"])(
-            jax.random.split(jax.random.fold_in(key, len(widths)), places.count)
-        )
-    return {"render": params}
 
 
 def pictures(model: ModelConfig, params: Params, view: View) -> Array:
@@ -160,30 +167,110 @@ def _apply(model: ModelConfig, params: Params, name: str, x: Array) -> Array:
     return _embeddings(model)[name].apply({"params": params[name]}, x)
 
 
-def prepare(
-    model: ModelConfig, params: Params, sight: MemoryReadout, camera: Camera, rays_BthwC: Array
-) -> Readers:
-    """Embed the memory's pictures; see ``readers``."""
-    del camera, rays_BthwC  # the pictures are what these cameras see
-    config, places, weights = _settings(model), model.backbone.places, params["render"]
-    embed = functools.partial(_apply, model, weights)
-    layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
+@dataclasses.dataclass(frozen=True)
+class RenderConfig(Reader):
+    """What the memory looks like from each frame's camera, given to the video tokens there."""
 
-    read_BthwC, seen_B = cells(model, weights, sight)
-    missing = -read_BthwC.shape[1] % places.patch_t
-    read_BthwC = jnp.concatenate([read_BthwC[:, :1]] * missing + [read_BthwC], 1)
-    patches = patchify(read_BthwC, places.patch, places.patch_t)
-    picture: Array = embed("embed_2", jax.nn.silu(embed("embed_1", patches)))
-    # A clip whose cameras see nothing of the memory is left alone.
-    shown = (seen_B | (not model.memory.REMEMBERS))[:, None, None]
-    added = layout.spread(jnp.where(shown, embed("added", picture), 0))
-    if not config.blocks:
-        return Readers(added_BND=added)
-    picture = layout.spread(picture)
-    block = RenderBlock(config.mlp_ratio, layout)
+    SHARDING: ClassVar[Rules] = _RULES
 
-    def read(layer: Params, video: Array, time: Array) -> Array:
-        out: Array = block.apply({"params": layer}, video, time, picture)
-        return jnp.where(shown, out, video)
+    READS_TOKENS: ClassVar[bool] = False
+    READS_VIEW: ClassVar[bool] = True
 
-    return Readers(read, weights["blocks"], added)
+    picture: Literal["pixels", "latents"] = "pixels"
+    """What a token gets of the picture: the `pixels` that it stands for, or the `latents` that the
+    codec makes of them, holes filled; these only of memories that show colours."""
+    picture_width: int = 128
+    """Channels of a token's part of the picture, embedded."""
+    reduced: int = 8
+    """Pictures of more channels are first reduced to this many, at every pixel."""
+    blocks: bool = True
+    """Also give the picture to a memory block after every block of the backbone; else only to its
+    input."""
+    mlp_ratio: int = 2
+    """Hidden channels of such a block over model width."""
+
+    @property
+    def READS_LATENTS(self) -> bool:  # noqa: N802  # type: ignore[override]
+        """Whether it takes the picture as the codec encodes it."""
+        return self.picture == "latents"
+
+    def check(self, model: Any) -> None:
+        """Refuse clips that cannot be folded as the pictures are, and latents of features."""
+        clip, q = model.clip, model.codec.temporal
+        require(
+            (clip.frames - 1) % q == 0,
+            f"clip.frames is {clip.frames}: the memory's pictures are folded by codec.temporal = "
+            f"{q}, so use {q}k + 1 frames, or memory.reader.kind attend.",
+        )
+        require(
+            self.picture == "pixels" or not model.memory.KEEPS_FEATURES,
+            "memory.reader.picture is latents, which the codec makes of colours, and this memory "
+            "shows features: use memory.kind surfels or points, or memory.reader.picture pixels.",
+        )
+
+    def init(self, model: ModelConfig, key: Array) -> Params:
+        """Return random parameters, under ``render``; gates and ``added`` are zero."""
+        places = model.backbone.places
+        widths = {
+            "embed_1": token_channels(model),
+            "embed_2": self.picture_width,
+            "added": self.picture_width,
+            "reduce": model.memory.rendered_channels,
+        }
+        params: Params = {}
+        for place, (name, layer) in enumerate(sorted(_embeddings(model).items())):
+            example = jnp.zeros((1, widths[name]))
+            params[name] = layer.init(jax.random.fold_in(key, place), example)["params"]
+        if self.blocks:
+            example = (
+                jnp.zeros((1, 1, places.width)),
+                jnp.zeros((1, places.time)),
+                jnp.zeros((1, 1, self.picture_width)),
+            )
+            block = RenderBlock(self.mlp_ratio, TokenLayout(1, 0, 1, 1))
+            params["blocks"] = jax.vmap(lambda k: block.init(k, *example)["params"])(
+                jax.random.split(jax.random.fold_in(key, len(widths)), places.count)
+            )
+        return {"render": params}
+
+    def prepare(
+        self,
+        model: ModelConfig,
+        params: Params,
+        sight: MemoryReadout,
+        camera: Camera,
+        rays_BthwC: Array,
+    ) -> Readers:
+        """Embed the memory's pictures; see ``readers``."""
+        del camera, rays_BthwC  # the pictures are what these cameras see
+        places, weights = model.backbone.places, params["render"]
+        embed = functools.partial(_apply, model, weights)
+        layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
+
+        read_BthwC, seen_B = cells(model, weights, sight)
+        missing = -read_BthwC.shape[1] % places.patch_t
+        read_BthwC = jnp.concatenate([read_BthwC[:, :1]] * missing + [read_BthwC], 1)
+        patches = patchify(read_BthwC, places.patch, places.patch_t)
+        picture: Array = embed("embed_2", jax.nn.silu(embed("embed_1", patches)))
+        # A clip whose cameras see nothing of the memory is left alone.
+        shown = (seen_B | (not model.memory.REMEMBERS))[:, None, None]
+        added = layout.spread(jnp.where(shown, embed("added", picture), 0))
+        if not self.blocks:
+            return Readers(added_BND=added)
+        picture = layout.spread(picture)
+        block = RenderBlock(self.mlp_ratio, layout)
+
+        def read(layer: Params, video: Array, time: Array) -> Array:
+            out: Array = block.apply({"params": layer}, video, time, picture)
+            return jnp.where(shown, out, video)
+
+        return Readers(read, weights["blocks"], added)
+
+
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "memory.reader", "picture_width", "reduced", "mlp_ratio")
+        require(
+            self.picture in ("pixels", "latents"),
+            f"memory.reader.picture is {self.picture!r}; choose pixels or latents.",
+        )

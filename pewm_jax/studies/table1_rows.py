@@ -16,23 +16,18 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import (
-    AttentionConfig,
-    Config,
-    ImagesConfig,
-    Map2DConfig,
-    Memory,
-    NoMemoryConfig,
-    PointsConfig,
-    Reader,
-    RenderConfig,
-    SurfelConfig,
-    UserError,
-    VoxelConfig,
-)
+from pewm_jax.config import Config, Memory, Reader, UserError
 from pewm_jax.encoders.latents import LatentsConfig
+from pewm_jax.memory.images import ImagesConfig
+from pewm_jax.memory.map2d import Map2DConfig
+from pewm_jax.memory.none import NoMemoryConfig
+from pewm_jax.memory.points import PointsConfig
+from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.readers.render import RenderConfig
 from pewm_jax.worlds import world_model
 
 POINTS, SURFELS = (0.4, 4), (0.12, 24)

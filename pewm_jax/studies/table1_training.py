@@ -28,12 +28,13 @@ import jax
 
 from pewm_jax import config as configuration
 from pewm_jax import shipped
-from pewm_jax.config import Config, ModelConfig, NoMemoryConfig, StageConfig, UserError
+from pewm_jax.config import Config, ModelConfig, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.errors import require
 from pewm_jax.io import atomic, weights
 from pewm_jax.io.store import file_hash, inputs_hash, make_once
+from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.studies.table1_rows import Row
 from pewm_jax.train import loop, sharding

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import rgbd
 from pewm_jax.config import ModelConfig, UserError
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, View
 from pewm_jax.worlds import world_model
 

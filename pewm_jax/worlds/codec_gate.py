@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from pewm_jax.codecs import gates, rgbd
 from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, TrainSettings
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.types import Array, Camera, Clip, Frames, Params
 

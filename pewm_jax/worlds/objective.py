@@ -12,7 +12,7 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, signal_from_rgb
 from pewm_jax.config import ModelConfig, TrainSettings
 from pewm_jax.config.parts import Noise
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
 from pewm_jax.nn import placement
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, MemoryReadout, Params
 from pewm_jax.worlds import chained, world_model
@@ -38,7 +38,7 @@ def clip_readout(
             context: Frames, valid_S: Array, features: Array, camera: Camera
         ) -> MemoryReadout:
             memory = memories.from_context(model, weights, context, valid_S, features)
-            return memories.look(model, memory, camera, params=weights, pictures=pictures)
+            return memories.readout(model, memory, camera, params=weights, pictures=pictures)
 
         features = clip.extras.get("context_features_ShwF")
         if features is None:

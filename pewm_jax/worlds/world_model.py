@@ -23,7 +23,6 @@ from pewm_jax.config import ModelConfig
 from pewm_jax.controls import camera as camera_control
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.interface import NO_READERS, Conditioning, Observed
-from pewm_jax.readers import interface as readers
 from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params
 
 
@@ -157,7 +156,7 @@ def init(model: ModelConfig, key: Array, *, memory: bool = True) -> Params:
     channels = model.in_channels, model.codec.channels
     params: Params = {"backbone": model.backbone.init(backbone_key, *channels)}
     if memory and model.backbone.places is not None:
-        params["memory"] = readers.init(model, memory_key)
+        params["memory"] = model.memory.reader.init(model, memory_key)
     parts = {
         "codec": model.codec.init(frozen_key),
         "encoder": model.memory.encoder.init(jax.random.fold_in(frozen_key, 1)),
@@ -194,7 +193,7 @@ def apply(
     """
     dtype, memory_readers = jnp.dtype(model.dtype), NO_READERS
     if sight is not None and "memory" in params:
-        memory_readers = readers.prepare(
+        memory_readers = model.memory.reader.prepare(
             model, params["memory"], sight, conditioning.camera, conditioning.rays_BthwC
         )
     noisy = _seen(model, noisy_BthwC).astype(dtype)

@@ -29,7 +29,6 @@ from pewm_jax.io.published import LINEAR, Entry
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.readers import interface as readers
 from pewm_jax.types import Camera, MapTokens, MemoryReadout
 from pewm_jax.worlds import world_model
 
@@ -221,7 +220,9 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     plan = widen.plan(old, 4, config.model.control.channels(config.model))
     wide = {
         "backbone": widen.widen(plan, params),
-        "memory": jax.jit(lambda: readers.init(config.model, jax.random.key(0)))(),
+        "memory": jax.jit(
+            lambda: config.model.memory.reader.init(config.model, jax.random.key(0))
+        )(),
     }
     noisy, conditioning, tokens, video = inputs(config, plan)
     times = jnp.array([999, 40])
@@ -304,7 +305,7 @@ def test_an_imported_checkpoint_starts_from_the_preset_of_its_size(variant, bill
         backbone, codec, noise, (None,) * 3, "bfloat16", encoder=encoder
     )
     assert made.model.memory == preset.model.memory
-    blocks = jax.eval_shape(lambda: readers.init(made.model, jax.random.key(0)))
+    blocks = jax.eval_shape(lambda: made.model.memory.reader.init(made.model, jax.random.key(0)))
     count = sum(leaf.size for leaf in jax.tree.leaves(blocks))
     assert abs(count / 1e9 - billions) < 0.01
 

@@ -13,10 +13,12 @@ import pytest
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import worlds
-from pewm_jax.config import AttentionConfig, ClipConfig, UserError, VoxelConfig
+from pewm_jax.config import ClipConfig, UserError
 from pewm_jax.convert import stablehlo, stablehlo_programs
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree
+from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.train import runs
 from pewm_jax.worlds import world_model
 from tests.helpers import random_frames, tiny_config

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pewm_jax.config import ConfigError, GridConfig, ModelConfig, NomadWorldConfig, PersistConfig
+from pewm_jax.config import ConfigError, ModelConfig, NomadWorldConfig, PersistConfig
 from pewm_jax.data import voxel_pictures
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.loader import require_same_cells
@@ -15,6 +15,7 @@ from pewm_jax.data.voxel_pictures import grid_from_camera
 from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig
 from pewm_jax.geometry import block_light
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.types import Camera
 
 NAMES = VoxelsConfig(kinds="groups", colours=2).names

@@ -8,21 +8,21 @@ import numpy as np
 
 from pewm_jax.config import (
     ActionConfig,
-    AttentionConfig,
     ClipConfig,
     Config,
     DataConfig,
     EvalConfig,
     ModelConfig,
     TrainConfig,
-    VoxelConfig,
 )
 from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry.actions import discrete_table, integrate
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, ray_directions
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.types import Camera, Frames
 
 SIZE = 16

@@ -13,14 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax import worlds
-from pewm_jax.config import (
-    ImagesConfig,
-    Map2DConfig,
-    PointsConfig,
-    SurfelConfig,
-    UserError,
-    VoxelConfig,
-)
+from pewm_jax.config import UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.eval.clips import (
@@ -34,6 +27,11 @@ from pewm_jax.eval.clips import (
 from pewm_jax.eval.reproject import CANDIDATES, reproject
 from pewm_jax.geometry.actions import integrate
 from pewm_jax.io.store import file_hash
+from pewm_jax.memory.images import ImagesConfig
+from pewm_jax.memory.map2d import Map2DConfig
+from pewm_jax.memory.points import PointsConfig
+from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 
 
 @pytest.fixture(scope="module")

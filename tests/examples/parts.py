@@ -13,7 +13,6 @@ from examples.control import PushConfig
 from examples.noise import CosineConfig
 from pewm_jax import worlds
 from pewm_jax.config import (
-    BothConfig,
     ClipConfig,
     Config,
     DataConfig,
@@ -24,6 +23,7 @@ from pewm_jax.config import (
 )
 from pewm_jax.data import abstract
 from pewm_jax.plan import measure
+from pewm_jax.readers.both import BothConfig
 from pewm_jax.train import sharding, step
 from tests.helpers import random_frames
 from tests.strangers.memory import NewestConfig

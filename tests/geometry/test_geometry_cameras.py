@@ -10,9 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pewm_jax
-from pewm_jax.config import ImagesConfig, Map2DConfig, PointsConfig, SurfelConfig, VoxelConfig
 from pewm_jax.geometry import actions, cameras, plucker
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
+from pewm_jax.memory.images import ImagesConfig
+from pewm_jax.memory.map2d import Map2DConfig
+from pewm_jax.memory.points import PointsConfig
+from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Camera, Frames
 from tests.helpers import random_camera, rigid, tiny_model
 
@@ -131,9 +135,9 @@ def test_memories_place_and_show_points_in_full_precision(kind):
     features = jnp.zeros((2, 2, 2, model.memory.encoder.channels))
 
     def all_of_it():
-        memory = memories.empty(model, jnp.zeros(3))
-        memory = memories.remember(model, memory, frames, features)
-        seen = memories.tokens(model, memory, camera)
+        memory = model.memory.empty(model, jnp.zeros(3))
+        memory = memories.insert(model, {}, memory, frames, features)
+        seen = model.memory.read(model, memory, camera)
         return seen, memories.render(model, memory, camera, clip.height, clip.width)
 
     highest = jax.lax.Precision.HIGHEST

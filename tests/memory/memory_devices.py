@@ -11,8 +11,8 @@ import jax
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
-from pewm_jax.config import VoxelConfig
 from pewm_jax.memory import voxel_map
+from pewm_jax.memory.voxel_map import VoxelConfig
 from tests.helpers import random_frames
 
 CONFIG = VoxelConfig(cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8), capacity=300, tokens=8)

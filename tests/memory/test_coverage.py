@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import RenderConfig
 from pewm_jax.geometry import zbuffer
-from pewm_jax.memory import coverage, memories
+from pewm_jax.memory import coverage
+from pewm_jax.memory import interface as memories
+from pewm_jax.readers.render import RenderConfig
 from tests.helpers import random_camera
 from tests.memory.test_memory_rivals import ALL, KINDS, encoded, model_of, scene, seen
 
@@ -20,7 +21,7 @@ def test_what_is_looked_at_is_chosen_and_what_is_chosen_is_held(kind):
     frames = scene()
     memory, _ = seen(model, frames, ALL)
     first = jax.tree.map(lambda x: jnp.concatenate([x, x, x[:1]]), frames)
-    tokens = memories.tokens(model, memory, first.camera)
+    tokens = model.memory.read(model, memory, first.camera)
     mask = np.ones(first.depth_THW.shape, bool)
     count = jax.jit(coverage.coverage, static_argnums=0)
     found = {k: int(v) for k, v in vars(count(model, memory, tokens, first, mask)).items()}
@@ -39,10 +40,10 @@ def test_no_measurement_is_no_surface(kind):
     model = model_of(kind)
     frames = scene()
     blank = dataclasses.replace(frames, depth_THW=jnp.zeros_like(frames.depth_THW))
-    start = memories.empty(model, jnp.zeros(3))
+    start = model.memory.empty(model, jnp.zeros(3))
     for observed in (True, False):
-        memory = memories.remember(model, start, blank, encoded(frames), observed=observed)
-        assert not np.asarray(memories.to_points(model, memory)[2]).any()
+        memory = memories.insert(model, {}, start, blank, encoded(frames), observed=observed)
+        assert not np.asarray(model.memory.to_points(model, memory)[2]).any()
 
 
 def test_far_near_and_edges_of_imagined_frames_are_not_trusted():

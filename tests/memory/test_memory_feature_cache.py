@@ -12,7 +12,8 @@ from pewm_jax.config import UserError, save
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.io import weights
-from pewm_jax.memory import feature_build, feature_cache
+from pewm_jax.memory import feature_cache
+from pewm_jax.memory import feature_cache as feature_build
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig

@@ -9,10 +9,10 @@ import pytest
 
 from pewm_jax.cli.data import main
 from pewm_jax.codecs.signals import signal_from_rgb
-from pewm_jax.config import VoxelConfig
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import cells, voxel_map
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Camera, Frames
 
 RECORDING = Path(__file__).parents[3] / "shared" / "data" / "icl_livingroom"

@@ -13,17 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax import registry as kinds
-from pewm_jax.config import (
-    ConfigError,
-    ImagesConfig,
-    Map2DConfig,
-    NoMemoryConfig,
-    PointsConfig,
-    SurfelConfig,
-    VoxelConfig,
-)
+from pewm_jax.config import ConfigError
 from pewm_jax.geometry import cameras
-from pewm_jax.memory import cells, images, map2d, memories, points, voxel_map
+from pewm_jax.memory import cells, images, points, voxel_map
+from pewm_jax.memory import interface as memories
+from pewm_jax.memory.images import ImagesConfig
+from pewm_jax.memory.map2d import Map2DConfig
+from pewm_jax.memory.none import NoMemoryConfig
+from pewm_jax.memory.points import PointsConfig
+from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, random_camera, random_frames, tiny_model, with_reader
@@ -70,10 +69,10 @@ def encoded(frames):
 @functools.partial(jax.jit, static_argnums=0)
 def seen(model, frames, valid_T):
     """The memory of some frames and its tokens for cameras elsewhere."""
-    memory = memories.empty(model, frames.camera.world_from_camera[0, :3, 3])
-    memory = memories.remember(model, memory, frames, encoded(frames), valid_T)
+    memory = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
+    memory = memories.insert(model, {}, memory, frames, encoded(frames), valid_T)
     camera = jax.tree.map(jnp.asarray, random_camera(np.random.default_rng(9), 5))
-    return memory, memories.tokens(model, memory, camera)
+    return memory, model.memory.read(model, memory, camera)
 
 
 ALL = np.ones(4, bool)
@@ -122,10 +121,10 @@ def test_nothing_is_remembered_of_invalid_frames_and_of_pixels_without_depth(kin
 @EVERY_KIND
 def test_a_memory_keeps_its_structure_so_that_a_rollout_can_carry_it(kind):
     model, frames = model_of(kind), scene()
-    before = jax.eval_shape(lambda: memories.empty(model, jnp.zeros(3)))
+    before = jax.eval_shape(lambda: model.memory.empty(model, jnp.zeros(3)))
     after = jax.eval_shape(
-        lambda: memories.remember(
-            model, memories.empty(model, jnp.zeros(3)), frames, encoded(frames)
+        lambda: memories.insert(
+            model, {}, model.memory.empty(model, jnp.zeros(3)), frames, encoded(frames)
         )
     )
     assert jax.tree.structure(before) == jax.tree.structure(after)
@@ -157,7 +156,7 @@ def test_batched_memories_equal_single_ones(kind):
 def test_every_memory_can_be_drawn(kind):
     model = model_of(kind)
     memory, _ = seen(model, scene(), ALL)
-    places, values, valid = memories.to_points(model, memory)
+    places, values, valid = model.memory.to_points(model, memory)
     shades = memories.colours(model, values)
     assert shades.shape == places.shape == (len(valid), 3)
     assert np.abs(np.asarray(shades)).max() <= 1 + 1e-6
@@ -188,7 +187,7 @@ def test_snapshots_stand_where_their_patches_show_and_repetition_adds_none():
     model = model_of("images")
     frames = scene(count=4)
     _, tokens = seen(model, frames, ALL)
-    rows, columns = images.patch_grid(model)
+    rows, columns = model.memory.patch_grid(model)
     assert rows * columns * 3 <= model.memory.tokens
     size = np.array([24 / columns, 16 / rows])
     uv, z = cameras.project(tokens.points_world_M3[None], frames.camera)
@@ -204,12 +203,12 @@ def test_snapshots_stand_where_their_patches_show_and_repetition_adds_none():
 
 def test_snapshots_chosen_over_time_stay_the_best_of_what_was_kept():
     model, frames = model_of("images", snapshots=2), scene(count=4)
-    memory = memories.empty(model, frames.camera.world_from_camera[0, :3, 3])
-    more = jax.jit(memories.remember, static_argnums=0)
+    memory = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
+    more = jax.jit(memories.insert, static_argnums=0)
     covered = []
     for index in range(4):
         one = jax.tree.map(lambda x, i=index: x[i : i + 1], frames)
-        memory = more(model, memory, one, encoded(one))
+        memory = more(model, {}, memory, one, encoded(one))
         covered.append(len(np.unique(memory.cell_KC)) - 1)
     assert covered == sorted(covered)
     at_once, _ = seen(model, frames, ALL)
@@ -218,7 +217,7 @@ def test_snapshots_chosen_over_time_stay_the_best_of_what_was_kept():
 
 
 def cloud_of(model, places, rgb, valid, cloud=None):
-    cloud = points.empty(model, np.zeros(3)) if cloud is None else cloud
+    cloud = model.memory.empty(model, np.zeros(3)) if cloud is None else cloud
     return insert_points(model.memory, cloud, places, rgb, valid)
 
 
@@ -252,7 +251,7 @@ def test_a_point_is_the_mean_of_its_cell_however_the_points_come(seed):
     half = cloud_of(model, places[order[:20]], rgb[order[:20]], valid[order[:20]])
     both = cloud_of(model, places[order[20:]], rgb[order[20:]], valid[order[20:]], half)
     for cloud in (cloud_of(model, places, rgb, valid), both):
-        where, values, there = (np.asarray(x) for x in points.to_points(model, cloud))
+        where, values, there = (np.asarray(x) for x in model.memory.to_points(model, cloud))
         assert int(cloud.outside) == outside
         assert int(cloud.occupied) == there.sum() == len(expected)
         found = {
@@ -282,8 +281,8 @@ def test_the_map_from_above_is_the_maximum_over_the_height():
     frames = scene()
     above, tokens = seen(model, frames, ALL)
     centre = np.asarray(frames.camera.world_from_camera[0, :3, 3])
-    flat = map2d.flattened(model.memory)
-    places, values, valid = (np.asarray(x) for x in memories.to_points(model, above))
+    flat = model.memory.grid
+    places, values, valid = (np.asarray(x) for x in model.memory.to_points(model, above))
     np.testing.assert_allclose(places[valid, 2], centre[2], atol=1e-5)
     assert np.asarray(tokens.valid_M).any()
 

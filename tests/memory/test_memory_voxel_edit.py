@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import UserError, VoxelConfig
+from pewm_jax.config import UserError
+from pewm_jax.memory import cells as grid_cells
 from pewm_jax.memory import voxel_map
+from pewm_jax.memory.voxel_map import VoxelConfig
 from tests.helpers import rigid
 
 CONFIG = VoxelConfig(cell_m=(0.25, 0.25, 0.5), cells=(24, 24, 8), capacity=400, tokens=4)
@@ -102,7 +104,7 @@ def test_each_cell_takes_the_one_its_centre_comes_from(seed):
     pasted = paste(CONFIG, blank, voxels, motion)
     cells = np.arange(np.prod(CONFIG.cells))
     origin = np.asarray(voxels.origin_3, np.float64)
-    there = np.asarray(voxel_map.cell_centres(CONFIG, origin, cells), np.float64)
+    there = np.asarray(grid_cells.centres(CONFIG, origin, cells), np.float64)
     here = (there - motion[:3, 3]) @ motion[:3, :3].astype(np.float64)
     place = (here - origin) / CONFIG.cell_m
     clear = (np.abs(place - np.round(place)) > 1e-3).all(-1)

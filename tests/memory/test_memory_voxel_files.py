@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from pewm_jax.config import UserError, VoxelConfig
+from pewm_jax.config import UserError
 from pewm_jax.io import weights
 from pewm_jax.memory import voxel_map
+from pewm_jax.memory.voxel_map import VoxelConfig
 
 CONFIG = VoxelConfig(cell_m=(0.25, 0.25, 0.5), cells=(24, 24, 8), capacity=60, tokens=4)
 

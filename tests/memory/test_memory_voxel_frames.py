@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import VoxelConfig
 from pewm_jax.geometry import cameras
 from pewm_jax.memory import cells, voxel_frames, voxel_map
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Frames
 from tests.helpers import random_camera
 

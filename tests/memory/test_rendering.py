@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pewm_jax.config import VoxelConfig
 from pewm_jax.geometry import cameras, zbuffer
-from pewm_jax.memory import memories, rendering, views, voxel_map
+from pewm_jax.memory import interface as memories
+from pewm_jax.memory import rendering, voxel_map
+from pewm_jax.memory import rendering as views
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Camera, Frames
 from tests.helpers import random_camera, tiny_model
 from tests.memory.test_memory_rivals import ALL, KINDS, model_of, scene, seen
@@ -98,11 +100,11 @@ def test_every_memory_can_be_rendered(kind):
     colours = kind in ("points", "surfels", "none")
     assert memories.shows_colours(model) == (colours and kind != "none")
     channels = 3 if colours else model.memory.encoder.channels
-    assert memories.rendered_channels(model) == channels
+    assert model.memory.rendered_channels == channels
     assert view.features_THWF.shape == (3, HEIGHT, WIDTH, channels)
     assert view.depth_THW.shape == view.seen_THW.shape == (3, HEIGHT, WIDTH)
     assert bool(view.seen_THW.any()) == (kind != "none")
-    points, _, valid = memories.to_points(model, memory)
+    points, _, valid = model.memory.to_points(model, memory)
     points = np.asarray(points)[np.asarray(valid)]
     alone = by_loop(points, points[:, :1], np.ones(len(points), bool), camera, HEIGHT, WIDTH)[2]
     known = np.asarray(view.seen_THW | (view.depth_THW > 0))

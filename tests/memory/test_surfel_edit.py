@@ -6,21 +6,30 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import ImagesConfig, SurfelConfig, UserError, VoxelConfig
+from pewm_jax.config import UserError
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
-from pewm_jax.memory import memories, surfels, voxel_map
+from pewm_jax.memory import surfels, voxel_map
+from pewm_jax.memory.images import ImagesConfig
+from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from tests.helpers import tiny_model
 from tests.memory.test_surfels import drawn, insert
 
 CONFIG = SurfelConfig(cell_m=(0.5,) * 3, cells=(16, 16, 16), capacity=400, tokens=8)
 MODEL = tiny_model(memory=CONFIG)
 BOX = np.array([[-1.0, -1.0, -1.0], [0.5, 1.0, 1.0]], np.float32)
-erase = jax.jit(memories.erase, static_argnums=0)
-move = jax.jit(memories.move, static_argnums=0, static_argnames="leave")
+erase = jax.jit(lambda model, *args: model.memory.erase(model, *args), static_argnums=0)
+move = jax.jit(
+    lambda model, *args, **options: model.memory.move(model, *args, **options),
+    static_argnums=0,
+    static_argnames="leave",
+)
 
 
 def a_world(seed=0, observed=True, spread=1.9):
-    return insert(CONFIG, surfels.empty(MODEL, np.zeros(3)), drawn(seed, spread=spread), observed)
+    return insert(
+        CONFIG, MODEL.memory.empty(MODEL, np.zeros(3)), drawn(seed, spread=spread), observed
+    )
 
 
 def held(world):
@@ -101,10 +110,12 @@ def test_what_does_not_fit_and_what_leaves_the_grid_is_counted():
     assert int(after.outside) == count
     assert int(after.occupied) == int(world.occupied) - count
     full = dataclasses.replace(CONFIG, capacity=int(world.occupied))
-    tight = surfels.trimmed(world)
+    tight = CONFIG.trimmed(world)
     tight = jax.tree.map(lambda x: x[: full.capacity] if np.ndim(x) else x, tight)
     tight = dataclasses.replace(tight, origin_3=world.origin_3)
-    after = memories.move(tiny_model(memory=full), tight, BOX, turned(0, (0, 0, 3.0)), leave=True)
+    after = tiny_model(memory=full).memory.move(
+        tiny_model(memory=full), tight, BOX, turned(0, (0, 0, 3.0)), leave=True
+    )
     assert int(after.dropped) > 0
     assert int(after.occupied) == full.capacity
 
@@ -120,19 +131,19 @@ def test_any_memory_of_places_is_edited_by_the_same_functions_and_others_say_so(
     shift = turned(0, (0.5, 0, 0))
     jax.tree.map(
         np.testing.assert_array_equal,
-        memories.move(model, world, BOX, shift),
+        model.memory.move(model, world, BOX, shift),
         voxel_map.move(config, world, BOX, shift),
     )
     jax.tree.map(
         np.testing.assert_array_equal,
-        memories.erase(model, world, BOX),
+        model.memory.erase(model, world, BOX),
         voxel_map.erase(config, world, BOX),
     )
     with_images = tiny_model(memory=ImagesConfig(encoder=PatchColoursConfig(patch=8)))
-    assert memories.editable(model)
-    assert not memories.editable(with_images)
-    with pytest.raises(UserError, match="'images' keeps no places"):
-        memories.erase(with_images, None, BOX)
+    assert model.memory.EDITABLE
+    assert not with_images.memory.EDITABLE
+    with pytest.raises(UserError, match="cannot be edited"):
+        with_images.memory.erase(with_images, None, BOX)
 
 
 @pytest.mark.parametrize(
@@ -146,4 +157,4 @@ def test_any_memory_of_places_is_edited_by_the_same_functions_and_others_say_so(
 )
 def test_what_is_no_box_and_what_is_no_motion_is_refused(box, transform, says):
     with pytest.raises(UserError, match=says):
-        memories.move(MODEL, a_world(), box, transform)
+        MODEL.memory.move(MODEL, a_world(), box, transform)

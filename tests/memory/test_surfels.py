@@ -12,12 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import ConfigError, SurfelConfig, VoxelConfig
+from pewm_jax.config import ConfigError
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.eval.seen import seen_masks
-from pewm_jax.memory import memories, rendering, surfels, views
+from pewm_jax.memory import interface as memories
+from pewm_jax.memory import rendering, surfels
+from pewm_jax.memory import rendering as views
+from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Frames
 from tests.helpers import TINY, random_camera, tiny_model
 from tests.memory.test_memory_rivals import encoded, scene
@@ -32,7 +36,7 @@ def of(config, **changes):
 
 
 def blank(config):
-    return surfels.empty(of(config), np.zeros(3))
+    return config.empty(of(config), np.zeros(3))
 
 
 def drawn(seed, count=200, spread=1.9, frames=3):
@@ -164,13 +168,17 @@ def test_what_was_imagined_gives_way_to_what_is_observed_and_never_the_other_way
 def test_a_memory_is_told_what_is_imagined_where_it_asks():
     frames = jax.tree.map(jnp.asarray, scene())
     for config, told in ((SMALL, True), (TINY.memory, False)):
-        assert told == config.TELLS_IMAGINED
         easy = {"imagined_far": 99.0, "imagined_edge": 0.0}
         config = dataclasses.replace(config, cells=(24, 24, 24), capacity=2048, **easy)  # noqa: PLW2901
         model = tiny_model(memory=config)
         made = [
-            memories.remember(
-                model, memories.empty(model, jnp.zeros(3)), frames, encoded(frames), observed=truth
+            memories.insert(
+                model,
+                {},
+                model.memory.empty(model, jnp.zeros(3)),
+                frames,
+                encoded(frames),
+                observed=truth,
             )
             for truth in (True, False)
         ]
@@ -185,14 +193,14 @@ def test_features_are_those_of_the_patch_a_pixel_lies_in():
     assert not SMALL.KEEPS_FEATURES
     frames = scene(count=1)
     patches = encoded(frames)
-    memory = memories.remember(model, memories.empty(model, jnp.zeros(3)), frames, patches)
-    _, features, valid = memories.to_points(model, memory)
+    memory = memories.insert(model, {}, model.memory.empty(model, jnp.zeros(3)), frames, patches)
+    _, features, valid = model.memory.to_points(model, memory)
     assert features.shape[1] == model.memory.encoder.channels
     rows = {tuple(x) for x in np.asarray(patches).reshape(-1, patches.shape[-1])}
     single = np.asarray(valid & (memory.sums_VC[:, 0] == 1))
     assert single.sum() > 100
     assert {tuple(x) for x in np.asarray(features)[single]} <= rows
-    assert np.asarray(memories.tokens(model, memory, frames.camera).valid_M).all()
+    assert np.asarray(model.memory.read(model, memory, frames.camera).valid_M).all()
 
 
 def test_wrong_settings_are_refused_in_a_sentence():
@@ -201,9 +209,9 @@ def test_wrong_settings_are_refused_in_a_sentence():
     with pytest.raises(ConfigError, match="mean or newest"):
         dataclasses.replace(SMALL, keep="oldest")
     model = of(SMALL, features=True)
-    memory = memories.empty(model, jnp.zeros(3))
+    memory = model.memory.empty(model, jnp.zeros(3))
     with pytest.raises(ValueError, match="no features"):
-        surfels.remember(model, memory, scene())
+        model.memory.insert(model, {}, memory, scene())
 
 
 @pytest.mark.parametrize("footprint", [1, 3])
@@ -213,9 +221,9 @@ def test_what_was_seen_is_seen_again_by_the_camera_that_saw_it(footprint):
     camera = jax.tree.map(jnp.asarray, random_camera(rng, 1, upright=True))
     depth = np.full((1, 16, 24), 2.0, np.float32)
     rgb = rng.uniform(-1, 1, (1, 16, 24, 3)).astype(np.float32)
-    memory = memories.empty(model, camera.world_from_camera[0, :3, 3])
-    memory = surfels.remember(model, memory, Frames(rgb, depth, camera))
-    view = surfels.render_colours(model, memory, camera, 16, 24)
+    memory = model.memory.empty(model, camera.world_from_camera[0, :3, 3])
+    memory = model.memory.insert(model, {}, memory, Frames(rgb, depth, camera))
+    view = model.memory.render_colours(memory, camera, 16, 24)
     assert np.asarray(view.seen_THW).all()
     np.testing.assert_allclose(view.features_THWF, rgb, atol=0.01)
     np.testing.assert_allclose(view.depth_THW, depth, atol=0.01)
@@ -256,7 +264,7 @@ def test_surfels_show_a_house_better_than_the_voxel_map():
         assert int(memory.dropped) == 0
         assert int(memory.outside) == 0
         if name == "surfels":
-            view = surfels.render_colours(model, memory, target.camera, 64, 64)
+            view = model.memory.render_colours(memory, target.camera, 64, 64)
             colours, sight = view.features_THWF, view.seen_THW
         else:
             view = memories.render(model, memory, target.camera, 64, 64)

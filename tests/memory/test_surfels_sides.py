@@ -5,17 +5,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import SurfelConfig
 from pewm_jax.geometry.cameras import pose_from_yaw
-from pewm_jax.memory import memories, rendering, surfels, views
+from pewm_jax.memory import rendering
+from pewm_jax.memory import rendering as views
+from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.types import Camera, Frames, MemoryReadout, View
 from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import random_camera, tiny_model
 
 SIZE = (16, 24)
 FINE = SurfelConfig(cell_m=(0.05,) * 3, cells=(512,) * 3, capacity=4096, tokens=8, footprint=5)
-render = jax.jit(surfels.render, static_argnums=(0, 3, 4))
-look = jax.jit(surfels.remember, static_argnums=(0, 5))
+render = jax.jit(lambda model, *args: model.memory.render(model, *args), static_argnums=(0, 3, 4))
+look = jax.jit(
+    lambda model, memory, frames, observed: model.memory.insert(
+        model, {}, memory, frames, observed=observed
+    ),
+    static_argnums=(0, 3),
+)
 
 
 def camera_at(x, yaw):
@@ -34,9 +40,9 @@ def wall(depth, colour, camera):
 def remember(config, *seen):
     """A memory of frames, each ``(frames, observed)``."""
     model = tiny_model(memory=config)
-    memory = memories.empty(model, jnp.zeros(3))
+    memory = model.memory.empty(model, jnp.zeros(3))
     for frames, observed in seen:
-        memory = look(model, memory, frames, None, None, observed)
+        memory = look(model, memory, frames, observed)
     return model, memory
 
 

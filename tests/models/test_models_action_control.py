@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import ConfigError, NoMemoryConfig, RenderConfig, UserError
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.controls import actions as action_control
 from pewm_jax.controls.actions import ModulationConfig
+from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.models import interface as backbones
+from pewm_jax.readers.render import RenderConfig
 from pewm_jax.types import Control
 from tests.helpers import TINY, random_camera, random_frames, randomise, tiny_model
 

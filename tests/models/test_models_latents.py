@@ -14,26 +14,20 @@ from pewm_jax import worlds
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import (
-    AttentionConfig,
-    BothConfig,
-    CodecWorldConfig,
-    Config,
-    ConfigError,
-    DataConfig,
-    PointsConfig,
-    RenderConfig,
-    SurfelConfig,
-    UserError,
-    VoxelConfig,
-)
+from pewm_jax.config import CodecWorldConfig, Config, ConfigError, DataConfig, UserError
 from pewm_jax.convert import stablehlo_programs
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders.latents import LatentsConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.io import tree
-from pewm_jax.memory import feature_cache, memories
-from pewm_jax.readers import interface as readers
+from pewm_jax.memory import feature_cache
+from pewm_jax.memory import interface as memories
+from pewm_jax.memory.points import PointsConfig
+from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.readers.both import BothConfig
+from pewm_jax.readers.render import RenderConfig
 from pewm_jax.train import prepared
 from pewm_jax.types import Clip, Control, EncodedView, Frames, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
@@ -169,7 +163,7 @@ def test_a_rollout_looks_as_training_does(kind):
         assert sight.encoded.latents_thwC.shape == (2, *GRID, 8)
         assert sight.encoded.seen_THW.mean() > 0.1
     again = jax.jit(
-        lambda params, memory, camera: memories.look(model, memory, camera, params=params)
+        lambda params, memory, camera: memories.readout(model, memory, camera, params=params)
     )
     for i in range(2):
         frames = jax.tree.map(lambda x, i=i: x[i], clips.frames)
@@ -224,7 +218,7 @@ def test_each_token_gets_the_latents_and_the_mask_of_its_cell():
     params = weights("picture")["memory"]
     added = jax.jit(
         lambda encoded: (
-            readers.prepare(
+            model.memory.reader.prepare(
                 model,
                 params,
                 MemoryReadout(encoded=encoded),

@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 
 from pewm_jax import worlds
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import NoMemoryConfig, TrainConfig, VoxelConfig
+from pewm_jax.config import TrainConfig
 from pewm_jax.geometry.cameras import project
+from pewm_jax.memory.none import NoMemoryConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.readers.geometry import sightings, sinusoid_3d
 from pewm_jax.readers.memory_block import MemoryBlock, masked_attention

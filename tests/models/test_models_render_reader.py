@@ -8,17 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import (
-    AttentionConfig,
-    BothConfig,
-    NoMemoryConfig,
-    RenderConfig,
-    SurfelConfig,
-    VoxelConfig,
-)
-from pewm_jax.memory import memories
-from pewm_jax.readers import interface as readers
+from pewm_jax.memory import interface as memories
+from pewm_jax.memory.none import NoMemoryConfig
+from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.readers import render as render_reader
+from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.readers.both import BothConfig
+from pewm_jax.readers.render import RenderConfig
 from pewm_jax.types import Clip, Control, Frames, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.pewm import world as pewm
@@ -115,7 +112,9 @@ def test_each_token_gets_the_pixels_that_it_stands_for():
     model, (conditioning, sight, _) = model_of("render"), inputs()
     params = randomise(init_world(model)["memory"])
     camera, rays = conditioning.camera, conditioning.rays_BthwC
-    added = functools.partial(readers.prepare, model, params, camera=camera, rays_BthwC=rays)
+    added = functools.partial(
+        model.memory.reader.prepare, model, params, camera=camera, rays_BthwC=rays
+    )
     base = added(sight=sight).added_BND.reshape(2, 3, 2, 3, -1)
     rng = np.random.default_rng(1)
     for frame, row, column in zip(*(rng.integers(n, size=6) for n in (9, 16, 24)), strict=True):
@@ -146,7 +145,9 @@ def test_many_channels_are_reduced_and_a_token_in_time_may_hold_two_latent_frame
 def test_a_block_takes_a_time_for_each_frame():
     model, (conditioning, sight, _) = model_of("render"), inputs()
     params = randomise(init_world(model)["memory"])
-    read = readers.prepare(model, params, sight, conditioning.camera, conditioning.rays_BthwC)
+    read = model.memory.reader.prepare(
+        model, params, sight, conditioning.camera, conditioning.rays_BthwC
+    )
     layer = jax.tree.map(lambda x: x[0], read.params)
     rng = np.random.default_rng(0)
     video = jnp.asarray(rng.normal(size=(2, 18, 32)), jnp.float32)
@@ -171,10 +172,10 @@ def test_a_rollout_looks_as_training_does(memory):
     model = model_of("both", memory)
     batch = batch_of(model)
     sight = look(model, {}, batch)
-    assert sight.view.features_THWF.shape == (2, 9, 16, 24, memories.rendered_channels(model))
+    assert sight.view.features_THWF.shape == (2, 9, 16, 24, model.memory.rendered_channels)
     assert sight.view.seen_THW.mean() > 0.1
     start = jax.jit(pewm.start, static_argnums=0)
-    again = jax.jit(functools.partial(memories.look, model))
+    again = jax.jit(functools.partial(memories.readout, model))
     for i in range(2):
         frames = jax.tree.map(lambda x, i=i: x[i], batch.frames)
         alone = again(start(model, {}, frames).map, frames.camera)

@@ -9,13 +9,14 @@ import pytest
 
 from pewm_jax import presets, worlds
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.config import ConfigError, RenderConfig, SurfelConfig, UserError
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.navigation import is_free, navigable, sample_free
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.geometry.actions import discrete_table, rotation_z
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.planning import candidates, costs
@@ -24,6 +25,7 @@ from pewm_jax.planning.mpc import imagining, knowing, mpc
 from pewm_jax.planning.plan import plan
 from pewm_jax.planning.ranking import rank, rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig, RandomShooting
+from pewm_jax.readers.render import RenderConfig
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds.pewm import views as pewm_views
 from tests.compiled import counted

@@ -16,16 +16,10 @@ from hypothesis import strategies as st
 import pewm_jax
 from pewm_jax import worlds
 from pewm_jax.cli import play
-from pewm_jax.config import (
-    CodecTrainConfig,
-    CodecWorldConfig,
-    Config,
-    ConfigError,
-    ImagesConfig,
-    UserError,
-)
+from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, ConfigError, UserError
 from pewm_jax.config import command_line as cli
 from pewm_jax.data.navigation import is_free
+from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.play import board, engine, picking, places, saved, session
 from pewm_jax.play.settings import Serve, Start
 from tests.persist_world import MODEL as PERSIST

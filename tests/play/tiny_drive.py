@@ -8,9 +8,10 @@ import jax
 import numpy as np
 
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import Config, SurfelConfig
+from pewm_jax.config import Config
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry.cameras import pose_from_yaw, unproject
+from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.play import engine, places, session
 from pewm_jax.play.settings import Start
 from pewm_jax.report.pictures import as_bytes

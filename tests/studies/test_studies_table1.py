@@ -17,7 +17,7 @@ from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax.cli import table1 as command
 from pewm_jax.cli.data import main as data_command
-from pewm_jax.config import AttentionConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.convert import dinov2 as convert
 from pewm_jax.eval import metrics
 from pewm_jax.eval.metrics.images import MASKS, SUMS
@@ -27,6 +27,7 @@ from pewm_jax.io import tree, weights
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.lpips import model as lpips
+from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.studies import (
     table1,
     table1_numbers,

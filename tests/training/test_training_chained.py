@@ -14,9 +14,11 @@ from pewm_jax import worlds
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import BothConfig, ConfigError, TrainConfig, UserError
-from pewm_jax.memory import memories
+from pewm_jax.config import ConfigError, TrainConfig, UserError
 from pewm_jax.train import flops
+from pewm_jax.config import ConfigError, TrainConfig, UserError
+from pewm_jax.memory import interface as memories
+from pewm_jax.readers.both import BothConfig
 from pewm_jax.types import EncodedView, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import chained, objective, world_model
 from tests.helpers import TINY, init_world, randomise, tiny_config
@@ -45,7 +47,7 @@ def shows(config, seed=0):
     rng, size = np.random.default_rng(seed), config.model.clip
     shape = (BATCH, size.frames, size.height, size.width)
     number = np.broadcast_to(np.arange(size.frames)[:, None, None], shape)
-    channels = memories.rendered_channels(config.model)
+    channels = config.model.memory.rendered_channels
     features = rng.normal(size=(*shape, channels)).astype(np.float32)
     features[..., :3] = number[..., None] / size.frames
     points = rng.normal(size=(BATCH, SLOTS, channels + 3)).astype(np.float32)

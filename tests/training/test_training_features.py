@@ -10,7 +10,8 @@ import pytest
 from pewm_jax.config import ClipConfig, ConfigError, UserError
 from pewm_jax.data import loader
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
-from pewm_jax.memory import feature_build, feature_cache
+from pewm_jax.memory import feature_cache
+from pewm_jax.memory import feature_cache as feature_build
 from pewm_jax.train import loop, runs, stages, starting
 from pewm_jax.worlds import objective
 from pewm_jax.worlds.pewm import world as pewm

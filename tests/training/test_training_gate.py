@@ -12,22 +12,22 @@ from pewm_jax import shipped, worlds
 from pewm_jax.codecs import gates
 from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import (
-    AttentionConfig,
     ClipConfig,
     CodecTrainConfig,
     CodecWorldConfig,
     Config,
     ConfigError,
     DataConfig,
-    RenderConfig,
     StageConfig,
-    SurfelConfig,
     UserError,
 )
 from pewm_jax.data import abstract
 from pewm_jax.io import tree
+from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
+from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.readers.render import RenderConfig
 from pewm_jax.train import loop, stages
 from pewm_jax.types import Frames
 from pewm_jax.worlds import codec_gate

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets as configs
-from pewm_jax.config import RenderConfig, SurfelConfig
 from pewm_jax.io import tree
+from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.readers.render import RenderConfig
 from pewm_jax.train import sharding, stages, step
 from pewm_jax.types import Clip
 from pewm_jax.worlds import world_model

@@ -19,21 +19,19 @@ import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import (
-    AttentionConfig,
-    ConfigError,
-    ImagesConfig,
-    Map2DConfig,
-    NoMemoryConfig,
-    PointsConfig,
-    VoxelConfig,
-)
+from pewm_jax.config import ConfigError
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.io import tree, weights
+from pewm_jax.memory.images import ImagesConfig
+from pewm_jax.memory.map2d import Map2DConfig
+from pewm_jax.memory.none import NoMemoryConfig
+from pewm_jax.memory.points import PointsConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.train import integrity, loop, runs, sharding, step
 from pewm_jax.train.checkpoint import CONFIG_ITEM, Checkpoints
 from pewm_jax.worlds.pewm.world import STAGES

@@ -10,8 +10,6 @@ from typing import Literal
 
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
-    AttentionConfig,
-    BothConfig,
     ClipConfig,
     Config,
     DataConfig,
@@ -19,15 +17,17 @@ from pewm_jax.config import (
     ModelConfig,
     StageConfig,
     TrainConfig,
-    VoxelConfig,
 )
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.plan import hlo, measure, suggest
 from pewm_jax.plan.measure import MeshSizes
+from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.readers.both import BothConfig
 from pewm_jax.worlds.pewm.world import STAGES
 
 DINOV2 = DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56)

@@ -12,7 +12,6 @@ from pewm_jax.geometry.actions import (
     follow_camera_steps,
     step_pose,
 )
-from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist import camera_model, voxel_renderer
 from pewm_jax.models.persist.blocks import FrameCache
@@ -106,7 +105,7 @@ def drawn(
     """
     cells = ClassGrid(classes_XYZ, corner_3)
     one = jax.tree.map(lambda x: x[None], camera)
-    view = class_grid.render(model, cells, one, model.clip.height, model.clip.width)
+    view = model.memory.render(model, cells, one, model.clip.height, model.clip.width)
     return encoded(model, params, view.features_THWF[0], view.depth_THW[0])
 
 

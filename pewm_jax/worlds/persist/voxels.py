@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import PersistConfig
 from pewm_jax.geometry.actions import camera_numbers
-from pewm_jax.memory.class_edit import EMPTY, UNKNOWN
+from pewm_jax.memory.class_grid import EMPTY, UNKNOWN
 from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.nn.layers import linear

@@ -15,7 +15,7 @@ import numpy as np
 
 from pewm_jax.config import POINT_WAVES, PersistConfig
 from pewm_jax.geometry.cameras import resize_intrinsics, unproject
-from pewm_jax.memory.class_edit import UNKNOWN
+from pewm_jax.memory.class_grid import UNKNOWN
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.types import Array, Camera
 

@@ -3,7 +3,7 @@
 What is remembered is the state of the world itself. A diffusion transformer makes the next voxels,
 a camera model says where the agent goes, rays through the voxels say what it faces, and a second
 diffusion transformer makes the picture of that (arXiv 2603.03482). Decoded voxels are encoded anew
-at each step, so what is edited in the grid (``memory.class_edit``, ``memories.erase`` and ``move``,
+at each step, so what is edited in the grid (``memory.class_grid``, ``Memory.erase`` and ``move``,
 ``edit`` here) is the world that goes on.
 
 Where actions steer, the camera model says where they lead; cameras that are given are kept.
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import PersistConfig, UserError
 from pewm_jax.geometry import actions as action_geometry
-from pewm_jax.memory import class_edit, class_grid
+from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds import checks
@@ -117,7 +117,7 @@ def _start_in(
             "give (n, n, n) class ids and the (3,) lowest corner in metres."
         )
     params, frames = _arrays(params, as_signal(frames))
-    empty = class_grid.empty(model, frames.camera.world_from_camera[0, :3, 3])
+    empty = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
     size, origin = windows.cell_m(model), jnp.asarray(origin_3, jnp.float32)
     # The world's cells are laid where the given ones are, and their heights where those are.
     off = jnp.round((empty.low_3 - origin) / size)
@@ -171,15 +171,15 @@ def edit(state: WorldState, change: Callable[..., ClassGrid], *arguments: Any) -
 
     ::
 
-        state = edit(state, class_edit.place, model.memory, box_23, number)
-        state = edit(state, class_edit.erase, model.memory, box_23)
-        state = edit(state, class_edit.move, model.memory, box_23, transform)
-        piece = class_edit.copy(model.memory, state.map, box_23)
-        state = edit(state, class_edit.paste, model.memory, piece, transform)
+        state = edit(state, class_grid.place, model.memory, box_23, number)
+        state = edit(state, class_grid.erase, model.memory, box_23)
+        state = edit(state, class_grid.move, model.memory, box_23, transform)
+        piece = class_grid.copy(model.memory, state.map, box_23)
+        state = edit(state, class_grid.paste, model.memory, piece, transform)
 
     Args:
         state: the world.
-        change: one of the functions of ``memory.class_edit``.
+        change: one of the functions of ``memory.class_grid``.
         arguments: the grid's settings, and what follows the grid among the function's arguments.
     """
     config, *rest = arguments
@@ -246,7 +246,7 @@ def _from_nothing(
 ) -> WorldState:
     """Return a world of which nothing but frames is known."""
     params, frames = _arrays(params, as_signal(frames))
-    grid = class_grid.empty(model, frames.camera.world_from_camera[0, :3, 3])
+    grid = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
     return _started(model, params, grid, frames, real=real)
 
 
@@ -309,5 +309,5 @@ def _pasted(cells_XYZ: Array, given_XYZ: Array, at_3: Array) -> Array:
         found = jnp.take(given_XYZ, jnp.clip(index, 0, size - 1), axis=axis)
         inside = (index >= 0) & (index < size)
         inside = inside.reshape([-1 if a == axis else 1 for a in range(3)])
-        given_XYZ = jnp.where(inside, found, class_edit.UNKNOWN)
+        given_XYZ = jnp.where(inside, found, class_grid.UNKNOWN)
     return jnp.where(given_XYZ >= 0, given_XYZ, cells_XYZ)

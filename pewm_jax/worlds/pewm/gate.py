@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, signal_from_depth
 from pewm_jax.config import ModelConfig, TrainConfig, TrainSettings, UserError
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.types import Array, Clip, Control, Frames, Params

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import rgbd
 from pewm_jax.config import ModelConfig
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params, View, WorldState
 from pewm_jax.worlds import sampling, world_model
 from pewm_jax.worlds.control import control_of
@@ -72,7 +72,7 @@ def imagine_many(
 
 def to_compare(model: ModelConfig, state: WorldState) -> WorldState:
     """Return a state whose memory has no more room than it needs; see ``worlds.to_compare``."""
-    return WorldState(state.frame, memories.trimmed(model, state.map))
+    return WorldState(state.frame, model.memory.trimmed(state.map))
 
 
 def _filled(x_KT: Array, length: int) -> Array:
@@ -152,7 +152,7 @@ def _clip(
 def look(
     model: ModelConfig, remembered: Any, camera: Camera, params: Params, view: View | None = None
 ) -> MemoryReadout:
-    """Return what a memory shows K clips, leading axis K; see ``memories.look``.
+    """Return what a memory shows K clips, leading axis K; see ``memory.interface.readout``.
 
     Args:
         model: the model.
@@ -163,7 +163,7 @@ def look(
     """
     pictures = memories.gated(model)
     reader = model.memory.reader
-    each = functools.partial(memories.look, model, remembered, params=params, pictures=pictures)
+    each = functools.partial(memories.readout, model, remembered, params=params, pictures=pictures)
     if not (pictures or reader.READS_VIEW):
         return jax.vmap(each)(camera)
 

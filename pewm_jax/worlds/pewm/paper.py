@@ -10,14 +10,14 @@ from typing import Literal
 
 from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.experiment import Config
-from pewm_jax.config.memory import VoxelConfig
 from pewm_jax.config.mesh import MeshConfig
 from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.parts import Codec, Encoder, Noise
-from pewm_jax.config.reader import AttentionConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.readers.attention import AttentionConfig
 
 CLIP = ClipConfig(frames=9, height=512, width=512)
 """The paper's clip."""

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import ModelConfig
-from pewm_jax.memory import memories
+from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Camera, Params, View, WorldState
 from pewm_jax.worlds.control import control_of
 

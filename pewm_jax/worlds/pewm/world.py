@@ -19,8 +19,8 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import ModelConfig, UserError, functions
 from pewm_jax.memory import coverage as memory_coverage
-from pewm_jax.memory import memories
-from pewm_jax.memory import views as memory_views
+from pewm_jax.memory import interface as memories
+from pewm_jax.memory import rendering as memory_views
 from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, WorldState
 from pewm_jax.worlds import chunks, objective, sampling, world_model
 from pewm_jax.worlds.control import control_of
@@ -195,7 +195,7 @@ def imagine_clip(
     sight = None
     if memory and "memory" in params:
         gated = memories.gated(model)
-        shown = memories.look(model, state.map, camera, params=params, pictures=gated)
+        shown = memories.readout(model, state.map, camera, params=params, pictures=gated)
         sight = jax.tree.map(lambda x: x[None], shown)
     latents = sampling.draw(model, params, conditioning, sight, key)
     rgb, depth = rgbd.decode_rgbd(model, params, latents)
@@ -213,7 +213,7 @@ def imagine_clip(
 
 def memory_points(model: ModelConfig, memory: Any) -> tuple[Array, Array, Array, Array | None]:
     """Return the memory's points; see ``World.memory_points``."""
-    return *memories.to_points(model, memory), getattr(memory, "observed_V", None)
+    return *model.memory.to_points(model, memory), getattr(memory, "observed_V", None)
 
 
 def point_colours(model: ModelConfig, features_VF: Array) -> Array:
@@ -224,7 +224,7 @@ def point_colours(model: ModelConfig, features_VF: Array) -> Array:
 def erase(model: ModelConfig, params: Params, state: WorldState, box_23: Array) -> WorldState:
     """Forget what is in a box, in the memory and in the present frame; see ``World.erase``."""
     del params
-    return _looked_at(model, state, memories.erase(model, state.map, box_23))
+    return _looked_at(model, state, model.memory.erase(model, state.map, box_23))
 
 
 def move(
@@ -238,7 +238,7 @@ def move(
 ) -> WorldState:
     """Move what is in a box, in the memory and in the present frame; see ``World.move``."""
     del params
-    changed = memories.move(model, state.map, box_23, transform, leave=leave)
+    changed = model.memory.move(model, state.map, box_23, transform, leave=leave)
     return _looked_at(model, state, changed)
 
 
@@ -269,7 +269,7 @@ def coverage(
 ) -> dict[str, Array]:
     """Count the pixels that the memory covers; see ``memory.coverage``."""
     del params
-    tokens = memories.tokens(model, state.map, frames.camera)
+    tokens = model.memory.read(model, state.map, frames.camera)
     return vars(memory_coverage.coverage(model, state.map, tokens, frames, seen_THW))
 
 
@@ -294,7 +294,7 @@ def _remember(
 ) -> Any:
     """Put frames into the memory."""
     features = model.memory.encoder.features(model, params, frames.rgb_THWC)
-    return memories.remember(model, memory, frames, features, valid_T, observed=observed)
+    return memories.insert(model, params, memory, frames, features, valid_T, observed=observed)
 
 
 def require_frames(model: ModelConfig, frames: Frames, who: str) -> int:

@@ -1,0 +1,233 @@
+"""Functions over any memory: insert frames, render, and read what a clip's cameras see.
+
+============ ============================================ =====================================
+kind         content                                      paper
+============ ============================================ =====================================
+voxel        maximum of features per 3D cell              PEWM
+none         nothing                                      NWM (own backbone, empty memory)
+images       features of a few covering snapshots         Image Memory (3D-Mem)
+map2d        maximum of features per square of the floor  PEWM (2D map)
+points       a coloured point per 3D cell, no features    point cloud (ablation of the map)
+surfels      a coloured surfel per small cell             –
+grid         class ids of cells                           PERSIST
+============ ============================================ =====================================
+
+A memory is one class, ``config.parts.Memory``, in a file of its own. Its state is a pytree of
+static size. Tokens of all memories have the same shapes, so a reader has the same parameters with
+any of them. The functions are pure and handle one world: jit and vmap them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.codecs import rgbd
+from pewm_jax.config import ModelConfig
+from pewm_jax.memory import rendering
+from pewm_jax.types import (
+    Array,
+    Camera,
+    EncodedView,
+    Frames,
+    MemoryReadout,
+    Params,
+    View,
+)
+
+Memory: TypeAlias = Any
+"""A pytree, of the type that the memory's ``empty`` returns."""
+NEAR = 1.5
+"""Imagined depths below this many times ``clip.near_m`` count as not measured."""
+
+
+def insert(
+    model: ModelConfig,
+    params: Params,
+    memory: Memory,
+    frames: Frames,
+    features_ThwF: Array,
+    valid_T: Array | None = None,
+    *,
+    observed: bool = True,
+) -> Memory:
+    """Return the memory after T more frames.
+
+    Args:
+        model: the model.
+        params: the world model's parameters, for memories whose update is learned.
+        memory: from ``model.memory.empty`` or from an earlier call.
+        frames: T frames, colours float in [−1, 1]; pixels without depth are ignored.
+        features_ThwF: (T, h, w, F) their patch features (``Encoder.features``).
+        valid_T: (T,) bool; False frames are ignored.
+        observed: False if the frames were imagined: of these only ``trusted`` pixels are inserted.
+    """
+    frames = frames if observed else trusted(model, frames)
+    return model.memory.insert(
+        model, params, memory, frames, features_ThwF, valid_T, observed=observed
+    )
+
+
+def trusted(model: ModelConfig, frames: Frames) -> Frames:
+    """Return imagined frames with a depth of 0 where it must not be inserted.
+
+    These pixels are beyond ``memory.imagined_far`` of ``clip.far_m`` (unobserved walls are imagined
+    at the end of the range), at the near end of the range (where models put pixels without depth),
+    and on both sides of an edge (``memory.imagined_edge``), where the imagined depth lies between
+    two surfaces.
+
+    Args:
+        model: the model.
+        frames: (..., T) frames.
+    """
+    settings, clip = model.memory, model.clip
+    depth = jnp.asarray(frames.depth_THW)
+    measured = (depth > NEAR * clip.near_m) & jnp.isfinite(depth)
+    kept = measured & (depth <= settings.imagined_far * clip.far_m)
+    if settings.imagined_edge:
+        for axis in (-2, -1):
+            ahead = jax.lax.slice_in_dim(depth, 1, None, axis=axis)
+            behind = jax.lax.slice_in_dim(depth, 0, -1, axis=axis)
+            apart = jnp.abs(ahead - behind) > settings.imagined_edge * jnp.minimum(ahead, behind)
+            # Beside a pixel without depth there is no known edge.
+            apart = apart & (jnp.minimum(ahead, behind) > NEAR * clip.near_m)
+            sides = [(0, 0)] * depth.ndim
+            sides[axis] = (1, 0)
+            kept = kept & ~jnp.pad(apart, sides)
+            sides[axis] = (0, 1)
+            kept = kept & ~jnp.pad(apart, sides)
+    return dataclasses.replace(frames, depth_THW=jnp.where(kept, depth, 0))
+
+
+def render(
+    model: ModelConfig, memory: Memory, camera: Camera, height: int, width: int
+) -> rendering.View:
+    """Render the memory for cameras; nearer points occlude farther ones.
+
+    Points are as wide as the cells of ``memory.cell_m``, unless the memory has its own ``render``.
+    Shapes are static. Large memories are drawn in branches, both of which ``jax.vmap`` computes:
+    render a batch with ``jax.lax.map``.
+
+    Args:
+        model: the model.
+        memory: what is remembered.
+        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
+        height: height of the images, pixels.
+        width: width of the images, pixels.
+
+    Returns:
+        The view; its features have ``model.memory.rendered_channels`` channels.
+    """
+    own = model.memory.render(model, memory, camera, height, width)
+    if own is not None:
+        return own
+    points, features, valid = model.memory.to_points(model, memory)
+    shown = features[:, : model.memory.rendered_channels]
+    cell_m = model.memory.cell_m
+    return rendering.splat_cells(points, shown, cell_m, valid, camera, height, width)
+
+
+def shows_colours(model: ModelConfig) -> bool:
+    """Tell whether the first three channels of the memory's pictures are the colours seen."""
+    return model.memory.REMEMBERS and not model.memory.KEEPS_FEATURES
+
+
+def gated(model: ModelConfig) -> bool:
+    """Tell whether the codec's gate blends decoded frames with the rendered memory."""
+    gate = bool(getattr(model.codec, "gate", 0))
+    return gate and model.clip.depth and shows_colours(model)
+
+
+def readout(
+    model: ModelConfig,
+    memory: Memory,
+    camera: Camera,
+    *,
+    params: Params | None = None,
+    pictures: bool = False,
+    view: View | None = None,
+) -> MemoryReadout:
+    """Return the part of the memory that the reader needs for one clip.
+
+    Args:
+        model: the model.
+        memory: what is remembered.
+        camera: (T,) cameras of the clip, whose intrinsics are for images of its size.
+        params: the world model's parameters; those of the codec are used if the reader takes
+            latents, and they may be left out if it does not.
+        pictures: give the view even if the reader does not take it.
+        view: what ``render`` gives for these cameras, if it was made beforehand.
+    """
+    reader = model.memory.reader
+    seen, encoded = None, None
+    if reader.READS_TOKENS:
+        seen = model.memory.read(model, memory, camera)
+    if not (pictures or reader.READS_VIEW):
+        view = None
+    else:
+        if view is None:
+            view = render(model, memory, camera, model.clip.height, model.clip.width)
+        features = view.features_THWF[..., : model.memory.rendered_channels]
+        view = View(features, view.depth_THW, view.seen_THW)
+        if reader.READS_LATENTS:
+            encoded = encode(model, params or {}, view)
+            view = view if pictures else None
+    return MemoryReadout(seen, view, encoded)
+
+
+def encode(model: ModelConfig, params: Params, view: View) -> EncodedView:
+    """Encode a view of colours as the clip's frames are encoded.
+
+    The codec knows whole images: a pixel that shows nothing gets colour and depth of the nearest
+    pixel of its image that shows something. An image that shows nothing is grey and at
+    ``clip.far_m``.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; those of the codec are used.
+        view: (T,) images of the clip's size; the first 3 features are colours.
+    """
+    whole = rendering.fill_nearest(view)
+    depth = jnp.where(whole.depth_THW > 0, whole.depth_THW, model.clip.far_m)
+    latents = rgbd.encode_rgbd(model, params, whole.features_THWF[None, ..., :3], depth[None])
+    return EncodedView(latents[0], view.seen_THW)
+
+
+def from_context(
+    model: ModelConfig,
+    params: Params,
+    context: Frames,
+    valid_S: Array,
+    features_ShwF: Array | None = None,
+) -> Memory:
+    """Build the memory of one world from the frames it has seen.
+
+    The grid is centred on the last valid frame's camera.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; those that make features (``encoders.weights``) are
+            used.
+        context: S frames of one world, colours in [−1, 1].
+        valid_S: (S,) bool, False frames are ignored.
+        features_ShwF: (S, h, w, F) the encoder's features of the frames, if they are known.
+    """
+    last = jnp.argmax(jnp.where(valid_S, jnp.arange(valid_S.shape[0]), -1))
+    memory = model.memory.empty(model, context.camera.world_from_camera[last, :3, 3])
+    if features_ShwF is None:
+        features = model.memory.encoder.features(model, params, context.rgb_THWC)
+    else:
+        features = features_ShwF.astype(jnp.float32)
+    return insert(model, params, memory, context, features, valid_S)
+
+
+def colours(model: ModelConfig, features_VF: Array) -> np.ndarray:
+    """Return (V, 3) colours in [−1, 1] in which the memory's points are drawn."""
+    values = np.asarray(features_VF)
+    if not model.memory.KEEPS_FEATURES or not len(values):
+        return values[..., :3]
+    return model.memory.encoder.colours(values)
