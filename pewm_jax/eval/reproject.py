@@ -26,9 +26,9 @@ from pewm_jax.eval.statistics import scores
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.depth_images import normals
 from pewm_jax.io.store import ResultCache, file_hash, inputs_hash
-from pewm_jax.types import Array, Camera, Clip, Frames, View
 from pewm_jax.memory import rendering
 from pewm_jax.memory import rendering as views
+from pewm_jax.types import Array, Camera, Clip, Frames, View
 
 
 @dataclasses.dataclass(frozen=True)

@@ -187,7 +187,6 @@ class AttentionConfig(Reader):
 
         return Readers(read, params["blocks"])
 
-
     def __post_init__(self):
         """Validate."""
         require_positive(self, "memory.reader", "looks", "heads", "head_dim", "mlp_ratio")

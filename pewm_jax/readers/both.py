@@ -56,7 +56,6 @@ class BothConfig(AttentionConfig, RenderConfig):
         stacked = {"attend": attend.params, "render": render.params}
         return Readers(read, stacked, render.added_BND)
 
-
     def check(self, model: Any) -> None:
         """Refuse what either of the two refuses."""
         AttentionConfig.check(self, model)

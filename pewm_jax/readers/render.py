@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.pixel import fold
 from pewm_jax.codecs.signals import signal_from_depth
 from pewm_jax.config import ModelConfig
@@ -76,7 +75,6 @@ _RULES = (
     (r"memory/render/(embed_[12]|added)/kernel", P(None, "fsdp")),
     (r"memory/render/(reduce/(kernel|bias)|(embed_[12]|added)/bias)", REPLICATED),
 )
-
 
 
 def _settings(model: ModelConfig) -> RenderConfig:
@@ -265,7 +263,6 @@ class RenderConfig(Reader):
             return jnp.where(shown, out, video)
 
         return Readers(read, weights["blocks"], added)
-
 
     def __post_init__(self):
         """Validate."""

@@ -15,10 +15,9 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import ConfigError, TrainConfig, UserError
-from pewm_jax.train import flops
-from pewm_jax.config import ConfigError, TrainConfig, UserError
 from pewm_jax.memory import interface as memories
 from pewm_jax.readers.both import BothConfig
+from pewm_jax.train import flops
 from pewm_jax.types import EncodedView, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import chained, objective, world_model
 from tests.helpers import TINY, init_world, randomise, tiny_config
