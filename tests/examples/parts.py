@@ -10,6 +10,7 @@ import numpy as np
 from examples.backbone import PerceptronConfig
 from examples.codec import TurnConfig
 from examples.control import PushConfig
+from examples.memory import NewestConfig
 from examples.noise import CosineConfig
 from pewm_jax import worlds
 from pewm_jax.config import (
@@ -26,7 +27,6 @@ from pewm_jax.plan import measure
 from pewm_jax.readers.both import BothConfig
 from pewm_jax.train import sharding, step
 from tests.helpers import random_frames
-from tests.strangers.memory import NewestConfig
 
 
 def experiment(mesh=None, run="runs/parts", batch=8, width=32) -> Config:

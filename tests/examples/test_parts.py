@@ -25,15 +25,14 @@ from tests.helpers import random_camera, random_frames
 
 ROOT = Path(__file__).parents[2]
 PARTS = {
-    **{
-        name: ROOT / "examples" / f"{name}.py" for name in ("backbone", "codec", "control", "noise")
-    },
-    "memory": ROOT / "tests" / "strangers" / "memory.py",
+    name: ROOT / "examples" / f"{name}.py"
+    for name in ("backbone", "codec", "control", "memory", "noise")
 }
 CHOICES = {
     "backbone": ["--backbone.kind", "perceptron"],
     "codec": ["--codec.kind", "turn", "--clip.frames", "5"],
     "control": ["--control.kind", "push"],
+    "memory": ["--memory.kind", "newest"],
     "noise": ["--noise.kind", "cosine"],
 }
 """The flags that choose each example; the codec folds no frames."""
