@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import re
+import sys
 from typing import Any
 
 
@@ -34,3 +36,30 @@ def is_pattern(text: str) -> bool:
     except re.error:
         return False
     return True
+
+
+def report(error: UserError | OSError | KeyboardInterrupt) -> int:
+    """Print an error as one sentence on stderr.
+
+    Returns:
+        The exit code: 2 for bad input and for files that cannot be used; 130, or the error's
+        ``exit_code``, for an interruption.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        print(str(error) or "Interrupted.", file=sys.stderr)
+        return getattr(error, "exit_code", 130)
+    sentence = _file_sentence(error) if isinstance(error, OSError) else str(error)
+    print(f"error: {sentence}", file=sys.stderr)
+    return 2
+
+
+def _file_sentence(error: OSError) -> str:
+    """Return a sentence: which file could not be used, why, and what to do."""
+    where = f"{error.filename}: " if error.filename else ""
+    if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+        fix = "free some space there"
+    elif error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
+        fix = "allow access to it or name another folder"
+    else:
+        fix = "fix that"
+    return f"{where}{error.strerror or error}; {fix}, then run the same command again."

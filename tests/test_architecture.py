@@ -69,7 +69,7 @@ HOMES = {
     "trimesh": {"data", "houses"},
     "tyro": {"config", "convert/options", "data", "memory/feature_command"},
     "viser": {"play/extra"},
-    "wandb": {"train/wandb_log"},
+    "wandb": {"train/log"},
     "websockets": {"play/serving"},
 }
 """Libraries and the only files and folders that import them."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
-import errno
 import hashlib
 import io
 import json
@@ -21,6 +20,7 @@ import tyro
 from pewm_jax import config as configuration
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.config import flags as flag_names
+from pewm_jax.errors import report
 
 T = TypeVar("T")
 _RULE = "─╭╮╰╯-+ "
@@ -43,27 +43,8 @@ def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None 
     """
     try:
         return main(sys.argv[1:] if argv is None else argv) or 0
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"error: {_file_sentence(error)}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt as error:
-        print(str(error) or "Interrupted.", file=sys.stderr)
-        return getattr(error, "exit_code", 130)
-
-
-def _file_sentence(error: OSError) -> str:
-    """Return a sentence: which file could not be used, why, and what to do."""
-    where = f"{error.filename}: " if error.filename else ""
-    if error.errno in {errno.ENOSPC, errno.EDQUOT}:
-        fix = "free some space there"
-    elif error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
-        fix = "allow access to it or name another folder"
-    else:
-        fix = "fix that"
-    return f"{where}{error.strerror or error}; {fix}, then run the same command again."
+    except (UserError, OSError, KeyboardInterrupt) as error:
+        return report(error)
 
 
 def parse(

@@ -109,11 +109,11 @@ def evaluate(
     loaded = runs.open_run(run, config)
     job = _open_job(loaded, changes)
     config, folder = job.config, Path(out) if out else runs.report_folder(loaded, job.config)
-    processes.meet("evaluate: begin")
+    processes.barrier("evaluate: begin")
     complete = is_complete(
         folder, config, job.fingerprint, job.none_weights, job.metrics.hashes, job.validation
     )
-    processes.meet("evaluate: decided")  # nobody writes before all have looked
+    processes.barrier("evaluate: decided")  # nobody writes before all have looked
     if complete:
         log("the report is complete for these weights and this protocol; nothing to do")
         return folder / PAGE
@@ -133,14 +133,14 @@ def evaluate(
     methods = _methods(job, choice, log, cameras=protocol.control == "cameras")
     measured = _measure(job, methods, cache, clips, rollouts, log)
     if not processes.is_primary():
-        processes.meet("evaluate: report")  # devices that wait for one another would give up
+        processes.barrier("evaluate: report")  # devices that wait for one another would give up
         return folder / PAGE
     log("drawing the report …")
     metrics = _metrics(job, measured, protocol, choice)
     save_protocol(folder / PROTOCOL, protocol, {"data": str(job.split)})
     gallery = make_gallery(config, job.episodes, measured.long)
     _write(folder, metrics, gallery, measured.scored, measured.long)
-    processes.meet("evaluate: report")
+    processes.barrier("evaluate: report")
     for line in [*score_lines(metrics), *summary_lines(metrics)]:
         log(line)
     return folder / PAGE

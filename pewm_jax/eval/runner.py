@@ -40,7 +40,9 @@ from pewm_jax.worlds.rollouts import rollout
 def workers() -> Workers:
     """Return the processes of this job, which share the work of an evaluation."""
     return Workers(
-        jax.process_count(), jax.process_index(), lambda what: processes.meet(f"evaluate: {what}")
+        jax.process_count(),
+        jax.process_index(),
+        lambda what: processes.barrier(f"evaluate: {what}"),
     )
 
 

@@ -25,7 +25,7 @@ from pewm_jax.plan.measure import Compiled, MeshSizes, StepWork, in_bfloat16
 from pewm_jax.train import sharding
 from pewm_jax.train.chips import Chip
 from pewm_jax.train.stages import Stage
-from pewm_jax.train.state import TrainState, create
+from pewm_jax.train.step import TrainState, create
 
 MARGIN = 0.9
 """Share of the memory that a plan may fill; the runtime and fragmentation need the rest."""

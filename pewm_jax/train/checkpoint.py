@@ -14,7 +14,9 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import errno
+import logging
 import os
+import sys
 import time
 import types
 from collections.abc import Callable, Iterator
@@ -29,13 +31,12 @@ from etils import epath
 from pewm_jax import config as configuration
 from pewm_jax.config import Config, UserError
 from pewm_jax.io import tree
-from pewm_jax.train import integrity, processes, runs, step_folders
-from pewm_jax.train.background import Quiet
+from pewm_jax.train import checkpoint_files, processes, runs
 from pewm_jax.train.stages import Stage
-from pewm_jax.train.state import TrainState, inference_params
+from pewm_jax.train.step import TrainState, inference_params
 from pewm_jax.types import Params
 
-WEIGHTS_ITEM = step_folders.WEIGHTS_ITEM
+WEIGHTS_ITEM = checkpoint_files.WEIGHTS_ITEM
 STATE_ITEM, DATA_ITEM, CONFIG_ITEM = "state", "data", "config"
 
 _MOMENT_S, _SHARE = 2.0, 0.02
@@ -60,14 +61,14 @@ class Checkpoints:
 
     def __init__(self, run: Path, config: Config, stage: Stage, say: Callable[[str], None] = print):
         self.run = run
-        self.folder = step_folders.of(run, stage.name).resolve()
+        self.folder = checkpoint_files.of(run, stage.name).resolve()
         self.config = config
         self.stage = stage
         self._writer = ocp.AsyncCheckpointer(ocp.CompositeCheckpointHandler())
         self._pool = concurrent.futures.ThreadPoolExecutor(1, "checkpoint")
         self._finishing: concurrent.futures.Future[None] | None = None
         self._began, self._interval, self._settled = time.monotonic(), 0.0, True
-        self._latest: int | None = processes.first(lambda: _tidied(self.folder, say))
+        self._latest: int | None = processes.run_on_process_0(lambda: _tidied(self.folder, say))
         self._quiet, self._failed = Quiet(), False
 
     def __enter__(self) -> Self:
@@ -91,7 +92,7 @@ class Checkpoints:
                 raise
         finally:
             if processes.is_primary():
-                step_folders.clear(self.folder)  # of a write that failed
+                checkpoint_files.clear(self.folder)  # of a write that failed
             if not self._failed:  # otherwise some threads may still print
                 self._quiet.end()
 
@@ -125,7 +126,7 @@ class Checkpoints:
         }
         with self._writing():
             self._writer.save(
-                step_folders.writing(self.folder, step),
+                checkpoint_files.writing(self.folder, step),
                 args=ocp.args.Composite(**items),
                 force=True,
             )
@@ -207,14 +208,16 @@ class Checkpoints:
                 whole = params if alone else _read_arrays(self.folder / str(step), params)
                 runs.publish(self.run, self.stage, step, whole)
 
-        processes.first(write)
+        processes.run_on_process_0(write)
 
     def _finish(self, step: int) -> None:
         """Wait for Orbax, add the manifest, rename the checkpoint, and delete old ones."""
         self._writer.wait_until_finished()
         if processes.is_primary():
-            step_folders.put(self.folder, step)
-            step_folders.prune(self.folder, self.config.train.keep, self.config.train.keep_every)
+            checkpoint_files.put(self.folder, step)
+            checkpoint_files.prune(
+                self.folder, self.config.train.keep, self.config.train.keep_every
+            )
         self._latest = step
 
     @contextlib.contextmanager
@@ -266,7 +269,7 @@ def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[C
     Raises:
         UserError: what is read is damaged.
     """
-    found = integrity.flaws(folder, (WEIGHTS_ITEM, DATA_ITEM, CONFIG_ITEM))
+    found = checkpoint_files.flaws(folder, (WEIGHTS_ITEM, DATA_ITEM, CONFIG_ITEM))
     if found:
         raise UserError(
             f"The checkpoint {folder} is damaged ({tree.listing(found, 2)}): copy it again, or "
@@ -295,8 +298,8 @@ def _read_arrays(folder: Path, like: Params) -> Params:
 def _tidied(folder: Path, say: Callable[[str], None]) -> int | None:
     """Clean up the folder of a stage; returns the step of its newest undamaged checkpoint."""
     folder.mkdir(parents=True, exist_ok=True)
-    step_folders.clear(folder)
-    return step_folders.newest(folder, say)
+    checkpoint_files.clear(folder)
+    return checkpoint_files.newest(folder, say)
 
 
 @contextlib.contextmanager
@@ -328,3 +331,31 @@ def _training_state(stage: Stage, state: TrainState) -> dict[str, Any]:
         "opt_state": state.opt_state,
         "step": jax.tree.map(lambda leaf: leaf, state.step),
     }
+
+
+_LOGGERS = ("absl", "asyncio")
+
+
+class Quiet:
+    """Keeps failures of Orbax's threads from being printed, until ``end``."""
+
+    def __init__(self) -> None:
+        self._before = sys.unraisablehook
+        sys.unraisablehook = self._unraisable
+        for name in _LOGGERS:
+            logging.getLogger(name).addFilter(self._has_no_trace)
+
+    def end(self) -> None:
+        """Let such failures be printed again."""
+        for name in _LOGGERS:
+            logging.getLogger(name).removeFilter(self._has_no_trace)
+        if sys.unraisablehook == self._unraisable:
+            sys.unraisablehook = self._before
+
+    def _unraisable(self, what: Any) -> None:
+        """Drop the error of a write whose event loop was closed by another failed write."""
+        if "Event loop is closed" not in str(what.exc_value):
+            self._before(what)
+
+    def _has_no_trace(self, record: logging.LogRecord) -> bool:
+        return record.exc_info is None

@@ -28,7 +28,7 @@ from pewm_jax import worlds
 from pewm_jax.config import Config
 from pewm_jax.io import tree
 from pewm_jax.train.stages import Stage
-from pewm_jax.train.state import create
+from pewm_jax.train.step import create
 from pewm_jax.types import Params
 
 LINEAR, ATTENTION, CONVOLUTION = "linear", "attention", "convolution"

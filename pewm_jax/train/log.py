@@ -8,23 +8,26 @@ On a terminal the live view is a progress bar, elsewhere a line every ten second
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import math
 import sys
 import time
 import types
-from collections.abc import Mapping
+import uuid
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
+import jax
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from pewm_jax.config import Config
+from pewm_jax import config as configuration
+from pewm_jax.config import Config, UserError
 from pewm_jax.io import atomic
 from pewm_jax.train import processes
 from pewm_jax.train.stages import Stage
-from pewm_jax.train.wandb_log import WandbLog
 
 FLUSH_S = 10
 """Seconds between writes of TensorBoard's events; lines of JSON are written at once."""
@@ -231,3 +234,142 @@ def duration(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min {rest:02d} s"
     return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+ID = "wandb.id"
+"""File in a run's folder: what the runs of its stages are called there."""
+
+
+def require_wandb() -> Any:
+    """Import the package.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        return importlib.import_module("wandb")  # takes a second: only where it is asked for
+    except ImportError:
+        raise UserError(
+            "train.wandb needs Weights & Biases, which is not installed: "
+            "pip install 'pewm-jax[wandb]'."
+        ) from None
+
+
+class WandbLog:
+    """Sends the scalars of a stage; one process of a job has one.
+
+    Args:
+        config: the experiment, which is shown beside the curves; ``train.wandb`` is the project.
+        run: the run's folder.
+        stage: the stage about to be trained.
+
+    Raises:
+        UserError: the package is not installed, nobody is logged in, or it cannot begin.
+    """
+
+    def __init__(self, config: Config, run: Path, stage: Stage):
+        wandb = require_wandb()
+        try:
+            self._run = wandb.init(
+                project=config.train.wandb,
+                name=f"{run.name} {stage.name}",
+                group=run.name,
+                id=f"{_id(run)}-{stage.name}",
+                resume="allow",
+                dir=str(run),
+                config=configuration.to_dict(config),
+                settings=wandb.Settings(console="off"),  # the live view is ours
+            )
+        except wandb.Error as error:
+            reason = " ".join(str(error).split()).rstrip(".")
+            raise UserError(
+                f"Weights & Biases does not begin ({reason}): run `wandb login` first, or set "
+                "WANDB_MODE=offline to keep everything here, or leave out --train.wandb."
+            ) from None
+
+    def write(self, step: int, scalars: Mapping[str, float]) -> None:
+        """Log the scalars of one step; a step that was logged before is left as it was."""
+        self._run.log(dict(scalars), step=step)
+
+    def close(self, *, failed: bool) -> None:
+        """Send or keep what is left, and end."""
+        self._run.finish(exit_code=int(failed))
+
+
+def _id(run: Path) -> str:
+    """Return the name kept in the run's folder, made when it is first asked for."""
+    path = run / ID
+    if not path.exists():
+        atomic.write_text(path, uuid.uuid4().hex[:12])
+    return path.read_text("utf-8").strip()
+
+
+FOLDER = "profile"
+SKIPPED = 2
+"""First steps that are not traced: they also load programs and fill caches."""
+
+
+class Profile:
+    """Traces some steps of a stage; does nothing where none are asked for.
+
+    Args:
+        run: the run's folder; the trace goes to ``profile/stage1`` inside.
+        stage: the stage.
+        steps: how many steps are traced, 0 for none.
+        first: the first step of this start.
+        last: the last step of the stage; a trace ends with it at the latest.
+        say: prints where the trace is and what opens it.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        stage: Stage,
+        *,
+        steps: int,
+        first: int,
+        last: int,
+        say: Callable[[str], Any],
+    ):
+        self.folder = run / FOLDER / stage.name
+        begin = max(min(first + SKIPPED, last - steps + 1), first)
+        self._steps = range(begin, min(begin + steps, last + 1))
+        self._stage, self._say = stage, say
+        self._tracing = False
+        self._traced = 0
+
+    @contextlib.contextmanager
+    def around(self, step: int) -> Iterator[None]:
+        """Trace what is done inside, if this step is one of those."""
+        if step not in self._steps:
+            yield
+            return
+        if step == self._steps[0]:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            jax.profiler.start_trace(self.folder)
+            self._tracing = True
+        with jax.profiler.StepTraceAnnotation("train", step_num=step):
+            yield
+        self._traced += 1
+
+    def after(self, step: int, result: Any) -> float:
+        """End the trace with its last step, once that is computed; returns seconds spent on it."""
+        if not (self._tracing and step == self._steps[-1]):
+            return 0.0
+        jax.block_until_ready(result)
+        began = time.monotonic()
+        self.close()
+        return time.monotonic() - began
+
+    def close(self) -> None:
+        """Write what was traced so far, if anything."""
+        if not self._tracing:
+            return
+        self._tracing = False
+        jax.profiler.stop_trace()
+        made = sorted(self.folder.rglob("*.trace.json.gz"), key=lambda p: p.stat().st_mtime)
+        drop = f", or drop {made[-1]} on https://ui.perfetto.dev" if made else ""
+        self._say(
+            f"{self._stage.title}: traced {self._traced} step{'s'[: self._traced != 1]}; open with "
+            f"`tensorboard --logdir {self.folder}` (and the xprof plugin){drop}"
+        )

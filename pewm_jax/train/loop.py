@@ -22,33 +22,32 @@ from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.loader import BadRecords
 from pewm_jax.memory import feature_cache
-from pewm_jax.train import (
-    flops,
-    prepared,
-    processes,
-    runs,
-    sharding,
-    stages,
-    starting,
-    wandb_log,
-)
+from pewm_jax.train import flops, loading, processes, runs, sharding, stages
+from pewm_jax.train import log as training_log
 from pewm_jax.train.checkpoint import Checkpoints
-from pewm_jax.train.feed import Feed, rows_of
-from pewm_jax.train.log import LiveView, MetricsLog, Pace, duration
-from pewm_jax.train.profile import Profile
-from pewm_jax.train.samples import Preview, Samples
+from pewm_jax.train.feed import (
+    Feed,
+    draw_prepared,
+    prepare_clips,
+    prepared_seed,
+    rows_of,
+    start_digest,
+    uses_prepared,
+)
+from pewm_jax.train.log import LiveView, MetricsLog, Pace, Profile, duration
 from pewm_jax.train.signals import Stop
 from pewm_jax.train.stages import Stage
-from pewm_jax.train.state import TrainState, inference_params
 from pewm_jax.train.step import (
     Metrics,
+    TrainState,
     abstract_state,
     compile_step,
     given_weights,
+    inference_params,
     initial_state,
     noise_key,
 )
-from pewm_jax.train.watch import Watch
+from pewm_jax.train.watch import Preview, Samples, Watch
 from pewm_jax.types import Clip, Params
 
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
@@ -82,9 +81,9 @@ def train(
     """
     config = runs.resumed(config, say if processes.is_primary() else _silent)
     planned = stages.planned(config)
-    starting.require_weights(config)
+    loading.require_weights(config)
     if config.train.wandb:
-        wandb_log.load()  # refused now, and not after the data are prepared
+        training_log.require_wandb()  # refused now, and not after the data are prepared
     mesh = sharding.make_mesh(arranged=config.train.mesh)
     for stage in planned:
         sharding.require_divisible(config, stage, mesh)
@@ -92,15 +91,15 @@ def train(
     bad = BadRecords(config.data.bad_records)
     alone, agreed = jax.process_count() == 1, processes.Votes().cast
     with (
-        processes.entered_by_first(runs.alone(run)),
+        processes.on_process_0(runs.alone(run)),
         Stop(config.train.grace_s, agreed=agreed, alone=alone) as stop,
     ):
-        processes.first(lambda: str(runs.prepare(config)))
-        if processes.first(lambda: runs.is_finished(run, config)):
+        processes.run_on_process_0(lambda: str(runs.prepare(config)))
+        if processes.run_on_process_0(lambda: runs.is_finished(run, config)):
             say(f"{run} is already trained: nothing to do.")
             return run
         weights: Params | None = None
-        for stage in starting.remaining_stages(run, planned):
+        for stage in loading.remaining_stages(run, planned):
             worker = _Worker(
                 config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, say=say
             )
@@ -197,7 +196,7 @@ class _Worker:
     def run(self, done: int) -> TrainState:
         """Do the steps after ``done``, once the first batch is there; returns the last state."""
         config, settings = self.config, self.settings
-        cache = starting.features(config, self.stage)
+        cache = loading.features(config, self.stage)
         where = sharding.of_batch(self.mesh)
         batches = loader.clips(
             config,
@@ -220,7 +219,7 @@ class _Worker:
             say=self.view.say,
         )
         batches, state = iter(batches), None
-        if prepared.applies(config, self.stage):
+        if uses_prepared(config, self.stage):
             state = self._make_state(done)
             batches = self._prepare(done, state)
         with Feed(batches, where, settings.batch) as feed, closing(traced):
@@ -228,9 +227,9 @@ class _Worker:
             state, step_fn = self._compile(done, clip, state)
             if cache is not None:
                 split = Path(config.data.path) / "train"
-                processes.first(
+                processes.run_on_process_0(
                     lambda: feature_cache.require_fresh(
-                        cache, config.model.memory.encoder, starting.encoder(config), split
+                        cache, config.model.memory.encoder, loading.encoder(config), split
                     )
                 )
             self.watch.pace = Pace(time.monotonic())
@@ -265,20 +264,20 @@ class _Worker:
         batch = self.settings.batch
 
         def read(first: int) -> Iterator[Clip]:
-            chosen = prepared.seed(self.config, self.stage)
+            chosen = prepared_seed(self.config, self.stage)
             return loader.clips(
                 self.config, "train", seed=chosen, batch=batch, bad=self.bad, start_step=first
             )
 
         digest = ""
         if self.config.data.prepared_path:
-            digest = prepared.start_digest(self.path, self.stage, state.params, done)
-        clips = prepared.gather(
+            digest = start_digest(self.path, self.stage, state.params, done)
+        clips = prepare_clips(
             self.config, self.stage, state.params, read, self.stop.unless_requested, digest
         )
         if clips is None:
             raise self.stop.interrupted(self.stage.title, done)
-        return prepared.draw(clips, batch, seed, done)
+        return draw_prepared(clips, batch, seed, done)
 
     def _compile(self, done: int, clip: Clip, state: TrainState | None):
         """Make the state, whose first weights are compiled too, and compile the step."""
@@ -299,7 +298,7 @@ class _Worker:
             return self.checkpoints.restore(self.like)
         start, self.start = self.start, None
         if start is None:
-            start = starting.read_weights(self.config, self.stage, self.say)
+            start = loading.read_weights(self.config, self.stage, self.say)
         return initial_state(self.config, self.stage, self.mesh, start)
 
     def _report(self, step: int, metrics: Metrics, shown: TrainState | None = None) -> None:

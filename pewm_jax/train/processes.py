@@ -1,7 +1,7 @@
 """The processes of one job: joining, agreeing on values, and ending together.
 
-All of them run the same program in the same order. Only the first one writes files. Decisions that
-must be the same everywhere are made by ``agree`` and ``Votes``.
+All of them run the same program in the same order. Only process 0 writes files. Decisions that must
+be the same everywhere are made by ``agree`` and ``Votes``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jax.sharding import PartitionSpec as P
 from orbax.checkpoint import multihost
 
 from pewm_jax.config import Join, UserError
-from pewm_jax.config import command_line as cli
+from pewm_jax.errors import report
 
 HEARTBEAT_S = 20
 """Seconds of silence after which a process counts as dead, and all others end."""
@@ -42,8 +42,8 @@ _REPORT_S = 5
 _COMMUNICATION = ("gloo", "nccl", "unavailable", "deadline", "connect", "coordination", "socket")
 """Parts of the messages of errors that JAX raises when another process is gone."""
 
-MEET_S = 7 * 24 * 3600
-"""Seconds that processes wait for one another in ``meet``: one that is gone is noticed sooner."""
+BARRIER_S = 7 * 24 * 3600
+"""Seconds that processes wait in ``barrier``: one that is gone is noticed sooner."""
 
 T = TypeVar("T")
 
@@ -52,10 +52,10 @@ T = TypeVar("T")
 def joined(launch: Join) -> Iterator[None]:
     """Join the processes of a job while this is entered, if the launch asks for it.
 
-    Inside, only the first process prints. An error ends this process, with one sentence and the
-    exit code of ``cli.run``, as soon as the others have reported one too, or after ``_REPORT_S``;
-    the others notice within ``HEARTBEAT_S``. JAX may write more to standard error, or end this
-    process itself (SIGABRT) when the first process is gone.
+    Inside, only process 0 prints. An error ends this process, with one sentence and the exit code
+    of ``errors.report``, as soon as the others have reported one too, or after ``_REPORT_S``; the
+    others notice within ``HEARTBEAT_S``. JAX may write more to standard error, or end this process
+    itself (SIGABRT) when process 0 is gone.
 
     Raises:
         UserError: there is nothing to join.
@@ -123,7 +123,7 @@ def start(launch: Join) -> None:
 
 
 def is_primary() -> bool:
-    """Tell whether this is the first process, which writes logs, pictures and unsharded files."""
+    """Tell whether this is process 0, which writes logs, pictures and unsharded files."""
     return jax.process_index() == 0
 
 
@@ -133,11 +133,11 @@ def wait(name: str) -> None:
         multihost_utils.sync_global_devices(name)
 
 
-def meet(name: str, patience_s: float = MEET_S) -> None:
+def barrier(name: str, patience_s: float = BARRIER_S) -> None:
     """Wait until all processes have reached the barrier of this name, however long one takes.
 
-    ``wait`` is for steps of one program: it uses devices, whose collectives give up after a while.
-    This one is for processes whose shares of some work take minutes or hours.
+    ``wait`` is for steps of one program: it uses devices, whose collectives time out. This one is
+    for processes whose shares of some work take minutes or hours.
     """
     if jax.process_count() > 1:
         multihost.get_barrier_sync_fn()(key=name, timeout_ms=int(1000 * patience_s))
@@ -157,14 +157,14 @@ def agree(value: Any) -> Any:
     return json.loads(bytes(multihost_utils.broadcast_one_to_all(padded)))
 
 
-def first(work: Callable[[], Any]) -> Any:
-    """Call a function in the first process only, and return its result in all of them.
+def run_on_process_0(work: Callable[[], Any]) -> Any:
+    """Call a function in process 0 only, and return its result in all processes.
 
     Args:
         work: returns something that JSON can hold.
 
     Raises:
-        UserError: in all processes, if the function raised it or ``OSError`` in the first.
+        UserError: in all processes, if the function raised it or ``OSError`` in process 0.
     """
     outcome: dict[str, Any] = {}
     if is_primary():
@@ -181,14 +181,14 @@ def first(work: Callable[[], Any]) -> Any:
 
 
 @contextlib.contextmanager
-def entered_by_first(context: contextlib.AbstractContextManager[Any]) -> Iterator[None]:
-    """Enter a context in the first process only; raises as ``first`` does."""
+def on_process_0(context: contextlib.AbstractContextManager[Any]) -> Iterator[None]:
+    """Enter a context in process 0 only; raises as ``run_on_process_0`` does."""
     with contextlib.ExitStack() as held:
 
         def enter() -> None:
             held.enter_context(context)
 
-        first(enter)
+        run_on_process_0(enter)
         yield
 
 
@@ -339,8 +339,4 @@ def _report(error: BaseException) -> int:
     if not isinstance(error, (UserError, OSError, KeyboardInterrupt)):
         sys.excepthook(type(error), error, error.__traceback__)
         return 1
-
-    def again(_: Any) -> None:
-        raise error
-
-    return cli.run(again, [])
+    return report(error)

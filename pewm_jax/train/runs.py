@@ -32,7 +32,7 @@ CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
 BASE = "base.json"
 
-FREE = (
+MUTABLE_FIELDS = (
     "evaluate",
     "data.features",
     "data.prepared_path",
@@ -74,18 +74,18 @@ KEPT = ("noise_key", "beta1", "beta2", "epsilon")
 def identity(config: Config) -> dict[str, Any]:
     """Return the settings that make a run what it is, flat: ``{"train.seed": 0, …}``."""
     flat = _flatten(json.loads(json.dumps(configuration.to_dict(config))))
-    return {name: value for name, value in flat.items() if not _is_free(name)}
+    return {name: value for name, value in flat.items() if not _is_mutable(name)}
 
 
 def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
     """List the settings in which two identities differ, with both values.
 
-    Settings in ``FREE`` are ignored, also in identities written when they were not free yet.
+    Settings in ``MUTABLE_FIELDS`` are ignored, also those that older versions compared.
     """
     return [
         f"{name} {there.get(name)} there, {here.get(name)} here"
         for name in sorted(there.keys() | here.keys())
-        if there.get(name) != here.get(name) and not _is_free(name)
+        if there.get(name) != here.get(name) and not _is_mutable(name)
     ]
 
 
@@ -210,8 +210,8 @@ def alone(run: Path) -> Iterator[None]:
         yield
 
 
-def _is_free(name: str) -> bool:
-    return any(name == free or name.startswith(free + ".") for free in FREE)
+def _is_mutable(name: str) -> bool:
+    return any(name == one or name.startswith(one + ".") for one in MUTABLE_FIELDS)
 
 
 def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:

@@ -19,7 +19,7 @@ from pewm_jax.convert import commands, svd
 from pewm_jax.convert.options import ImportSVD
 from pewm_jax.io import tree
 from pewm_jax.models.svd.convert import BLOCK, DOWN, UP
-from pewm_jax.train import starting
+from pewm_jax.train import loading
 from tests.helpers import random_frames
 
 UNET = {
@@ -96,9 +96,9 @@ def test_it_loads_with_every_tensor_and_can_be_imagined_and_trained(folder, tmp_
     )
     assert frames.rgb_THWC.shape == (10, 32, 48, 3)
     train = dataclasses.replace(config.train, start=str(tmp_path / "world"))
-    starting.require_weights(dataclasses.replace(config, train=train))
+    loading.require_weights(dataclasses.replace(config, train=train))
     with pytest.raises(UserError, match=r"name its folder by train\.start"):
-        starting.require_weights(config)
+        loading.require_weights(config)
 
 
 def test_what_does_not_fit_is_refused_before_anything_is_written(folder, tmp_path):

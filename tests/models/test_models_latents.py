@@ -28,7 +28,7 @@ from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.both import BothConfig
 from pewm_jax.readers.render import RenderConfig
-from pewm_jax.train import prepared
+from pewm_jax.train import feed
 from pewm_jax.types import Clip, Control, EncodedView, Frames, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.pewm import world as pewm
@@ -301,13 +301,13 @@ def test_clips_prepared_before_there_was_a_choice_are_found(monkeypatch):
     """The name of their folder depends on the picture only where it is not the pixels."""
     told = []
     dumps = json.dumps
-    monkeypatch.setattr(prepared.json, "dumps", lambda x, **k: told.append(x) or dumps(x, **k))
-    monkeypatch.setattr(prepared, "read_manifest", lambda _: type("Manifest", (), {"shards": ()}))
+    monkeypatch.setattr(feed.json, "dumps", lambda x, **k: told.append(x) or dumps(x, **k))
+    monkeypatch.setattr(feed, "read_manifest", lambda _: type("Manifest", (), {"shards": ()}))
     names = set()
     for reader in (RENDER, LATENTS):
         model = tiny_model(memory=dataclasses.replace(SURFELS, reader=reader))
         config = Config(model=model, data=DataConfig(prepared=2, prepared_path="there"))
-        names.add(prepared._folder(config, pewm.STAGES[1], {}))
+        names.add(feed._folder(config, pewm.STAGES[1], {}))
     assert len(names) == 2
     pictures = [facts["model"]["memory"]["reader"].get("picture") for facts in told]
     assert pictures == [None, "latents"]

@@ -20,7 +20,7 @@ from pewm_jax.config import ConfigError, EgoWMConfig, UserError
 from pewm_jax.convert import commands, cosmos
 from pewm_jax.convert.options import ImportCosmos2
 from pewm_jax.io import tree
-from pewm_jax.train import starting
+from pewm_jax.train import loading
 from pewm_jax.types import Camera, Control, Frames
 from pewm_jax.worlds import sampling, world_model
 from tests.convert.convert_pipelines import save_text
@@ -201,8 +201,8 @@ def test_it_loads_with_every_tensor_and_can_be_trained(world, folder, where):
         for path, leaf in tree.flatten(params[part]).items():
             np.testing.assert_array_equal(leaf, stored[path], err_msg=path)
     with pytest.raises(UserError, match=r"name its folder by train\.start"):
-        starting.require_weights(config)
-    starting.require_weights(
+        loading.require_weights(config)
+    loading.require_weights(
         dataclasses.replace(config, train=dataclasses.replace(config.train, start=str(where)))
     )
 

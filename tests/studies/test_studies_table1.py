@@ -36,7 +36,7 @@ from pewm_jax.studies import (
     table1_scoring,
     table1_training,
 )
-from pewm_jax.train import prepared
+from pewm_jax.train import feed
 from pewm_jax.worlds.pewm.world import STAGES
 
 SIZE = ["--size", "16", "--frames", "30"]
@@ -476,7 +476,7 @@ def test_a_row_without_a_memory_learns_from_the_clips_that_readers_learn_from():
     def drawn(row):
         stage = STAGES[1 if row.reads else 0]
         config = table1_training.settings(study, row, 3, 10, start="x")
-        return prepared.seed(config, stage), stage.data_seed(config)
+        return feed.prepared_seed(config, stage), stage.data_seed(config)
 
     alike = {drawn(row) for row in every.values()}
     assert len(alike) == 1

@@ -10,7 +10,7 @@ import training_fakes as fakes
 
 from pewm_jax.config import UserError
 from pewm_jax.io import tree
-from pewm_jax.train import checkpoint, runs, sharding, step, step_folders
+from pewm_jax.train import checkpoint, checkpoint_files, runs, sharding, step
 from pewm_jax.train.checkpoint import Checkpoints
 
 ONE, TWO = fakes.STAGES[:2]
@@ -95,8 +95,8 @@ def test_a_save_is_waited_for_within_reason_before_a_step_is_told_of(
     config = fakes.config()
     mesh, _ = train(config, ONE, tmp_path, 1)
     state = step.initial_state(config, ONE, mesh)
-    go_on, put = threading.Event(), step_folders.put
-    monkeypatch.setattr(step_folders, "put", lambda *args: (go_on.wait(), put(*args)))
+    go_on, put = threading.Event(), checkpoint_files.put
+    monkeypatch.setattr(checkpoint_files, "put", lambda *args: (go_on.wait(), put(*args)))
     monkeypatch.setattr(checkpoint, "_MOMENT_S", 0.01)
     with Checkpoints(tmp_path, config, ONE) as checkpoints:
         checkpoints.save(state)
@@ -121,7 +121,7 @@ def test_what_fails_in_the_background_is_told_at_the_next_step(fake_model, tmp_p
     def full(*_args):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(step_folders, "put", full)
+    monkeypatch.setattr(checkpoint_files, "put", full)
     with Checkpoints(tmp_path, config, ONE) as checkpoints:
         checkpoints.save(state)
         with pytest.raises(UserError, match=r"\(No space left on device\); that of step 1 is kept"):

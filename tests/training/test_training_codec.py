@@ -34,7 +34,7 @@ from pewm_jax.io import tree, weights
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.plan import plan
-from pewm_jax.train import loop, stages, starting, step
+from pewm_jax.train import loading, loop, stages, step
 from pewm_jax.worlds import codec as world
 from tests.helpers import random_camera
 
@@ -267,13 +267,13 @@ def test_a_model_starts_from_it_and_is_refused_without_it(clips, tmp_path):
     with pytest.raises(
         UserError, match=r"codec of kind learned .*train it \(pewm-jax train codec\)"
     ):
-        starting.require_weights(tiny)
+        loading.require_weights(tiny)
     fresh = (r"memory/.*", r"backbone/.*", r"control/.*")
     train = dataclasses.replace(tiny.train, start=str(run), fresh=fresh)
     tiny = dataclasses.replace(tiny, train=train)
-    starting.require_weights(tiny)
+    loading.require_weights(tiny)
     stage = stages.planned(tiny)[0]
-    start = starting.read_weights(tiny, stage, print)
+    start = loading.read_weights(tiny, stage, print)
     mesh = loop.sharding.make_mesh()
     state = step.initial_state(tiny, stage, mesh, start)
     mine = tree.flatten(state.params["codec"])

@@ -31,7 +31,8 @@ from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.wan.codec import WanVAECodec
 from pewm_jax.plan import hlo
 from pewm_jax.plan.measure import QUICK
-from pewm_jax.train import flops, sharding, state
+from pewm_jax.train import flops, sharding
+from pewm_jax.train import step as state
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, random_frames, randomise, with_reader
 

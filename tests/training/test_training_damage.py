@@ -9,7 +9,7 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax.config import UserError
-from pewm_jax.train import integrity, loop
+from pewm_jax.train import checkpoint_files, loop
 from pewm_jax.train.checkpoint import Checkpoints
 
 
@@ -96,19 +96,19 @@ def test_damage_is_found_and_named_in_whatever_file_it_is(run, damage):
             if not whole and damage in (cut, flip):
                 continue
             damage(path)
-            (flaw,) = integrity.flaws(newest(run))
+            (flaw,) = checkpoint_files.flaws(newest(run))
             assert flaw.startswith(f"{name} "), (name, flaw)
             path.write_bytes(whole)
-        assert integrity.flaws(newest(run)) == []
+        assert checkpoint_files.flaws(newest(run)) == []
 
 
 def test_what_was_added_and_what_is_gone_together_are_listed(run):
     shutil.rmtree(newest(run) / "state")
     (newest(run) / "weights" / "more").write_text("")
-    found = integrity.flaws(newest(run))
+    found = checkpoint_files.flaws(newest(run))
     assert "state/_METADATA is missing" in found
     assert "weights/more was not written with it" in found
-    assert integrity.flaws(newest(run), ["config", "data"]) == []
+    assert checkpoint_files.flaws(newest(run), ["config", "data"]) == []
 
 
 @pytest.mark.parametrize(
@@ -178,10 +178,10 @@ def test_damage_to_a_stage_that_a_later_one_has_built_on_does_no_harm(run, train
 
 
 def test_checking_many_bytes_is_announced_and_its_progress_told(run, monkeypatch):
-    monkeypatch.setattr(integrity, "LARGE", 1000)
-    monkeypatch.setattr(integrity, "_EVERY_S", 0.0)
+    monkeypatch.setattr(checkpoint_files, "LARGE", 1000)
+    monkeypatch.setattr(checkpoint_files, "_EVERY_S", 0.0)
     said = []
-    assert integrity.flaws(newest(run), say=said.append) == []
+    assert checkpoint_files.flaws(newest(run), say=said.append) == []
     assert said[0].startswith(f"checking {newest(run)}: 0.0 GB")
     assert all("s left" in text for text in said[1:])
     assert len(said) == len(files(newest(run)))

@@ -32,7 +32,8 @@ from pewm_jax.models.svd.backbone import SVDUNetBackbone
 from pewm_jax.models.svd.vae_codec import SVDVAECodec
 from pewm_jax.plan import hlo
 from pewm_jax.plan.measure import QUICK
-from pewm_jax.train import flops, sharding, state, step
+from pewm_jax.train import flops, sharding, step
+from pewm_jax.train import step as state
 from tests.helpers import TINY, randomise, with_reader
 
 IMAGE = CLIPVisionConfig(

@@ -12,7 +12,7 @@ from pewm_jax.data import loader
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.memory import feature_cache
 from pewm_jax.memory import feature_cache as feature_build
-from pewm_jax.train import loop, runs, stages, starting
+from pewm_jax.train import loading, loop, runs, stages
 from pewm_jax.worlds import objective
 from pewm_jax.worlds.pewm import world as pewm
 from tests.data import data_world
@@ -40,7 +40,7 @@ def batch(config, cache):
 
 
 def test_the_map_of_kept_features_is_the_map_of_computed_ones(config):
-    cache = starting.features(config, pewm.STAGES[1])
+    cache = loading.features(config, pewm.STAGES[1])
     kept, plain = batch(config, cache), batch(config, None)
     assert not kept.context_valid_S.all(), "the test should see slots without a frame"
     assert kept.extras["context_features_ShwF"].shape == (3, 6, 8, 12, 6)
@@ -55,12 +55,12 @@ def test_the_map_of_kept_features_is_the_map_of_computed_ones(config):
 
 
 def test_features_are_opened_only_where_a_map_is_built(config):
-    assert starting.features(config, pewm.STAGES[0]) is None
+    assert loading.features(config, pewm.STAGES[0]) is None
     none = dataclasses.replace(config, data=dataclasses.replace(config.data, features=""))
-    assert starting.features(none, pewm.STAGES[1]) is None
+    assert loading.features(none, pewm.STAGES[1]) is None
     absent = dataclasses.replace(config, data=dataclasses.replace(config.data, features="absent"))
     with pytest.raises(UserError, match=r"absent/train is no cache; make it with"):
-        starting.features(absent, pewm.STAGES[1])
+        loading.features(absent, pewm.STAGES[1])
 
 
 def test_training_on_stale_features_is_refused(config, tmp_path, monkeypatch):

@@ -9,7 +9,8 @@ import training_fakes as fakes
 
 from pewm_jax.config import ConfigError
 from pewm_jax.io import tree, weights
-from pewm_jax.train import loop, state
+from pewm_jax.train import loop
+from pewm_jax.train import step as state
 
 TWO = fakes.STAGES[1]
 KEY = jax.random.key(7)

@@ -15,8 +15,8 @@ from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data import loader
 from pewm_jax.io import weights
 from pewm_jax.train import loop, runs
-from pewm_jax.train.samples import Previewed
 from pewm_jax.train.signals import Interrupted
+from pewm_jax.train.watch import Previewed
 
 PICTURE = Previewed((Path("picture.png"),))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pewm_jax import worlds
-from pewm_jax.train import prepared
+from pewm_jax.train import feed
 from pewm_jax.types import Clip
 from tests.helpers import init_world, random_frames, randomise, tiny_config
 
@@ -41,7 +41,7 @@ def test_a_prepared_batch_has_the_same_loss_without_its_context(number):
 
 def test_every_clip_comes_once_before_any_comes_again():
     clips = [{"x": np.arange(8)}, {"x": np.arange(8, 12)}]
-    batches = [b["x"] for b in itertools.islice(prepared.draw(clips, 4, seed=3), 6)]
+    batches = [b["x"] for b in itertools.islice(feed.draw_prepared(clips, 4, seed=3), 6)]
     for epoch in (batches[:3], batches[3:]):
         assert sorted(np.concatenate(epoch)) == list(range(12))
     assert not np.array_equal(batches[0], batches[3])
@@ -49,8 +49,8 @@ def test_every_clip_comes_once_before_any_comes_again():
 
 def test_batches_go_on_where_they_stopped():
     clips = [{"x": np.arange(5)}, {"x": np.arange(5, 10)}]
-    whole = [b["x"] for b in itertools.islice(prepared.draw(clips, 4, seed=3), 7)]
-    after = [b["x"] for b in itertools.islice(prepared.draw(clips, 4, seed=3, start=5), 2)]
+    whole = [b["x"] for b in itertools.islice(feed.draw_prepared(clips, 4, seed=3), 7)]
+    after = [b["x"] for b in itertools.islice(feed.draw_prepared(clips, 4, seed=3, start=5), 2)]
     np.testing.assert_array_equal(whole[5:], after)
 
 
@@ -60,6 +60,6 @@ def test_the_rows_of_a_batch_can_be_named():
     stage = worlds.stages(config)[0]
     batch = stage.settings(config).batch
     count = -(-9 // batch) * batch
-    drawn = prepared.draw([{"x": np.arange(count)}], batch, stage.data_seed(config))
+    drawn = feed.draw_prepared([{"x": np.arange(count)}], batch, stage.data_seed(config))
     third = next(itertools.islice(drawn, 2, None))["x"]
-    assert prepared.rows(config, stage, 2) == list(third)
+    assert feed.prepared_rows(config, stage, 2) == list(third)

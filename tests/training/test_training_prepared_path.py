@@ -13,7 +13,7 @@ import training_fakes as fakes
 from test_training_loop import file_bytes, losses, train
 
 from pewm_jax.config import UserError
-from pewm_jax.train import prepared
+from pewm_jax.train import feed
 from pewm_jax.worlds.pewm import world as pewm
 
 CLIPS = 20
@@ -41,7 +41,7 @@ STAGE = dataclasses.replace(fakes.STAGES[0], prepare=prepare)
 def split(monkeypatch):
     """A split of one shard, whose checksum a test may change."""
     shard = types.SimpleNamespace(sha256="0" * 64)
-    monkeypatch.setattr(prepared, "read_manifest", lambda _: types.SimpleNamespace(shards=(shard,)))
+    monkeypatch.setattr(feed, "read_manifest", lambda _: types.SimpleNamespace(shards=(shard,)))
     return shard
 
 
@@ -58,7 +58,7 @@ class Reader:
         self.config, self.taken = config, []
 
     def __call__(self, first):
-        seed = prepared.seed(self.config, STAGE)
+        seed = feed.prepared_seed(self.config, STAGE)
         for number, clip in enumerate(
             fakes.clips(self.config, seed=seed, batch=8, start_step=first), first
         ):
@@ -73,7 +73,7 @@ def gather(config, params=PARAMS, most=None, stage=STAGE):
     def unless_stopped(call):
         return None if most is not None and next(done) > most else call()
 
-    return prepared.gather(config, stage, params, reader, unless_stopped), reader.taken
+    return feed.prepare_clips(config, stage, params, reader, unless_stopped), reader.taken
 
 
 def same(one, two):
@@ -99,7 +99,7 @@ def test_a_second_run_reads_the_same_files_and_draws_the_same_batches(tmp_path):
     assert files(tmp_path) == written
     same(first, alone)
     same(again, alone)
-    one, two = (list(itertools.islice(prepared.draw(x, 8, 5), 4)) for x in (alone, again))
+    one, two = (list(itertools.islice(feed.draw_prepared(x, 8, 5), 4)) for x in (alone, again))
     same(one, two)
 
 
@@ -139,7 +139,7 @@ def test_the_folder_is_named_by_all_that_the_clips_depend_on(tmp_path, split):
     config = fakes.with_stage(experiment(tmp_path), "joint", batch=8)
 
     def folder(config=config, params=PARAMS, stage=STAGE):
-        return prepared._folder(config, stage, prepared._digest(stage, params))
+        return feed._folder(config, stage, feed._digest(stage, params))
 
     def with_data(**changes):
         return dataclasses.replace(config, data=dataclasses.replace(config.data, **changes))

@@ -72,13 +72,13 @@ def test_a_port_in_use_is_refused(joining):
 def test_one_process_agrees_with_itself():
     assert processes.is_primary()
     assert processes.agree({"a": [1, None]}) == {"a": [1, None]}
-    assert processes.first(lambda: "x") == "x"
+    assert processes.run_on_process_0(lambda: "x") == "x"
     votes = processes.Votes()
     assert [votes.cast(None), votes.cast(15)] == [None, 15]
     tree = {"a": np.arange(3)}
     assert processes.gather(tree) is tree
     with pytest.raises(OSError, match="full"):
-        processes.first(lambda: (_ for _ in ()).throw(OSError("full")))
+        processes.run_on_process_0(lambda: (_ for _ in ()).throw(OSError("full")))
 
 
 def run_here(monkeypatch, argv, term_at=0):

@@ -17,7 +17,8 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
-from pewm_jax.train import sharding, state
+from pewm_jax.train import sharding
+from pewm_jax.train import step as state
 from pewm_jax.worlds.pewm.world import STAGES
 
 ONE, TWO = STAGES[:2]

@@ -13,7 +13,8 @@ from pewm_jax import presets as configs
 from pewm_jax.config import AXES, ConfigError
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
-from pewm_jax.train import optimizer, sharding, stages, state, step
+from pewm_jax.train import optimizer, sharding, stages, step
+from pewm_jax.train import step as state
 from pewm_jax.worlds import world_model
 from pewm_jax.worlds.pewm import world as pewm
 

@@ -32,7 +32,7 @@ from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.readers.attention import AttentionConfig
-from pewm_jax.train import integrity, loop, runs, sharding, step
+from pewm_jax.train import checkpoint_files, loop, runs, sharding, step
 from pewm_jax.train.checkpoint import CONFIG_ITEM, Checkpoints
 from pewm_jax.worlds.pewm.world import STAGES
 
@@ -223,8 +223,8 @@ def as_version_1(run):
     shutil.copy(HERE / "finished.json", run / "config.json")
     for checkpoint in run.glob("checkpoints/*/[0-9]*"):
         shutil.copy(HERE / "checkpoint.json", checkpoint / CONFIG_ITEM / "metadata")
-        (checkpoint / integrity.MANIFEST).unlink()
-        integrity.seal(checkpoint)
+        (checkpoint / checkpoint_files.MANIFEST).unlink()
+        checkpoint_files.seal(checkpoint)
 
 
 def same(left, right):

@@ -16,7 +16,8 @@ import training_fakes as fakes
 from pewm_jax.config import UserError
 from pewm_jax.data import loader
 from pewm_jax.io import weights
-from pewm_jax.train import chips, flops, loop, optimizer, samples, step, watch
+from pewm_jax.train import chips, flops, loop, optimizer, step, watch
+from pewm_jax.train import watch as samples
 from pewm_jax.train.sharding import make_mesh
 from pewm_jax.train.signals import Interrupted
 

@@ -18,7 +18,8 @@ from pewm_jax import registry as kinds
 from pewm_jax.config import Config, ConfigError, StageConfig, TrainSettings, World, register
 from pewm_jax.data import loader
 from pewm_jax.io import tree
-from pewm_jax.train import loop, samples, stages
+from pewm_jax.train import loop, stages
+from pewm_jax.train import watch as samples
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 STEPS = StageConfig(steps=4, batch=8, warmup=0, learning_rate=0.1)

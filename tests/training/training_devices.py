@@ -27,7 +27,7 @@ from pewm_jax.config import MeshConfig
 from pewm_jax.io import tree
 from pewm_jax.train import sharding, step
 from pewm_jax.train.checkpoint import Checkpoints
-from pewm_jax.train.state import create
+from pewm_jax.train.step import create
 from pewm_jax.worlds import world_model
 from pewm_jax.worlds.pewm.world import STAGES
 from tests.helpers import random_camera

@@ -14,7 +14,7 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax.config import command_line as cli
-from pewm_jax.train import integrity, loop, runs, step_folders
+from pewm_jax.train import checkpoint_files, loop, runs
 from pewm_jax.train.checkpoint import Checkpoints
 from pewm_jax.train.log import MetricsLog
 
@@ -58,8 +58,12 @@ def meet(folder, when):
     with pytest.MonkeyPatch.context() as patch:
         before(patch, *traps[when], lambda: fill(folder))
         code, told = train(config)
-    stage = step_folders.of(folder / when, "stage1")
-    whole = [step for step in step_folders.steps(stage) if not integrity.flaws(stage / str(step))]
+    stage = checkpoint_files.of(folder / when, "stage1")
+    whole = [
+        step
+        for step in checkpoint_files.steps(stage)
+        if not checkpoint_files.flaws(stage / str(step))
+    ]
     found = {"code": code, "told": told, "whole": whole}
     found["partial"] = [path.name for path in (folder / when).rglob("*.partial")]
     (folder / "ballast").unlink()

@@ -19,7 +19,7 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax.data import loader
-from pewm_jax.train import checkpoint, loop, step_folders
+from pewm_jax.train import checkpoint, checkpoint_files, loop
 
 EVERY, STEPS = 3, 27
 
@@ -64,7 +64,9 @@ def wait(child):
 def newest(run):
     """Return the stage and step that a new start would go on from."""
     found = [
-        (n, step) for n in (1, 2) for step in step_folders.steps(step_folders.of(run, f"stage{n}"))
+        (n, step)
+        for n in (1, 2)
+        for step in checkpoint_files.steps(checkpoint_files.of(run, f"stage{n}"))
     ]
     return max(found, default=(1, 0))
 
@@ -85,7 +87,7 @@ def wait_and_kill(child, run, dice, saves, longest):
     delay = dice.uniform(0, 0.15 if saves else longest)
     seen = set()
     while len(seen) < saves and not ended(child):
-        seen |= {path.name for path in run.glob(f"checkpoints/*/*{step_folders.WRITING}*")}
+        seen |= {path.name for path in run.glob(f"checkpoints/*/*{checkpoint_files.WRITING}*")}
         time.sleep(0.001)
     time.sleep(delay)
     os.kill(child, signal.SIGKILL)  # it is not waited for yet, so this id is still its own
