@@ -282,7 +282,7 @@ MOVED = {
     "worlds.persist_step": "worlds.persist.step",
     "worlds.persist_voxels": "worlds.persist.voxels",
     "worlds.persist_windows": "worlds.persist.windows",
-    "worlds.pewm_costs": "planning.planners",
+    "worlds.pewm_costs": "train.flops",
     "worlds.pewm_gate": "worlds.pewm.gate",
     "worlds.pewm_many": "worlds.pewm.many",
     "worlds.pewm_views": "worlds.pewm.views",
