@@ -1,4 +1,4 @@
-"""The evaluation protocol: which clips are scored, with what context and which actions.
+"""The clips of an evaluation: which are scored, with what context and which actions.
 
 Nothing here is random. Clips start on the way back of every held-out episode, where the agent sees
 places again. Their context is thinned in the same way for every method, and the recorded motion
@@ -149,7 +149,7 @@ def long_choices(config: Config, episodes: Sequence[Episode]) -> list[ClipChoice
 
 
 def needs_cameras(episodes: Sequence[Episode], choices: Sequence[ClipChoice]) -> bool:
-    """Tell whether clips must be driven by cameras: some motion is not upright (by hand, log)."""
+    """Tell whether clips must be driven by cameras, because some motion is not upright."""
     for choice in choices:
         episode = episodes[choice.episode]
         poses = episode.world_from_camera[[choice.start, *choice.targets_N]]

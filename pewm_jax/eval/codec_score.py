@@ -1,4 +1,4 @@
-"""The numbers of a codec: what is left of frames that it never saw, encoded and decoded.
+"""Reconstruction errors of a codec on held-out frames.
 
 Frames are scored at the size that they were recorded at, which need not be the one trained on.
 """
@@ -46,7 +46,7 @@ def score(
             with the library.
         data: the data set's folder; by default the run's.
         split: the folder inside it; by default the run's ``evaluate.split``.
-        log: told the numbers.
+        log: shows a line.
 
     Returns:
         The file written, ``RUN/report/codec-SPLIT.json`` (``runs/NAME/report/…`` of a codec that

@@ -1,4 +1,4 @@
-"""Two scored runs side by side: differences clip by clip, under one protocol or not at all."""
+"""Compare two evaluated runs: paired differences, clip by clip, under one protocol."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def read(name: str | Path) -> Report:
     folder = Path(name)
     if not (folder / METRICS).is_file():
         folder = shipped.home(name) / OWN
-    again = f"score it with `pewm-jax evaluate {name}`; what is scored is kept"
+    again = f"score it with `pewm-jax evaluate {name}`; finished scores are reused"
     try:
         metrics = json.loads((folder / METRICS).read_text("utf-8"))
     except OSError:

@@ -1,4 +1,4 @@
-"""What the model's memory covers of the pixels that it will be scored on, clip by clip."""
+"""Share of the scored pixels that the model's memory covers."""
 
 from __future__ import annotations
 

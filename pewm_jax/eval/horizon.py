@@ -1,4 +1,4 @@
-"""Long horizons: hundreds of frames from one start, with the recorded actions, by several worlds.
+"""Long rollouts of several worlds: hundreds of frames from one start by the recorded actions.
 
 PERSIST's protocol (arXiv 2603.03482): windows of 16 frames that end at 200, 400 and 600 imagined
 frames of held-out walks, compared with the true ones as sets (FVD, KVD). Beside that PSNR by

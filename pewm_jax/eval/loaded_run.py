@@ -1,4 +1,4 @@
-"""What an evaluation works with: a trained run, a rival without a memory, and where to write."""
+"""Load trained runs for an evaluation, and find the folder of the report."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def report_folder(opened: LoadedRun, config: Config) -> Path:
 def open_none(opened: LoadedRun, config: Config) -> LoadedRun | None:
     """Open the run without a memory that ``evaluate.none`` names, or return None.
 
-    Its configuration is laid under the protocol of the evaluation: the same clips, context, batch
+    Its configuration gets the protocol of the evaluation: the same clips, context, batch
     and number of sampling steps.
 
     Raises:

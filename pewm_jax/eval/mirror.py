@@ -1,4 +1,4 @@
-"""The mirror test: the agent goes a way and comes back the same way. Does it find what it left?
+"""The mirror test: the agent goes a way and comes back. Does it see the same places again?
 
 From the start of each long rollout the model imagines the first frames of the recorded way, then
 the same way back: it was walked, so it is free. Each place is thus visited twice, and the later a

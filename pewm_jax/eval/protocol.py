@@ -1,8 +1,11 @@
-"""The protocol as a value with a hash: what is scored, whatever model it is scored with.
+"""The evaluation protocol as a value with a hash, and its file.
 
-It says which episodes (by the hash of what they hold), starts, context, motion, noise and horizon.
-It knows nothing of a model, so any two models of its size can be scored by it and compared clip by
-clip. Equal choices have equal hashes, wherever the data lie (``protocol_file.py`` keeps them).
+It fixes episodes (by the hash of their content), starts, context, motion, noise and horizon. It
+does not depend on a model, so any two models of its size can be scored by it and compared clip by
+clip. Equal choices have equal hashes, wherever the data are stored.
+
+The file is written before training and read by ``evaluate``; ``docs/evaluation.md`` describes it.
+Where the data were, and which version wrote the file, are notes that are not hashed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The baseline without a network: what was observed, moved to where the camera looks now.
+"""The reprojection baseline: observed pixels, drawn for the present camera without a network.
 
 Every observed pixel becomes a coloured point in the world, a z-buffer draws the points for each
-frame to imagine, and holes are filled with the nearest pixel that was hit. Nothing is learnt,
-nothing forgotten and nothing imagined. A memory that is worth its name must beat it.
+frame to imagine, and holes are filled with the nearest pixel that was hit. Its settings are those
+that score best on the validation split; the evaluated split is not used to choose them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,10 @@
-"""The content of ``metrics.json``: scores, margins, and the protocol that they were made by."""
+"""The results of an evaluation: the content of ``metrics.json`` and the scores of every clip.
+
+``samples.npz`` stores the scores of every clip, so that any two runs can be compared clip by clip
+later. It holds an array for each of ``clips``, ``frames`` and ``rollouts``, each method, mask and
+metric, under a name such as ``clips/memory/seen/psnr``; NaN if a clip has no score. Its member
+``about`` is JSON. ``docs/evaluation.md`` describes both.
+"""
 
 from __future__ import annotations
 
@@ -197,7 +203,7 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
 
 
 def _memory_of(config: Config, *, remembers: bool) -> dict[str, Any]:
-    """Return what is said of the memory; nulls where the model has none."""
+    """Return the facts about the memory; nulls if the model has none."""
     facts = config.model.facts
     if not remembers:
         return {"memory": "none"} | dict.fromkeys(("encoder", "reader", "positions", "map"))
@@ -306,7 +312,7 @@ def load_samples(folder: Path) -> Samples:
         UserError: it is absent, damaged, or of another version.
     """
     path = folder / SAMPLES
-    again = "score the run again with `pewm-jax evaluate`; what is scored is kept"
+    again = "score the run again with `pewm-jax evaluate`; finished scores are reused"
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
             arrays = {name: found[name] for name in found.files}
@@ -316,7 +322,7 @@ def load_samples(folder: Path) -> Samples:
     except (
         zipfile.BadZipFile,
         zlib.error,
-        NotImplementedError,  # of a method of compression that there is not
+        NotImplementedError,  # an unknown compression method
         ValueError,
         EOFError,
         KeyError,

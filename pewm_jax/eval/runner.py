@@ -1,4 +1,4 @@
-"""Who imagines: batches of clips through a compiled model, and the baselines beside it.
+"""Imagine batches of clips by every method: a compiled model and the baselines.
 
 ============= ====================================================================================
 memory        the model with its map
@@ -269,7 +269,7 @@ class Methods:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The methods that there are."""
+        """The available methods."""
         left_out = {"model"} if self.remembers else {"memory", "empty"}
         left_out |= {"none"} if self.none is None else set()
         return tuple(name for name in METHODS if name not in left_out)

@@ -1,4 +1,4 @@
-"""Does what is placed in a world stay? Measured in its voxels, after many imagined frames.
+"""Trials in a world of voxels: whether placed blocks persist, and what the 3D VAE reconstructs.
 
 In each trial a world begins in a recorded grid. A block of one class is put on the floor in front
 of the agent, which then walks as recorded. Beside it the same walk without the block is imagined.

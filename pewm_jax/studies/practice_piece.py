@@ -1,4 +1,4 @@
-"""One piece of the study of practice, and its settings: one policy in one house.
+"""One piece of the practice study: one policy in one house; and the settings of the study.
 
 A policy practises in a place (``planning.practice``), its walks are kept as a dataset, it learns
 from them, and is sent to goals in the real house.

@@ -58,7 +58,7 @@ class Scorer:
     """The clips and measures that everything is scored by.
 
     Attributes:
-        config: the settings that all rows share, with the protocol laid on them.
+        config: the settings that all rows share, under the protocol.
         protocol: what is scored.
         batches: the clips.
         nets: the measures that need weights, as far as they are at hand.
@@ -108,10 +108,10 @@ class Scorer:
         piece = "memory" if memory else "empty"
 
         def score() -> Arrays:
-            laid = apply_protocol(self.protocol, config)
+            fixed = apply_protocol(self.protocol, config)
             batch, context = self.config.evaluate.batch, self.config.data.context
             params, devices = load_finished(run)[1], jax.devices()
-            model = ModelRunner(laid, params, batch, context, self.log, devices=devices)
+            model = ModelRunner(fixed, params, batch, context, self.log, devices=devices)
 
             def imagine(
                 context: Frames, control: Any, camera: Camera, seeds_B2: np.ndarray
@@ -217,7 +217,7 @@ def open_scorer(
     log: Callable[[str], Any],
     weights: Mapping[str, str | Path] | None = None,
 ) -> Scorer:
-    """Fix what is scored, before anything is trained, and read it.
+    """Fix the protocol before anything is trained, and read its clips.
 
     Args:
         config: the settings that all rows share.
@@ -316,7 +316,7 @@ def recorded_path(study: Study, row: Row, seed: int, steps: Mapping[str, int], s
         row: the row.
         seed: of its training.
         steps: name of a row or backbone → steps.
-        scored: hash of what is scored and how (``Scorer.name``).
+        scored: hash of the protocol and the metrics (``Scorer.name``).
     """
     start = study.base.train.start
     facts: list[Any] = [

@@ -1,4 +1,4 @@
-"""Which of the measures that need weights a report has, and a sentence on each that it has not."""
+"""Select the metrics of a report by its settings, with a sentence on each that is left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SCS, the structural consistency score: whether things are where they really are (EgoWM, Eq. 7).
+"""SCS, the structural consistency score: whether objects are where they should be (EgoWM, Eq. 7).
 
 The mean over things and frames of IoU(mask in the imagined clip, mask in the true one), times 100
 (arXiv 2601.15284). Frame 0 is the observed one: it defines the things and does not count. A pair of

@@ -1,4 +1,4 @@
-"""FVD and KVD: how far imagined clips, as a set, are from true ones, seen by I3D.
+"""FVD and KVD: distances between the sets of imagined and of true clips in the features of I3D.
 
 The Fréchet and the kernel distance between the logits of I3D (``models.i3d``), as in Unterthiner et
 al. 2018. The Fréchet distance is biased: two sets of n vectors of one distribution differ by an
