@@ -30,9 +30,10 @@ from pewm_jax.planning.candidates import Imagination, Judged
 from pewm_jax.planning.plan import plan
 from pewm_jax.planning.settings import CEM, PlanConfig
 from pewm_jax.types import Control, Frames, MemoryReadout
-from pewm_jax.worlds import sampling, world_model
+from pewm_jax.worlds import world_model
+from pewm_jax.worlds import world_model as sampling
 from pewm_jax.worlds.control import control_of
-from pewm_jax.worlds.pewm import many as pewm_many
+from pewm_jax.worlds.pewm import candidates as pewm_many
 
 CONTEXT = 24
 """Frames that are seen before; the goal is 8 frames on."""

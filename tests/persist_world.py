@@ -41,8 +41,8 @@ MODEL = PersistConfig(
     ),
     noise=NOISE,
     voxel_noise=NOISE,
-    hold=1e6,
-    sight=1e3,
+    persistence_logit=1e6,
+    observation_logit=1e3,
     points=True,
     dead_reckoning=True,
 )  # fmt: skip

@@ -20,12 +20,12 @@ from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Clip, Control, Frames
-from pewm_jax.worlds.persist import pictures as persist_pictures
 from pewm_jax.worlds.persist import prepare as persist_prepare
-from pewm_jax.worlds.persist import voxels as persist_voxels
-from pewm_jax.worlds.persist import windows
+from pewm_jax.worlds.persist import state as windows
+from pewm_jax.worlds.persist import step as persist_pictures
+from pewm_jax.worlds.persist import voxel_frames as persist_voxels
 from pewm_jax.worlds.persist import world as persist
-from pewm_jax.worlds.persist.past import encoded
+from pewm_jax.worlds.persist.state import encoded
 from tests.helpers import random_frames
 from tests.persist_world import MODEL, NOISE
 
@@ -122,8 +122,8 @@ def test_the_camera_model_steers(params, state, walked):
 def test_a_cell_changes_only_where_another_class_is_likelier_by_what_is_held(params):
     latents = jnp.asarray(np.random.default_rng(3).normal(size=(1, 4, 4, 4, 3)), jnp.float32)
     nothing = jnp.full((8, 8, 8), -1, jnp.int16)
-    free, firm = (dataclasses.replace(MODEL, hold=hold) for hold in (0.0, 0.5))
-    held = jax.jit(persist_voxels.held, static_argnums=0)
+    free, firm = (dataclasses.replace(MODEL, persistence_logit=hold) for hold in (0.0, 0.5))
+    held = jax.jit(persist_voxels.decode_classes, static_argnums=0)
     made = held(free, params, latents, nothing)
     np.testing.assert_array_equal(held(firm, params, latents, nothing), made)
     before = jnp.full((8, 8, 8), 3, jnp.int16)
@@ -136,9 +136,13 @@ def test_a_cell_changes_only_where_another_class_is_likelier_by_what_is_held(par
 def test_a_cell_of_which_nothing_was_known_has_air_unless_a_class_is_likelier_by_the_doubt(params):
     latents = jax.random.normal(KEY, (1, 4, 4, 4, 3))
     unknown = jnp.full((8, 8, 8), class_grid.UNKNOWN).at[:4].set(3)
-    models = [dataclasses.replace(MODEL, hold=0.0, doubt=nats) for nats in (0.0, 0.5, 1e6)]
+    models = [
+        dataclasses.replace(MODEL, persistence_logit=0.0, empty_prior=nats)
+        for nats in (0.0, 0.5, 1e6)
+    ]
     free, doubtful, sure = (
-        np.asarray(persist_voxels.held(model, params, latents, unknown)) for model in models
+        np.asarray(persist_voxels.decode_classes(model, params, latents, unknown))
+        for model in models
     )
     np.testing.assert_array_equal(doubtful[:4], free[:4])  # what was known is not doubted
     assert ((doubtful == free) | (doubtful == 0)).all()
@@ -162,7 +166,7 @@ def test_an_edit_is_the_world_that_goes_on(params, state):
 
 
 def test_the_next_voxels_depend_on_what_was_edited_elsewhere(params, state):
-    free = dataclasses.replace(MODEL, hold=0.0)
+    free = dataclasses.replace(MODEL, persistence_logit=0.0)
     low = np.asarray(state.map.low_3) + 0.5 * np.asarray(state.map.history.start_3)
     box = np.stack([low, low + np.array([2.0, 4.0, 4.0])]).astype(np.float32)  # half of the window
     edited = persist.edit(state, class_grid.place, MODEL.memory, box, 5)
@@ -420,8 +424,8 @@ def test_its_settings_travel_and_what_cannot_work_is_refused():
     tiny = presets.load("persist_tiny")
     assert configuration.from_dict(Config, configuration.to_dict(tiny)) == tiny
     for changes, says in (
-        ({"hold": -1.0}, "use 0 or more nats"),
-        ({"sight": -1.0}, "model.sight is -1.0: use 0 or more nats"),
+        ({"persistence_logit": -1.0}, "use 0 or more nats"),
+        ({"observation_logit": -1.0}, "model.observation_logit is -1.0: use 0 or more nats"),
         (
             {"memory": dataclasses.replace(MODEL.memory, pictures="surfaces")},
             "it reads colours of blocks",

@@ -14,9 +14,9 @@ from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, unproj
 from pewm_jax.geometry.march import through_pixels
 from pewm_jax.memory import class_grid
 from pewm_jax.types import Camera
-from pewm_jax.worlds.persist import sight as persist_sight
-from pewm_jax.worlds.persist import voxels as persist_voxels
-from pewm_jax.worlds.persist import windows
+from pewm_jax.worlds.persist import state as windows
+from pewm_jax.worlds.persist import voxel_frames as persist_sight
+from pewm_jax.worlds.persist import voxel_frames as persist_voxels
 from pewm_jax.worlds.persist import world as persist
 from tests.helpers import random_frames
 from tests.persist_world import MODEL
@@ -101,7 +101,7 @@ def test_a_world_begins_on_the_lattice_of_recorded_cells_and_with_what_it_sees()
     assert cells[np.asarray(sight.colour_XYZ) >= 0].all()
     # A frame that was imagined says nothing of its cells.
     still = jax.jit(persist.imagine, static_argnums=0, static_argnames="memory")
-    doubted = dataclasses.replace(MODEL, sight=0.0)
+    doubted = dataclasses.replace(MODEL, observation_logit=0.0)
     key, none = jax.random.key(0), np.zeros((1, 3), np.float32)
     one, two = (
         still(model, params, state, none, key, memory=False)[1].rgb_THWC
@@ -118,14 +118,16 @@ def test_what_is_seen_decides_between_classes_and_nothing_else_changes():
     air = jnp.zeros((8, 8, 8), bool).at[:2].set(True)
     colour = jnp.full((8, 8, 8), -1).at[2:4].set(2)
     sight = persist_sight.ObservedCells(air, colour)
-    free = dataclasses.replace(ROOM, hold=0.0)
-    made = np.asarray(persist_voxels.held(free, params, latents, before))
-    looked = np.asarray(persist_voxels.held(free, params, latents, before, sight))
+    free = dataclasses.replace(ROOM, persistence_logit=0.0)
+    made = np.asarray(persist_voxels.decode_classes(free, params, latents, before))
+    looked = np.asarray(persist_voxels.decode_classes(free, params, latents, before, sight))
     assert not looked[:2].any()
     assert ((looked[2:4] > 0) & ((looked[2:4] - 1) % COLOURS == 2)).all()
     np.testing.assert_array_equal(looked[4:], made[4:])
-    blind = dataclasses.replace(free, sight=0.0)
-    np.testing.assert_array_equal(persist_voxels.held(blind, params, latents, before, sight), made)
+    blind = dataclasses.replace(free, observation_logit=0.0)
+    np.testing.assert_array_equal(
+        persist_voxels.decode_classes(blind, params, latents, before, sight), made
+    )
     given = persist_sight.advantage(ROOM, sight, classes)
     assert given.shape == (8, 8, 8, classes)
-    assert float(given.max()) == ROOM.sight
+    assert float(given.max()) == ROOM.observation_logit

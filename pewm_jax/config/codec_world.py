@@ -78,7 +78,8 @@ class CodecWorldConfig(Task):
         ),
     )
     INSTEAD: ClassVar[str] = (
-        "it holds a codec: name its folder by train.start of a model whose codec.kind is learned"
+        "trained a codec alone, which imagines nothing: name its folder by train.start of a model "
+        "whose codec.kind is learned"
     )
 
     clip: ClipConfig = ClipConfig(frames=2)

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
 from pewm_jax.config import Config, ConfigError, Settings, serialize
-from pewm_jax.config.migrations import RENAMED_FLAGS, kind_now
+from pewm_jax.config.migrations import RENAMED_FLAGS, RENAMED_SETTINGS, kind_now
 
 T = TypeVar("T")
 
@@ -43,11 +43,21 @@ def spelled_out(flags: Sequence[str], default: Any) -> list[str]:
         for old, new in RENAMED_FLAGS:
             if name == old or (old.endswith((".", "_")) and name.startswith(old)):
                 return f"--{new}{name.removeprefix(old)}{equals}{value}"
+        for old, new in _renamed(default.model).items():
+            if name in (old, f"model.{old}"):
+                return f"--model.{new}{equals}{value}"
         first = name.partition(".")[0]
         ours = first in short or first.removeprefix("no_") in short
         return f"--model.{name}{equals}{value}" if ours else given
 
     return [full(flag) for flag in flags]
+
+
+def _renamed(model: Any) -> dict[str, str]:
+    """Return earlier names of a world's settings, with their names now."""
+    fields = {field.name for field in dataclasses.fields(model)}
+    tables = RENAMED_SETTINGS.values()
+    return {old: new for table in tables for old, new in table.items() if new in fields}
 
 
 def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:

@@ -42,6 +42,7 @@ def upgrade(values: Values, where: str, under: Kinds | None = None) -> Values:
     for number in range(version, VERSION):
         values = MIGRATIONS[number](values, where, under or {})
         values["version"] = number + 1
+    _rename_settings(values)
     return values
 
 
@@ -105,6 +106,14 @@ def from_3(values: Values, where: str, under: Kinds) -> Values:
     return values
 
 
+def _rename_settings(values: Values) -> None:
+    """Rename settings that earlier files of the current version call otherwise, in place."""
+    model = values.get("model")
+    if isinstance(model, dict):
+        for old, new in RENAMED_SETTINGS.get(str(model.get("kind")), {}).items():
+            _move(model, old, model, new)
+
+
 def kind_now(section: str, name: Any) -> Any:
     """Return the present name of a kind that earlier versions may have called otherwise."""
     return RENAMED_KINDS.get((section, name), name) if isinstance(name, str) else name
@@ -166,6 +175,15 @@ MIGRATIONS: dict[int, Callable[[Values, str, Kinds], Values]] = {1: from_1, 2: f
 
 RENAMED_KINDS = {("reader", "attention"): "attend"}
 """Section and name of kinds in earlier versions → their names now."""
+
+RENAMED_SETTINGS = {
+    "persist": {
+        "hold": "persistence_logit",
+        "doubt": "empty_prior",
+        "sight": "observation_logit",
+    },
+}
+"""Kind of world → earlier names of its settings → their names now."""
 
 RENAMED_FLAGS = (
     ("dit.", "model.backbone."),

@@ -136,8 +136,8 @@ class NomadWorldConfig(Task):
     TRAIN: ClassVar[type[TrainSettings]] = NomadTrainConfig
     EXPORTED: ClassVar[bool] = False
     INSTEAD: ClassVar[str] = (
-        "it holds a policy: have it propose ways by pewm_jax.planning.nomad_policy, and imagine "
-        "them with a world model"
+        "trained a policy, which imagines nothing: have it propose ways by "
+        "pewm_jax.planning.nomad_policy, and imagine them with a world model"
     )
 
     clip: ClipConfig = ClipConfig(frames=24)

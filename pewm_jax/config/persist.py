@@ -110,16 +110,15 @@ class PersistConfig(ModelConfig):
     """Noise of pictures, sampler."""
     voxel_noise: Noise = part("noise", "frame_flow", per_frame=True)
     """Noise of voxel frames, sampler."""
-    hold: float = 0.0
-    """By how many nats another class must be likelier than the one that a cell has had, for it to
-    change; 0 as published. Small networks forget without it."""
-    doubt: float = 0.0
-    """By how many nats a class must be likelier than air in a cell of which nothing was known; 0 as
-    published. Small networks fill with rubble what they cannot know."""
-    sight: float = 0.0
-    """By how many nats a class is likelier that a real picture of blocks (`memory.pictures cells`)
-    shows in a cell: air before what its depth says, a surface there; 0 for not at all, as
-    published."""
+    persistence_logit: float = 0.0
+    """Nats by which another class must be likelier than the one that a cell has had before the cell
+    changes; 0 as published. Small networks forget without it."""
+    empty_prior: float = 0.0
+    """Nats by which a class must be likelier than air in a cell of which nothing was known; 0 as
+    published. Small networks fill unknown cells with clutter without it."""
+    observation_logit: float = 0.0
+    """Nats that a real picture of blocks (`memory.pictures cells`) adds to the class that it shows
+    in a cell: air before the measured depth, a surface at it; 0 as published."""
     points: bool = False
     """Whether the picture that a voxel frame is shown comes with the place of its surfaces, from
     its depth; not as published."""
@@ -171,18 +170,19 @@ class PersistConfig(ModelConfig):
                 f"model.{name}.per_frame is false, and every frame of this world has a time of its "
                 "own: use true.",
             )
-        for name in ("hold", "doubt", "sight"):
+        for name in ("persistence_logit", "empty_prior", "observation_logit"):
             value = getattr(self, name)
             require(value >= 0, f"model.{name} is {value}: use 0 or more nats.")
-        for name in ("points", "sight"):
+        for name in ("points", "observation_logit"):
             require(
                 self.clip.depth or not getattr(self, name),
                 f"model.{name} needs depth: use clip.depth true, or leave {name} out.",
             )
+        pictures = self.memory.pictures  # type: ignore[attr-defined]
         require(
-            not self.sight or self.memory.pictures == "cells",  # type: ignore[attr-defined]
-            f"model.sight is {self.sight} and memory.pictures is not cells: it reads colours of "
-            "blocks; use 0, or data of --voxels.pictures cells.",
+            not self.observation_logit or pictures == "cells",
+            f"model.observation_logit is {self.observation_logit} and memory.pictures {pictures}: "
+            "it reads colours of blocks; use 0, or data of --voxels.pictures cells.",
         )
         require(
             not self.dead_reckoning or self.control.actions == 3,

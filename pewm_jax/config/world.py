@@ -133,7 +133,8 @@ class Task(Settings):
         TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
             for each of the task's stages, named as the stage.
         TRAINS: parts that other tasks take from ``train.start`` and this one trains itself.
-        INSTEAD: what to do with a run of a task that imagines nothing, for error messages.
+        INSTEAD: what a run of a task that imagines nothing did, and what to do with it, for error
+            messages: "trained a codec alone, which imagines nothing: …".
         EXPORTED: whether ``export inference`` writes it with 16-bit weights.
         CARD: what its model card says of what it is and of its use, for tasks that are no world;
             ``{version}`` and ``{name}`` are filled in.
@@ -144,7 +145,7 @@ class Task(Settings):
     SECTION: ClassVar[str] = "world"
     TRAIN: ClassVar[type[TrainSettings]] = TrainSettings
     TRAINS: ClassVar[tuple[str, ...]] = ()
-    INSTEAD: ClassVar[str] = "use a run of a world model"
+    INSTEAD: ClassVar[str] = "imagines nothing: use a run of a world model"
     EXPORTED: ClassVar[bool] = True
     CARD: ClassVar[tuple[str, str]] = ("", "")
     clip: ClipConfig = ClipConfig()

@@ -78,7 +78,7 @@ def open_run(run: str | Path, config: Config | None = None) -> LoadedRun:
     """
     folder, home = folders(run)
     config, params = load_finished(folder, config=config)
-    require_world(config.model, f"a report of {run}")
+    require_world(config.model, f"evaluating {run}")
     return LoadedRun(folder, home, config, params, file_hash(folder / WEIGHTS))
 
 

@@ -2,8 +2,8 @@
 
 In each trial a world begins in a recorded grid. A block of one class is put on the floor in front
 of the agent, which then walks as recorded. Beside it the same walk without the block is imagined.
-What is outside of the window around the agent cannot change, and inside ``model.hold`` keeps it:
-how many frames had a part of the block in their window stands beside what stayed.
+Cells outside the window around the agent cannot change; inside, ``model.persistence_logit`` keeps
+them. The report also states how many frames had a part of the block in their window.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
 from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.types import Array, Params, WorldState
-from pewm_jax.worlds.persist import windows
+from pewm_jax.worlds.persist import state as windows
 from pewm_jax.worlds.persist import world as persist
 
 AHEAD_M = (1.25, 1.75, 2.25, 0.75)
@@ -50,7 +50,7 @@ class Trials:
         within: in how many frames a block was in the window that may change.
         frames: how many frames there were, of all walks with a block.
         asked: how many walks there were, with room for a block or without.
-        hold: ``model.hold``, nats.
+        hold: ``model.persistence_logit``, nats.
     """
 
     kept_N: np.ndarray
@@ -185,7 +185,7 @@ def run(
             meter.advance(len(some))
     shown, visible, within = (int(x) for x in seen)
     frames = steps * len(ready)
-    return Trials(np.array(kept), shown, visible, within, frames, looked, model.hold)
+    return Trials(np.array(kept), shown, visible, within, frames, looked, model.persistence_logit)
 
 
 def block_visibility(there_hw: np.ndarray, change_HW: np.ndarray) -> tuple[bool, bool]:

@@ -19,7 +19,12 @@ from pewm_jax.controls.camera import CameraConfig
 from pewm_jax.errors import require, require_positive
 from pewm_jax.models.interface import Readers
 from pewm_jax.nn import modules
-from pewm_jax.nn.tokens import TokenLayout, patchify, text_tokens, video_tokens
+from pewm_jax.nn.tokens import (
+    TokenLayout,
+    patchify,
+    text_tokens,
+    video_tokens,
+)
 from pewm_jax.readers.geometry import Sightings, patch_pixels, sightings, sinusoid_3d
 from pewm_jax.readers.memory_block import MemoryBlock
 from pewm_jax.types import Array, Camera, MemoryReadout, Params

@@ -62,9 +62,7 @@ def require_world(model: Task, who: str) -> World:
         UserError: it is a training task alone.
     """
     if not isinstance(model, World):
-        raise UserError(
-            f"{who} needs a world model, and this run imagines nothing: {model.INSTEAD}."
-        )
+        raise UserError(f"{who} got a run that {model.INSTEAD}.")
     return model
 
 

@@ -34,8 +34,8 @@ ROOT = HERE.parents[1]
 FILES = {"keyframes": ROOT / "examples" / "world.py", "odd-1": HERE / "odd_world.py"}
 SIZE = ["--clip.height", "16", "--clip.width", "16"]
 SHORT = {
-    "keyframes": ["--data.context", "6", "--train.fit.steps", "40", "--train.fit.batch", "4"],
-    "odd-1": ["--Lambda", "0.25", "--no_bias", "--steps", "4", "--train.then_2.steps", "34"],
+    "keyframes": ["--data.context", "6", "--train.fit.steps", "400", "--train.fit.batch", "4"],
+    "odd-1": ["--Lambda", "0.25", "--no_bias", "--steps", "4", "--train.then_2.steps", "400"],
 }
 REPORT = ["--evaluate.clips", "2", "--evaluate.videos", "1", "--evaluate.video_clips", "2"]
 QUICK = ["--lpips", "off", "--fvd", "off", "--scs", "off", "--mirror", "0", "--batch", "2"]
@@ -82,12 +82,14 @@ def trained(request, data, tmp_path_factory):
         "--train.preview_every",
         "0",
         "--train.save_every",
-        "2",
+        "20",
     ]
     killed = command(folder, *words)
     until = time.monotonic() + 300
-    while not list(folder.glob("run/checkpoints/*/[0-9]*")) and time.monotonic() < until:
-        time.sleep(0.05)
+    while not any(path.name.isdigit() for path in folder.glob("run/checkpoints/*/*")):
+        assert time.monotonic() < until
+        assert killed.poll() is None
+        time.sleep(0.02)
     killed.send_signal(signal.SIGKILL)
     killed.communicate()
     assert not (folder / "run" / "weights.safetensors").exists()

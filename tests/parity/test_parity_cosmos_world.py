@@ -22,7 +22,8 @@ from pewm_jax.convert.options import ImportCosmos2
 from pewm_jax.io import tree
 from pewm_jax.train import loading
 from pewm_jax.types import Camera, Control, Frames
-from pewm_jax.worlds import sampling, world_model
+from pewm_jax.worlds import world_model
+from pewm_jax.worlds import world_model as sampling
 from tests.convert.convert_pipelines import save_text
 from tests.helpers import random_frames
 from tests.parity.cosmos_references import channels_first, channels_last, small_pipeline

@@ -27,7 +27,7 @@ from pewm_jax.planning.ranking import rank, rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig, RandomShooting
 from pewm_jax.readers.render import RenderConfig
 from pewm_jax.types import Camera, Frames
-from pewm_jax.worlds.pewm import views as pewm_views
+from pewm_jax.worlds.pewm import candidates as pewm_views
 from tests.compiled import counted
 from tests.helpers import init_world, random_frames, randomise
 

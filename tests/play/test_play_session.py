@@ -238,7 +238,9 @@ def test_a_world_of_blocks_does_not_begin_with_surfaces():
     with pytest.raises(UserError, match="knows pictures of blocks"):
         places.require_shown(PERSIST, Start())
     surfaces = dataclasses.replace(PERSIST.memory, pictures="surfaces")
-    places.require_shown(dataclasses.replace(PERSIST, memory=surfaces, sight=0.0), Start())
+    places.require_shown(
+        dataclasses.replace(PERSIST, memory=surfaces, observation_logit=0.0), Start()
+    )
 
 
 def test_a_drive_begins_with_a_recording_of_another_shape(tmp_path):

@@ -19,7 +19,8 @@ from pewm_jax.memory import interface as memories
 from pewm_jax.readers.both import BothConfig
 from pewm_jax.train import flops
 from pewm_jax.types import EncodedView, MapTokens, MemoryReadout, View
-from pewm_jax.worlds import chained, objective, world_model
+from pewm_jax.worlds import objective, world_model
+from pewm_jax.worlds import objective as chained
 from tests.helpers import TINY, init_world, randomise, tiny_config
 
 BATCH, SLOTS = 4, 5

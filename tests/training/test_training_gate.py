@@ -30,7 +30,7 @@ from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.render import RenderConfig
 from pewm_jax.train import loop, stages
 from pewm_jax.types import Frames
-from pewm_jax.worlds import codec_gate
+from pewm_jax.worlds import codec as codec_gate
 from pewm_jax.worlds.rollouts import load_finished
 from tests.helpers import TINY, init_world, random_camera, randomise, tiny_config
 

@@ -22,8 +22,8 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import EgoWMConfig, EgoWMTrainConfig, TrainSettings
 from pewm_jax.types import Array, Clip, Control, Frames, Params, WorldState
-from pewm_jax.worlds import chunks, objective, sampling, world_model
-from pewm_jax.worlds.control import control_of
+from pewm_jax.worlds import objective, world_model
+from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
 from pewm_jax.worlds.pewm import world as pewm
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -100,20 +100,20 @@ def imagine(
     del memory
     asked = control_of(model, state.frame.camera, control)
     count = asked.camera.world_from_camera.shape[0]
-    chunked, wanted = chunks.cut(asked, model.clip.frames - model.history)
+    chunked, wanted = cut_into_clips(asked, model.clip.frames - model.history)
     keys = jax.random.split(key, chunked.camera.world_from_camera.shape[0])
 
     def step(past: Frames, inputs: tuple[Control, Array, Array | None]) -> tuple[Frames, Frames]:
         chunk, chunk_key, valid = inputs
         frames = imagine_chunk(model, params, past, chunk, chunk_key)
         seen = None if valid is None else valid.sum() + model.history
-        return chunks.last(_behind(past, frames), seen, model.history), frames
+        return last_frames(_behind(past, frames), seen, model.history), frames
 
     past, frames = jax.lax.scan(step, _behind(state.map, state.frame), (chunked, keys, wanted))
     after = _state(model, past)
     if not remember:
         after = WorldState(after.frame, state.map)
-    return after, chunks.joined(frames, count)
+    return after, join_clips(frames, count)
 
 
 def imagine_chunk(
@@ -156,7 +156,7 @@ def imagine_chunk(
     blind = None
     if model.noise.guidance != 1:
         blind = world_model.blind(model, params, given, np.ones((1,), bool))
-    latents = sampling.draw(model, params, given, None, key, blind=blind)
+    latents = world_model.draw(model, params, given, None, key, blind=blind)
     rgb, depth = rgbd.decode_rgbd(model, params, latents)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     return Frames(rgb[0, model.history :], depth[0, model.history :], control.camera)

@@ -19,8 +19,9 @@ from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
 from pewm_jax.types import Array, Camera, Clip, Params
-from pewm_jax.worlds.persist import losses, windows
-from pewm_jax.worlds.persist.pictures import drawn
+from pewm_jax.worlds.persist import losses
+from pewm_jax.worlds.persist import state as grid_state
+from pewm_jax.worlds.persist.step import drawn
 
 
 def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
@@ -37,16 +38,16 @@ def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
         UserError: the data have no voxels, no actions, or grids of another size.
     """
     require_recorded(model, clip)
-    size = windows.cell_m(model)
+    size = grid_state.cell_m(model)
     origin = jnp.asarray(clip.extras["origin_T3"])
     first = jnp.floor(origin[:, :1] / size + 1e-3).astype(jnp.int32)
     recorded = first + jnp.round((origin - origin[:, :1]) / size).astype(jnp.int32)
     place = jnp.asarray(clip.frames.camera.world_from_camera)[..., :3, 3]
     agent = recorded + jnp.floor((place - origin) / size).astype(jnp.int32)
-    wide, token = windows.side(model), model.backbone.token_cells  # type: ignore[attr-defined]
+    wide, token = grid_state.side(model), model.backbone.token_cells  # type: ignore[attr-defined]
     shift = _mixed(agent[:, :1]) % token
     recorded, agent = recorded + shift, agent + shift
-    start = windows.snapped(agent - wide // 2, token)
+    start = grid_state.snapped(agent - wide // 2, token)
     beside = (model.memory.recorded - wide) // 2  # type: ignore[attr-defined]
     return recorded, start.at[..., 2].set(recorded[..., 2] + beside)
 
@@ -63,17 +64,19 @@ def _mixed(cell_BT3: Array) -> Array:
 def cut(model: PersistConfig, clip: Clip, start_BT3: Array, recorded_BT3: Array) -> Array:
     """Return (B, T, X, Y, Z) int16 windows of the recorded grids, unknown where they reach out."""
     classes = jnp.asarray(clip.extras["classes_TXYZ"]).astype(jnp.int16)
-    one = functools.partial(windows.cut, count=windows.side(model))
+    one = functools.partial(grid_state.cut, count=grid_state.side(model))
     return jax.vmap(jax.vmap(one))(classes, start_BT3 - recorded_BT3)
 
 
-def pictures(model: PersistConfig, params: Params, clip: Clip) -> tuple[Array, windows.Shown]:
+def pictures(
+    model: PersistConfig, params: Params, clip: Clip
+) -> tuple[Array, grid_state.ShownPicture]:
     """Return (B, T, h, w, C) latents of the frames, and the same as voxel frames are shown them."""
     frames = as_signal(clip.frames)
     latents = rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
     latents = latents[..., : model.picture_channels]
     camera = jax.tree.map(jnp.asarray, frames.camera)
-    return latents, windows.shown_of(latents, jnp.asarray(frames.depth_THW), camera)
+    return latents, grid_state.shown_of(latents, jnp.asarray(frames.depth_THW), camera)
 
 
 def grids(model: PersistConfig, params: Params, clip: Clip) -> Clip:
@@ -100,23 +103,23 @@ def frames(model: PersistConfig, params: Params, clip: Clip) -> Clip:
 
     latents = jax.lax.map(encode, flat)
     latents = latents.reshape(*shape, *latents.shape[1:])
-    recorded_too = jax.vmap(jax.vmap(functools.partial(windows.known_latents, model)))(classes)
-    token, wide = model.backbone.token_cells, windows.side(model)  # type: ignore[attr-defined]
+    recorded_too = jax.vmap(jax.vmap(functools.partial(grid_state.known_latents, model)))(classes)
+    token, wide = model.backbone.token_cells, grid_state.side(model)  # type: ignore[attr-defined]
     at = last[..., None] + jnp.arange(0, wide, token)  # (B, T, 3, tokens)
     inside = (at >= start[..., None]) & (at < start[..., None] + wide)
     x, y, z = jnp.moveaxis(inside, 2, 0)
     own = x[..., :, None, None] & y[..., None, :, None] & z[..., None, None, :]
     patch = model.backbone.world_frames.patch  # type: ignore[attr-defined]
-    known = windows.spread(own, patch) & recorded_too
+    known = grid_state.spread(own, patch) & recorded_too
 
-    corner = jnp.asarray(clip.extras["origin_T3"]) - recorded * windows.cell_m(model)
-    middle = windows.middle(model, corner, last)
+    corner = jnp.asarray(clip.extras["origin_T3"]) - recorded * grid_state.cell_m(model)
+    middle = grid_state.middle(model, corner, last)
     _, shown = pictures(model, params, clip)
-    told = windows.told(model, shown, middle)
+    channels = grid_state.picture_channels(model, shown, middle)
     camera = camera_numbers(shown.camera, model.clip.width, middle)
     made = {
         "latents": latents.astype(jnp.float16),
-        "told": told.astype(jnp.float16),
+        "told": channels.astype(jnp.float16),
         "camera": camera,
         "actions": losses.led_to(clip.actions_TA),
         "known": known,
@@ -139,12 +142,12 @@ def cameras(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     """Return the voxels around where the camera was before each frame, and the cameras."""
     del params
     recorded, _ = lattice(model, clip)
-    size, config = windows.cell_m(model), model.backbone.camera_model  # type: ignore[attr-defined]
+    size, config = grid_state.cell_m(model), model.backbone.camera_model  # type: ignore[attr-defined]
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     place, origin = camera.world_from_camera[..., :3, 3], jnp.asarray(clip.extras["origin_T3"])
     cell = jnp.floor((place - origin) / size).astype(jnp.int32)
     before = losses.previous(recorded + cell)
-    one = functools.partial(windows.cut, count=config.inner)
+    one = functools.partial(grid_state.cut, count=config.inner)
     classes = jnp.asarray(clip.extras["classes_TXYZ"]).astype(jnp.int16)
     inner = jax.vmap(jax.vmap(one))(classes, before - config.inner // 2 - recorded)
     made = {
@@ -160,7 +163,7 @@ def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     """Return latents of the pictures, and what their rays meet in the true voxels."""
     recorded, start = lattice(model, clip)
     classes = jnp.maximum(cut(model, clip, start, recorded), 0)
-    size = windows.cell_m(model)
+    size = grid_state.cell_m(model)
     corner = jnp.asarray(clip.extras["origin_T3"]) + (start - recorded) * size
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     pixels = (model.clip.height, model.clip.width)
@@ -195,7 +198,7 @@ def require_recorded(model: PersistConfig, clip: Clip) -> None:
     memory, classes = model.memory, clip.extras.get("classes_TXYZ")
     groups = f"--voxels.kinds {memory.kinds} --voxels.colours {memory.colours}"  # type: ignore[attr-defined]
     command = (
-        f"pewm-jax data collect DATA --moving --voxels --voxels.cell {windows.cell_m(model):g} "
+        f"pewm-jax data collect DATA --moving --voxels --voxels.cell {grid_state.cell_m(model):g} "
         f"--voxels.side {memory.recorded} {groups} --voxels.pictures {memory.pictures}"  # type: ignore[attr-defined]
     )
     if classes is None or clip.actions_TA is None:

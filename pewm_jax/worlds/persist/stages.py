@@ -17,10 +17,8 @@ from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import nets as persist_nets
 from pewm_jax.models.persist import voxel_vae
 from pewm_jax.types import Array, Clip, Params
-from pewm_jax.worlds.persist import classes as persist_classes
-from pewm_jax.worlds.persist import losses
-from pewm_jax.worlds.persist import prepare as persist_prepare
-from pewm_jax.worlds.persist.pictures import reckoning
+from pewm_jax.worlds.persist import losses, prepare
+from pewm_jax.worlds.persist.step import reckoning
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 Measured = dict[str, Array]
@@ -53,7 +51,7 @@ def autoencode(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``voxel_vae``."""
     del train
-    grids: Any = _of(persist_prepare.grids, model, params, clip)
+    grids: Any = _of(prepare.grids, model, params, clip)
     config = model.backbone.voxel_vae  # type: ignore[attr-defined]
     dtype = jnp.dtype(model.dtype)
     return losses.voxel_vae(config, params["voxel_vae"], grids.astype(jnp.int32), key, dtype)
@@ -64,7 +62,7 @@ def distribute(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``voxel_statistics``: least at mean 0 and variance 1 of latents."""
     del train, key
-    grids: Any = _of(persist_prepare.grids, model, params, clip)
+    grids: Any = _of(prepare.grids, model, params, clip)
     config, weights = model.backbone.voxel_vae, params["voxel_vae"]  # type: ignore[attr-defined]
     grids = grids.reshape(-1, *grids.shape[2:]).astype(jnp.int32)
     mean, _ = voxel_vae.moments(config, weights, grids, jnp.dtype(model.dtype))
@@ -82,13 +80,13 @@ def world_frames(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``world_frames``."""
     assert isinstance(train, PersistTrainConfig)
-    made = _of(persist_prepare.frames, model, params, clip)
+    made = _of(prepare.frames, model, params, clip)
     config = model.backbone.world_frames  # type: ignore[attr-defined]
 
     def compare(x0: Array, weight: Array, key: Array) -> tuple[Array, Array]:
         vae, cells = model.backbone.voxel_vae, made["classes"]  # type: ignore[attr-defined]
         frozen = params["voxel_vae"]
-        error, right = persist_classes.compared(vae, frozen, x0, cells, weight, train.compared, key)
+        error, right = losses.compared(vae, frozen, x0, cells, weight, train.compared, key)
         return train.classes * error, right
 
     return losses.world_frames(
@@ -113,7 +111,7 @@ def camera(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``camera``."""
     del train, key
-    made = _of(persist_prepare.cameras, model, params, clip)
+    made = _of(prepare.cameras, model, params, clip)
     return losses.camera(
         model.backbone.camera_model,  # type: ignore[attr-defined]
         params["camera_model"],
@@ -132,7 +130,7 @@ def renderer(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``renderer``."""
     del train
-    made = _of(persist_prepare.layers, model, params, clip)
+    made = _of(prepare.layers, model, params, clip)
     config = model.backbone.renderer  # type: ignore[attr-defined]
     layers = RayHits(
         made["ids"].astype(jnp.int32),
@@ -170,11 +168,11 @@ def _stage(
 
 _WEIGHTS = r"voxel_vae/(encoder|decoder)/.*"
 STAGES = (
-    _stage(1, "voxel_vae", _WEIGHTS, 1, autoencode, persist_prepare.grids),
-    _stage(2, "voxel_statistics", STATISTICS, 1, distribute, persist_prepare.grids),
-    _stage(3, "world_frames", r"voxel_dit/.*", 2, world_frames, persist_prepare.frames),
-    _stage(4, "camera", r"camera_model/.*", 3, camera, persist_prepare.cameras),
-    _stage(5, "renderer", r"renderer/.*", 4, renderer, persist_prepare.layers),
+    _stage(1, "voxel_vae", _WEIGHTS, 1, autoencode, prepare.grids),
+    _stage(2, "voxel_statistics", STATISTICS, 1, distribute, prepare.grids),
+    _stage(3, "world_frames", r"voxel_dit/.*", 2, world_frames, prepare.frames),
+    _stage(4, "camera", r"camera_model/.*", 3, camera, prepare.cameras),
+    _stage(5, "renderer", r"renderer/.*", 4, renderer, prepare.layers),
 )
 """The stages, in order. The codec of pictures is given (``train.start``): the world ``codec``
 trains it."""

@@ -11,15 +11,168 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import PersistConfig
+from pewm_jax.geometry.actions import (
+    CAMERA_STEP_NUMBERS,
+    camera_numbers,
+    follow_camera_steps,
+    step_pose,
+)
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer
+from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.types import Array, Camera, Frames, Params
-from pewm_jax.worlds.persist import pictures as persist_pictures
-from pewm_jax.worlds.persist import sight as persist_sight
-from pewm_jax.worlds.persist import voxels as persist_voxels
-from pewm_jax.worlds.persist import windows
-from pewm_jax.worlds.persist.past import Given, History, Past, decoded, encoded
-from pewm_jax.worlds.persist.sight import ObservedCells
+from pewm_jax.worlds.persist import state as grid_state
+from pewm_jax.worlds.persist import voxel_frames
+from pewm_jax.worlds.persist.state import History, KnownFrame, Past, context, decoded, encoded
+from pewm_jax.worlds.persist.voxel_frames import ObservedCells
+
+
+def reckoned(model: PersistConfig, here: Camera, action_A: Array) -> Camera:
+    """Return about where an action leads, to lay the window there: planar ones alone say."""
+    if model.control.actions != 3:
+        return here
+    return Camera(here.intrinsics_4, step_pose(here.world_from_camera, action_A))
+
+
+def reckoning(model: PersistConfig, actions_A: Array) -> Array:
+    """Return the steps (..., 6) to which the camera model adds what it says."""
+    if not model.dead_reckoning:
+        return jnp.zeros((*actions_A.shape[:-1], CAMERA_STEP_NUMBERS))
+    dx, dy, turn = jnp.moveaxis(actions_A, -1, 0)
+    still = jnp.zeros_like(dx)
+    return jnp.stack([dx, dy, still, still, turn, still], -1)
+
+
+def next_camera(
+    model: PersistConfig,
+    params: Params,
+    classes_XYZ: Array,
+    low_3: Array,
+    here: Camera,
+    action_A: Array,
+    cache: FrameCache,
+) -> tuple[Camera, FrameCache]:
+    """Return where the camera goes, given the voxels around where it is."""
+    config = model.backbone.camera_model  # type: ignore[attr-defined]
+    place, size = here.world_from_camera[:3, 3], grid_state.cell_m(model)
+    cell = jnp.floor((place - low_3) / size).astype(jnp.int32)
+    inner = grid_state.cut(classes_XYZ, cell - config.inner // 2, config.inner)
+    seen = camera_numbers(here, model.clip.width, low_3 + cell * size)
+    made, cache = camera_model.apply(
+        config,
+        params["camera_model"],
+        jnp.maximum(inner, 0).astype(jnp.int32)[None, None],
+        seen[None, None],
+        action_A[None, None],
+        dtype=jnp.dtype(model.dtype),
+        cache=cache,
+    )  # type: ignore[assignment]
+    change = made[0, 0] + reckoning(model, action_A)
+    return follow_camera_steps(here, change, model.clip.width), cache
+
+
+def features(
+    model: PersistConfig,
+    params: Params,
+    classes_XYZ: Array,
+    low_3: Array,
+    start_3: Array,
+    camera: Camera,
+) -> Array:
+    """Return what the camera sees of a window, (1, 1, h, w, F); no gradient goes through rays."""
+    config = model.backbone.renderer  # type: ignore[attr-defined]
+    camera = jax.lax.stop_gradient(camera)
+    corner = low_3 + start_3 * grid_state.cell_m(model)
+    layers = voxel_renderer.cast_rays(
+        config,
+        jnp.maximum(classes_XYZ, 0)[None],
+        corner[None],
+        grid_state.cell_m(model),
+        jax.tree.map(lambda x: x[None], camera),
+        (model.clip.height, model.clip.width),
+    )
+    colours = None
+    if config.drawn:
+        colours = drawn(model, params, classes_XYZ, corner, camera)[None]
+    dtype = jnp.dtype(model.dtype)
+    return voxel_renderer.features(config, params["renderer"], layers, dtype, drawn_hwC=colours)[
+        None
+    ]
+
+
+def drawn(
+    model: PersistConfig, params: Params, classes_XYZ: Array, corner_3: Array, camera: Camera
+) -> Array:
+    """Return latents (h, w, C) of a window drawn in the colours of its classes, without light.
+
+    Args:
+        model: the model.
+        params: gives the codec.
+        classes_XYZ: the window's cells.
+        corner_3: its lowest corner, metres.
+        camera: one camera.
+    """
+    cells = ClassGrid(classes_XYZ, corner_3)
+    one = jax.tree.map(lambda x: x[None], camera)
+    view = model.memory.render(model, cells, one, model.clip.height, model.clip.width)
+    return encoded(model, params, view.features_THWF[0], view.depth_THW[0])
+
+
+def sample(
+    model: PersistConfig,
+    params: Params,
+    features: Array,
+    action_A: Array,
+    cache: FrameCache,
+    key: Array,
+) -> Array:
+    """Sample the latents (h, w, C) of a picture of the voxels."""
+    config, noise = model.backbone.renderer, model.noise  # type: ignore[attr-defined]
+    shape = (1, 1, config.height, config.width, config.latent_channels)
+
+    def denoise(x: Array, time_B: Array, weight: Array) -> Array:
+        del weight
+        times = time_B[:, None]
+        made, _ = _render(model, params, x, times, features, action_A, cache)
+        return noise.to_x0(made.astype(jnp.float32), x, times)
+
+    return noise.sample(denoise, jax.random.normal(key, shape))[0, 0]
+
+
+def remembered(
+    model: PersistConfig,
+    params: Params,
+    latents_hwC: Array,
+    features: Array,
+    action_A: Array,
+    cache: FrameCache,
+    key: Array,
+) -> FrameCache:
+    """Add a picture to the renderer's cache."""
+    x, times = context(model.noise, latents_hwC[None, None], key)
+    return _render(model, params, x, times, features, action_A, cache)[1]
+
+
+def _render(
+    model: PersistConfig,
+    params: Params,
+    x: Array,
+    times_BT: Array,
+    features: Array,
+    action_A: Array,
+    cache: FrameCache,
+) -> tuple[Array, FrameCache]:
+    config, noise = model.backbone.renderer, model.noise  # type: ignore[attr-defined]
+    inputs, network_times = noise.precondition(x, times_BT)
+    return voxel_renderer.apply(
+        config,
+        params["renderer"],
+        inputs.astype(jnp.dtype(model.dtype)),
+        network_times,
+        features,
+        actions_BTA=action_A[None, None] if config.actions else None,
+        cache=cache,
+    )  # type: ignore[return-value]
 
 
 def begin(
@@ -39,14 +192,14 @@ def begin(
         grid: what is known of the world.
         frame: (1,) the first frame, colours in [−1, 1].
         key: randomness of w₀.
-        real: whether the frame is real, and shows what is there (``model.sight``).
+        real: whether the frame is real, and shows what is there (``model.observation_logit``).
     """
     camera = jax.tree.map(lambda x: x[0], frame.camera)
     latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
-    shown = windows.shown_of(latents, frame.depth_THW[0], camera)
+    shown = grid_state.shown_of(latents, frame.depth_THW[0], camera)
     nets = model.backbone
     dtype = jnp.dtype(model.dtype)
-    start = windows.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
+    start = grid_state.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
     history = History(
         voxel_dit.empty_cache(nets.world_frames, 1, dtype),  # type: ignore[attr-defined]
         camera_model.empty_cache(nets.camera_model, 1, dtype),  # type: ignore[attr-defined]
@@ -56,18 +209,18 @@ def begin(
         start,
     )
     voxel_key, picture_key = jax.random.split(key)
-    before = windows.window(model, grid.classes_XYZ, start)
-    middle = windows.middle(model, grid.low_3, start)
+    before = grid_state.window(model, grid.classes_XYZ, start)
+    middle = grid_state.middle(model, grid.low_3, start)
     sight = None
     if real:
         sight = _sight(model, grid, start, frame.rgb_THWC[0], frame.depth_THW[0], camera)
-    made = persist_voxels.sample(
+    made = voxel_frames.sample(
         model, params, history, history.voxels, middle, before, voxel_key, sight
     )
     classes = jnp.where(before >= 0, before, made)  # a known grid is not changed by its picture
-    everything = windows.written(grid.classes_XYZ, classes, start)
-    seen = persist_pictures.features(model, params, classes, grid.low_3, start, camera)
-    pictures = persist_pictures.remembered(
+    everything = grid_state.written(grid.classes_XYZ, classes, start)
+    seen = features(model, params, classes, grid.low_3, start, camera)
+    pictures = remembered(
         model, params, latents, seen, history.action_A, history.pictures, picture_key
     )
     history = dataclasses.replace(history, pictures=pictures)
@@ -80,7 +233,7 @@ def step(
     past: Past,
     action_A: Array,
     key: Array,
-    given: Given | None = None,
+    known: KnownFrame | None = None,
 ) -> tuple[Past, Frames]:
     """Carry the world on by one frame.
 
@@ -90,52 +243,50 @@ def step(
         past: the world so far.
         action_A: the action that leads to the frame.
         key: randomness.
-        given: what is known of the frame.
+        known: what is known of the frame.
 
     Returns:
         The world after it, and the frame, (1,).
     """
-    given = Given() if given is None else given
+    known = KnownFrame() if known is None else known
     grid, history, here = past.grid, past.grid.history, past.shown.camera
     keys = jax.random.split(key, 4)
-    camera = given.camera
+    camera = known.camera
     if camera is None:
-        camera = persist_pictures.reckoned(model, here, action_A)
-    start = given.start_3
+        camera = reckoned(model, here, action_A)
+    start = known.start_3
     if start is None:
-        start = windows.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
-    middle = windows.middle(model, grid.low_3, start)
-    before = windows.window(model, grid.classes_XYZ, start)
-    cache = windows.moved(model, history.voxels, history.start_3, start)
-    cache = persist_voxels.taken_in(model, params, history, cache, middle, before, keys[0])
+        start = grid_state.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
+    middle = grid_state.middle(model, grid.low_3, start)
+    before = grid_state.window(model, grid.classes_XYZ, start)
+    cache = grid_state.moved(model, history.voxels, history.start_3, start)
+    cache = voxel_frames.taken_in(model, params, history, cache, middle, before, keys[0])
     now = dataclasses.replace(history, action_A=action_A, shown=past.shown)
-    classes = given.classes_XYZ
+    classes = known.classes_XYZ
     if classes is None:
         sight = None
-        if given.rgb_HWC is not None and given.depth_HW is not None:
-            sight = _sight(model, grid, start, given.rgb_HWC, given.depth_HW, camera)
-        classes = persist_voxels.sample(model, params, now, cache, middle, before, keys[1], sight)
-    everything = windows.written(grid.classes_XYZ, classes, start)
-    made, cameras = persist_pictures.next_camera(
+        if known.rgb_HWC is not None and known.depth_HW is not None:
+            sight = _sight(model, grid, start, known.rgb_HWC, known.depth_HW, camera)
+        classes = voxel_frames.sample(model, params, now, cache, middle, before, keys[1], sight)
+    everything = grid_state.written(grid.classes_XYZ, classes, start)
+    made, cameras = next_camera(
         model, params, everything, grid.low_3, here, action_A, history.cameras
     )
-    camera = made if given.camera is None else camera
-    seen = persist_pictures.features(model, params, classes, grid.low_3, start, camera)
-    if given.rgb_HWC is None:
-        latents = persist_pictures.sample(model, params, seen, action_A, history.pictures, keys[2])
+    camera = made if known.camera is None else camera
+    seen = features(model, params, classes, grid.low_3, start, camera)
+    if known.rgb_HWC is None:
+        latents = sample(model, params, seen, action_A, history.pictures, keys[2])
         rgb, depth = decoded(model, params, latents)
     else:
-        rgb, depth = given.rgb_HWC, given.depth_HW
+        rgb, depth = known.rgb_HWC, known.depth_HW
         latents = encoded(model, params, rgb, depth)
-    pictures = persist_pictures.remembered(
-        model, params, latents, seen, action_A, history.pictures, keys[3]
-    )
+    pictures = remembered(model, params, latents, seen, action_A, history.pictures, keys[3])
     history = dataclasses.replace(
         now, voxels=cache, cameras=cameras, pictures=pictures, start_3=start
     )
     after = Past(
         ClassGrid(everything, grid.low_3, history),
-        windows.shown_of(latents, depth, camera),
+        grid_state.shown_of(latents, depth, camera),
     )
     one = jax.tree.map(lambda x: x[None], (rgb, depth, camera))
     return after, Frames(*one)
@@ -150,7 +301,7 @@ def _sight(
     camera: Camera,
 ) -> ObservedCells | None:
     """Return what a real picture shows of the window's cells, where the model looks."""
-    if not model.sight:
+    if not model.observation_logit:
         return None
-    corner = grid.low_3 + start_3 * windows.cell_m(model)
-    return persist_sight.seen(model, corner, rgb_HWC, depth_HW, camera)
+    corner = grid.low_3 + start_3 * grid_state.cell_m(model)
+    return voxel_frames.seen(model, corner, rgb_HWC, depth_HW, camera)

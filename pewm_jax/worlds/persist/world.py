@@ -28,8 +28,8 @@ from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds import checks
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.persist import stages as persist_stages
-from pewm_jax.worlds.persist import windows
-from pewm_jax.worlds.persist.past import Given, Past, encoded
+from pewm_jax.worlds.persist import state as grid_state
+from pewm_jax.worlds.persist.state import KnownFrame, Past, encoded
 from pewm_jax.worlds.persist.step import begin, step
 from pewm_jax.worlds.pewm import world as pewm
 from pewm_jax.worlds.stages import Stage
@@ -118,7 +118,7 @@ def _start_in(
         )
     params, frames = _arrays(params, as_signal(frames))
     empty = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
-    size, origin = windows.cell_m(model), jnp.asarray(origin_3, jnp.float32)
+    size, origin = grid_state.cell_m(model), jnp.asarray(origin_3, jnp.float32)
     # The world's cells are laid where the given ones are, and their heights where those are.
     off = jnp.round((empty.low_3 - origin) / size)
     low = origin + off * size
@@ -156,8 +156,8 @@ def imagine(
 
     def one(past: Past, inputs: tuple[Array, Camera, Array]) -> tuple[Past, Frames]:
         action, camera, frame_key = inputs
-        given = None if steered else Given(camera=camera)
-        return step(model, params, past, action, frame_key, given)
+        known = None if steered else KnownFrame(camera=camera)
+        return step(model, params, past, action, frame_key, known)
 
     keys = jax.random.split(key, asked.camera.intrinsics_4.shape[0])
     after, frames = jax.lax.scan(one, past, (asked.actions_TA, asked.camera, keys))
@@ -211,15 +211,15 @@ def render_true(
     params = _arrays(params)[0]
     asked, _ = _asked(model, state.frame.camera, control)
     past = past_of(model, params, state)
-    size, low = windows.cell_m(model), state.map.low_3
+    size, low = grid_state.cell_m(model), state.map.low_3
 
     def one(past: Past, inputs: Any) -> tuple[Past, Frames]:
         action, camera, classes, origin, frame_key = inputs
-        first = windows.first_cell(model, low, camera.world_from_camera[:3, 3])
+        first = grid_state.first_cell(model, low, camera.world_from_camera[:3, 3])
         recorded = jnp.round((origin - low) / size).astype(jnp.int32)
-        grid = windows.cut(classes.astype(jnp.int16), first - recorded, windows.side(model))
-        given = Given(camera=camera, classes_XYZ=grid, start_3=first)
-        return step(model, params, past, action, frame_key, given)
+        grid = grid_state.cut(classes.astype(jnp.int16), first - recorded, grid_state.side(model))
+        known = KnownFrame(camera=camera, classes_XYZ=grid, start_3=first)
+        return step(model, params, past, action, frame_key, known)
 
     keys = jax.random.split(key, asked.camera.intrinsics_4.shape[0])
     inputs = (asked.actions_TA, asked.camera, jnp.asarray(classes_TXYZ), origin_T3, keys)
@@ -233,7 +233,7 @@ def past_of(model: PersistConfig, params: Params, state: WorldState) -> Past:
     frame = state.frame
     latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
     camera = jax.tree.map(lambda x: x[0], frame.camera)
-    return Past(state.map, windows.shown_of(latents, frame.depth_THW[0], camera))
+    return Past(state.map, grid_state.shown_of(latents, frame.depth_THW[0], camera))
 
 
 def _arrays(*trees: Any) -> Any:
@@ -271,8 +271,8 @@ def _observed(model: PersistConfig, params: Params, past: Past, frames: Frames) 
 
     def one(past: Past, inputs: tuple[Frames, Array, Array]) -> tuple[Past, None]:
         frame, action, key = inputs
-        given = Given(frame.camera, frame.rgb_THWC, frame.depth_THW)
-        return step(model, params, past, action, key, given)[0], None
+        known = KnownFrame(frame.camera, frame.rgb_THWC, frame.depth_THW)
+        return step(model, params, past, action, key, known)[0], None
 
     past, _ = jax.lax.scan(one, past, (frames, actions, keys))
     return WorldState(jax.tree.map(lambda x: x[-1:], frames), past.grid)

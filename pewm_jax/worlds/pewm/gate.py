@@ -20,7 +20,8 @@ from pewm_jax.memory import interface as memories
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.types import Array, Clip, Control, Frames, Params
-from pewm_jax.worlds import codec_gate, objective, sampling, world_model
+from pewm_jax.worlds import codec as codec_task
+from pewm_jax.worlds import objective, world_model
 
 
 def require_gate(model: ModelConfig) -> None:
@@ -54,7 +55,9 @@ def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
     key = jax.random.fold_in(jax.random.key(0), clip.frames.rgb_THWC.astype(jnp.uint32).sum())
     shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
     noise = jax.random.normal(key, shape)
-    latents = sampling.sample(model, params, conditioning, sight, noise, jax.random.fold_in(key, 1))
+    latents = world_model.sample(
+        model, params, conditioning, sight, noise, jax.random.fold_in(key, 1)
+    )
     emptied = dataclasses.replace(
         clip,
         context=jax.tree.map(lambda x: x[:, :0], clip.context),
@@ -66,7 +69,7 @@ def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
 def loss(
     model: ModelConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of the gate on imagined frames; see ``codec_gate.score``."""
+    """Return the loss of the gate on imagined frames; see ``codec_task.score``."""
     assert isinstance(train, TrainConfig)
     del key
     if "latents_thwC" not in clip.extras:
@@ -82,7 +85,7 @@ def loss(
         frames.depth_THW[:, 1:],
         jax.tree.map(lambda x: x[:, 1:], frames.camera),
     )
-    return codec_gate.score(
+    return codec_task.score(
         model,
         params["codec"]["gate"],
         rgb[:, 1:],
@@ -103,7 +106,7 @@ def perceptual(model: ModelConfig, train: TrainSettings) -> Params | None:
     assert isinstance(train, TrainConfig)
     if not train.gate_lpips:
         return None
-    file = lpips_weights.find(codec_gate.LPIPS)
-    found = {"lpips": lpips_weights.read(file, codec_gate.LPIPS)[1]}
-    lpips.require_size(codec_gate.LPIPS, model.clip.height, model.clip.width)
+    file = lpips_weights.find(codec_task.LPIPS)
+    found = {"lpips": lpips_weights.read(file, codec_task.LPIPS)[1]}
+    lpips.require_size(codec_task.LPIPS, model.clip.height, model.clip.width)
     return found

@@ -22,18 +22,17 @@ from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import interface as memories
 from pewm_jax.memory import rendering as memory_views
 from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, WorldState
-from pewm_jax.worlds import chunks, objective, sampling, world_model
-from pewm_jax.worlds.control import control_of
+from pewm_jax.worlds import objective, world_model
+from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
+from pewm_jax.worlds.pewm import candidates
 from pewm_jax.worlds.pewm import gate as pewm_gate
-from pewm_jax.worlds.pewm import many as pewm_many
-from pewm_jax.worlds.pewm import views as pewm_views
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 init = world_model.init
-sample = sampling.sample
-imagine_many = pewm_many.imagine_many
-to_compare = pewm_many.to_compare
-views = pewm_views.views
+sample = world_model.sample
+imagine_many = candidates.imagine_many
+to_compare = candidates.to_compare
+views = candidates.views
 
 STAGES = (
     Stage(
@@ -145,7 +144,7 @@ def imagine(
     """Imagine clip after clip; see ``worlds.imagine``."""
     asked = control_of(model, state.frame.camera, control)
     count = asked.camera.world_from_camera.shape[0]
-    chunked, wanted = chunks.cut(asked, model.clip.frames - 1)
+    chunked, wanted = cut_into_clips(asked, model.clip.frames - 1)
     clips = chunked.camera.world_from_camera.shape[0]
 
     def step(state: WorldState, inputs: tuple[Control, Array, Array | None]) -> Any:
@@ -156,7 +155,7 @@ def imagine(
 
     inputs = (chunked, jax.random.split(key, clips), wanted)
     state, frames = jax.lax.scan(step, state, inputs)
-    return state, chunks.joined(frames, count)
+    return state, join_clips(frames, count)
 
 
 def imagine_clip(
@@ -197,7 +196,7 @@ def imagine_clip(
         gated = memories.gated(model)
         shown = memories.readout(model, state.map, camera, params=params, pictures=gated)
         sight = jax.tree.map(lambda x: x[None], shown)
-    latents = sampling.draw(model, params, conditioning, sight, key)
+    latents = world_model.draw(model, params, conditioning, sight, key)
     rgb, depth = rgbd.decode_rgbd(model, params, latents)
     if sight is not None and memories.gated(model):
         rgb, depth = rgbd.mix(model, params, rgb, depth, sight.view)
@@ -208,7 +207,7 @@ def imagine_clip(
         new = new_surfaces(model, frames, sight)
         remembered = _remember(model, params, state.map, new, valid_T, observed=False)
     end = None if valid_T is None else valid_T.sum()
-    return WorldState(chunks.last(frames, end), remembered), frames
+    return WorldState(last_frames(frames, end), remembered), frames
 
 
 def memory_points(model: ModelConfig, memory: Any) -> tuple[Array, Array, Array, Array | None]:

@@ -1,7 +1,7 @@
-"""Which cells are a voxel frame of the world ``persist``, and what its networks are told of them.
+"""The state of the world ``persist``: windows of its grid, and what its networks keep of them.
 
-A frame is a window of the world's grid around the agent. It moves by whole tokens of the
-transformer, so that most steps leave it where it is, and so that what is remembered moves with it
+A voxel frame is a window of the world's grid around the agent. It moves by whole tokens of the
+transformer, so that most steps leave it where it is, and so that the networks' caches move with it
 exactly. Cells that come into it and were never near the agent are unknown.
 """
 
@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import POINT_WAVES, PersistConfig
+from pewm_jax.codecs import rgbd
+from pewm_jax.config import POINT_WAVES, Noise, PersistConfig
 from pewm_jax.geometry.cameras import resize_intrinsics, unproject
-from pewm_jax.memory.class_grid import UNKNOWN
+from pewm_jax.memory.class_grid import UNKNOWN, ClassGrid
 from pewm_jax.models.persist.blocks import FrameCache
-from pewm_jax.types import Array, Camera
+from pewm_jax.types import Array, Camera, Params
 
 LONGEST_M, SHORTEST_M = 24.0, 1.5
 """Wavelengths of the sinusoids of a place, metres."""
@@ -25,7 +26,7 @@ LONGEST_M, SHORTEST_M = 24.0, 1.5
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Shown:
+class ShownPicture:
     """A picture as voxel frames are shown it.
 
     Attributes:
@@ -126,7 +127,7 @@ def moved(model: PersistConfig, cache: FrameCache, before_3: Array, after_3: Arr
     )
 
 
-def shown_of(latents_hwC: Array, depth_HW: Array, camera: Camera) -> Shown:
+def shown_of(latents_hwC: Array, depth_HW: Array, camera: Camera) -> ShownPicture:
     """Return what is shown of pictures, any leading shape.
 
     Args:
@@ -139,10 +140,10 @@ def shown_of(latents_hwC: Array, depth_HW: Array, camera: Camera) -> Shown:
     cells = depth_HW.reshape(*depth_HW.shape[:-2], rows, height // rows, columns, width // columns)
     measured = (cells > 0).sum((-3, -1))
     mean = cells.sum((-3, -1)) / jnp.maximum(measured, 1)
-    return Shown(latents_hwC, mean, camera)
+    return ShownPicture(latents_hwC, mean, camera)
 
 
-def told(model: PersistConfig, shown: Shown, middle_3: Array) -> Array:
+def picture_channels(model: PersistConfig, shown: ShownPicture, middle_3: Array) -> Array:
     """Return the channels of pictures as voxel frames are shown them, (..., h, w, C).
 
     Args:
@@ -169,3 +170,83 @@ def told(model: PersistConfig, shown: Shown, middle_3: Array) -> Array:
 def middle(model: PersistConfig, low_3: Array, start_3: Array) -> Array:
     """Return the middle (3,) of the window that begins at a cell, metres."""
     return low_3 + (start_3 + side(model) / 2) * cell_m(model)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class History:
+    """What the networks keep of the frames so far.
+
+    The present voxel frame is not in ``voxels`` yet: it is encoded anew when the next one is made,
+    so that what was edited counts.
+
+    Attributes:
+        voxels: of the world frames' transformer, up to the frame before the present one.
+        cameras: of the camera model, up to the present frame.
+        pictures: of the renderer, up to the present frame.
+        action_A: the action that led to the present frame.
+        shown: the picture that the present voxel frame was shown.
+        start_3: int32, first cell of the present window in the world's grid.
+    """
+
+    voxels: FrameCache
+    cameras: FrameCache
+    pictures: FrameCache
+    action_A: Array
+    shown: ShownPicture
+    start_3: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Past:
+    """The world before a step.
+
+    Attributes:
+        grid: the world's voxels, with their ``History``.
+        shown: the present picture as the next voxel frame is shown it.
+    """
+
+    grid: ClassGrid
+    shown: ShownPicture
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class KnownFrame:
+    """What is known of the frame that a step leads to; None is made by the networks.
+
+    Attributes:
+        camera: its camera.
+        rgb_HWC: its colours in [−1, 1], with ``depth_HW``.
+        depth_HW: its depth, metres.
+        classes_XYZ: its voxels, a window at ``start_3``.
+        start_3: int32, where that window begins in the world's grid.
+    """
+
+    camera: Camera | None = None
+    rgb_HWC: Array | None = None
+    depth_HW: Array | None = None
+    classes_XYZ: Array | None = None
+    start_3: Array | None = None
+
+
+def encoded(model: PersistConfig, params: Params, rgb_HWC: Array, depth_HW: Array) -> Array:
+    """Return the latents (h, w, C) of a picture: those of its depth with them, if it has any."""
+    both = rgbd.encode_rgbd(model, params, rgb_HWC[None, None], depth_HW[None, None])
+    return both[0, 0, ..., : model.picture_channels]
+
+
+def decoded(model: PersistConfig, params: Params, latents_hwC: Array) -> tuple[Array, Array]:
+    """Return colours (H, W, 3) and depth (H, W) of a picture's latents; depth 0 without any."""
+    missing = model.codec.channels - latents_hwC.shape[-1]
+    latents = jnp.pad(latents_hwC, ((0, 0), (0, 0), (0, missing)))
+    rgb, depth = rgbd.decode_rgbd(model, params, latents[None, None])
+    return rgb[0, 0], depth[0, 0] if model.clip.depth else jnp.zeros_like(depth[0, 0])
+
+
+def context(noise: Noise, x0: Array, key: Array) -> tuple[Array, Array]:
+    """Return frames (1, 1, …) with the noise that given ones have, and their times."""
+    times = jnp.full(x0.shape[:2], getattr(noise, "context_noise", 0.0))
+    drawn = jax.random.normal(key, x0.shape, x0.dtype)
+    return noise.corrupt(x0, drawn, times), times

@@ -1,0 +1,246 @@
+"""Voxel frames of the world ``persist``: how the next one is sampled (arXiv 2603.03482).
+
+The present voxels, as they are now, are encoded again and enter the transformer's cache. The next
+ones are sampled from noise; a class that a cell has had is preferred by
+``model.persistence_logit``.
+
+In a world of blocks (``memory.pictures cells``) a real picture says more, without a network: its
+depth shows which cells are empty and which hold a surface, and a surface has the colour of the
+picture without the light on it. ``model.observation_logit`` is the advantage, in nats, that this
+gives a class when voxels are sampled for a real frame. Imagined frames are made of the voxels, so
+nothing is concluded from them. Not as published.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax.config import PersistConfig
+from pewm_jax.data.voxels import PALETTE
+from pewm_jax.geometry import block_light
+from pewm_jax.geometry.actions import camera_numbers
+from pewm_jax.geometry.cameras import invert_rigid, transform_points, unproject
+from pewm_jax.memory.class_grid import EMPTY, UNKNOWN
+from pewm_jax.models.persist import voxel_dit, voxel_vae
+from pewm_jax.models.persist.blocks import FrameCache
+from pewm_jax.nn.layers import linear
+from pewm_jax.types import Array, Camera, Params
+from pewm_jax.worlds.persist import state as grid_state
+from pewm_jax.worlds.persist.state import History, context
+
+
+def sample(
+    model: PersistConfig,
+    params: Params,
+    history: History,
+    cache: FrameCache,
+    middle_3: Array,
+    before_XYZ: Array,
+    key: Array,
+    sight: ObservedCells | None = None,
+) -> Array:
+    """Sample a voxel frame: (X, Y, Z) class ids.
+
+    Args:
+        model: the model.
+        params: all parameters.
+        history: gives the action that leads to the frame, and the picture that it is shown.
+        cache: of the frames before it.
+        middle_3: the middle of its window, metres.
+        before_XYZ: the window's cells before; ``model.persistence_logit`` applies where they are
+            known.
+        key: randomness.
+        sight: what a real picture of this frame shows of the window's cells.
+    """
+    config, noise = model.backbone.world_frames, model.voxel_noise  # type: ignore[attr-defined]
+    asked = _asked(model, history, middle_3)
+    shape = (1, 1, *(config.latent_side,) * 3, config.latent_channels)
+
+    def denoise(x: Array, time_B: Array, weight: Array) -> Array:
+        del weight
+        times = time_B[:, None]
+        inputs, network_times = noise.precondition(x, times)
+        inputs = inputs.astype(jnp.dtype(model.dtype))
+        made, _ = voxel_dit.apply(
+            config, params["voxel_dit"], inputs, network_times, **asked, cache=cache
+        )
+        return noise.to_x0(made.astype(jnp.float32), x, times)
+
+    latents = noise.sample(denoise, jax.random.normal(key, shape))[:, 0]
+    return decode_classes(model, params, latents, before_XYZ, sight)
+
+
+def decode_classes(
+    model: PersistConfig,
+    params: Params,
+    latents_BxyzC: Array,
+    before_XYZ: Array,
+    sight: ObservedCells | None = None,
+) -> Array:
+    """Return the class ids (X, Y, Z) that latents (1, …) decode to.
+
+    A cell whose class was known changes only if another class is likelier by
+    ``model.persistence_logit``. An unknown cell is empty unless a class is likelier by
+    ``model.empty_prior``. ``model.observation_logit`` is added to the class that a real picture
+    shows.
+    """
+    config = model.backbone.voxel_vae  # type: ignore[attr-defined]
+    weights, dtype = params["voxel_vae"], jnp.dtype(model.dtype)
+    looked = sight is not None and model.observation_logit > 0
+    if not model.persistence_logit and not model.empty_prior and not looked:
+        return voxel_vae.decode(config, weights, latents_BxyzC, dtype)[0]
+    features = voxel_vae.features(config, weights, latents_BxyzC, dtype)[0]
+
+    def likeliest(slab: tuple[Array, Array, ObservedCells | None]) -> Array:
+        features, before, sight = slab
+        scores = linear(weights["decoder"]["scores"], features).astype(jnp.float32)
+        number, before = jnp.arange(config.classes), before[..., None]
+        scores = scores + model.persistence_logit * (number == before)
+        scores = scores + model.empty_prior * ((before == UNKNOWN) & (number == EMPTY))
+        if sight is not None:
+            scores = scores + advantage(model, sight, config.classes)
+        return scores.argmax(-1).astype(jnp.int32)
+
+    slab = config.slab or config.side
+    whole = features, before_XYZ.astype(jnp.int32), sight if looked else None
+    cut = jax.tree.map(lambda x: x.reshape(-1, slab, *x.shape[1:]), whole)
+    return jax.lax.map(likeliest, cut).reshape(before_XYZ.shape)
+
+
+def taken_in(
+    model: PersistConfig,
+    params: Params,
+    history: History,
+    cache: FrameCache,
+    middle_3: Array,
+    classes_XYZ: Array,
+    key: Array,
+) -> FrameCache:
+    """Encode the present voxels and add them to the cache; what is not known of them is noise."""
+    config, noise = model.backbone.world_frames, model.voxel_noise  # type: ignore[attr-defined]
+    vae, dtype = model.backbone.voxel_vae, jnp.dtype(model.dtype)  # type: ignore[attr-defined]
+    known = grid_state.known_latents(model, classes_XYZ)
+    ids = jnp.maximum(classes_XYZ, 0).astype(jnp.int32)
+    latents = voxel_vae.encode(vae, params["voxel_vae"], ids[None], dtype)[:, None]
+    noise_key, unknown_key = jax.random.split(key)
+    x, times = context(noise, latents, noise_key)
+    x = jnp.where(known[..., None], x, jax.random.normal(unknown_key, x.shape))
+    inputs, network_times = noise.precondition(x, times)
+    _, cache = voxel_dit.apply(
+        config,
+        params["voxel_dit"],
+        inputs.astype(dtype),
+        network_times,
+        **_asked(model, history, middle_3),
+        known_BTxyz=known[None, None],
+        cache=cache,
+    )  # type: ignore[assignment]
+    return cache
+
+
+def _asked(model: PersistConfig, history: History, middle_3: Array) -> dict[str, Any]:
+    """Return the transformer's condition of one voxel frame."""
+    config, shown = model.backbone.world_frames, history.shown  # type: ignore[attr-defined]
+    channels = grid_state.picture_channels(model, shown, middle_3)
+    camera = camera_numbers(shown.camera, model.clip.width, middle_3)
+    return {
+        "actions_BTA": history.action_A[None, None],
+        "pixels_BThwC": channels[None, None],
+        "camera_BTN": camera[None, None] if config.camera_numbers else None,
+    }
+
+
+INTO_M = 0.005
+"""A measured point belongs to the cell this far behind it, metres; depth is kept in millimetres."""
+VOTES = 2
+"""Pixels that must show a surface in a cell: a single one may be a ray that clips an edge."""
+NEAREST_M = 0.05
+"""Cells nearer to the camera than this are not judged, metres."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ObservedCells:
+    """What is seen of the cells of a window.
+
+    Attributes:
+        air_XYZ: bool, that nothing is there.
+        colour_XYZ: int32 number of the palette's colour of the surface in it, −1 where none is.
+    """
+
+    air_XYZ: Array
+    colour_XYZ: Array
+
+
+def advantage(model: PersistConfig, sight: ObservedCells, classes: int) -> Array:
+    """Return the nats (X, Y, Z, classes) that sight adds to the scores of classes."""
+    number = jnp.arange(classes)
+    colours = model.memory.colours  # type: ignore[attr-defined]
+    air = sight.air_XYZ[..., None] & (number == 0)
+    surface = (number > 0) & ((number - 1) % colours == sight.colour_XYZ[..., None])
+    return model.observation_logit * (air | surface)
+
+
+def seen(
+    model: PersistConfig, corner_3: Array, rgb_HWC: Array, depth_HW: Array, camera: Camera
+) -> ObservedCells:
+    """Return what a picture shows of a window's cells.
+
+    Args:
+        model: the model.
+        corner_3: the window's lowest corner, metres.
+        rgb_HWC: colours in [−1, 1].
+        depth_HW: depth, metres; 0 where nothing was measured.
+        camera: its camera.
+    """
+    size, side = grid_state.cell_m(model), grid_state.side(model)
+    eye = camera.world_from_camera[:3, 3]
+    way_HW3 = unproject(depth_HW, camera) - eye
+    metres_HW1 = jnp.linalg.norm(way_HW3, axis=-1, keepdims=True)
+    behind_HW3 = way_HW3 * (1 + INTO_M / jnp.maximum(metres_HW1, INTO_M)) + (eye - corner_3)
+    at = jnp.floor(behind_HW3 / size).astype(jnp.int32)
+    met = (depth_HW > 0) & ((at >= 0) & (at < side)).all(-1)
+    cell = jnp.where(met, (at[..., 0] * side + at[..., 1]) * side + at[..., 2], side**3)
+    cell = cell.reshape(-1)
+    hits = jnp.zeros(side**3 + 1, jnp.int32).at[cell].add(1)[:-1]
+    surface = (hits >= VOTES).reshape((side,) * 3)
+
+    # What lights the cells that are seen is known, so their own colours are.
+    borders = block_light.side_of((way_HW3 + (eye - corner_3)) / size)
+    ones = jnp.ones(depth_HW.shape)
+    lit = block_light.light(surface, corner_3, size, eye, way_HW3, ones, borders)
+    colour_HW = _nearest(model, (rgb_HWC + 1) / 2 / lit[..., None])
+    colours = model.memory.colours  # type: ignore[attr-defined]
+    votes = jnp.zeros((side**3 + 1, colours), jnp.int32)
+    votes = votes.at[cell, colour_HW.reshape(-1)].add(1)[:-1]
+    colour = votes.argmax(-1).reshape((side,) * 3).astype(jnp.int32)
+    air = _before(model, corner_3, depth_HW, camera) & ~surface
+    return ObservedCells(air, jnp.where(surface, colour, -1))
+
+
+def _before(model: PersistConfig, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:
+    """Return which cells (X, Y, Z) lie before what was measured in their direction."""
+    size, side = grid_state.cell_m(model), grid_state.side(model)
+    steps = (np.arange(side) + 0.5) * size
+    middle = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).astype(np.float32)
+    place = transform_points(invert_rigid(camera.world_from_camera), middle + corner_3)
+    far = jnp.maximum(place[..., 2], NEAREST_M)
+    fx, fy, cx, cy = camera.intrinsics_4
+    column = jnp.floor(place[..., 0] / far * fx + cx).astype(jnp.int32)
+    row = jnp.floor(place[..., 1] / far * fy + cy).astype(jnp.int32)
+    height, width = depth_HW.shape
+    within = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    measured = depth_HW[jnp.clip(row, 0, height - 1), jnp.clip(column, 0, width - 1)]
+    return within & (place[..., 2] > NEAREST_M) & (place[..., 2] + size / 2 < measured)
+
+
+def _nearest(model: PersistConfig, rgb_HW3: Array) -> Array:
+    """Return the number of the nearest colour of the palette, (H, W)."""
+    count = model.memory.colours  # type: ignore[attr-defined]
+    palette = np.array(list(PALETTE.values())[:count], np.float32) / 255
+    return jnp.square(rgb_HW3[..., None, :] - palette).sum(-1).argmin(-1)
