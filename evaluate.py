@@ -1,9 +1,8 @@
-"""Score a trained run: `python evaluate.py runs/demo` is `pewm-jax evaluate runs/demo`."""
+"""Score a run: ``python evaluate.py RUN``, the same as ``pewm-jax evaluate RUN``."""
 
 import sys
 
-from pewm_jax.cli.evaluate import main
-from pewm_jax.config import command_line as cli
+from pewm_jax.cli import main, parser
 
 if __name__ == "__main__":
-    sys.exit(cli.run(main))
+    sys.exit(parser.run(lambda argv: main.execute(["evaluate", *argv], "python evaluate.py")))

@@ -1,9 +1,8 @@
-"""Train a world model: `python train.py demo` is `pewm-jax train demo` from a checkout."""
+"""Train a world model: ``python train.py PRESET``, the same as ``pewm-jax train PRESET``."""
 
 import sys
 
-from pewm_jax.cli.train import main
-from pewm_jax.config import command_line as cli
+from pewm_jax.cli import main, parser
 
 if __name__ == "__main__":
-    sys.exit(cli.run(main))
+    sys.exit(parser.run(lambda argv: main.execute(["train", *argv], "python train.py")))

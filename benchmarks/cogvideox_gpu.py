@@ -30,8 +30,8 @@ import numpy as np
 import optax
 import record
 
+from pewm_jax.cli import parser as cli
 from pewm_jax.config import UserError
-from pewm_jax.config import command_line as cli
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import atomic
 from pewm_jax.models.cogvideox import model as dit

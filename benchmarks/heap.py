@@ -2,7 +2,7 @@
 
     python benchmarks/heap.py --preset demo --record
 
-``pewm-jax train`` asks glibc to keep what was once taken (``pewm_jax.io.heap``). Here the same step
+``pewm-jax train`` asks glibc to keep freed memory (``pewm_jax.io.runtime``). Here the same step
 runs in processes of their own, in turn with and without.
 """
 
@@ -40,17 +40,17 @@ class Settings:
 
 def child(settings: Settings) -> None:
     """Time steps in this process and print them as JSON."""
-    from pewm_jax.io import heap
+    from pewm_jax.io import runtime
 
     if settings.child == "kept":
-        assert heap.keep_large(), "this C library is not glibc"
+        assert runtime.keep_large(), "this C library is not glibc"
     import functools
 
     import jax
 
     from pewm_jax import presets, worlds
-    from pewm_jax.config import command_line as cli
     from pewm_jax.data import loader
+    from pewm_jax.io import runtime
     from pewm_jax.train import sharding
     from pewm_jax.train.step import compile_step, initial_state, noise_key
 
@@ -58,7 +58,7 @@ def child(settings: Settings) -> None:
     config = dataclasses.replace(
         config, train=dataclasses.replace(config.train, start="", run="runs/heap")
     )
-    cli.cache_compilation("runs/heap")
+    runtime.cache_compilation("runs/heap")
     stage, mesh = worlds.stages(config.model)[0], sharding.make_mesh(jax.devices()[:1])
     batch = next(iter(loader.clips(config, "train", seed=0, batch=stage.settings(config).batch)))
     key = jax.device_put(noise_key(config, stage), sharding.replicated(mesh))

@@ -17,8 +17,7 @@ from typing import Any
 
 from record import machine, record, table
 
-from pewm_jax.cli import evaluate, train
-from pewm_jax.cli.data import main as data_command
+from pewm_jax.cli import main as program
 
 VOXELS = [
     *("--model.memory.kind", "voxel", "--model.memory.cell_m", "0.25", "0.25", "1.0"),
@@ -42,7 +41,7 @@ Result = dict[str, Any]
 def main() -> None:
     """Train, score, print."""
     options = parse()
-    if data_command(["collect", str(options.data), *options.collect]):
+    if program.main(["data", "collect", str(options.data), *options.collect]):
         raise SystemExit(f"{options.data} could not be collected.")
     before = options.out / "stage1"
     run_training(options, before, ["--train.stage1.steps", str(options.steps1)], 0)
@@ -73,7 +72,7 @@ def one(
     start = ["--train.start", str(before), "--train.stage1.steps", "0"]
     run_training(options, run, [*flags, *start], steps)
     clips = ["--clips", str(options.clips), "--videos", "1", "--video_clips", "1"]
-    if evaluate.main([str(run), *clips, "--seeds", *map(str, range(options.seeds))]):
+    if program.execute(["evaluate", str(run), *clips, "--seeds", *map(str, range(options.seeds))]):
         raise SystemExit(f"{run} could not be scored.")
     metrics = json.loads((run / "report" / "metrics.json").read_text())
     lines = (run / "metrics.jsonl").read_text().splitlines()
@@ -92,7 +91,7 @@ def run_training(options: argparse.Namespace, run: Path, flags: list[str], stage
         *("--data.prepared_path", str(options.out / "prepared")),
         *("--train.stage2.steps", str(stage2), "--train.log_every", str(options.log_every)),
     ]
-    if train.main([options.preset, *shared, "--train.run", str(run), *flags]):
+    if program.execute(["train", options.preset, *shared, "--train.run", str(run), *flags]):
         raise SystemExit(f"{run} could not be trained.")
 
 

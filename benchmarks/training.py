@@ -26,8 +26,8 @@ import record
 import training_parts
 
 from pewm_jax import presets as configs
+from pewm_jax.cli import parser as cli
 from pewm_jax.config import Config, UserError
-from pewm_jax.config import command_line as cli
 from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import read_manifest, write_manifest
 from pewm_jax.data.make_episode import CollectConfig

@@ -30,8 +30,8 @@ import numpy as np
 import record
 
 from pewm_jax import presets as configs
+from pewm_jax.cli import parser as cli
 from pewm_jax.config import Config, MeshConfig, UserError
-from pewm_jax.config import command_line as cli
 from pewm_jax.data import abstract
 from pewm_jax.io import atomic
 from pewm_jax.plan import plan

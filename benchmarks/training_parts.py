@@ -21,8 +21,8 @@ from typing import Any
 from unittest import mock
 
 from pewm_jax import presets as configs
+from pewm_jax.cli import parser as cli
 from pewm_jax.config import Config
-from pewm_jax.config import command_line as cli
 
 Spans = dict[str, list[tuple[float, float]]]
 """What was done → when it began and ended, each time (seconds of ``time.time``)."""
@@ -137,10 +137,10 @@ def launch(spans: Spans, stage: int, called: float) -> dict[str, float]:
 
 def train_with_clocks(argv: Sequence[str], interrupt: tuple[int, int] | None = None) -> Spans:
     """Run ``train.py`` here; an interruption that was asked for is no error."""
-    import train
+    from pewm_jax.cli import main
 
     with clocks(interrupt) as spans, contextlib.suppress(KeyboardInterrupt):
-        train.main(argv)
+        main.execute(["train", *argv])
     return spans
 
 

@@ -1,4 +1,4 @@
-"""Errors that refuse a setting, or other user input, in one sentence."""
+"""Errors that refuse a setting, or other user input, in one sentence; how commands report them."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ HOMES = {
     "torch": {"convert", "eval/metrics/sam2"},
     "transformers": {"convert", "eval/metrics/sam2"},
     "trimesh": {"data", "houses"},
-    "tyro": {"config", "convert/options", "data", "memory/feature_command"},
+    "tyro": {"cli", "convert/options", "data", "memory/feature_cache"},
     "viser": {"play/extra"},
     "wandb": {"train/log"},
     "websockets": {"play/serving"},
@@ -80,6 +80,7 @@ BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}
 ANY_NAME = {
     "__init__",
     "_moved",
+    "cli/main",
     "config/__init__",
     "registry",
     "presets/__init__",

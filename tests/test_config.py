@@ -28,7 +28,7 @@ from pewm_jax.config import (
     StageConfig,
     TrainConfig,
 )
-from pewm_jax.config import command_line as cli
+from pewm_jax.config.overlay import overlay
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
@@ -195,7 +195,7 @@ def test_what_the_checks_must_not_refuse():
 def test_a_wrong_file_is_refused_by_name(change, sentence, tmp_path):
     path = tmp_path / "config.json"
     path.write_text(json.dumps(change))
-    for read in (configuration.load, functools.partial(cli.overlay, Config())):
+    for read in (configuration.load, functools.partial(overlay, Config())):
         with pytest.raises(ConfigError, match=sentence) as refusal:
             read(path)
         assert "\n" not in str(refusal.value)

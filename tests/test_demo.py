@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pewm_jax.cli import demo
+from pewm_jax.cli import demo, parser
+from pewm_jax.cli import main as program
 from pewm_jax.config import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -19,31 +20,27 @@ def called(monkeypatch, tmp_path):
     """What the parts are called with, in place of doing it."""
     monkeypatch.chdir(tmp_path)
     seen = []
-
-    def part(name, code=0):
-        def run(argv, prog):
-            seen.append((prog, list(argv)))
-            return code
-
-        return run
-
-    for name in ("data", "train", "evaluate"):
-        monkeypatch.setattr(getattr(demo, name), "main", part(name))
+    monkeypatch.setattr(program, "execute", lambda argv: seen.append(list(argv)) or 0)
     return seen
 
 
+def run(*words):
+    """Run the demo with its own arguments."""
+    return demo.run(parser.parse(demo.Settings, words, prog="pewm-jax demo"))
+
+
 def test_it_does_what_make_demo_does(called, capsys):
-    assert demo.main([]) == 0
+    assert run() == 0
     makefile = (ROOT / "Makefile").read_text()
     settings = dict(re.findall(r"^(\w+) \?= (.+)$", makefile, re.MULTILINE))
     (recipe,) = re.findall(r"^demo: .*\n((?:\t.*\n)+)", makefile, re.MULTILINE)
     asked = [
         re.sub(r"\$\((\w+)\)", lambda m: settings.get(m[1], m[0]), x) for x in recipe.split("\n")
     ]
-    plain = [re.sub(r"^\t@\$\(PY\) (-m pewm_jax\.)?", "", x).replace(".py", "") for x in asked if x]
-    assert [shlex.split(line) for line in plain] == [
-        [prog.removeprefix("pewm-jax "), *argv] for prog, argv in called
+    plain = [
+        re.sub(r"^\t@\$\(PY\) (-m pewm_jax[. ])?", "", x).replace(".py", "") for x in asked if x
     ]
+    assert [shlex.split(line) for line in plain] == called
     lines = capsys.readouterr().out.splitlines()
     assert [line[:5] for line in lines[:3]] == ["[1/3]", "[2/3]", "[3/3]"]
     assert "runs/demo/report/index.html" in lines[-1]
@@ -51,13 +48,13 @@ def test_it_does_what_make_demo_does(called, capsys):
 
 def test_walks_are_collected_as_large_as_the_preset_wants_them():
     parts = {preset: demo.steps(demo.Settings(preset)) for preset in ("demo", "tiny")}
-    assert "--size" not in parts["demo"][0][2]
-    assert parts["tiny"][0][2][-2:] == ["--size", "16"]
+    assert "--size" not in parts["demo"][0][1]
+    assert parts["tiny"][0][1][-2:] == ["--size", "16"]
 
 
 def test_a_part_that_fails_ends_it(called, monkeypatch, capsys):
-    monkeypatch.setattr(demo.data, "main", lambda argv, prog: 2)
-    assert demo.main(["--run", "elsewhere"]) == 2
+    monkeypatch.setattr(program, "execute", lambda argv: 2)
+    assert run("--run", "elsewhere") == 2
     assert called == []
     assert "Done" not in capsys.readouterr().out
 
@@ -65,14 +62,14 @@ def test_a_part_that_fails_ends_it(called, monkeypatch, capsys):
 def test_a_folder_that_training_refuses_is_refused_before_the_walks(called):
     Path("taken").write_text("a file")
     with pytest.raises(UserError, match="taken cannot be made"):
-        demo.main(["--run", "taken"])
+        run("--run", "taken")
     assert called == []
 
 
 def test_its_end_names_the_command_that_installs_the_viewer():
-    run = Path("my runs/a")
-    assert demo.ending(run, viewer=True).endswith("Drive in it: pewm-jax play 'my runs/a'")
-    assert "pip install 'pewm-jax[play]' && pewm-jax play" in demo.ending(run, viewer=False)
+    folder = Path("my runs/a")
+    assert demo.ending(folder, viewer=True).endswith("Drive in it: pewm-jax play 'my runs/a'")
+    assert "pip install 'pewm-jax[play]' && pewm-jax play" in demo.ending(folder, viewer=False)
 
 
 def test_what_cannot_be_is_refused_before_anything_is_made(called):
@@ -87,7 +84,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made(called):
     )
     for argv, says in wrong:
         with pytest.raises(UserError, match=says):
-            demo.main(argv)
+            run(*argv)
     assert called == []
 
 

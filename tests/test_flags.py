@@ -9,8 +9,9 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax import registry as kinds
-from pewm_jax.config import Config, ConfigError, flags
-from pewm_jax.config import command_line as cli
+from pewm_jax.cli import flags
+from pewm_jax.cli import parser as cli
+from pewm_jax.config import Config, ConfigError
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
 from pewm_jax.memory.images import ImagesConfig
@@ -35,13 +36,19 @@ def leaves(table, prefix=""):
 
 def test_the_model_s_settings_have_short_names():
     world = ("--model.kind", "--version")
-    full = [name for name, _ in flags.of(TINY) if name.startswith("--model.") and name not in world]
+    full = [
+        name
+        for name, _ in flags.flags_of(TINY)
+        if name.startswith("--model.") and name not in world
+    ]
     short = [name.replace("--model.", "--") for name in full]
     assert len(full) > 50
-    assert flags.spelled_out(short, TINY) == full
-    assert flags.spelled_out(full, TINY) == full
-    other = [name for name, _ in flags.of(TINY) if not name.startswith("--model.") or name in world]
-    assert flags.spelled_out(other, TINY) == other
+    assert flags.full_names(short, TINY) == full
+    assert flags.full_names(full, TINY) == full
+    other = [
+        name for name, _ in flags.flags_of(TINY) if not name.startswith("--model.") or name in world
+    ]
+    assert flags.full_names(other, TINY) == other
 
 
 def test_a_short_name_a_full_one_and_one_with_hyphens_set_the_same():
@@ -86,8 +93,8 @@ def test_a_kind_is_chosen_by_its_earlier_name_too_and_keeps_what_the_kinds_share
 def test_every_flag_of_an_earlier_version_is_one_now():
     preset = presets.load("pewm_2b")
     old = [f"--{name}" for name in leaves(json.loads((VERSION_1 / "pewm_2b.json").read_text()))]
-    now = set(flags.spelled_out(old, preset))
-    known = {name for name, _ in flags.of(preset)}
+    now = set(flags.full_names(old, preset))
+    known = {name for name, _ in flags.flags_of(preset)}
     of_other_kinds = {
         "--model.codec.spatial",
         "--model.memory.snapshots",
@@ -238,7 +245,7 @@ def test_a_flag_is_negated_in_every_spelling(setting, new):
     spellings = [f"no-{setting}", f"no_{setting}", f"{head}.no-{last}", f"{head}.no_{last}"]
     spellings += [name.replace("_", "-") for name in spellings]
     for name in spellings:
-        (full,) = flags.spelled_out([f"--{name}"], VAE)
+        (full,) = flags.full_names([f"--{name}"], VAE)
         assert full.replace("no-", "no_").replace("-terminal-snr", "_terminal_snr") == f"--{new}"
         assert parse(f"--{name}", default=VAE) == parse(f"--{new}", default=VAE)
 

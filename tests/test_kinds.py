@@ -13,7 +13,9 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax import registry as kinds
-from pewm_jax.cli import evaluate, train
+from pewm_jax.cli import flags
+from pewm_jax.cli import main as program
+from pewm_jax.cli import parser as cli
 from pewm_jax.cli import plugins as imports
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
@@ -24,12 +26,12 @@ from pewm_jax.config import (
     ModelConfig,
     Noise,
     World,
-    flags,
     register,
 )
-from pewm_jax.config import command_line as cli
+from pewm_jax.config.overlay import overlay
 from pewm_jax.controls.camera import CameraConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.io import runtime
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.readers.attention import AttentionConfig
 from tests.examples import parts
@@ -138,8 +140,8 @@ def test_a_file_in_the_current_folder_is_imported_for_training(spelling, tmp_pat
 
     monkeypatch.setattr(plan, "show", lambda config, launch: seen.append(config))
     chosen = ["--noise.kind", "here", "--noise.strength", "2"]
-    train.main(["tiny", *spelling, *chosen, "--plan"])
-    train.plan([*spelling, "tiny", *chosen])
+    program.execute(["train", "tiny", *spelling, *chosen, "--plan"])
+    program.execute(["plan", *spelling, "tiny", *chosen])
     configuration.save(seen[0], tmp_path / "config.json")
     assert [type(config.model.noise).__name__ for config in seen] == ["MineConfig"] * 2
     assert seen[0].model.noise.strength == 2
@@ -156,13 +158,14 @@ def test_evaluation_imports_before_it_opens_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr(
         report, "evaluate", lambda run, **_: seen.append([run, *kinds.names("noise")])
     )
-    monkeypatch.setattr(cli, "cache_compilation", lambda folder: None)
-    evaluate.main(["--import", "mine_first", "runs/x", "--import", "mine_second", "--clips", "1"])
+    monkeypatch.setattr(runtime, "cache_compilation", lambda folder: None)
+    words = ["--import", "mine_first", "runs/x", "--import", "mine_second", "--clips", "1"]
+    program.execute(["evaluate", *words])
     assert seen[0][0] == "runs/x"
     assert {"first", "second"} <= set(seen[0])
 
 
-@pytest.mark.parametrize("command", [train.main, train.plan, evaluate.main])
+@pytest.mark.parametrize("command", ["train", "plan", "evaluate"])
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -175,7 +178,7 @@ def test_evaluation_imports_before_it_opens_the_run(tmp_path, monkeypatch):
 )
 def test_what_cannot_be_imported_is_refused_in_a_sentence(command, words, sentence):
     with pytest.raises(ConfigError, match=sentence) as refusal:
-        command(["tiny", *words])
+        program.execute([command, "tiny", *words])
     one_sentence(refusal)
 
 
@@ -188,10 +191,10 @@ def test_a_module_that_is_broken_is_refused_in_a_sentence(tmp_path, monkeypatch)
 
 
 def test_the_help_names_the_flag(capsys):
-    for command in (train.main, train.plan, evaluate.main):
+    for command in program.COMMANDS:
         with contextlib.suppress(SystemExit):
-            command(["--help"])
-        assert "--import MODULE" in capsys.readouterr().out
+            program.execute([*command.split(), "--help"])
+        assert "--plugin" in capsys.readouterr().out
 
 
 def cell(module="__main__"):
@@ -335,7 +338,7 @@ def test_a_kind_is_chosen_together_with_what_it_needs(words, tmp_path):
     file = tmp_path / "mine.json"
     table = {"clip": {"frames": 5}, "codec": {"kind": "pixel"}, "memory": {"reader": {"heads": 4}}}
     file.write_text(json.dumps({"model": table}))
-    assert cli.overlay(default, file).model == found
+    assert overlay(default, file).model == found
     with pytest.raises(ConfigError, match=r"use 4k \+ 1"):
         cli.parse(Config, ["--codec.kind", "pixel"], default=default, prog="train.py")
 
@@ -374,4 +377,4 @@ def test_a_world_is_chosen_before_its_parts(tmp_path):
     assert (type(found.model), type(found.model.noise).__name__, rest) == (Other, "FlowConfig", [])
     file = tmp_path / "mine.json"
     file.write_text('{"model": {"noise": {"kind": "flow", "shift": 2}, "kind": "other"}}')
-    assert cli.overlay(TINY, file).model.noise.shift == 2
+    assert overlay(TINY, file).model.noise.shift == 2

@@ -10,7 +10,6 @@ import errno
 import inspect
 import io
 import itertools
-import re
 import signal
 import types
 import typing
@@ -25,21 +24,10 @@ from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax.cli import main as program
 from pewm_jax.config import UserError
-from pewm_jax.config import command_line as cli
 from pewm_jax.io import atomic
 
 SECONDS = 120
 """No refusal takes so long; what does has begun to work."""
-MOST = 3
-"""Positional arguments that are tried at most."""
-
-
-class SettingsFoundError(Exception):
-    """Ends a command once its settings are known."""
-
-    def __init__(self, kind):
-        super().__init__(kind)
-        self.kind = kind
 
 
 @contextlib.contextmanager
@@ -70,41 +58,19 @@ def call(*argv):
     return code, out.getvalue(), err.getvalue()
 
 
-def below(*words):
-    """Yield the commands under some words, from their lists in ``--help``."""
-    code, out, _ = call(*words, "--help")
-    assert code == 0
-    listed = re.search(r"^commands:\n((?:  .*\n)+)", out, re.MULTILINE)
-    if listed is None:
-        yield words
-        return
-    for line in listed[1].splitlines():
-        found = re.match(r"  ((?:[\w-]+ ?)+?)  +\S", line)
-        if found:
-            yield from below(*words, *found[1].split())
-
-
-COMMANDS = sorted(set(below()))
+COMMANDS = sorted(tuple(name.split()) for name in program.COMMANDS)
+FIRST = {
+    **dict.fromkeys(("train", "plan", "protocol"), "tiny"),
+    **dict.fromkeys(("evaluate", "horizon", "play"), "small"),
+}
+"""What a command's first argument names where it is no path: a preset, or weights that ship."""
 
 
 def settings_of(words):
-    """Return what a command's flags are read into, and how many positional arguments it wants."""
-
-    def known(kind, *_, **__):
-        raise SettingsFoundError(kind)
-
-    def given(kind, *_, default=None, **__):
-        raise SettingsFoundError(default if default is not None else kind)
-
-    first = ("tiny",) if words[0] in ("train", "plan", "protocol") else ("nowhere",)
-    for count in range(MOST + 1):
-        argv = [*words, *(first * count)]
-        with mock.patch.object(cli, "parse", given), mock.patch.object(cli, "parse_command", known):
-            try:
-                call(*argv)
-            except SettingsFoundError as found:
-                return found.kind, count
-    raise AssertionError(f"{words}: its settings were not read")
+    """Return the dataclasses that a command reads, each as a type or with its defaults."""
+    name = " ".join(words)
+    found = program.arguments_of(name, [FIRST.get(words[0], "nowhere")], f"pewm-jax {name}")
+    return [default or kind for kind, default in found.groups.values()]
 
 
 def fields_of(kind, prefix=""):
@@ -116,7 +82,8 @@ def fields_of(kind, prefix=""):
         hint = hints[field.name]
         value = getattr(kind, field.name, None)
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            yield from fields_of(value, f"{prefix}{field.name}.")
+            flat = any(getattr(mark, "name", None) == "" for mark in typing.get_args(hint))
+            yield from fields_of(value, prefix if flat else f"{prefix}{field.name}.")
         else:
             yield f"{prefix}{field.name}", hint, "Positional" in str(hint)
 
@@ -188,21 +155,15 @@ def refused(code, out, err, what):
 WRITTEN = ("out", "dst", "run", "worlds", "train.run", "data.prepared_path")
 """Names of settings that name what is written: only what cannot be written is wrong there."""
 UNWRITABLE = ("below a file", "a device")
-FIRST = {
-    **dict.fromkeys(("train", "plan", "protocol"), "tiny"),
-    **dict.fromkeys(("evaluate", "horizon", "play"), "small"),
-}
-"""What a command's first argument names where it is no path: a preset, or weights that ship."""
 LATER = {"train": "evaluate."}
 """Settings that a command keeps for another one, which refuses them."""
 
 
 def cases(words, bad):
     """Yield ``(arguments, what is wrong)``: every bad path in the place of every path."""
-    kind, count = settings_of(words)
-    fields = list(fields_of(kind))
+    fields = [field for kind in settings_of(words) for field in fields_of(kind)]
     named = [name for name, _, positional in fields if positional]
-    slots = named or ["run"] * count
+    slots = named
     new = (bad.base / f"new{number}" for number in itertools.count())
 
     def other(name):
@@ -213,7 +174,7 @@ def cases(words, bad):
             if slot not in WRITTEN or wrong in UNWRITABLE:
                 rest = [path if place == k else other(name) for k, name in enumerate(slots)]
                 yield [*words, *rest], f"{slot}: {wrong}"
-    first = [next(new) for _ in named] or [FIRST.get(words[0], "nowhere")] * count
+    first = [FIRST[words[0]]] if words[0] in FIRST else [next(new) for _ in named]
     for name, hint, positional in fields:
         if positional or not takes_path(name, hint) or name.startswith(LATER.get(words[0], "?")):
             continue
@@ -235,10 +196,10 @@ def test_a_command_refuses_every_bad_path_in_one_sentence(words, bad, monkeypatc
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_a_command_refuses_an_unknown_flag_and_explains_itself(words):
-    first = FIRST.get(words[0], "nowhere")
-    count = settings_of(words)[1]
-    refused(*call(*words, *[first] * count, "--no-such-setting", "1"), words)
-    code, out, err = call(*words, *[first] * count, "--help")
+    fields = [field for kind in settings_of(words) for field in fields_of(kind)]
+    first = [FIRST.get(words[0], "nowhere") for _, _, positional in fields if positional]
+    refused(*call(*words, *first, "--no-such-setting", "1"), words)
+    code, out, err = call(*words, *first, "--help")
     assert (code, err) == (0, "")
     assert len(out.splitlines()) > 5
 
@@ -249,9 +210,9 @@ def test_a_disk_that_fails_is_one_sentence_and_names_the_file(name, number):
     def fails(*_):
         raise OSError(number, "the system's reason", "runs/x/file")
 
-    command = dataclasses.replace(program.COMMANDS[name], main=fails)
-    with mock.patch.dict(program.COMMANDS, {name: command}):
-        code, out, err = call(name)
+    found = {"read": lambda *_: [None], "function_of": lambda _: fails}
+    with mock.patch.multiple(program, **found):
+        code, out, err = call(*name.split())
     refused(code, out, err, name)
     assert "runs/x/file: the system's reason" in err
 

@@ -1,77 +1,74 @@
-"""The command line of the data: ``pewm-jax data``, or ``python -m pewm_jax.data``."""
+"""Run ``pewm-jax data`` and ``pewm-jax memory``, and choose what some commands read."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import Any
 
-from pewm_jax.config import command_line as cli
-
-USAGE = """usage: {prog} COMMAND …
-
-commands:
-  collect   let an agent walk through houses and write its frames as episodes; with
-            --env MODULE:NAME, through your own environment
-  import    import a recording: a folder of colour, depth and a trajectory
-  validate  check a dataset: files, counts, units, poses, geometry
-  show      draw an episode as a contact sheet and its path from above
-
-Each has --help. The format of the files is described in docs/data_format.md."""
-COMMANDS = ("collect", "import", "validate", "show")
+from pewm_jax.cli.parser import Arguments
 
 
-def main(argv: Sequence[str] | None = None, prog: str = "python -m pewm_jax.data") -> int:
-    """Run one command.
+def collect_arguments(argv: Sequence[str], prog: str) -> Arguments:
+    """Return what ``data collect`` reads: with ``--env`` it collects from a user's environment."""
+    if any(word.split("=")[0] == "--env" for word in argv):
+        from pewm_jax.data.collect_env import CollectEnvConfig
 
-    Args:
-        argv: the arguments, by default those of the process.
-        prog: the words that it was called by, for help and refusals.
+        return Arguments({"settings": (CollectEnvConfig, None)}, hint=f"{prog} --env")
+    from pewm_jax.data.make_episode import CollectConfig
 
-    Returns:
-        The exit code: 0, 1 problems found, 2 bad input, 130 interrupted.
-    """
-    return cli.run(lambda given: _main(given, prog), argv)
+    return Arguments({"settings": (CollectConfig, None)}, renamed={"--voxels": "--voxels.record"})
 
 
-def _main(argv: Sequence[str], prog: str) -> int:
-    if not argv or argv[0] in ("-h", "--help"):
-        print(USAGE.format(prog=prog))
-        return 0 if argv else 2
-    command, flags = cli.choose(argv[0], COMMANDS, "command"), argv[1:]
+def collect(settings: Any) -> None:
+    """Run ``data collect``."""
+    from pewm_jax.data.make_episode import CollectConfig
+
+    with _resumable():
+        if isinstance(settings, CollectConfig):
+            from pewm_jax.data.collect import collect as collect_houses
+
+            collect_houses(settings)
+        else:
+            from pewm_jax.data.collect_env import collect_env
+
+            collect_env(settings)
+
+
+def import_recording(settings: Any) -> None:
+    """Run ``data import``."""
+    from pewm_jax.data import importer
+
+    importer.import_recording(settings)
+
+
+def validate(settings: Any) -> int:
+    """Run ``data validate``; returns 1 if there are problems."""
+    from pewm_jax.data.validate import validate as find_problems
+
+    return 1 if find_problems(settings).problems else 0
+
+
+def show(settings: Any) -> None:
+    """Run ``data show``."""
+    from pewm_jax.data.show import show as draw
+
+    draw(settings)
+
+
+def cache_features(settings: Any) -> None:
+    """Run ``memory cache``."""
+    from pewm_jax.memory.feature_cache import cache
+
+    with _resumable():
+        cache(settings)
+
+
+@contextlib.contextmanager
+def _resumable() -> Iterator[None]:
+    """Say after Ctrl-C that the same command resumes."""
     try:
-        return _run(command, flags, f"{prog} {command}")
+        yield
     except KeyboardInterrupt:
-        again = "; run the same command again to resume" if command == "collect" else ""
-        raise KeyboardInterrupt(f"Interrupted{again}.") from None
-
-
-def _run(command: str, flags: Sequence[str], prog: str) -> int:
-    """Run one command; returns the exit code."""
-    # Imported here and not above: help comes at once, and only collecting loads the renderer.
-    if command == "collect" and any(flag.split("=")[0] == "--env" for flag in flags):
-        from pewm_jax.data.collect_env import CollectEnvConfig, collect_env
-
-        collect_env(cli.parse_command(CollectEnvConfig, flags, f"{prog} --env"))
-    elif command == "collect":
-        from pewm_jax.data.collect import collect
-        from pewm_jax.data.make_episode import CollectConfig
-
-        flags = ["--voxels.record" if flag == "--voxels" else flag for flag in flags]
-        collect(cli.parse_command(CollectConfig, flags, prog))
-    elif command == "import":
-        from pewm_jax.data.importer import ImportConfig, import_recording
-
-        import_recording(cli.parse_command(ImportConfig, flags, prog))
-    elif command == "show":
-        from pewm_jax.data.show import ShowConfig, show
-
-        show(cli.parse_command(ShowConfig, flags, prog))
-    else:
-        from pewm_jax.data.validate import ValidateConfig, validate
-
-        return 1 if validate(cli.parse_command(ValidateConfig, flags, prog)).problems else 0
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        again = "Interrupted; run the same command again to resume."
+        raise KeyboardInterrupt(again) from None

@@ -1,30 +1,28 @@
-"""``pewm-jax demo``: everything once, from walks through houses to a report, by one command."""
+"""Run ``pewm-jax demo``: data, training and report by one command."""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
 import shlex
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pewm_jax import presets
-from pewm_jax.cli import data, evaluate, train
+from pewm_jax.cli import main, parser
 from pewm_jax.config import ModelConfig
-from pewm_jax.config import command_line as cli
+from pewm_jax.errors import ConfigError
 
-ABOUT = (
-    "Collect walks through generated houses, train a world model on them, let it imagine walks "
-    "through houses it has never seen, and score it. Interrupted and started again, it goes on "
-    "where it was."
-)
 SIZE = 64
 """Width and height of a walk's pictures, pixels, where collecting is not told another."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What is made, and where."""
+    """Collect walks through generated houses, train a world model on them and score it.
+
+    It is scored on imagined walks through houses that were not in training. If interrupted, run it
+    again: it resumes.
+    """
 
     preset: str = "demo"
     """Preset that is trained; `pewm-jax train --help` lists them."""
@@ -39,10 +37,10 @@ class Settings:
 
     def __post_init__(self):
         """Validate."""
-        cli.choose(self.preset, presets.names(), "preset")
+        parser.choose(self.preset, presets.names(), "preset")
         for name in ("houses", "frames"):
             if getattr(self, name) < 1:
-                raise cli.ConfigError(f"--{name} is {getattr(self, name)}: give at least 1.")
+                raise ConfigError(f"--{name} is {getattr(self, name)}: give at least 1.")
         _ = self.size
 
     @property
@@ -55,47 +53,37 @@ class Settings:
         model = presets.load(self.preset).model
         maps = type(model) is ModelConfig  # of other worlds, which need other data
         if not maps or model.clip.width != model.clip.height:
-            raise cli.ConfigError(
+            raise ConfigError(
                 f"--preset {self.preset} does not fit the demo, which trains a world with a map on "
                 "square pictures: take demo, or the steps one by one."
             )
         return model.clip.width
 
 
-def main(argv: Sequence[str], prog: str = "pewm-jax demo") -> int:
-    """Do all of it, and say which files to open.
-
-    Args:
-        argv: the arguments.
-        prog: the words that the command was called by, for help and refusals.
-
-    Returns:
-        The exit code.
-    """
-    settings = cli.parse(Settings, argv, default=Settings(), prog=prog, description=ABOUT)
+def run(settings: Settings) -> int:
+    """Run all steps, and print which files to open."""
     _require_folder(settings)
     parts = steps(settings)
-    for number, (what, run, flags) in enumerate(parts, 1):
-        words = shlex.join(flags)
-        print(f"[{number}/{len(parts)}] {what}: {words}", flush=True)
-        code = run(flags[2:], " ".join(flags[:2]))
+    for number, (what, words) in enumerate(parts, 1):
+        print(f"[{number}/{len(parts)}] {what}: {shlex.join(['pewm-jax', *words])}", flush=True)
+        code = main.execute(words)
         if code:
             return code
     print(ending(settings.run, _viewer()), flush=True)
     return 0
 
 
-def steps(settings: Settings) -> list[tuple[str, Callable[[Sequence[str], str], int], list[str]]]:
-    """Return the parts: what each does, its function, and the same as a command of its own."""
-    walks, run = str(settings.data), str(settings.run)
+def steps(settings: Settings) -> list[tuple[str, list[str]]]:
+    """Return what each step does, and the words of its command."""
+    walks, folder = str(settings.data), str(settings.run)
     collect = ["collect", walks, "--train", str(settings.houses), "--frames", str(settings.frames)]
     if settings.size != SIZE:
         collect += ["--size", str(settings.size)]
-    learn = [settings.preset, "--data.path", walks, "--train.run", run]
+    learn = [settings.preset, "--data.path", walks, "--train.run", folder]
     return [
-        ("Walking through generated houses", data.main, ["pewm-jax", "data", *collect]),
-        ("Training a world model", train.main, ["pewm-jax", "train", *learn]),
-        ("Imagining walks and scoring them", evaluate.main, ["pewm-jax", "evaluate", run]),
+        ("Walking through generated houses", ["data", *collect]),
+        ("Training a world model", ["train", *learn]),
+        ("Imagining walks and scoring them", ["evaluate", folder]),
     ]
 
 
@@ -115,11 +103,11 @@ def ending(run: Path, viewer: bool) -> str:
 
 
 def _require_folder(settings: Settings) -> None:
-    """Refuse a folder that training would refuse, before minutes of walks; makes none."""
+    """Refuse a folder that training would refuse, before collecting; makes none."""
     there = next(path for path in (settings.run, *settings.run.parents) if path.exists())
     if there != settings.run and there.is_dir():
         return
-    from pewm_jax.train import runs  # here: help and refusals of words come at once
+    from pewm_jax.train import runs  # here: help and refusals are fast
 
     config = presets.load(settings.preset)
     where = dataclasses.replace(config.data, path=str(settings.data))

@@ -1,36 +1,39 @@
-"""``pewm-jax horizon``: hundreds of imagined frames, by one world or several beside each other."""
+"""Run ``pewm-jax horizon``: imagine hundreds of frames, and measure them."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pewm_jax.cli import named
-from pewm_jax.cli import plugins as imports
-from pewm_jax.config import command_line as cli
+import tyro
 
-ABOUT = (
-    "Imagine long walks through held-out houses with the recorded actions, compare them with the "
-    "truth by stretches (PSNR) and as sets of windows of 16 frames (FVD, KVD), and, of a world of "
-    "voxels, see what its renderer makes of the true ones and whether what is placed in it stays."
-)
+from pewm_jax.errors import ConfigError
+from pewm_jax.io import runtime
+
 SPARE = 4
-"""One walk in so many more than trials, for those without room for a block."""
+"""One spare walk for this many trials, because some walks have no room for a block."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What is imagined and measured."""
+    """Imagine long walks through held-out houses with the recorded actions, and measure them.
 
+    The frames are compared with the ground truth by stretches (PSNR) and as sets of windows of 16
+    frames (FVD, KVD). For a world of voxels, its renderer is measured on the true voxels, and
+    trials measure whether a block that is placed in it stays.
+    """
+
+    run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """The run's folder, or the name of a model that comes with the library."""
     data: Path = Path("data/persist_long")
     """Folder of the data set; its episodes must be longer than the horizon."""
     split: str = "revisit"
     """Folder inside it."""
     beside: tuple[str, ...] = ()
-    """Other worlds, runs' folders or names of models that come with the library, which go the same
-    ways."""
+    """Other worlds (runs' folders or names of models that come with the library) that imagine the
+    same walks."""
     ends: tuple[int, ...] = (200, 400, 600)
     """Frames at which windows end, and between which PSNR is averaged."""
     walks: int = 4
@@ -50,42 +53,25 @@ class Settings:
     """Folder of the report; by default RUN/horizon."""
 
 
-def main(argv: Sequence[str], prog: str = "pewm-jax horizon") -> int:
-    """Measure, write RUN/horizon/horizon.html and print the numbers.
-
-    Args:
-        argv: the arguments: a run's folder and settings.
-        prog: the words that the command was called by, for help and refusals.
-
-    Returns:
-        The exit code.
-    """
-    missing = f"Name a run folder first: {prog} runs/persist_tiny."
-    run, flags = named.take(imports.take(argv), "RUN", missing)
-    settings = cli.parse(
-        Settings,
-        flags,
-        default=Settings(),
-        prog=f"{prog} RUN",
-        description=f"{ABOUT} Beside these settings:\n{imports.HELP}",
-    )
+def run(settings: Settings) -> None:
+    """Measure, write RUN/horizon/horizon.html and print the numbers."""
     ends = settings.ends
     if not ends or sorted(set(ends)) != list(ends) or ends[0] < 16:
-        raise cli.ConfigError(
+        raise ConfigError(
             f"--ends is {ends}: name rising numbers of frames from 16 on, such as 200 400 600."
         )
     if min(settings.walks, settings.context, settings.windows, settings.trial_frames) < 1:
-        raise cli.ConfigError("--walks, --context, --windows and --trial-frames must be above 0.")
-    # Imported here and not above: help and refusals come at once.
+        raise ConfigError("--walks, --context, --windows and --trial-frames must be above 0.")
+    # Imported here and not above: help and refusals are fast.
     from pewm_jax.eval.loaded_run import open_run
     from pewm_jax.report import horizon_page
 
-    opened = open_run(run)
+    opened = open_run(settings.run)
     others = [(name, open_run(name)) for name in settings.beside]
-    cli.cache_compilation(opened.home.parent)
+    runtime.cache_compilation(opened.home.parent)
     facts, videos = _measured(settings, opened, others)
     facts["protocol"] = {
-        "run": run,
+        "run": settings.run,
         "weights_sha256": opened.weights_hash,
         "data": f"{settings.data}/{settings.split}",
         "walks": settings.walks,
@@ -96,7 +82,6 @@ def main(argv: Sequence[str], prog: str = "pewm-jax horizon") -> int:
     page = horizon_page.write(settings.out or opened.home / "horizon", facts, videos, ends)
     print("\n".join(horizon_page.lines(facts, ends)))
     print(f"report: {page}")
-    return 0
 
 
 def _measured(
@@ -119,7 +104,7 @@ def _measured(
     i3d = read_i3d(i3d_weights.find(None), "fvd") if settings.fvd == "on" else None
     episodes = EpisodeSource(settings.data / settings.split)
     if len(episodes) < settings.walks:
-        raise cli.ConfigError(
+        raise ConfigError(
             f"--walks is {settings.walks}, and {settings.data}/{settings.split} has "
             f"{len(episodes)} episodes: ask for as many, or collect more."
         )
@@ -132,7 +117,7 @@ def _measured(
     of_voxels = isinstance(config.model, PersistConfig)
     if tried:  # before hours of imagining
         if not of_voxels:
-            raise cli.ConfigError("--trials places blocks in a world of voxels; this has none.")
+            raise ConfigError("--trials places blocks in a world of voxels; this has none.")
         voxel_trials.block_class(config, tried)
     truth = np.stack([walk.truth_THWC for walk in walks])
     made: dict[str, Any] = {"world": horizon.imagine_walks(config, params, walks)}
@@ -167,7 +152,7 @@ def _tried(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
     shortest = min(episode.length for episode in chosen)
     starts = range(first, shortest - settings.trial_frames)
     if not starts:
-        raise cli.ConfigError(
+        raise ConfigError(
             f"--trial-frames is {settings.trial_frames}, and the shortest episode has {shortest} "
             "frames: take fewer, or collect longer episodes."
         )

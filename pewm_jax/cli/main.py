@@ -1,84 +1,264 @@
-"""The command ``pewm-jax``: finds the subcommand and hands its arguments on."""
+"""The command ``pewm-jax``: the table of commands, and how one of them is found and run."""
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
+import sys
+import textwrap
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import pewm_jax
-from pewm_jax.cli import (
-    compare,
-    convert,
-    data,
-    demo,
-    evaluate,
-    horizon,
-    memory,
-    play,
-    plugins,
-    practice,
-    protocol,
-    table1,
-    table2,
-    train,
-)
-from pewm_jax.config import command_line as cli
+from pewm_jax.cli import parser, plugins
+from pewm_jax.cli.parser import HELP, Arguments
 
 PROGRAM = "pewm-jax"
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """A subcommand.
+    """A command.
 
     Attributes:
-        main: takes the arguments after its name and the words it was called by; returns the exit
-            code. Its module must be light: what is heavy is imported when it is needed.
         about: what it does, in one line.
+        settings: ``MODULE:NAME`` of the dataclass that it reads; or of a function that takes its
+            arguments and the words it was called by, and returns ``parser.Arguments``. The module
+            must be light: it is imported for ``--help``.
+        run: ``MODULE:NAME`` of the function that takes the settings and returns an exit code; None
+            is 0. Heavy modules are imported here.
     """
 
-    main: Callable[[Sequence[str], str], int]
     about: str
+    settings: str
+    run: str
 
 
+CLI, CONVERT = "pewm_jax.cli", "pewm_jax.convert"
 COMMANDS = {
-    "play": Command(play.main, "drive through a world that a model imagines, in the browser"),
-    "demo": Command(demo.main, "collect, train, imagine and score, small and by one command"),
-    "data": Command(data.main, "collect, import, validate and show episodes"),
-    "train": Command(train.main, "train a world model, or go on where a training stopped"),
-    "protocol": Command(protocol.main, "choose what runs are scored by, before training them"),
-    "evaluate": Command(evaluate.main, "score a trained run on held-out scenes and write a report"),
-    "compare": Command(compare.main, "set two scored runs side by side, with paired differences"),
-    "horizon": Command(horizon.main, "imagine hundreds of frames, and measure what comes of it"),
-    "table1": Command(table1.main, "train and score every memory: the paper's Table 1, ablations"),
-    "table2": Command(table2.main, "decide by policies, rankings and plans: the paper's Table 2"),
-    "practice": Command(practice.main, "let a policy practise in imagination, and measure it"),
-    "memory": Command(memory.main, "compute the image encoder's features of a data set once"),
-    "convert": Command(convert.main, "bring a CogVideoX or DINOv2 in, take trained weights out"),
-    "plan": Command(train.plan, "say what a training would take on hardware that is not here"),
+    "play": Command(
+        "drive through a world that a model imagines, in the browser",
+        f"{CLI}.play:Settings",
+        f"{CLI}.play:run",
+    ),
+    "demo": Command(
+        "collect, train, imagine and score, small and by one command",
+        f"{CLI}.demo:Settings",
+        f"{CLI}.demo:run",
+    ),
+    "data collect": Command(
+        "let an agent walk through houses, or your own environment (--env)",
+        f"{CLI}.data:collect_arguments",
+        f"{CLI}.data:collect",
+    ),
+    "data import": Command(
+        "import a recording: a folder of colour, depth and a trajectory",
+        "pewm_jax.data.importer:ImportConfig",
+        f"{CLI}.data:import_recording",
+    ),
+    "data validate": Command(
+        "check a dataset: files, counts, units, poses, geometry",
+        "pewm_jax.data.validate:ValidateConfig",
+        f"{CLI}.data:validate",
+    ),
+    "data show": Command(
+        "draw an episode as a contact sheet and its path from above",
+        "pewm_jax.data.show:ShowConfig",
+        f"{CLI}.data:show",
+    ),
+    "train": Command(
+        "train a world model, or resume an interrupted training",
+        f"{CLI}.train:arguments",
+        f"{CLI}.train:run",
+    ),
+    "protocol": Command(
+        "choose the clips that runs are scored on, before training them",
+        f"{CLI}.evaluate:ProtocolSettings",
+        f"{CLI}.evaluate:protocol",
+    ),
+    "evaluate": Command(
+        "score a trained run on held-out scenes and write a report",
+        f"{CLI}.evaluate:EvaluateSettings",
+        f"{CLI}.evaluate:evaluate",
+    ),
+    "compare": Command(
+        "compare two scored runs, with paired differences",
+        f"{CLI}.evaluate:CompareSettings",
+        f"{CLI}.evaluate:compare",
+    ),
+    "horizon": Command(
+        "imagine hundreds of frames, and measure their quality",
+        f"{CLI}.horizon:Settings",
+        f"{CLI}.horizon:run",
+    ),
+    "table1": Command(
+        "train and score every memory: the paper's Table 1, ablations",
+        f"{CLI}.studies:Table1Settings",
+        f"{CLI}.studies:table1",
+    ),
+    "table2": Command(
+        "decide by policies, rankings and plans: the paper's Table 2",
+        f"{CLI}.studies:Table2Settings",
+        f"{CLI}.studies:table2",
+    ),
+    "practice": Command(
+        "train a policy in imagination, and measure it",
+        f"{CLI}.studies:PracticeSettings",
+        f"{CLI}.studies:practice",
+    ),
+    "memory cache": Command(
+        "compute the image encoder's features of every frame once",
+        "pewm_jax.memory.feature_cache:CacheConfig",
+        f"{CLI}.data:cache_features",
+    ),
+    "convert import cogvideox": Command(
+        "a CogVideoX checkpoint in the layout of diffusers → our layout, or with --rgbd --camera "
+        "[--memory] a world model to train from",
+        f"{CONVERT}.options:ImportCogVideoX",
+        f"{CONVERT}.commands:import_cogvideox",
+    ),
+    "convert import dinov2": Command(
+        "DINOv2 (transformers or the original state dict) → the map's image encoder",
+        f"{CONVERT}.options:ImportDINOv2",
+        f"{CONVERT}.commands:import_dinov2",
+    ),
+    "convert import svd": Command(
+        "a checkpoint of Stable Video Diffusion → a world model steered by actions",
+        f"{CONVERT}.options:ImportSVD",
+        f"{CONVERT}.commands:import_svd",
+    ),
+    "convert import cosmos2": Command(
+        "a checkpoint of Cosmos-Predict2 for video → a world model steered by actions",
+        f"{CONVERT}.options:ImportCosmos2",
+        f"{CONVERT}.commands:import_cosmos2",
+    ),
+    "convert export diffusers": Command(
+        "our CogVideoX weights, fine-tuned or not → a folder for from_pretrained",
+        f"{CONVERT}.options:ExportDiffusers",
+        f"{CONVERT}.commands:export_diffusers",
+    ),
+    "convert export inference": Command(
+        "a training run → averaged weights in bfloat16, settings and a card",
+        f"{CONVERT}.options:ExportInference",
+        f"{CONVERT}.commands:export_inference",
+    ),
+    "convert export stablehlo": Command(
+        "a world model → programs that run without this library",
+        f"{CONVERT}.options:ExportStableHLO",
+        f"{CONVERT}.commands:export_stablehlo",
+    ),
+    "plan": Command(
+        "print what a training would take on other hardware",
+        f"{CLI}.train:arguments",
+        f"{CLI}.train:plan",
+    ),
 }
+GROUPS = {
+    "data": "collect, import, validate and show episodes",
+    "memory": "compute the image encoder's features of a data set once",
+    "convert": "import CogVideoX, SVD, Cosmos or DINOv2, export trained weights",
+    "convert import": "read a checkpoint of another library",
+    "convert export": "write weights for another program",
+}
+"""What the commands of a group do, in one line."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a subcommand; returns the exit code: 0, 2 bad input, 130 interrupted."""
-    return cli.run(_main, argv)
+    """Run a command; returns the exit code: 0, 1 problems found, 2 bad input, 130 interrupted."""
+    return parser.run(execute, argv)
 
 
-def _main(argv: Sequence[str]) -> int:
-    if not argv or argv[0] in ("-h", "--help"):
-        print(usage())
-        return 0 if argv else 2
-    if argv[0] == "--version":
+def deprecated(group: str) -> int:
+    """Run a group of commands called as a module; returns the exit code."""
+    called = f"python -m pewm_jax.{group}"
+    print(f"warning: `{called}` is deprecated; use `{PROGRAM} {group}`.", file=sys.stderr)
+    return parser.run(lambda argv: execute([group, *argv], called))
+
+
+def execute(argv: Sequence[str], called: str = "") -> int:
+    """Run a command; errors are raised.
+
+    Args:
+        argv: the words of the command and its arguments.
+        called: what the user typed instead of ``pewm-jax`` and the first word.
+
+    Returns:
+        The exit code.
+    """
+    if argv and argv[0] == "--version":
         print(f"{PROGRAM} {pewm_jax.__version__}")
         return 0
-    argv = plugins.take(argv)  # also for commands that need no worlds of a user's own
-    name = cli.choose(argv[0] if argv else "", list(COMMANDS), "command")
-    return COMMANDS[name].main(argv[1:], f"{PROGRAM} {name}")
+    name, rest = find(plugins.take(argv))
+    if name not in COMMANDS:
+        print(usage(name, called))
+        return 0 if rest else 2
+    values = read(name, rest, _prog(name, called))
+    return function_of(COMMANDS[name].run)(*values) or 0
 
 
-def usage() -> str:
-    """Return the help text: a line for each subcommand."""
-    lines = [f"  {name:<10}{command.about}" for name, command in COMMANDS.items()]
-    return "\n".join(
-        [f"usage: {PROGRAM} COMMAND …", "", "commands:", *lines, "", "Each has --help."]
-    )
+def find(argv: Sequence[str]) -> tuple[str, list[str]]:
+    """Return the name of the command that the arguments begin with, and the other arguments.
+
+    It is the name of a group where the arguments end or ask for help before a command is named.
+
+    Raises:
+        ConfigError: there is no such command; the message names the nearest one.
+    """
+    name, rest = "", list(argv)
+    while name not in COMMANDS:
+        if not rest or rest[0] in HELP:
+            return name, rest
+        words = list(below(name))
+        what = f"command {name}" if name else "command"
+        name = f"{name} {parser.choose(rest.pop(0), words, what)}".strip()
+    return name, rest
+
+
+def below(group: str) -> dict[str, str]:
+    """Return the next words under a group ("" for all commands), with what each does."""
+    start = f"{group} " if group else ""
+    found = {}
+    for name, command in COMMANDS.items():
+        if name.startswith(start):
+            word = name.removeprefix(start).split()[0]
+            found[word] = GROUPS.get(start + word, command.about)
+    return found
+
+
+def read(name: str, argv: Sequence[str], prog: str) -> list[Any]:
+    """Return what a command's function takes, read from its arguments."""
+    return list(parser.read(arguments_of(name, argv, prog), argv, prog).values())
+
+
+def arguments_of(name: str, argv: Sequence[str], prog: str) -> Arguments:
+    """Return what a command reads; see ``Command.settings``."""
+    found = function_of(COMMANDS[name].settings)
+    return Arguments({"settings": (found, None)}) if isinstance(found, type) else found(argv, prog)
+
+
+def function_of(where: str) -> Callable[..., Any]:
+    """Import what ``MODULE:NAME`` names."""
+    module, _, name = where.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def usage(group: str = "", called: str = "") -> str:
+    """Return the help of a group: a line for each command."""
+    start = f"{group} " if group else ""
+    names = [name.removeprefix(start) for name in COMMANDS if name.startswith(start)]
+    found = {name: COMMANDS[start + name].about for name in names} if group else below("")
+    width = max(8, *map(len, found)) + 2
+    lines = [
+        textwrap.fill(
+            about, 80, initial_indent=f"  {name:<{width}}", subsequent_indent=" " * (width + 2)
+        )
+        for name, about in found.items()
+    ]
+    usage_line = f"usage: {_prog(group, called)} COMMAND …"
+    return "\n".join([usage_line, "", "commands:", *lines, "", "Each has --help."])
+
+
+def _prog(name: str, called: str) -> str:
+    """Return the words that a command was called by."""
+    rest = name.partition(" ")[2]
+    return f"{called} {rest}".strip() if called else f"{PROGRAM} {name}".strip()

@@ -1,4 +1,4 @@
-"""``pewm-jax play``: drive through an imagined world in the browser."""
+"""Run ``pewm-jax play``: drive through an imagined world in the browser."""
 
 from __future__ import annotations
 
@@ -6,25 +6,30 @@ import dataclasses
 import functools
 import os
 import threading
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from pewm_jax import shipped
-from pewm_jax.cli import plugins as imports
-from pewm_jax.config import command_line as cli
-from pewm_jax.io import heap
+from pewm_jax.errors import ConfigError
+from pewm_jax.io import runtime
 from pewm_jax.play.settings import Serve, Start
-
-ABOUT = (
-    "Drive through a world that a model imagines, in the browser: W, A, S, D or the arrows, the "
-    "map in 3D, boxes to erase and move in it. It begins in a generated house, unless a mesh, an "
-    "episode or a recording is named. Ctrl-C ends it."
-)
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings(Start, Serve):
-    """Where the drive begins, and how the page is served."""
+    """Drive through a world that a model imagines, in the browser.
+
+    W, A, S, D or the arrows drive; the page has the map in 3D, with boxes to erase and move. The
+    drive begins in a generated house, unless a mesh, an episode or a recording is named. Ctrl-C
+    ends it.
+    """
+
+    model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = dataclasses.field(
+        kw_only=True
+    )
+    """A run's folder, an export, or the name of a model that comes with the library."""
 
     def __post_init__(self):
         """Validate."""
@@ -32,41 +37,26 @@ class Settings(Start, Serve):
         Serve.__post_init__(self)
 
 
-def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
-    """Serve the page until Ctrl-C.
-
-    Args:
-        argv: the arguments: a run, an export, or the name of weights that come along; and settings.
-        prog: the words that the command was called by, for help and refusals.
-
-    Returns:
-        The exit code.
-    """
-    argv = imports.take(argv)
-    asks = any(word in ("-h", "--help") for word in argv)
-    if not asks and (not argv or argv[0].startswith("-")):
-        raise cli.ConfigError(f"Name a model first: {prog} small.")
-    flags = ["--help"] if asks else argv[1:]
-    named = f"{prog} {'RUN' if asks else argv[0]}"
-    about = f"{ABOUT} Beside these settings:\n{imports.HELP}"
-    settings = cli.parse(Settings, flags, default=Settings(), prog=named, description=about)
-    if not (shipped.find(argv[0]) / "config.json").is_file():
-        raise cli.ConfigError(
-            f"{argv[0]} is no run: name its folder, such as runs/demo, or one of "
+def run(settings: Settings) -> None:
+    """Serve the page until Ctrl-C."""
+    model = settings.model
+    if not (shipped.find(model) / "config.json").is_file():
+        raise ConfigError(
+            f"{model} is no run: name its folder, such as runs/demo, or one of "
             f"{', '.join(shipped.names())}."
         )
-    # Imported here and not above: help and refusals come at once, and memory is set up before.
-    heap.keep_small()
+    # Imported here and not above: help and refusals are fast, and malloc is set up first.
+    runtime.keep_small()
     print("Starting …", flush=True)
     from pewm_jax.play import page as pages
     from pewm_jax.play import serving
 
     serve, start = _part(Serve, settings), _part(Start, settings)
-    home = shipped.home(argv[0])
-    _require_usable(argv[0], start, settings.worlds)
+    home = shipped.home(model)
+    _require_usable(model, start, settings.worlds)
     folder = settings.worlds or home / "worlds"
-    name, say = Path(argv[0]).name, functools.partial(print, flush=True)
-    page = pages.Page(lambda: _load(argv[0], home), start, serve, folder, name, say)
+    name, say = Path(model).name, functools.partial(print, flush=True)
+    page = pages.Page(lambda: _load(model, home), start, serve, folder, name, say)
     try:
         if settings.open:
             serving.open_in_browser(page.url)
@@ -75,7 +65,6 @@ def main(argv: Sequence[str], prog: str = "pewm-jax play") -> int:
         print("\nEnding …", flush=True)
     finally:
         page.close()
-    return 0
 
 
 def _require_usable(name: str, start: Start, worlds: Path | None) -> None:
@@ -96,7 +85,7 @@ def _require_usable(name: str, start: Start, worlds: Path | None) -> None:
     if worlds is not None:
         there = next(path for path in (worlds, *worlds.absolute().parents) if path.exists())
         if not there.is_dir() or not os.access(there, os.W_OK):
-            raise cli.ConfigError(
+            raise ConfigError(
                 f"--worlds is {worlds}, and {there} is no folder that can be written: choose "
                 "another one."
             )
@@ -107,7 +96,7 @@ def _load(name: str, home: Path):
     from pewm_jax.play.engine import open_engine
     from pewm_jax.train.loading import load
 
-    cli.cache_compilation(home.parent)
+    runtime.cache_compilation(home.parent)
     return open_engine(Path(name).name, *load(name))
 
 

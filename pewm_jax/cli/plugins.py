@@ -1,7 +1,8 @@
-"""``--plugin FILE`` and ``--import MODULE``: a user's own code runs before settings are read."""
+"""``--plugin FILE``: run a user's own code before settings are read."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import sys
 from collections.abc import Sequence
@@ -10,27 +11,29 @@ from pathlib import Path
 from pewm_jax import registry as kinds
 from pewm_jax.config import ConfigError
 
-HELP = (
-    "  --plugin FILE.py   run this file first: it registers worlds or parts of your own; may be\n"
-    "                     repeated\n"
-    "  --import MODULE    the same for a module that Python finds"
-)
-"""The line of the help text."""
+
+@dataclasses.dataclass(frozen=True)
+class Plugins:
+    """Code of the user's own that runs before settings are read; every command takes it."""
+
+    plugin: tuple[Path, ...] = ()
+    """FILE.py: run this Python file first; it registers worlds or parts of your own. May be
+    repeated."""
 
 
 def take(argv: Sequence[str]) -> list[str]:
-    """Import what ``--import`` and ``--plugin`` name, such as kinds of a user's own.
+    """Import the files that ``--plugin`` names, and the modules of the deprecated ``--import``.
 
-    They are looked for in the current folder too, after all others.
+    Modules are looked for in the current folder too, after all others.
 
     Args:
-        argv: the arguments; the flag may be repeated.
+        argv: the arguments; the flags may be repeated.
 
     Returns:
         The other arguments.
 
     Raises:
-        ConfigError: a flag without the name of a module, or one that cannot be imported.
+        ConfigError: a flag without its value, or a file or module that cannot be imported.
     """
     rest, queue = [], list(argv)
     while queue:
@@ -49,6 +52,8 @@ def take(argv: Sequence[str]) -> list[str]:
                 f"--import needs the name of a module, such as my_parts for my_parts.py, got "
                 f"{name!r}."
             )
+        message = "warning: --import MODULE is deprecated; use --plugin FILE.py."
+        print(message, file=sys.stderr)
         look_here()
         kinds.imported(name, "--import")
     return rest

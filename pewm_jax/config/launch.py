@@ -1,19 +1,14 @@
-"""Flags that say how a command is launched; they are not stored in a configuration."""
+"""Flags of commands that are not settings: which processes join, and what a plan is for."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
-from typing import Any
 
 from pewm_jax.errors import require
 
 COMPILED = ("auto", "on", "off")
 """Whether a plan compiles the step."""
-
-
-def _flag(default: Any, text: str) -> Any:
-    return dataclasses.field(default=default, metadata={"help": text})
 
 
 def is_address(text: str) -> bool:
@@ -24,23 +19,18 @@ def is_address(text: str) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Join:
-    """The flags by which a process joins the others of its job; help texts are in the metadata.
+    """How this process joins the others of its job."""
 
-    Attributes:
-        distributed: join the other processes of the job.
-        coordinator: address of process 0; if empty, JAX detects it.
-        processes: number of processes; if 0, JAX detects it.
-        process: number of this process; if −1, JAX detects it.
-        patience: seconds to wait for the other processes.
-    """
-
-    distributed: bool = _flag(
-        False, "join the other processes of this job (JAX detects SLURM, Kubernetes and TPU)"
-    )
-    coordinator: str = _flag("", "HOST:PORT of process 0, if JAX cannot detect it")
-    processes: int = _flag(0, "number of processes, if JAX cannot detect it")
-    process: int = _flag(-1, "number of this process, if JAX cannot detect it")
-    patience: int = _flag(60, "with --distributed: seconds to wait for all processes")
+    distributed: bool = False
+    """Join the other processes of this job. JAX detects SLURM, Kubernetes and TPU."""
+    coordinator: str = ""
+    """HOST:PORT of process 0, if JAX cannot detect it."""
+    processes: int = 0
+    """Number of processes, if JAX cannot detect it."""
+    process: int = -1
+    """Number of this process, if JAX cannot detect it."""
+    patience: int = 60
+    """With --distributed: seconds to wait for all processes."""
 
     def __post_init__(self):
         """Validate."""
@@ -69,25 +59,19 @@ class Join:
 
 @dataclasses.dataclass(frozen=True)
 class Launch(Join):
-    """The flags of ``train.py`` that are not settings; their help texts are in the metadata.
+    """What `pewm-jax train` and `pewm-jax plan` take besides the settings of a run."""
 
-    Attributes:
-        plan: do not train, but compile for other hardware and print what training would take.
-        devices: devices to plan for.
-        chip: kind of device to plan for.
-        compiled: whether a plan compiles the step.
-        profile: steps to trace.
-    """
-
-    plan: bool = _flag(False, "do not train: compile the step and print what training would take")
-    devices: int = _flag(8, "with --plan: how many devices")
-    chip: str = _flag("h200", "with --plan: h100, h200, b200, v5p or v6e")
-    compiled: str = _flag(
-        "auto",
-        "with --plan: on compiles the step and says what the program does, off gives the formulas' "
-        "numbers alone, auto leaves compiling out where it takes very long",
-    )
-    profile: int = _flag(0, "profile this many steps, for TensorBoard and Perfetto")
+    plan: bool = False
+    """Do not train: print what training would take on other hardware, as `pewm-jax plan` does."""
+    devices: int = 8
+    """Of a plan: number of devices."""
+    chip: str = "h200"
+    """Of a plan: h100, h200, b200, v5p or v6e."""
+    compiled: str = "auto"
+    """Of a plan: `on` compiles the step and reads the program, `off` prints the estimates of the
+    formulas alone, `auto` compiles unless that takes very long."""
+    profile: int = 0
+    """Profile this many steps, for TensorBoard and Perfetto."""
 
     def __post_init__(self):
         """Validate."""

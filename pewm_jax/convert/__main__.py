@@ -1,8 +1,8 @@
-"""``python -m pewm_jax.convert``: the former name of ``pewm-jax convert``."""
+"""``python -m pewm_jax.convert``: the deprecated name of ``pewm-jax convert``."""
 
 import sys
 
-from pewm_jax.cli import convert
+from pewm_jax.cli import main
 
 if __name__ == "__main__":
-    sys.exit(convert.main())
+    sys.exit(main.deprecated("convert"))

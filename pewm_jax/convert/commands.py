@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from pewm_jax.config import Config, UserError
-from pewm_jax.config import command_line as cli
+from pewm_jax.config.overlay import overlay
 from pewm_jax.convert import (
     cogvideox,
     cogvideox_world,
@@ -97,7 +96,7 @@ def _world(
         run=options.dst.name,
         encoder=DINOv2EncoderConfig(network=network) if network else None,
     )
-    config = cli.overlay(config, options.config) if options.config else config
+    config = overlay(config, options.config) if options.config else config
     cogvideox_world.require_size(config)
     kept = config.model.memory.encoder
     if network and not (isinstance(kept, DINOv2EncoderConfig) and kept.network == network):
@@ -190,15 +189,3 @@ def export_stablehlo(options: ExportStableHLO) -> None:
         platforms=options.platforms,
         check=options.check,
     )
-
-
-COMMANDS: dict[str, tuple[type, Callable[[Any], None]]] = {
-    "import cogvideox": (ImportCogVideoX, import_cogvideox),
-    "import dinov2": (ImportDINOv2, import_dinov2),
-    "import svd": (ImportSVD, import_svd),
-    "import cosmos2": (ImportCosmos2, import_cosmos2),
-    "export diffusers": (ExportDiffusers, export_diffusers),
-    "export inference": (ExportInference, export_inference),
-    "export stablehlo": (ExportStableHLO, export_stablehlo),
-}
-"""The flags of each command and what runs it."""

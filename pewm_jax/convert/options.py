@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -26,6 +26,9 @@ class ImportCogVideoX:
     it predicts the colours of the original. Without these flags the networks are only
     converted to our layout.
     """
+
+    REPEATED: ClassVar[tuple[str, ...]] = ("--prompt",)
+    """Flags of several values that may also be given several times."""
 
     src: Annotated[Path, tyro.conf.Positional]
     """The pipeline's folder: transformer/, vae/, scheduler/ and, if prompts are to be encoded,

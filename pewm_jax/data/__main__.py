@@ -1,8 +1,8 @@
-"""``python -m pewm_jax.data``: the former name of ``pewm-jax data``."""
+"""``python -m pewm_jax.data``: the deprecated name of ``pewm-jax data``."""
 
 import sys
 
-from pewm_jax.cli import data
+from pewm_jax.cli import main
 
 if __name__ == "__main__":
-    sys.exit(data.main())
+    sys.exit(main.deprecated("data"))

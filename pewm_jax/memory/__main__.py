@@ -1,8 +1,8 @@
-"""``python -m pewm_jax.memory``: the former name of ``pewm-jax memory``."""
+"""``python -m pewm_jax.memory``: the deprecated name of ``pewm-jax memory``."""
 
 import sys
 
-from pewm_jax.cli import memory
+from pewm_jax.cli import main
 
 if __name__ == "__main__":
-    sys.exit(memory.main())
+    sys.exit(main.deprecated("memory"))

@@ -22,7 +22,7 @@ from transformers import AutoTokenizer, T5EncoderModel
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import presets, registry
-from pewm_jax.cli.convert import main
+from pewm_jax.cli import main as program
 from pewm_jax.convert import cogvideox, cogvideox_world, pipeline, schedulers, widen
 from pewm_jax.io import sources, tensor_files, weights
 from pewm_jax.io.published import LINEAR, Entry
@@ -36,7 +36,7 @@ WORLD = ["--rgbd", "--camera", "--memory", "--frames", "9", "--height", "32", "-
 
 
 def run(*argv):
-    assert main([str(word) for word in argv]) == 0
+    assert program.main(["convert", *(str(word) for word in argv)]) == 0
 
 
 def bits(module):
@@ -327,7 +327,7 @@ def test_learned_positions_are_for_other_clips_by_choice(images, tmp_path, learn
     wide = square if learned == "reference" else ["--height", "32", "--width", "48"]
     dst = tmp_path / "dst"
     argv = ["import", "cogvideox", images, dst, *small, *wide]
-    assert main([str(word) for word in argv]) == 2
+    assert program.main(["convert", *(str(word) for word in argv)]) == 2
     assert "--positions" in capsys.readouterr().err
     run(*argv, "--positions", learned)
     config, params = pewm_jax.load(dst)

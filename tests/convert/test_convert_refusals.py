@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pewm_jax.cli.convert import COMMANDS, main
+from pewm_jax.cli import main as program
 
 WEIGHTS = "diffusion_pytorch_model"
 INDEX = f"{WEIGHTS}.safetensors.index.json"
@@ -31,7 +31,7 @@ def src(pristine, tmp_path):
 
 def refused(capsys, *argv):
     """The one sentence that a refused command prints on stderr."""
-    assert main([str(word) for word in argv]) == 2
+    assert program.main(["convert", *map(str, argv)]) == 2
     lines = [x for x in capsys.readouterr().err.splitlines() if x and not x.startswith("Loading")]
     assert len(lines) == 1, lines
     assert lines[0].startswith("error: ")
@@ -217,7 +217,7 @@ def test_a_failure_in_the_middle_leaves_nothing(src, capsys):
     argv = ["import", "cogvideox", src, src.parent / "dst", "--dtype"]
     assert "beyond float16's 65504" in refused(capsys, *argv, "float16")
     assert [p.name for p in src.parent.iterdir()] == ["src"]
-    assert main([str(word) for word in [*argv, "bfloat16"]]) == 0
+    assert program.main(["convert", *map(str, argv), "bfloat16"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -270,15 +270,15 @@ def test_an_import_without_the_libraries_says_what_to_install(
 
 
 def test_the_help_explains_every_command(capsys):
-    assert main(["--help"]) == 0
+    assert program.main(["convert", "--help"]) == 0
     text = capsys.readouterr().out
-    assert main([]) == 2
-    assert main(["import"]) == 2
+    assert program.main(["convert"]) == 2
+    assert program.main(["convert", "import"]) == 2
     capsys.readouterr()
-    for command in COMMANDS:
+    for command in (name for name in program.COMMANDS if name.startswith("convert ")):
         assert f"\n  {command} " in text
         with pytest.raises(SystemExit) as leave:
-            main([*command.split(), "--help"])
+            program.main([*command.split(), "--help"])
         assert leave.value.code == 0
         assert "Folder to make" in capsys.readouterr().out
     assert "did you mean import?" in refused(capsys, "imprt")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -12,17 +13,19 @@ import cv2
 import pytest
 from data_world import split
 
-from pewm_jax.cli.data import COMMANDS, main
+from pewm_jax.cli import main as program
 from pewm_jax.data.validate import ValidationResult
 from pewm_jax.io.progress import Meter
 from pewm_jax.presets.demo import config as demo
 
 ROOT = Path(__file__).parents[2]
 
+COMMANDS = ("collect", "import", "validate", "show")
+
 
 def refused(capsys, *argv):
     """The one sentence that a refused command prints on stderr."""
-    assert main([str(word) for word in argv]) == 2
+    assert program.main(["data", *map(str, argv)]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1, lines
     assert lines[0].startswith("error: ")
@@ -32,16 +35,16 @@ def refused(capsys, *argv):
 
 
 def test_the_help_lists_the_commands(capsys):
-    assert main(["--help"]) == 0
+    assert program.main(["data", "--help"]) == 0
     text = capsys.readouterr().out
     assert all(f"\n  {command} " in text for command in COMMANDS)
-    assert main([]) == 2
+    assert program.main(["data"]) == 2
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help(command, capsys):
     with pytest.raises(SystemExit) as leave:
-        main([command, "--help"])
+        program.main(["data", command, "--help"])
     assert leave.value.code == 0
     text = capsys.readouterr().out
     shown = {
@@ -87,8 +90,10 @@ def test_the_commands_of_the_format_description_fit_together(monkeypatch):
         lambda asked: ran["validate"].append(asked) or ValidationResult(0, 0, []),
     )
     text = (ROOT / "docs" / "data_format.md").read_text("utf-8")
-    lines = [x for x in text.splitlines() if x.startswith("python -m pewm_jax.data ")]
-    assert [main(shlex.split(line)[3:]) for line in lines] == [0] * len(lines)
+    called = r"^(?:python -m pewm_jax\.|pewm-jax )(data .*)$"
+    lines = [shlex.split(line) for line in re.findall(called, text, re.MULTILINE)]
+    assert lines
+    assert [program.main(words) for words in lines] == [0] * len(lines)
     assert all(ran.values())
     folders = [made.out for made in ran["collect"] + ran["import"]]
     assert len(set(folders)) == len(folders)  # an import is refused where a collection lies
@@ -104,17 +109,17 @@ def test_what_the_system_refuses_ends_in_one_sentence(capsys, tmp_path):
 
 def test_validate_and_show_from_the_command_line(capsys, tmp_path):
     folder = split(tmp_path / "train", frames=20)
-    assert main(["validate", str(tmp_path)]) == 0
+    assert program.main(["data", "validate", str(tmp_path)]) == 0
     assert "4 episodes, 80 frames, no problems" in capsys.readouterr().out
     picture = tmp_path / "x.png"
-    assert main(["show", str(folder), "--episode", "2", "--out", str(picture)]) == 0
+    assert program.main(["data", "show", str(folder), "--episode", "2", "--out", str(picture)]) == 0
     assert cv2.imread(str(picture)) is not None
     assert "0 to 3" in refused(capsys, "show", folder, "--episode", 9, "--out", picture)
     shard = folder / "shard-00000-of-00002.array_record"
     content = bytearray(shard.read_bytes())
     content[content.index(b"PEWMEPIS") + 9000] ^= 1
     shard.write_bytes(content)
-    assert main(["validate", str(tmp_path)]) == 1
+    assert program.main(["data", "validate", str(tmp_path)]) == 1
     assert "sha256" in capsys.readouterr().out
     shard.write_bytes(content[:-1])
     assert "truncated" in refused(capsys, "validate", tmp_path)
@@ -140,7 +145,7 @@ def test_an_interruption_says_so(capsys, monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("pewm_jax.data.collect.collect", interrupted)
-    assert main(["collect", str(tmp_path / "x")]) == 130
+    assert program.main(["data", "collect", str(tmp_path / "x")]) == 130
     assert "run the same command again to resume" in capsys.readouterr().err
 
 

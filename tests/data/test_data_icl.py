@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pewm_jax.cli.data import main
+from pewm_jax.cli import main as program
 from pewm_jax.data.checks import share_floating
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry.cameras import unproject
@@ -22,12 +22,12 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory):
     out = tmp_path_factory.mktemp("icl")
-    assert main(["import", str(RECORDING), str(out), *FLAGS]) == 0
+    assert program.main(["data", "import", str(RECORDING), str(out), *FLAGS]) == 0
     return out
 
 
 def test_it_imports_and_validates(imported, capsys):
-    assert main(["validate", str(imported)]) == 0
+    assert program.main(["data", "validate", str(imported)]) == 0
     assert "1 episodes, 43 frames, no problems" in capsys.readouterr().out
     episode = EpisodeSource(imported / "train")[0]
     assert (episode.length, episode.height, episode.width) == (43, 120, 160)
@@ -66,7 +66,10 @@ def test_frames_agree_with_each_other(imported):
 )
 def test_it_is_refused_as_what_it_is_not(tmp_path, capsys, flags, says):
     options = FLAGS[5:] if flags[0] == "--intrinsics" else FLAGS
-    assert main(["import", str(RECORDING), str(tmp_path / "out"), *options, *flags]) == 2
+    assert (
+        program.main(["data", "import", str(RECORDING), str(tmp_path / "out"), *options, *flags])
+        == 2
+    )
     told = capsys.readouterr().err.strip().splitlines()
     assert len(told) == 1
     assert says in told[0]

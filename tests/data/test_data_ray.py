@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pewm_jax.cli.data import main
+from pewm_jax.cli import main as program
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data import engines
 from pewm_jax.data.collect import collect
@@ -194,7 +194,7 @@ def test_an_engine_that_cannot_be_used_is_refused_before_anything_is_touched(
 ):
     flags = ["collect", str(tmp_path / "out"), "--engine", "ray"]
     monkeypatch.setitem(sys.modules, "ray", None)
-    assert main(flags) == 2
+    assert program.main(["data", *flags]) == 2
     assert "pip install 'pewm-jax[ray]'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -205,7 +205,7 @@ def test_a_cluster_that_does_not_answer_is_named(tmp_path, monkeypatch, capsys):
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
         flags = ["collect", str(tmp_path / "out"), "--engine", "ray", "--address", address]
-        assert main(flags) == 2
+        assert program.main(["data", *flags]) == 2
     err = capsys.readouterr().err
     assert err.startswith(f"error: there is no Ray cluster at --address {address} (Connection refu")
     assert err.count("\n") == 1

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from test_data_import import config as import_config
 from test_data_import import record
 
-from pewm_jax.cli.data import main
+from pewm_jax.cli import main as program
 from pewm_jax.config import ArraySpec, BatchSpec, ConfigError, DataConfig, ModelConfig, UserError
 from pewm_jax.data import clips, loader
 from pewm_jax.data.checks import check_episode
@@ -420,14 +420,16 @@ def test_the_flags_record_and_draw(tmp_path, capsys):
     out = tmp_path / "data"
     flags = ["--train=1", "--validation=0", "--test=0", "--frames=4", "--size=16", "--workers=1"]
     command = ["collect", str(out), *flags, "--voxels.side", "12"]
-    assert main(command) == 2
+    assert program.main(["data", *command]) == 2
     assert "--voxels.side 12 needs --voxels" in capsys.readouterr().err
-    assert main([*command, "--voxels", "--moving", "--voxels.kinds=groups"]) == 0
+    assert program.main(["data", *command, "--voxels", "--moving", "--voxels.kinds=groups"]) == 0
     episode = EpisodeSource(out / "train")[0]
     assert (episode.voxel_grid.side, episode.voxel_grid.cell_m) == (12, 0.2)
     assert "furniture/white" in episode.voxel_grid.names
     picture = tmp_path / "voxels.png"
-    assert main(["show", str(out / "train"), "--voxels", "--out", str(picture)]) == 0
+    assert (
+        program.main(["data", "show", str(out / "train"), "--voxels", "--out", str(picture)]) == 0
+    )
     drawn = cv2.imread(str(picture))
     np.testing.assert_array_equal(drawn[..., ::-1], draw_voxels(episode))
     assert drawn.shape[0] == 5 * 128

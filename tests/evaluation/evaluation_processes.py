@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from evaluation_scene import knowing_rollout, tiny
 
-from pewm_jax.config import Join
-from pewm_jax.config import command_line as cli
+from pewm_jax.cli import main as program
+from pewm_jax.cli import parser as cli
 
 
 def score(folder, devices):
@@ -46,7 +46,8 @@ def score(folder, devices):
 
 def main(argv):
     """Join, score, and write."""
-    join, (folder,) = cli.take(Join, argv)
+    settings = program.read("evaluate", argv, "evaluation_processes.py")[0]
+    join, folder = settings.join, settings.run
     from pewm_jax.train import processes
 
     with processes.joined(join):

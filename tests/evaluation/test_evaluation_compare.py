@@ -14,9 +14,8 @@ from PIL import Image
 from test_evaluation_statistics import sums_of
 
 from pewm_jax import config as configs
-from pewm_jax.cli import compare as command
+from pewm_jax.cli import main as program
 from pewm_jax.config import UserError
-from pewm_jax.config import command_line as cli
 from pewm_jax.eval import compare, results
 from pewm_jax.eval import protocol as protocols
 from pewm_jax.eval.clips import ClipChoice
@@ -160,7 +159,7 @@ def test_different_protocols_are_refused(tmp_path, errors):
     with pytest.raises(UserError, match=r"different protocols .*context 6 and 5.*--protocol"):
         compare.compare(a, b)
     assert not (a / "compare-b").exists()
-    assert cli.run(command.main, [str(a), str(b)]) == 2
+    assert program.main(["compare", str(a), str(b)]) == 2
 
 
 def test_what_is_no_pair_of_reports_is_refused(tmp_path, errors, capsys):
@@ -195,7 +194,7 @@ def test_what_is_no_pair_of_reports_is_refused(tmp_path, errors, capsys):
     (where / "samples.npz").unlink()
     with pytest.raises(UserError, match="the scores clip by clip"):
         compare.compare(a, b)
-    assert cli.run(command.main, [str(a)]) == 2
+    assert program.main(["compare", str(a)]) == 2
     assert "Name two scored runs first" in capsys.readouterr().err
 
 

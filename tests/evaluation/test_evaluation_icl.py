@@ -11,7 +11,7 @@ from evaluation_scene import tiny
 import pewm_jax
 from pewm_jax import config as configs
 from pewm_jax import worlds
-from pewm_jax.cli.data import main
+from pewm_jax.cli import main as program
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.eval import evaluate as report
 from pewm_jax.io import weights
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     out = tmp_path_factory.mktemp("icl")
-    assert main(["import", str(RECORDING), str(out), *FLAGS]) == 0
+    assert program.main(["data", "import", str(RECORDING), str(out), *FLAGS]) == 0
     return out
 
 

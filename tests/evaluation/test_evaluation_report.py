@@ -23,9 +23,8 @@ from evaluation_scene import tiny, write_split
 from PIL import Image
 
 from pewm_jax import config as configs
-from pewm_jax.cli import protocol as protocol_command
+from pewm_jax.cli import main as program
 from pewm_jax.config import StageConfig, TrainConfig, UserError
-from pewm_jax.config import command_line as cli
 from pewm_jax.eval import compare, preview, runner
 from pewm_jax.eval import evaluate as report
 from pewm_jax.eval import loaded_run as runs
@@ -223,12 +222,12 @@ def test_the_protocol_of_a_report_scores_another_run_which_is_compared(run, copi
 
 def test_a_protocol_is_written_before_training_and_followed(run, copied, tmp_path, capsys):
     path = tmp_path / "protocol.json"
-    assert cli.run(protocol_command.main, [str(run), "--out", str(path)]) == 0
+    assert program.main(["protocol", str(run), "--out", str(path)]) == 0
     metrics = json.loads((run / "report" / "metrics.json").read_text())
     assert metrics["protocol"]["protocol_sha256"] in capsys.readouterr().out
     other = tmp_path / "other.json"
     flags = ["--clips", "3", "--seeds", "5", "--out", str(other)]
-    assert cli.run(protocol_command.main, [str(run), *flags]) == 0
+    assert program.main(["protocol", str(run), *flags]) == 0
     settings = json.loads((copied / "config.json").read_text())
     settings["evaluate"]["protocol"] = str(other)
     (copied / "config.json").write_text(json.dumps(settings))
@@ -240,8 +239,8 @@ def test_a_protocol_is_written_before_training_and_followed(run, copied, tmp_pat
     report.evaluate(copied, log=lambda _: None, protocol="off")
     own = json.loads((copied / "report" / "metrics.json").read_text())["protocol"]
     assert own["protocol_sha256"] == metrics["protocol"]["protocol_sha256"]
-    assert cli.run(protocol_command.main, ["nothing"]) == 2
-    assert cli.run(protocol_command.main, ["codec"]) == 2
+    assert program.main(["protocol", "nothing"]) == 2
+    assert program.main(["protocol", "codec"]) == 2
 
 
 def test_untrained_memory_changes_nothing(run):

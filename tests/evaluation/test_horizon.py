@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pewm_jax.cli import horizon as command
+from pewm_jax.cli import main as program
 from pewm_jax.config import UserError
-from pewm_jax.config.command_line import ConfigError
+from pewm_jax.errors import ConfigError
 from pewm_jax.eval import horizon, voxel_trials
 from pewm_jax.models.persist import voxel_vae
 from pewm_jax.models.persist.config import VoxelVAEConfig
@@ -109,6 +109,6 @@ def test_cells_are_given_back_with_their_class_or_count_as_wrong(monkeypatch):
 def test_ends_that_make_no_windows_are_refused():
     for ends in (["600", "200"], ["8"]):
         with pytest.raises(ConfigError, match="rising numbers"):
-            command.main(["runs/x", "--ends", *ends])
+            program.execute(["horizon", "runs/x", "--ends", *ends])
     with pytest.raises(ConfigError, match="Name a run"):
-        command.main([])
+        program.execute(["horizon"])

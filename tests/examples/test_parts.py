@@ -15,7 +15,8 @@ import pytest
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import worlds
-from pewm_jax.config import Config, UserError, flags
+from pewm_jax.cli import flags
+from pewm_jax.config import Config, UserError
 from pewm_jax.data import loader
 from pewm_jax.io import tree
 from pewm_jax.train import loop

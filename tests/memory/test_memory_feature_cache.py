@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.cli import memory as command
+from pewm_jax.cli import main as program
 from pewm_jax.codecs import signals
 from pewm_jax.config import UserError, save
 from pewm_jax.data.dataset import EpisodeSource
@@ -164,13 +164,15 @@ def test_the_command_fills_every_split_with_either_encoder(cache, params, data, 
     weights.save(folder / "weights.safetensors", params)
     arguments = ["cache", str(data.parent), str(tmp_path / "c"), "--size", "28", "--dtype"]
     arguments += ["float32", "--batch", "4", "--encoder", str(folder)]
-    assert command.main(arguments) == 0
+    assert program.main(["memory", *arguments]) == 0
     assert "features: 21 frames in" in capsys.readouterr().out
-    assert command.main(arguments) == 0
+    assert program.main(["memory", *arguments]) == 0
     assert "finished already, 3 episodes" in capsys.readouterr().out
     made = feature_cache.open_cache(tmp_path / "c" / "train", CONFIG, params, data)
     assert made.files == cache.files
-    assert command.main(["cache", str(data), str(tmp_path / "colours"), "--patch", "4"]) == 0
+    assert (
+        program.main(["memory", "cache", str(data), str(tmp_path / "colours"), "--patch", "4"]) == 0
+    )
     colours = PatchColoursConfig(patch=4)
     made = feature_cache.open_cache(tmp_path / "colours", colours, {}, data)
     assert feature_cache.features(made, "episode-2", [3]).shape == (1, 4, 4, 6)
@@ -189,7 +191,7 @@ def test_the_command_fills_every_split_with_either_encoder(cache, params, data, 
 )
 def test_bad_commands_are_refused_in_a_sentence(arguments, words, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert command.main(arguments) == 2
+    assert program.main(["memory", *arguments]) == 2
     told = capsys.readouterr()
     assert told.err.startswith("error: ")
     assert words in told.err

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.cli.data import main
+from pewm_jax.cli import main as program
 from pewm_jax.codecs.signals import signal_from_rgb
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry import cameras
@@ -27,7 +27,7 @@ LATER = 42
 @pytest.fixture(scope="module")
 def episode(tmp_path_factory):
     out = tmp_path_factory.mktemp("icl_map")
-    assert main(["import", str(RECORDING), str(out), *FLAGS]) == 0
+    assert program.main(["data", "import", str(RECORDING), str(out), *FLAGS]) == 0
     return EpisodeSource(out / "train")[0]
 
 

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from pewm_jax.cli import data
+from pewm_jax.cli import main as program
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.collect_env import CollectEnvConfig, collect_env, open_env
 from pewm_jax.data.collect_env import make as make_record
@@ -100,10 +100,10 @@ def hashes(folder):
 def test_the_command_walks_a_registered_house(tmp_path, capsys):
     arguments = ["collect", str(tmp_path), "--env", HOUSE, "--env_args", SIZE]
     counts = ["--train", "2", "--validation", "1", "--test", "0", "--frames", "20"]
-    assert data.main([*arguments, *counts]) == 0
-    assert data.main(["validate", str(tmp_path)]) == 0
+    assert program.main(["data", *arguments, *counts]) == 0
+    assert program.main(["data", "validate", str(tmp_path)]) == 0
     assert "3 episodes, 60 frames, no problems" in capsys.readouterr().out
-    assert data.main([*arguments, *counts]) == 0
+    assert program.main(["data", *arguments, *counts]) == 0
     assert "nothing to do" in capsys.readouterr().out
     episode = EpisodeSource(tmp_path / "train")[0]
     moved = np.linalg.norm(episode.actions[:, :2], axis=1)
@@ -220,9 +220,9 @@ def test_settings_that_cannot_work_are_refused(tmp_path, options, says):
 
 def test_help_explains_every_flag(tmp_path, capsys):
     with pytest.raises(SystemExit):
-        data.main(["collect", "--env", "--help"])
+        program.main(["data", "collect", "--env", "--help"])
     text = capsys.readouterr().out
     for field in dataclasses.fields(CollectEnvConfig):
         assert field.name == "out" or f"--{field.name}" in text
-    assert data.main(["collect", str(tmp_path), "--env=x"]) == 2
+    assert program.main(["data", "collect", str(tmp_path), "--env=x"]) == 2
     assert "give MODULE:NAME" in capsys.readouterr().err

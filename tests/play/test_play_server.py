@@ -14,6 +14,7 @@ import viser.transforms
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from pewm_jax.cli import main as program
 from pewm_jax.cli import play
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.play import page, panels, serving, session
@@ -214,7 +215,7 @@ def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
     )
     for argv, says in wrong:
         with pytest.raises(UserError, match=says):
-            play.main(argv)
+            program.execute(["play", *argv])
     code = (
         "import sys; sys.modules['viser'] = None\n"
         "from pewm_jax.cli.main import main\n"
@@ -228,9 +229,9 @@ def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
 
 
 def test_settings_of_a_page_are_those_of_its_parts():
-    settings = play.Settings(house=5, port=0)
+    settings = play.Settings(model="small", house=5, port=0)
     assert play._part(Start, settings).house == 5
     assert play._part(Serve, settings).port == 0
     with pytest.raises(ConfigError):
-        play.Settings(port=-1)
+        play.Settings(model="small", port=-1)
     assert session.Begin(Start()).start.house == 2

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 import pewm_jax
 from pewm_jax import worlds
+from pewm_jax.cli import parser as cli
 from pewm_jax.cli import play
 from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, ConfigError, UserError
-from pewm_jax.config import command_line as cli
 from pewm_jax.data.navigation import is_free
 from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.play import board, engine, picking, places, saved, session
@@ -88,10 +88,10 @@ def test_the_commands_of_the_documentation_can_be_read_and_its_buttons_are_there
     assert len(lines) >= 5
     for line in lines:
         _, *flags = line.split()
-        cli.parse(play.Settings, flags, default=play.Settings(), prog="pewm-jax play")
+        cli.parse(play.Settings, ["small", *flags], prog="pewm-jax play")
     for flag in set(re.findall(r"`(--[\w-]+)", PAGE)):
         value = {"--host": ["0.0.0.0"], "--frames": ["8"], "--worlds": ["here"]}.get(flag, [])
-        cli.parse(play.Settings, [flag, *value], default=play.Settings(), prog="pewm-jax play")
+        cli.parse(play.Settings, ["small", flag, *value], prog="pewm-jax play")
     files = ("page.py", "panels.py")
     code = "".join((ROOT / "pewm_jax" / "play" / name).read_text() for name in files)
     for button in re.findall(r"(?<!\*)\*([A-Z][^*\n]+)\*(?!\*)", PAGE):

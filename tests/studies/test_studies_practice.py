@@ -9,7 +9,8 @@ import pytest
 
 from pewm_jax import config as configuration
 from pewm_jax import presets
-from pewm_jax.cli import table2 as table2_command
+from pewm_jax.cli import main as program
+from pewm_jax.cli import studies as commands
 from pewm_jax.config import ActionConfig, ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.simulator import move
@@ -157,12 +158,12 @@ def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
     with pytest.raises(UserError, match="train a policy first"):
         deciders.open_policy(tmp_path / "nothing")
     with pytest.raises(ConfigError, match="nor the folder of a trained NoMaD"):
-        table2_command.main(["--policy", str(tmp_path / "nothing")])
+        program.execute(["table2", "--policy", str(tmp_path / "nothing")])
 
 
 def test_a_trained_nomad_proposes_for_table_2(made, home):
     folder, _ = made
-    name, policy = table2_command._policy(str(folder / "policy"))
+    name, policy = commands._policy(str(folder / "policy"))
     assert name.startswith("policy-")
     first = deciders.proposed(policy, home, 3)
     assert first.shape == (3, 4)

@@ -15,8 +15,7 @@ import pytest
 
 from pewm_jax import config as configuration
 from pewm_jax import presets
-from pewm_jax.cli import table1 as command
-from pewm_jax.cli.data import main as data_command
+from pewm_jax.cli import main as program
 from pewm_jax.config import UserError
 from pewm_jax.convert import dinov2 as convert
 from pewm_jax.eval import metrics
@@ -62,17 +61,15 @@ def made(tmp_path_factory):
     """A whole table by the command, one seed, two steps of each training, and what was said."""
     folder = tmp_path_factory.mktemp("table1")
     few = ["--train", "2", "--validation", "0", "--test", "2"]
-    assert data_command(["collect", str(folder / "data"), *few, *SIZE]) == 0
+    assert program.main(["data", "collect", str(folder / "data"), *few, *SIZE]) == 0
     said = io.StringIO()
     with (
         mock.patch.object(presets, "load", return_value=small(folder / "data")),
-        mock.patch(
-            "pewm_jax.config.command_line.cache_compilation"
-        ),  # it sets an option of all of JAX
+        mock.patch("pewm_jax.io.runtime.cache_compilation"),  # it sets an option of all of JAX
         contextlib.redirect_stdout(said),
     ):
         argv = ["--data", str(folder / "data"), "--out", str(folder / "out")]
-        assert command.main([*argv, "--steps", "2", "2", "--seeds", "0"]) == 0
+        assert program.execute(["table1", *argv, "--steps", "2", "2", "--seeds", "0"]) == 0
     return folder, folder / "out" / "table1.md", said.getvalue().splitlines()
 
 
@@ -368,7 +365,7 @@ def measured(tmp_path_factory):
     """A judge with every measure that Table 1 has, by random weights, and small clips."""
     folder = tmp_path_factory.mktemp("measured")
     few = ["--train", "1", "--validation", "0", "--test", "3", "--size", "32", "--frames", "48"]
-    assert data_command(["collect", str(folder / "data"), *few]) == 0
+    assert program.main(["data", "collect", str(folder / "data"), *few]) == 0
     alex = folder / "alex.safetensors"
     weights.save(alex, lpips.init("alex", jax.random.key(0)))
     nets = {
@@ -513,7 +510,9 @@ def test_the_walk_back_passes_the_same_cameras():
 )
 def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):
     with pytest.raises(UserError, match=words):
-        command.main([*argv, "--out", str(tmp_path / "out"), "--data", str(tmp_path / "none")])
+        program.execute(
+            ["table1", *argv, "--out", str(tmp_path / "out"), "--data", str(tmp_path / "none")]
+        )
     assert not (tmp_path / "out" / "protocol.json").exists()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from pewm_jax import config as configuration
 from pewm_jax import presets
-from pewm_jax.cli import table2 as command
+from pewm_jax.cli import main as program
 from pewm_jax.config import ActionConfig, ConfigError, UserError
 from pewm_jax.io import weights
 from pewm_jax.planning import costs, scores
@@ -191,7 +191,7 @@ def test_ranking_takes_the_best_proposal():
 )
 def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):
     with pytest.raises(ConfigError, match=words):
-        command.main([*argv, "--cost", "pixels", "--out", str(tmp_path / "out")])
+        program.execute(["table2", *argv, "--cost", "pixels", "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
 
 
@@ -275,4 +275,4 @@ def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
 @pytest.mark.parametrize("far", [["2"], ["1", "1"], ["3", "1"], ["0"]])
 def test_distances_of_goals_that_cannot_be_are_refused(far):
     with pytest.raises(ConfigError, match="--multiples needs growing numbers from 1 on"):
-        command.main(["--multiples", *far])
+        program.execute(["table2", "--multiples", *far])

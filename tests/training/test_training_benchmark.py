@@ -9,8 +9,8 @@ import pytest
 import training_fakes as fakes
 
 from pewm_jax import presets as configs
+from pewm_jax.cli import parser as cli
 from pewm_jax.config import Config, UserError
-from pewm_jax.config import command_line as cli
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
 from pewm_jax.train import loop

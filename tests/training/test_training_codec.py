@@ -11,7 +11,7 @@ import pytest
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import presets, worlds
-from pewm_jax.cli import evaluate
+from pewm_jax.cli import main as program
 from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
@@ -327,7 +327,7 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
     recorded(data / "validation", 3)
     recorded(data / "blind", 1, holes=True)
     argv = [str(run), "--data", str(data), "--split", "validation"]
-    assert evaluate.main(argv) == 0
+    assert program.execute(["evaluate", *argv]) == 0
     out = capsys.readouterr().out
     assert "3 scenes, 24×16 pixels" in out
     result = json.loads((run / "report" / "codec-validation.json").read_text())
@@ -351,4 +351,4 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
     with pytest.raises(UserError, match="is not trained to its end"):
         codec_score.score(run, data=data, split="validation")
     with pytest.raises(ConfigError, match="leave out --seeds, --steps"):
-        evaluate.main([str(run), "--steps", "2", "--seeds", "0"])
+        program.execute(["evaluate", str(run), "--steps", "2", "--seeds", "0"])

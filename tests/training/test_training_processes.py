@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import training_processes as jobs
 
-import train
+from pewm_jax.cli import main as program
 from pewm_jax.config import Launch, UserError
-from pewm_jax.config import command_line as cli
 from pewm_jax.data import loader
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
+from pewm_jax.io import runtime
 from pewm_jax.train import processes
 
 FAKE = {"FAKE": "1"}
@@ -57,7 +57,7 @@ def test_nothing_to_join_is_said_in_a_sentence(capsys, monkeypatch):
         processes.start(Launch(distributed=True))
     for address in ("node-0", ":1234", "node-0:0", "node-0:65536"):
         by_hand = ["--coordinator", address, "--processes", "2", "--process", "0"]
-        assert cli.run(train.main, ["tiny", "--distributed", *by_hand]) == 2
+        assert program.main(["train", "tiny", "--distributed", *by_hand]) == 2
         assert "HOST:PORT" in capsys.readouterr().err
 
 
@@ -83,9 +83,9 @@ def test_one_process_agrees_with_itself():
 
 def run_here(monkeypatch, argv, term_at=0):
     """Run train.py in this process, with one device; returns its exit code."""
-    monkeypatch.setattr(cli, "cache_compilation", lambda folder: None)
+    monkeypatch.setattr(runtime, "cache_compilation", lambda folder: None)
     monkeypatch.setattr(loader, "clips", jobs.told_at(loader.clips, term_at))
-    return cli.run(train.main, list(map(str, argv)))
+    return program.main(["train", *map(str, argv)])
 
 
 def test_two_processes_of_two_devices_compute_the_losses_of_one(tmp_path, monkeypatch):

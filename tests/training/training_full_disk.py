@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import training_fakes as fakes
 
-from pewm_jax.config import command_line as cli
+from pewm_jax.cli import parser as cli
 from pewm_jax.train import checkpoint_files, loop, runs
 from pewm_jax.train.checkpoint import Checkpoints
 from pewm_jax.train.log import MetricsLog

@@ -24,8 +24,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from pewm_jax.config import Launch
-from pewm_jax.config import command_line as cli
+from pewm_jax.cli import main as program
+from pewm_jax.cli import parser as cli
 from pewm_jax.train import feed, processes
 
 HERE = Path(__file__).parent
@@ -171,7 +171,7 @@ def told_at(read, batch, pause=0.0):
 
 def meet(argv):
     """Do nothing but agree, again and again."""
-    launch, _ = cli.take(Launch, argv)
+    launch = program.read("train", argv, "train.py")[0].launch
     with processes.joined(launch):
         for count in itertools.count():
             processes.agree(count)
@@ -181,7 +181,7 @@ def meet(argv):
 
 def place(argv):
     """Place a batch on meshes of every kind, and check what lies on each device of this process."""
-    launch, _ = cli.take(Launch, argv)
+    launch = program.read("train", argv, "train.py")[0].launch
     with processes.joined(launch):
         first, second = np.asarray(jax.devices()).reshape(2, -1)
         count = len(first)
@@ -230,7 +230,7 @@ def main():
     loader.clips = told_at(
         loader.clips, int(os.environ.get("TERM_AT", "0")), float(os.environ.get("PAUSE", "0"))
     )
-    return cli.run(importlib.import_module("train").main)
+    return cli.run(lambda argv: program.execute(["train", *argv]))
 
 
 if __name__ == "__main__":

@@ -6,14 +6,14 @@ import sys
 
 import pytest
 
-from pewm_jax.io import heap
+from pewm_jax.io import runtime
 
 THREADS = 6
 COUNT = f"""
 import ctypes, sys, threading
-from pewm_jax.io import heap
+from pewm_jax.io import runtime
 if sys.argv[1] == "few":
-    assert heap.keep_small()
+    assert runtime.keep_small()
 libc = ctypes.CDLL(None)
 together = threading.Barrier({THREADS})
 
@@ -38,9 +38,9 @@ def arenas(how):
 
 FAULTS = """
 import ctypes, resource, sys
-from pewm_jax.io import heap
+from pewm_jax.io import runtime
 if sys.argv[1] == "kept":
-    assert heap.keep_large()
+    assert runtime.keep_large()
 libc, size = ctypes.CDLL(None), 64 << 20
 libc.malloc.restype = libc.memset.restype = ctypes.c_void_p
 
@@ -75,10 +75,10 @@ def test_large_blocks_are_kept_only_when_asked_to():
 
 @glibc
 def test_threads_share_keep_small_only_when_asked_to():
-    assert arenas("few") <= heap.ARENAS < arenas("many")
+    assert arenas("few") <= runtime.ARENAS < arenas("many")
 
 
 def test_where_there_is_nothing_to_set_it_says_so(monkeypatch):
-    monkeypatch.setattr(heap.ctypes, "CDLL", lambda _: object())
-    assert not heap.keep_small()
-    assert not heap.keep_large()
+    monkeypatch.setattr(runtime.ctypes, "CDLL", lambda _: object())
+    assert not runtime.keep_small()
+    assert not runtime.keep_large()

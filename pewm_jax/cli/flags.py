@@ -8,18 +8,19 @@ settings that both kinds have are kept.
 from __future__ import annotations
 
 import dataclasses
+import typing
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
-from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
-from pewm_jax.config import Config, ConfigError, Settings, serialize
+from pewm_jax.config import Config, ConfigError, Settings
 from pewm_jax.config.migrations import RENAMED_FLAGS, RENAMED_SETTINGS, kind_now
+from pewm_jax.config.overlay import section_with_kinds, with_kind
 
 T = TypeVar("T")
 
 
-def spelled_out(flags: Sequence[str], default: Any) -> list[str]:
+def full_names(flags: Sequence[str], default: Any) -> list[str]:
     """Return flags by their full, current names, if the default is an experiment.
 
     Args:
@@ -86,7 +87,7 @@ def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
         path = flag.removeprefix("--").split(".")[:-1]
         chosen.append((path, value if equals else queue.pop(0) if queue else None, flag))
     for path, name, flag in sorted(chosen, key=lambda choice: len(choice[0])):
-        section = _section(default, path)
+        section = section_with_kinds(default, path)
         if section is None:
             rest.append(flag if name is None else f"{flag}={name}")
         elif name is None:
@@ -97,33 +98,19 @@ def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
     return default, rest
 
 
-def with_kind(default: T, path: Sequence[str], name: str) -> T:
-    """Put settings of another kind into a section, with what both kinds have in common.
-
-    Args:
-        default: the settings that the section is in.
-        path: of the section; where there is none that has kinds, nothing changes.
-        name: of the kind.
-
-    Returns:
-        Settings that are not validated: what follows may be what makes them fit each other.
-
-    Raises:
-        ConfigError: there is no such kind, or one that cannot be made from defaults.
-    """
-    section = _section(default, path)
-    return default if section is None else _replaced(default, path, _as_kind(section, name))
-
-
-def of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
+def flags_of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
     """Yield the flags of settings (or of a dataclass type), nested ones too, with their fields."""
     instance = None if isinstance(settings, type) else settings
     if isinstance(instance, Settings) and prefix != "--":
         yield f"{prefix}kind", None
+    hints = typing.get_type_hints(type(instance) if instance else settings, include_extras=True)
     for field in dataclasses.fields(settings):
         value = kinds.default_of(field) if instance is None else getattr(instance, field.name)
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            yield from of(value, f"{prefix}{field.name}.")
+        flat = any(getattr(mark, "name", None) == "" for mark in typing.get_args(hints[field.name]))
+        if flat:
+            yield from flags_of(value, prefix)
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            yield from flags_of(value, f"{prefix}{field.name}.")
         else:
             yield f"{prefix}{field.name}", field
 
@@ -142,55 +129,6 @@ def kinds_text(default: Any, prefix: str = "") -> str:
                 lines.append(f"  --{name}.kind {{{','.join(known)}}} ({kinds.of(value).name})")
         below = kinds_text(value, f"{name}.")
         lines += [below] if below else []
+    if lines and not prefix:
+        lines.insert(0, "Parts of the model of which there are several kinds:")
     return "\n".join(lines)
-
-
-def _section(settings: Any, path: Sequence[str]) -> Any:
-    """Return the settings at a path if their section has kinds, else None."""
-    for name in path:
-        if not dataclasses.is_dataclass(settings) or not hasattr(settings, name):
-            return None
-        settings = getattr(settings, name)
-    return settings if path and isinstance(settings, Settings) else None
-
-
-def _as_kind(old: Any, name: str) -> Any:
-    """Return settings of another kind, keeping what both kinds have, without validation."""
-    kind = kinds.named(old.SECTION, name)
-    if kind.settings is type(old):
-        return old
-    needed = serialize.needed(kind.settings)
-    if needed:
-        raise ConfigError(
-            f"The {kind.section} {name!r} cannot be chosen by its name: its settings "
-            f"{', '.join(needed)} have no default; give {kind.settings.__name__} one for each."
-        )
-    values = {field.name: getattr(old, field.name) for field in dataclasses.fields(old)}
-    both = values.keys() & {field.name for field in dataclasses.fields(kind.settings)}
-    shared = {name for name in both if serialize.accepts(kind.settings, name, values[name])}
-    return _unchecked(kind.settings(), {name: values[name] for name in shared})
-
-
-def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
-    """Return settings with the value at a path replaced."""
-    if not path:
-        return value
-    inner = _replaced(getattr(settings, path[0]), path[1:], value)
-    changes = {path[0]: inner}
-    if isinstance(settings, Config) and list(path) == ["model"]:
-        # Another world has other stages, which start with their default settings.
-        common = configuration.to_dict(settings.train)
-        wanted = {field.name for field in dataclasses.fields(value.TRAIN)}
-        changes["train"] = configuration.from_dict(
-            value.TRAIN, {name: common[name] for name in common.keys() & wanted}, "train"
-        )
-    return _unchecked(settings, changes)
-
-
-def _unchecked(settings: Any, changes: dict[str, Any]) -> Any:
-    """Return changed settings, not validated: the flags that follow may be what makes them fit."""
-    new = object.__new__(type(settings))
-    for field in dataclasses.fields(settings):
-        value = changes.get(field.name, getattr(settings, field.name))
-        object.__setattr__(new, field.name, value)
-    return new

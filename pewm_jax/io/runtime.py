@@ -1,12 +1,16 @@
-"""Memory that a process keeps: settings of glibc's ``malloc``, for command lines only.
+"""Set up the process of a command: glibc's ``malloc``, and the cache of compiled programs.
 
-They must come before libraries begin threads, and so before NumPy is imported. With other C
-libraries nothing happens.
+``keep_small`` and ``keep_large`` must run before libraries start threads, and so before NumPy is
+imported. With other C libraries they do nothing.
 """
 
 from __future__ import annotations
 
 import ctypes
+import hashlib
+import platform
+from pathlib import Path
+from typing import Any
 
 TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -2, -3, -4, -8
 """The names of these settings in glibc's ``malloc.h``: ``M_TRIM_THRESHOLD`` and so on."""
@@ -51,3 +55,24 @@ def _set(values: dict[int, int]) -> bool:
     except (OSError, AttributeError, TypeError):
         return False
     return all(mallopt(name, value) == 1 for name, value in values.items())
+
+
+def cache_compilation(folder: str | Path) -> None:
+    """Make JAX cache compiled programs in a folder, so that the next start is faster.
+
+    There is one cache per set of processor features, for which programs are compiled. Call this
+    from commands only: it sets a global option of JAX. A folder that the caller has chosen, by
+    ``JAX_COMPILATION_CACHE_DIR`` or ``jax.config``, stays, and so does a cache that the caller has
+    switched off (``JAX_ENABLE_COMPILATION_CACHE``).
+    """
+    import jax  # noqa: PLC0415 - takes seconds, and refusals do not need it
+
+    chosen: Any = jax.config
+    if chosen.jax_compilation_cache_dir or not chosen.jax_enable_compilation_cache:
+        return
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else [platform.processor()]
+    features = next((line for line in lines if line.startswith(("flags", "Features"))), lines[0])
+    kind = hashlib.sha256(features.encode()).hexdigest()[:12]
+    path = (Path(folder) / ".cache" / kind).resolve()
+    jax.config.update("jax_compilation_cache_dir", str(path))

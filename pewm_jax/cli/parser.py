@@ -1,0 +1,331 @@
+"""Read the settings of a command from its arguments, with tyro; refuse them in one sentence.
+
+The settings are dataclasses. Their fields are the flags, fields marked ``tyro.conf.Positional`` are
+the positional arguments, and docstrings are the help. Several dataclasses are composed, not copied:
+a field of type ``Flat[Join]`` adds the flags of ``Join`` without a prefix.
+
+For the settings of an experiment, ``--config FILE`` overlays a JSON file, ``--SECTION.kind NAME``
+replaces a section by that of another kind, ``--clip.width 64`` is short for ``--model.clip.width
+64``, and names from earlier versions are accepted.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import dataclasses
+import difflib
+import inspect
+import re
+import sys
+import textwrap
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+
+from pewm_jax.cli.flags import flags_of, full_names, kinds_text, take_kinds
+from pewm_jax.cli.plugins import Plugins
+from pewm_jax.config import Config
+from pewm_jax.config.overlay import overlay
+from pewm_jax.errors import ConfigError, UserError, report
+
+T = TypeVar("T")
+Flat = Annotated[T, tyro.conf.arg(name="")]
+"""The type of a field whose own fields are flags without a prefix."""
+HELP = ("-h", "--help")
+_PLAIN = (
+    (r"invalid literal for int\(\) with base 10: (.*)", r"needs a whole number, got \1"),
+    (r"could not convert string to float: (.*)", r"needs a number, got \1"),
+    (r"(?s)no type matching (?:\{None\}\|)?\{?(.*?)\}? could be .* from (\[.*?\])\..*",
+     r"needs \1, got \2"),
+)  # fmt: skip
+"""Messages of tyro, and what is said instead behind the flag's name."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ConfigFile:
+    """A file of settings."""
+
+    config: Path | None = None
+    """JSON file of settings, nested like a run's config.json; flags override it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """What a command takes.
+
+    Attributes:
+        groups: dataclasses whose fields become flags, each with its default; None for the default
+            of the class itself.
+        description: the first paragraph of the help; by default the docstring of the first group.
+        epilog: text under the help, printed as it is.
+        hint: the command whose ``--help`` lists the settings, for error messages.
+        renamed: earlier names of flags, with the present ones.
+    """
+
+    groups: Mapping[str, tuple[type, Any]]
+    description: str | None = None
+    epilog: str = ""
+    hint: str = ""
+    renamed: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+
+def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:
+    """Run a command; turn errors into an exit code and one sentence on stderr.
+
+    Args:
+        main: the command; takes the arguments and returns an exit code (None is 0).
+        argv: the arguments, by default those of the process.
+
+    Returns:
+        0; 2 for bad input and for files that cannot be used; 130, or the error's ``exit_code``,
+        for an interruption.
+    """
+    try:
+        return main(sys.argv[1:] if argv is None else argv) or 0
+    except (UserError, OSError, KeyboardInterrupt) as error:
+        return report(error)
+
+
+def parse(
+    kind: type[T],
+    argv: Sequence[str],
+    *,
+    default: T | None = None,
+    prog: str,
+    description: str | None = None,
+) -> T:
+    """Read one dataclass from flags such as ``--train.stage1.steps 10``.
+
+    Args:
+        kind: the frozen dataclass to read.
+        argv: the arguments.
+        default: the settings if no flags are given; None for the defaults of the class.
+        prog: the command as the user typed it, for help and error messages.
+        description: the first paragraph of the help text.
+
+    Raises:
+        ConfigError: an unknown flag (with the nearest known one), or a value that is refused.
+    """
+    return read(Arguments({"settings": (kind, default)}, description), argv, prog)["settings"]
+
+
+def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
+    """Read what a command takes; ``--help`` prints every flag with its docstring and exits.
+
+    Args:
+        wanted: the groups of settings.
+        argv: the arguments.
+        prog: the command as the user typed it.
+
+    Returns:
+        The settings of each group, by its name.
+
+    Raises:
+        ConfigError: an unknown flag (with the nearest known one), a value that is refused, or an
+            argument is missing.
+    """
+    flags = [wanted.renamed.get(word, word) for word in argv]
+    groups = dict(wanted.groups)
+    for name in (name for kind, _ in groups.values() for name in getattr(kind, "REPEATED", ())):
+        flags = _joined(flags, name)
+    extra: dict[str, tuple[type, Any]] = {"plugins": (Plugins, Plugins())}
+    epilog = wanted.epilog
+    for name, (kind, default) in groups.items():
+        if isinstance(default, Config):
+            file, flags = _take_config_file(flags)
+            under = default if file is None else overlay(default, file)
+            config, flags = take_kinds(full_names(flags, under), under)
+            groups[name] = kind, config
+            extra["file"] = ConfigFile, ConfigFile()
+            epilog = "\n\n".join(text for text in (kinds_text(config), epilog) if text)
+    description = wanted.description or inspect.getdoc(next(iter(groups.values()))[0])
+    everything = groups | extra
+    hint = wanted.hint or prog
+    known = [name for kind, default in everything.values() for name, _ in flags_of(default or kind)]
+
+    def refuse(event: Any) -> None:
+        raise ConfigError(_sentence(event, known, hint))
+
+    try:
+        with _on_parse_error(refuse):
+            found = tyro.cli(
+                _composed(everything),
+                args=flags,
+                prog=prog,
+                description=description,
+                use_underscores=True,
+            )
+    except SystemExit as end:
+        if end.code == 0 and epilog:
+            print(epilog)
+        raise
+    return {name: getattr(found, name) for name in groups}
+
+
+def _composed(groups: Mapping[str, tuple[type, Any]]) -> type:
+    """Return a dataclass whose flags are those of all groups."""
+    fields: list[Any] = []
+    for name, (kind, default) in groups.items():
+        field = () if default is None else (dataclasses.field(default=default),)
+        fields.append((name, Flat[kind], *field))  # type: ignore[valid-type]
+    return dataclasses.make_dataclass("Arguments", fields, kw_only=True)
+
+
+def _on_parse_error(refuse: Callable[[Any], None]) -> contextlib.AbstractContextManager[Any]:
+    """Call a function with each error as tyro found it.
+
+    This hook of tyro is private. Versions without it print a message of their own and exit with 2.
+    """
+    try:
+        from tyro._errors import on_parse_error
+    except ImportError:
+        return contextlib.nullcontext()
+    return on_parse_error(refuse)
+
+
+def _sentence(event: Any, known: Sequence[str], hint: str) -> str:
+    """Return one sentence about an error: what is wrong, where, and what to do."""
+    unknown = getattr(event, "tokens", None) or getattr(event, "unrecognized_tokens", None)
+    if unknown:
+        return _unknown(unknown, known, hint)
+    if missing := [found.arg for found in getattr(event, "missing_arguments", ())]:
+        return _missing(missing, hint)
+    argument = getattr(event, "argument", None)
+    where = "" if argument is None else _name_of(argument)
+    if hasattr(event, "choices"):
+        choices = [choice for choice in event.choices if choice != "None"]
+        return f"{where} is {event.value}: use {', '.join(choices)}."
+    if argument is not None and not hasattr(event, "message"):
+        count = argument.lowered.nargs
+        return f"{where} needs {f'{count} values' if count not in (1, '?', '*') else 'a value'}."
+    return _refused(str(getattr(event, "message", "")), where, hint)
+
+
+def _refused(message: str, where: str, hint: str) -> str:
+    """Return a sentence about a value that a type or the settings refuse."""
+    text = re.sub(r"\[/?\w+\]", "", message).strip()
+    for pattern, plain in _PLAIN if where else ():
+        text, count = re.subn(pattern, plain, text)
+        if count:
+            return f"{where} {text}."
+    text = " ".join(text.split())
+    if not text:
+        return f"The arguments cannot be read; see `{hint} --help`."
+    text = f"{where}: {text}" if where else text
+    return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def _missing(arguments: Sequence[Any], hint: str) -> str:
+    """Return a sentence about arguments that are required."""
+    if len(arguments) > 1:
+        return f"{' and '.join(map(_name_of, arguments))} are missing; see `{hint} --help`."
+    text = arguments[0].field.helptext
+    about = " ".join(str(text() if callable(text) else text).split()).rstrip(".")
+    return f"{_name_of(arguments[0])} is missing ({about}); see `{hint} --help`."
+
+
+def _unknown(tokens: Sequence[str], known: Sequence[str], hint: str) -> str:
+    """Return a sentence about arguments that nothing reads."""
+    if not tokens[0].startswith("--"):
+        return f"There is no place for {tokens[0]}; `{hint} --help` lists the settings."
+    flag = tokens[0].split("=")[0]
+    name = "--" + flag[2:].replace("-", "_")
+    return f"{flag} is not a setting{_nearest(name, known)}; `{hint} --help` lists them all."
+
+
+def _name_of(argument: Any) -> str:
+    """Return how messages name an argument: its flag, or the name of a position in capitals."""
+    if argument.is_positional():
+        shown = str(argument.lowered.metavar)
+        name = argument.field.intern_name.rpartition(".")[2].upper()
+        return name if shown in ("PATH", "STR") else shown
+    return argument.lowered.name_or_flags[0]
+
+
+def _joined(flags: Sequence[str], name: str) -> list[str]:
+    """Let a flag of many values be given many times: ``--p a --p b`` becomes ``--p a b``."""
+    values: list[str] = []
+    rest: list[str] = []
+    into = rest
+    for flag in flags:
+        if flag == name or flag.startswith(f"{name}="):
+            into = values
+            values += [flag.removeprefix(f"{name}=")] if flag != name else []
+            continue
+        into = rest if flag.startswith("--") else into
+        into.append(flag)
+    given = any(flag.split("=")[0] == name for flag in flags)
+    return [*rest, name, *values] if given else rest
+
+
+def _take_config_file(flags: Sequence[str]) -> tuple[Path | None, list[str]]:
+    """Take ``--config FILE`` out of the arguments."""
+    for index, flag in enumerate(flags):
+        if flag.startswith("--config="):
+            return Path(flag.removeprefix("--config=")), [*flags[:index], *flags[index + 1 :]]
+        if flag == "--config":
+            if index + 1 == len(flags):
+                raise ConfigError("--config needs the name of a JSON file of settings.")
+            return Path(flags[index + 1]), [*flags[:index], *flags[index + 2 :]]
+    return None, list(flags)
+
+
+def optional(kind: type, *names: str) -> type:
+    """Return a dataclass of fields of another one, each None unless it is given.
+
+    Args:
+        kind: the dataclass; its types and docstrings are those of the flags.
+        names: of the fields, in the order of the help.
+    """
+    hints = typing.get_type_hints(kind, include_extras=True)
+    texts = _field_docs(kind)
+    fields = [
+        (
+            name,
+            Annotated[
+                hints[name] | None,
+                tyro.conf.arg(help=texts[name], help_behavior_hint="(default: the run's)"),
+            ],
+            dataclasses.field(default=None),
+        )
+        for name in names
+    ]
+    return dataclasses.make_dataclass(f"Optional{kind.__name__}", fields, frozen=True)
+
+
+def _field_docs(kind: type) -> dict[str, str]:
+    """Return the docstring under each field of a dataclass."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for field, text in zip(tree.body, tree.body[1:], strict=False):
+        if not (isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)):
+            continue
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            found[field.target.id] = " ".join(str(text.value.value).split())
+    return found
+
+
+def choose(name: str, known: Sequence[str], what: str) -> str:
+    """Return ``name`` if it is known.
+
+    Raises:
+        ConfigError: it is not known; the message lists the known names, and the nearest first.
+    """
+    if name in known:
+        return name
+    raise ConfigError(
+        f"There is no {what} {name!r}{_nearest(name, known)}; there is {', '.join(known)}."
+    )
+
+
+def _nearest(name: str, known: Sequence[str]) -> str:
+    """Suggest a flag with the same last part, or else with the most similar spelling."""
+    last = name.rsplit(".", 1)[-1].lstrip("-")
+    close = [flag for flag in known if flag.rsplit(".", 1)[-1].lstrip("-") == last]
+    close = close or difflib.get_close_matches(name, known, 1, 0.5)
+    return f" (did you mean {close[0]}?)" if close else ""

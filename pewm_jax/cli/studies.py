@@ -1,0 +1,227 @@
+"""Run the studies: ``pewm-jax table1``, ``table2`` and ``practice``."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from pewm_jax import presets, registry
+from pewm_jax.cli import parser, plugins
+from pewm_jax.errors import ConfigError
+from pewm_jax.io import runtime
+
+
+@dataclasses.dataclass(frozen=True)
+class Table1Settings:
+    """Train and score every memory with every reader that applies: the paper's Table 1.
+
+    All start from the same backbones and train for equal time; all are scored on the same held-out
+    clips. Writes a table (Markdown, LaTeX, CSV) and a plot. If interrupted, run it again: it
+    resumes. More seeds are added to the existing results.
+    """
+
+    out: Path = Path("runs/table1")
+    """Folder that everything is kept in."""
+    data: Path | None = None
+    """Folder of the data set; by default the preset's."""
+    preset: str = "table1"
+    """Settings that all rows share; its memory is the paper's map."""
+    minutes: tuple[float, float] = (8.0, 6.0)
+    """Processor minutes of training steps: of the backbone of each seed, and of each row."""
+    steps: tuple[int, int] | None = None
+    """Numbers of steps instead: equal steps, and not equal time."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Training seeds."""
+    rows: tuple[str, ...] = ()
+    """Only these rows, such as --rows none voxel-attend."""
+    ablate: Literal["cell", "extent", "tokens", "features", "time"] | None = None
+    """Instead of the table vary a setting of the voxel map that attention reads: side of a cell on
+    the ground, m; side of the map, m; tokens that condition a clip; what a cell holds (colours,
+    latents, points, or dinov2=FOLDER of `convert import dinov2`); or train the paper's own form
+    longer (times the others' time)."""
+    values: tuple[str, ...] = ()
+    """Values to try in the place of the ablation's own."""
+    clips: int | None = None
+    """Held-out clips; by default the preset's."""
+    dreamsim: Path | None = None
+    """Folder with the weights of DreamSim 0.2 (ensemble), which no package has."""
+
+
+def table1(settings: Table1Settings) -> None:
+    """Make the table and print its path."""
+    config = presets.load(parser.choose(settings.preset, presets.names(), "preset"))
+    if settings.data is not None:
+        data = dataclasses.replace(config.data, path=str(settings.data))
+        config = dataclasses.replace(config, data=data)
+    if settings.clips is not None:
+        evaluate = dataclasses.replace(config.evaluate, clips=settings.clips)
+        config = dataclasses.replace(config, evaluate=evaluate)
+    runtime.keep_large()
+    # Imported here and not above: help and refusals are fast.
+    from pewm_jax.studies import table1 as study
+
+    runtime.cache_compilation(settings.out)
+    page = study.run(
+        config,
+        settings.out,
+        minutes=settings.minutes,
+        steps=settings.steps,
+        seeds=settings.seeds,
+        only=settings.rows,
+        ablation=settings.ablate or "",
+        values=settings.values,
+        weights={"dreamsim": settings.dreamsim} if settings.dreamsim else None,
+    )
+    print(f"table: {page}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Table2Settings:
+    """Decide tasks in held-out houses by policies, rankings and plans: the paper's Table 2.
+
+    All decide the same tasks: a policy alone, its proposals ranked by a world model, one plan (open
+    loop) and plans in a closed loop (MPC). Each uses an empty memory, reprojection without a
+    network, the memory, or the renderer itself as the model. Writes a table, a plot and videos.
+    If interrupted, run it again: it resumes.
+    """
+
+    model: str = "small"
+    """A run's folder, or a model that comes with the library."""
+    out: Path = Path("runs/table2")
+    """Folder that everything is kept in."""
+    tasks: int = 48
+    """Tasks; they take the houses in turn."""
+    houses: int = 24
+    """Held-out houses."""
+    proposals: tuple[int, ...] = (8, 16)
+    """Numbers of a policy's proposals that are ranked."""
+    candidates: int = 60
+    """Candidates of a round of planning."""
+    elites: int = 18
+    """The best of them, which the next round is drawn from."""
+    rounds: int = 12
+    """Rounds of planning."""
+    horizon: int = 8
+    """Actions of the shortest walk to a goal, a multiple of what the model imagines at once."""
+    multiples: tuple[int, ...] = (1, 2, 3)
+    """Goals are so many times --horizon actions away, and plans are as long."""
+    none: str = ""
+    """A run that was trained without memory (`pewm-jax train small --train.stage2.steps 0
+    --train.joint.steps 0 --train.gate.steps 0 …`), which gets rows of its own."""
+    policy: str = "wander"
+    """`wander` (walks that know nothing), the folder of a trained NoMaD (`runs/nomad`), or
+    MODULE:FUNCTION, see `studies.deciders.Policy`."""
+    cost: Literal["lpips", "pixels"] = "lpips"
+    """How far the last frame is from the goal's picture."""
+    videos: int = 3
+    """Tasks whose plan is shown beside what happened."""
+
+
+def table2(settings: Table2Settings) -> None:
+    """Make the table and print its path."""
+    for name in ("tasks", "houses", "videos"):
+        if getattr(settings, name) < (name != "videos"):
+            raise ConfigError(f"--{name} is {getattr(settings, name)}: give at least 1.")
+    counts = settings.proposals
+    if not counts or min(counts) < 1 or len(set(counts)) < len(counts):
+        raise ConfigError(
+            "--proposals needs different numbers from 1 on, such as --proposals 8 16."
+        )
+    far = settings.multiples
+    if not far or far[0] != 1 or min(far) < 1 or list(far) != sorted(set(far)):
+        raise ConfigError("--multiples needs growing numbers from 1 on, such as 1 2 3.")
+    # Imported here and not above: help and refusals are fast.
+    from pewm_jax.planning import costs
+    from pewm_jax.planning.settings import PlanConfig
+    from pewm_jax.studies import table2 as study
+
+    plan = PlanConfig(
+        horizon=settings.horizon,
+        candidates=settings.candidates,
+        elites=settings.elites,
+        rounds=settings.rounds,
+    )
+    shared = ("tasks", "houses", "proposals", "policy", "cost", "videos", "multiples", "none")
+    chosen = {name: getattr(settings, name) for name in shared}
+    chosen["policy"], policy = _policy(settings.policy)
+    errand = study.Table2Config(plan=plan, **chosen)
+    cost = costs.perceptual() if settings.cost == "lpips" else costs.Pixels()
+    runtime.cache_compilation(settings.out)
+    page = study.run(settings.model, settings.out, errand, policy, cost)
+    print(f"table: {page}")
+
+
+def _policy(name: str) -> tuple[str, Callable[..., Any]]:
+    """Return what the decisions of a policy are kept under, and the policy."""
+    from pewm_jax.studies import deciders
+
+    if name in deciders.POLICIES:
+        return name, deciders.POLICIES[name]
+    if deciders.is_run(name):
+        opened = deciders.open_policy(name)
+        propose = deciders.nomad(opened.config.model.policy, opened.weights, opened.motion)
+        return f"{Path(name).name}-{opened.digest[:8]}", propose
+    module, _, function = name.partition(":")
+    if not function.isidentifier() or not all(part.isidentifier() for part in module.split(".")):
+        raise ConfigError(
+            f"--policy {name} is neither one of {', '.join(deciders.POLICIES)}, nor the folder of "
+            "a trained NoMaD (pewm-jax train nomad), nor MODULE:FUNCTION."
+        )
+    plugins.look_here()
+    found = getattr(registry.imported(module, "--policy"), function, None)
+    if not callable(found):
+        raise ConfigError(f"--policy {name}: {module} has no function {function}.")
+    return name, found
+
+
+@dataclasses.dataclass(frozen=True)
+class PracticeSettings:
+    """Train a policy (NoMaD) in imagination in held-out houses of which it has few pictures.
+
+    It practises in the world that these pictures start, with its memory and without, and in the
+    house itself, and is then sent to goals there. Writes a table and a picture. If interrupted, run
+    it again: it resumes.
+    """
+
+    policy: Path = Path("runs/nomad")
+    """The run of a NoMaD (pewm-jax train nomad)."""
+    model: str = "small"
+    """A run's folder, or a model that comes with the library."""
+    out: Path = Path("runs/practice")
+    """Folder that everything is kept in."""
+    houses: int = 12
+    """Held-out houses."""
+    tasks: int = 12
+    """Goals in each house."""
+    walks: int = 32
+    """Walks of a practice."""
+    blocks: int = 4
+    """Proposals that are carried out in a walk, one after the other."""
+    steps: int = 150
+    """Steps of training on the walks."""
+    learning_rate: float = 2e-4
+    """Learning rate of that training."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of practice and training."""
+
+
+def practice(settings: PracticeSettings) -> None:
+    """Run the study and print the path of its table."""
+    # Imported here and not above: help and refusals are fast.
+    from pewm_jax.planning.practice import Practice
+    from pewm_jax.studies import practice as study
+    from pewm_jax.studies.practice_piece import PracticeConfig
+
+    errand = PracticeConfig(
+        houses=settings.houses,
+        tasks=settings.tasks,
+        practice=Practice(walks=settings.walks, blocks=settings.blocks),
+        steps=settings.steps,
+        learning_rate=settings.learning_rate,
+        seeds=settings.seeds,
+    )
+    runtime.cache_compilation(settings.out)
+    page = study.run(settings.model, settings.policy, settings.out, errand)
+    print(f"table: {page}")
