@@ -178,7 +178,7 @@ def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, pa
         (["tiny", "--train.seed", "abc"], "--train.seed needs a whole number, got 'abc'."),
         (["tiny", "--train.ema", "abc"], "--train.ema needs a number, got 'abc'."),
         (["tiny", "--train.seed"], "--train.seed needs a value."),
-        (["tiny", "--noise.target", "x1"], "--model.noise.target is x1: use x0, v, eps."),
+        (["tiny", "--noise.target", "x1"], "--model.noise.target is 'x1': use x0, v, eps."),
         (["tiny", "--memory.cell_m", "1", "2"], "--model.memory.cell_m needs 3 values."),
         (
             ["tiny", "--memory.kind", "image"],

@@ -198,7 +198,7 @@ def _sentence(event: Any, known: Sequence[str], hint: str) -> str:
     where = "" if argument is None else _name_of(argument)
     if hasattr(event, "choices"):
         choices = [choice for choice in event.choices if choice != "None"]
-        return f"{where} is {event.value}: use {', '.join(choices)}."
+        return f"{where} is {event.value!r}: use {', '.join(choices)}."
     if argument is not None and not hasattr(event, "message"):
         count = argument.lowered.nargs
         return f"{where} needs {f'{count} values' if count not in (1, '?', '*') else 'a value'}."

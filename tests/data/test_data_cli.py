@@ -127,7 +127,7 @@ def test_validate_and_show_from_the_command_line(capsys, tmp_path):
 
 def test_the_module_runs_and_its_exit_code_is_seen_outside(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "pewm_jax.data", "validate", str(tmp_path / "nowhere")],
+        [sys.executable, "-m", "pewm_jax", "data", "validate", str(tmp_path / "nowhere")],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"},
         capture_output=True,

@@ -159,7 +159,7 @@ def test_a_killed_collection_goes_on(tmp_path, mesh, how):
     out = tmp_path / "killed"
     flags = [f"--{k}={v}" for k, v in {**options, "workers": 2, "shard-episodes": 1}.items()]
     process = subprocess.Popen(
-        [sys.executable, "-m", "pewm_jax.data", "collect", str(out), f"--scene={mesh}", *flags],
+        [sys.executable, "-m", "pewm_jax", "data", "collect", str(out), f"--scene={mesh}", *flags],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"},
         stderr=subprocess.PIPE,

@@ -122,7 +122,7 @@ def test_ctrl_c_ends_the_cluster_that_was_started_and_the_pool_goes_on(tmp_path)
     flags = [f"--{k.replace('_', '-')}={v}" for k, v in options.items()]
     flags += ["--engine=ray", "--workers=2"]
     process = subprocess.Popen(
-        [sys.executable, "-W", "error", "-m", "pewm_jax.data", "collect", str(tmp_path), *flags],
+        [sys.executable, "-W", "error", "-m", "pewm_jax", "data", "collect", str(tmp_path), *flags],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"},
         stderr=subprocess.PIPE,
