@@ -70,7 +70,9 @@ def _forms(model: Task) -> tuple[Form, ...]:
 
 
 def _form(model: Task, init: Any) -> Form | None:
-    shapes = jax.eval_shape(functools.partial(init, model), jax.random.key(0))
+    # No key is made: that would start JAX's devices, of which a plan sets the number.
+    key = jax.eval_shape(jax.random.key, jax.ShapeDtypeStruct((), "uint32"))
+    shapes = jax.eval_shape(functools.partial(init, model), key)
     leaves = tree.flatten(shapes)
     structure = jax.tree.structure(shapes)
     if structure == jax.tree.structure(tree.unflatten(leaves)):
