@@ -26,7 +26,7 @@ from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import make_episode
 from pewm_jax.memory import interface as memories
 from pewm_jax.planning import costs
-from pewm_jax.planning.candidates import Imagination, Judged
+from pewm_jax.planning.candidates import CandidateCost, ImaginedRollout
 from pewm_jax.planning.plan import plan
 from pewm_jax.planning.settings import CEM, PlanConfig
 from pewm_jax.types import Control, Frames, MemoryReadout
@@ -155,7 +155,7 @@ def main() -> None:
 
     def fresh():
         """A rollout that has rendered nothing yet."""
-        return Imagination(config, params, state, key, chosen.batch)
+        return ImaginedRollout(config, params, state, key, chosen.batch)
 
     rollout = fresh()
     asked: list[np.ndarray] = []
@@ -167,7 +167,7 @@ def main() -> None:
     begun = np.random.default_rng(0).integers(0, 3, (settings.candidates, settings.horizon))
     jax.block_until_ready(cost(rollout(begun), goal))  # compiles
     rollout._views(np.ones((1, 1), int))  # one camera alone is another program
-    judged = Judged(rolled, cost, goal)
+    judged = CandidateCost(rolled, cost, goal)
     plan(CEM(), settings, lambda *_: np.zeros(settings.candidates), key, progress=False)  # too
     rollout, imagining = fresh(), Clock()
     asked.clear()

@@ -1,25 +1,23 @@
-"""Chapter 8: how it decides.
+"""Planning: environments to act in, and planners that choose actions by imagined frames.
 
-An agent chooses actions by what a world model imagines of them. This chapter has the places where
-it acts, and how it chooses.
+Environments:
 
-Places, in reading order:
-
-* ``house_config``, ``tasks``, ``house``: the environment ``pewm_jax/House-v0``, a Gymnasium
-  environment over the library's renderer, with goals; ``oracle`` knows the way;
-* ``observations``: what environments show, and observations as the frames that worlds take;
+* ``house_config``, ``house``: ``pewm_jax/House-v0``, a Gymnasium environment over the library's
+  renderer, with goals; ``oracle`` follows the shortest path;
+* ``observations``: observation spaces, and observations as the frames that worlds take;
 * ``imagined``, ``imagined_env``: any world as an environment, as pure functions and as a Gymnasium
-  environment that looks like a house;
-* ``nomad_policy``: ways to go on, proposed by a learned policy (``models.nomad``);
-* ``scores``: how near an agent came, and by which way.
+  environment with the interface of a house;
+* ``nomad_policy``: trajectories proposed by a learned policy (``models.nomad``); ``practice``:
+  walks of a policy inside a world, to learn from;
+* ``scores``: trajectory errors, success and SPL.
 
-How it chooses:
+Planners:
 
-* ``settings``, ``planners``, ``plan``: CEM, MPPI and random shooting, apart from model and cost;
-* ``costs``, ``candidates``: what is imagined of many actions, and how far that is from the goal;
-* ``mpc``, ``ranking``: acting and planning in turn; which of a policy's proposals is best.
+* ``settings``, ``planners``, ``plan``: CEM, MPPI and random shooting, for any model and cost;
+* ``costs``, ``candidates``: frames of many candidates, their costs and their ranking;
+* ``mpc``: acting and planning in turn.
 
-Importing this chapter registers ``pewm_jax/House-v0`` where Gymnasium is installed
+Importing this package registers ``pewm_jax/House-v0`` where Gymnasium is installed
 (``pip install 'pewm-jax[planning]'``)::
 
     import gymnasium

@@ -1,14 +1,16 @@
-"""Candidates: what would be seen if their actions were carried out, and what that costs.
+"""Candidates: the frames that their actions lead to, their costs, and their ranking.
 
 A *rollout* is any function ``rollout(actions_KN) -> Frames``, (K, N) frames of K candidates, or the
-last of each, (K, 1). ``imagination`` makes one of a world model; a simulator, which renders what
-will truly be seen, is another. ``judged`` joins one with a cost to what ``plan.plan`` minimises.
+last of each, (K, 1). ``ImaginedRollout`` imagines them with a world model; a simulator renders the
+ground truth. ``CandidateCost`` joins a rollout and a cost to the function that ``plan.plan``
+minimizes. ``rank`` sorts the proposals of any policy, such as the 8 or 16 of the paper's Table 2.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeAlias
@@ -21,15 +23,28 @@ from pewm_jax import worlds
 from pewm_jax.config import Config, UserError, World
 from pewm_jax.errors import require
 from pewm_jax.planning.costs import FrameCost
+from pewm_jax.planning.plan import checked
 from pewm_jax.types import Array, Frames, Params, WorldState
 from pewm_jax.worlds.checks import check_control
+
+_DEPRECATED = {"Imagination": "ImaginedRollout", "Judged": "CandidateCost"}
+
+
+def __getattr__(name: str) -> Any:
+    """Return a class by its former name, with a warning."""
+    if name not in _DEPRECATED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    now = _DEPRECATED[name]
+    warnings.warn(f"{name} is deprecated: use {now}.", DeprecationWarning, stacklevel=2)
+    return globals()[now]
+
 
 Rollout: TypeAlias = Callable[[Any], Frames]
 """``rollout(actions_KN) -> Frames``, leading shape (K, N) or, of the last ones, (K, 1)."""
 
 
 WORKERS = 2
-"""Batches under way at once: what XLA does on one core (convolutions) would leave others idle."""
+"""Batches computed at once: operations that XLA runs on one core would leave others idle."""
 
 
 @functools.partial(jax.jit, static_argnums=0, static_argnames=("memory", "last"))
@@ -51,8 +66,8 @@ def _imagined(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Imagination:
-    """A rollout through a world model, a batch of candidates at a time; its memory is not written.
+class ImaginedRollout:
+    """A rollout through a world model, one batch of candidates at a time; memory is not written.
 
     All candidates are imagined from the same noise. Their costs then differ by their actions alone,
     and the same actions have the same cost in every round.
@@ -62,10 +77,10 @@ class Imagination:
         params: its parameters.
         state: the world so far.
         key: the noise.
-        batch: candidates that are imagined together, two batches at a time. It bounds memory and
-            changes no result, but for rounding.
-        last: give only the last frame of each, which spares decoding the others.
-        memory: False ignores what is remembered.
+        batch: candidates that are imagined together, two batches at a time. It bounds memory use
+            and changes results only by rounding.
+        last: return only the last frame of each; the others are not decoded.
+        memory: False ignores the world's memory.
     """
 
     config: Config | World
@@ -130,18 +145,18 @@ class Imagination:
 
 
 @dataclasses.dataclass(eq=False)
-class Judged:
-    """Rollout and cost together: the cost of actions, as ``plan.plan`` takes it.
+class CandidateCost:
+    """The cost of candidates, as ``plan.plan`` takes it: a rollout and a cost of its frames.
 
-    The costs of discrete actions are kept, and those that were judged before, in this round or an
-    earlier one, are not rolled out again. The rollout must therefore be a function of the actions.
+    The costs of discrete actions are cached: candidates of an earlier round, or of this one, are
+    not rolled out again. The rollout must therefore be a function of the actions.
 
     Attributes:
         rollout: from actions to frames.
         cost: from frames and goal to costs.
         goal: the goal, T = 1.
-        asked: candidates that were asked for so far.
-        rolled_out: of these, how many were rolled out.
+        asked: number of candidates requested so far.
+        rolled_out: number of these that were rolled out.
     """
 
     rollout: Rollout
@@ -168,9 +183,64 @@ class Judged:
         return np.array([self._known[name] for name in names], np.float32)
 
     def _costs(self, actions: np.ndarray, count: int) -> np.ndarray:
-        """Return the costs of actions, judged as that many, of which the last are repeated."""
+        """Return the costs of actions; the last frames are repeated up to ``count`` candidates."""
         self.rolled_out += len(actions)
         frames, missing = self.rollout(actions), count - len(actions)
         if missing:  # so that a cost is compiled once
             frames = jax.tree.map(lambda x: np.concatenate([x, [x[-1]] * missing]), frames)
         return np.asarray(self.cost(frames, self.goal), np.float32)[: len(actions)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranking:
+    """Proposals in order.
+
+    Attributes:
+        order_K: (K,) their numbers, the best first; of equal ones the first given.
+        costs_K: (K,) their costs, in the order given.
+        frames: what was rolled out of each, leading axis K, in the order given.
+    """
+
+    order_K: np.ndarray
+    costs_K: np.ndarray
+    frames: Frames = dataclasses.field(repr=False)
+
+
+def rank(
+    config: Config | World,
+    params: Params,
+    state: WorldState,
+    proposals_KN: Any,
+    cost: FrameCost,
+    goal: Frames,
+    key: Array,
+    *,
+    batch: int = 6,
+    last: bool = True,
+) -> Ranking:
+    """Imagine proposals and sort them by cost.
+
+    Args:
+        config: the model's settings, or an experiment's.
+        params: its parameters.
+        state: the world so far.
+        proposals_KN: (K, N) discrete or (K, N, 3) continuous actions of any policy.
+        cost: see ``planning.costs``.
+        goal: the goal, T = 1.
+        key: the noise, the same for all.
+        batch: see ``ImaginedRollout``.
+        last: imagine only the last frame of each; False for costs that look at all.
+
+    Raises:
+        UserError: a cost is no number; see ``plan.checked``.
+    """
+    return rank_by(
+        ImaginedRollout(config, params, state, key, batch, last), proposals_KN, cost, goal
+    )
+
+
+def rank_by(rollout: Rollout, proposals_KN: Any, cost: FrameCost, goal: Frames) -> Ranking:
+    """Sort proposals by the cost of any rollout, such as a simulator's; see ``rank``."""
+    frames = rollout(proposals_KN)
+    costs = checked(cost(frames, goal), len(proposals_KN))
+    return Ranking(np.argsort(costs, kind="stable"), costs, frames)

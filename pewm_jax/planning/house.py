@@ -24,6 +24,8 @@ An episode ends where the goal is reached (``terminated``): nearer than ``succes
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,12 +33,73 @@ import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.data.make_episode import SPLITS
-from pewm_jax.data.navigation import NavGrid
+from pewm_jax.data.navigation import NavGrid, PathsToGoal, sample_free
 from pewm_jax.data.simulator import Simulator, move, open_simulator
-from pewm_jax.planning import observations, scores, tasks
+from pewm_jax.planning import observations, scores
 from pewm_jax.planning.extra import gymnasium
 from pewm_jax.planning.house_config import HouseConfig, settings
 from pewm_jax.types import Frames
+
+GOALS_TRIED = 20
+STARTS_TRIED = 10
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """An episode's task.
+
+    Attributes:
+        start_3: (3,) x, y, yaw of the first frame.
+        goal_3: (3,) x, y, yaw of the goal; its heading is that of an agent that arrives by
+            the shortest path.
+        ways: the shortest paths to the goal.
+        shortest_m: length of the shortest path from the start.
+    """
+
+    start_3: np.ndarray
+    goal_3: np.ndarray
+    ways: PathsToGoal
+    shortest_m: float
+
+
+def draw_task(config: HouseConfig, grid: NavGrid, rng: np.random.Generator, where: str) -> Task:
+    """Draw a start and a goal whose distance on foot lies within the configured bounds.
+
+    The goal is uniform over the free area, the start over that part of it which is in bounds, the
+    start's heading over the circle.
+
+    Args:
+        config: ``min_distance_m`` and ``max_distance_m`` count.
+        grid: where the agent can stand.
+        rng: everything random comes from here.
+        where: name of the scene, for the refusal.
+
+    Raises:
+        UserError: no such pair was found.
+    """
+    low, high = config.min_distance_m, config.max_distance_m
+    farthest = 0.0
+    for goal in sample_free(grid, rng, GOALS_TRIED):
+        ways = PathsToGoal(grid, goal)
+        distance = np.where(np.isfinite(ways.distance_YX), ways.distance_YX, -1.0)
+        farthest = max(farthest, float(distance.max()))
+        # Distances from cell to cell are up to 8 % longer than the way pulled tight.
+        cells = np.argwhere((distance >= low) & (distance <= 1.1 * high + grid.cell_m))
+        for _ in range(STARTS_TRIED if len(cells) else 0):
+            start = grid.centre_of(cells[rng.integers(len(cells))])
+            start = start + rng.uniform(-0.499, 0.499, 2) * grid.cell_m
+            path = ways.path(start)
+            length = ways.length(start)
+            if path is not None and low <= length <= high:
+                last = path[-1] - path[-2]
+                heading = math.atan2(last[1], last[0])
+                yaw = rng.uniform(-math.pi, math.pi)
+                return Task(np.array([*start, yaw]), np.array([*goal, heading]), ways, length)
+    raise UserError(
+        f"{where} has no two places from {low:g} to {high:g} m apart on foot (the farthest found "
+        f"are {farthest:.1f} m): change min_distance_m and max_distance_m, or take a scene with "
+        "more room."
+    )
 
 
 class HouseEnv(gymnasium.Env):
@@ -75,7 +138,7 @@ class HouseEnv(gymnasium.Env):
         self.action_space = observations.action_space(self.config)
         self._simulator = self._open(self.config.house)
         self.intrinsics_4 = self._simulator.intrinsics_4.copy()
-        self._task: tasks.Task | None = None
+        self._task: Task | None = None
         self._over = True
 
     def reset(
@@ -98,7 +161,7 @@ class HouseEnv(gymnasium.Env):
             number = int(self.np_random.integers(config.houses))
             self._simulator = self._open(config.house + len(SPLITS) * number)
         simulator = self._simulator
-        self._task = tasks.draw(config, simulator.grid, self.np_random, simulator.scene.name)
+        self._task = draw_task(config, simulator.grid, self.np_random, simulator.scene.name)
         self._planar = self._task.start_3
         self._goal = simulator.frames(self._task.goal_3[None])
         self._steps, self._walked, self._collided, self._over = 0, 0.0, False, False
@@ -171,7 +234,7 @@ class HouseEnv(gymnasium.Env):
         return self._simulator.grid
 
     @property
-    def task(self) -> tasks.Task:
+    def task(self) -> Task:
         """Return the episode's task.
 
         Raises:

@@ -1,9 +1,9 @@
-"""Model predictive control: plan, carry out the first actions, look, plan anew.
+"""Model predictive control: plan, carry out the first actions, observe, and plan again.
 
-What plans is a ``Mind``: a world model, which takes in every real frame that it is shown
-(``imagining``), or a simulator that knows the truth (``knowing``). What it acts in is a function
-``step(action) -> (frames, done)`` that gives the one real frame seen after an action, and whether
-the goal is reached.
+A ``Predictor`` rolls candidates out: a world model, which observes every real frame
+(``world_predictor``), or a simulator that has the ground truth (``simulator_predictor``). The
+agent acts through a function ``step(action) -> (frames, done)`` that returns the one real frame
+after an action, and whether the goal is reached.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -22,20 +23,36 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import Config, UserError, World
 from pewm_jax.io.progress import Meter
-from pewm_jax.planning.candidates import Imagination, Judged, Rollout
+from pewm_jax.planning.candidates import CandidateCost, ImaginedRollout, Rollout
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.plan import Plan, plan
 from pewm_jax.planning.planners import shifted
 from pewm_jax.planning.settings import PlanConfig, Planner
 from pewm_jax.types import Array, Frames, Params
 
+_DEPRECATED = {
+    "Mind": "Predictor",
+    "imagining": "world_predictor",
+    "knowing": "simulator_predictor",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Return a class or function by its former name, with a warning."""
+    if name not in _DEPRECATED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    now = _DEPRECATED[name]
+    warnings.warn(f"{name} is deprecated: use {now}.", DeprecationWarning, stacklevel=2)
+    return globals()[now]
+
+
 Step: TypeAlias = Callable[[Any], tuple[Frames, bool]]
 """``step(action) -> (frames, done)``: one real frame, T = 1, and whether the goal is reached."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Mind:
-    """What an agent plans with.
+class Predictor:
+    """What predicts the frames of candidates.
 
     Attributes:
         start: from the first real frames to a state of any kind.
@@ -48,37 +65,37 @@ class Mind:
     rollout: Callable[[Any, Array], Rollout]
 
 
-def imagining(
+def world_predictor(
     config: Config | World,
     params: Params,
     *,
     batch: int = 6,
     last: bool = True,
     memory: bool = True,
-) -> Mind:
-    """Return a mind that imagines with a world model and remembers what it really sees.
+) -> Predictor:
+    """Return a predictor that imagines with a world model and remembers the real frames.
 
     Args:
         config: the model's settings, or an experiment's.
         params: its parameters.
-        batch: see ``Imagination``.
+        batch: see ``ImaginedRollout``.
         last: imagine only the last frame of each candidate; False for costs that look at all.
-        memory: False ignores what is remembered.
+        memory: False ignores the world's memory.
     """
     model = worlds.model_of(config)
 
     def rollout(state: Any, key: Array) -> Rollout:
-        return Imagination(model, params, state, key, batch, last, memory)
+        return ImaginedRollout(model, params, state, key, batch, last, memory)
 
-    return Mind(
+    return Predictor(
         functools.partial(worlds.start, model, params),
         functools.partial(worlds.observe, model, params),
         rollout,
     )
 
 
-def knowing(rollout_from: Callable[[Frames], Rollout]) -> Mind:
-    """Return a mind that needs to imagine nothing: a simulator tells what will be seen.
+def simulator_predictor(rollout_from: Callable[[Frames], Rollout]) -> Predictor:
+    """Return a predictor that renders the frames of candidates with a simulator.
 
     Args:
         rollout_from: from the present frame, T = 1, to a rollout.
@@ -87,7 +104,7 @@ def knowing(rollout_from: Callable[[Frames], Rollout]) -> Mind:
     def last(frames: Frames) -> Frames:
         return jax.tree.map(lambda x: x[-1:], frames)
 
-    return Mind(last, lambda _, frames: last(frames), lambda state, _: rollout_from(state))
+    return Predictor(last, lambda _, frames: last(frames), lambda state, _: rollout_from(state))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +117,7 @@ class Trajectory:
         plans: every plan that it made.
         costs: (p,) the cost of each plan, as it was foreseen.
         reached: whether the goal was reached.
-        state: the mind's state at the end.
+        state: the predictor's state at the end.
     """
 
     actions: np.ndarray
@@ -112,7 +129,7 @@ class Trajectory:
 
 
 def mpc(
-    mind: Mind,
+    predictor: Predictor,
     step: Step,
     observed: Frames,
     goal: Frames,
@@ -128,11 +145,11 @@ def mpc(
 ) -> Trajectory:
     """Act until the goal is reached or the budget is spent.
 
-    Each plan but the first is searched for around what is left of the one before. The same key in
-    the same surroundings gives the same trajectory.
+    Each plan but the first starts from the rest of the one before. The same key in the same
+    surroundings gives the same trajectory.
 
     Args:
-        mind: see ``imagining`` and ``knowing``.
+        predictor: see ``world_predictor`` and ``simulator_predictor``.
         step: the surroundings.
         observed: (S,) real frames; the last one is the present.
         goal: the goal, T = 1.
@@ -141,11 +158,11 @@ def mpc(
         config: the size of a plan, and how much of it is carried out.
         key: randomness; plan i uses ``fold_in(key, i)``.
         budget: actions at most.
-        folder: where plans are kept while they are searched for and afterwards. The same call again
-            then reads them, acts anew by them, and goes on with the plan that was interrupted; what
-            was seen must be the same.
-        about: with ``folder``: what plans depend on beside settings, key and what is seen, such as
-            hashes of the cost and of the model's weights. Plans of something else are refused.
+        folder: where plans are stored during the search and afterwards. The same call resumes: it
+            reads the finished plans, carries them out again, and continues the interrupted one. The
+            frames must be the same.
+        about: with ``folder``: what plans depend on besides settings, key and frames, such as
+            hashes of the cost and of the model's weights. Plans with other inputs are refused.
         progress: show it.
 
     Raises:
@@ -161,7 +178,7 @@ def mpc(
         )
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    state, rest = mind.start(observed), None
+    state, rest = predictor.start(observed), None
     actions: list[Any] = []
     frames: list[Frames] = []
     plans: list[Plan] = []
@@ -173,7 +190,7 @@ def mpc(
             found = plan(
                 planner,
                 config,
-                Judged(mind.rollout(state, imagined), cost, goal),
+                CandidateCost(predictor.rollout(state, imagined), cost, goal),
                 searched,
                 rest,
                 checkpoint=folder and folder / f"plan_{len(plans):04d}.npz",
@@ -191,7 +208,7 @@ def mpc(
                 if reached:
                     break
             present = _joined(seen)
-            state = mind.observe(state, present)
+            state = predictor.observe(state, present)
             frames.append(present)
             rest = shifted(config, found.choices)
     costs = np.array([float(found.cost) for found in plans])
@@ -203,7 +220,7 @@ def _joined(frames: list[Frames]) -> Frames:
 
 
 def _hash(*frames: Frames) -> str:
-    """Return a hash of frames, by which a kept plan is recognised."""
+    """Return a hash of frames, by which a stored plan is recognised."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(frames):
         digest.update(np.ascontiguousarray(leaf).tobytes())

@@ -1,8 +1,8 @@
-"""Plan: round after round of candidates, their costs, and what the planner learns from them.
+"""Plan: draw candidates, compute their costs, update the planner, and repeat.
 
 ``search`` is pure and jitted whole, for costs that JAX can trace. ``plan`` is the same loop on the
-host, for costs of any kind: it shows progress, refuses costs that are no numbers, and goes on where
-it was interrupted. Both draw a round's randomness from the key and the round's number alone: the
+host, for costs of any kind: it shows progress, refuses costs that are NaN or −inf, and resumes an
+interrupted search. Both draw a round's randomness from the key and the round's number alone: the
 same key gives the same plan.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -21,7 +22,8 @@ import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.io.progress import Meter
-from pewm_jax.planning import planners, rounds_file
+from pewm_jax.io.store import ProgressFile
+from pewm_jax.planning import planners
 from pewm_jax.planning.planners import Search
 from pewm_jax.planning.settings import PlanConfig, Planner
 from pewm_jax.types import Array
@@ -39,8 +41,8 @@ class Rounds:
         least_R: (R,) the lowest cost of the round.
         mean_R: (R,) the mean of its finite costs.
         best_R: (R,) the lowest cost so far.
-        spread_R: (R,) how undecided the planner is afterwards: entropy over the uniform one's, or
-            the mean standard deviation.
+        spread_R: (R,) spread of the planner's distribution afterwards: its entropy relative to the
+            uniform one's, or the mean standard deviation.
     """
 
     least_R: Array
@@ -152,14 +154,14 @@ def plan(
     Args:
         planner: the planner.
         config: the size of the search.
-        cost_of_actions: see ``Cost``; it is called once a round and may do what it likes. inf means
-            that a candidate is out of the question.
+        cost_of_actions: see ``Cost``; it is called once a round and need not be pure. inf excludes
+            a candidate.
         key: randomness.
         start: see ``planners.init``.
-        checkpoint: a file that is rewritten after every round; a search goes on from it, and a
-            finished one is read from it. It belongs to one search: one of other settings, key,
-            start or ``about`` is refused.
-        about: what the cost is about, for the checkpoint, such as a hash of state and goal.
+        checkpoint: a file that is rewritten after every round. The same call resumes from it, or
+            returns the finished plan. A file of a search with other settings, key, start or
+            ``about`` is refused.
+        about: what the cost depends on, for the checkpoint, such as a hash of state and goal.
         progress: show it.
 
     Raises:
@@ -168,9 +170,10 @@ def plan(
     """
     begun = planners.init(planner, config, start)
     made: list[Rounds] = []
-    identity = rounds_file.identity(planner, config, key, begun, about) if checkpoint else ""
-    if checkpoint is not None and checkpoint.exists():
-        begun, made = rounds_file.read(checkpoint, identity, begun, Rounds)
+    file = None
+    if checkpoint is not None:
+        file = ProgressFile(checkpoint, _identity(planner, config, key, begun, about), "a search")
+        begun, made = _resumed(file.read(), begun)
     meter = Meter("plan", config.rounds * config.candidates, "candidates") if progress else None
     found = begun
     with meter or contextlib.nullcontext():
@@ -181,8 +184,8 @@ def plan(
             costs = checked(cost_of_actions(actions, judged), config.candidates, number)
             found, statistics = _learned(planner, config, found, choices, costs)
             made.append(jax.tree.map(np.asarray, statistics))
-            if checkpoint is not None:
-                rounds_file.write(checkpoint, identity, found, made)
+            if file is not None:
+                file.write(_arrays_of(found, made))
             if meter is not None:
                 meter.advance(config.candidates)
     if not np.isfinite(float(found.cost)):
@@ -191,6 +194,31 @@ def plan(
             "choose: look at the cost, or allow other actions."
         )
     return _finished(config, found, jax.tree.map(lambda *x: jnp.stack(x), *made))
+
+
+def _identity(planner: Planner, config: PlanConfig, key: Array, begun: Search, about: str) -> str:
+    """Return a hash of everything that a search depends on."""
+    digest = hashlib.sha256(repr((planner, config, about)).encode())
+    for leaf in [jax.random.key_data(key), *jax.tree.leaves(begun)]:
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def _arrays_of(search: Search, rounds: list[Rounds]) -> dict[str, np.ndarray]:
+    """Return the state of a search and the statistics of its rounds as named arrays."""
+    arrays = {f"search_{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(search))}
+    columns = zip(*(jax.tree.leaves(x) for x in rounds), strict=True)
+    return arrays | {f"rounds_{i}": np.stack(column) for i, column in enumerate(columns)}
+
+
+def _resumed(arrays: dict[str, np.ndarray] | None, begun: Search) -> tuple[Search, list[Rounds]]:
+    """Return the state and the rounds of ``_arrays_of``; of None those of a new search."""
+    if arrays is None:
+        return begun, []
+    leaves, tree = jax.tree.flatten(begun)
+    saved = [arrays[f"search_{i}"] for i in range(len(leaves))]
+    columns = [arrays[name] for name in sorted(arrays) if name.startswith("rounds_")]
+    return jax.tree.unflatten(tree, saved), [Rounds(*row) for row in zip(*columns, strict=True)]
 
 
 def checked(costs: Any, count: int, number: int | None = None) -> np.ndarray:

@@ -6,7 +6,7 @@ picture of such a walk is a goal that the walk reached (hindsight relabelling): 
 from any walk in this way.
 
 A world knows no walls, but the given pictures have depth: where something that they show stands in
-the way of a step forward, the rest of the block is a turn on the spot (``floor_map``). So walls are
+the way of a step forward, the rest of the block is a turn on the spot (``FloorMap``). So walls are
 the same whatever the world imagines.
 """
 
@@ -35,12 +35,88 @@ from pewm_jax.geometry.actions import (
     heading,
 )
 from pewm_jax.planning import nomad_policy
-from pewm_jax.planning.floor_map import FloorMap
 from pewm_jax.types import Frames, Params
 
+CELL_M = 0.05
+RADIUS_M = 0.27
+"""Points nearer than this to the middle of the way block it."""
+ABOVE_FLOOR_M, ABOVE_CAMERA_M = 0.2, 0.1
+"""Points lower than the first, or higher above the camera than the second, block nothing."""
+LEAST_POINTS = 3
+"""Points that make a cell occupied: single ones are errors of measured or imagined depth."""
+FLOOR_PERCENTILE = 1.0
+"""Percentile of the points' heights that is taken for the floor."""
+WAY_SAMPLES = 6
+"""Positions along a way that are checked."""
+FARTHEST_M = 6.0
+"""Points farther from the camera are left out: their position is uncertain."""
 Act: TypeAlias = Callable[[np.ndarray, np.ndarray | None, jax.Array], np.ndarray]
 """``act(rgb_SHWC, goal_HWC, key) -> (N,)`` discrete actions: pictures seen, the present last, and
 the picture of a goal or None."""
+
+
+class FloorMap:
+    """Occupied cells of the floor, from the posed depth of all frames that were added.
+
+    A camera does not see what stands beside the agent's feet, so one image is not enough: all
+    earlier frames count. Everything between the floor and a little above the camera is an obstacle.
+    The floor is the lowest level with many points.
+    """
+
+    def __init__(self) -> None:
+        self._points = np.zeros((0, 3))
+        self._cameras = np.zeros(0)
+        self._cells: set[tuple[int, int]] | None = None
+
+    def add(self, frames: Frames) -> None:
+        """Add (T,) posed depth; 0 is no measurement."""
+        depth_THW = np.asarray(frames.depth_THW, np.float64)
+        poses = np.asarray(frames.camera.world_from_camera, np.float64)
+        fx, fy, cx, cy = np.moveaxis(
+            np.asarray(frames.camera.intrinsics_4, np.float64)[:, None, None], -1, 0
+        )
+        rows, columns = np.indices(depth_THW.shape[1:]) + 0.5
+        right, down = (columns - cx) / fx * depth_THW, (rows - cy) / fy * depth_THW
+        seen = np.stack([right, down, depth_THW], -1)
+        world = np.einsum("tij,thwj->thwi", poses[:, :3, :3], seen) + poses[:, None, None, :3, 3]
+        measured = (depth_THW > 0) & (depth_THW <= FARTHEST_M)
+        self._points = np.concatenate([self._points, world[measured]])
+        self._cameras = np.concatenate([self._cameras, poses[:, 2, 3]])
+        self._cells = None
+
+    def free(self, start_xy: np.ndarray, end_xy: np.ndarray) -> bool:
+        """Tell whether a straight way has no obstacle in it."""
+        cells = self._occupied()
+        reach = int(np.ceil(RADIUS_M / CELL_M)) + 1
+        around = np.arange(-reach, reach + 1)
+        for share in np.linspace(0, 1, WAY_SAMPLES)[1:]:
+            place = np.asarray(start_xy) + share * (np.asarray(end_xy) - np.asarray(start_xy))
+            middle = np.floor(place / CELL_M).astype(int)
+            for dx in around:
+                for dy in around:
+                    cell = int(middle[0] + dx), int(middle[1] + dy)
+                    if cell in cells:
+                        away = (np.array(cell) + 0.5) * CELL_M - place
+                        if np.hypot(*away) < RADIUS_M:
+                            return False
+        return True
+
+    def _occupied(self) -> set[tuple[int, int]]:
+        """Return the cells with obstacles, computed at first use."""
+        if self._cells is None:
+            points = self._points
+            if not len(points):
+                return set()
+            height = points[:, 2]
+            floor = np.percentile(height, FLOOR_PERCENTILE)
+            body = (height > floor + ABOVE_FLOOR_M) & (
+                height < self._cameras.mean() + ABOVE_CAMERA_M
+            )
+            cells, counts = np.unique(
+                np.floor(points[body, :2] / CELL_M).astype(int), axis=0, return_counts=True
+            )
+            self._cells = {(int(x), int(y)) for x, y in cells[counts >= LEAST_POINTS]}
+        return self._cells
 
 
 @dataclasses.dataclass(frozen=True)

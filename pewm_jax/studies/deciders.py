@@ -35,10 +35,9 @@ from pewm_jax.eval.reproject import ReprojectSettings, reproject
 from pewm_jax.geometry.actions import continuous, integrate
 from pewm_jax.io.store import file_hash
 from pewm_jax.planning import nomad_policy
-from pewm_jax.planning.candidates import Imagination, Judged, Rollout
+from pewm_jax.planning.candidates import CandidateCost, ImaginedRollout, Rollout, rank_by
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.plan import plan
-from pewm_jax.planning.ranking import rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig
 from pewm_jax.studies.goals import Goal, TaskInput, wander
 from pewm_jax.train.runs import WEIGHTS
@@ -114,7 +113,7 @@ class Predictors:
             return Reprojection(self.config.model.actions, REPROJECTION, state)
         config, params = self._model(predictor)
         key = jax.random.key(goal.number)
-        return Imagination(config, params, state, key, self.batch, memory=predictor == "memory")
+        return ImaginedRollout(config, params, state, key, self.batch, memory=predictor == "memory")
 
     def _model(self, predictor: str) -> tuple[Config, Params]:
         if predictor != NONE:
@@ -200,7 +199,7 @@ def decide(
         ranking = rank_by(rollout, proposals, cost, goal.frame)
         best = ranking.order_K[0]
         return Decision(proposals[best], float(ranking.costs_K[best]))
-    watched = _Watched(Judged(rollout, cost, goal.frame))
+    watched = _Watched(CandidateCost(rollout, cost, goal.frame))
     found = plan(CEM(), config, watched, jax.random.key(goal.number), progress=False)
     return Decision(np.asarray(found.actions), float(found.cost), watched.found)
 
@@ -221,7 +220,9 @@ def _closed_loop(
     while len(done) < total + clip:
         here = float(np.asarray(cost(jax.tree.map(lambda x: x[None], present), goal.frame))[0])
         horizon = max(total - len(done), clip)
-        judged = Judged(predictors.rollout_from(predictor, state, goal, planar), cost, goal.frame)
+        judged = CandidateCost(
+            predictors.rollout_from(predictor, state, goal, planar), cost, goal.frame
+        )
         key = jax.random.fold_in(jax.random.key(goal.number), len(done))
         found = plan(
             CEM(),

@@ -87,7 +87,7 @@ def toy(monkeypatch):
     monkeypatch.setattr(pewm_jax, "load", lambda _: (model.config, {}), raising=False)
     monkeypatch.setattr(pewm_jax, "start", lambda _c, _p, f: model.start(f), raising=False)
     monkeypatch.setattr(pewm_jax, "rollout", rollout, raising=False)
-    monkeypatch.setattr(candidates, "Imagination", imagination)
+    monkeypatch.setattr(candidates, "ImaginedRollout", imagination)
     monkeypatch.setattr(engine, "open_engine", lambda *_: model)
 
 

@@ -22,7 +22,7 @@ from pewm_jax import registry, worlds
 from pewm_jax.cli import plugins
 from pewm_jax.config import ConfigError
 from pewm_jax.planning import costs
-from pewm_jax.planning.candidates import Imagination, Judged
+from pewm_jax.planning.candidates import CandidateCost, ImaginedRollout
 from pewm_jax.planning.imagined_env import WorldModelEnv
 from pewm_jax.planning.plan import plan
 from pewm_jax.planning.settings import CEM, PlanConfig
@@ -158,7 +158,9 @@ def test_it_is_driven_searched_and_walked_in(trained):
     jax.tree.map(np.testing.assert_array_equal, after.map, state.map)
     _, alone = worlds.imagine(config, params, state, actions[1], keys[1])
     np.testing.assert_allclose(frames.rgb_THWC[1], alone.rgb_THWC, atol=1e-5)
-    cost = Judged(Imagination(config, params, state, jax.random.key(0)), costs.Pixels(), goal)
+    cost = CandidateCost(
+        ImaginedRollout(config, params, state, jax.random.key(0)), costs.Pixels(), goal
+    )
     settings = PlanConfig(horizon=2, candidates=4, elites=2, rounds=2)
     assert np.isfinite(plan(CEM(), settings, cost, jax.random.key(1)).cost)
 

@@ -250,7 +250,7 @@ def test_a_checkpoint_of_another_search_and_a_damaged_one_are_refused(tmp_path):
         lambda: ours(planner, key=KEY, checkpoint=file, start=jnp.array([1])),
         lambda: ours(planner, key=KEY, checkpoint=file, about="another goal"),
     ):
-        with pytest.raises(UserError, match="belongs to a search of other settings"):
+        with pytest.raises(UserError, match="belongs to a search with other inputs"):
             other()
     file.write_bytes(file.read_bytes()[:-100])
     with pytest.raises(UserError, match=r"damaged .*: remove it"):

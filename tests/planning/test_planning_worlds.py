@@ -20,10 +20,9 @@ from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.planning import candidates, costs
-from pewm_jax.planning.candidates import Imagination, Judged
-from pewm_jax.planning.mpc import imagining, knowing, mpc
+from pewm_jax.planning.candidates import CandidateCost, ImaginedRollout, rank, rank_by
+from pewm_jax.planning.mpc import mpc, simulator_predictor, world_predictor
 from pewm_jax.planning.plan import plan
-from pewm_jax.planning.ranking import rank, rank_by
 from pewm_jax.planning.settings import CEM, PlanConfig, RandomShooting
 from pewm_jax.readers.render import RenderConfig
 from pewm_jax.types import Camera, Frames
@@ -64,7 +63,7 @@ def imagined():
     """The last frames of ``SHORT_PLANS``, in batches, and how often that was compiled."""
     model, params, state = world("tiny")
     before = candidates._imagined._cache_size()
-    whole = Imagination(model, params, state, KEY, batch=BATCH)(SHORT_PLANS)
+    whole = ImaginedRollout(model, params, state, KEY, batch=BATCH)(SHORT_PLANS)
     return whole, candidates._imagined._cache_size() - before
 
 
@@ -74,7 +73,7 @@ def equal(a, b, atol=0.0):
 
 def test_batches_are_the_loop_after_several_clips_of_a_rendered_memory():
     model, params, state = world("surfels")
-    rollout = Imagination(model, params, state, KEY, batch=3)
+    rollout = ImaginedRollout(model, params, state, KEY, batch=3)
     last = rollout(PLANS)
     imagine = jax.jit(functools.partial(worlds.imagine, model, remember=False))
     for number, actions in enumerate(PLANS):
@@ -90,7 +89,7 @@ def test_batches_are_the_loop_after_several_clips_of_a_rendered_memory():
 def test_a_camera_is_rendered_once_whatever_came_before(monkeypatch):
     model, params, state = world("surfels")
     turns = np.array([[1, 2, 0], [2, 1, 0], [0, 0, 0], [0, 1, 2]])
-    one, other = (Imagination(model, params, state, KEY, batch=4) for _ in range(2))
+    one, other = (ImaginedRollout(model, params, state, KEY, batch=4) for _ in range(2))
     first = one(turns)
     assert (
         one._views.rendered == 7
@@ -108,7 +107,7 @@ def test_a_camera_is_rendered_once_whatever_came_before(monkeypatch):
 
 def test_the_size_of_a_batch_changes_nothing_and_compiles_once():
     model, params, state = world("tiny")
-    (whole, compiled), rollout = imagined(), Imagination(model, params, state, KEY, batch=BATCH)
+    (whole, compiled), rollout = imagined(), ImaginedRollout(model, params, state, KEY, batch=BATCH)
     assert compiled == 1
     before = candidates._imagined._cache_size()
     for part in (SHORT_PLANS[:1], SHORT_PLANS[:4]):
@@ -118,7 +117,7 @@ def test_the_size_of_a_batch_changes_nothing_and_compiles_once():
     with pytest.raises(UserError, match="candidates of shape"):
         rollout(PLANS[0])
     with pytest.raises(ConfigError, match="batch is 0"):
-        Imagination(model, params, state, KEY, batch=0)
+        ImaginedRollout(model, params, state, KEY, batch=0)
 
 
 def test_a_planner_with_64_candidates_holds_one_map():
@@ -136,7 +135,7 @@ def test_a_planner_with_64_candidates_holds_one_map():
         return np.arange(64.0)
 
     before = bytes_of_maps()
-    rollout = Imagination(model, params, state, KEY, batch=BATCH)
+    rollout = ImaginedRollout(model, params, state, KEY, batch=BATCH)
     assert rollout.state.map.features_VF is features
     rank(model, params, state, np.resize(SHORT_PLANS, (64, 3)), cost, None, KEY, batch=BATCH)
     config = PlanConfig(horizon=3, candidates=64, elites=8, rounds=2)
@@ -154,7 +153,7 @@ def test_planning_again_compiles_nothing():
     def once(number):
         key = jax.random.key(number)
         rank(model, params, state, rng.integers(0, 3, (5, 3)), costs.Pixels(), goal, key)
-        judged = Judged(Imagination(model, params, state, key), costs.Pixels(), goal)
+        judged = CandidateCost(ImaginedRollout(model, params, state, key), costs.Pixels(), goal)
         return plan(CEM(), config, judged, key, progress=False)
 
     once(0)
@@ -181,7 +180,7 @@ def test_what_was_judged_is_not_imagined_again():
         seen.append(len(actions))
         return of_colour(np.asarray(actions)[:, -1] / 2)
 
-    judged = Judged(rollout, costs.Pixels(), of_colour([0.0], goal=True))
+    judged = CandidateCost(rollout, costs.Pixels(), of_colour([0.0], goal=True))
     actions = np.array([[0, 1], [1, 0], [0, 1]])
     first = judged(actions)
     np.testing.assert_allclose(first, [0.0625, 0, 0.0625])
@@ -253,7 +252,9 @@ def test_a_model_that_imagines_nan_is_refused_in_a_sentence():
     model, params, state = world("tiny")
     broken = jax.tree.map(lambda x: x * np.nan, params)
     goal = state.frame
-    judged = Judged(Imagination(model, broken, state, KEY, batch=BATCH), costs.Pixels(), goal)
+    judged = CandidateCost(
+        ImaginedRollout(model, broken, state, KEY, batch=BATCH), costs.Pixels(), goal
+    )
     config = PlanConfig(horizon=3, candidates=4, elites=2, rounds=2)
     with pytest.raises(UserError, match="in round 0 the cost of 4 of 4 candidates"):
         plan(CEM(), config, judged, KEY, progress=False)
@@ -292,7 +293,7 @@ def walk(limit=None):
 def test_an_agent_remembers_what_it_really_sees_and_can_be_interrupted(tmp_path):
     model, params, state = world("tiny")
     mind, seen = (
-        imagining(model, params, batch=BATCH),
+        world_predictor(model, params, batch=BATCH),
         random_frames(np.random.default_rng(0), 3, 16, 16),
     )
     goal = jax.tree.map(lambda x: x[2], imagined()[0])
@@ -380,7 +381,7 @@ def test_with_the_true_renderer_goals_within_the_horizon_are_reached(cost):
         start = pose_from_yaw((*sample_free(grid, rng, 1)[0], HEIGHT), rng.uniform(-3, 3))
         goal = truly(start, rng.integers(0, 3, (1, 6)))
         present, wanted = (jax.tree.map(lambda x: x[0], seen_from(x)) for x in (start[None], goal))
-        judged = Judged(simulator(present), cost, wanted)
+        judged = CandidateCost(simulator(present), cost, wanted)
         found = plan(CEM(), config, judged, jax.random.key(number), progress=False)
         shot = rng.integers(0, 3, (1, 6))
         for actions, count in ((np.asarray(found.actions)[None], reached), (shot, by_chance)):
@@ -404,11 +405,13 @@ def test_an_agent_that_knows_the_truth_walks_to_its_goal():
 
     config = PlanConfig(horizon=4, receding_horizon=2, candidates=30, elites=8, rounds=5)
     oracle = costs.Distance(costs.straight)
-    done = mpc(knowing(simulator), step, present, wanted, oracle, CEM(), config, KEY, budget=16)
+    done = mpc(
+        simulator_predictor(simulator), step, present, wanted, oracle, CEM(), config, KEY, budget=16
+    )
     assert done.reached
     assert len(done.plans) > 1
     blind = mpc(
-        knowing(simulator),
+        simulator_predictor(simulator),
         step,
         present,
         wanted,

@@ -17,8 +17,7 @@ from pewm_jax.data.simulator import move
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.io import weights
 from pewm_jax.planning import practice
-from pewm_jax.planning.floor_map import FloorMap
-from pewm_jax.planning.practice import Imagined, Practice, Real
+from pewm_jax.planning.practice import FloorMap, Imagined, Practice, Real
 from pewm_jax.studies import deciders, goals
 from pewm_jax.studies import practice as study
 from pewm_jax.studies.practice import COLUMNS
