@@ -193,6 +193,11 @@ def compare(settings: CompareSettings) -> None:
     # Imported here and not above: help and refusals are fast.
     from pewm_jax.eval import compare as comparison
 
-    also = {"also_one": settings.also_a, "also_two": settings.also_b}
-    page = comparison.compare(settings.run_a, settings.run_b, out=settings.out, **also)
+    page = comparison.compare(
+        settings.run_a,
+        settings.run_b,
+        out=settings.out,
+        also_one=settings.also_a,
+        also_two=settings.also_b,
+    )
     print(f"comparison: {page}")

@@ -197,7 +197,7 @@ def stack(clips: Sequence[Clip]) -> Clip:
                 f"clips of one batch have {field} of different shapes ({sizes}): use episodes that "
                 "record the same, and one stride where actions are not planar (dx, dy, dyaw)."
             )
-        return None if None in shapes else np.stack(parts)
+        return None if None in shapes else np.stack(list(parts))  # type: ignore[arg-type]
 
     def frames(parts: Sequence[Frames]) -> Frames:
         return Frames(

@@ -387,7 +387,7 @@ def require_same_cells(world: World, episode: Episode) -> None:
     Raises:
         ConfigError: the episode has another table of classes, or other pictures.
     """
-    memory = getattr(world, "memory", None)
+    memory: Any = getattr(world, "memory", None)
     if not getattr(memory, "CLASSES", False) or episode.voxel_grid is None:
         return
     for kinds in ("all", "groups"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -190,7 +191,7 @@ def _above(config: Config, long: LongRollouts, index: int, item: _Rollout) -> np
     for (title, track), (points, shades) in zip(tracks, clouds, strict=True):
         path = track if track is poses else np.concatenate([poses[-1:], track])
         yaw = float(heading(track[-1]))
-        cell_m = config.model.facts.cell_m or (DOT_M,) * 3
+        cell_m: Any = config.model.facts.cell_m or (DOT_M,) * 3
         panels.append(
             from_above(points, shades, cell_m, path[:, :3, 3], yaw, title=title, bounds=bounds)
         )

@@ -206,7 +206,7 @@ def device_memory(compiled: Any) -> tuple[float, float]:
 
 def as_on_chips(config: Config) -> Config:
     """Choose the form of the VAE's convolutions that accelerators use."""
-    codec = getattr(config.model, "codec", None)  # a policy has none
+    codec: Any = getattr(config.model, "codec", None)  # a policy has none
     if getattr(codec, "convolution", "") != "auto":
         return config
     return config.with_model(codec=dataclasses.replace(codec, convolution="volume"))

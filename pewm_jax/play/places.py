@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -85,7 +86,7 @@ def require_shown(model: World, start: Start) -> None:
     Raises:
         UserError: the world knows pictures of blocks, and the drive begins with surfaces.
     """
-    memory = getattr(model, "memory", None)
+    memory: Any = getattr(model, "memory", None)
     if not getattr(memory, "CLASSES", False):
         return
     if start.episode:

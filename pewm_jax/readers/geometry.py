@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import ModelConfig
-from pewm_jax.config.parts import Reader
 from pewm_jax.geometry import zbuffer
 from pewm_jax.geometry.cameras import invert_rigid, project, transform_points
 from pewm_jax.geometry.plucker import fold_frames
@@ -103,7 +103,7 @@ def patch_pixels(model: ModelConfig) -> int:
 
 
 def sightings(
-    model: ModelConfig, config: Reader, camera: Camera, points_M3: Array, valid_M: Array
+    model: ModelConfig, config: Any, camera: Camera, points_M3: Array, valid_M: Array
 ) -> Sightings:
     """Choose the map tokens that each camera attends to, and compute their positions.
 
@@ -132,7 +132,7 @@ def sightings(
 
 
 def _look(
-    model: ModelConfig, config: Reader, camera: Camera, points_M3: Array, valid_M: Array
+    model: ModelConfig, config: Any, camera: Camera, points_M3: Array, valid_M: Array
 ) -> tuple[Array, ...]:
     """Return the first four fields of ``Sightings``."""
     clip, patch, patch_t = model.clip, patch_pixels(model), model.backbone.places.patch_t
@@ -169,7 +169,7 @@ def _turns(model: ModelConfig, points_M3: Array, valid_M: Array, camera: Camera)
     return zbuffer.visibility_rank(points_M3, wide, tall, valid_M, camera, size)
 
 
-def sinusoid_3d(model: ModelConfig, config: Reader, camera: Camera, points_M3: Array) -> Array:
+def sinusoid_3d(model: ModelConfig, config: Any, camera: Camera, points_M3: Array) -> Array:
     """Return (B, M, 6·10) sines and cosines of the positions of map tokens.
 
     The 10 wavelengths grow geometrically from 4 × a cell's smallest side to 4 × the map's largest

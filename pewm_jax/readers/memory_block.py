@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config.parts import Reader
 from pewm_jax.nn import layers, modules, placement
 from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.readers.geometry import Sightings, frequencies
@@ -188,7 +188,7 @@ def _read_seen(
 class MemoryBlock(nn.Module):
     """One memory expert block."""
 
-    config: Reader
+    config: Any
     grid: int
     """Patches along the longer side of the image."""
     layout: TokenLayout

@@ -39,7 +39,7 @@ from pewm_jax.worlds import checks, forms
 from pewm_jax.worlds.stages import Stage
 
 
-def model_of(config: Config | Task) -> Any:
+def model_of(config: Any) -> Any:
     """Return the model's settings, from a whole experiment's if those are given."""
     return config.model if isinstance(config, Config) else config
 
@@ -221,7 +221,7 @@ def imagine_many(
     return WorldState(frame, state.map), frames
 
 
-def _world_of(model: Config | Task, params: Params, who: str) -> World:
+def _world_of(model: Any, params: Params, who: str) -> World:
     """Return the settings of a world, after checking that these are settings and parameters."""
     model = model_of(model)
     checks.check_model(model, who)
@@ -319,27 +319,27 @@ def views(model: Config | Task, params: Params, state: WorldState) -> Callable[[
     return function(model, "views")(model, forms.own(model, params), state)
 
 
-def init(model: Config | Task, key: Array) -> Params:
+def init(model: Any, key: Array) -> Params:
     """Return random parameters for all networks of a world."""
     model = model_of(model)
     return function(model, "init")(model, key)
 
 
-def stages(model: Config | Task) -> tuple[Stage, ...]:
+def stages(model: Any) -> tuple[Stage, ...]:
     """Return the stages of a world's training, in order."""
     model = model_of(model)
     found = function(model, "stages")(model)
     return tuple(forms.with_dictionaries(model, stage) for stage in found)
 
 
-def sharding(model: Config | Task) -> tuple[tuple[str, Any], ...]:
+def sharding(model: Any) -> tuple[tuple[str, Any], ...]:
     """Return the rules from paths of parameters to the mesh axes of their last axes."""
     model = model_of(model)
     rules = function(model, "sharding")(model)
     return tuple((pattern, PartitionSpec(*spec)) for pattern, spec in rules)
 
 
-def split_heads(model: Config | Task, stage: Stage) -> dict[str, int]:
+def split_heads(model: Any, stage: Stage) -> dict[str, int]:
     """Return the numbers that ``train.mesh.tensor`` must divide, by the setting's name."""
     model = model_of(model)
     return function(model, "split_heads")(model, stage)

@@ -166,7 +166,7 @@ def candidates_of(controls: Any, who: str) -> int:
         found, wanted = f"cameras with poses {poses}", "(K, n, 4, 4) and intrinsics (K, n, 4)"
         shape = poses
     else:
-        shape = jnp.shape(controls)
+        shape = jnp.shape(controls)  # type: ignore[arg-type]
         fits = len(shape) in (2, 3)
         found, wanted = f"actions of shape {shape}", "(K, n) integers or (K, n, 3) floats"
     if not fits or shape[0] == 0:

@@ -133,7 +133,7 @@ def apply(
     wanted = {
         "timesteps_Bt": (timesteps_Bt, ((batch,), (batch, grid[0]))),
         "text_BLD": (text_BLD, ((batch, "L", config.raw_text_dim or config.text_dim),)),
-        "modulation_BtE": (modulation_BtE, ((batch, grid[0], config.time_dim),)),
+        "modulation_BtE": (modulation_BtE, ((batch, grid[0], config.width),)),
         "added_BND": (added_BND, ((batch, math.prod(grid), config.width),)),
         "fps": (None if fps is None else jnp.asarray(fps), ((),)),
     }

@@ -115,6 +115,7 @@ def drawn(
     cells = ClassGrid(classes_XYZ, corner_3)
     one = jax.tree.map(lambda x: x[None], camera)
     view = model.memory.render(model, cells, one, model.clip.height, model.clip.width)
+    assert view is not None
     return encoded(model, params, view.features_THWF[0], view.depth_THW[0])
 
 
