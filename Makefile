@@ -8,9 +8,8 @@ COLLECT ?= --train 144 --frames 80
 BENCH ?= render cogvideox memory dinov2 training
 # Tests that depend on the versions of Python and JAX: parities, sampling, sharding over simulated
 # devices, a training from the command line that is interrupted and resumed.
-NEWEST = tests/parity tests/diffusion tests/training/test_training_sharding.py \
-  tests/training/test_training_loop.py tests/training/test_training_two_stages.py \
-  tests/test_train_cli.py
+NEWEST = tests/models/*/test_parity*.py tests/diffusion tests/train/test_sharding.py \
+  tests/train/test_loop.py tests/train/test_two_stages.py tests/cli/test_train.py
 
 .PHONY: help demo table1 table2 test test-all test-newest docs lint format bench clean
 

@@ -65,18 +65,19 @@ def pytest_unconfigure(config):
         config.stash[COMPILED].cleanup()
 
 
-SLOW = (
-    "test_readme.py",
-    "test_training_devices.py",
-    "test_training_plan_sums.py",
-    "test_training_processes.py",
-    "test_training_kills.py",
-    "test_train_cli.py",
-    "test_evaluation_report.py",
+FIRST = (
+    "docs/test_commands.py",
+    "train/test_devices.py",
+    "plan/test_sums.py",
+    "train/test_processes.py",
+    "train/test_kills.py",
+    "cli/test_train.py",
+    "eval/test_evaluate.py",
 )
-"""Files of long programs: begun first, so that no worker is left alone with one at the end."""
+"""Files that take longest: begun first, so that no worker is left alone with one at the end."""
 
 
+HERE = Path(__file__).parent
 MAPS = Path("/proc/self/maps")
 MOST_MAPS = 25_000
 """Linux lets a process map 65,530 regions of memory. Every compiled program takes several, and one
@@ -96,4 +97,5 @@ def pytest_runtest_teardown(item, nextitem):
 
 def pytest_collection_modifyitems(items):
     """Order the files for workers that take one file at a time."""
-    items.sort(key=lambda item: SLOW.index(item.path.name) if item.path.name in SLOW else len(SLOW))
+    first = {HERE / name: place for place, name in enumerate(FIRST)}
+    items.sort(key=lambda item: first.get(item.path, len(first)))

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import tracemalloc
 
-import convert_pipelines as pipelines
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +30,7 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.types import Camera, MapTokens, MemoryReadout
 from pewm_jax.worlds import world_model
+from tests.convert import pipelines
 
 WORLD = ["--rgbd", "--camera", "--memory", "--frames", "9", "--height", "32", "--width", "32"]
 

@@ -17,7 +17,7 @@ from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig, FrameFlowConfig
 from pewm_jax.worlds import objective
-from tests.diffusion.test_diffusion import make_clip
+from tests.diffusion.test_ddpm import make_clip
 from tests.helpers import TINY, init_world, randomise, tiny_model
 
 KINDS = {

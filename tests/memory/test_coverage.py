@@ -12,7 +12,7 @@ from pewm_jax.memory import coverage
 from pewm_jax.memory import interface as memories
 from pewm_jax.readers.render import RenderConfig
 from tests.helpers import random_camera
-from tests.memory.test_memory_rivals import ALL, KINDS, encoded, model_of, scene, seen
+from tests.memory.test_memories import ALL, KINDS, encoded, model_of, scene, seen
 
 
 @pytest.mark.parametrize("kind", KINDS)

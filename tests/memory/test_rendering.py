@@ -14,7 +14,7 @@ from pewm_jax.memory import rendering as views
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Camera, Frames
 from tests.helpers import random_camera, tiny_model
-from tests.memory.test_memory_rivals import ALL, KINDS, model_of, scene, seen
+from tests.memory.test_memories import ALL, KINDS, model_of, scene, seen
 
 HEIGHT, WIDTH = 6, 9
 splat = jax.jit(rendering.splat, static_argnums=(4, 5))

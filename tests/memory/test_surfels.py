@@ -24,7 +24,7 @@ from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Frames
 from tests.helpers import TINY, random_camera, tiny_model
-from tests.memory.test_memory_rivals import encoded, scene
+from tests.memory.test_memories import encoded, scene
 
 SMALL = SurfelConfig(cell_m=(0.5,) * 3, cells=(8, 8, 8), capacity=64, tokens=8)
 insert = jax.jit(surfels.insert, static_argnums=(0, 3))

@@ -1,0 +1,93 @@
+"""What a stage starts from: all of its weights, but for those that train.fresh lets be random."""
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from pewm_jax.config import ConfigError
+from pewm_jax.io import tree, weights
+from pewm_jax.train import loop
+from pewm_jax.train import step as state
+from tests.train import fakes
+
+TWO = fakes.STAGES[1]
+KEY = jax.random.key(7)
+
+
+def create(start, stage=TWO, **changes):
+    config = fakes.config(**changes)
+    return state.create(config, stage, KEY, start)
+
+
+@pytest.fixture
+def whole(fake_model):
+    return jax.tree.map(np.asarray, fakes.init(None, jax.random.key(1)))
+
+
+def same(left, right):
+    return {p for p, leaf in tree.flatten(left).items() if (leaf == tree.flatten(right)[p]).all()}
+
+
+def test_memory_blocks_that_are_absent_begin_at_random_and_others_go_on(whole):
+    drawn = fakes.init(None, KEY)
+    given, memory = {"backbone": whole["backbone"]}, {"memory": {"gate": whole["memory"]["gate"]}}
+    made = create(given)
+    assert same(made.params, whole) >= {"backbone/kernel", "backbone/bias"}
+    assert same(made.params, drawn) >= {"memory/kernel", "memory/gate"}
+    made = create(given | memory)
+    assert "memory/gate" in same(made.params, whole)
+    assert "memory/kernel" in same(made.params, drawn)
+    assert same(create(whole).params, whole) == tree.flatten(whole).keys()
+
+
+def test_anything_else_absent_or_unexpected_is_an_error_that_lists_it(whole):
+    broken = {"backbone": {"kernel": whole["backbone"]["kernel"]}, "memroy": {"gate": np.ones(3)}}
+    with pytest.raises(tree.TreeError) as refused:
+        create(broken)
+    for part in ("backbone/bias is missing", "memroy/gate is unexpected", r"memory/.*"):
+        assert part in str(refused.value)
+    assert "memory/kernel" not in str(refused.value)
+
+
+def test_train_fresh_says_what_may_be_absent(whole):
+    without = {"backbone": {"kernel": whole["backbone"]["kernel"]}}
+    made = create(without, fresh=(r"memory/.*", r".*/bias"))
+    assert "backbone/bias" in same(made.params, fakes.init(None, KEY))
+    with pytest.raises(tree.TreeError, match=r"memory/gate is missing, memory/kernel is missing"):
+        create({"backbone": whole["backbone"]}, fresh=())
+    with pytest.raises(ConfigError, match="no regular expression"):
+        fakes.config(fresh=("(",))
+
+
+def test_the_rule_is_known_before_anything_is_computed(whole):
+    shapes = jax.eval_shape(functools.partial(fakes.init, None), KEY)
+    config = fakes.config()
+    state.require_start(config, TWO, {"backbone": shapes["backbone"]}, shapes)
+    with pytest.raises(tree.TreeError, match="backbone/bias is missing"):
+        state.require_start(config, TWO, {"memory": shapes["memory"]}, shapes)
+
+
+def test_stage_2_starts_from_another_run_of_stage_1_alone(fake_model, tmp_path):
+    loop.train(fakes.config(tmp_path / "one", stage1=3, stage2=0), say=lambda _: None)
+    config = fakes.config(tmp_path / "two", stage1=0, stage2=3, start=str(tmp_path / "one"))
+    loop.train(config, say=lambda _: None)
+    one, two = (weights.load(tmp_path / n / "weights.safetensors") for n in ("one", "two"))
+    assert set(one) == {"backbone"}
+    assert set(two) == {"backbone", "memory"}
+    for name, leaf in one["backbone"].items():
+        assert leaf.tobytes() == two["backbone"][name].tobytes()
+    (tmp_path / "one" / "weights.safetensors").unlink()
+    for number, start in enumerate(("one", "one/checkpoints/stage1/3")):
+        config = fakes.config(
+            tmp_path / f"again{number}", stage1=0, stage2=3, start=str(tmp_path / start)
+        )
+        loop.train(config, say=lambda _: None)
+        again = weights.load(tmp_path / f"again{number}" / "weights.safetensors")
+        assert same(again, two) == tree.flatten(two).keys()
+    strict = fakes.config(
+        tmp_path / "three", stage1=0, stage2=3, start=str(tmp_path / "one"), fresh=()
+    )
+    with pytest.raises(tree.TreeError, match="memory/gate is missing"):
+        loop.train(strict, say=lambda _: None)

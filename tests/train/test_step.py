@@ -1,0 +1,152 @@
+"""One step: what moves, what stays bit-identical, what is averaged, what it costs."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax import presets as configs
+from pewm_jax.config import AXES, ConfigError
+from pewm_jax.io import tree
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.train import optimizer, sharding, stages, step
+from pewm_jax.train import step as state
+from pewm_jax.worlds import world_model
+from pewm_jax.worlds.pewm import world as pewm
+from tests.train import fakes
+
+ONE, TWO = fakes.STAGES[:2]
+REAL = pewm.STAGES[1]
+
+
+def run(config, stage, steps, start=None):
+    """Run the compiled step; returns the state before, the state after and the losses."""
+    mesh = sharding.make_mesh(jax.devices()[:1])
+    batch = stage.settings(config).batch
+    now = step.initial_state(config, stage, mesh, start)
+    before = jax.tree.map(np.array, now)
+    step_fn = step.compile_step(config, stage, mesh, fakes.clip(config, batch, 0))
+    key = step.noise_key(config, stage)
+    history, losses = [], []
+    for number in range(steps):
+        placed = jax.device_put(fakes.clip(config, batch, number), sharding.of_batch(mesh))
+        now, metrics = step_fn(now, placed, key)
+        history.append(jax.tree.map(np.array, now))
+        losses.append(float(metrics["loss"]))
+    return before, history, losses
+
+
+def test_stage_1_has_no_memory_and_moves_everything(fake_model):
+    before, history, losses = run(fakes.config(), ONE, 6)
+    assert set(before.params) == {"backbone"}
+    for path, leaf in tree.flatten(before.params).items():
+        assert not np.array_equal(leaf, tree.flatten(history[-1].params)[path]), path
+    assert losses[-1] < losses[0]
+    assert history[-1].step == 6
+
+
+def test_stage_2_moves_the_memory_and_leaves_all_else_bit_identical(fake_model):
+    start = fakes.init(fakes.config(), jax.random.key(9), memory=False)
+    before, history, _ = run(fakes.config(weight_decay=0.1), TWO, 4, start)
+    after = history[-1]
+    for path, leaf in tree.flatten(after.params).items():
+        same = leaf.tobytes() == tree.flatten(before.params)[path].tobytes()
+        assert same == path.startswith("backbone/"), path
+    for path, leaf in tree.flatten(start).items():
+        assert np.asarray(leaf).tobytes() == tree.flatten(after.params)[path].tobytes()
+
+
+def test_moments_and_average_exist_for_trained_leaves_only(fake_model):
+    before, _, _ = run(fakes.config(), TWO, 1)
+    assert set(before.ema) == {"memory"}
+    moments = {path for path in tree.flatten(before.opt_state) if "/mu/" in path or "/nu/" in path}
+    assert moments
+    assert all("/memory/" in path for path in moments)
+
+
+def test_the_average_follows_its_definition(fake_model):
+    config = fakes.config(ema=0.3)
+    before, history, _ = run(config, ONE, 5)
+    average = before.params["backbone"]["kernel"]
+    for number, now in enumerate(history):
+        decay = min(0.3, (2 + number) / (11 + number))
+        average = decay * average + (1 - decay) * now.params["backbone"]["kernel"]
+        np.testing.assert_allclose(now.ema["backbone"]["kernel"], average, rtol=1e-5, atol=1e-6)
+
+
+def test_inference_uses_the_average_where_trained_and_the_frozen_weights_elsewhere(fake_model):
+    _, history, _ = run(fakes.config(), TWO, 3)
+    params = state.inference_params(TWO, history[-1])
+    np.testing.assert_array_equal(params["memory"]["gate"], history[-1].ema["memory"]["gate"])
+    np.testing.assert_array_equal(
+        params["backbone"]["kernel"], history[-1].params["backbone"]["kernel"]
+    )
+    assert tree.mismatches(params, history[-1].params) == []
+
+
+def test_the_noise_of_a_step_depends_on_its_number_and_on_nothing_else(fake_model):
+    config = fakes.config()
+    clip, key = fakes.clip(config, 8, 0), step.noise_key(config, ONE)
+    now = state.create(config, ONE, key)
+    loss = [
+        float(step.train_step(config, ONE, s, clip, key)[1]["loss"])
+        for s in (now, now, state.TrainState(now.params, now.ema, now.opt_state, jnp.int32(7)))
+    ]
+    assert loss[0] == loss[1]
+    assert loss[0] != loss[2]
+
+
+def test_weights_that_a_stage_cannot_start_from_are_refused(fake_model):
+    config, key = fakes.config(), jax.random.key(0)
+    wrong = {"backbone": {"kernel": jnp.zeros((3, 4)), "bias": jnp.zeros(3)}}
+    with pytest.raises(tree.TreeError, match=r"stage 2 starts from .* \(3, 4\)"):
+        state.create(config, TWO, key, wrong)
+
+
+def test_a_batch_that_devices_cannot_share_is_refused(fake_model):
+    mesh = jax.sharding.AbstractMesh((3, 1, 1, 1), AXES)
+    with pytest.raises(ConfigError, match=r"stage1\.batch is 8, which 3 devices"):
+        sharding.require_divisible(fakes.config(), ONE, mesh)
+
+
+def test_every_leaf_of_the_state_needs_a_sharding_rule(monkeypatch):
+    model = configs.load("tiny").model
+    first = pewm.sharding(model)[:1]
+    monkeypatch.setattr(pewm, "sharding", lambda model: first)
+    with pytest.raises(tree.TreeError, match="sharding rules matches params/w"):
+        sharding.of_state(model, sharding.make_mesh(), {"step": 0, "params": {"w": 0}})
+
+
+def test_freezing_the_backbone_makes_the_step_of_the_real_model_cheaper():
+    small = configs.load("tiny")
+    wide = DiTBackbone(layers=1, heads=16, head_dim=32, text_length=1, text_dim=8, time_dim=16)
+    config = small.with_model(backbone=wide)
+    clip, mesh = fakes.clip(config, 2, 0), sharding.make_mesh(jax.devices()[:1])
+
+    def flops(stage):
+        return step.trace_step(config, stage, mesh, clip).lower().cost_analysis()["flops"]
+
+    everything = dataclasses.replace(REAL, rules=((r".*", stages.TRAIN),))
+    assert flops(REAL) < 0.85 * flops(everything)
+
+
+def test_the_stages_cover_the_parameters_of_the_real_model():
+    make = functools.partial(world_model.init, configs.load("tiny").model, memory=True)
+    params = jax.eval_shape(make, jax.random.key(0))
+    assert set(tree.select(params, REAL.trained)) == {"memory"}
+    labels = tree.flatten(REAL.labels(params))
+    assert {p for p, label in labels.items() if label == stages.TRAIN} == {
+        p for p in labels if p.startswith("memory/")
+    }
+    with pytest.raises(tree.TreeError, match="rules of stage2 matches stranger"):
+        REAL.labels({**params, "stranger": 0})
+    assert set(tree.exclude(params, REAL.trained)) == {"backbone"}
+    assert (
+        tree.mismatches(tree.select(params, ONE.trained), tree.exclude(params, REAL.trained)) == []
+    )
+    decayed = tree.flatten(tree.assign(optimizer.DECAYED, params))
+    assert any(decayed.values())
+    assert not all(decayed.values())

@@ -1,0 +1,133 @@
+"""What a real picture says of cells: air, surfaces and their colours, and what comes of it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pewm_jax import worlds
+from pewm_jax.data import voxel_pictures
+from pewm_jax.data.voxels import VoxelFrames, table_colours
+from pewm_jax.geometry import block_light
+from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, unproject
+from pewm_jax.geometry.march import through_pixels
+from pewm_jax.memory import class_grid
+from pewm_jax.types import Camera
+from pewm_jax.worlds.persist import state as windows
+from pewm_jax.worlds.persist import voxel_frames as persist_sight
+from pewm_jax.worlds.persist import voxel_frames as persist_voxels
+from pewm_jax.worlds.persist import world as persist
+from tests.helpers import random_frames
+from tests.worlds.persist.tiny_persist import MODEL
+
+SIZE, CELL, COLOURS = 48, 0.5, 8
+LOW = np.array([-2.0, 2.5, -2.0], np.float32)
+MEMORY = dataclasses.replace(MODEL.memory, colours=COLOURS)
+ROOM = dataclasses.replace(MODEL, memory=MEMORY)
+
+
+def furnished():
+    """A closed room, a different colour on each side, and two blocks in it."""
+    grid = np.zeros((8, 8, 8), np.uint8)
+    grid[0], grid[7], grid[:, 0], grid[:, 7] = 1, 7, 3, 5
+    grid[:, :, 0], grid[:, :, 7] = 2, 1
+    grid[5:7, 2, 1:4], grid[6, 4:6, 1] = 8, 12
+    pose = pose_from_yaw(np.array([-0.9, 4.6, 0.2]), 0.1)[None].astype(np.float32)
+    camera = Camera(np.asarray(intrinsics_from_fov(SIZE, SIZE, 90.0), np.float32), pose)
+    voxels = VoxelFrames(grid[None], LOW[None], CELL, class_grid.names(MEMORY))
+    seen = voxel_pictures.draw_blocks(voxels, camera, SIZE, SIZE)
+    rgb = seen.rgb_THWC[0].astype(np.float32) / 127.5 - 1
+    one = Camera(camera.intrinsics_4, camera.world_from_camera[0])
+    return grid, rgb, seen.depth_THW[0], one
+
+
+def test_a_picture_tells_air_from_surfaces_and_their_colours():
+    grid, rgb, depth, camera = furnished()
+    sight = persist_sight.seen(ROOM, LOW, rgb, depth, camera)
+    air, colour = np.asarray(sight.air_XYZ), np.asarray(sight.colour_XYZ)
+    assert air.sum() > 30
+    assert not grid[air].any()
+    surface = colour >= 0
+    assert surface.sum() > 60
+    assert (grid[surface] > 0).mean() > 0.98
+    right = (grid[surface].astype(int) - 1) % COLOURS == colour[surface]
+    assert right.mean() > 0.95
+    assert not (air & surface).any()
+    # The cell of a block's face that is looked at, its colour, and the air beside it.
+    assert colour[5, 2, 2] == 7
+    assert air[4, 3, 3]
+
+
+def test_where_nothing_was_measured_nothing_is_said():
+    _, rgb, depth, camera = furnished()
+    sight = persist_sight.seen(ROOM, LOW, rgb, 0 * depth, camera)
+    assert not np.asarray(sight.air_XYZ).any()
+    assert (np.asarray(sight.colour_XYZ) == -1).all()
+
+
+def test_the_light_that_is_read_is_the_light_that_was_drawn():
+    grid, rgb, depth, camera = furnished()
+    way = unproject(depth, camera) - camera.world_from_camera[:3, 3]
+    at = (way + camera.world_from_camera[:3, 3] - LOW) / CELL
+    lit = block_light.light(
+        grid > 0, LOW, CELL, camera.world_from_camera[:3, 3], way, np.ones(depth.shape),
+        block_light.side_of(at),
+    )  # fmt: skip
+    one = Camera(camera.intrinsics_4[None], camera.world_from_camera[None])
+    met = through_pixels(grid.astype(np.int32), LOW, CELL, one, SIZE, SIZE, 1).ids_L[0, ..., 0]
+    wanted = table_colours(class_grid.names(MEMORY))[met] / 255 * np.asarray(lit)[..., None]
+    off = np.abs((rgb + 1) / 2 - wanted).max(-1)
+    # Pixels at edges mix what their rays meet; all others have the class's colour in its light.
+    assert np.quantile(off, 0.8) < 0.02
+
+
+def test_a_world_begins_on_the_lattice_of_recorded_cells_and_with_what_it_sees():
+    frames = random_frames(np.random.default_rng(0), 1, 16, 16)
+    params = jax.jit(lambda: worlds.init(MODEL, jax.random.key(0)))()
+    run = jax.jit(worlds.start, static_argnums=0)
+    state = run(MODEL, params, frames)
+    low = np.asarray(state.map.low_3)[:2] / 0.5
+    np.testing.assert_allclose(low, np.round(low), atol=1e-5)
+    first = np.asarray(state.map.history.start_3)
+    corner = state.map.low_3 + first * 0.5
+    camera = jax.tree.map(lambda x: jnp.asarray(x[0]), frames.camera)
+    rgb = frames.rgb_THWC[0].astype(np.float32) / 127.5 - 1
+    sight = persist_sight.seen(MODEL, corner, rgb, frames.depth_THW[0], camera)
+    cells = np.asarray(windows.window(MODEL, state.map.classes_XYZ, first))
+    assert np.asarray(sight.air_XYZ).any()
+    assert (np.asarray(sight.colour_XYZ) >= 0).any()
+    assert not cells[np.asarray(sight.air_XYZ)].any()
+    assert cells[np.asarray(sight.colour_XYZ) >= 0].all()
+    # A frame that was imagined says nothing of its cells.
+    still = jax.jit(persist.imagine, static_argnums=0, static_argnames="memory")
+    doubted = dataclasses.replace(MODEL, observation_logit=0.0)
+    key, none = jax.random.key(0), np.zeros((1, 3), np.float32)
+    one, two = (
+        still(model, params, state, none, key, memory=False)[1].rgb_THWC
+        for model in (MODEL, doubted)
+    )
+    np.testing.assert_array_equal(one, two)
+
+
+def test_what_is_seen_decides_between_classes_and_nothing_else_changes():
+    classes = MODEL.backbone.voxel_vae.classes  # 13: of the second kind not all colours
+    params = jax.jit(lambda: worlds.init(ROOM, jax.random.key(0)))()
+    latents = jax.random.normal(jax.random.key(1), (1, 4, 4, 4, 3))
+    before = jnp.full((8, 8, 8), -1)
+    air = jnp.zeros((8, 8, 8), bool).at[:2].set(True)
+    colour = jnp.full((8, 8, 8), -1).at[2:4].set(2)
+    sight = persist_sight.ObservedCells(air, colour)
+    free = dataclasses.replace(ROOM, persistence_logit=0.0)
+    made = np.asarray(persist_voxels.decode_classes(free, params, latents, before))
+    looked = np.asarray(persist_voxels.decode_classes(free, params, latents, before, sight))
+    assert not looked[:2].any()
+    assert ((looked[2:4] > 0) & ((looked[2:4] - 1) % COLOURS == 2)).all()
+    np.testing.assert_array_equal(looked[4:], made[4:])
+    blind = dataclasses.replace(free, observation_logit=0.0)
+    np.testing.assert_array_equal(
+        persist_voxels.decode_classes(blind, params, latents, before, sight), made
+    )
+    given = persist_sight.advantage(ROOM, sight, classes)
+    assert given.shape == (8, 8, 8, classes)
+    assert float(given.max()) == ROOM.observation_logit
