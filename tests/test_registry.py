@@ -126,7 +126,7 @@ def test_a_module_of_entry_points_is_imported_once(tmp_path, monkeypatch):
 
 
 def test_the_refusal_of_an_unknown_kind_names_both_ways():
-    with pytest.raises(ConfigError, match=r"--import MODULE .* entry point .*pewm_jax\.kinds") as e:
+    with pytest.raises(ConfigError, match=r"--plugin FILE, .* entry point .*pewm_jax\.kinds") as e:
         kinds.named("noise", "absent")
     one_sentence(e)
 

@@ -13,7 +13,7 @@ from pewm_jax.config import ModelConfig
 from pewm_jax.errors import ConfigError
 
 SIZE = 64
-"""Width and height of a walk's pictures, pixels, where collecting is not told another."""
+"""Width and height that `data collect` gives pictures by default, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -147,6 +147,9 @@ def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
     hint = wanted.hint or prog
     known = [name for kind, default in everything.values() for name, _ in flags_of(default or kind)]
 
+    if any(word in HELP for word in flags):
+        flags = ["--help"]  # in the place of a flag's value, too
+
     def refuse(event: Any) -> None:
         raise ConfigError(_sentence(event, known, hint))
 

@@ -23,7 +23,7 @@ class Table1Settings:
     """
 
     out: Path = Path("runs/table1")
-    """Folder that everything is kept in."""
+    """Folder of the results."""
     data: Path | None = None
     """Folder of the data set; by default the preset's."""
     preset: str = "table1"
@@ -90,9 +90,9 @@ class Table2Settings:
     model: str = "small"
     """A run's folder, or a model that comes with the library."""
     out: Path = Path("runs/table2")
-    """Folder that everything is kept in."""
+    """Folder of the results."""
     tasks: int = 48
-    """Tasks; they take the houses in turn."""
+    """Tasks, spread evenly over the houses."""
     houses: int = 24
     """Held-out houses."""
     proposals: tuple[int, ...] = (8, 16)
@@ -106,17 +106,17 @@ class Table2Settings:
     horizon: int = 8
     """Actions of the shortest walk to a goal, a multiple of what the model imagines at once."""
     multiples: tuple[int, ...] = (1, 2, 3)
-    """Goals are so many times --horizon actions away, and plans are as long."""
+    """Distances of goals and lengths of plans, in multiples of --horizon."""
     none: str = ""
     """A run that was trained without memory (`pewm-jax train small --train.stage2.steps 0
     --train.joint.steps 0 --train.gate.steps 0 …`), which gets rows of its own."""
     policy: str = "wander"
-    """`wander` (walks that know nothing), the folder of a trained NoMaD (`runs/nomad`), or
+    """`wander` (random walks), the folder of a trained NoMaD (`runs/nomad`), or
     MODULE:FUNCTION, see `studies.deciders.Policy`."""
     cost: Literal["lpips", "pixels"] = "lpips"
     """How far the last frame is from the goal's picture."""
     videos: int = 3
-    """Tasks whose plan is shown beside what happened."""
+    """Tasks of which a video shows the plan next to the real frames."""
 
 
 def table2(settings: Table2Settings) -> None:
@@ -154,7 +154,7 @@ def table2(settings: Table2Settings) -> None:
 
 
 def _policy(name: str) -> tuple[str, Callable[..., Any]]:
-    """Return what the decisions of a policy are kept under, and the policy."""
+    """Return the name under which decisions of a policy are stored, and the policy."""
     from pewm_jax.studies import deciders
 
     if name in deciders.POLICIES:
@@ -190,7 +190,7 @@ class PracticeSettings:
     model: str = "small"
     """A run's folder, or a model that comes with the library."""
     out: Path = Path("runs/practice")
-    """Folder that everything is kept in."""
+    """Folder of the results."""
     houses: int = 12
     """Held-out houses."""
     tasks: int = 12

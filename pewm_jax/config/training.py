@@ -14,7 +14,7 @@ class DataConfig:
     """The data that training reads."""
 
     path: str = "data/demo"
-    """Data folder made by `python -m pewm_jax.data collect` or `import`; it contains train/."""
+    """Data folder made by `pewm-jax data collect` or `import`; it contains train/."""
     stride_min: int = 1
     """Smallest number of actions between two frames of a clip."""
     stride_max: int = 3
@@ -22,7 +22,7 @@ class DataConfig:
     context: int = 24
     """Earlier frames of the same episode that fill the memory."""
     features: str = ""
-    """Folder of cached image features of `data.path`, made by `python -m pewm_jax.memory cache`; if
+    """Folder of cached image features of `data.path`, made by `pewm-jax memory cache`; if
     empty, they are computed at every step."""
     prepared: int = 0
     """Clips that are encoded, and their memories built and shown, once before the first step, kept
@@ -81,7 +81,7 @@ class TrainSettings:
     run: str = "runs/demo"
     """Folder of this run: checkpoints, logs, images, report."""
     start: str = ""
-    """Folder with weights to start from, made by `python -m pewm_jax.convert import … --rgbd
+    """Folder with weights to start from, made by `pewm-jax convert import … --rgbd
     --camera` or an earlier run; if empty, weights are random. Weights that the first stage does not
     use, such as memory blocks in stage 1, are not loaded and start afresh later."""
     optimizer: Literal["adam", "muon"] = "adam"

@@ -83,7 +83,7 @@ class ImportCogVideoX:
             raise ConfigError("--memory was given without --rgbd --camera; add them.")
         for name in ("frames", "height", "width", "positions", "encoder", "config"):
             if getattr(self, name) is not None:
-                raise ConfigError(f"--{name} is of a world model; add --rgbd --camera.")
+                raise ConfigError(f"--{name} is a setting of a world model; add --rgbd --camera.")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -224,7 +224,7 @@ def _check_motion(integrated: np.ndarray, poses: np.ndarray, choice: ClipChoice,
         frame = (choice.start, *choice.targets_N)[worst]
         raise UserError(
             f"episode {choice.name}: at frame {frame} the {what} and the recorded pose disagree "
-            f"by {error[worst]:.3g}; run `python -m pewm_jax.data validate` on the data."
+            f"by {error[worst]:.3g}; run `pewm-jax data validate` on the data."
         )
 
 

@@ -145,7 +145,7 @@ def refuse_stale(path: Path, have: Mapping[str, Any], want: Mapping[str, Any]) -
     Raises:
         UserError: the fingerprints differ; the message says in what.
     """
-    again = "make it again with `python -m pewm_jax.memory cache` in a new folder"
+    again = "make it again with `pewm-jax memory cache` in a new folder"
     for key in ("encoder", "network", "preprocessing"):
         old, new = have.get(key), want[key]
         if old != new:
@@ -174,9 +174,7 @@ def read(path: Path) -> FeatureCache:
     if not (path / MANIFEST).is_file():
         begun = (path / UNFINISHED).is_file()
         hint = "is not finished: the command that makes it goes on" if begun else "is no cache"
-        raise UserError(
-            f"{path} {hint}; make it with `python -m pewm_jax.memory cache DATA {path}`."
-        )
+        raise UserError(f"{path} {hint}; make it with `pewm-jax memory cache DATA {path}`.")
     value = read_json(path / MANIFEST)
     try:
         version, made_of = value["version"], value["made_of"]
@@ -363,7 +361,7 @@ class CacheConfig:
     out: Annotated[Path, tyro.conf.Positional]
     """The folder to fill; for a dataset, it gets a folder per split."""
     encoder: str = ""
-    """Folder of DINOv2 made by `python -m pewm_jax.convert import dinov2`; if empty, patch colours,
+    """Folder of DINOv2 made by `pewm-jax convert import dinov2`; if empty, patch colours,
     which have no weights, are the encoder."""
     size: int = 518
     """Side in pixels of the square that images are resized to for DINOv2; `memory.encoder.size` of

@@ -1,12 +1,12 @@
-"""Costs: how far what would be seen is from the goal, the lower the better.
+"""Costs: the distance of frames from the goal; lower is better.
 
 A cost is any function ``cost(frames, goal) -> costs_K`` of (K, N) frames and the goal, one frame.
-Those here look at the last frame, or at all of them with ``weights``::
+The costs here compare the last frame, or all of them with ``weights``::
 
     cost = costs.perceptual()                          # LPIPS, as the paper's
     cost = costs.with_depth(costs.Pixels(), weight=0.1)
-    cost = costs.Features(config.model, params)        # what the memory's encoder makes of pictures
-    cost = costs.Distance(my_distance)                 # the truth, of the last pose: an oracle
+    cost = costs.Features(config.model, params)        # features of the memory's encoder
+    cost = costs.Distance(my_distance)                 # ground truth of the last pose: an oracle
 
 Pictures of NaN cost NaN, which ``plan.plan`` refuses.
 """
@@ -35,11 +35,11 @@ from pewm_jax.types import Array, Frames, Params
 FrameCost: TypeAlias = Callable[[Frames, Frames], Any]
 """``cost(frames, goal) -> costs_K`` of (K, N) frames and a goal of one frame."""
 AT_ONCE = 2**18
-"""Pixels that are in a network at once, or one picture if it has more."""
+"""Pixels in one batch of a network, or one picture if it has more."""
 
 
 @dataclasses.dataclass(frozen=True)
-class _OfPictures:
+class PictureCost:
     """A cost of single pictures, taken of the last frame or of all with weights.
 
     Attributes:
@@ -95,20 +95,20 @@ def _require_alike(frames: Frames, goal: Frames) -> int:
 
 
 @dataclasses.dataclass(frozen=True)
-class Pixels(_OfPictures):
+class Pixels(PictureCost):
     """Mean squared difference of colours in [0, 1]."""
 
     def pictures(self, frames: Frames, goal: Frames) -> Array:
-        """See ``_OfPictures``."""
+        """See ``PictureCost``."""
         return jnp.square((frames.rgb_THWC - goal.rgb_THWC) / 2).mean((1, 2, 3))
 
 
 @dataclasses.dataclass(frozen=True)
-class Depth(_OfPictures):
+class Depth(PictureCost):
     """Mean |log d − log d_goal| where both have a depth, NaN where no pixel has."""
 
     def pictures(self, frames: Frames, goal: Frames) -> Array:
-        """See ``_OfPictures``."""
+        """See ``PictureCost``."""
         a, b = jnp.broadcast_arrays(jnp.asarray(frames.depth_THW), jnp.asarray(goal.depth_THW))
         both = (a > 0) & (b > 0)
         apart = jnp.abs(jnp.log(jnp.where(both, a, 1)) - jnp.log(jnp.where(both, b, 1)))
@@ -117,7 +117,7 @@ class Depth(_OfPictures):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Perceptual(_OfPictures):
+class Perceptual(PictureCost):
     """LPIPS to the goal; see ``perceptual``, which reads its weights.
 
     Attributes:
@@ -129,7 +129,7 @@ class Perceptual(_OfPictures):
     params: Params = dataclasses.field(repr=False)
 
     def pictures(self, frames: Frames, goal: Frames) -> Array:
-        """See ``_OfPictures``."""
+        """See ``PictureCost``."""
         lpips.require_size(self.net, *goal.rgb_THWC.shape[1:3])
         return _lpips(self.net, self.params, frames.rgb_THWC, goal.rgb_THWC)
 
@@ -142,7 +142,7 @@ def perceptual(
     Args:
         path: a file of weights (``models.lpips.convert``), or None for the package's.
         net: the network.
-        weights: see ``_OfPictures``.
+        weights: see ``PictureCost``.
 
     Raises:
         UserError: there are no weights, or they are damaged or of another network.
@@ -166,7 +166,7 @@ def _at_once(rgb_PHWC: Array) -> int:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Features(_OfPictures):
+class Features(PictureCost):
     """Mean squared difference of the features that an image encoder makes.
 
     Attributes:
@@ -178,7 +178,7 @@ class Features(_OfPictures):
     params: Params = dataclasses.field(repr=False)
 
     def pictures(self, frames: Frames, goal: Frames) -> Array:
-        """See ``_OfPictures``."""
+        """See ``PictureCost``."""
         params = self.params
         if not isinstance(self.settings, Encoder):
             params = self.settings.memory.encoder.weights(params)
@@ -202,7 +202,7 @@ def _features(
 
 @dataclasses.dataclass(frozen=True)
 class Distance:
-    """The true distance of the last pose from the goal's: an oracle, for what planners can do.
+    """The true distance of the last pose from the goal's: an oracle, to measure planners alone.
 
     Attributes:
         function: from poses (K, 4, 4) and the goal's (4, 4), ``world_from_camera``, to (K,) numbers
@@ -224,7 +224,7 @@ def straight(poses_K44: Any, goal_44: Any, metres_per_radian: float = 0.25) -> A
     Args:
         poses_K44: (K, 4, 4) poses.
         goal_44: (4, 4) the goal's.
-        metres_per_radian: what a radian counts.
+        metres_per_radian: the weight of a radian.
     """
     poses, goal = jnp.asarray(poses_K44), jnp.asarray(goal_44)
     apart = jnp.linalg.norm(poses[:, :3, 3] - goal[:3, 3], axis=-1)
@@ -252,7 +252,7 @@ def with_depth(cost: FrameCost, weight: float) -> Sum:
 
     Args:
         cost: that of colours.
-        weight: what a mean difference of the depths' logarithm by 1 costs (``Depth``).
+        weight: of the mean difference of the depths' logarithms (``Depth``).
     """
     weights = getattr(cost, "weights", None)
     return Sum(((1.0, cost), (weight, Depth(weights=weights))))

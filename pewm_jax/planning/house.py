@@ -71,7 +71,7 @@ def draw_task(config: HouseConfig, grid: NavGrid, rng: np.random.Generator, wher
     Args:
         config: ``min_distance_m`` and ``max_distance_m`` count.
         grid: where the agent can stand.
-        rng: everything random comes from here.
+        rng: random numbers.
         where: name of the scene, for the refusal.
 
     Raises:
@@ -83,7 +83,7 @@ def draw_task(config: HouseConfig, grid: NavGrid, rng: np.random.Generator, wher
         ways = PathsToGoal(grid, goal)
         distance = np.where(np.isfinite(ways.distance_YX), ways.distance_YX, -1.0)
         farthest = max(farthest, float(distance.max()))
-        # Distances from cell to cell are up to 8 % longer than the way pulled tight.
+        # Distances from cell to cell are up to 8 % longer than the shortened path.
         cells = np.argwhere((distance >= low) & (distance <= 1.1 * high + grid.cell_m))
         for _ in range(STARTS_TRIED if len(cells) else 0):
             start = grid.centre_of(cells[rng.integers(len(cells))])
@@ -131,7 +131,7 @@ class HouseEnv(gymnasium.Env):
         if render_mode not in (None, "rgb_array"):
             raise UserError(f"House has no render_mode {render_mode!r}; there is 'rgb_array'.")
         if config is not None and given:
-            raise UserError("House got a HouseConfig and settings beside it; give one of the two.")
+            raise UserError("House got a HouseConfig and other settings; give one of the two.")
         self.config = settings(given) if config is None else config
         self.render_mode = render_mode
         self.observation_space = observations.observation_space(self.config)

@@ -24,7 +24,7 @@ class HouseConfig:
     """Seed of the generated house. `pewm-jax data collect` trains on 0, 3, 6, …, watches training
     on 1, 4, 7, … and tests on 2, 5, 8, …"""
     houses: int = 1
-    """Each episode is in one of so many houses: `house`, `house` + 3, …, of one split all."""
+    """Number of houses for episodes: `house`, `house` + 3, …, all of one split."""
     height: int = 64
     """Height of the images, pixels."""
     width: int = 64
@@ -41,7 +41,7 @@ class HouseConfig:
     turn_deg: float = 30.0
     """Angle of a turn, degrees; continuous: the largest |dyaw|."""
     sliding: bool = False
-    """Where the way is not free: slide along the obstacle, instead of staying."""
+    """Slide along obstacles instead of stopping."""
     task: Literal["point", "image"] = "point"
     """What is known of the goal. `point`: where it is, seen from the agent. `image`: what is seen
     there."""
@@ -54,9 +54,9 @@ class HouseConfig:
     success_deg: float = 180.0
     """… and with a heading this near to the goal's, degrees; 180: any."""
     success_reward: float = 2.5
-    """Reward for reaching the goal, beside that for coming nearer, 1 per metre."""
+    """Reward for reaching the goal, in addition to 1 per metre of approach."""
     max_steps: int = 200
-    """An episode is cut off after so many steps."""
+    """Steps after which an episode is truncated."""
 
     def __post_init__(self):
         """Validate."""

@@ -173,7 +173,7 @@ def mpc(
         raise UserError(f"budget is {budget}: allow at least one action.")
     if folder is not None and not about:
         raise UserError(
-            "plans are kept in a folder: say by about=… what they depend on, such as the names of "
+            "plans are stored in a folder: give about=…, what they depend on, such as the names of "
             "the model and of the cost, so that plans of another are not taken for them."
         )
     if folder is not None:

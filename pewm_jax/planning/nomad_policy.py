@@ -1,11 +1,11 @@
-"""Proposals by NoMaD: ways to go on, from what was seen and perhaps a picture of the goal.
+"""Proposals by NoMaD: trajectories from the pictures seen and, optionally, one of the goal.
 
     waypoints = nomad_policy.propose(policy, params, seen, goal, key, 16)   # (16, 8, 2) metres
     actions = nomad_policy.continuous(waypoints)                            # (16, 8, 3)
     steps = nomad_policy.discrete(model.actions, waypoints)                 # (16, 8)
 
-Either kind of actions is what ``worlds.imagine_many`` and a ranking of candidates take. ``Policy``
-walks by itself.
+``worlds.imagine_many`` and ``candidates.rank`` take either kind of actions. ``Policy`` acts on its
+own.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from pewm_jax.types import Array, Params
 
 STILL_M = 0.02
 """A step shorter than this has no direction, metres."""
-KEPT = 6561
-"""Sequences of discrete actions that are looked at together: all there are of 8."""
+SEQUENCES_AT_ONCE = 6561
+"""Sequences of discrete actions that are compared at once: all sequences of 8 actions."""
 
 
 def history(config: NomadConfig, rgb_SHWC: np.ndarray) -> np.ndarray:
@@ -48,7 +48,7 @@ def propose(
     key: Array,
     count: int,
 ) -> Array:
-    """Draw ways to go on.
+    """Sample trajectories.
 
     Pure, and compiled once for each configuration, count and set of shapes; under a jit of the
     caller's, config and count are static.
@@ -109,7 +109,7 @@ def continuous(waypoints_KN2: np.ndarray) -> np.ndarray:
 
     The agent moves straight to a waypoint and then turns to where the next one is; after the last
     it looks where it came from, as it does where waypoints do not differ. So the first move may
-    be sideways, and each is as long as the way to its waypoint.
+    be sideways, and each is as long as the distance to its waypoint.
 
     Args:
         waypoints_KN2: (..., N, 2) metres forward and left of the present place.
@@ -137,8 +137,8 @@ def discrete(actions: ActionConfig, waypoints_KN2: np.ndarray) -> np.ndarray:
     """Return the discrete actions that come nearest to waypoints, one for each.
 
     The squared distances between the place after action k and waypoint k are least in sum: of all
-    sequences for up to 8 waypoints, and else of the best ``KEPT`` beginnings. Of equally good ones
-    the one that goes forward first, then left, is taken.
+    sequences for up to 8 waypoints, and else of the best ``SEQUENCES_AT_ONCE`` beginnings. Of
+    equally good ones the one that goes forward first, then left, is taken.
 
     Args:
         actions: what an action does.
@@ -168,8 +168,8 @@ def _nearest(table: np.ndarray, points_N2: np.ndarray) -> np.ndarray:
         costs = np.repeat(costs, len(table)) + np.square(places - point).sum(-1)
         last = np.tile(np.arange(len(table)), len(taken))[:, None]
         taken = np.concatenate([np.repeat(taken, len(table), 0), last], -1)
-        if len(costs) > KEPT:
-            best = np.sort(np.argsort(costs, kind="stable")[:KEPT])
+        if len(costs) > SEQUENCES_AT_ONCE:
+            best = np.sort(np.argsort(costs, kind="stable")[:SEQUENCES_AT_ONCE])
             places, yaws, costs, taken = (x[best] for x in (places, yaws, costs, taken))
     return taken[np.argmin(np.round(costs, 9))]
 

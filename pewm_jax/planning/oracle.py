@@ -1,6 +1,6 @@
-"""An oracle for the house: it knows the map and walks a shortest way to the goal.
+"""An oracle for the house: it has the map and walks a shortest path to the goal.
 
-It bounds what any policy can reach, and walks where demonstrations are wanted::
+It is an upper bound for policies, and a source of demonstrations::
 
     for action in oracle.actions(env):
         observation, reward, terminated, truncated, info = env.step(action)
@@ -24,8 +24,8 @@ from pewm_jax.planning.house import HouseEnv
 
 TURN_STEPS = 0.25
 """Cost of a turn, in forward steps."""
-HURRY = 1.3
-"""Weight of what is left: above 1 the search is much faster, and its way a little longer."""
+HEURISTIC_WEIGHT = 1.3
+"""Weight of A*'s estimate: above 1 the search is much faster and its path a little longer."""
 SAME_M = 0.05
 """Places this near to each other, with one heading, are one place to the search, metres."""
 
@@ -46,7 +46,7 @@ def actions(env: gymnasium.Env) -> list[Any]:
     """
     house = env.unwrapped
     if not isinstance(house, HouseEnv):
-        raise UserError(f"the oracle knows the way in House alone, got a {type(house).__name__}.")
+        raise UserError(f"the oracle needs a house, got a {type(house).__name__}.")
     found = _search(house)
     if house.config.actions == "discrete":
         return found
@@ -90,15 +90,15 @@ def _search(house: HouseEnv) -> list[int]:
 
 
 def _estimate(house: HouseEnv, planar: np.ndarray) -> float:
-    """Return the forward steps that are left, from cell to cell."""
+    """Return an estimate of the remaining forward steps, from cell to cell."""
     ways = house.task.ways
     row, column = house.grid.cell_of(planar[:2])
     left = float(ways.distance_YX[row, column]) - house.config.success_m
-    return HURRY * max(0.0, left) / house.config.step_m
+    return HEURISTIC_WEIGHT * max(0.0, left) / house.config.step_m
 
 
 def _key(planar: np.ndarray, turn_deg: float) -> tuple[int, int, int]:
-    """Return what tells places and headings apart."""
+    """Return a key that is equal for nearly equal poses."""
     around = max(1, round(360 / turn_deg))
     heading = round(planar[2] / math.radians(turn_deg)) % around
     return round(planar[0] / SAME_M), round(planar[1] / SAME_M), heading

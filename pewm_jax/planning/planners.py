@@ -1,4 +1,4 @@
-"""Planners: where candidates come from, and what their costs change; no model, no cost.
+"""Planners: propose candidates, and update their distribution from costs; no model, no cost.
 
 Three pure functions drive every planner::
 
@@ -7,8 +7,8 @@ Three pure functions drive every planner::
     search = update(planner, config, search, choices_KH, costs_K)
 
 ``plan.plan`` loops over them. The best candidate of all rounds is kept in ``search.best``.
-Candidate 0 is the distribution's own mode or mean: what a search believes in is tried, too, and in
-the first round what it was started from.
+Candidate 0 is the distribution's own mode or mean; in the first round these are the choices that
+the search starts from.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Normals:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """What a planner knows.
+    """The state of a planner.
 
     Attributes:
         belief: (H, A) probabilities of discrete actions, or ``Normals``.
@@ -96,8 +96,8 @@ def kept(planner: Planner, config: PlanConfig) -> int:
     return round(getattr(planner, "keep", 0.0) * config.elites)
 
 
-WARM = 0.5
-"""Probability that a search begins with for the discrete choices it is started from."""
+START_PROBABILITY = 0.5
+"""Initial probability of the discrete choices that a search starts from."""
 
 
 def _around(planner: Planner, belief: Any, start: Array, blocks: int) -> Any:
@@ -112,7 +112,9 @@ def _around(planner: Planner, belief: Any, start: Array, blocks: int) -> Any:
     given = len(start)
     if isinstance(space, Discrete):
         sure = jax.nn.one_hot(start, space.count)
-        return belief.at[:given].set(WARM * sure + (1 - WARM) / space.count)
+        return belief.at[:given].set(
+            START_PROBABILITY * sure + (1 - START_PROBABILITY) / space.count
+        )
     low, high = bounds(space)
     return Normals(belief.mean_HA.at[:given].set(jnp.clip(start, low, high)), belief.std_HA)
 

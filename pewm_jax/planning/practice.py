@@ -146,7 +146,7 @@ class Practice:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Walk:
+class PracticeWalk:
     """What was seen and done.
 
     Attributes:
@@ -158,7 +158,7 @@ class Walk:
     actions_N: np.ndarray
 
 
-class Place(Protocol):
+class PracticeEnvironment(Protocol):
     """Where a policy practises: a world, or a simulator."""
 
     def begin(self, number: int) -> tuple[Any, Frames]:
@@ -174,7 +174,9 @@ class Place(Protocol):
         ...
 
 
-def walks(place: Place, seen: Frames, act: Act, practice: Practice, seed: int) -> Iterator[Walk]:
+def walks(
+    place: PracticeEnvironment, seen: Frames, act: Act, practice: Practice, seed: int
+) -> Iterator[PracticeWalk]:
     """Let a policy walk.
 
     Args:
@@ -208,10 +210,10 @@ def walks(place: Place, seen: Frames, act: Act, practice: Practice, seed: int) -
             frames.append(after)
             done.append(actions)
         together = jax.tree.map(lambda *x: np.concatenate(x), *frames)
-        yield Walk(together, np.concatenate(done))
+        yield PracticeWalk(together, np.concatenate(done))
 
 
-class Imagined:
+class ImaginedEnvironment:
     """A world as a place to practise in.
 
     Args:
@@ -255,7 +257,7 @@ class Imagined:
         return state, Frames(rgb, np.asarray(frames.depth_THW), camera)
 
 
-class Real:
+class SimulatedEnvironment:
     """A simulator as a place to practise in: the same number of real walks.
 
     Args:

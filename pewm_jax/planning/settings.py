@@ -19,7 +19,7 @@ class PlanConfig:
     horizon: int = 8
     """Blocks of a plan."""
     receding_horizon: int = 0
-    """Blocks of it that are carried out before planning anew; 0 for all."""
+    """Blocks that are carried out before the next plan; 0 for all."""
     action_block: int = 1
     """Equal actions that make a block."""
     candidates: int = 60
@@ -36,7 +36,7 @@ class PlanConfig:
 
     @property
     def carried_out(self) -> int:
-        """The actions of a plan that are carried out before planning anew."""
+        """Number of actions that are carried out before the next plan."""
         return (self.receding_horizon or self.horizon) * self.action_block
 
     def __post_init__(self):

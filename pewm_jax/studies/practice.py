@@ -23,7 +23,7 @@ from pewm_jax.io import atomic
 from pewm_jax.io.progress import Meter
 from pewm_jax.io.store import TABLE, ResultCache, require_same_inputs
 from pewm_jax.planning import practice
-from pewm_jax.planning.practice import Place, Walk
+from pewm_jax.planning.practice import PracticeEnvironment, PracticeWalk
 from pewm_jax.report import pictures
 from pewm_jax.report.table import Cell, Table
 from pewm_jax.studies import practice_piece
@@ -162,14 +162,16 @@ def _require_fit(
 
 def _places_shown(
     world: LoadedRun, study: PracticeConfig
-) -> Iterator[tuple[Goal, dict[str, Place]]]:
+) -> Iterator[tuple[Goal, dict[str, PracticeEnvironment]]]:
     for house in range(min(study.shown, study.houses)):
         home = open_home(study, world.config, house)
         motion = world.config.model.actions
         yield home, {how: place_of(world, home, motion, how) for how in (REAL, MEMORY, EMPTY)}
 
 
-def _first_walk(place: Place, home: Goal, begun: LoadedPolicy, study: PracticeConfig) -> Walk:
+def _first_walk(
+    place: PracticeEnvironment, home: Goal, begun: LoadedPolicy, study: PracticeConfig
+) -> PracticeWalk:
     seed = study.seeds[0]
     return next(practice.walks(place, home.context, act_of(begun), study.practice, seed))
 
@@ -247,7 +249,7 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
 
 
 def write_page(
-    results: Mapping[str, Any], page: Path, shown: Sequence[tuple[str, Mapping[str, Walk]]]
+    results: Mapping[str, Any], page: Path, shown: Sequence[tuple[str, Mapping[str, PracticeWalk]]]
 ) -> None:
     """Write the table as ``page`` (Markdown), and its picture beside it."""
     atomic.write_text(page, markdown(results, page.stem if shown else ""))
@@ -324,7 +326,7 @@ def _power(results: Mapping[str, Any]) -> str:
     )
 
 
-def picture(shown: Sequence[tuple[str, Mapping[str, Walk]]]) -> np.ndarray:
+def picture(shown: Sequence[tuple[str, Mapping[str, PracticeWalk]]]) -> np.ndarray:
     """Return the first walk of each house, seen in each place, as rows; (H, W, 3) uint8."""
     rows = []
     for house, walks in shown:

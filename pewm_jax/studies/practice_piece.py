@@ -25,7 +25,14 @@ from pewm_jax.errors import require
 from pewm_jax.eval.loaded_run import LoadedRun
 from pewm_jax.geometry.actions import FORWARD, discrete_table
 from pewm_jax.planning import practice, scores
-from pewm_jax.planning.practice import Act, Imagined, Place, Practice, Real, Walk
+from pewm_jax.planning.practice import (
+    Act,
+    ImaginedEnvironment,
+    Practice,
+    PracticeEnvironment,
+    PracticeWalk,
+    SimulatedEnvironment,
+)
 from pewm_jax.studies import goals
 from pewm_jax.studies.deciders import LoadedPolicy, open_policy
 from pewm_jax.studies.goals import Goal
@@ -156,11 +163,11 @@ def open_home(study: PracticeConfig, config: Config, house: int) -> Goal:
     )
 
 
-def place_of(world: LoadedRun, home: Goal, motion: ActionConfig, how: str) -> Place:
+def place_of(world: LoadedRun, home: Goal, motion: ActionConfig, how: str) -> PracticeEnvironment:
     """Return where a policy practises: one of ``LEARNED``."""
     if how == REAL:
-        return Real(home.simulator, motion, home.context)
-    return Imagined(world.config, world.params, home.context, memory=how == MEMORY)
+        return SimulatedEnvironment(home.simulator, motion, home.context)
+    return ImaginedEnvironment(world.config, world.params, home.context, memory=how == MEMORY)
 
 
 def act_of(policy: LoadedPolicy) -> Act:
@@ -198,7 +205,12 @@ def _learned(
 
 
 def _collect(
-    folder: Path, place: Place, home: Goal, begun: LoadedPolicy, study: PracticeConfig, seed: int
+    folder: Path,
+    place: PracticeEnvironment,
+    home: Goal,
+    begun: LoadedPolicy,
+    study: PracticeConfig,
+    seed: int,
 ) -> None:
     """Write the walks of a practice as a dataset, or find them written."""
     settings = {"made_by": "practice", "seed": seed, **dataclasses.asdict(study.practice)}
@@ -220,7 +232,7 @@ def _collect(
     resume.publish(folder, settings, [shard], resume.frames_of(folder, shard))
 
 
-def _record(walk: Walk, table_A3: np.ndarray, name: str, house: str) -> bytes:
+def _record(walk: PracticeWalk, table_A3: np.ndarray, name: str, house: str) -> bytes:
     camera = walk.frames.camera
     arrays = EpisodeArrays(
         np.asarray(walk.frames.rgb_THWC),

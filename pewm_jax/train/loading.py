@@ -116,7 +116,7 @@ def require_weights(config: Config) -> None:
         if where in config.model.TRAINS or config.train.start:
             continue
         if getattr(part, "CONVERTED", False):
-            convert = "convert a checkpoint (python -m pewm_jax.convert --help)"
+            convert = "convert a checkpoint (pewm-jax convert --help)"
             raise UserError(
                 f"{where} of kind {kinds.of(part).name} needs weights that are not trained here: "
                 f"{getattr(part, 'WEIGHTS_FROM', convert)} and name its folder by train.start."

@@ -110,5 +110,5 @@ def test_ends_that_make_no_windows_are_refused():
     for ends in (["600", "200"], ["8"]):
         with pytest.raises(ConfigError, match="rising numbers"):
             program.execute(["horizon", "runs/x", "--ends", *ends])
-    with pytest.raises(ConfigError, match="Name a run"):
+    with pytest.raises(ConfigError, match="RUN is missing"):
         program.execute(["horizon"])

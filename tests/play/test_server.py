@@ -208,7 +208,7 @@ def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so(
 
 def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
     wrong = (
-        ([], "Name a model"),
+        ([], "MODEL is missing"),
         (["runs/none"], "is no run"),
         (["small", "--port", "a"], "whole number"),
         (["small", "--scene", "a.glb", "--episode", "b"], "one place"),

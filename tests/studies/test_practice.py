@@ -17,7 +17,7 @@ from pewm_jax.data.simulator import move
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.io import weights
 from pewm_jax.planning import practice
-from pewm_jax.planning.practice import FloorMap, Imagined, Practice, Real
+from pewm_jax.planning.practice import FloorMap, ImaginedEnvironment, Practice, SimulatedEnvironment
 from pewm_jax.studies import deciders, goals
 from pewm_jax.studies import practice as study
 from pewm_jax.studies.practice import COLUMNS
@@ -193,7 +193,7 @@ def test_differences_are_paired_and_over_houses():
 
 
 def test_real_walks_end_at_walls_by_turning(home):
-    place = Real(home.simulator, MOTION, home.context)
+    place = SimulatedEnvironment(home.simulator, MOTION, home.context)
     many = Practice(walks=3, blocks=6)
     for walk in practice.walks(place, home.context, forward, many, 0):
         poses = walk.frames.camera.world_from_camera
@@ -204,7 +204,7 @@ def test_real_walks_end_at_walls_by_turning(home):
 
 def test_equal_seeds_walk_alike_and_other_seeds_do_not(world, home):
     config, params = world
-    place, few = Imagined(config, params, home.context), Practice(walks=1, blocks=1)
+    place, few = ImaginedEnvironment(config, params, home.context), Practice(walks=1, blocks=1)
 
     def drawn(rgb_SHWC, goal_HWC, key):
         return np.asarray(jax.random.randint(key, (4,), 1, 3))
@@ -221,7 +221,7 @@ def test_equal_seeds_walk_alike_and_other_seeds_do_not(world, home):
 
 def test_where_a_step_is_not_possible_the_block_is_a_turn(world, home, monkeypatch):
     config, params = world
-    place = Imagined(config, params, home.context)
+    place = ImaginedEnvironment(config, params, home.context)
     monkeypatch.setattr(place, "possible", lambda state, actions: 2)
     (walk,) = practice.walks(place, home.context, forward, Practice(walks=1, blocks=1), 0)
     assert walk.actions_N[:2].tolist() == [0, 0]
@@ -231,7 +231,9 @@ def test_where_a_step_is_not_possible_the_block_is_a_turn(world, home, monkeypat
 
 def test_both_worlds_meet_the_walls_that_the_pictures_show(world, home):
     config, params = world
-    imagined = [Imagined(config, params, home.context, memory=memory) for memory in (True, False)]
+    imagined = [
+        ImaginedEnvironment(config, params, home.context, memory=memory) for memory in (True, False)
+    ]
     assert [place.memory for place in imagined] == [True, False]
     ways = np.zeros((4, 12), int)
     ways[:, 0] = [0, 1, 2, 1]
@@ -281,7 +283,7 @@ def test_an_unseen_floor_is_free_and_no_measurement_is_nothing():
     "wrong", [np.array([0, 3]), np.array([-1]), np.zeros(2), np.zeros((1, 2), int)]
 )
 def test_a_policy_that_gives_no_actions_is_refused(home, wrong):
-    place = Real(home.simulator, MOTION, home.context)
+    place = SimulatedEnvironment(home.simulator, MOTION, home.context)
     with pytest.raises(UserError, match="the policy gave"):
         next(practice.walks(place, home.context, lambda *_: wrong, Practice(walks=1), 0))
 

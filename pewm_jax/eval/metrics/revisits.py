@@ -215,7 +215,7 @@ def read_encoder(encoder: str, path: str | Path | None = None) -> Similarity:
 
     Args:
         encoder: one of ``ENCODERS``.
-        path: of DINOv2 a folder made by ``python -m pewm_jax.convert import dinov2``; of the others
+        path: of DINOv2 a folder made by ``pewm-jax convert import dinov2``; of the others
             a file as of LPIPS, by default the installed package's.
 
     Raises:

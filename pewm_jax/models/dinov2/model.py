@@ -169,7 +169,7 @@ def _blocks(config: DINOv2Config, blocks: Params, tokens_BND: Array) -> Array:
 
 
 def load(folder: Path) -> tuple[DINOv2Config, Params]:
-    """Read a folder made by ``python -m pewm_jax.convert import dinov2``.
+    """Read a folder made by ``pewm-jax convert import dinov2``.
 
     Returns:
         The configuration and NumPy parameters in the stored dtype.
@@ -179,8 +179,7 @@ def load(folder: Path) -> tuple[DINOv2Config, Params]:
     """
     if not (folder / "config.json").is_file():
         raise UserError(
-            f"{folder} holds no DINOv2; make it with `python -m pewm_jax.convert import dinov2 SRC "
-            f"{folder}`."
+            f"{folder} holds no DINOv2; make it with `pewm-jax convert import dinov2 SRC {folder}`."
         )
     config = configuration.load(folder / "config.json", DINOv2Config)
     path = folder / "weights.safetensors"
