@@ -59,7 +59,8 @@ table2: .venv/installed
 	@$(PY) -m pewm_jax table2 $(ARGS)
 
 test: .venv/installed-dev
-	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" $(ARGS)
+	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder \
+	  -m "not slow" --hypothesis-profile quick $(ARGS)
 
 test-all: .venv/installed-dev
 	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# No example has a deadline: a busy machine is no fault of the code.
-settings.register_profile("untimed", deadline=None)
-settings.load_profile("untimed")
+from tests import properties  # noqa: F401 - registers the profiles of hypothesis
+
+settings.load_profile("all")  # `make test` asks for the profile `quick`
 
 QUICK = {
     "xla_backend_optimization_level": "0",

@@ -1,19 +1,20 @@
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.codecs import rgbd, signals
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import ClipConfig
 from tests.helpers import TINY
+from tests.properties import examples
 
 encode = jax.jit(PixelConfig.encode, static_argnums=0)
 decode = jax.jit(PixelConfig.decode, static_argnums=0)
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(
     k=st.integers(0, 3),
     h=st.integers(1, 3),

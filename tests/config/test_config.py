@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax import config as configuration
@@ -42,6 +42,7 @@ from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.readers.attention import AttentionConfig
+from tests.properties import examples
 
 VERSION_1 = Path(__file__).parent / "version_1"
 """Settings as they were written before there were versions."""
@@ -290,7 +291,7 @@ def experiments(draw):
     return Config(model=model, train=train)
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(experiments())
 def test_every_combination_of_kinds_goes_to_json_and_back(config):
     assert there_and_back(config, Config) == config

@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
 from pewm_jax.convert import widen
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.nn import tokens
+from tests.properties import examples
 
 
 def build(patch, patch_t, latents, *, image):
@@ -18,7 +19,7 @@ def build(patch, patch_t, latents, *, image):
     return DiTBackbone(patch=patch, patch_t=patch_t, in_channels=inputs, out_channels=latents)
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(
     patch=st.integers(1, 3),
     patch_t=st.integers(1, 2),

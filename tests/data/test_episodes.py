@@ -11,13 +11,14 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
 from pewm_jax.data.dataset import EpisodeSource, count_records, describe_shard, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, read_episode, to_millimetres, write_episode
 from tests.data.two_rooms import arrays, split
+from tests.properties import examples
 
 
 def random_arrays(frames, height, width, seed, extras):
@@ -34,7 +35,7 @@ def random_arrays(frames, height, width, seed, extras):
     )
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     frames=st.integers(1, 5),
     height=st.integers(1, 9),

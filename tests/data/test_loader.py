@@ -5,7 +5,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import (
@@ -22,6 +22,7 @@ from pewm_jax.data import loader
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry.cameras import unproject
 from tests.data.two_rooms import split
+from tests.properties import examples
 
 
 def config(path="", **data):
@@ -113,7 +114,7 @@ def test_context_and_clip_see_one_world(folder):
         assert off.max() < 5e-3
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     length=st.integers(5, 60),
     seed=st.integers(0, 10_000),
@@ -192,7 +193,7 @@ def rows_config(tmp_path_factory):
 
 
 @given(st.integers(0, BATCH - 1), st.integers(1, BATCH), st.integers(0, 9))
-@settings(max_examples=20, deadline=None)
+@examples(20)
 def test_rows_are_those_of_the_whole_batch_at_every_step(rows_config, first, count, step):
     rows = slice(first, min(first + count, BATCH))
     whole = next(loader.clips(rows_config, seed=5, batch=BATCH, start_step=step))

@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from trimesh.visual import TextureVisuals
@@ -17,6 +17,7 @@ from pewm_jax.data.scenes import from_trimesh, house, load_scene
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, unproject
 from pewm_jax.houses.generate import generate_house
 from pewm_jax.types import Camera
+from tests.properties import examples
 
 
 def wall_facing_minus_x(distance: float, half: float = 50.0) -> trimesh.Trimesh:
@@ -42,7 +43,7 @@ def camera(*poses: np.ndarray, height: int = 24, width: int = 32, fov: float = 8
 LOOK_X = pose_from_yaw(np.zeros(3), 0.0)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(
     st.floats(-1.2, 1.2),
     st.floats(-0.5, 0.5),

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from pewm_jax.config import ActionConfig, UserError
@@ -14,6 +14,7 @@ from pewm_jax.data.navigation import NavGrid, is_free
 from pewm_jax.data.trajectories import make_trajectory
 from pewm_jax.geometry.actions import actions_between, discrete_table, integrate
 from tests.data.two_rooms import two_rooms
+from tests.properties import examples
 
 GRID = two_rooms()
 
@@ -32,7 +33,7 @@ def longest_blocked(start, end):
 
 
 @example(seed=1512, policy="follow", continuous=False)  # grazes a corner
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(
     seed=st.integers(0, 10_000),
     policy=st.sampled_from(["follow", "walk", "revisit"]),

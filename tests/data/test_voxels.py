@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.cli import main as program
@@ -35,6 +35,7 @@ from tests.data.test_importer import config as import_config
 from tests.data.test_importer import record
 from tests.data.two_rooms import arrays, write_split
 from tests.helpers import tiny_config
+from tests.properties import examples
 
 GRID = VoxelsConfig(record=True, cell=0.2, side=40)
 PLAIN = CollectConfig(Path("x"), frames=24, size=32)
@@ -55,7 +56,7 @@ def lattice(seed=0):
 # What is in a grid.
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 2.0, 9.0]), st.booleans())
 def test_triangles_are_cut_at_the_borders_of_cells_and_nothing_is_lost(seed, size, on_borders):
     rng = np.random.default_rng(seed)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax import registry as kinds
@@ -19,6 +19,7 @@ from pewm_jax.diffusion.flow import FlowConfig, FrameFlowConfig
 from pewm_jax.worlds import objective
 from tests.diffusion.test_ddpm import make_clip
 from tests.helpers import TINY, init_world, randomise, tiny_model
+from tests.properties import examples
 
 KINDS = {
     "ddpm_x0": DDPMConfig(target="x0"),
@@ -146,7 +147,7 @@ def test_what_edm_shows_and_asks_for_has_unit_variance(config, sigma):
     np.testing.assert_allclose(told, np.log(sigma) / 4, rtol=1e-5)
 
 
-@settings(max_examples=20)
+@examples(20)
 @given(
     steps=st.integers(2, 40),
     least=st.floats(1e-3, 0.1),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -21,6 +21,7 @@ from pewm_jax.eval.intervals import (
     table,
 )
 from tests.eval.test_statistics import sums_of
+from tests.properties import examples
 
 
 def looped(values, houses):
@@ -59,7 +60,7 @@ def test_every_house_counts_once_however_many_clips_it_has():
     assert again == entry(values, houses)
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(st.integers(0, 2**31), st.floats(-5, 5), st.floats(0.1, 9))
 def test_intervals_move_and_stretch_with_the_values(seed, shift, scale):
     rng = np.random.default_rng(seed)
@@ -125,7 +126,7 @@ def test_training_seeds_have_students_interval():
     assert over_seeds([1.0, 1.0])["low"] == 1.0
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(st.integers(0, 2**31), st.integers(2, 6))
 def test_students_interval_is_symmetric_and_swaps_its_sign(seed, count):
     rng = np.random.default_rng(seed)
@@ -136,7 +137,7 @@ def test_students_interval_is_symmetric_and_swaps_its_sign(seed, count):
     assert there["high"] - there["mean"] == pytest.approx(there["mean"] - there["low"])
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(st.lists(st.one_of(st.none(), st.floats(0, 1)), min_size=1, max_size=12))
 def test_holms_correction_rejects_what_its_steps_reject(p_values):
     """The steps: the k-th smallest of m is compared with α / (m − k + 1), until one fails."""
@@ -159,7 +160,7 @@ def test_holms_correction_of_a_textbook_example():
     assert holm([]) == []
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(st.integers(0, 2**31), st.integers(2, 9), st.floats(-0.6, 0.6))
 def test_p_values_over_houses_agree_with_the_interval(seed, count, shift):
     rng = np.random.default_rng(seed)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import jax
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.eval import seen as masks
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pixel_grid, pose_from_yaw
 from pewm_jax.types import Camera, Frames
+from tests.properties import examples
 
 SIZE = 64
 seen_masks = jax.jit(masks.seen_masks)
@@ -54,7 +55,7 @@ def at(x, y, yaw_deg):
     return pose_from_yaw(np.array([x, y, 1.25]), np.radians(yaw_deg))
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0, 360))
 def test_a_frame_has_seen_itself(x, y, yaw):
     frame = view([at(x, y, yaw)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.eval.metrics.images import MASKS, SUMS
@@ -19,6 +19,7 @@ from pewm_jax.eval.statistics import (
     summary,
     table,
 )
+from tests.properties import examples
 
 
 def sums_of(error_SCT, pixels=(60, 40, 100)):
@@ -52,7 +53,7 @@ def test_masks_that_cover_next_to_nothing_have_no_score():
     assert got["all"]["psnr"] == pytest.approx(20)
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(st.lists(st.floats(-50, 50), min_size=2, max_size=30))
 def test_one_clip_per_episode_is_the_textbook_standard_error(values):
     got = summary(np.array(values), np.arange(len(values)))

@@ -5,7 +5,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import ActionConfig
@@ -18,11 +18,12 @@ from pewm_jax.geometry.actions import (
     follow_camera_steps,
 )
 from pewm_jax.types import Camera
+from tests.properties import examples
 
 START = cameras.pose_from_yaw(np.array([1.0, -2.0, 1.25]), 0.7)
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(seed=st.integers(0, 10_000))
 def test_actions_between_inverts_integrate(seed):
     rng = np.random.default_rng(seed)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import pewm_jax
@@ -19,9 +19,10 @@ from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Camera, Frames
 from tests.helpers import random_camera, rigid, tiny_model
+from tests.properties import examples
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(seed=st.integers(0, 10_000))
 def test_every_unprojected_pixel_projects_back_to_its_centre(seed):
     rng = np.random.default_rng(seed)

@@ -2,18 +2,19 @@
 
 import jax
 import numpy as np
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from pewm_jax.geometry import depth_images
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.depth_images import normals
 from tests.helpers import random_camera
+from tests.properties import examples
 
 fill = jax.jit(depth_images.fill_depth, static_argnums=1)
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(st.integers(0, 10_000), st.sampled_from([0.02, 0.3, 0.9]))
 def test_a_hole_takes_the_depth_of_a_nearest_pixel(seed, share):
     rng = np.random.default_rng(seed)
@@ -53,7 +54,7 @@ def plane(seed, facing=0.05):
     return depth.astype(np.float32), normal * np.sign(against.flat[0]), camera
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(st.integers(0, 10_000))
 def test_normals_of_a_plane_are_its_own_and_face_the_camera(seed):
     drawn = plane(seed)

@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
 from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera
+from tests.properties import examples
 
 SHAPE, RAYS, LAYERS = (5, 4, 6), 32, 15  # 15 = as many cells as a ray can enter
 LOW, CELL = np.array([-1.0, 0.5, -0.25]), 0.5
@@ -34,7 +35,7 @@ def brute_force(ids, origin, direction):
     return sorted(found)
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.booleans())
 def test_the_march_is_brute_force(seed, share, axes):
     compare(seed, share, axes, SHAPE)

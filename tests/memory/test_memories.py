@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax import registry as kinds
@@ -26,6 +26,7 @@ from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, random_camera, random_frames, tiny_model, with_reader
+from tests.properties import examples
 
 KINDS = {
     "voxel": VoxelConfig,
@@ -164,7 +165,7 @@ def test_every_memory_can_be_drawn(kind):
 
 
 @given(seed=SEEDS, count=st.integers(1, 5))
-@settings(max_examples=20, deadline=None)
+@examples(20)
 def test_greedy_cover_is_what_it_says(seed, count):
     rng = np.random.default_rng(seed)
     nowhere, sets = 12, 6
@@ -233,7 +234,7 @@ def random_points(seed, count=40):
 
 
 @given(seed=SEEDS)
-@settings(max_examples=20, deadline=None)
+@examples(20)
 def test_a_point_is_the_mean_of_its_cell_however_the_points_come(seed):
     model = model_of("points", cell_m=(1, 0.5, 2), cells=(4, 8, 2), capacity=64, tokens=4)
     config = model.memory

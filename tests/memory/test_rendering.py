@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.geometry import cameras, zbuffer
@@ -15,6 +15,7 @@ from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Camera, Frames
 from tests.helpers import random_camera, tiny_model
 from tests.memory.test_memories import ALL, KINDS, model_of, scene, seen
+from tests.properties import examples
 
 HEIGHT, WIDTH = 6, 9
 splat = jax.jit(rendering.splat, static_argnums=(4, 5))
@@ -56,7 +57,7 @@ def compare(view, expected):
     np.testing.assert_allclose(view.depth_THW, depth, rtol=1e-6)
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(seed=st.integers(0, 100_000))
 def test_each_pixel_shows_its_nearest_point(seed):
     camera = random_camera(np.random.default_rng(seed), 2, HEIGHT, WIDTH)
@@ -223,7 +224,7 @@ def test_points_with_a_size_are_drawn_as_by_a_loop(seed, most, average):
         assert seen.any()
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(seed=st.integers(0, 100_000), most=st.integers(1, 5))
 def test_a_window_holds_the_pixel_of_its_point_and_has_the_size_of_its_point(seed, most):
     rng = np.random.default_rng(seed)

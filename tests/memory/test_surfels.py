@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.codecs.signals import as_signal
@@ -25,6 +25,7 @@ from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Frames
 from tests.helpers import TINY, random_camera, tiny_model
 from tests.memory.test_memories import encoded, scene
+from tests.properties import examples
 
 SMALL = SurfelConfig(cell_m=(0.5,) * 3, cells=(8, 8, 8), capacity=64, tokens=8)
 insert = jax.jit(surfels.insert, static_argnums=(0, 3))
@@ -91,7 +92,7 @@ def compare(config, memory, held):
         assert not np.asarray(rest)[~valid].any()
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(
     seed=st.integers(0, 100_000), keep=st.sampled_from(["mean", "newest"]), protect=st.booleans()
 )

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
@@ -12,6 +12,7 @@ from pewm_jax.memory import cells as grid_cells
 from pewm_jax.memory import voxel_map
 from pewm_jax.memory.voxel_map import VoxelConfig
 from tests.helpers import rigid
+from tests.properties import examples
 
 CONFIG = VoxelConfig(cell_m=(0.25, 0.25, 0.5), cells=(24, 24, 8), capacity=400, tokens=4)
 SEEDS = st.integers(0, 100_000)
@@ -56,7 +57,7 @@ def centres(voxels):
     return points[valid], values[valid]
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(seed=SEEDS)
 def test_erase_forgets_a_box_and_paste_restores_it(seed):
     voxels, box = a_map(seed), a_box(seed)
@@ -93,7 +94,7 @@ def test_a_quarter_turn_is_exact():
     equal(paste(CONFIG, blank, voxels, turn), expected)
 
 
-@settings(max_examples=10, deadline=None)
+@examples(10)
 @given(seed=SEEDS)
 def test_each_cell_takes_the_one_its_centre_comes_from(seed):
     """Against the definition, over all cells of the grid, for any rigid motion."""

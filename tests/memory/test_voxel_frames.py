@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.geometry import cameras
@@ -14,6 +14,7 @@ from pewm_jax.memory import cells, voxel_frames, voxel_map
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.types import Frames
 from tests.helpers import random_camera
+from tests.properties import examples
 
 CONFIG = VoxelConfig(cell_m=(0.5, 0.5, 1.0), cells=(40, 40, 12), capacity=700, tokens=8)
 T, H, W, F = 3, 32, 48, 5
@@ -63,7 +64,7 @@ def same_map(a, b, **tolerance):
     np.testing.assert_allclose(a.features_VF, b.features_VF, **tolerance)
 
 
-@settings(max_examples=10, deadline=None)
+@examples(10)
 @given(seed=SEEDS, kind=st.sampled_from(["room", "noise"]))
 def test_it_equals_inserting_every_upsampled_pixel(seed, kind):
     frames, patches = a_clip(seed, kind)
@@ -138,7 +139,7 @@ def there_and_back(depth_THW, camera):
     return points, *cameras.project(points, camera)
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(seed=SEEDS)
 def test_every_point_projects_back_into_its_pixel_and_lies_in_its_cell(seed):
     frames, _ = a_clip(seed, "noise")

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
@@ -13,6 +13,7 @@ from pewm_jax.geometry import cameras
 from pewm_jax.memory import voxel_map
 from pewm_jax.types import Camera, Frames
 from tests.helpers import TINY, random_frames
+from tests.properties import examples
 
 CONFIG = dataclasses.replace(TINY.memory, cell_m=(0.5, 0.25, 1.0), cells=(6, 8, 3))
 insert = jax.jit(voxel_map.insert, static_argnums=0)
@@ -72,7 +73,7 @@ def reference(config, points, values, valid):
     return cells, outside
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(seed=SEEDS)
 def test_a_cell_is_the_maximum_of_its_points(seed):
     points, values, valid = random_points(seed)
@@ -84,7 +85,7 @@ def test_a_cell_is_the_maximum_of_its_points(seed):
     assert int(voxels.dropped) == 0
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(seed=SEEDS)
 def test_order_repetition_and_batching_do_not_matter(seed):
     points, values, valid = random_points(seed)
@@ -100,7 +101,7 @@ def test_order_repetition_and_batching_do_not_matter(seed):
     identical(once, dataclasses.replace(parts, outside=once.outside))
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(seed=SEEDS)
 def test_inserting_after_one_another_is_merging(seed):
     a, b = random_points(seed), random_points(seed + 1)

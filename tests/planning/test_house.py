@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from gymnasium.utils.env_checker import check_env
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import pewm_jax.planning
@@ -22,6 +22,7 @@ from pewm_jax.planning import observations, oracle, scores
 from pewm_jax.planning.house import HouseEnv
 from pewm_jax.planning.house_config import HouseConfig
 from tests.data.two_rooms import two_rooms
+from tests.properties import examples
 
 ROOT = Path(__file__).parents[2]
 SMALL = {"height": 12, "width": 16}
@@ -153,7 +154,7 @@ NUMBER = st.floats(-0.6, 0.6)
     moves=st.lists(st.tuples(NUMBER, NUMBER, NUMBER), min_size=1, max_size=6),
     sliding=st.booleans(),
 )
-@settings(max_examples=150)
+@examples(150)
 def test_no_move_ends_in_a_wall_or_leads_through_one(cell, inside, yaw, moves, sliding):
     planar = np.array([*(ROOMS.centre_of(FREE[cell]) + np.array(inside) * ROOMS.cell_m), yaw])
     for action in moves:

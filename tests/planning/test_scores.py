@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
 from pewm_jax.geometry.cameras import pose_from_yaw
 from pewm_jax.planning import scores
 from tests.helpers import rigid
+from tests.properties import examples
 
 
 def walk(rng, frames):
@@ -45,7 +46,7 @@ planar = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-7, 7))
 
 
 @given(st.lists(st.tuples(planar, planar), min_size=2, max_size=5))
-@settings(max_examples=30)
+@examples(30)
 def test_planar_poses_and_cameras_score_alike(pairs):
     reference, estimate = (np.array(side) for side in zip(*pairs, strict=True))
     cameras = [

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import pewm_jax
@@ -31,6 +31,7 @@ from tests.play.tiny_drive import (
     an_engine,
     same,
 )
+from tests.properties import examples
 from tests.worlds.persist.tiny_persist import MODEL as PERSIST
 
 ROOT = Path(__file__).parents[2]
@@ -207,7 +208,7 @@ def test_names_that_lead_elsewhere_are_refused(name, tmp_path):
 POSES = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(before=POSES, after=POSES)
 def test_a_way_leads_to_its_end_in_small_steps(before, after):
     actions, planar = places.way(before, after, 0.25, 30.0), before

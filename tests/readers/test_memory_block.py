@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax import worlds
@@ -22,6 +22,7 @@ from pewm_jax.readers.memory_block import MemoryBlock, masked_attention
 from pewm_jax.types import Camera, Clip, Control, Frames, MapTokens, MemoryReadout
 from pewm_jax.worlds import objective, rollouts, world_model
 from tests.helpers import TINY, random_camera, random_frames, randomise, rigid, with_reader
+from tests.properties import examples
 
 BOTH = pytest.mark.parametrize("positions", ["projective", "sinusoid"])
 VALID = 15
@@ -230,7 +231,7 @@ def away_from_edges(points_world, camera):
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=15, deadline=None)
+@examples(15)
 def test_a_rigid_motion_of_world_cameras_and_map_changes_nothing(seed):
     conditioning, tokens, _ = inputs()
     rng = np.random.default_rng(seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.eval.metrics.images import (
@@ -19,6 +19,7 @@ from pewm_jax.eval.metrics.images import (
     unit_colours,
 )
 from pewm_jax.types import Camera, Frames
+from tests.properties import examples
 
 
 def naive_ssim_map(a, b):
@@ -58,7 +59,7 @@ def test_ssim_equals_the_naive_loop():
     np.testing.assert_allclose(ssim_map(a, b), naive_ssim_map(a, b), atol=2e-5)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.integers(0, 2**31), st.floats(0.01, 0.5))
 def test_ssim_is_symmetric_and_one_only_for_equal_images(seed, noise):
     rng = np.random.default_rng(seed)
@@ -86,7 +87,7 @@ def test_colours_of_both_kinds_meet():
     assert float(unit_colours(np.float32(3.0))) == 1.0
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(st.integers(0, 2**31))
 def test_sums_are_those_of_masked_pixels_alone(seed):
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import ConfigError, UserError
@@ -18,6 +18,7 @@ from pewm_jax.nn.tokens import TokenLayout, patchify, unpatchify
 from pewm_jax.types import MemoryReadout
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, init_world, randomise
+from tests.properties import examples
 from tests.worlds.test_world_model import setup as world
 
 CONFIG = dataclasses.replace(TINY.backbone, in_channels=5, out_channels=7)
@@ -38,7 +39,7 @@ def random_params(config=CONFIG):
 run = jax.jit(dit.apply, static_argnums=0, static_argnames="memory_block")
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(
     t=st.integers(1, 3),
     h=st.integers(1, 3),

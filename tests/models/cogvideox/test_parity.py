@@ -12,7 +12,7 @@ import torch
 from diffusers import CogVideoXTransformer3DModel
 from diffusers.models.embeddings import get_3d_rotary_pos_embed, get_3d_sincos_pos_embed
 from diffusers.pipelines.cogvideo.pipeline_cogvideox import get_resize_crop_region_for_grid
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import UserError
@@ -22,6 +22,7 @@ from pewm_jax.models.cogvideox import positions
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.config import PUBLISHED
 from pewm_jax.models.cogvideox.convert import TRANSFORMER
+from tests.properties import examples
 
 LENGTH = 7
 OLDER = {"sample_height": 8, "sample_width": 12, "sample_frames": 9}
@@ -184,7 +185,7 @@ def test_gradients_are_equal():
         assert off < 1e-4, (entry.name, off)
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(
     name=st.sampled_from(["5b", "5b-I2V", "1.5-5B"]),
     t=st.integers(1, 13),
@@ -200,7 +201,7 @@ def test_rotary_angles_are_the_pipelines(name, t, rows, columns):
         np.testing.assert_allclose(turn(angles[5:]).repeat(2, -1), there, atol=3e-5)
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(t=st.integers(1, 13), rows=st.integers(1, 40), columns=st.integers(1, 40))
 def test_the_sinusoid_of_positions_is_the_references(t, rows, columns):
     config = dataclasses.replace(DiTBackbone.published("2b"), heads=1, temporal_interpolation=1.25)

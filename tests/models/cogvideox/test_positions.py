@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax import presets
@@ -18,6 +18,7 @@ from pewm_jax.models.cogvideox import positions
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.worlds import world_model
 from tests.helpers import randomise
+from tests.properties import examples
 
 TABLE = dataclasses.replace(
     DiTBackbone.published("5b-I2V"),
@@ -58,7 +59,7 @@ def axes(grid):
     return np.meshgrid(*((np.arange(n) + 0.5) / n for n in grid), indexing="ij")
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(grid=st.tuples(st.integers(1, 3), st.integers(1, 2), st.integers(1, 3)), seed=st.integers(0))
 def test_a_table_that_is_linear_in_space_and_time_stays_so(grid, seed):
     rng = np.random.default_rng(seed % 2**32)

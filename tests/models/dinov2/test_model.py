@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config, published
 from tests.helpers import randomise
+from tests.properties import examples
 
 ROOT = Path(__file__).parents[3]
 TINY = DINOv2Config(layers=2, heads=2, width=16, patch=14, pretrained_size=42)
@@ -57,7 +58,7 @@ def test_the_order_of_a_batch_is_the_order_of_its_tokens(params):
     np.testing.assert_allclose(turned[::-1], tokens, rtol=1e-4, atol=1e-5)
 
 
-@settings(deadline=None, max_examples=40)
+@examples(40)
 @given(st.integers(1, 40), st.integers(1, 40), st.booleans())
 def test_interpolation_keeps_constants_and_the_order_of_places(old, new, antialias):
     weights = dinov2.resize_matrix(old, new, antialias)
