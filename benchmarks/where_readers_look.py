@@ -28,7 +28,6 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.eval.clips import choose, load_clip
 from pewm_jax.geometry.cameras import project
-from pewm_jax.readers import attention as attention_reader
 from pewm_jax.readers import memory_block
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.geometry import NEAREST_M, patch_pixels
@@ -44,14 +43,16 @@ SAYS = ("mass", "chance")
 @contextmanager
 def watched(found: dict[str, list[float]]) -> Iterator[None]:
     """Add to ``found`` where attention goes, wherever a reader is traced and then run."""
-    apply, attend = attention_reader.prepare, memory_block.masked_attention
+    apply, attend = AttentionConfig.prepare, memory_block.masked_attention
     held: dict[str, Array] = {}
 
     def add(mass: Array, chance: Array) -> None:
         found["mass"].append(float(mass))
         found["chance"].append(float(chance))
 
-    def prepare(model: Any, params: Params, sight: Any, camera: Any, rays: Array) -> Any:
+    def prepare(
+        reader: AttentionConfig, model: Any, params: Params, sight: Any, camera: Any, rays: Array
+    ) -> Any:
         patch = patch_pixels(model)
         rows, columns = model.clip.height // patch, model.clip.width // patch
         v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
@@ -62,7 +63,7 @@ def watched(found: dict[str, list[float]]) -> Iterator[None]:
         seen = (z > NEAREST_M) & tokens.valid_M[:, None]
         held["near"] = near & seen[:, :, None]
         held["valid"] = tokens.valid_M
-        return apply(model, params, sight, camera, rays)
+        return apply(reader, model, params, sight, camera, rays)
 
     def read_seen(q: Array, k: Array, v: Array, views: Any, turns: Array, learned: Any) -> Array:
         held["index"] = views[0]
@@ -88,7 +89,7 @@ def watched(found: dict[str, list[float]]) -> Iterator[None]:
 
     read = memory_block._read_seen
     with (
-        mock.patch.object(attention_reader, "prepare", prepare),
+        mock.patch.object(AttentionConfig, "prepare", prepare),
         mock.patch.object(memory_block, "masked_attention", attention),
         mock.patch.object(memory_block, "_read_seen", read_seen),
     ):

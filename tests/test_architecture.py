@@ -238,7 +238,7 @@ def test_importing_the_package_loads_no_network_code():
 
 @pytest.mark.parametrize(
     "module",
-    ["worlds.rollouts", "train.loop", "eval.report", "plan.plan", "convert.commands"],
+    ["worlds.rollouts", "train.loop", "eval.evaluate", "plan.plan", "convert.commands"],
 )
 def test_only_what_makes_houses_loads_the_renderer(module):
     spared = {"trimesh", "embreex", "tensorboardX", "torch", "ray"}

@@ -1,6 +1,6 @@
 """Train in a small file system that fills up, then go on with space again.
 
-Run as ``python training_full_disk.py FOLDER`` with a small file system mounted at FOLDER; prints
+Run as ``python full_disk.py FOLDER`` with a small file system mounted at FOLDER; prints
 one line of JSON: by what the full disk met first, what was told, what was left, what came after.
 """
 

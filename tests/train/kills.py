@@ -1,6 +1,6 @@
 """Train, be killed, start again, many times; each start is a fork of a process with all imports.
 
-Run as ``python training_kills.py FOLDER KILLS SEED``; prints one line of JSON: exit
+Run as ``python kills.py FOLDER KILLS SEED``; prints one line of JSON: exit
 codes, and of every kill when it came and what was told and saved until then.
 The clips are real, read from shards; the model is the small one of ``fakes``.
 """

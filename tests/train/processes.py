@@ -222,7 +222,7 @@ def main():
     loader = importlib.import_module("pewm_jax.data.loader")
     if "FAKE" in os.environ:
         patch = importlib.import_module("pytest").MonkeyPatch()
-        fakes = importlib.import_module("training_fakes")
+        fakes = importlib.import_module("tests.train.fakes")
         fakes.install(patch)
         if "NAN_AT" in os.environ:
             fakes.install(patch, fakes.loss_of_depth)
