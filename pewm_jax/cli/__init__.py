@@ -1,1 +1,1 @@
-"""The last chapter: the command ``pewm-jax``, of which train.py and evaluate.py are shells."""
+"""The command ``pewm-jax``; train.py and evaluate.py call it."""

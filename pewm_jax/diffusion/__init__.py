@@ -1,1 +1,1 @@
-"""Chapter 5, how the model imagines: kinds of noise, prediction targets, samplers."""
+"""Diffusion: kinds of noise, prediction targets, samplers."""

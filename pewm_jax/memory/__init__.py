@@ -1,1 +1,1 @@
-"""Chapter 4, what is remembered: image features, the voxel map and its rivals, map tokens."""
+"""Memories of a scene: voxel map, images, points, surfels, 2D map, and their image features."""

@@ -1,1 +1,1 @@
-"""Chapter 3, the networks: codec, control, denoiser, memory readers, image encoder."""
+"""The networks: video transformers, autoencoders, image encoders and networks of metrics."""

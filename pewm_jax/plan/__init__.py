@@ -1,1 +1,1 @@
-"""Chapter 7b, what a training will cost before it starts: FLOPs, memory, time, the best mesh."""
+"""Predict what a training needs before it starts: FLOPs, memory, time and the best mesh."""

@@ -94,7 +94,7 @@ class Driver:
 
     def tell(self, sentence: str) -> None:
         """Show an error message."""
-        self._say(sentence, failed=True)
+        self._log(sentence, failed=True)
 
     def put(self, request: Request) -> None:
         """Queue a request; return at once.
@@ -162,11 +162,11 @@ class Driver:
             work()
         except UserError as error:
             self._todo.clear()
-            self._say(str(error), failed=True)
+            self._log(str(error), failed=True)
         except Exception as error:  # noqa: BLE001 - no error may stop the page
             self._todo.clear()
             reason = " ".join(str(error).split())[:200] or type(error).__name__
-            self._say(
+            self._log(
                 f"That failed ({type(error).__name__}: {reason}); the world is unchanged.",
                 failed=True,
             )
@@ -188,7 +188,7 @@ class Driver:
             steps, target = engine.model.actions, np.asarray(request.planar, np.float64)
             parts = places.way(now.planar_3, target, steps.step_m, steps.turn_deg)
             if len(parts) > MOST_WAY:
-                self._say(
+                self._log(
                     f"That place is {len(parts)} steps away: driving the first {MOST_WAY} steps. "
                     "Drag again from there."
                 )
@@ -205,7 +205,7 @@ class Driver:
         """Save a world, load one, or undo an edit."""
         if isinstance(request, Save):
             path = saved.save(engine, now.world, self._folder, request.name)
-            self._say(f"Saved this world as {request.name!r}.", link=path)
+            self._log(f"Saved this world as {request.name!r}.", link=path)
             return
         self._todo.clear()
         if isinstance(request, Load):
@@ -222,13 +222,13 @@ class Driver:
         with self._during(f"preparing {steps} steps of the sampler"):
             self._warm(engine, now)
         self._made, self._engine = {}, engine
-        self._say(f"Now imagining in {steps} steps of the sampler.")
+        self._log(f"Now imagining in {steps} steps of the sampler.")
 
     def _edit(self, engine: Engine, now: Session, request: Event, asked: float) -> None:
         if isinstance(request, session.Walls):
             self._session = session.apply(engine, now, request)
             self._made = {}  # the steps imagined ahead may be different now
-            self._say(self._session.said)
+            self._log(self._session.said)
             return
         with self._during("changing the map"):
             after = session.apply(engine, now, request)
@@ -251,7 +251,7 @@ class Driver:
         self._set(begun)
         with self._during("preparing to imagine (half a minute the first time)"):
             self._warm(engine, begun)
-        self._say(f"{begun.said} Press W, A, S, D or the arrows.")
+        self._log(f"{begun.said} Press W, A, S, D or the arrows.")
 
     def _warm(self, engine: Engine, now: Session) -> None:
         """Compile the programs of a step by imagining one ahead."""
@@ -281,7 +281,7 @@ class Driver:
         assert self._session is not None
         if self._session.due is not None:
             self._session = session.catch_up(self._engine, self._session)
-            self._say(self._session.said, picture=self._board())
+            self._log(self._session.said, picture=self._board())
         if self._film is not None:
             self._film.add(self._board())
 
@@ -292,7 +292,7 @@ class Driver:
         self._session = after
         picture = self._board()  # waits for the imagined frame
         taken = None if asked is None else time.monotonic() - asked
-        self._say(after.said, picture=picture, session=after, seconds=taken)
+        self._log(after.said, picture=picture, session=after, seconds=taken)
 
     def _look_ahead(self) -> bool:
         """Imagine one likely next step; return whether there was one left."""
@@ -325,20 +325,20 @@ class Driver:
     def _begin_film(self) -> None:
         self._end_film()
         self._film = DriveFilm(self._folder, self._board())
-        self._say("Recording: every step becomes a frame of the video.")
+        self._log("Recording: every step becomes a frame of the video.")
 
     def _end_film(self) -> None:
         if self._film is None:
             return
         film, self._film = self._film, None
         path = film.close()
-        self._say(f"The video is {path.name}.", link=path)
+        self._log(f"The video is {path.name}.", link=path)
 
     def _during(self, text: str) -> contextlib.AbstractContextManager[None]:
         """Show what is being done, and for how long."""
-        return ticking(text, lambda said: self._say(said, busy=True))
+        return ticking(text, lambda said: self._log(said, busy=True))
 
-    def _say(self, said: str, **rest) -> None:
+    def _log(self, said: str, **rest) -> None:
         worlds = tuple(saved.names(self._folder))
         shown = PageUpdate(
             said, engine=self._engine, recording=self._film is not None, worlds=worlds, **rest
@@ -352,19 +352,19 @@ TICK_S = 1.0
 
 
 @contextlib.contextmanager
-def ticking(text: str, say: Callable[[str], None]) -> Iterator[None]:
+def ticking(text: str, log: Callable[[str], None]) -> Iterator[None]:
     """Report once a second what is being done and for how long, while the block runs.
 
     Args:
         text: what is being done.
-        say: receives the messages, also from another thread.
+        log: receives the messages, also from another thread.
     """
     begun, ended = time.monotonic(), threading.Event()
-    say(f"{text.capitalize()} …")
+    log(f"{text.capitalize()} …")
 
     def tick() -> None:
         while not ended.wait(TICK_S):
-            say(f"{text.capitalize()} … {time.monotonic() - begun:.0f} s")
+            log(f"{text.capitalize()} … {time.monotonic() - begun:.0f} s")
 
     ticker = threading.Thread(target=tick, name="ticker", daemon=True)
     ticker.start()

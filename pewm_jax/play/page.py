@@ -81,7 +81,7 @@ class Page:
         serve: Serve,
         folder: Path,
         name: str,
-        say: Callable[[str], None] = lambda _: None,
+        log: Callable[[str], None] = lambda _: None,
     ):
         """Serve the page, and begin to load the model.
 
@@ -91,19 +91,19 @@ class Page:
             serve: address, port and names.
             folder: folder of saved worlds and videos.
             name: name of the model, for the title.
-            say: receives the page's address, its progress and its errors.
+            log: receives the page's address, its progress and its errors.
 
         Raises:
             ConfigError: the page cannot be served at the address.
         """
-        self._start, self._seconds, self._tell = start, None, panels.Terminal(say)
-        self._server = serving.server(serve, say)
+        self._start, self._seconds, self._tell = start, None, panels.Terminal(log)
+        self._server = serving.server(serve, log)
         # Sharing would ask an external server for a public address; this page stays local.
         self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
         self.url = f"http://{serving.here(serve.host)}:{self._server.get_port()}"
-        say(f"drive: {self.url}  (Ctrl-C ends)")
+        log(f"drive: {self.url}  (Ctrl-C ends)")
         if serving.warning(serve):
-            say(serving.warning(serve))
+            log(serving.warning(serve))
         self._map = MapView(self._server)
         gui = self._server.gui
         gui.configure_theme(

@@ -19,18 +19,18 @@ SAY_AGAIN_S = 10.0
 class Terminal:
     """Prints to the terminal what the page waits for, and its errors."""
 
-    def __init__(self, say: Callable[[str], None]):
-        self._say, self._phase, self._told = say, "", 0.0
+    def __init__(self, log: Callable[[str], None]):
+        self._log, self._phase, self._reported = log, "", 0.0
 
     def __call__(self, shown: PageUpdate) -> None:
         """Print an update of the driver if it is new."""
         phase = shown.said.partition(" …")[0] if shown.busy or shown.failed else ""
-        late = shown.busy and time.monotonic() - self._told >= SAY_AGAIN_S
+        late = shown.busy and time.monotonic() - self._reported >= SAY_AGAIN_S
         if phase and (phase != self._phase or late):
-            self._say(shown.said if shown.busy else f"error: {phase}")
-            self._told = time.monotonic()
+            self._log(shown.said if shown.busy else f"error: {phase}")
+            self._reported = time.monotonic()
         if self._phase.startswith("Preparing") and not phase:
-            self._say("Ready.")
+            self._log("Ready.")
         self._phase = phase
 
 

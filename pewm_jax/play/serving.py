@@ -53,12 +53,12 @@ def here(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def server(serve: Serve, say: Callable[[str], None] = lambda _: None) -> viser.ViserServer:
+def server(serve: Serve, log: Callable[[str], None] = lambda _: None) -> viser.ViserServer:
     """Start the server, without viser's own message; refuse pages of other sites.
 
     Args:
         serve: address, port and names.
-        say: receives the reasons of refusals.
+        log: receives the reasons of refusals.
 
     Raises:
         ConfigError: the host is not an address of this machine; viser would wait for it forever.
@@ -73,7 +73,7 @@ def server(serve: Serve, say: Callable[[str], None] = lambda _: None) -> viser.V
             f"--host {serve.host} is not an address that this machine can serve on ({error}); use "
             "127.0.0.1, or 0.0.0.0 to allow other machines."
         ) from None
-    checked = refuse_other_sites(serve.host, serve.names, say)
+    checked = refuse_other_sites(serve.host, serve.names, log)
     with contextlib.redirect_stdout(io.StringIO()), checked as servers:
         begun = viser.ViserServer(host=serve.host, port=serve.port, verbose=False)
         if not servers:
@@ -89,7 +89,7 @@ PORTS = {"http": 80, "https": 443}
 """Default ports, which addresses omit."""
 PLAIN = re.compile(r"[a-z0-9._:-]{1,253}")
 """Host names that are safe to print; other text that a client sends must not reach the terminal."""
-MOST_TOLD = 20
+MOST_REPORTED = 20
 """Largest number of refusals printed: a page that tries many names must not fill the terminal."""
 
 
@@ -130,7 +130,7 @@ def _objection_to_page(origin: str, called: SplitResult, names: Sequence[str]) -
 
 @contextlib.contextmanager
 def refuse_other_sites(
-    here: str, names: Sequence[str], say: Callable[[str], None]
+    here: str, names: Sequence[str], log: Callable[[str], None]
 ) -> Iterator[list[Any]]:
     """Let websocket servers that start inside the block check requests and refuse with 403.
 
@@ -140,13 +140,13 @@ def refuse_other_sites(
     Args:
         here: the host served on.
         names: further allowed names, as for ``objection``.
-        say: receives each reason once.
+        log: receives each reason once.
 
     Yields:
         A list with an entry for each server that checks.
     """
     home, plain = websockets.asyncio.server, websockets.asyncio.server.serve
-    servers, told = [], set()
+    servers, reported = [], set()
 
     def serve(*args: Any, process_request: Any = None, **rest: Any) -> Any:
         def process(connection: Any, request: Request) -> Any:
@@ -157,9 +157,9 @@ def refuse_other_sites(
                 reason = "A request with two hosts or two origins is refused."
             if not reason:
                 return None if process_request is None else process_request(connection, request)
-            if reason not in told and len(told) < MOST_TOLD:
-                told.add(reason)
-                say(f"refused: {reason}")
+            if reason not in reported and len(reported) < MOST_REPORTED:
+                reported.add(reason)
+                log(f"refused: {reason}")
             return _forbidden(reason)
 
         servers.append(process)

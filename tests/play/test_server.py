@@ -25,8 +25,8 @@ LONG = 120
 
 
 @contextlib.contextmanager
-def a_page(folder, load=a_toy, say=lambda _: None):
-    one = page.Page(load, Start(house=2), Serve(port=0, ahead=False), folder, "toy", say)
+def a_page(folder, load=a_toy, log=lambda _: None):
+    one = page.Page(load, Start(house=2), Serve(port=0, ahead=False), folder, "toy", log)
     try:
         yield one
     finally:
