@@ -409,6 +409,7 @@ def test_training_real_episodes_stopped_by_ctrl_c_and_started_again(data, tmp_pa
     assert "model.backbone.layers 2 there, 1 here" in err
 
 
+@pytest.mark.slow
 def test_told_to_end_while_it_compiles_then_trained_without_a_record_that_is_damaged(
     data, tmp_path
 ):

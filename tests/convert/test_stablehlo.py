@@ -68,6 +68,7 @@ def alone(folder, *flags):
     )
 
 
+@pytest.mark.slow
 @serialises
 def test_a_rollout_runs_without_the_library_and_equals_it(run, params, tmp_path):
     dst, said = tmp_path / "program", []
@@ -104,6 +105,7 @@ def test_a_rollout_runs_without_the_library_and_equals_it(run, params, tmp_path)
         stablehlo.export(run, dst, log=said.append)
 
 
+@pytest.mark.slow
 @serialises
 def test_a_denoise_step_is_checked_in_a_fresh_process(run, params, tmp_path):
     said = []

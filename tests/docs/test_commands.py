@@ -152,6 +152,7 @@ def runnable(command):
     return "stablehlo" not in command or importlib.util.find_spec("flatbuffers") is not None
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_readme_and_its_example_work_as_written(folder):
     found = commands(README)
     assert len(found) >= 2
@@ -184,6 +185,7 @@ REWRITTEN = {".lock", "config.json"}
 """Files of a run that every start writes: the lock, and the settings it has checked."""
 
 
+@pytest.mark.slow
 def test_make_demo_runs_all_of_it_and_does_nothing_twice(tmp_path):
     settings = {
         "PY": sys.executable,

@@ -91,12 +91,14 @@ def toy(monkeypatch):
     monkeypatch.setattr(engine, "open_engine", lambda *_: model)
 
 
+@pytest.mark.slow
 def test_the_first_rollout_remembers():
     names = run("1_first_rollout")
     assert names["psnr"](names["imagined"]) > names["psnr"](names["forgetful"]) + 3
     assert int(names["after"].map.occupied) >= int(names["state"].map.occupied) > 10_000
 
 
+@pytest.mark.slow
 def test_a_recording_is_imported_and_a_wrong_unit_refused(toy, capsys):
     names = run("2_your_recording")
     said = capsys.readouterr().out
@@ -106,12 +108,14 @@ def test_a_recording_is_imported_and_a_wrong_unit_refused(toy, capsys):
     assert np.isfinite(names["imagined"].rgb_THWC).all()
 
 
+@pytest.mark.slow
 def test_a_plan_is_found_and_carried_out(toy, capsys):
     names = run("3_planning")
     assert len(names["found"].actions) == len(names["poses"]) - 1
     assert "from the goal and ends" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_sofa_is_erased_and_moved(toy):
     names = run("4_edit_a_world")
     model, box = names["model"], names["box"]
@@ -127,6 +131,7 @@ def test_a_sofa_is_erased_and_moved(toy):
     assert "Moved the box" in names["moved"].said
 
 
+@pytest.mark.slow
 def test_a_pipeline_is_converted_and_comes_back_bit_for_bit(capsys):
     names = run("5_convert_cogvideox")
     assert names["apart"] < 1e-4

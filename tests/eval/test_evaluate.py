@@ -150,6 +150,7 @@ def test_metrics_hold_means_over_houses_with_intervals(run):
     assert "House by house" in (run / "report" / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_things_are_followed_where_the_episodes_have_instance_ids(run, copied, tmp_path, command):
     protocol = json.loads((run / "report" / "metrics.json").read_text())["protocol"]
     assert protocol["scs"].startswith("SCS is left out, since the episodes have no instance ids")
@@ -189,6 +190,7 @@ def test_the_page_on_evaluation_names_every_entry(run):
         assert re.search(rf"[`.]{name}[`.]", page), name
 
 
+@pytest.mark.slow
 def test_the_protocol_of_a_report_scores_another_run_which_is_compared(run, copied, command):
     metrics = json.loads((run / "report" / "metrics.json").read_text())
     protocol = run / "report" / "protocol.json"
@@ -220,6 +222,7 @@ def test_the_protocol_of_a_report_scores_another_run_which_is_compared(run, copi
         compare.compare(copied, run)
 
 
+@pytest.mark.slow
 def test_a_protocol_is_written_before_training_and_followed(run, copied, tmp_path, capsys):
     path = tmp_path / "protocol.json"
     assert program.main(["protocol", str(run), "--out", str(path)]) == 0
@@ -307,6 +310,7 @@ def test_a_damaged_page_is_drawn_again_without_imagining(copied, monkeypatch):
     assert page.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_a_report_with_another_validation_split_is_not_complete(run, tmp_path):
     """The settings of ``reproject`` are chosen on that split, also without a protocol's file."""
     base = tmp_path / "copy"
@@ -327,6 +331,7 @@ def test_a_report_with_another_validation_split_is_not_complete(run, tmp_path):
     assert "nothing to do" in said[-1]
 
 
+@pytest.mark.slow
 def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(copied, tmp_path):
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     assert "lpips" not in metrics["results"]["memory"]["all"]
@@ -358,6 +363,7 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
     assert "nothing to do" in said[-1]
 
 
+@pytest.mark.slow
 def test_more_seeds_keep_what_was_scored(copied):
     said = []
     report.evaluate(copied, log=said.append, seeds=(0, 1, 2))
@@ -366,6 +372,7 @@ def test_more_seeds_keep_what_was_scored(copied):
     assert metrics["protocol"]["seeds"] == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_a_quick_look_does_not_cost_the_full_scores(copied, monkeypatch):
     page = copied / "report" / "index.html"
     whole = page.read_bytes()
@@ -376,6 +383,7 @@ def test_a_quick_look_does_not_cost_the_full_scores(copied, monkeypatch):
     assert page.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_other_weights_start_anew(copied):
     params = weights.load(copied / "weights.safetensors")
     changed = jax.tree.map(lambda leaf: leaf * np.float32(1.01), params)
@@ -402,6 +410,7 @@ def rival(run, folder, *, steps, **changes):
     return folder
 
 
+@pytest.mark.slow
 def test_a_model_without_a_memory_gets_a_row(copied, tmp_path):
     none = rival(copied, tmp_path / "none", steps=1000)
     said = []
@@ -431,6 +440,7 @@ def test_a_rival_that_cannot_be_compared_is_refused(copied, command, capsys, tmp
     assert "does not exist" in refused(command, [str(copied), "--none", "gone"], capsys)
 
 
+@pytest.mark.slow
 def test_a_run_without_a_memory_is_scored_and_compared_under_its_own_name(run, tmp_path, command):
     own, said = rival(run, tmp_path / "own", steps=3), []
     report.evaluate(own, log=said.append, protocol=run / "report" / "protocol.json")
@@ -485,6 +495,7 @@ def test_a_training_without_a_memory_that_is_not_finished_is_refused(run, tmp_pa
         report.evaluate(short, log=lambda _: None)
 
 
+@pytest.mark.slow
 def test_other_data_get_a_report_of_their_own(copied, tmp_path):
     own = (copied / "report" / "metrics.json").read_bytes()
     write_split(tmp_path / "walks" / "revisit", episodes=1, scene="theirs")

@@ -39,6 +39,7 @@ def test_as_many_devices_are_used_as_divide_a_batch(devices, batch, used, monkey
     assert made == (None if used == 1 else ((used,), list("abcd")[:used]))
 
 
+@pytest.mark.slow
 def test_two_processes_of_four_devices_find_what_one_finds(tmp_path, monkeypatch):
     write_split(tmp_path / "data" / "revisit", episodes=2)
     quick = os.environ.get("XLA_FLAGS", "")

@@ -86,6 +86,7 @@ def run_command(folder, *words):
     return done.stdout
 
 
+@pytest.mark.slow
 def test_a_user_trains_with_all_four_in_an_empty_folder(data, tmp_path):
     words = ["train", "tiny", "--data.path", str(data), "--data.context", "3", "--train.run", "run"]
     words += ["--clip.height", "16", "--clip.width", "16", "--train.preview_every", "0"]
@@ -169,11 +170,13 @@ def test_many_candidates_share_one_memory():
     np.testing.assert_allclose(frames.rgb_THWC[2], alone.rgb_THWC, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_eight_devices_by_their_own_rules_give_the_losses_of_one(measured):
     np.testing.assert_allclose(measured["eight"], measured["one"], rtol=1e-5)
     assert measured["split"] == {"spec": "P(None, 'fsdp', 'tensor')", "part": 1 / 8}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", [0, 1])
 def test_a_plan_counts_their_flops(measured, stage):
     compiled, expected = measured["flops"][stage]

@@ -26,6 +26,7 @@ def measured():
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", training_plans.VARIANTS)
 def test_the_sums_agree_with_the_compiled_step(measured, name):
     one = measured[name]
@@ -34,6 +35,7 @@ def test_the_sums_agree_with_the_compiled_step(measured, name):
     assert one["state_expected"] == pytest.approx(one["state"], rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["all-gather", "reduce-scatter"])
 def test_the_traffic_of_weights_agrees_with_the_compiled_step(measured, kind):
     one = measured["stage 2, tensor 2 × fsdp 4"]

@@ -109,6 +109,7 @@ def steps(served):
     return served.driver._session.steps
 
 
+@pytest.mark.slow
 def test_keys_and_buttons_drive_and_the_picture_changes(served, tabs):
     tab, _, outside = tabs
     before, count = shown(tab, LEFT_HALF), steps(served)
@@ -134,6 +135,7 @@ def test_keys_and_buttons_drive_and_the_picture_changes(served, tabs):
     ] == []
 
 
+@pytest.mark.slow
 def test_a_box_that_is_chosen_in_the_map_and_erased_is_gone(served, tabs):
     tab, _, _ = tabs
     count, many = steps(served), len(served._map.points)
@@ -161,6 +163,7 @@ def test_a_box_that_is_chosen_in_the_map_and_erased_is_gone(served, tabs):
     until(tab, lambda: len(served._map.points) == many)
 
 
+@pytest.mark.slow
 def test_a_second_tab_sees_the_same_and_a_closed_one_stops_nothing(served, tabs):
     tab, context, _ = tabs
     second = context.new_page()
@@ -174,6 +177,7 @@ def test_a_second_tab_sees_the_same_and_a_closed_one_stops_nothing(served, tabs)
     until(tab, lambda: steps(served) == count + 1)
 
 
+@pytest.mark.slow
 def test_a_world_that_fails_says_so_on_the_page(served, tabs, monkeypatch):
     from pewm_jax.play import session
 

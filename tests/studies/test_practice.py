@@ -79,6 +79,7 @@ def _clip(frames):
     return configuration.ClipConfig(frames=frames, height=16, width=16)
 
 
+@pytest.mark.slow
 def test_the_whole_study_is_made_kept_and_goes_on(made):
     folder, page = made
     results = json.loads((folder / "out" / "results.json").read_text())
@@ -110,6 +111,7 @@ def test_the_whole_study_is_made_kept_and_goes_on(made):
         study.run(folder / "world", folder / "policy", folder / "out", other, log=lambda _: None)
 
 
+@pytest.mark.slow
 def test_what_it_learns_from_are_whole_walks_of_its_own_actions(made):
     folder, _ = made
     for how in LEARNED:
@@ -124,6 +126,7 @@ def test_what_it_learns_from_are_whole_walks_of_its_own_actions(made):
             np.testing.assert_allclose(moved[stepped], MOTION.step_m, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_page_runs_as_it_is_written(made, world, home):
     folder, _ = made
     config, params = world
@@ -136,6 +139,7 @@ def test_the_page_runs_as_it_is_written(made, world, home):
     assert len(second.actions_N) == 2 * 4
 
 
+@pytest.mark.slow
 def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
     folder, _ = made
     config = configuration.load(folder / "policy" / "config.json")
@@ -160,6 +164,7 @@ def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
         program.execute(["table2", "--policy", str(tmp_path / "nothing")])
 
 
+@pytest.mark.slow
 def test_a_trained_nomad_proposes_for_table_2(made, home):
     folder, _ = made
     name, policy = commands._policy(str(folder / "policy"))

@@ -73,6 +73,7 @@ def made(tmp_path_factory):
     return folder, folder / "out" / "table1.md", said.getvalue().splitlines()
 
 
+@pytest.mark.slow
 def test_the_whole_table_is_made(made):
     _, page, said = made
     text = page.read_text()
@@ -102,6 +103,7 @@ def whole(folder, say, out=None):
     return table1.run(base, out, minutes=(1, 1), steps=(2, 2), seeds=[0], log=say)
 
 
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again(made):
     folder = made[0]
     files = sorted((folder / "out").glob("seed0/*/*.safetensors"))
@@ -114,6 +116,7 @@ def test_what_is_done_is_not_done_again(made):
     assert not any("compil" in line for line in said)
 
 
+@pytest.mark.slow
 def test_scores_outlive_the_weights(made):
     folder, page, _ = made
     out, before = folder / "elsewhere", page.read_text()
@@ -143,6 +146,7 @@ def test_scores_outlive_the_weights(made):
     assert path != table1_scoring.recorded_path(from_codec, row, 0, steps, "x")
 
 
+@pytest.mark.slow
 def test_all_rows_start_from_one_backbone_and_keep_it(made):
     out = made[0] / "out" / "seed0"
     before = tree.flatten(weights.load(out / "backbone" / "weights.safetensors"))
@@ -152,6 +156,7 @@ def test_all_rows_start_from_one_backbone_and_keep_it(made):
         assert any(leaf.startswith("memory/") for leaf in after)
 
 
+@pytest.mark.slow
 def test_the_features_of_a_network_can_be_tried(made):
     """The paper's own: a DINOv2 behind the map, from the backbone that all rows start from."""
     folder, said = made[0], []
@@ -186,6 +191,7 @@ def test_the_features_of_a_network_can_be_tried(made):
         table1_rows.ablated(base, "features", ("hog",))
 
 
+@pytest.mark.slow
 def test_a_step_is_timed(made):
     folder = made[0]
     study = table1_training.Study(small(folder / "data"), folder / "timed", (1, 1))
@@ -197,6 +203,7 @@ def test_a_step_is_timed(made):
     assert any(": compiled in " in line for line in said)
 
 
+@pytest.mark.slow
 def test_what_was_made_from_other_weights_is_refused(made):
     folder = made[0]
     mark = folder / "out" / "seed0" / "surfels-render" / table1_training.MADE_FROM
@@ -207,6 +214,7 @@ def test_what_was_made_from_other_weights_is_refused(made):
     mark.write_text(before)
 
 
+@pytest.mark.slow
 def test_the_memory_is_what_differs_from_an_empty_one(made):
     from tests.helpers import randomise
 

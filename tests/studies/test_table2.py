@@ -50,6 +50,7 @@ def made(tmp_path_factory):
     return folder, page
 
 
+@pytest.mark.slow
 def test_the_whole_table_is_made(made):
     _, page = made
     results = json.loads((page.parent / "results.json").read_text())
@@ -71,6 +72,7 @@ def test_the_whole_table_is_made(made):
     assert (page.parent / "plan0.mp4").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_what_is_decided_is_kept_and_more_can_be_added(made):
     folder, page = made
     files = sorted((folder / "out").glob("decisions/**/*.json"))
@@ -247,6 +249,7 @@ def test_a_closed_loop_with_the_truth_and_a_true_cost_comes_to_the_goal():
     assert after < 0.3 < before
 
 
+@pytest.mark.slow
 def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
     folder, _ = made
     config = presets.load("tiny")

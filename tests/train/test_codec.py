@@ -180,7 +180,7 @@ def of_32(batch):
     )
 
 
-def test_lpips_counts_as_much_as_it_weighs_and_can_be_descended(tmp_path):
+def test_lpips_counts_as_much_as_it_weighs(tmp_path):
     config = perceptual(tmp_path)
     stage, make = worlds.stages(config)[0], of_32(batch)
     params, given = init(config, jax.random.key(0)), stage.given(config.model, config.train)
@@ -193,7 +193,17 @@ def test_lpips_counts_as_much_as_it_weighs_and_can_be_descended(tmp_path):
     assert "lpips" not in few
     assert measured["lpips"] > 0
     assert whole == pytest.approx(float(without + 0.5 * measured["lpips"]), rel=1e-5)
-    only = dataclasses.replace(plain, lpips_weight=1.0, gradient_weight=0.0, squared_weight=0.0)
+
+
+@pytest.mark.slow
+def test_lpips_can_be_descended(tmp_path):
+    config = perceptual(tmp_path)
+    stage, make = worlds.stages(config)[0], of_32(batch)
+    params, given = init(config, jax.random.key(0)), stage.given(config.model, config.train)
+    clip = make(config)
+    only = dataclasses.replace(
+        config.train, lpips_weight=1.0, gradient_weight=0.0, squared_weight=0.0
+    )
     fitting = dataclasses.replace(config, train=only)
     _, found = descend(fitting, params | given, with_given(stage), 15, 5e-3, lambda _: clip)
     assert found[-1][1]["lpips"] < 0.9 * found[0][1]["lpips"]
@@ -204,6 +214,7 @@ def with_given(stage):
     return dataclasses.replace(stage, rules=((r"lpips/.*", stages.FREEZE), *stage.rules))
 
 
+@pytest.mark.slow
 def test_the_trainer_reads_lpips_and_saves_none_of_it(clips, monkeypatch, tmp_path):
     make = of_32(batch)
 

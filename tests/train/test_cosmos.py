@@ -151,6 +151,7 @@ def test_worlds_on_cosmos_imagine_and_compare_candidates(model):
     assert many.shape == (3, *alone.shape)
 
 
+@pytest.mark.slow
 def test_actions_and_a_memory_on_cosmos():
     model = PEWM
     assert model.in_channels == 8 + 1 + 12

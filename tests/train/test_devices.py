@@ -36,6 +36,7 @@ def measured(tmp_path_factory):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "mesh"), SHARED)
 def test_eight_devices_compute_the_losses_of_one(measured, stage, mesh):
     alone, shared = (np.array(measured["losses"][f"{stage} {name}"]) for name in ("one", mesh))
@@ -44,12 +45,14 @@ def test_eight_devices_compute_the_losses_of_one(measured, stage, mesh):
     np.testing.assert_allclose(shared, alone, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_muon_and_chained_clips_compute_on_eight_devices_what_they_do_on_one(measured):
     alone, shared = (np.array(measured["losses"][f"muon {name}"]) for name in MUON)
     assert len(set(alone)) == 3
     np.testing.assert_allclose(shared, alone, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_batch_is_shared_over_data_and_fsdp(measured):
     rows = {name.removeprefix("stage1 "): rows for name, rows in measured["rows"].items()}
     assert rows["one"] == [8]
@@ -58,11 +61,13 @@ def test_a_batch_is_shared_over_data_and_fsdp(measured):
     assert rows["context 4 data 2"] == [4]
 
 
+@pytest.mark.slow
 def test_copies_of_the_weights_only_add_up_their_gradients(measured):
     kinds = {kind for kind, _, _ in measured["moved"]["stage1 data 8"]}
     assert kinds == {"all-reduce"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "mesh"), [SHARED[1], SHARED[2], SHARED[4]])
 def test_weights_are_gathered_layer_by_layer(measured, stage, mesh):
     gathered = [part for part in measured["moved"][f"{stage} {mesh}"] if part[0] == "all-gather"]
@@ -72,6 +77,7 @@ def test_weights_are_gathered_layer_by_layer(measured, stage, mesh):
     assert not any("shard_map" in where and "attention" not in where for _, _, where in gathered)
 
 
+@pytest.mark.slow
 def test_no_device_ever_holds_the_whole_state(measured):
     fresh = measured["fresh"]
     assert fresh["made"] < fresh["whole"] / 4
@@ -79,6 +85,7 @@ def test_no_device_ever_holds_the_whole_state(measured):
     assert measured["split"] > 40
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_eight_devices_is_restored_on_one(measured):
     assert measured["restored"] is True
     assert measured["restored_on"] == 1

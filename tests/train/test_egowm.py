@@ -112,6 +112,7 @@ def test_a_video_model_is_made_first_where_there_is_none_and_the_control_waits(s
     assert adapt.rates == ((r"control/.*", SVD.control.rate),)
 
 
+@pytest.mark.slow
 def test_its_sums_are_those_of_the_compiled_step(svd):
     config, stage, *_, text = svd
     needed = flops.of_stage(config, stage, abstract.clip(config, 2)).total
@@ -166,6 +167,7 @@ def test_what_does_not_fit_the_u_net_is_refused():
         dataclasses.replace(TINY, backbone=UNET)
 
 
+@pytest.mark.slow
 def test_actions_and_a_memory_on_one_backbone():
     """World ``pewm`` with the control ``actions`` and rays, in both stages."""
     model = dataclasses.replace(

@@ -146,8 +146,8 @@ LAST = worlds.stages(tiny_config())[3]
     "reader",
     [
         None,
-        AttentionConfig(heads=4, head_dim=8),
-        RenderConfig(picture_width=8, picture="latents"),
+        pytest.param(AttentionConfig(heads=4, head_dim=8), marks=pytest.mark.slow),
+        pytest.param(RenderConfig(picture_width=8, picture="latents"), marks=pytest.mark.slow),
     ],
 )
 def test_the_gate_learns_alone_on_what_the_model_imagines(reader):

@@ -31,6 +31,7 @@ def logged(run):
     return [(e["stage"], e["step"], e["loss"], e["grad_norm"]) for e in entries]
 
 
+@pytest.mark.slow
 def test_kills_at_random_moments_change_no_bit(folder):
     outcome = subprocess.run(
         [sys.executable, kills.__file__, folder, "21", "0"],
@@ -79,6 +80,7 @@ def finish(process):
     return out
 
 
+@pytest.mark.slow
 def test_the_real_program_killed_as_it_saves_goes_on_and_ends_the_same(folder):
     finish(start(folder, "undisturbed"))
     run, dice = folder / "runs" / "killed", random.Random()

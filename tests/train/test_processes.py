@@ -106,6 +106,7 @@ def test_two_processes_of_two_devices_compute_the_losses_of_one(tmp_path, monkey
     np.testing.assert_allclose(list(found.values()), list(expected.values()), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_other_numbers_of_devices_and_processes(
     fake_model, tmp_path, monkeypatch
 ):
@@ -130,6 +131,7 @@ def test_every_process_places_its_rows_whatever_the_mesh():
     assert jobs.finish([], processes=2, devices=3, settings={"PLACE": ""}) == ["placed\n", ""]
 
 
+@pytest.mark.slow
 def test_a_signal_to_one_stops_all_after_the_same_step(tmp_path):
     run = tmp_path / "run"
     argv = ["tiny", *STAGES, "--train.stage1.steps", 10_000, "--train.run", run]
@@ -147,6 +149,7 @@ def test_a_signal_to_one_stops_all_after_the_same_step(tmp_path):
     assert (run / "checkpoints" / "stage1" / str(done)).is_dir()
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_stops_all_or_is_skipped_by_all(tmp_path):
     run, step = tmp_path / "run", 4
     argv = ["tiny", *STAGES, "--train.stage1.steps", 6, "--train.stage2.steps", 0]
@@ -166,6 +169,7 @@ def test_what_is_not_finite_stops_all_or_is_skipped_by_all(tmp_path):
     assert [line["skipped"] for line in jobs.metrics(run)] == [0, 0, 0, 1, 1, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("killed", [0, 1])
 def test_when_one_is_killed_the_other_says_so_and_ends(killed):
     by_slurm = killed == 1  # once by hand, once as JAX finds the processes itself
@@ -183,6 +187,7 @@ def test_when_one_is_killed_the_other_says_so_and_ends(killed):
     assert outputs[1] == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("process", [0, 1])
 def test_processes_that_do_not_meet_say_so_in_time(process):
     argv = ["--distributed", "--patience", 1, "--processes", 2, "--process", process]

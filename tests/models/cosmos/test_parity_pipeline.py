@@ -35,6 +35,7 @@ def folder(pipeline, tmp_path_factory):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # the reference's
 def test_what_the_pipeline_samples_is_what_we_sample(pipeline, folder, monkeypatch):
     texts = draw(2, 1, 5, 24)

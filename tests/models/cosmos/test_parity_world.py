@@ -101,6 +101,7 @@ START = draw(1, 3, 4, 4, 4, seed=1)
 FIRST = np.tanh(draw(1, 1, SIZE, SIZE, 3, seed=2))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # the reference's
 def test_what_the_pipeline_samples_the_world_samples(pipeline, model, params, monkeypatch):
     monkeypatch.setattr(  # the mode instead of a draw
