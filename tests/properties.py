@@ -1,6 +1,12 @@
 """How many examples a property test draws: few in ``make test``, all in ``make test-all``."""
 
+import itertools
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
+
 from hypothesis import settings
+
+Case = TypeVar("Case")
 
 QUICK = 8
 """Examples of each property under the profile ``quick``."""
@@ -13,6 +19,11 @@ settings.register_profile("all", deadline=None)
 def examples(count: int) -> settings:
     """Draw ``count`` examples, or fewer under the profile ``quick``."""
     return settings(max_examples=min(count, QUICK) if _is_quick() else count)
+
+
+def cases(every: Iterable[Case], step: int) -> Iterator[Case]:
+    """Yield all cases, or one of ``step`` under the profile ``quick``."""
+    return itertools.islice(every, 0, None, step if _is_quick() else 1)
 
 
 def _is_quick() -> bool:
