@@ -1,5 +1,7 @@
 """Compile fast rather than well: tests are never timed, and compiling is most of what they do."""
 
+import contextlib
+import ctypes
 import gc
 import importlib.util
 import mmap
@@ -78,21 +80,27 @@ FIRST = (
 
 
 HERE = Path(__file__).parent
-MAPS = Path("/proc/self/maps")
+MAPS, PAGES = Path("/proc/self/maps"), Path("/proc/self/statm")
 MOST_MAPS = 25_000
 """Linux lets a process map 65,530 regions of memory. Every compiled program takes several, and one
 too many ends the process."""
+MOST_BYTES = 1_200_000_000
+"""Memory above which a worker drops its compiled programs; 2 GB is what it may take."""
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Let go of compiled programs between files, where there are very many."""
-    another = nextitem is None or nextitem.path != item.path
-    if another and "jax" in sys.modules and MAPS.exists():
+    """Drop compiled programs where they take much memory; most are found on disk again."""
+    if "jax" not in sys.modules or not PAGES.exists():
+        return
+    full = int(PAGES.read_text().split()[1]) * mmap.PAGESIZE > MOST_BYTES
+    if not full and (nextitem is None or nextitem.path != item.path):  # to count takes a while
         with MAPS.open("rb") as file:
-            count = sum(1 for _ in file)
-        if count > MOST_MAPS:
-            sys.modules["jax"].clear_caches()
-            gc.collect()
+            full = sum(1 for _ in file) > MOST_MAPS
+    if full:
+        sys.modules["jax"].clear_caches()
+        gc.collect()
+        with contextlib.suppress(OSError, AttributeError):  # a C library other than GNU's
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def pytest_collection_modifyitems(items):

@@ -73,6 +73,16 @@ def reference(config, points, values, valid):
     return cells, outside
 
 
+def test_where_nothing_was_observed_features_are_below_any_other():
+    assert np.isneginf(fresh().features_VF).all()
+    voxels = insert(CONFIG, fresh(), *random_points(0))
+    held = np.asarray(voxels.cell_of_slot_V) < math.prod(CONFIG.cells)
+    assert 0 < held.sum() < len(held)
+    assert np.isneginf(voxels.features_VF[~held]).all()
+    assert np.isfinite(voxels.features_VF[held]).all()
+    assert (np.asarray(voxels.features_VF)[held] < 0).any()
+
+
 @examples(25)
 @given(seed=SEEDS)
 def test_a_cell_is_the_maximum_of_its_points(seed):

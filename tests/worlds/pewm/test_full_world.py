@@ -148,6 +148,7 @@ def test_frames_that_decode_to_another_number_are_refused():
         VAE.decode({}, jnp.zeros((1, 2, 4, 6, 4)))
 
 
+@pytest.mark.slow
 def test_training_needs_converted_weights_and_leaves_them_alone(world, tmp_path, monkeypatch):
     monkeypatch.setattr(loader, "clips", clips)
     config, params = world
