@@ -84,15 +84,22 @@ MAPS, PAGES = Path("/proc/self/maps"), Path("/proc/self/statm")
 MOST_MAPS = 25_000
 """Linux lets a process map 65,530 regions of memory. Every compiled program takes several, and one
 too many ends the process."""
-MOST_BYTES = 1_200_000_000
-"""Memory above which a worker drops its compiled programs; 2 GB is what it may take."""
+MOST_BYTES, MORE_BYTES = 1_200_000_000, 300_000_000
+"""Memory above which a worker drops its compiled programs, and growth until it does so once more;
+it may take 2 GB."""
+LIMIT = [MOST_BYTES]
+
+
+def resident():
+    """Return the bytes of memory that this process holds."""
+    return int(PAGES.read_text().split()[1]) * mmap.PAGESIZE
 
 
 def pytest_runtest_teardown(item, nextitem):
     """Drop compiled programs where they take much memory; most are found on disk again."""
     if "jax" not in sys.modules or not PAGES.exists():
         return
-    full = int(PAGES.read_text().split()[1]) * mmap.PAGESIZE > MOST_BYTES
+    full = resident() > LIMIT[0]
     if not full and (nextitem is None or nextitem.path != item.path):  # to count takes a while
         with MAPS.open("rb") as file:
             full = sum(1 for _ in file) > MOST_MAPS
@@ -101,6 +108,7 @@ def pytest_runtest_teardown(item, nextitem):
         gc.collect()
         with contextlib.suppress(OSError, AttributeError):  # a C library other than GNU's
             ctypes.CDLL(None).malloc_trim(0)
+        LIMIT[0] = max(MOST_BYTES, resident() + MORE_BYTES)
 
 
 def pytest_collection_modifyitems(items):
