@@ -87,27 +87,27 @@ def parts(model, params, state, actions_KN, key) -> dict[str, Clock]:
 
         return jax.vmap(one)(cameras(actions))
 
-    def draw(params, conditioning, sight, keys):
-        batched = jax.tree.map(lambda x: x[:, None], sight)
+    def draw(params, conditioning, readout, keys):
+        batched = jax.tree.map(lambda x: x[:, None], readout)
         one = functools.partial(sampling.draw, model, params)
         return jax.vmap(one)(conditioning, batched, keys)[:, 0]
 
-    def decode(params, latents, sight):
+    def decode(params, latents, readout):
         rgb, depth = rgbd.decode_rgbd(model, params, latents[:, -1:])
         if memories.gated(model):
-            view = jax.tree.map(lambda x: x[:, -1:], sight.view)
+            view = jax.tree.map(lambda x: x[:, -1:], readout.view)
             rgb, depth = rgbd.mix(model, params, rgb, depth, view)
         return rgb, depth
 
     looking, conditioning, drawing, decoding = (jax.jit(f) for f in (look, condition, draw, decode))
     clocks: dict[str, Clock] = {}
-    sight: MemoryReadout = jax.block_until_ready(looking(params, state.map, actions_KN))
+    readout: MemoryReadout = jax.block_until_ready(looking(params, state.map, actions_KN))
     given = jax.block_until_ready(conditioning(params, state.frame, actions_KN))
-    latents = jax.block_until_ready(drawing(params, given, sight, keys))
+    latents = jax.block_until_ready(drawing(params, given, readout, keys))
     for name, run in {
-        "the sampler (denoiser, 2 steps)": lambda: drawing(params, given, sight, keys),
+        "the sampler (denoiser, 2 steps)": lambda: drawing(params, given, readout, keys),
         "the present frame and the rays": lambda: conditioning(params, state.frame, actions_KN),
-        "decoding and the gate, last frame": lambda: decoding(params, latents, sight),
+        "decoding and the gate, last frame": lambda: decoding(params, latents, readout),
     }.items():
         jax.block_until_ready(run())
         clocks[name] = Clock()

@@ -51,19 +51,19 @@ def watched(found: dict[str, list[float]]) -> Iterator[None]:
         found["chance"].append(float(chance))
 
     def prepare(
-        reader: AttentionConfig, model: Any, params: Params, sight: Any, camera: Any, rays: Array
+        reader: AttentionConfig, model: Any, params: Params, readout: Any, camera: Any, rays: Array
     ) -> Any:
         patch = patch_pixels(model)
         rows, columns = model.clip.height // patch, model.clip.width // patch
         v, u = np.meshgrid(np.arange(rows) + 0.5, np.arange(columns) + 0.5, indexing="ij")
         centres = patch * np.stack([u.ravel(), v.ravel()], -1)
-        tokens = sight.tokens
+        tokens = readout.tokens
         uv, z = project(tokens.points_world_M3[:, None], camera)
         near = jnp.abs(uv[:, :, None] - centres[:, None]).max(-1) <= REACH * patch  # (B, T, n, M)
         seen = (z > NEAREST_M) & tokens.valid_M[:, None]
         held["near"] = near & seen[:, :, None]
         held["valid"] = tokens.valid_M
-        return apply(reader, model, params, sight, camera, rays)
+        return apply(reader, model, params, readout, camera, rays)
 
     def read_seen(q: Array, k: Array, v: Array, views: Any, turns: Array, learned: Any) -> Array:
         held["index"] = views[0]

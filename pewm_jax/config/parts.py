@@ -407,14 +407,14 @@ class Reader(Settings):
         raise NotImplementedError
 
     def prepare(
-        self, model: Any, params: Params, sight: MemoryReadout, camera: Camera, rays_BthwC: Array
+        self, model: Any, params: Params, readout: MemoryReadout, camera: Camera, rays_BthwC: Array
     ) -> Any:
         """Prepare to read the memories of a batch of clips.
 
         Args:
             model: the model.
             params: its parameters.
-            sight: what the memory shows each clip, leading axis B; it has what the class
+            readout: what the memory shows each clip, leading axis B; it has what the class
                 attributes ask for.
             camera: (B, T) cameras of the clips.
             rays_BthwC: their Plücker rays at the latent rate (``controls.camera.rays``).

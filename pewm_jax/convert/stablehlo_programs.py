@@ -109,18 +109,18 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
         def read(p: Params, c: Camera) -> Any:
             return memories.readout(model, model.memory.empty(model, jnp.zeros(3)), c, params=p)
 
-        sight = jax.eval_shape(jax.vmap(read, (None, 0)), params, camera)
-        shown = {"tokens": sight.tokens, "view": sight.view, "encoded": sight.encoded}
+        readout = jax.eval_shape(jax.vmap(read, (None, 0)), params, camera)
+        shown = {"tokens": readout.tokens, "view": readout.view, "encoded": readout.encoded}
         parts |= {name: part for name, part in shown.items() if part is not None}
     noisy = like((*model.latent_shape, model.codec.channels))
 
     def denoise(weights: Arrays, inputs: Arrays) -> Arrays:
         given = dict(zip(parts, _pack(parts, inputs), strict=True))
         conditioning = given.pop("conditioning")
-        sight = MemoryReadout(**given) if given else None
+        readout = MemoryReadout(**given) if given else None
         noisy, times = inputs["noisy_BthwC"], inputs["timesteps_B"]
         world = tree.unflatten(weights)
-        out = world_model.apply(model, world, noisy, conditioning, times, sight)
+        out = world_model.apply(model, world, noisy, conditioning, times, readout)
         return {"prediction_BthwC": out}
 
     noise, time = model.noise, like(())

@@ -50,7 +50,7 @@ class Trials:
         within: in how many frames a block was in the window that may change.
         frames: how many frames there were, of all walks with a block.
         asked: how many walks there were, with room for a block or without.
-        hold: ``model.persistence_logit``, nats.
+        persistence_logit: ``model.persistence_logit``, nats.
     """
 
     kept_N: np.ndarray
@@ -59,7 +59,7 @@ class Trials:
     within: int
     frames: int
     asked: int
-    hold: float
+    persistence_logit: float
 
     def facts(self) -> dict[str, Any]:
         """Return plain values, for a report."""
@@ -74,7 +74,7 @@ class Trials:
             "changed_in_sight": int(self.visible),
             "frames": int(self.frames),
             "frames_in_window": int(self.within),
-            "hold": float(self.hold),
+            "hold": float(self.persistence_logit),
         }
 
 

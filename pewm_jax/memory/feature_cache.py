@@ -216,7 +216,7 @@ def build(
     *,
     dtype: Dtype = "float16",
     batch: int = 16,
-    say: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
 ) -> FeatureCache:
     """Compute the features of every frame of a split, or continue an interrupted build.
 
@@ -229,7 +229,7 @@ def build(
         out: the folder to fill.
         dtype: dtype of the stored features.
         batch: frames encoded at once, rounded up to a multiple of the devices.
-        say: shows a progress line.
+        log: shows a progress line.
 
     Returns:
         The finished cache.
@@ -243,13 +243,13 @@ def build(
     if (out / MANIFEST).is_file():
         cache = read(out)
         refuse_stale(out, cache.made_of, made_of)
-        say(f"{out}: finished already, {len(cache.files)} episodes")
+        log(f"{out}: finished already, {len(cache.files)} episodes")
         return cache
     settings = {"version": VERSION, "made_of": made_of, "dtype": dtype}
     files: dict[str, tuple[str, int]] = {}
     with _locked(out):
         _begin(out, settings)
-        encode = _Encoder(config, params, batch, say)
+        encode = _Encoder(config, params, batch, log)
         with Meter("features", source.manifest.frames, "frames") as meter:
             for index in range(len(source)):
                 episode: Episode = source[index]
@@ -266,20 +266,20 @@ def build(
                 files[episode.name] = (path.name, episode.length)
         write_json(out / MANIFEST, {**settings, "files": files})
         (out / UNFINISHED).unlink()
-    say(f"{out}: {meter.summary()}")
+    log(f"{out}: {meter.summary()}")
     return FeatureCache(out, made_of, files)
 
 
 class _Encoder:
     """The encoder compiled for batches of frames, spread over all devices."""
 
-    def __init__(self, config: Encoder, params: Params, batch: int, say: Callable[[str], None]):
+    def __init__(self, config: Encoder, params: Params, batch: int, log: Callable[[str], None]):
         devices = jax.devices()
         mesh = jax.make_mesh((len(devices),), ("frames",), (AxisType.Auto,), devices=devices)
         self._spread = NamedSharding(mesh, P("frames"))
         self._params = jax.device_put(params, NamedSharding(mesh, P()))
         self._batch = -(-batch // len(devices)) * len(devices)
-        self._say, self._compiled = say, set()
+        self._say, self._compiled = log, set()
 
         def encode(params: Params, rgb_THWC: Array) -> Array:
             return config.encode(params, signal_from_rgb(rgb_THWC))

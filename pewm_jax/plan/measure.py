@@ -157,7 +157,7 @@ def work_of(config: Config, stage: Stage, traced: jax.stages.Traced, chip: Chip 
     """
     config = as_on_chips(config)
     clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
-    given = stage.given(config.model, config.train) if stage.given else None
+    given = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
     return StepWork(
         needed=flops.of_stage(config, stage, clip, given),
         executed=flops.executed(traced.jaxpr, chip.platform if chip else "cpu"),

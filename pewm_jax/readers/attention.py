@@ -160,7 +160,7 @@ class AttentionConfig(Reader):
         self,
         model: ModelConfig,
         params: Params,
-        sight: MemoryReadout,
+        readout: MemoryReadout,
         camera: Camera,
         rays_BthwC: Array,
     ) -> Readers:
@@ -173,7 +173,7 @@ class AttentionConfig(Reader):
         patches = patchify(rays, places.patch, places.patch_t)
         looks_from = layout.spread(camera_layer.apply({"params": params["camera"]}, patches))
 
-        seen = sight.tokens
+        seen = readout.tokens
         assert seen is not None
         valid, sights = seen.valid_M, None
         points, features = (

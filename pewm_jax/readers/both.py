@@ -37,13 +37,13 @@ class BothConfig(AttentionConfig, RenderConfig):
         self,
         model: ModelConfig,
         params: Params,
-        sight: MemoryReadout,
+        readout: MemoryReadout,
         camera: Camera,
         rays_BthwC: Array,
     ) -> Readers:
         """Prepare both; see ``Reader.prepare``."""
-        attend = AttentionConfig.prepare(self, model, params, sight, camera, rays_BthwC)
-        render = RenderConfig.prepare(self, model, params, sight, camera, rays_BthwC)
+        attend = AttentionConfig.prepare(self, model, params, readout, camera, rays_BthwC)
+        render = RenderConfig.prepare(self, model, params, readout, camera, rays_BthwC)
         if render.block is None:
             return dataclasses.replace(attend, added_BND=render.added_BND)
 

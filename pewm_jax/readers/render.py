@@ -135,13 +135,13 @@ def pictures(model: ModelConfig, params: Params, view: View) -> Array:
     return jnp.concatenate([x.astype(dtype) for x in (features, depth, seen)], -1)
 
 
-def cells(model: ModelConfig, params: Params, sight: MemoryReadout) -> tuple[Array, Array]:
+def cells(model: ModelConfig, params: Params, readout: MemoryReadout) -> tuple[Array, Array]:
     """Return what is read at each cell of the latents, and which clips see anything.
 
     Args:
         model: the model.
         params: the reader's parameters under ``render``.
-        sight: of a batch; what it holds where nothing is seen is not read.
+        readout: of a batch; what it holds where nothing is seen is not read.
 
     Returns:
         ``(cells_BthwC, seen_B)``: the pixels of each cell (see ``pictures``), or its latents and
@@ -149,10 +149,10 @@ def cells(model: ModelConfig, params: Params, sight: MemoryReadout) -> tuple[Arr
     """
     fold_cells = functools.partial(fold, spatial=model.codec.spatial, temporal=model.codec.temporal)
     if not _settings(model).READS_LATENTS:
-        view = sight.view
+        view = readout.view
         assert view is not None
         return fold_cells(pictures(model, params, view)), view.seen_THW.any((1, 2, 3))
-    encoded, dtype = sight.encoded, jnp.dtype(model.dtype)
+    encoded, dtype = readout.encoded, jnp.dtype(model.dtype)
     assert encoded is not None
     seen = fold_cells(encoded.seen_THW[..., None])
     latents = jnp.where(seen.any(-1, keepdims=True), encoded.latents_thwC, 0)
@@ -235,7 +235,7 @@ class RenderConfig(Reader):
         self,
         model: ModelConfig,
         params: Params,
-        sight: MemoryReadout,
+        readout: MemoryReadout,
         camera: Camera,
         rays_BthwC: Array,
     ) -> Readers:
@@ -245,7 +245,7 @@ class RenderConfig(Reader):
         embed = functools.partial(_apply, model, weights)
         layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
 
-        read_BthwC, seen_B = cells(model, weights, sight)
+        read_BthwC, seen_B = cells(model, weights, readout)
         missing = -read_BthwC.shape[1] % places.patch_t
         read_BthwC = jnp.concatenate([read_BthwC[:, :1]] * missing + [read_BthwC], 1)
         patches = patchify(read_BthwC, places.patch, places.patch_t)

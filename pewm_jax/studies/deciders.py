@@ -209,9 +209,9 @@ def _closed_loop(
 ) -> Decision:
     """Plan, carry out one clip's actions, observe, and plan the rest anew.
 
-    The horizon shrinks with what is left of the task's actions. When they are spent, the agent may
-    correct once more, by one clip, if that is foreseen to cost less than what is seen now. It is
-    never told whether it is at the goal.
+    The horizon shrinks with the remaining actions of the task. When they are spent, the agent may
+    execute one more clip if its predicted cost is lower than the present cost. The agent does not
+    know whether it is at the goal.
     """
     clip = predictors.config.model.clip.frames - 1
     state, planar = predictors.begin(predictor, goal), goal.walk_T3[0]

@@ -199,7 +199,7 @@ def _learned(
         config.train, run=str(folder / "run"), start=str(begun.folder), seed=seed, policy=stage
     )
     data = dataclasses.replace(config.data, path=str(folder / "data"))
-    loop.train(dataclasses.replace(config, train=train, data=data), say=lambda _: None)
+    loop.train(dataclasses.replace(config, train=train, data=data), log=lambda _: None)
     shutil.rmtree(folder / "run" / "checkpoints", ignore_errors=True)
     return open_policy(folder / "run")
 

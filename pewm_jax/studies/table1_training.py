@@ -151,7 +151,7 @@ def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], log: Log)
         config = settings(study, which, seed, steps[which.name], start=where)
         log(f"{which.name}, training seed {seed}: {steps[which.name]} steps")
         _require_same(config)
-        loop.train(config, say=log)
+        loop.train(config, log=log)
         shutil.rmtree(study.folder(which.name, seed) / "checkpoints", ignore_errors=True)
         gc.collect()  # arrays, and programs that no other row needs
     return config

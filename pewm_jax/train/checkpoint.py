@@ -53,13 +53,13 @@ class Checkpoints:
         run: the run's folder.
         config: the experiment, remembered in each checkpoint.
         stage: the stage.
-        say: prints a line, for example about a damaged checkpoint.
+        log: prints a line, for example about a damaged checkpoint.
 
     Raises:
         UserError: there were checkpoints, and all are damaged.
     """
 
-    def __init__(self, run: Path, config: Config, stage: Stage, say: Callable[[str], None] = print):
+    def __init__(self, run: Path, config: Config, stage: Stage, log: Callable[[str], None] = print):
         self.run = run
         self.folder = checkpoint_files.of(run, stage.name).resolve()
         self.config = config
@@ -68,7 +68,7 @@ class Checkpoints:
         self._pool = concurrent.futures.ThreadPoolExecutor(1, "checkpoint")
         self._finishing: concurrent.futures.Future[None] | None = None
         self._began, self._interval, self._settled = time.monotonic(), 0.0, True
-        self._latest: int | None = processes.run_on_process_0(lambda: _tidied(self.folder, say))
+        self._latest: int | None = processes.run_on_process_0(lambda: _tidied(self.folder, log))
         self._quiet, self._failed = Quiet(), False
 
     def __enter__(self) -> Self:
@@ -295,11 +295,11 @@ def _read_arrays(folder: Path, like: Params) -> Params:
         )
 
 
-def _tidied(folder: Path, say: Callable[[str], None]) -> int | None:
+def _tidied(folder: Path, log: Callable[[str], None]) -> int | None:
     """Clean up the folder of a stage; returns the step of its newest undamaged checkpoint."""
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint_files.clear(folder)
-    return checkpoint_files.newest(folder, say)
+    return checkpoint_files.newest(folder, log)
 
 
 @contextlib.contextmanager

@@ -96,12 +96,12 @@ def clear(folder: Path) -> None:
             atomic.remove(path)
 
 
-def newest(folder: Path, say: Callable[[str], None]) -> int | None:
+def newest(folder: Path, log: Callable[[str], None]) -> int | None:
     """Find the newest undamaged checkpoint; newer, damaged ones are moved to ``damaged/``.
 
     Args:
         folder: the stage's checkpoints.
-        say: called with a sentence for each that is moved.
+        log: called with a sentence for each that is moved.
 
     Returns:
         Its step, None if the folder has no checkpoint.
@@ -110,11 +110,11 @@ def newest(folder: Path, say: Callable[[str], None]) -> int | None:
         UserError: all are damaged.
     """
     for step in reversed(steps(folder)):
-        found = flaws(folder / str(step), say=say)
+        found = flaws(folder / str(step), log=log)
         if not found:
             return step
         kept = _set_aside(folder, step)
-        say(
+        log(
             f"The checkpoint {folder / str(step)} is damaged ({tree.listing(found, 2)}): it is "
             f"set aside as {kept}, and the one before it is used."
         )
@@ -170,14 +170,14 @@ def seal(folder: Path) -> None:
 def flaws(
     folder: Path,
     parts: Iterable[str] = (),
-    say: Callable[[str], None] = lambda _: None,
+    log: Callable[[str], None] = lambda _: None,
 ) -> list[str]:
     """Compare a folder with its manifest.
 
     Args:
         folder: a folder that ``seal`` was called on.
         parts: look only at what lies inside these subfolders; by default at everything.
-        say: prints progress where checking takes seconds.
+        log: prints progress where checking takes seconds.
 
     Returns:
         What is wrong, such as ``state/d/3f is cut short (10 of 505 bytes)``; empty if nothing is.
@@ -203,7 +203,7 @@ def flaws(
             found.append(f"{name} {how} ({have} of {want} bytes)")
     if not found:
         total = sum(listed[name]["bytes"] for name in whole)
-        progress = _progress(f"checking {folder}", total, say)
+        progress = _progress(f"checking {folder}", total, log)
         for name, digest in _digests(whole, _digest_if_readable):
             if digest != listed[name]["sha256"]:
                 found.append(f"{name} holds other bytes than were written")
@@ -269,12 +269,12 @@ def _digest_of(files: Any) -> str:
     return hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()
 
 
-def _progress(label: str, total: int, say: Callable[[str], None]) -> Callable[[int], None]:
+def _progress(label: str, total: int, log: Callable[[str], None]) -> Callable[[int], None]:
     """Return a function that counts bytes, and prints progress every ``_EVERY_S`` seconds."""
     began = printed = time.monotonic()
     done = 0
     if total >= LARGE:
-        say(f"{label}: {total / 1e9:.1f} GB …")
+        log(f"{label}: {total / 1e9:.1f} GB …")
 
     def advance(count: int) -> None:
         nonlocal done, printed
@@ -283,7 +283,7 @@ def _progress(label: str, total: int, say: Callable[[str], None]) -> Callable[[i
             printed = now
             rate = done / (now - began)
             left = (total - done) / max(rate, 1.0)
-            say(
+            log(
                 f"{label}: {done / 1e9:.1f}/{total / 1e9:.1f} GB, {rate / 1e9:.2f} GB/s, "
                 f"{left:.0f} s left"
             )

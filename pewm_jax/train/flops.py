@@ -129,7 +129,7 @@ def of_stage(config: Config, stage: Stage, clip: Any, given: Params | None = Non
         config: the experiment.
         stage: the stage.
         clip: the batch, or its shapes.
-        given: weights that only the loss needs, see ``Stage.given``.
+        given: weights that only the loss needs, see ``Stage.extra_weights``.
     """
     clip, given = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (clip, given or {})

@@ -110,8 +110,8 @@ def require_weights(config: Config) -> None:
     Those of the model are named by ``train.start``; a stage's loss may need others.
     """
     for stage in all_stages(config):
-        if stage.given is not None and stage.settings(config).steps > 0:
-            stage.given(config.model, config.train)
+        if stage.extra_weights is not None and stage.settings(config).steps > 0:
+            stage.extra_weights(config.model, config.train)
     for where, part in _parts(config.model):
         if where in config.model.TRAINS or config.train.start:
             continue
@@ -132,7 +132,7 @@ def _parts(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Settings
             yield from _parts(part, f"{prefix}{field.name}.")
 
 
-def read_weights(config: Config, stage: Stage, say: Callable[[str], None]) -> Params | None:
+def read_weights(config: Config, stage: Stage, log: Callable[[str], None]) -> Params | None:
     """Return the weights in ``train.start``, mapped into memory; None if it is empty.
 
     What only later stages have is dropped, which is said: PEWM's memory blocks are trained further
@@ -149,7 +149,7 @@ def read_weights(config: Config, stage: Stage, say: Callable[[str], None]) -> Pa
             _stage_shapes(config, later).keys() - _stage_shapes(config, stage).keys()
         ) & params.keys()
         if extra:
-            say(
+            log(
                 f"{config.train.start}: its {' and '.join(sorted(extra))} blocks are left out; "
                 f"{later.title} begins with fresh ones"
             )

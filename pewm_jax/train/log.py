@@ -184,7 +184,7 @@ class LiveView:
         if self._bar is not None:
             self._bar.stop()
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """Print a line."""
         self._console.print(text, markup=False)
         self._printed = time.monotonic()
@@ -195,7 +195,7 @@ class LiveView:
         if self._bar is not None:
             self._bar.update(self._task, completed=step, text=text)
         elif step == self._total or time.monotonic() - self._printed >= LINE_EVERY_S:
-            self.say(f"{self._label} {step}/{self._total} {text}")
+            self.log(f"{self._label} {step}/{self._total} {text}")
 
 
 def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
@@ -318,7 +318,7 @@ class Profile:
         steps: how many steps are traced, 0 for none.
         first: the first step of this start.
         last: the last step of the stage; a trace ends with it at the latest.
-        say: prints where the trace is and what opens it.
+        log: prints where the trace is and what opens it.
     """
 
     def __init__(
@@ -329,12 +329,12 @@ class Profile:
         steps: int,
         first: int,
         last: int,
-        say: Callable[[str], Any],
+        log: Callable[[str], Any],
     ):
         self.folder = run / FOLDER / stage.name
         begin = max(min(first + SKIPPED, last - steps + 1), first)
         self._steps = range(begin, min(begin + steps, last + 1))
-        self._stage, self._say = stage, say
+        self._stage, self._say = stage, log
         self._tracing = False
         self._traced = 0
 

@@ -59,7 +59,7 @@ def train(
     *,
     preview: Preview | None = None,
     profile: int = 0,
-    say: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
 ) -> Path:
     """Train all planned stages, going on where an earlier start of the same run stopped.
 
@@ -68,7 +68,7 @@ def train(
         preview: makes sample pictures every ``config.train.preview_every`` steps and at the end
             of a stage.
         profile: steps to trace in each stage, for ``profile/`` in the run's folder.
-        say: prints a line.
+        log: prints a line.
 
     Returns:
         The run's folder, ready for ``pewm_jax.load``.
@@ -79,7 +79,7 @@ def train(
         Interrupted: Ctrl-C or SIGTERM came; everything is saved. (Where saving takes longer than
             ``train.grace_s``, and at a second signal, the process ends itself.)
     """
-    config = runs.resumed(config, say if processes.is_primary() else _silent)
+    config = runs.resumed(config, log if processes.is_primary() else _silent)
     planned = stages.planned(config)
     loading.require_weights(config)
     if config.train.wandb:
@@ -96,18 +96,18 @@ def train(
     ):
         processes.run_on_process_0(lambda: str(runs.prepare(config)))
         if processes.run_on_process_0(lambda: runs.is_finished(run, config)):
-            say(f"{run} is already trained: nothing to do.")
+            log(f"{run} is already trained: nothing to do.")
             return run
         weights: Params | None = None
         for stage in loading.remaining_stages(run, planned):
             worker = _Worker(
-                config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, say=say
+                config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, log=log
             )
             worker.start, weights = weights, None  # so they are freed once a state is made of them
             weights = worker.train()
             if stop.requested and stage is not planned[-1]:
                 raise stop.interrupted(stage.title, stage.settings(config).steps)
-    say(f"Trained: {run / runs.WEIGHTS}")
+    log(f"Trained: {run / runs.WEIGHTS}")
     return run
 
 
@@ -145,12 +145,12 @@ class _Worker:
         bad: BadRecords,
         preview: Preview | None,
         profile: int,
-        say: Callable[[str], None],
+        log: Callable[[str], None],
     ):
         self.config, self.stage, self.mesh, self.path = config, stage, mesh, run
         self.like = abstract_state(config, stage, mesh)
         self.stop, self.bad, self.preview, self.profile = stop, bad, preview, profile
-        self.say = say
+        self.log = log
 
     @property
     def settings(self) -> StageConfig:
@@ -159,7 +159,7 @@ class _Worker:
     def train(self) -> Params:
         """Train the stage, or find it done; returns its inference weights."""
         config, stage, run, steps = self.config, self.stage, self.path, self.settings.steps
-        with Checkpoints(run, config, stage, self.say) as self.checkpoints, self._writing():
+        with Checkpoints(run, config, stage, self.log) as self.checkpoints, self._writing():
             self.stop.at_once, self.stop.kept = True, self._kept
             done = self.checkpoints.latest() or 0
             if done >= steps:
@@ -168,9 +168,9 @@ class _Worker:
                 return params
             with (
                 LiveView(stage.title, steps, done) as self.view,
-                MetricsLog(run, stage, done, config) as log,
+                MetricsLog(run, stage, done, config) as metrics_log,
             ):
-                self.bad.log = self.view.say if processes.is_primary() else _print_error
+                self.bad.log = self.view.log if processes.is_primary() else _print_error
                 self.watch = Watch(
                     config,
                     stage,
@@ -178,14 +178,14 @@ class _Worker:
                     done,
                     devices=self.mesh.size,
                     view=self.view,
-                    log=log,
+                    log=metrics_log,
                     bad=self.bad,
                 )
                 self.samples = Samples(
                     config,
                     stage,
                     self.preview,
-                    say=self.view.say,
+                    log=self.view.log,
                     unless_stopped=self.stop.unless_requested,
                 )
                 state = self.run(done)
@@ -216,7 +216,7 @@ class _Worker:
             steps=self.profile if processes.is_primary() else 0,
             first=done + 1,
             last=settings.steps,
-            say=self.view.say,
+            log=self.view.log,
         )
         batches, state = iter(batches), None
         if uses_prepared(config, self.stage):
@@ -281,24 +281,24 @@ class _Worker:
 
     def _compile(self, done: int, clip: Clip, state: TrainState | None):
         """Make the state, whose first weights are compiled too, and compile the step."""
-        self.view.say(f"{self.stage.title}: compiling the training step …")
+        self.view.log(f"{self.stage.title}: compiling the training step …")
         began = time.monotonic()
         state = self._make_state(done) if state is None else state
         given = given_weights(self.config, self.stage, self.mesh)
         step_fn = compile_step(self.config, self.stage, self.mesh, clip, given)
         self.watch.flops = flops.of_stage(self.config, self.stage, clip, given).total
         took = duration(time.monotonic() - began)
-        self.view.say(f"{self.stage.title}: compiled the training step in {took}")
+        self.view.log(f"{self.stage.title}: compiled the training step in {took}")
         return state, step_fn
 
     def _make_state(self, done: int) -> TrainState:
         """Make the state of the stage's start, or read that after ``done`` steps."""
         if done:
-            self.view.say(f"{self.stage.title}: going on after step {done}")
+            self.view.log(f"{self.stage.title}: going on after step {done}")
             return self.checkpoints.restore(self.like)
         start, self.start = self.start, None
         if start is None:
-            start = loading.read_weights(self.config, self.stage, self.say)
+            start = loading.read_weights(self.config, self.stage, self.log)
         return initial_state(self.config, self.stage, self.mesh, start)
 
     def _report(self, step: int, metrics: Metrics, shown: TrainState | None = None) -> None:

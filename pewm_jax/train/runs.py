@@ -128,11 +128,11 @@ def has_begun(run: Path) -> bool:
     return (run / WEIGHTS).exists() or any(run.glob("checkpoints/*/[0-9]*"))
 
 
-def resumed(config: Config, say: Callable[[str], None] = print) -> Config:
+def resumed(config: Config, log: Callable[[str], None] = print) -> Config:
     """Return the settings with which a run is resumed.
 
     A run begun by version 3 or earlier has the settings ``KEPT`` as they were fixed then; where a
-    preset has other values now, the run's own are kept, and ``say`` gets a line.
+    preset has other values now, the run's own are kept, and ``log`` gets a line.
     """
     run = Path(config.train.run)
     if not has_begun(run):
@@ -143,7 +143,7 @@ def resumed(config: Config, say: Callable[[str], None] = print) -> Config:
     if there.noise_key != "weights" or not kept:
         return config
     listed = ", ".join(f"train.{name} {value}" for name, value in kept.items())
-    say(f"{run} keeps the settings that it was begun with: {listed}")
+    log(f"{run} keeps the settings that it was begun with: {listed}")
     return dataclasses.replace(config, train=dataclasses.replace(config.train, **kept))
 
 

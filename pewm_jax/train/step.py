@@ -140,7 +140,7 @@ def train_step(
         state: the state before.
         clip: a batch with leading B, uint8 colours and metric depth.
         key: from ``noise_key``, the same for all steps; the step's number is folded in.
-        given: weights that only the loss needs, see ``Stage.given``.
+        given: weights that only the loss needs, see ``Stage.extra_weights``.
 
     Returns:
         The state after, and scalars: ``loss``, ``grad_norm`` (before clipping),
@@ -231,7 +231,7 @@ def given_weights(config: Config, stage: Stage, mesh: Mesh) -> Params | None:
     Raises:
         UserError: it is absent or damaged.
     """
-    given = stage.given(config.model, config.train) if stage.given else None
+    given = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
     if given is None:
         return None
     everywhere = sharding.replicated(mesh)

@@ -126,7 +126,7 @@ class Watch:
             else:
                 atomic.write_text(path, json.dumps(entry, ensure_ascii=False, indent=2) + "\n")
         if skipped:
-            self.view.say(
+            self.view.log(
                 f"{self.stage.title}: step {step} is skipped, {what} are not both finite; "
                 f"{path} names its records"
             )
@@ -201,7 +201,7 @@ class Samples:
         config: the experiment.
         stage: the stage.
         preview: makes them; None for none.
-        say: prints what is compiled and made.
+        log: prints what is compiled and made.
         unless_stopped: does what a stop signal may break off, ``Stop.unless_requested``.
     """
 
@@ -211,13 +211,13 @@ class Samples:
         stage: Stage,
         preview: Preview | None,
         *,
-        say: Callable[[str], Any],
+        log: Callable[[str], Any],
         unless_stopped: Callable[[Callable[[], Previewed]], Previewed | None],
     ):
         self._every = config.train.preview_every
         self._steps = stage.settings(config).steps
         self._stage, self._preview = stage, preview
-        self._say, self._unless_stopped = say, unless_stopped
+        self._say, self._unless_stopped = log, unless_stopped
         self._made = False
 
     def due(self, step: int) -> bool:

@@ -289,7 +289,7 @@ STAGES = (
         ((STATISTICS, FREEZE), (NETWORKS, TRAIN)),
         _without_gate,
         reconstruct,
-        given=perceptual,
+        extra_weights=perceptual,
     ),
     Stage("statistics", 2, ((STATISTICS, TRAIN), (NETWORKS, FREEZE)), _without_gate, distribute),
     Stage("gate", 3, ((GATE, TRAIN), (STATISTICS, FREEZE), (NETWORKS, FREEZE)), init, mix),

@@ -64,8 +64,8 @@ def imitate(
     any_frame = jax.random.randint(keys[1], (batch,), 0, rgb.shape[1])
     other = far == 0
     picked = _frame(rgb, jnp.where(other, any_frame, now + far))
-    lent = jnp.roll(_frame(rgb, any_frame), 1, 0)
-    goal = jnp.where(other[:, None, None, None], lent, picked)
+    negative_goal = jnp.roll(_frame(rgb, any_frame), 1, 0)
+    goal = jnp.where(other[:, None, None, None], negative_goal, picked)
     steps = jnp.where(other, farthest, far).astype(jnp.float32)
     hidden = jax.random.bernoulli(keys[2], train.goal_hidden, (batch,))
 

@@ -147,20 +147,22 @@ def loss(
         train.image_noise_mean
         + train.image_noise_std * jax.random.normal(level_key, (batch, 1, 1, 1, 1))
     )
-    sight = clip.extras.get("readout") if memory else None
-    if memory and sight is None:
-        sight = clip_readout(model, params, clip)
-    if sight is not None and train.hidden:
+    readout = clip.extras.get("readout") if memory else None
+    if memory and readout is None:
+        readout = clip_readout(model, params, clip)
+    if readout is not None and train.hidden:
         kept = jax.random.bernoulli(jax.random.fold_in(key, 4), 1 - train.hidden, (batch,))
-        sight = shown(sight, kept)
+        readout = hide_readout(readout, kept)
     first, depth = frames.rgb_THWC[:, :history], frames.depth_THW[:, :history]
     if train.chained:
         again = jax.random.fold_in(key, 5)
-        first, depth = first_frames(model, train.chained, params, frames, x0, sight, again)
+        first, depth = first_frames(model, train.chained, params, frames, x0, readout, again)
     clean = first
     first = first + level * jax.random.normal(image_key, first.shape)
     if train.depth_noise:
-        depth = depth * wrong(jax.random.fold_in(image_key, 1), depth.shape, train.depth_noise)
+        depth = depth * depth_noise(
+            jax.random.fold_in(image_key, 1), depth.shape, train.depth_noise
+        )
     observed = Frames(first, depth, jax.tree.map(lambda x: x[:, :history], frames.camera))
     require_actions(model, clip.actions_TA, "the loss")
     control = Control(frames.camera, clip.actions_TA, clip.extras.get("state_A"))
@@ -171,15 +173,15 @@ def loss(
         hidden = jax.random.bernoulli(jax.random.fold_in(key, 6), blind, (batch,))
         conditioning = world_model.blind(model, params, conditioning, hidden)
     inputs, network_time = model.noise.precondition(x_t, times)
-    prediction = world_model.apply(model, params, inputs, conditioning, network_time, sight)
+    prediction = world_model.apply(model, params, inputs, conditioning, network_time, readout)
 
     error = (prediction - model.noise.prediction_target(x0, noise, times)) ** 2
     error = error * Noise.expand(model.noise.weight(times), error.ndim)
     split = model.codec.rgb_channels
     measured = jnp.broadcast_to(rgbd.measured(model, frames.depth_THW), error[..., split:].shape)
     rgb = error[..., :split].mean()
-    if conditioning.given.known_Bt is not None:
-        counted = Noise.expand(1.0 - conditioning.given.known_Bt, error.ndim)
+    if conditioning.backbone.known_Bt is not None:
+        counted = Noise.expand(1.0 - conditioning.backbone.known_Bt, error.ndim)
         rgb = (error[..., :split] * counted).mean() / jnp.maximum(counted.mean(), 1e-6)
         measured = measured * counted
     depth = (error[..., split:] * measured).sum() / jnp.maximum(measured.sum(), 1)
@@ -190,9 +192,9 @@ def loss(
     return total, {"loss_rgb": rgb, "loss_depth": depth}
 
 
-def shown(sight: MemoryReadout, kept_B: Array) -> MemoryReadout:
-    """Hide what the memory shows from the clips of a batch that are not kept."""
-    tokens, view, encoded = sight.tokens, sight.view, sight.encoded
+def hide_readout(readout: MemoryReadout, kept_B: Array) -> MemoryReadout:
+    """Mask the memory's readout for the clips of a batch that are not kept."""
+    tokens, view, encoded = readout.tokens, readout.view, readout.encoded
     if tokens is not None:
         tokens = dataclasses.replace(tokens, valid_M=tokens.valid_M & kept_B[:, None])
     if view is not None:
@@ -204,8 +206,8 @@ def shown(sight: MemoryReadout, kept_B: Array) -> MemoryReadout:
     return MemoryReadout(tokens, view, encoded)
 
 
-def wrong(key: Array, shape: tuple[int, ...], most: float) -> Array:
-    """Draw factors by which depth is wrong, as imagined depth is: broadly, and a little at pixels.
+def depth_noise(key: Array, shape: tuple[int, ...], most: float) -> Array:
+    """Draw multiplicative errors of depth: smooth over the image, and small per pixel.
 
     Args:
         key: randomness.
@@ -233,7 +235,7 @@ def first_frames(
     params: Params,
     frames: Frames,
     latents_BthwC: Array,
-    sight: MemoryReadout | None,
+    readout: MemoryReadout | None,
     key: Array,
 ) -> tuple[Array, Array]:
     """Return the first frames of a batch of clips, a share of them as the model makes them.
@@ -247,7 +249,7 @@ def first_frames(
         params: the world model's parameters.
         frames: (B, T) the clips' frames, colours in [−1, 1].
         latents_BthwC: their latents.
-        sight: what the memory shows the clips, leading axis B, or None without memory.
+        readout: what the memory shows the clips, leading axis B, or None without memory.
         key: randomness of choice, level and noise.
 
     Returns:
@@ -277,7 +279,7 @@ def first_frames(
             jax.lax.stop_gradient(params),
             leading(frames),
             leading(latents_BthwC),
-            leading(sight),
+            leading(readout),
             key,
         )
     )
@@ -290,7 +292,7 @@ def first_frames(
     return replaced(made[0], true[0]), replaced(made[1], true[1])
 
 
-def backwards(model: ModelConfig, sight: MemoryReadout) -> MemoryReadout:
+def backwards(model: ModelConfig, readout: MemoryReadout) -> MemoryReadout:
     """Return what the memory shows clips that are run backwards; leading axes B and T.
 
     Tokens have no order in time. All else is reversed along T; latents that stand for one frame
@@ -300,19 +302,19 @@ def backwards(model: ModelConfig, sight: MemoryReadout) -> MemoryReadout:
         UserError: the codec folds several frames into a latent one, and the reader takes latents,
             which cannot be reversed then.
     """
-    if sight.encoded is not None and not model.codec.framewise:
+    if readout.encoded is not None and not model.codec.framewise:
         raise UserError(
             "train.chained is above 0, which runs clips backwards, but memory.reader.picture is "
             "latents and the codec folds several frames into one latent: use a codec of single "
             "frames, memory.reader.picture pixels, or train.chained 0."
         )
-    parts = {field.name: getattr(sight, field.name) for field in dataclasses.fields(sight)}
+    parts = {field.name: getattr(readout, field.name) for field in dataclasses.fields(readout)}
     reversed_parts = {
         name: jax.tree.map(lambda x: x[:, ::-1], part)
         for name, part in parts.items()
         if name != "tokens"
     }
-    return dataclasses.replace(sight, **reversed_parts)
+    return dataclasses.replace(readout, **reversed_parts)
 
 
 def _looking_back(
@@ -320,7 +322,7 @@ def _looking_back(
     params: Params,
     frames: Frames,
     latents_BthwC: Array,
-    sight: MemoryReadout | None,
+    readout: MemoryReadout | None,
     key: Array,
 ) -> tuple[Array, Array]:
     """Run clips backwards, and return what the model makes of the frames where they arrive."""
@@ -329,15 +331,15 @@ def _looking_back(
         x0 = latents_BthwC[:, ::-1]
     else:
         x0 = rgbd.encode_rgbd(model, params, back.rgb_THWC, back.depth_THW)
-    sight = None if sight is None else backwards(model, sight)
-    view = None if sight is None else sight.view
+    readout = None if readout is None else backwards(model, readout)
+    view = None if readout is None else readout.view
     observed = jax.tree.map(lambda x: x[:, :1], back)
     conditioning = world_model.condition(model, params, observed, Control(back.camera))
     time_key, noise_key = jax.random.split(key)
     times = model.noise.draw(time_key, *x0.shape[:2])
     x_t = model.noise.corrupt(x0, jax.random.normal(noise_key, x0.shape), times)
     inputs, network_time = model.noise.precondition(x_t, times)
-    out = world_model.apply(model, params, inputs, conditioning, network_time, sight)
+    out = world_model.apply(model, params, inputs, conditioning, network_time, readout)
     latents = model.noise.to_x0(out, x_t, times)
     last = latents[:, -1:] if model.codec.framewise else latents
     rgb, depth = (x[:, -1:] for x in rgbd.decode_rgbd(model, params, last))

@@ -32,12 +32,12 @@ class ClipConditioning:
     """Everything that conditions a batch of clips, except the memory.
 
     Attributes:
-        given: the backbone's conditioning.
+        backbone: the backbone's conditioning.
         camera: (B, T) cameras of the clips' frames.
         rays_BthwC: their Plücker rays at the latent rate, for readers.
     """
 
-    given: Conditioning
+    backbone: Conditioning
     camera: Camera
     rays_BthwC: Array
 
@@ -95,7 +95,7 @@ def blind(
         conditioning: of a batch of clips.
         hidden_B: (B,) bool, the clips from which it is hidden.
     """
-    tokens = conditioning.given.tokens_BLC
+    tokens = conditioning.backbone.tokens_BLC
     if not model.backbone.GUIDED_BY_TEXT:
         return without_image(model, conditioning, hidden_B)
     stored = params.get("text", {})
@@ -104,8 +104,8 @@ def blind(
     negative = jnp.asarray(stored["negative_LC"], tokens.dtype)
     other = tokens.at[:, : len(negative)].set(negative)
     chosen = jnp.where(hidden_B[:, None, None], other, tokens)
-    given = dataclasses.replace(conditioning.given, tokens_BLC=chosen)
-    return dataclasses.replace(conditioning, given=given)
+    given = dataclasses.replace(conditioning.backbone, tokens_BLC=chosen)
+    return dataclasses.replace(conditioning, backbone=given)
 
 
 def without_image(
@@ -118,7 +118,7 @@ def without_image(
         conditioning: of a batch of clips.
         hidden_B: (B,) bool, the clips that are not to see it.
     """
-    given = conditioning.given
+    given = conditioning.backbone
 
     def hide(x: Array, channels: int) -> Array:
         there = hidden_B.reshape(-1, *(1,) * (x.ndim - 1))
@@ -132,7 +132,7 @@ def without_image(
         image_BMD=None if image is None else hide(image, image.shape[-1]),
         known_Bt=None if known is None else known & ~jnp.asarray(hidden_B)[:, None],
     )
-    return dataclasses.replace(conditioning, given=hidden)
+    return dataclasses.replace(conditioning, backbone=hidden)
 
 
 def _text(model: ModelConfig, params: Params, batch: int, more: Array | None) -> Array | None:
@@ -176,7 +176,7 @@ def apply(
     noisy_BthwC: Array,
     conditioning: ClipConditioning,
     time_B: Array,
-    sight: MemoryReadout | None = None,
+    readout: MemoryReadout | None = None,
 ) -> Array:
     """Predict the noise's target (x0, v, ε, velocity …) from noisy latents.
 
@@ -186,19 +186,19 @@ def apply(
         noisy_BthwC: (B, t, h, w, C) noisy colour and depth latents.
         conditioning: the observed frame, control and text.
         time_B: (B,) noise level as the network sees it, or (B, t), one for each latent frame.
-        sight: what the memory shows each clip, leading axis B; None is the stage-1 model.
+        readout: what the memory shows each clip, leading axis B; None is the stage-1 model.
 
     Returns:
         (B, t, h, w, C) float32 prediction.
     """
     dtype, memory_readers = jnp.dtype(model.dtype), NO_READERS
-    if sight is not None and "memory" in params:
+    if readout is not None and "memory" in params:
         memory_readers = model.memory.reader.prepare(
-            model, params["memory"], sight, conditioning.camera, conditioning.rays_BthwC
+            model, params["memory"], readout, conditioning.camera, conditioning.rays_BthwC
         )
     noisy = _seen(model, noisy_BthwC).astype(dtype)
     out = model.backbone.apply(
-        params["backbone"], noisy, time_B, conditioning.given, memory_readers
+        params["backbone"], noisy, time_B, conditioning.backbone, memory_readers
     )
     return _seen(model, out.astype(jnp.float32))
 
@@ -218,7 +218,7 @@ def draw(
     model: ModelConfig,
     params: Params,
     conditioning: ClipConditioning,
-    sight: MemoryReadout | None,
+    readout: MemoryReadout | None,
     key: Array,
     *,
     blind: ClipConditioning | None = None,
@@ -226,14 +226,14 @@ def draw(
     """Sample the latents of one clip, (1, t, h, w, C), from noise of its own; see ``sample``."""
     noise = jax.random.normal(key, (1, *model.latent_shape, model.codec.channels))
     again = jax.random.fold_in(key, 1)
-    return sample(model, params, conditioning, sight, noise, again, blind=blind)
+    return sample(model, params, conditioning, readout, noise, again, blind=blind)
 
 
 def sample(
     model: ModelConfig,
     params: Params,
     conditioning: ClipConditioning,
-    sight: MemoryReadout | None,
+    readout: MemoryReadout | None,
     noise_BthwC: Array,
     key: Array | None = None,
     *,
@@ -250,7 +250,7 @@ def sample(
         model: the model.
         params: the world model's parameters.
         conditioning: observed frame, control, text.
-        sight: what the memory shows the clips, or None for no memory.
+        readout: what the memory shows the clips, or None for no memory.
         noise_BthwC: standard normal start.
         key: randomness of the steps, if the sampler draws noise.
         blind: the conditioning without what guidance is to strengthen.
@@ -263,16 +263,16 @@ def sample(
     """
     noise = model.noise
 
-    def x0(x: Array, times: Array, given: ClipConditioning, sight: MemoryReadout | None) -> Array:
+    def x0(x: Array, times: Array, given: ClipConditioning, readout: MemoryReadout | None) -> Array:
         inputs, network_time = noise.precondition(x, times)
-        out = apply(model, params, inputs, given, network_time, sight)
+        out = apply(model, params, inputs, given, network_time, readout)
         return noise.to_x0(out, x, times)
 
     def denoise(x: Array, times: Array, weight: Array) -> Array:
-        clean = x0(x, times, conditioning, sight)
-        if noise.guidance != 1 and (sight is not None or blind is not None):
+        clean = x0(x, times, conditioning, readout)
+        if noise.guidance != 1 and (readout is not None or blind is not None):
             without = x0(x, times, blind or conditioning, None)
             clean = without + weight * (clean - without)
-        return backbones.held(conditioning.given, clean)
+        return backbones.held(conditioning.backbone, clean)
 
     return noise.sample(denoise, noise_BthwC, key)

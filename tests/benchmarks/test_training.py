@@ -37,7 +37,7 @@ def parts(benchmark):
 def test_the_clocks_see_every_step_save_and_line_of_the_real_loop(parts, fake_model, tmp_path):
     config = fakes.config(tmp_path / "run", stage1=12, stage2=12, save_every=4)
     with parts.clocks() as spans:
-        loop.train(config, say=lambda _: None)
+        loop.train(config, log=lambda _: None)
     assert len(spans["step1"]) == len(spans["step2"]) == 12
     assert len(spans["save"]) == 6
     assert len(spans["compile"]) == len(spans["initial"]) == 2
@@ -54,7 +54,7 @@ def test_the_clocks_see_every_step_save_and_line_of_the_real_loop(parts, fake_mo
 
 def test_an_interrupted_training_is_measured_and_goes_on(parts, fake_model, tmp_path, monkeypatch):
     config = fakes.config(tmp_path / "run", stage1=8, stage2=8, save_every=100)
-    monkeypatch.setattr("train.main", lambda argv: loop.train(config, say=lambda _: None))
+    monkeypatch.setattr("train.main", lambda argv: loop.train(config, log=lambda _: None))
     spans = parts.train_with_clocks(["any"], interrupt=(2, 5))
     assert (len(spans["step1"]), len(spans["step2"])) == (8, 5)
     spans = parts.train_with_clocks(["any"])

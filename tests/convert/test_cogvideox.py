@@ -231,7 +231,7 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
         ..., : old.out_channels
     ]
     want = jax.jit(dit.apply, static_argnums=0)(
-        old, params, video, conditioning.given.tokens_BLC, times
+        old, params, video, conditioning.backbone.tokens_BLC, times
     )
     want = want[:, -got.shape[1] :]
     assert np.abs(want).max() > 0.1

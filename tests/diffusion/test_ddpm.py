@@ -159,21 +159,21 @@ def test_guidance_interpolates_between_with_and_without_map():
     clip, key = make_clip(), jax.random.key(0)
     params = randomise(init_world(TINY, key))
     conditioning = conditioning_of(TINY, params, clip)
-    sight = objective.clip_readout(TINY, params, clip)
+    readout = objective.clip_readout(TINY, params, clip)
     noise = jax.random.normal(key, (2, 3, 4, 6, 256))
 
-    def run(guidance, sight, **more):
+    def run(guidance, readout, **more):
         settings = dataclasses.replace(TINY.noise, guidance=guidance, sample_steps=1, **more)
-        return sample(tiny_model(noise=settings), params, conditioning, sight, noise)
+        return sample(tiny_model(noise=settings), params, conditioning, readout, noise)
 
-    with_map, without = run(1.0, sight), run(1.0, None)
-    np.testing.assert_allclose(run(0.0, sight), without, atol=1e-5)
-    np.testing.assert_allclose(run(3.0, sight), without + 3 * (with_map - without), atol=1e-3)
+    with_map, without = run(1.0, readout), run(1.0, None)
+    np.testing.assert_allclose(run(0.0, readout), without, atol=1e-5)
+    np.testing.assert_allclose(run(3.0, readout), without + 3 * (with_map - without), atol=1e-3)
     assert np.abs(with_map - without).max() > 1e-4
     settings = DDPMConfig(sample_steps=1, guidance=3.0, dynamic_guidance=True)
     (weight,) = settings.guidance_weights()
     assert 1 <= weight <= 4
-    swung = run(3.0, sight, dynamic_guidance=True)
+    swung = run(3.0, readout, dynamic_guidance=True)
     np.testing.assert_allclose(swung, without + weight * (with_map - without), atol=1e-3)
 
 

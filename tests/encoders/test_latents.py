@@ -125,14 +125,14 @@ def sight_of(kind, encoded):
     """What a reader of pictures is shown, without a token."""
     if not model_of(kind).memory.reader.READS_TOKENS:
         return MemoryReadout(encoded=encoded)
-    sight = look(model_of(kind), weights(kind), batch())
-    tokens = dataclasses.replace(sight.tokens, valid_M=jnp.zeros_like(sight.tokens.valid_M))
+    readout = look(model_of(kind), weights(kind), batch())
+    tokens = dataclasses.replace(readout.tokens, valid_M=jnp.zeros_like(readout.tokens.valid_M))
     return MemoryReadout(tokens, encoded=encoded)
 
 
-def predict(kind, params, sight):
+def predict(kind, params, readout):
     conditioning, _, noisy = inputs()
-    return apply(model_of(kind), params, noisy, conditioning, TIMES, sight)
+    return apply(model_of(kind), params, noisy, conditioning, TIMES, readout)
 
 
 def test_features_are_the_latents_of_each_frame_s_colours():
@@ -151,24 +151,24 @@ def test_features_are_the_latents_of_each_frame_s_colours():
 @ALL
 def test_a_rollout_looks_as_training_does(kind):
     model, params, clips = model_of(kind), weights(kind), batch()
-    sight = look(model, params, clips)
+    readout = look(model, params, clips)
     reader = model.memory.reader
     given = {
-        field.name for field in dataclasses.fields(MemoryReadout) if getattr(sight, field.name)
+        field.name for field in dataclasses.fields(MemoryReadout) if getattr(readout, field.name)
     }
     asked = {"tokens": reader.READS_TOKENS, "encoded": reader.READS_LATENTS}
     asked["view"] = reader.READS_VIEW and not reader.READS_LATENTS
     assert given == {name for name, wanted in asked.items() if wanted}
     if reader.READS_LATENTS:
-        assert sight.encoded.latents_thwC.shape == (2, *GRID, 8)
-        assert sight.encoded.seen_THW.mean() > 0.1
+        assert readout.encoded.latents_thwC.shape == (2, *GRID, 8)
+        assert readout.encoded.seen_THW.mean() > 0.1
     again = jax.jit(
         lambda params, memory, camera: memories.readout(model, memory, camera, params=params)
     )
     for i in range(2):
         frames = jax.tree.map(lambda x, i=i: x[i], clips.frames)
         alone = again(params, start(model, params, frames).map, frames.camera)
-        one = jax.tree.map(lambda x, i=i: x[i], sight)
+        one = jax.tree.map(lambda x, i=i: x[i], readout)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), alone, one)
 
 
@@ -194,11 +194,11 @@ def test_a_fresh_reader_and_an_empty_memory_change_nothing_bit_for_bit(kind):
     fresh = {**learned, "memory": init_world(model_of(kind))["memory"]}
     base = predict(kind, {"backbone": learned["backbone"]}, None)
     assert np.abs(base).max() > 0.1
-    sight = sight_of(kind, encoded)
-    np.testing.assert_array_equal(predict(kind, fresh, sight), base)
-    nothing = objective.shown(sight, jnp.zeros((2,), bool))
+    readout = sight_of(kind, encoded)
+    np.testing.assert_array_equal(predict(kind, fresh, readout), base)
+    nothing = objective.shown(readout, jnp.zeros((2,), bool))
     np.testing.assert_array_equal(predict(kind, learned, nothing), base)
-    first = objective.shown(sight, jnp.array([True, False]))
+    first = objective.shown(readout, jnp.array([True, False]))
     np.testing.assert_array_equal(predict(kind, learned, first)[1], base[1])
     assert np.abs(predict(kind, learned, first)[0] - base[0]).max() > 1e-3
 

@@ -56,11 +56,11 @@ def compile_once():
     """Let equal programs of this file be compiled once; compiling is most of its time."""
     compiled = {}
 
-    def cached(name, function, arguments, say):
+    def cached(name, function, arguments, log):
         shapes = jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), arguments)
         key = name, str(shapes)
         if key not in compiled:
-            compiled[key] = original(name, function, arguments, say)
+            compiled[key] = original(name, function, arguments, log)
         return compiled[key]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -117,7 +117,7 @@ def test_they_train_save_load_and_imagine(tmp_path, monkeypatch):
             step += 1
 
     monkeypatch.setattr(loader, "clips", clips)
-    run = loop.train(config, say=lambda _line: None)
+    run = loop.train(config, log=lambda _line: None)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert [(line["stage"], line["step"]) for line in lines][-1] == (2, 2)
 

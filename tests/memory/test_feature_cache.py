@@ -42,7 +42,7 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def cache(params, data, tmp_path_factory):
     out = tmp_path_factory.mktemp("cache") / "train"
-    feature_build.build(CONFIG, params, data, out, batch=4, dtype="float32", say=quiet)
+    feature_build.build(CONFIG, params, data, out, batch=4, dtype="float32", log=quiet)
     return feature_cache.open_cache(out, CONFIG, params, data)
 
 
@@ -60,7 +60,7 @@ def test_what_is_read_is_what_the_encoder_makes(cache, params, data):
 
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
 def test_half_precision_takes_half_the_space(cache, params, data, dtype, tmp_path):
-    small = feature_build.build(CONFIG, params, data, tmp_path / "c", dtype=dtype, say=quiet)
+    small = feature_build.build(CONFIG, params, data, tmp_path / "c", dtype=dtype, log=quiet)
     got = feature_cache.features(small, "episode-1", range(7))
     want = feature_cache.features(cache, "episode-1", range(7))
     assert got.dtype.name == dtype
@@ -81,16 +81,16 @@ def test_a_build_goes_on_after_the_last_whole_episode(cache, params, data, tmp_p
     with monkeypatch.context() as patch:
         patch.setattr(weights, "save", stop_at_the_second)
         with pytest.raises(KeyboardInterrupt):
-            feature_build.build(*arguments, dtype="float32", batch=4, say=quiet)
+            feature_build.build(*arguments, dtype="float32", batch=4, log=quiet)
     with pytest.raises(UserError, match="is not finished"):
         feature_cache.open_cache(out, CONFIG, params, data)
     with pytest.raises(UserError, match="begun with dtype float32, not float16"):
-        feature_build.build(*arguments, dtype="float16", say=quiet)
+        feature_build.build(*arguments, dtype="float16", log=quiet)
     other = jax.tree.map(lambda leaf: leaf + 1, params)
     with pytest.raises(UserError, match="other encoder weights"):
-        feature_build.build(CONFIG, other, data, out, dtype="float32", say=quiet)
+        feature_build.build(CONFIG, other, data, out, dtype="float32", log=quiet)
     before = made[0].stat().st_mtime_ns
-    feature_build.build(*arguments, dtype="float32", batch=4, say=quiet)
+    feature_build.build(*arguments, dtype="float32", batch=4, log=quiet)
     assert made[0].stat().st_mtime_ns == before
     resumed = feature_cache.open_cache(out, CONFIG, params, data)
     assert resumed.files == cache.files
@@ -135,12 +135,12 @@ def test_what_is_not_there_is_refused(cache, params, data, tmp_path):
         feature_cache.open_cache(tmp_path, CONFIG, params, data)
     (tmp_path / "other.txt").write_text("mine")
     with pytest.raises(UserError, match=r"holds other files \(other.txt\)"):
-        feature_build.build(CONFIG, params, data, tmp_path, say=quiet)
+        feature_build.build(CONFIG, params, data, tmp_path, log=quiet)
 
 
 def test_damaged_files_are_refused(params, data, tmp_path):
     out = tmp_path / "cache"
-    cache = feature_build.build(CONFIG, params, data, out, say=quiet)
+    cache = feature_build.build(CONFIG, params, data, out, log=quiet)
     file = out / cache.files["episode-0"][0]
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(UserError, match="damaged or cut short"):
@@ -154,7 +154,7 @@ def test_damaged_files_are_refused(params, data, tmp_path):
 def test_features_beyond_float16_are_refused(params, data, tmp_path):
     large = {**params, "norm": {**params["norm"], "scale": params["norm"]["scale"] * 1e6}}
     with pytest.raises(UserError, match=r"float16 does not hold .* --dtype bfloat16"):
-        feature_build.build(CONFIG, large, data, tmp_path / "cache", say=quiet)
+        feature_build.build(CONFIG, large, data, tmp_path / "cache", log=quiet)
 
 
 def test_the_command_fills_every_split_with_either_encoder(cache, params, data, tmp_path, capsys):

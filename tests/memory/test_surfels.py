@@ -266,14 +266,14 @@ def test_surfels_show_a_house_better_than_the_voxel_map():
         assert int(memory.outside) == 0
         if name == "surfels":
             view = model.memory.render_colours(memory, target.camera, 64, 64)
-            colours, sight = view.features_THWF, view.seen_THW
+            colours, readout = view.features_THWF, view.seen_THW
         else:
             view = memories.render(model, memory, target.camera, 64, 64)
             flat = memories.colours(model, view.features_THWF.reshape(-1, encoder.channels))
-            colours, sight = flat.reshape(truth.shape), view.seen_THW
-        filled = views.fill_nearest(rendering.View(colours, view.depth_THW, sight))
+            colours, readout = flat.reshape(truth.shape), view.seen_THW
+        filled = views.fill_nearest(rendering.View(colours, view.depth_THW, readout))
         reached[name] = decibels(filled.features_THWF, truth, seen)
-        shown[name] = np.asarray(sight)[seen].mean()
+        shown[name] = np.asarray(readout)[seen].mean()
         assert (np.asarray(filled.depth_THW) > 0).all()
     assert reached["surfels"] > reached["voxel"] + 2, reached
     assert shown["surfels"] > 0.95, shown

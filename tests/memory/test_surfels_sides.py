@@ -130,10 +130,10 @@ def test_what_the_memory_showed_is_not_remembered_again_as_imagined():
     new = np.asarray(pewm.new_surfaces(model, two, shown).depth_THW)
     np.testing.assert_array_equal(new, np.where(seen[0, 1:], 0, 2).astype(np.float32))
     again = tiny_model(memory=SurfelConfig(**{**vars(FINE), "imagined_again": True}))
-    for whole, sight in (
+    for whole, readout in (
         (model, None),
         (model, MemoryReadout()),
         (again, shown),
         (tiny_model(), shown),
     ):
-        assert pewm.new_surfaces(whole, two, sight) is two
+        assert pewm.new_surfaces(whole, two, readout) is two

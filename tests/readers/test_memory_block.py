@@ -282,7 +282,7 @@ def test_a_denoiser_without_depth_neither_sees_nor_makes_any():
     given = []
     for depth in (batch.depth_THW, batch.depth_THW + 1):
         observed = jax.tree.map(lambda x: x[:, :1], dataclasses.replace(batch, depth_THW=depth))
-        given.append(condition(model, {}, observed, Control(batch.camera)).given)
+        given.append(condition(model, {}, observed, Control(batch.camera)).backbone)
     jax.tree.map(np.testing.assert_array_equal, *given)
     assert np.abs(given[0].joined_BthwC[..., :split]).max() > 0.1
 
@@ -302,5 +302,5 @@ def test_without_depth_training_weighs_colour_alone_and_rollouts_add_nothing_to_
     np.testing.assert_array_equal(made.depth_THW, 0)
     for a, b in zip(jax.tree.leaves(after.map), jax.tree.leaves(state.map), strict=True):
         np.testing.assert_array_equal(a, b)
-    sight = jax.jit(objective.clip_readout, static_argnums=0)(model, params, batch)
-    assert np.asarray(sight.tokens.valid_M).any()
+    readout = jax.jit(objective.clip_readout, static_argnums=0)(model, params, batch)
+    assert np.asarray(readout.tokens.valid_M).any()

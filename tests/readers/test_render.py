@@ -54,76 +54,76 @@ def inputs():
     first = jax.tree.map(lambda x: x[:, :1], camera)
     observed = Frames(jnp.tanh(draw(2, 1, 16, 24, 3)), depth[:, :1], first)
     conditioning = condition(TINY, {}, observed, Control(camera))
-    sight = MemoryReadout(
+    readout = MemoryReadout(
         MapTokens(draw(2, 20, 6), draw(2, 20, 3), jnp.ones((2, 20), bool)),
         View(draw(2, 9, 16, 24, 6), depth, jnp.asarray(rng.uniform(size=(2, 9, 16, 24)) < 0.6)),
     )
-    return conditioning, sight, draw(2, *TINY.latent_shape, TINY.codec.channels)
+    return conditioning, readout, draw(2, *TINY.latent_shape, TINY.codec.channels)
 
 
-def predict(model, params, sight):
+def predict(model, params, readout):
     conditioning, _, noisy = inputs()
-    return apply(model, params, noisy, conditioning, TIMES, sight)
+    return apply(model, params, noisy, conditioning, TIMES, readout)
 
 
-def hidden(sight):
+def hidden(readout):
     """The same, but the memory shows nothing."""
-    tokens, view = sight.tokens, sight.view
+    tokens, view = readout.tokens, readout.view
     tokens = dataclasses.replace(tokens, valid_M=jnp.zeros_like(tokens.valid_M))
     return MemoryReadout(tokens, dataclasses.replace(view, seen_THW=jnp.zeros_like(view.seen_THW)))
 
 
 @ALL
 def test_a_fresh_reader_changes_nothing_bit_for_bit(kind):
-    model, (_, sight, _) = model_of(kind), inputs()
+    model, (_, readout, _) = model_of(kind), inputs()
     params = init_world(model)
     params["backbone"] = randomise(params["backbone"])
     base = predict(TINY, {"backbone": params["backbone"]}, None)
     assert np.abs(base).max() > 0.1
-    np.testing.assert_array_equal(predict(model, params, sight), base)
+    np.testing.assert_array_equal(predict(model, params, readout), base)
 
 
 @ALL
 def test_an_empty_memory_changes_nothing_bit_for_bit_whatever_was_learned(kind):
-    model, (_, sight, _) = model_of(kind), inputs()
+    model, (_, readout, _) = model_of(kind), inputs()
     params = randomise(init_world(model))
     backbone = {"backbone": params["backbone"]}
     base = predict(TINY, backbone, None)
-    np.testing.assert_array_equal(predict(model, params, hidden(sight)), base)
-    np.testing.assert_array_equal(predict(model, backbone, sight), base)
-    assert np.abs(predict(model, params, sight) - base).max() > 1e-3
+    np.testing.assert_array_equal(predict(model, params, hidden(readout)), base)
+    np.testing.assert_array_equal(predict(model, backbone, readout), base)
+    assert np.abs(predict(model, params, readout) - base).max() > 1e-3
 
 
 @RENDERS
 def test_what_features_say_where_nothing_is_seen_is_not_read(kind):
-    model, (_, sight, _) = model_of(kind), inputs()
+    model, (_, readout, _) = model_of(kind), inputs()
     params = randomise(init_world(model))
-    seen = sight.view.seen_THW
+    seen = readout.view.seen_THW
     junk = View(
-        jnp.where(seen[..., None], sight.view.features_THWF, jnp.nan),
-        sight.view.depth_THW,
+        jnp.where(seen[..., None], readout.view.features_THWF, jnp.nan),
+        readout.view.depth_THW,
         seen,
     )
-    base = predict(model, params, sight)
-    np.testing.assert_array_equal(predict(model, params, MemoryReadout(sight.tokens, junk)), base)
+    base = predict(model, params, readout)
+    np.testing.assert_array_equal(predict(model, params, MemoryReadout(readout.tokens, junk)), base)
 
 
 def test_each_token_gets_the_pixels_that_it_stands_for():
-    model, (conditioning, sight, _) = model_of("render"), inputs()
+    model, (conditioning, readout, _) = model_of("render"), inputs()
     params = randomise(init_world(model)["memory"])
     camera, rays = conditioning.camera, conditioning.rays_BthwC
     added = functools.partial(
         model.memory.reader.prepare, model, params, camera=camera, rays_BthwC=rays
     )
-    base = added(sight=sight).added_BND.reshape(2, 3, 2, 3, -1)
+    base = added(readout=readout).added_BND.reshape(2, 3, 2, 3, -1)
     rng = np.random.default_rng(1)
     for frame, row, column in zip(*(rng.integers(n, size=6) for n in (9, 16, 24)), strict=True):
-        features = sight.view.features_THWF.at[1, frame, row, column].add(3.0)
-        seen = sight.view.seen_THW.at[:, frame, row, column].set(True)
-        moved = dataclasses.replace(sight.view, features_THWF=features, seen_THW=seen)
-        shown = dataclasses.replace(sight.view, seen_THW=seen)
-        other = added(sight=MemoryReadout(None, moved)).added_BND.reshape(base.shape)
-        same = added(sight=MemoryReadout(None, shown)).added_BND.reshape(base.shape)
+        features = readout.view.features_THWF.at[1, frame, row, column].add(3.0)
+        seen = readout.view.seen_THW.at[:, frame, row, column].set(True)
+        moved = dataclasses.replace(readout.view, features_THWF=features, seen_THW=seen)
+        shown = dataclasses.replace(readout.view, seen_THW=seen)
+        other = added(readout=MemoryReadout(None, moved)).added_BND.reshape(base.shape)
+        same = added(readout=MemoryReadout(None, shown)).added_BND.reshape(base.shape)
         changed = np.argwhere(np.abs(other - same).max(-1) > 0).tolist()
         assert changed == [[1, (frame + 3) // 4, row // 8, column // 8]]
 
@@ -132,21 +132,21 @@ def test_many_channels_are_reduced_and_a_token_in_time_may_hold_two_latent_frame
     backbone = dataclasses.replace(TINY.backbone, patch_t=2)
     reader = RenderConfig(picture_width=16, reduced=2)
     memory = dataclasses.replace(TINY.memory, reader=reader)
-    model, (_, sight, _) = tiny_model(memory=memory, backbone=backbone), inputs()
+    model, (_, readout, _) = tiny_model(memory=memory, backbone=backbone), inputs()
     assert render_reader.pixel_channels(model) == 4
     params = init_world(model)
     assert params["memory"]["render"]["reduce"]["kernel"].shape == (6, 2)
     params["backbone"] = randomise(params["backbone"])
-    fresh = predict(model, params, sight)
+    fresh = predict(model, params, readout)
     np.testing.assert_array_equal(fresh, predict(model, {"backbone": params["backbone"]}, None))
-    assert np.abs(predict(model, randomise(params), sight) - fresh).max() > 1e-3
+    assert np.abs(predict(model, randomise(params), readout) - fresh).max() > 1e-3
 
 
 def test_a_block_takes_a_time_for_each_frame():
-    model, (conditioning, sight, _) = model_of("render"), inputs()
+    model, (conditioning, readout, _) = model_of("render"), inputs()
     params = randomise(init_world(model)["memory"])
     read = model.memory.reader.prepare(
-        model, params, sight, conditioning.camera, conditioning.rays_BthwC
+        model, params, readout, conditioning.camera, conditioning.rays_BthwC
     )
     layer = jax.tree.map(lambda x: x[0], read.params)
     rng = np.random.default_rng(0)
@@ -171,31 +171,33 @@ def batch_of(model, count=2):
 def test_a_rollout_looks_as_training_does(memory):
     model = model_of("both", memory)
     batch = batch_of(model)
-    sight = look(model, {}, batch)
-    assert sight.view.features_THWF.shape == (2, 9, 16, 24, model.memory.rendered_channels)
-    assert sight.view.seen_THW.mean() > 0.1
+    readout = look(model, {}, batch)
+    assert readout.view.features_THWF.shape == (2, 9, 16, 24, model.memory.rendered_channels)
+    assert readout.view.seen_THW.mean() > 0.1
     start = jax.jit(pewm.start, static_argnums=0)
     again = jax.jit(functools.partial(memories.readout, model))
     for i in range(2):
         frames = jax.tree.map(lambda x, i=i: x[i], batch.frames)
         alone = again(start(model, {}, frames).map, frames.camera)
-        one = jax.tree.map(lambda x, i=i: x[i], sight)
+        one = jax.tree.map(lambda x, i=i: x[i], readout)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), alone, one)
 
 
 def test_readers_get_what_they_ask_for():
     batch = batch_of(None)
     for kind, wanted in {"attend": "tokens", "render": "view", "both": "tokens view"}.items():
-        sight = jax.eval_shape(functools.partial(objective.clip_readout, model_of(kind), {}), batch)
-        given = {name for name in ("tokens", "view") if getattr(sight, name) is not None}
+        readout = jax.eval_shape(
+            functools.partial(objective.clip_readout, model_of(kind), {}), batch
+        )
+        given = {name for name in ("tokens", "view") if getattr(readout, name) is not None}
         assert given == set(wanted.split())
 
 
 @RENDERS
 def test_without_a_memory_there_is_nothing_to_see_but_a_reader_to_train(kind):
     model = model_of(kind, NoMemoryConfig)
-    sight = look(model, {}, batch_of(model))
-    assert not np.asarray(sight.view.seen_THW).any()
+    readout = look(model, {}, batch_of(model))
+    assert not np.asarray(readout.view.seen_THW).any()
     params = randomise(init_world(model))
     base = predict(model, {"backbone": params["backbone"]}, None)
-    assert np.abs(predict(model, params, sight) - base).max() > 1e-3
+    assert np.abs(predict(model, params, readout) - base).max() > 1e-3

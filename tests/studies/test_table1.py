@@ -97,10 +97,10 @@ def test_the_whole_table_is_made(made):
     assert results["about"]["hours"]["clock"] > 0
 
 
-def whole(folder, say, out=None):
+def whole(folder, log, out=None):
     """Make the table, as the command does."""
     base, out = small(folder / "data"), out or folder / "out"
-    return table1.run(base, out, minutes=(1, 1), steps=(2, 2), seeds=[0], log=say)
+    return table1.run(base, out, minutes=(1, 1), steps=(2, 2), seeds=[0], log=log)
 
 
 @pytest.mark.slow
@@ -280,7 +280,7 @@ def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
     seconds |= {"voxel-attend-sinusoid-time_4": 1.0, "none-attend-time_4": 0.8}
     asked, pace = [], 1.0
 
-    def measured(study, which, say):
+    def measured(study, which, log):
         asked.extend(row.name for row in which.values())
         return {model: pace * seconds[row.name] for model, row in which.items()}
 

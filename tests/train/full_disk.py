@@ -42,7 +42,7 @@ def train(config):
     """Train as the command line does; returns the exit code and what it prints to stderr."""
     told = io.StringIO()
     with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
-        code = cli.run(lambda _: loop.train(config, say=lambda _: None) and 0, [])
+        code = cli.run(lambda _: loop.train(config, log=lambda _: None) and 0, [])
     return code, told.getvalue()
 
 

@@ -45,7 +45,7 @@ def start(folder, name):
         with (folder / f"{name}.txt").open("a") as told:
             os.dup2(told.fileno(), 1)
             os.dup2(told.fileno(), 2)
-            loop.train(config(folder, name), say=print)
+            loop.train(config(folder, name), log=print)
         code = 0
     finally:
         os._exit(code)

@@ -89,9 +89,9 @@ def test_a_memory_hidden_from_all_clips_is_an_empty_one(world):
 
 
 def test_the_memory_is_hidden_clip_by_clip(world):
-    sight = world[1].extras["readout"]
+    readout = world[1].extras["readout"]
     kept = jnp.array([True, False, True, False])
-    partly = objective.shown(sight, kept)
+    partly = objective.hide_readout(readout, kept)
     for row, whole in enumerate(kept):
         tokens, seen = partly.tokens.valid_M[row], partly.view.seen_THW[row]
         assert tokens.all() == tokens.any() == seen.all() == seen.any() == whole
@@ -133,15 +133,15 @@ def looking_back(monkeypatch, config, share):
     model, ready = config.model, ready_batch(config)
     got = {}
 
-    def apply(model, params, noisy, conditioning, time, sight):
-        got.update(conditioning=conditioning, sight=sight, time=time)
+    def apply(model, params, noisy, conditioning, time, readout):
+        got.update(conditioning=conditioning, readout=readout, time=time)
         back = jax.tree.map(lambda x: x[: len(noisy), ::-1], ready.frames)
         return rgbd.encode_rgbd(model, {}, back.rgb_THWC, back.depth_THW)
 
     @jax.jit
     def made():
-        sight, latents = ready.extras["readout"], ready.extras["latents_thwC"]
-        out = chained.first_frames(model, share, {}, ready.frames, latents, sight, KEY)
+        readout, latents = ready.extras["readout"], ready.extras["latents_thwC"]
+        out = chained.first_frames(model, share, {}, ready.frames, latents, readout, KEY)
         return out, dict(got)
 
     monkeypatch.setattr(world_model, "apply", apply)
@@ -160,7 +160,7 @@ def test_the_clip_before_leads_back_to_the_first_frame(monkeypatch):
     np.testing.assert_array_equal(rgb, 0)
     poses = frames.camera.world_from_camera[:, ::-1]
     np.testing.assert_array_equal(got["conditioning"].camera.world_from_camera, poses)
-    observed = got["conditioning"].given.joined_BthwC[:, 0, ..., : model.codec.channels]
+    observed = got["conditioning"].backbone.joined_BthwC[:, 0, ..., : model.codec.channels]
     np.testing.assert_allclose(observed, ready.extras["latents_thwC"][:, -1], atol=1e-5)
     np.testing.assert_array_equal(got["sight"].view.depth_THW[0, :, 0, 0], [5, 4, 3, 2, 1])
     np.testing.assert_array_equal(
@@ -224,12 +224,12 @@ def test_the_forward_pass_of_chained_clips_is_counted():
 )
 def test_a_clip_that_is_run_backwards_is_shown_the_memory_backwards(field):
     """Every part of what the memory shows, also one that is added later."""
-    sight = shows(CONFIG)
+    readout = shows(CONFIG)
     latents = np.random.default_rng(1).normal(size=(BATCH, 5, 4, 4, 3)).astype(np.float32)
-    sight = dataclasses.replace(sight, encoded=EncodedView(latents, sight.view.seen_THW))
-    back = chained.backwards(CONFIG.model, sight)
-    assert back.tokens is sight.tokens
-    forward, there = (jax.tree.leaves(getattr(each, field)) for each in (sight, back))
+    readout = dataclasses.replace(readout, encoded=EncodedView(latents, readout.view.seen_THW))
+    back = chained.backwards(CONFIG.model, readout)
+    assert back.tokens is readout.tokens
+    forward, there = (jax.tree.leaves(getattr(each, field)) for each in (readout, back))
     assert forward
     for a, b in zip(forward, there, strict=True):
         np.testing.assert_array_equal(b, a[:, ::-1])
@@ -237,8 +237,8 @@ def test_a_clip_that_is_run_backwards_is_shown_the_memory_backwards(field):
 
 def test_encoded_pictures_of_folded_frames_cannot_be_run_backwards():
     folded = config_of(PixelConfig(spatial=4, temporal=4)).model
-    sight = shows(CONFIG)
-    seen = sight.view.seen_THW
-    sight = MemoryReadout(sight.tokens, None, EncodedView(np.zeros((BATCH, 2, 4, 4, 3)), seen))
+    readout = shows(CONFIG)
+    seen = readout.view.seen_THW
+    readout = MemoryReadout(readout.tokens, None, EncodedView(np.zeros((BATCH, 2, 4, 4, 3)), seen))
     with pytest.raises(UserError, match="folds several frames into one latent: use a codec of"):
-        chained.backwards(folded, sight)
+        chained.backwards(folded, readout)

@@ -183,13 +183,13 @@ def of_32(batch):
 def test_lpips_counts_as_much_as_it_weighs(tmp_path):
     config = perceptual(tmp_path)
     stage, make = worlds.stages(config)[0], of_32(batch)
-    params, given = init(config, jax.random.key(0)), stage.given(config.model, config.train)
+    params, given = init(config, jax.random.key(0)), stage.extra_weights(config.model, config.train)
     clip, key = make(config), jax.random.key(1)
     loss = jax.jit(stage.loss, static_argnums=(0, 1))
     whole, measured = loss(config.model, config.train, params | given, clip, key)
     plain = dataclasses.replace(config.train, lpips_weight=0.0)
     without, few = loss(config.model, plain, params, clip, key)
-    assert stage.given(config.model, plain) is None
+    assert stage.extra_weights(config.model, plain) is None
     assert "lpips" not in few
     assert measured["lpips"] > 0
     assert whole == pytest.approx(float(without + 0.5 * measured["lpips"]), rel=1e-5)
@@ -199,7 +199,7 @@ def test_lpips_counts_as_much_as_it_weighs(tmp_path):
 def test_lpips_can_be_descended(tmp_path):
     config = perceptual(tmp_path)
     stage, make = worlds.stages(config)[0], of_32(batch)
-    params, given = init(config, jax.random.key(0)), stage.given(config.model, config.train)
+    params, given = init(config, jax.random.key(0)), stage.extra_weights(config.model, config.train)
     clip = make(config)
     only = dataclasses.replace(
         config.train, lpips_weight=1.0, gradient_weight=0.0, squared_weight=0.0
@@ -224,7 +224,7 @@ def test_the_trainer_reads_lpips_and_saves_none_of_it(clips, monkeypatch, tmp_pa
 
     monkeypatch.setattr(loader, "clips", endless)
     config = perceptual(tmp_path)
-    run = loop.train(config, say=lambda _line: None)
+    run = loop.train(config, log=lambda _line: None)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert [("lpips" in line) for line in lines] == [True, True, False, False]
     assert set(pewm_jax.load(run)[1]) == {"codec"}
@@ -247,7 +247,7 @@ def test_lpips_without_weights_is_refused_before_anything_is_written(tmp_path, m
 
 def test_it_is_trained_stopped_in_the_middle_loaded_and_no_world_model(clips, tmp_path):
     config = experiment(tmp_path / "run")
-    run = loop.train(config, say=lambda _line: None)
+    run = loop.train(config, log=lambda _line: None)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert [(x["stage"], x["step"]) for x in lines] == [(1, 1), (1, 2), (2, 1), (2, 2)]
     assert {"psnr_rgb", "depth_m"} <= lines[0].keys()
@@ -270,7 +270,7 @@ def test_it_is_trained_stopped_in_the_middle_loaded_and_no_world_model(clips, tm
 
 
 def test_a_model_starts_from_it_and_is_refused_without_it(clips, tmp_path):
-    run = loop.train(experiment(tmp_path / "run"), say=lambda _line: None)
+    run = loop.train(experiment(tmp_path / "run"), log=lambda _line: None)
     tiny = presets.load("tiny")
     backbone = dataclasses.replace(tiny.model.backbone, patch=1)
     clip = ClipConfig(frames=3, height=16, width=24)
@@ -333,7 +333,7 @@ def recorded(folder, scenes, holes=False):
 
 
 def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
-    run = loop.train(experiment(tmp_path / "run"), say=lambda _line: None)
+    run = loop.train(experiment(tmp_path / "run"), log=lambda _line: None)
     data = tmp_path / "data"
     recorded(data / "validation", 3)
     recorded(data / "blind", 1, holes=True)

@@ -29,7 +29,7 @@ def config(tmp_path_factory):
     tiny = dataclasses.replace(tiny, data=dataclasses.replace(tiny.data, **paths))
     train, kept = root / "data" / "train", root / "features" / "train"
     feature_build.build(
-        tiny.model.memory.encoder, {}, train, kept, dtype="float32", say=lambda _: None
+        tiny.model.memory.encoder, {}, train, kept, dtype="float32", log=lambda _: None
     )
     return tiny
 
@@ -45,12 +45,12 @@ def test_the_map_of_kept_features_is_the_map_of_computed_ones(config):
     assert not kept.context_valid_S.all(), "the test should see slots without a frame"
     assert kept.extras["context_features_ShwF"].shape == (3, 6, 8, 12, 6)
     assert "context_features_ShwF" not in plain.extras
-    sight = jax.jit(objective.clip_readout, static_argnums=0)
-    got, want = (sight(config.model, {}, clip).tokens for clip in (kept, plain))
+    readout = jax.jit(objective.clip_readout, static_argnums=0)
+    got, want = (readout(config.model, {}, clip).tokens for clip in (kept, plain))
     assert np.asarray(want.valid_M).any(1).all()
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), got, want)
     scaled = kept.with_extras(context_features_ShwF=2 * kept.extras["context_features_ShwF"])
-    features = sight(config.model, {}, scaled).tokens.features_MF
+    features = readout(config.model, {}, scaled).tokens.features_MF
     np.testing.assert_allclose(features, 2 * np.asarray(want.features_MF), atol=1e-6)
 
 
@@ -76,7 +76,7 @@ def test_training_on_stale_features_is_refused(config, tmp_path, monkeypatch):
     monkeypatch.setattr(stages, "planned", lambda _: [pewm.STAGES[1]])
     monkeypatch.setattr(loop, "initial_state", fake_state)
     with pytest.raises(UserError, match=r"stale: it was made with other preprocessing"):
-        loop.train(stale, say=lambda _: None)
+        loop.train(stale, log=lambda _: None)
 
 
 def test_a_run_goes_on_with_features_that_were_moved(config, tmp_path):

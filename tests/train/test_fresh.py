@@ -70,9 +70,9 @@ def test_the_rule_is_known_before_anything_is_computed(whole):
 
 
 def test_stage_2_starts_from_another_run_of_stage_1_alone(fake_model, tmp_path):
-    loop.train(fakes.config(tmp_path / "one", stage1=3, stage2=0), say=lambda _: None)
+    loop.train(fakes.config(tmp_path / "one", stage1=3, stage2=0), log=lambda _: None)
     config = fakes.config(tmp_path / "two", stage1=0, stage2=3, start=str(tmp_path / "one"))
-    loop.train(config, say=lambda _: None)
+    loop.train(config, log=lambda _: None)
     one, two = (weights.load(tmp_path / n / "weights.safetensors") for n in ("one", "two"))
     assert set(one) == {"backbone"}
     assert set(two) == {"backbone", "memory"}
@@ -83,11 +83,11 @@ def test_stage_2_starts_from_another_run_of_stage_1_alone(fake_model, tmp_path):
         config = fakes.config(
             tmp_path / f"again{number}", stage1=0, stage2=3, start=str(tmp_path / start)
         )
-        loop.train(config, say=lambda _: None)
+        loop.train(config, log=lambda _: None)
         again = weights.load(tmp_path / f"again{number}" / "weights.safetensors")
         assert same(again, two) == tree.flatten(two).keys()
     strict = fakes.config(
         tmp_path / "three", stage1=0, stage2=3, start=str(tmp_path / "one"), fresh=()
     )
     with pytest.raises(tree.TreeError, match="memory/gate is missing"):
-        loop.train(strict, say=lambda _: None)
+        loop.train(strict, log=lambda _: None)

@@ -93,11 +93,11 @@ def clips(monkeypatch):
 
 
 def test_only_the_gate_learns_in_its_stage_and_the_run_can_be_loaded(clips, tmp_path):
-    first = loop.train(experiment(tmp_path / "codec", codec=1, statistics=1), say=lambda _: None)
+    first = loop.train(experiment(tmp_path / "codec", codec=1, statistics=1), log=lambda _: None)
     before = tree.flatten(pewm_jax.load(first)[1])
     config = experiment(tmp_path / "gate", gate=2)
     start = dataclasses.replace(config.train, start=str(first), fresh=(r"codec/gate/.*",))
-    run = loop.train(dataclasses.replace(config, train=start), say=lambda _: None)
+    run = loop.train(dataclasses.replace(config, train=start), log=lambda _: None)
     after = tree.flatten(load_finished(run)[1])
     assert {path for path in after if path.startswith("codec/gate/")} == after.keys() - before
     for path, leaf in before.items():
@@ -195,15 +195,15 @@ def test_lpips_of_the_mixed_frames_counts_as_much_as_it_weighs(monkeypatch):
     train = dataclasses.replace(imagining().train, gate_lpips=0.5)
     clip = dataclasses.replace(model.clip, height=32, width=32)
     large = dataclasses.replace(model, clip=clip)
-    assert LAST.given(model, imagining().train) is None
+    assert LAST.extra_weights(model, imagining().train) is None
     monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
     with pytest.raises(UserError, match="none are installed"):
-        LAST.given(large, train)
+        LAST.extra_weights(large, train)
     monkeypatch.setattr(lpips_weights, "find", lambda _: None)
     monkeypatch.setattr(lpips_weights, "read", lambda _, net: (net, network))
-    assert LAST.given(large, train) == {"lpips": network}
+    assert LAST.extra_weights(large, train) == {"lpips": network}
     with pytest.raises(UserError, match="too small for LPIPS"):  # before any stage
-        LAST.given(model, train)
+        LAST.extra_weights(model, train)
     with pytest.raises(ConfigError, match=r"train\.gate_lpips is -1"):
         dataclasses.replace(train, gate_lpips=-1)
 

@@ -44,7 +44,7 @@ def config(run, **changes):
 
 def train(run, **changes):
     said = []
-    loop.train(config(run, **changes), say=said.append)
+    loop.train(config(run, **changes), log=said.append)
     return said
 
 
@@ -181,7 +181,7 @@ def test_checking_many_bytes_is_announced_and_its_progress_told(run, monkeypatch
     monkeypatch.setattr(checkpoint_files, "LARGE", 1000)
     monkeypatch.setattr(checkpoint_files, "_EVERY_S", 0.0)
     said = []
-    assert checkpoint_files.flaws(newest(run), say=said.append) == []
+    assert checkpoint_files.flaws(newest(run), log=said.append) == []
     assert said[0].startswith(f"checking {newest(run)}: 0.0 GB")
     assert all("s left" in text for text in said[1:])
     assert len(said) == len(files(newest(run)))

@@ -39,12 +39,12 @@ def test_joint_starts_from_the_weights_of_stage_2_and_leaves_the_codec(
 
     monkeypatch.setattr(loop, "initial_state", noting)
     config = fakes.config(tmp_path / "two", stage1=3, stage2=3)
-    loop.train(config, say=lambda _: None)
+    loop.train(config, log=lambda _: None)
     assert set(starts) == {"stage1", "stage2"}
     two = tree.flatten(weights.load(tmp_path / "two" / "weights.safetensors"))
     config = fakes.config(tmp_path / "three", stage1=3, stage2=3)
     config = fakes.with_stage(config, "joint", steps=3, batch=8, warmup=1, learning_rate=1e-2)
-    loop.train(config, say=lambda _: None)
+    loop.train(config, log=lambda _: None)
     begun = tree.flatten(starts["joint"])
     ended = tree.flatten(weights.load(tmp_path / "three" / "weights.safetensors"))
     assert begun.keys() == two.keys() == ended.keys()

@@ -19,7 +19,7 @@ class PowerCutError(RuntimeError):
 
 
 def train(config):
-    loop.train(config, say=lambda _: None)
+    loop.train(config, log=lambda _: None)
 
 
 def spoil(folder):

@@ -104,7 +104,7 @@ def test_on_a_terminal_there_is_a_bar():
     console = Console(file=stream, force_terminal=True, width=160)
     with log.LiveView("stage 1", 10, 4, console) as live:
         live.update(5, METRICS)
-        live.say("a picture")
+        live.log("a picture")
     assert "5/10" in stream.getvalue()
     assert "a picture" in stream.getvalue()
 

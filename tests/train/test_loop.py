@@ -23,7 +23,7 @@ PICTURE = Previewed((Path("picture.png"),))
 
 def train(config, **options):
     said = []
-    loop.train(config, say=said.append, **options)
+    loop.train(config, log=said.append, **options)
     return said
 
 

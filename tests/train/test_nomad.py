@@ -86,7 +86,7 @@ def test_waypoints_are_the_places_of_the_next_steps():
 
 
 def test_it_learns_to_walk_as_it_was_shown(tmp_path, clips):
-    run = loop.train(experiment(tmp_path / "run", steps=300, save_every=300), say=lambda _: None)
+    run = loop.train(experiment(tmp_path / "run", steps=300, save_every=300), log=lambda _: None)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     found = [line["loss"] for line in lines if "loss" in line]
     assert np.mean(found[-20:]) < 0.3 * np.mean(found[:10])
@@ -101,7 +101,7 @@ def test_it_learns_to_walk_as_it_was_shown(tmp_path, clips):
 
 
 def test_training_goes_on_and_what_comes_out_is_read(tmp_path, clips):
-    whole = loop.train(experiment(tmp_path / "whole"), say=lambda _: None)
+    whole = loop.train(experiment(tmp_path / "whole"), log=lambda _: None)
     short = experiment(tmp_path / "halves")
     with pytest.MonkeyPatch.context() as patch:
         real = loader.clips
@@ -114,8 +114,8 @@ def test_training_goes_on_and_what_comes_out_is_read(tmp_path, clips):
 
         patch.setattr(loader, "clips", ending)
         with pytest.raises(KeyboardInterrupt):
-            loop.train(short, say=lambda _: None)
-    halves = loop.train(short, say=lambda _: None)
+            loop.train(short, log=lambda _: None)
+    halves = loop.train(short, log=lambda _: None)
     (config, one), (_, other) = pewm_jax.load(whole), pewm_jax.load(halves)
     assert config.model == MODEL
     for path, leaf in tree.flatten(one).items():

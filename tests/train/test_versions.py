@@ -267,7 +267,7 @@ def trained(fake_model, tmp_path):
     """A run that was trained without disturbance, and its copy with the settings of version 1."""
     config = parsed(written())
     whole = fakes.with_train(config, run=str(tmp_path / "whole"))
-    loop.train(whole, say=lambda _: None)
+    loop.train(whole, log=lambda _: None)
     old = Path(shutil.copytree(tmp_path / "whole", tmp_path / "old"))
     as_version_1(old)
     return tmp_path / "whole", old
@@ -281,7 +281,7 @@ def losses(run):
 def test_a_finished_run_of_version_1_is_known_as_finished(trained):
     _, old = trained
     said = []
-    loop.train(fakes.with_train(parsed(written()), run=str(old)), say=said.append)
+    loop.train(fakes.with_train(parsed(written()), run=str(old)), log=said.append)
     assert said == [f"{old} is already trained: nothing to do."]
 
 
@@ -293,7 +293,7 @@ def test_training_goes_on_from_a_run_of_version_1_to_the_same_end(trained, stage
     if stage == "stage1":
         shutil.rmtree(old / "checkpoints" / "stage2")
     assert set(pewm_jax.load(old)[1]) == set(fakes.init(None, KEY, memory=stage == "stage2"))
-    loop.train(fakes.with_train(parsed(written()), run=str(old)), say=lambda _: None)
+    loop.train(fakes.with_train(parsed(written()), run=str(old)), log=lambda _: None)
     assert losses(old) == losses(whole)
     same(*(weights.load(run / "weights.safetensors") for run in (old, whole)))
     assert json.loads((old / "config.json").read_text())["version"] == configuration.VERSION
@@ -304,7 +304,7 @@ def test_another_configuration_than_that_of_version_1_is_refused_by_the_names_of
     config = fakes.with_train(parsed(written()), run=str(old))
     other = config.with_model(backbone=dataclasses.replace(config.model.backbone, layers=3))
     with pytest.raises(ConfigError, match=r"model\.backbone\.layers 2 there, 3 here"):
-        loop.train(other, say=lambda _: None)
+        loop.train(other, log=lambda _: None)
 
 
 @pytest.mark.parametrize("noise_key", ["own", "weights"])

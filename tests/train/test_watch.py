@@ -36,7 +36,7 @@ def lines(path):
 
 
 def train(config, **options):
-    loop.train(config, say=lambda _: None, **options)
+    loop.train(config, log=lambda _: None, **options)
 
 
 def test_stopping_writes_the_step_and_the_records_and_names_the_file(nan_at_5, tmp_path):
@@ -167,7 +167,7 @@ def test_the_first_steps_are_traced_only_where_there_are_no_others(
     monkeypatch.setattr(jax.profiler, "start_trace", seen.append)
     monkeypatch.setattr(jax.profiler, "stop_trace", lambda: ended.append(now))
     profile = loop.Profile(
-        tmp_path, fakes.STAGES[0], steps=steps, first=first, last=last, say=told.append
+        tmp_path, fakes.STAGES[0], steps=steps, first=first, last=last, log=told.append
     )
     annotated = []
     monkeypatch.setattr(
@@ -190,7 +190,7 @@ def test_a_trace_that_is_broken_off_counts_what_it_holds(monkeypatch, tmp_path):
     monkeypatch.setattr(jax.profiler, "start_trace", lambda _folder: None)
     monkeypatch.setattr(jax.profiler, "stop_trace", lambda: None)
     told = []
-    profile = loop.Profile(tmp_path, fakes.STAGES[0], steps=5, first=1, last=9, say=told.append)
+    profile = loop.Profile(tmp_path, fakes.STAGES[0], steps=5, first=1, last=9, log=told.append)
     with profile.around(3):
         pass
     profile.close()

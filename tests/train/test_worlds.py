@@ -89,7 +89,7 @@ def train(config, **options):
     said = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop.LiveView, "say", lambda _view, text: said.append(text))
-        loop.train(config, say=said.append, **options)
+        loop.train(config, log=said.append, **options)
     return said
 
 

@@ -139,7 +139,7 @@ def test_a_head_peaks_at_the_patch_a_cell_projects_into():
 
 def test_conditioning_channels_matter_and_only_the_first_latent_frame_is_clean():
     model, conditioning, _, noisy, times = setup()
-    joined = conditioning.given.joined_BthwC
+    joined = conditioning.backbone.joined_BthwC
     channels = model.codec.channels
     assert joined.shape[-1] == model.in_channels - channels
     first, rays = np.split(np.asarray(joined), [channels], -1)
@@ -150,8 +150,8 @@ def test_conditioning_channels_matter_and_only_the_first_latent_frame_is_clean()
     base = apply(model, params, noisy, conditioning, times)
     for name, part in (("first", slice(channels)), ("rays", slice(channels, None))):
         halved = dataclasses.replace(
-            conditioning.given, joined_BthwC=joined.at[..., part].multiply(0.5)
+            conditioning.backbone, joined_BthwC=joined.at[..., part].multiply(0.5)
         )
-        other = dataclasses.replace(conditioning, given=halved)
+        other = dataclasses.replace(conditioning, backbone=halved)
         out = apply(model, params, noisy, other, times)
         assert np.abs(out - base).max() > 1e-4, name

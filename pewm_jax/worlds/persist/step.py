@@ -212,11 +212,11 @@ def begin(
     voxel_key, picture_key = jax.random.split(key)
     before = grid_state.window(model, grid.classes_XYZ, start)
     middle = grid_state.middle(model, grid.low_3, start)
-    sight = None
+    evidence = None
     if real:
-        sight = _sight(model, grid, start, frame.rgb_THWC[0], frame.depth_THW[0], camera)
+        evidence = _sight(model, grid, start, frame.rgb_THWC[0], frame.depth_THW[0], camera)
     made = voxel_frames.sample(
-        model, params, history, history.voxels, middle, before, voxel_key, sight
+        model, params, history, history.voxels, middle, before, voxel_key, evidence
     )
     classes = jnp.where(before >= 0, before, made)  # a known grid is not changed by its picture
     everything = grid_state.written(grid.classes_XYZ, classes, start)
@@ -265,10 +265,10 @@ def step(
     now = dataclasses.replace(history, action_A=action_A, shown=past.shown)
     classes = known.classes_XYZ
     if classes is None:
-        sight = None
+        evidence = None
         if known.rgb_HWC is not None and known.depth_HW is not None:
-            sight = _sight(model, grid, start, known.rgb_HWC, known.depth_HW, camera)
-        classes = voxel_frames.sample(model, params, now, cache, middle, before, keys[1], sight)
+            evidence = _sight(model, grid, start, known.rgb_HWC, known.depth_HW, camera)
+        classes = voxel_frames.sample(model, params, now, cache, middle, before, keys[1], evidence)
     everything = grid_state.written(grid.classes_XYZ, classes, start)
     made, cameras = next_camera(
         model, params, everything, grid.low_3, here, action_A, history.cameras

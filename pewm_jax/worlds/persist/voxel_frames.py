@@ -42,7 +42,7 @@ def sample(
     middle_3: Array,
     before_XYZ: Array,
     key: Array,
-    sight: ObservedCells | None = None,
+    evidence: ObservedCells | None = None,
 ) -> Array:
     """Sample a voxel frame: (X, Y, Z) class ids.
 
@@ -55,7 +55,7 @@ def sample(
         before_XYZ: the window's cells before; ``model.persistence_logit`` applies where they are
             known.
         key: randomness.
-        sight: what a real picture of this frame shows of the window's cells.
+        evidence: what a real picture of this frame shows of the window's cells.
     """
     config, noise = model.backbone.world_frames, model.voxel_noise  # type: ignore[attr-defined]
     asked = _asked(model, history, middle_3)
@@ -72,7 +72,7 @@ def sample(
         return noise.to_x0(made.astype(jnp.float32), x, times)
 
     latents = noise.sample(denoise, jax.random.normal(key, shape))[:, 0]
-    return decode_classes(model, params, latents, before_XYZ, sight)
+    return decode_classes(model, params, latents, before_XYZ, evidence)
 
 
 def decode_classes(
@@ -80,7 +80,7 @@ def decode_classes(
     params: Params,
     latents_BxyzC: Array,
     before_XYZ: Array,
-    sight: ObservedCells | None = None,
+    evidence: ObservedCells | None = None,
 ) -> Array:
     """Return the class ids (X, Y, Z) that latents (1, …) decode to.
 
@@ -91,23 +91,23 @@ def decode_classes(
     """
     config = model.backbone.voxel_vae  # type: ignore[attr-defined]
     weights, dtype = params["voxel_vae"], jnp.dtype(model.dtype)
-    looked = sight is not None and model.observation_logit > 0
+    looked = evidence is not None and model.observation_logit > 0
     if not model.persistence_logit and not model.empty_prior and not looked:
         return voxel_vae.decode(config, weights, latents_BxyzC, dtype)[0]
     features = voxel_vae.features(config, weights, latents_BxyzC, dtype)[0]
 
     def likeliest(slab: tuple[Array, Array, ObservedCells | None]) -> Array:
-        features, before, sight = slab
+        features, before, evidence = slab
         scores = linear(weights["decoder"]["scores"], features).astype(jnp.float32)
         number, before = jnp.arange(config.classes), before[..., None]
         scores = scores + model.persistence_logit * (number == before)
         scores = scores + model.empty_prior * ((before == UNKNOWN) & (number == EMPTY))
-        if sight is not None:
-            scores = scores + advantage(model, sight, config.classes)
+        if evidence is not None:
+            scores = scores + advantage(model, evidence, config.classes)
         return scores.argmax(-1).astype(jnp.int32)
 
     slab = config.slab or config.side
-    whole = features, before_XYZ.astype(jnp.int32), sight if looked else None
+    whole = features, before_XYZ.astype(jnp.int32), evidence if looked else None
     cut = jax.tree.map(lambda x: x.reshape(-1, slab, *x.shape[1:]), whole)
     return jax.lax.map(likeliest, cut).reshape(before_XYZ.shape)
 
@@ -177,12 +177,12 @@ class ObservedCells:
     colour_XYZ: Array
 
 
-def advantage(model: PersistConfig, sight: ObservedCells, classes: int) -> Array:
+def advantage(model: PersistConfig, evidence: ObservedCells, classes: int) -> Array:
     """Return the nats (X, Y, Z, classes) that sight adds to the scores of classes."""
     number = jnp.arange(classes)
     colours = model.memory.colours  # type: ignore[attr-defined]
-    air = sight.air_XYZ[..., None] & (number == 0)
-    surface = (number > 0) & ((number - 1) % colours == sight.colour_XYZ[..., None])
+    air = evidence.air_XYZ[..., None] & (number == 0)
+    surface = (number > 0) & ((number - 1) % colours == evidence.colour_XYZ[..., None])
     return model.observation_logit * (air | surface)
 
 

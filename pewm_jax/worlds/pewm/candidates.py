@@ -128,10 +128,10 @@ def _clip(
 
     whole = dataclasses.replace(control, camera=camera)
     conditioning = jax.vmap(condition, (None if shared else 0, 0))(frame, whole)
-    sight = None
+    readout = None
     if memory and "memory" in params:
-        sight = look(model, remembered, camera, params, view)
-        batched = jax.tree.map(lambda x: x[:, None], sight)
+        readout = look(model, remembered, camera, params, view)
+        batched = jax.tree.map(lambda x: x[:, None], readout)
         latents = jax.vmap(functools.partial(world_model.draw, model, params))(
             conditioning, batched, keys
         )
@@ -148,8 +148,8 @@ def _clip(
         seen_there = seen
     rgb, depth = rgbd.decode_rgbd(model, params, latents)
     rgb, depth = rgb[:, seen_there], depth[:, seen_there]
-    if sight is not None and sight.view is not None and memories.gated(model):
-        remembered_there = jax.tree.map(lambda x: x[:, seen], sight.view)
+    if readout is not None and readout.view is not None and memories.gated(model):
+        remembered_there = jax.tree.map(lambda x: x[:, seen], readout.view)
         rgb, depth = rgbd.mix(model, params, rgb, depth, remembered_there)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     return Frames(rgb, depth, jax.tree.map(lambda x: x[:, shown], control.camera))

@@ -1,9 +1,9 @@
-"""The gate's last lesson: what this model imagines, beside what its memory shows.
+"""Gate fine-tuning: blend imagined frames with the rendered memory.
 
-The codec's gate learned on true latents with noise. What a model imagines is wrong in other ways:
-sharp, plausible and elsewhere. After its training the model imagines each clip once, from the
-clip's first frame and with the memory of its context, and the gate alone learns which of the two to
-believe where.
+The codec's gate is trained on true latents with noise. The errors of imagined frames differ: they
+are sharp, plausible and displaced. After the other stages the model imagines each clip once, from
+the clip's first frame and with the memory of its context, and only the gate is trained to choose
+between the two at each pixel.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
         UserError: the model's codec has no gate, or its memory shows no colours.
     """
     require_gate(model)
-    sight = objective.clip_readout(model, params, clip, pictures=True)
+    readout = objective.clip_readout(model, params, clip, pictures=True)
     frames = as_signal(clip.frames)
     observed = jax.tree.map(lambda x: x[:, :1], frames)
     control = Control(frames.camera, clip.actions_TA, clip.extras.get("state_A"))
@@ -56,14 +56,14 @@ def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
     shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
     noise = jax.random.normal(key, shape)
     latents = world_model.sample(
-        model, params, conditioning, sight, noise, jax.random.fold_in(key, 1)
+        model, params, conditioning, readout, noise, jax.random.fold_in(key, 1)
     )
     emptied = dataclasses.replace(
         clip,
         context=jax.tree.map(lambda x: x[:, :0], clip.context),
         context_valid_S=clip.context_valid_S[:, :0],
     )
-    return emptied.with_extras(context_features_ShwF=None, latents_thwC=latents, readout=sight)
+    return emptied.with_extras(context_features_ShwF=None, latents_thwC=latents, readout=readout)
 
 
 def loss(

@@ -1,8 +1,8 @@
 """The world of PEWM: a video diffusion model, clip after clip, with a memory.
 
 Each clip is conditioned on the present frame, on the control, and on the part of the memory that
-its cameras see. Imagined frames are remembered in the same way as observed ones; a memory that says
-``TELLS_IMAGINED`` is told which they are.
+its cameras see. Imagined frames are inserted in the same way as observed ones, with
+``observed=False``.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ STAGES = (
         prepare=pewm_gate.prepare,
         prepares_by=("backbone", "control", "memory", "codec", "encoder", "image", "text"),
         optional=True,
-        given=pewm_gate.perceptual,
+        extra_weights=pewm_gate.perceptual,
         require=pewm_gate.require_gate,
     ),
 )
@@ -191,20 +191,20 @@ def imagine_clip(
     whole = jax.tree.map(lambda x: x[None], whole)
     observed = jax.tree.map(lambda x: x[None], present)
     conditioning = world_model.condition(model, params, observed, whole)
-    sight = None
+    readout = None
     if memory and "memory" in params:
         gated = memories.gated(model)
         shown = memories.readout(model, state.map, camera, params=params, pictures=gated)
-        sight = jax.tree.map(lambda x: x[None], shown)
-    latents = world_model.draw(model, params, conditioning, sight, key)
+        readout = jax.tree.map(lambda x: x[None], shown)
+    latents = world_model.draw(model, params, conditioning, readout, key)
     rgb, depth = rgbd.decode_rgbd(model, params, latents)
-    if sight is not None and memories.gated(model):
-        rgb, depth = rgbd.mix(model, params, rgb, depth, sight.view)
+    if readout is not None and memories.gated(model):
+        rgb, depth = rgbd.mix(model, params, rgb, depth, readout.view)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     frames = Frames(rgb[0, 1:], depth[0, 1:], future)
     remembered = state.map
     if remember:
-        new = new_surfaces(model, frames, sight)
+        new = new_surfaces(model, frames, readout)
         remembered = _remember(model, params, state.map, new, valid_T, observed=False)
     end = None if valid_T is None else valid_T.sum()
     return WorldState(last_frames(frames, end), remembered), frames
@@ -272,13 +272,13 @@ def coverage(
     return vars(memory_coverage.coverage(model, state.map, tokens, frames, seen_THW))
 
 
-def new_surfaces(model: ModelConfig, frames: Frames, sight: MemoryReadout | None) -> Frames:
+def new_surfaces(model: ModelConfig, frames: Frames, readout: MemoryReadout | None) -> Frames:
     """Return imagined frames with a depth of 0 where the memory showed something already."""
     again = getattr(model.memory, "imagined_again", True)
-    if again or sight is None or sight.view is None:
+    if again or readout is None or readout.view is None:
         return frames
     return dataclasses.replace(
-        frames, depth_THW=jnp.where(sight.view.seen_THW[0, 1:], 0, frames.depth_THW)
+        frames, depth_THW=jnp.where(readout.view.seen_THW[0, 1:], 0, frames.depth_THW)
     )
 
 

@@ -148,10 +148,10 @@ def test_before_training_any_action_leaves_the_output_bit_for_bit(model, params)
         return model.backbone.apply(part, x, jnp.float32([0.7]), given)
 
     given, _ = conditioned(model, params, FIRST, MOVES)
-    assert given.given.modulation_BtE.shape == (1, 3, 32)
-    without = dataclasses.replace(given.given, modulation_BtE=None)
+    assert given.backbone.modulation_BtE.shape == (1, 3, 32)
+    without = dataclasses.replace(given.backbone, modulation_BtE=None)
     np.testing.assert_array_equal(
-        predicted(model, params, START, given.given), predicted(model, params, START, without)
+        predicted(model, params, START, given.backbone), predicted(model, params, START, without)
     )
 
 
@@ -167,7 +167,7 @@ def test_attention_over_time_is_not_causal_and_the_given_frame_and_earlier_chunk
     later[-1] += 1  # it leads to the last frame, in the last of three latent frames
     given, _ = conditioned(model, trained, FIRST, MOVES)
     moved, _ = conditioned(model, trained, FIRST, later)
-    change = np.asarray(given.given.modulation_BtE - moved.given.modulation_BtE)
+    change = np.asarray(given.backbone.modulation_BtE - moved.backbone.modulation_BtE)
     assert not np.any(change[:, :2])
     assert np.any(change[:, 2])
     one = sampled(model, trained, FIRST, MOVES, START)

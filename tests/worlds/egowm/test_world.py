@@ -118,10 +118,10 @@ def test_guidance_hides_the_image_and_leaves_the_actions(params):
     camera = jax.tree.map(lambda x: np.repeat(x, 5, 1), frames.camera)
     condition = jax.jit(world_model.condition, static_argnums=0)
     given = condition(MODEL, params, frames, Control(camera, MOVES[None, :4]))
-    blind = world_model.without_image(MODEL, given, np.ones((1,), bool)).given
-    assert np.any(given.given.joined_BthwC)
+    blind = world_model.without_image(MODEL, given, np.ones((1,), bool)).backbone
+    assert np.any(given.backbone.joined_BthwC)
     assert not np.any(blind.joined_BthwC)
-    equal(blind.modulation_BtE, given.given.modulation_BtE)
+    equal(blind.modulation_BtE, given.backbone.modulation_BtE)
     assert np.any(blind.modulation_BtE)
 
 

@@ -44,8 +44,8 @@ def furnished():
 
 def test_a_picture_tells_air_from_surfaces_and_their_colours():
     grid, rgb, depth, camera = furnished()
-    sight = persist_sight.seen(ROOM, LOW, rgb, depth, camera)
-    air, colour = np.asarray(sight.air_XYZ), np.asarray(sight.colour_XYZ)
+    evidence = persist_sight.seen(ROOM, LOW, rgb, depth, camera)
+    air, colour = np.asarray(evidence.air_XYZ), np.asarray(evidence.colour_XYZ)
     assert air.sum() > 30
     assert not grid[air].any()
     surface = colour >= 0
@@ -61,9 +61,9 @@ def test_a_picture_tells_air_from_surfaces_and_their_colours():
 
 def test_where_nothing_was_measured_nothing_is_said():
     _, rgb, depth, camera = furnished()
-    sight = persist_sight.seen(ROOM, LOW, rgb, 0 * depth, camera)
-    assert not np.asarray(sight.air_XYZ).any()
-    assert (np.asarray(sight.colour_XYZ) == -1).all()
+    evidence = persist_sight.seen(ROOM, LOW, rgb, 0 * depth, camera)
+    assert not np.asarray(evidence.air_XYZ).any()
+    assert (np.asarray(evidence.colour_XYZ) == -1).all()
 
 
 def test_the_light_that_is_read_is_the_light_that_was_drawn():
@@ -93,12 +93,12 @@ def test_a_world_begins_on_the_lattice_of_recorded_cells_and_with_what_it_sees()
     corner = state.map.low_3 + first * 0.5
     camera = jax.tree.map(lambda x: jnp.asarray(x[0]), frames.camera)
     rgb = frames.rgb_THWC[0].astype(np.float32) / 127.5 - 1
-    sight = persist_sight.seen(MODEL, corner, rgb, frames.depth_THW[0], camera)
+    evidence = persist_sight.seen(MODEL, corner, rgb, frames.depth_THW[0], camera)
     cells = np.asarray(windows.window(MODEL, state.map.classes_XYZ, first))
-    assert np.asarray(sight.air_XYZ).any()
-    assert (np.asarray(sight.colour_XYZ) >= 0).any()
-    assert not cells[np.asarray(sight.air_XYZ)].any()
-    assert cells[np.asarray(sight.colour_XYZ) >= 0].all()
+    assert np.asarray(evidence.air_XYZ).any()
+    assert (np.asarray(evidence.colour_XYZ) >= 0).any()
+    assert not cells[np.asarray(evidence.air_XYZ)].any()
+    assert cells[np.asarray(evidence.colour_XYZ) >= 0].all()
     # A frame that was imagined says nothing of its cells.
     still = jax.jit(persist.imagine, static_argnums=0, static_argnames="memory")
     doubted = dataclasses.replace(MODEL, observation_logit=0.0)
@@ -117,17 +117,17 @@ def test_what_is_seen_decides_between_classes_and_nothing_else_changes():
     before = jnp.full((8, 8, 8), -1)
     air = jnp.zeros((8, 8, 8), bool).at[:2].set(True)
     colour = jnp.full((8, 8, 8), -1).at[2:4].set(2)
-    sight = persist_sight.ObservedCells(air, colour)
+    evidence = persist_sight.ObservedCells(air, colour)
     free = dataclasses.replace(ROOM, persistence_logit=0.0)
     made = np.asarray(persist_voxels.decode_classes(free, params, latents, before))
-    looked = np.asarray(persist_voxels.decode_classes(free, params, latents, before, sight))
+    looked = np.asarray(persist_voxels.decode_classes(free, params, latents, before, evidence))
     assert not looked[:2].any()
     assert ((looked[2:4] > 0) & ((looked[2:4] - 1) % COLOURS == 2)).all()
     np.testing.assert_array_equal(looked[4:], made[4:])
     blind = dataclasses.replace(free, observation_logit=0.0)
     np.testing.assert_array_equal(
-        persist_voxels.decode_classes(blind, params, latents, before, sight), made
+        persist_voxels.decode_classes(blind, params, latents, before, evidence), made
     )
-    given = persist_sight.advantage(ROOM, sight, classes)
+    given = persist_sight.advantage(ROOM, evidence, classes)
     assert given.shape == (8, 8, 8, classes)
     assert float(given.max()) == ROOM.observation_logit

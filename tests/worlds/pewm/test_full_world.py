@@ -104,7 +104,7 @@ def test_text_and_encoder_matter_and_depth_goes_through_the_vae(world):
     frames = random_frames(np.random.default_rng(1), 9)
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], signals.as_signal(frames))
     observed = jax.tree.map(lambda x: x[:, :1], batch)
-    said = world_model.condition(model, params, observed, Control(batch.camera)).given
+    said = world_model.condition(model, params, observed, Control(batch.camera)).backbone
     np.testing.assert_array_equal(said.tokens_BLC[0], params["text"]["prompt_LC"])
     latents = rgbd.encode_rgbd(model, params, batch.rgb_THWC, batch.depth_THW)
     assert latents.shape == (1, 3, 4, 6, 8)
@@ -163,7 +163,7 @@ def test_training_needs_converted_weights_and_leaves_them_alone(world, tmp_path,
     weights.save(start / "weights.safetensors", params)
     (start / "base.json").write_text("{}")
     config = dataclasses.replace(config, train=dataclasses.replace(train, start=str(start)))
-    run = loop.train(config, say=lambda _: None)
+    run = loop.train(config, log=lambda _: None)
 
     _, trained = rollouts.load_finished(run)
     before, after = tree.flatten(params), tree.flatten(trained)
