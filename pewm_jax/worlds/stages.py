@@ -39,9 +39,9 @@ class Stage:
             a batch with frozen weights alone, and leaves out what that no longer needs; the loss is
             the same.
         prepares_by: the top-level parameters that ``prepare`` reads.
-        extra_weights: ``extra_weights(model, train) -> params`` or None: weights that the loss needs
-            and that are no part of the model, under top-level names of their own. They are read when
-            training starts, placed on every device, never trained and never saved.
+        extra_weights: ``extra_weights(model, train) -> params`` or None: weights that the loss
+            needs and that are no part of the model, under top-level names of their own. They are
+            read when training starts, placed on every device, never trained and never saved.
         optional: whether it is left out where its settings give it no steps.
         require: ``require(model)``, where not every model has what the stage trains: refuses one
             that has not, before any stage is trained.
