@@ -28,6 +28,6 @@ def test_it_is_exactly_the_decoder_where_nothing_is_rendered():
 def test_a_fresh_gate_takes_one_share_of_what_was_seen():
     decoded, rendered = pictures(0), pictures(1)
     made = gates.apply(gates.init(8, jax.random.key(0)), decoded, rendered, SEEN)
-    share = jax.nn.sigmoid(gates.TRUST)
+    share = jax.nn.sigmoid(gates.INITIAL_LOGIT)
     mixed = decoded + share * (rendered - decoded)
     np.testing.assert_allclose(made[SEEN], mixed[SEEN], atol=1e-5)

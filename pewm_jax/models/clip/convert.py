@@ -102,7 +102,7 @@ def config_from_transformers(
     given = {key: values.get(key, default) for key, default in _DEFAULTS.items()}
     for key, default in _DEFAULTS.items():
         if type(given[key]) is not type(default):
-            raise UserError(f"{where} has {key} {given[key]!r}, give a value like {default!r}.")
+            raise UserError(f"{where} has {key} {given[key]!r}; give a value like {default!r}.")
     if given["hidden_act"] not in ("gelu", "quick_gelu"):
         raise UserError(
             f"{where} has hidden_act {given['hidden_act']!r}; only gelu and quick_gelu are known."

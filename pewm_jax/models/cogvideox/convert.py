@@ -355,7 +355,7 @@ def _checked(key: str, value: Any) -> Any:
         fits, as_type = number, float
     if not fits:
         raise UserError(
-            f"the VAE's config.json has {key} = {value!r}, give a value like {default!r}."
+            f"the VAE's config.json has {key} = {value!r}; give a value like {default!r}."
         )
     return as_type(value)
 

@@ -109,7 +109,7 @@ def test_images_are_prepared_as_by_the_pipeline(size):
         ("model_type", "siglip", "clip_vision_model only"),
         ("window", 3, "does not know: window"),
         ("num_channels", 1, "only 3"),
-        ("hidden_size", 2.5, "one like 768"),
+        ("hidden_size", 2.5, "a value like 768"),
     ],
 )
 def test_settings_that_are_not_supported_are_refused(pair, setting, value, words):

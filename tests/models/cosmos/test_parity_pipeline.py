@@ -145,7 +145,7 @@ def test_the_scheduler_is_written_back(pipeline, folder):
             schedulers.cosmos_from_diffusers(values | {key: value})
     with pytest.raises(UserError, match="not known: rho"):
         schedulers.cosmos_from_diffusers(values | {"rho": 7})
-    with pytest.raises(UserError, match=r"target is 'edm'; Cosmos-Predict2 has 'flow'"):
+    with pytest.raises(UserError, match=r"target is 'edm'; Cosmos-Predict2 supports only 'flow'"):
         schedulers.cosmos_to_diffusers(EDMConfig())
 
 

@@ -288,5 +288,5 @@ def test_settings_that_cannot_work_are_refused(wrong):
 def test_other_grids_are_refused():
     with pytest.raises(UserError, match="takes \\(batch, 8, 8, 8\\)"):
         voxel_vae.moments(FOLDED, {}, np.zeros((2, 8, 8, 4), int))
-    with pytest.raises(UserError, match="no integers"):
+    with pytest.raises(UserError, match="not integers"):
         voxel_vae.moments(FOLDED, {}, np.zeros((2, 8, 8, 8), np.float32))
