@@ -181,7 +181,7 @@ def test_the_command_fills_every_split_with_either_encoder(cache, params, data, 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["cash"], "no command 'cash'"),
+        (["cash"], "no command memory 'cash'"),
         (["cache"], "--help"),
         (["cache", "DATA", "OUT", "--sise", "3"], "--sise is not a setting"),
         (["cache", "nowhere", "OUT"], "nowhere does not exist"),
