@@ -1,9 +1,10 @@
-"""How many examples a property test draws: few in ``make test``, all in ``make test-all``."""
+"""How much of a test runs in ``make test``: few examples and cases, all in ``make test-all``."""
 
 import itertools
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
+import pytest
 from hypothesis import settings
 
 Case = TypeVar("Case")
@@ -24,6 +25,14 @@ def examples(count: int) -> settings:
 def cases(every: Iterable[Case], step: int) -> Iterator[Case]:
     """Yield all cases, or one of ``step`` under the profile ``quick``."""
     return itertools.islice(every, 0, None, step if _is_quick() else 1)
+
+
+def first(values: Iterable[Case], count: int) -> list:
+    """Return parameters of a test of which those after the first ``count`` are slow."""
+    return [
+        value if number < count else pytest.param(value, marks=pytest.mark.slow)
+        for number, value in enumerate(values)
+    ]
 
 
 def _is_quick() -> bool:

@@ -19,6 +19,7 @@ from pewm_jax.readers.render import RenderConfig
 from pewm_jax.types import Clip, Control, Frames, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.pewm import world as pewm
+from tests import properties
 from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
 
 READERS = {
@@ -27,8 +28,8 @@ READERS = {
     "input": RenderConfig(picture_width=16, blocks=False),
     "both": BothConfig(heads=4, head_dim=8, picture_width=16),
 }
-RENDERS = pytest.mark.parametrize("kind", ["render", "input", "both"])
-ALL = pytest.mark.parametrize("kind", READERS)
+RENDERS = pytest.mark.parametrize("kind", properties.first(["render", "input", "both"], 1))
+ALL = pytest.mark.parametrize("kind", properties.first(READERS, 2))
 TIMES = jnp.array([5, 700])
 apply = jax.jit(world_model.apply, static_argnums=0)
 condition = jax.jit(world_model.condition, static_argnums=0)

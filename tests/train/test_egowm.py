@@ -98,6 +98,7 @@ def test_the_u_net_learns_with_actions_and_the_rest_stands_still(svd):
     assert first["backbone"]["conv_in"]["kernel"].shape == (3, 3, 8, 32)
 
 
+@pytest.mark.slow
 def test_a_video_model_is_made_first_where_there_is_none_and_the_control_waits(svd):
     _, _, first, *_ = svd
     video, adapt = worlds.stages(SVD)

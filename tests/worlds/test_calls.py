@@ -552,6 +552,7 @@ def shapes_within(jaxpr):
                 yield from shapes_within(inner)
 
 
+@pytest.mark.slow
 def test_sixty_four_candidates_hold_one_map():
     """Neither by ``imagine_many`` nor by ``jax.vmap`` with the state's axis None is it copied."""
     model, params, state = made("pewm")
@@ -574,6 +575,7 @@ def test_sixty_four_candidates_hold_one_map():
     assert after.map.features_VF.shape == (64, *features), "each remembers what it imagined"
 
 
+@pytest.mark.slow
 def test_the_tutorial_compares_many_futures(capsys):
     """Its two blocks run, and give the same; neither copies the map."""
     page = (Path(__file__).parents[2] / "docs" / "tutorial.md").read_text()

@@ -15,6 +15,7 @@ from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import interface as memories
 from pewm_jax.types import Camera, Control, Frames, WorldState
+from tests import properties
 from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
 from tests.memory.test_memories import KINDS, model_of
 
@@ -96,7 +97,7 @@ def test_only_what_was_asked_for_is_remembered(params, state, count):
     assert int(after.map.outside) == int(expected.outside)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", properties.first(KINDS, 1))
 def test_every_memory_remembers_only_what_was_asked_for(kind):
     model = dataclasses.replace(MODEL, memory=model_of(kind).memory)
     params = randomise(init_world(model, memory=False))
