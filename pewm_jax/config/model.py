@@ -10,7 +10,7 @@ from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
 from pewm_jax.config.training import TrainConfig, TrainSettings
 from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities, Facts, World
 from pewm_jax.errors import require
-from pewm_jax.registry import functions, of, part, require_section
+from pewm_jax.registry import of, part, require_section
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +66,7 @@ class ModelConfig(World):
             depth=self.clip.depth,
             cameras=not self.control.actions,
             points=memory.REMEMBERS,
-            edits=all(hasattr(functions(memory), name) for name in ("erase", "move")),
+            edits=memory.EDITABLE,
             coverage=memory.REMEMBERS and memory.READ_BY_BLOCKS,
             stage_without_memory=True,
             silent_actions=self.control.MODULATES,

@@ -178,7 +178,7 @@ def test_a_memory_without_places_is_refused_an_edit_and_a_codec_a_drive():
     model = dataclasses.replace(an_engine(), config=Config(model=images))
     with pytest.raises(UserError, match="cannot be edited"):
         session.apply(model, a_session(), session.Erase(((0, 0, 0), (1, 1, 1))))
-    with pytest.raises(UserError, match="needs a world model"):
+    with pytest.raises(UserError, match="trained a codec alone"):
         engine.open_engine("codec", CODEC, {})
 
 
