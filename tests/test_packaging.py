@@ -99,6 +99,7 @@ def test_the_version_stands_in_one_place():
     assert cited[1] in (pewm_jax.__version__, newest[1])
 
 
+@pytest.mark.slow
 def test_the_presets_are_found_away_from_the_repository(installed, tmp_path):
     code = (
         "import pewm_jax; from pewm_jax import presets; "

@@ -36,6 +36,7 @@ def test_a_train_step_runs_and_is_reported(gpu):
     assert "%" in table[-1]
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_stopped(gpu, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(gpu, "has_gpu", lambda: True)
     monkeypatch.setattr(gpu, "torch_has_cuda", lambda: False)
@@ -47,6 +48,7 @@ def test_it_goes_on_where_it_stopped(gpu, monkeypatch, tmp_path, capsys):
     assert "| pewm_jax/clip | 2.0 | 2.0 | 100%" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_flop_formula_agrees_with_the_compiler(gpu):
     setting = gpu.smoke()
     config = dataclasses.replace(setting.dit, layers=1, heads=8)

@@ -151,6 +151,7 @@ def test_other_settings_are_refused_and_named(whole, tmp_path, mesh):
     assert len(EpisodeSource(out / "train")) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_collection_goes_on(tmp_path, mesh, how):
     """Killed, or interrupted by Ctrl-C, while workers write: the result is that of a calm run."""

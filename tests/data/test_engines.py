@@ -47,6 +47,7 @@ def jobs(out, count, **settings):
     return [Job(config, "train", out / f"{k}.array_record", range(k, k + 1)) for k in range(count)]
 
 
+@pytest.mark.slow
 def test_a_cluster_makes_the_very_files_of_the_local_pool_and_only_those_that_miss(
     cluster, tmp_path
 ):
@@ -69,6 +70,7 @@ def test_a_cluster_makes_the_very_files_of_the_local_pool_and_only_those_that_mi
     assert "nothing to do" in said[-1], "the engine is no setting of the files"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("broken", "says"),
     [
@@ -93,6 +95,7 @@ def test_what_goes_wrong_elsewhere_is_a_sentence_here(cluster, tmp_path, monkeyp
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_meshes_are_named_where_they_are_missing(cluster, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (job,) = jobs(tmp_path, 1, scene=(Path("here.ply"),))
@@ -100,6 +103,7 @@ def test_meshes_are_named_where_they_are_missing(cluster, tmp_path, monkeypatch)
         list(engines.run([job], job.config))
 
 
+@pytest.mark.slow
 def test_the_rest_is_given_up_when_it_is_not_wanted_any_more(cluster, tmp_path, monkeypatch):
     given_up = []
     cancel = cluster.cancel
@@ -116,6 +120,7 @@ def test_the_rest_is_given_up_when_it_is_not_wanted_any_more(cluster, tmp_path, 
     assert cluster.available_resources()["CPU"] == 1
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_cluster_that_was_started_and_the_pool_goes_on(tmp_path):
     pytest.importorskip("ray", reason="collecting on a cluster needs pewm-jax[ray]")
     options = {**SMALL, "train": 200, "test": 0}

@@ -297,6 +297,7 @@ def test_links_are_moved_to_the_site():
     )
 
 
+@pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path):
     if importlib.util.find_spec("mkdocs") is None or importlib.util.find_spec("material") is None:
         pytest.skip("MkDocs is not installed: pip install 'pewm-jax[docs]'")

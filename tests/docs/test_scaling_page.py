@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "scaling.md"
 
@@ -15,6 +17,7 @@ def table(page):
     return [line.split(" | ") for line in inside[1].splitlines() if line.startswith("| ")]
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_table_of_the_pages_form(tmp_path):
     copy = tmp_path / "scaling.md"
     copy.write_text(PAGE.read_text())

@@ -277,6 +277,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(params):
         env.step(7)
 
 
+@pytest.mark.slow
 def test_the_examples_of_the_page_run(monkeypatch, capsys, params):
     """With a tiny world of random weights in the place of the one that comes with the library."""
     monkeypatch.setattr(pewm_jax, "load", {"small": (CONFIG, params)}.__getitem__)

@@ -89,6 +89,7 @@ def test_preprocessing_stays_within_colours():
     assert out.max() <= 1 + 1e-6
 
 
+@pytest.mark.slow
 def test_eight_devices_share_a_batch_of_frames_and_compute_what_one_does():
     script = Path(__file__).with_name("devices.py")
     done = subprocess.run(

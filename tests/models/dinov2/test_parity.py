@@ -159,6 +159,7 @@ def test_an_original_state_dict_gives_the_same_parameters(pair, tmp_path):
         jax.tree.map(np.testing.assert_array_equal, read, params)
 
 
+@pytest.mark.slow
 def test_bfloat16_is_as_near_as_the_reference_in_bfloat16(tmp_path):
     network = randomise(reference("base", True))
     exact = patch_tokens(network, images((70, 70)))

@@ -13,6 +13,7 @@ from pewm_jax.io import tree, weights
 from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
 from pewm_jax.train import flops
+from tests import properties
 
 nn = torch.nn
 
@@ -139,7 +140,7 @@ def near(got, want):
     np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-4 * np.abs(want).max())
 
 
-@pytest.mark.parametrize("shape", [(2, 9, 64, 33), (1, 12, 31, 70)])
+@pytest.mark.parametrize("shape", properties.first([(2, 9, 64, 33), (1, 12, 31, 70)], 1))
 def test_the_last_modules_output_equals_torchs(pair, shape):
     reference, path = pair
     params, x = i3d_weights.read(path), videos(*shape)
@@ -197,6 +198,7 @@ def test_a_torchscript_file_is_refused(tmp_path):
         i3d_weights.read(tmp_path / "gone")
 
 
+@pytest.mark.slow
 def test_the_packages_weights_give_torchs_logits_and_the_published_distance():
     params, reference = i3d_weights.read(i3d_weights.find()), Reference()
     flat = tree.flatten(params)

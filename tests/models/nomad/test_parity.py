@@ -321,6 +321,7 @@ def test_it_equals_the_reference_in_odd_sizes(pair, tmp_path, batch):
     assert max(compare(config, pair, params, batch)) < 1e-4
 
 
+@pytest.mark.slow
 def test_the_published_sizes_have_the_published_names_and_shapes():
     with torch.device("meta"):
         published = Reference.__new__(Reference)

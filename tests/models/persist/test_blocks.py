@@ -198,6 +198,7 @@ PUBLISHED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_published_sizes_and_sharding(name):
     module, config, published, tokens = PUBLISHED[name]
@@ -211,6 +212,7 @@ def test_published_sizes_and_sharding(name):
     assert whole < 0.001 * count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NETS)
 def test_published_sizes_run_in_bfloat16_with_a_cache(name):
     module, config, *_ = PUBLISHED[name]

@@ -258,6 +258,7 @@ def test_residual_blocks_change_nothing_at_first_and_it_learns():
     assert right[-1] > 0.98
 
 
+@pytest.mark.slow
 def test_published_size_and_sharding():
     config = VoxelVAEConfig()
     params = jax.eval_shape(lambda: voxel_vae.init(config, jax.random.key(0)))

@@ -75,6 +75,7 @@ def test_what_is_written_back_is_what_was_read(pair, tmp_path):
     assert VAE.read_config(dict(again.config)) == config
 
 
+@pytest.mark.slow
 def test_the_published_size_has_the_reference_s_tensors():
     config = SVDVAECodec()
     with torch.device("meta"):
