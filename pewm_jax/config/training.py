@@ -135,7 +135,7 @@ class TrainSettings:
     chained: float = 0.0
     """Share of clips that start from a frame of the model's own, as all but the first do in a
     rollout: the clip is run backwards in one denoising step from a random level of noise, and
-    starts from what the model, without gradient, makes of its first frame (`worlds/chained.py`
+    starts from what the model, without gradient, makes of its first frame (`worlds/objective.py`
     says what that leaves out). Costs a forward pass for that share."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
     """If a loss or gradient is not finite: `stop` training, or `skip` the update and count it."""

@@ -210,7 +210,7 @@ def from_context(
 
     Args:
         model: the model.
-        params: the world model's parameters; those that make features (``encoders.weights``) are
+        params: the world model's parameters; those that make features (``Encoder.weights``) are
             used.
         context: S frames of one world, colours in [−1, 1].
         valid_S: (S,) bool, False frames are ignored.

@@ -2,7 +2,7 @@
 
 ``data`` holds copies of the weights, ``fsdp`` splits weights, optimizer and average (a layer's
 weights are gathered when it computes), ``tensor`` splits heads and feed-forward channels,
-``context`` splits tokens and no weights. Where activations live is said in ``models.placement``.
+``context`` splits tokens and no weights. Where activations live is said in ``nn.placement``.
 """
 
 from __future__ import annotations

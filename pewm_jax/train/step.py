@@ -267,7 +267,7 @@ def trace_step(
         donate_argnums=0,
     )
     abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
-    with jax.set_mesh(mesh):  # which ``models.placement`` asks for
+    with jax.set_mesh(mesh):  # which ``nn.placement`` asks for
         return step.trace(state, batch, abstract_key, *extra)
 
 

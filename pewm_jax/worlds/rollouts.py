@@ -31,7 +31,7 @@ from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 def load_finished(
     path: str | Path, *, lazily: bool = False, config: Config | None = None
 ) -> tuple[Config, Params]:
-    """Load the weights of a finished training; ``training.loading.load`` also reads checkpoints.
+    """Load the weights of a finished training; ``train.loading.load`` also reads checkpoints.
 
     Args:
         path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``,

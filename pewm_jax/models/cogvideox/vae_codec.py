@@ -56,7 +56,7 @@ class VAECodec(VAEConfig, Codec):
         return vae.init(self, key)
 
     def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
-        """Encode a video to the scaled mean of its latents; see ``codecs.interface.encode``."""
+        """Encode a video to the scaled mean of its latents; see ``Codec.encode``."""
         mean, _ = vae.encode(self, params, video_BTHWC)
         return mean * self._scale(condition=condition)
 

