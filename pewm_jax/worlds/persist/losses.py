@@ -282,7 +282,7 @@ def compared(
     flat = latents_BTxyzC.reshape(frames, side**3, -1)
     weight = weight_BTxyz.reshape(frames, -1).astype(jnp.float32)
     cells = cells_of_latents(config, classes_BTXYZ.reshape(frames, *classes_BTXYZ.shape[2:]))
-    drawn = voxel_vae.sample_cells(weight, count, key)[..., None]
+    drawn = voxel_vae_model.sample_cells(weight, count, key)[..., None]
     error, right = error_of(
         config,
         params,
