@@ -201,9 +201,9 @@ def test_a_fresh_reader_and_an_empty_memory_change_nothing_bit_for_bit(kind):
     assert np.abs(base).max() > 0.1
     readout = sight_of(kind, encoded)
     np.testing.assert_array_equal(predict(kind, fresh, readout), base)
-    nothing = objective.shown(readout, jnp.zeros((2,), bool))
+    nothing = objective.hide_readout(readout, jnp.zeros((2,), bool))
     np.testing.assert_array_equal(predict(kind, learned, nothing), base)
-    first = objective.shown(readout, jnp.array([True, False]))
+    first = objective.hide_readout(readout, jnp.array([True, False]))
     np.testing.assert_array_equal(predict(kind, learned, first)[1], base[1])
     assert np.abs(predict(kind, learned, first)[0] - base[0]).max() > 1e-3
 

@@ -4,7 +4,7 @@ Text and video tokens attend jointly. Each kind has its own adaptive-layernorm m
 time embedding ("expert" adaptive layernorm) around one shared layernorm. Queries and keys are
 normalised per head, and video tokens get a 3D rotary embedding. The blocks are scanned, so
 compile time does not grow with depth. Reference: ``CogVideoXTransformer3DModel`` of diffusers;
-``pewm_jax.config.published`` has the settings of its five published networks.
+``models.cogvideox.config`` has the settings of its five published networks.
 
 A memory enters the network in two places: ``memory_block`` runs after every block, and
 ``added_BND`` is added to the embedded tokens (both from ``models.interface.Readers``).

@@ -188,7 +188,7 @@ def test_the_cache_of_a_rollout_is_that_of_its_frames_at_once(params, state):
     frames, present, shown = [], state, persist.past_of(MODEL, params, state).shown
     for move in (MOVES[0] * 0.01, MOVES[1] * 0.01):  # small steps, that leave the window
         grid = windows.window(MODEL, present.map.classes_XYZ, present.map.history.start_3)
-        told = windows.told(MODEL, shown, middle)
+        told = windows.picture_channels(MODEL, shown, middle)
         camera = camera_numbers(shown.camera, MODEL.clip.width, middle)
         latents = voxel_vae.encode(coder, params["voxel_vae"], grid[None].astype(int))[0]
         frames.append((latents, present.map.history.action_A, told, camera))
