@@ -172,5 +172,5 @@ def test_actions_and_a_memory_on_cosmos():
 
 
 def test_frames_that_share_a_token_are_refused():
-    with pytest.raises(ConfigError, match="a token is of one latent frame"):
+    with pytest.raises(ConfigError, match="a token covers one latent frame"):
         dataclasses.replace(MODEL, backbone=dataclasses.replace(COSMOS, patch_t=2))
