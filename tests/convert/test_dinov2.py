@@ -159,7 +159,7 @@ def test_a_folder_of_ours_is_checked_when_it_is_loaded(folder, tmp_path):
     (tmp_path / "ours" / "config.json").write_text(json.dumps({**settings, "layers": 1}))
     with pytest.raises(UserError, match="does not fit this configuration"):
         model.load(tmp_path / "ours")
-    with pytest.raises(UserError, match=r"pewm_jax.convert import dinov2"):
+    with pytest.raises(UserError, match=r"pewm-jax convert import dinov2"):
         model.load(tmp_path / "absent")
 
 
