@@ -230,8 +230,8 @@ def read_encoder(encoder: str, path: str | Path | None = None) -> Similarity:
         raise UserError(f"there is no encoder {encoder!r}; there is {', '.join(ENCODERS)}.")
     if path is None:
         raise UserError(
-            "DINOv2 needs weights, which come with no package: name a folder made by `python -m "
-            "pewm_jax.convert import dinov2`, or take the encoder alex or vgg under its own name."
+            "DINOv2 needs weights, which come with no package: name a folder made by `pewm-jax "
+            "convert import dinov2`, or take the encoder alex or vgg under its own name."
         )
     network, params = dinov2.load(Path(path))
     params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
