@@ -225,7 +225,7 @@ def test_a_run_folder_that_is_a_file_is_refused(fake_model, tmp_path):
 
 def test_nothing_is_compiled_unannounced(fake_model, tmp_path, monkeypatch):
     told = []
-    monkeypatch.setattr(loop.LiveView, "say", lambda _view, text: told.append(text))
+    monkeypatch.setattr(loop.LiveView, "log", lambda _view, text: told.append(text))
 
     def noting(name):
         real = getattr(loop, name)
