@@ -146,7 +146,7 @@ def test_utilisation_is_told_where_the_chip_is_known(fake_model, tmp_path, monke
 
 def test_a_profile_is_written_and_said_where(fake_model, tmp_path, monkeypatch):
     told = []
-    monkeypatch.setattr(loop.LiveView, "say", lambda _view, text: told.append(text))
+    monkeypatch.setattr(loop.LiveView, "log", lambda _view, text: told.append(text))
     train(fakes.config(tmp_path, stage2=0), profile=2)
     folder = tmp_path / "profile" / "stage1"
     (trace,) = folder.rglob("*.xplane.pb")
@@ -200,7 +200,7 @@ def test_a_trace_that_is_broken_off_counts_what_it_holds(monkeypatch, tmp_path):
 
 def test_what_a_preview_measures_stands_in_its_steps_line(fake_model, tmp_path, monkeypatch):
     told = []
-    monkeypatch.setattr(loop.LiveView, "say", lambda _view, text: told.append(text))
+    monkeypatch.setattr(loop.LiveView, "log", lambda _view, text: told.append(text))
 
     def preview(_params, stage, number):
         psnr = {"model": 12.5} if stage.number == 1 else {"memory": 15.25, "empty": 13.0 + number}
@@ -223,7 +223,7 @@ def test_a_preview_that_does_not_fit_costs_a_line_and_not_the_training(
     fake_model, tmp_path, monkeypatch
 ):
     told = []
-    monkeypatch.setattr(loop.LiveView, "say", lambda _view, text: told.append(text))
+    monkeypatch.setattr(loop.LiveView, "log", lambda _view, text: told.append(text))
 
     def preview(_params, _stage, _number):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")

@@ -88,7 +88,7 @@ def config(run, **changes):
 def train(config, **options):
     said = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop.LiveView, "say", lambda _view, text: said.append(text))
+        patch.setattr(loop.LiveView, "log", lambda _view, text: said.append(text))
         loop.train(config, log=said.append, **options)
     return said
 
