@@ -261,7 +261,7 @@ class _Walk:
     def _scan(
         self, params: Mapping[str, Any], marks: list[_Mark], wanted: list[bool]
     ) -> tuple[Work, list[_Mark]]:
-        consts, carries = params["num_consts"], params["num_carry"]
+        consts, carries = _scan_sizes(params)
         before, each = marks[:consts], [_sliced(mark) for mark in marks[consts + carries :]]
         carry = [_Mark(mark.trained) for mark in marks[consts : consts + carries]]
         work, out = self._loop(params["jaxpr"].jaxpr, before, carry, each, wanted)
@@ -364,12 +364,20 @@ def _reaching(jaxpr: Any, wanted: Sequence[bool]) -> frozenset[Any]:
     return frozenset(found)
 
 
+def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the numbers of a scan's constants and of the values that it carries."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()  # JAX 0.12
+    return len(list(consts)), len(list(carry))
+
+
 def _wanted_inputs(eqn: Any, wanted: Sequence[bool]) -> list[bool]:
     """Return which inputs of an equation wanted results depend on."""
     name, params, count = eqn.primitive.name, eqn.params, len(eqn.invars)
     if name == "scan":
-        body, consts = params["jaxpr"].jaxpr, params["num_consts"]
-        inside = _wanted_in_loop(body, consts, params["num_carry"], wanted)
+        body = params["jaxpr"].jaxpr
+        inside = _wanted_in_loop(body, *_scan_sizes(params), wanted)
         return _inputs_of(body, inside)
     if name == "while":
         body, skipped = params["body_jaxpr"].jaxpr, params["cond_nconsts"]
