@@ -195,7 +195,7 @@ def test_what_is_no_pair_of_reports_is_refused(tmp_path, errors, capsys):
     with pytest.raises(UserError, match="the scores clip by clip"):
         compare.compare(a, b)
     assert program.main(["compare", str(a)]) == 2
-    assert "Name two scored runs first" in capsys.readouterr().err
+    assert "RUN_B is missing" in capsys.readouterr().err
 
 
 def test_lpips_of_different_networks_is_left_out(tmp_path, errors):

@@ -537,7 +537,7 @@ def test_bad_input_ends_in_one_sentence(copied, command, capsys, tmp_path):
     assert "missing does not exist" in refused(
         command, [str(copied), "--data", str(tmp_path / "missing"), "--split", ""], capsys
     ).replace("/ ", " ")
-    assert "Name a run folder" in refused(command, [], capsys)
+    assert "RUN is missing" in refused(command, [], capsys)
     assert "did you mean --clips" in refused(command, [str(copied), "--clip", "1"], capsys)
     assert "evaluate.clips" in refused(command, [str(copied), "--clips", "0"], capsys)
     assert "sample_steps" in refused(command, [str(copied), "--steps", "0"], capsys)
