@@ -310,7 +310,7 @@ def test_the_oracle_says_where_it_knows_no_way(mesh):
     env.reset(seed=0)
     with pytest.raises(UserError, match="do not lead to this goal"):
         oracle.actions(env)
-    with pytest.raises(UserError, match="House alone"):
+    with pytest.raises(UserError, match="the oracle needs a house"):
         oracle.actions(gymnasium.make("CartPole-v1"))
 
 
