@@ -52,8 +52,8 @@ def clocks(interrupt: tuple[int, int] | None = None) -> Iterator[Spans]:
 
         return call
 
-    def compiled(config: Any, stage: Any, mesh: Any, clip: Any) -> Callable[..., Any]:
-        step = compile_step(config, stage, mesh, clip)
+    def compiled(config: Any, stage: Any, mesh: Any, clip: Any, *given: Any) -> Callable[..., Any]:
+        step = compile_step(config, stage, mesh, clip, *given)
         name = f"step{stage.number}"
 
         def call(*args: Any) -> Any:

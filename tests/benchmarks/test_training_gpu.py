@@ -30,7 +30,7 @@ def test_without_a_gpu_it_refuses_in_a_sentence(gpu, monkeypatch):
 
 
 def test_the_real_step_is_measured_beside_what_was_predicted(gpu, fake_model, monkeypatch):
-    guess = {"predicted_s": 0.1, "predicted_mfu": 0.5, "predicted_gb": 1.0}
+    guess = {"predicted_s": 0.1, "predicted_mfu": 0.5, "held_gb": 1.0}
     monkeypatch.setattr(gpu, "predicted", lambda *_: guess)
     monkeypatch.setattr(configs, "load", lambda _: fakes.config())
     found = {f"{number}, 4": gpu.measure("any", number, 4, 2) for number in (1, 2)}
@@ -46,7 +46,7 @@ def test_batches_grow_until_the_memory_ends_and_no_part_is_done_twice(
     gpu, monkeypatch, tmp_path, capsys
 ):
     numbers = {"s": 0.1, "predicted_s": 0.2, "mfu": 0.5, "predicted_mfu": 0.25}
-    numbers |= {"peak_gb": 50.0, "predicted_gb": 51.0, "compile_s": 60.0}
+    numbers |= {"peak_gb": 50.0, "held_gb": 51.0, "compile_s": 60.0}
     asked = []
 
     def run(command, **_options):
@@ -59,7 +59,7 @@ def test_batches_grow_until_the_memory_ends_and_no_part_is_done_twice(
         )
 
     monkeypatch.setattr(gpu, "has_gpu", lambda: True)
-    monkeypatch.setattr(gpu, "predicted", lambda *_: {"predicted_gb": 99.0})
+    monkeypatch.setattr(gpu, "predicted", lambda *_: {"held_gb": 99.0})
     monkeypatch.setattr(gpu.subprocess, "run", run)
     state = ["--state", str(tmp_path / "state.json")]
     gpu.main([*state, "--seconds", "-1"])
@@ -79,5 +79,5 @@ def test_the_preset_fits_one_device_by_the_sums(gpu):
         config = gpu.setting("pewm_2b", stage, 1)
         assert stage.settings(config).batch == 1
         found = gpu.predicted(config, stage, gpu.chips.named("h200"))
-        assert 10 < found["predicted_gb"] < 141
+        assert 10 < found["held_gb"] < 141
         assert 0 < found["predicted_mfu"] < 0.65

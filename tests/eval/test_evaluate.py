@@ -5,12 +5,10 @@ from __future__ import annotations
 import base64
 import dataclasses
 import functools
-import importlib.util
 import io
 import json
 import re
 import shutil
-import sys
 import types
 from html.parser import HTMLParser
 from pathlib import Path
@@ -22,13 +20,15 @@ import pytest
 from PIL import Image
 
 from pewm_jax import config as configs
+from pewm_jax.cli import main, parser
 from pewm_jax.cli import main as program
 from pewm_jax.config import StageConfig, TrainConfig, UserError
 from pewm_jax.eval import compare, preview, runner
 from pewm_jax.eval import evaluate as report
 from pewm_jax.eval import loaded_run as runs
 from pewm_jax.eval.runner import Methods, ModelRunner
-from pewm_jax.io import tree, weights
+from pewm_jax.io import runtime, tree, weights
+from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.report.evaluation_page import introduction
 from pewm_jax.report.labels import format_comparison, format_drift, format_verdict, number
@@ -43,12 +43,12 @@ FLAT = Frames(np.zeros((1, 1, 2, 2, 3)), np.zeros((1, 1, 2, 2)), None)
 
 @pytest.fixture(scope="module")
 def command():
-    spec = importlib.util.spec_from_file_location("evaluate_command", ROOT / "evaluate.py")
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    def evaluate(argv):
+        return main.execute(["evaluate", *argv], "python evaluate.py")
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module.cli, "cache_compilation", lambda _: None)
-        yield functools.partial(module.cli.run, module.main)
+        patch.setattr(runtime, "cache_compilation", lambda _: None)
+        yield functools.partial(parser.run, evaluate)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -468,7 +468,7 @@ def test_a_run_without_a_memory_is_scored_and_compared_under_its_own_name(run, t
 
 def test_a_memory_of_kind_none_is_no_memory_and_its_blocks_are_used(run, tmp_path):
     none = configs.load(run / "config.json").model.memory
-    memory = configs.NoMemoryConfig(capacity=none.capacity, tokens=none.tokens, reader=none.reader)
+    memory = NoMemoryConfig(capacity=none.capacity, tokens=none.tokens, reader=none.reader)
     config = configs.load(run / "config.json").with_model(memory=memory)
     (tmp_path / "none").mkdir()
     configs.save(config, tmp_path / "none" / "config.json")
@@ -582,7 +582,7 @@ def test_an_interruption_is_said_and_has_its_own_exit_code(copied, command, caps
 
     monkeypatch.setattr(ModelRunner, "run", interrupted)
     assert command([str(copied), "--stride", "2"]) == 130
-    assert "go on" in capsys.readouterr().err
+    assert "to resume" in capsys.readouterr().err
 
 
 def test_weights_that_diverged_are_refused(copied):

@@ -171,7 +171,7 @@ def told_at(read, batch, pause=0.0):
 
 def meet(argv):
     """Do nothing but agree, again and again."""
-    launch = program.read("train", argv, "train.py")[0].launch
+    launch = program.read("train", ["tiny", *argv], "train.py")[0].launch
     with processes.joined(launch):
         for count in itertools.count():
             processes.agree(count)
@@ -181,7 +181,7 @@ def meet(argv):
 
 def place(argv):
     """Place a batch on meshes of every kind, and check what lies on each device of this process."""
-    launch = program.read("train", argv, "train.py")[0].launch
+    launch = program.read("train", ["tiny", *argv], "train.py")[0].launch
     with processes.joined(launch):
         first, second = np.asarray(jax.devices()).reshape(2, -1)
         count = len(first)

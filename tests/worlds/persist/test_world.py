@@ -16,6 +16,7 @@ from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.memory import class_grid
 from pewm_jax.memory import interface as memories
+from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.planning import imagined_env
@@ -439,7 +440,7 @@ def test_its_settings_travel_and_what_cannot_work_is_refused():
             },
             "backbone.renderer.drawn is 5: use 0, or the 64",
         ),
-        ({"memory": configuration.VoxelConfig()}, "made of a GridConfig"),
+        ({"memory": VoxelConfig()}, "made of a GridConfig"),
         ({"codec": PixelConfig(spatial=2, temporal=1)}, "pixel_channels is 88"),
         ({"noise": dataclasses.replace(NOISE, per_frame=False)}, "per_frame is false"),
         ({"memory": dataclasses.replace(MODEL.memory, recorded=8)}, "memory.recorded is 8"),

@@ -1,0 +1,3 @@
+from tests.train.fakes import fake_model
+
+__all__ = ["fake_model"]
