@@ -55,7 +55,9 @@ def test_the_clocks_see_every_step_save_and_line_of_the_real_loop(parts, fake_mo
 @pytest.mark.slow
 def test_an_interrupted_training_is_measured_and_goes_on(parts, fake_model, tmp_path, monkeypatch):
     config = fakes.config(tmp_path / "run", stage1=8, stage2=8, save_every=100)
-    monkeypatch.setattr("train.main", lambda argv: loop.train(config, log=lambda _: None))
+    monkeypatch.setattr(
+        "pewm_jax.cli.main.execute", lambda _argv: loop.train(config, log=lambda _: None)
+    )
     spans = parts.train_with_clocks(["tiny"], interrupt=(2, 5))
     assert (len(spans["step1"]), len(spans["step2"])) == (8, 5)
     spans = parts.train_with_clocks(["tiny"])
