@@ -22,6 +22,8 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import os
+import sys
 import warnings
 from collections.abc import Callable
 from importlib import metadata
@@ -285,8 +287,20 @@ def _address(settings: type) -> str:
 
 
 def _same(one: type, other: type) -> bool:
-    """Tell whether two classes are one, or the same definition run twice."""
-    return _address(one) == _address(other)
+    """Tell whether two classes are one, or the same definition run twice.
+
+    A file that is imported by its name and by ``--plugin`` is run twice, as two modules.
+    """
+    if one.__qualname__ != other.__qualname__:
+        return False
+    files = [_file(kind) for kind in (one, other)]
+    return one.__module__ == other.__module__ or (None not in files and files[0] == files[1])
+
+
+def _file(kind: type) -> str | None:
+    """Return the path of the file that defines a class, None if there is none."""
+    path = getattr(sys.modules.get(kind.__module__), "__file__", None)
+    return None if path is None else os.path.realpath(path)
 
 
 def names(section: str) -> list[str]:

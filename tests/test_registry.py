@@ -378,3 +378,20 @@ def test_a_world_is_chosen_before_its_parts(tmp_path):
     file = tmp_path / "mine.json"
     file.write_text('{"model": {"noise": {"kind": "flow", "shift": 2}, "kind": "other"}}')
     assert overlay(TINY, file).model.noise.shift == 2
+
+
+def test_a_file_run_as_two_modules_registers_one_kind(tmp_path):
+    path = tmp_path / "twice.py"
+    path.write_text(
+        "import dataclasses\n"
+        "from pewm_jax.config.parts import Noise\n"
+        "from pewm_jax.registry import register\n"
+        "@register('noise', 'twice')\n"
+        "@dataclasses.dataclass(frozen=True)\n"
+        "class TwiceConfig(Noise):\n"
+        "    pass\n"
+    )
+    for name in ("twice_by_name", "twice_by_file"):
+        spec = importlib.util.spec_from_file_location(name, path)
+        module = sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
