@@ -29,8 +29,6 @@ PATCH = 4
 COLOURS = 3
 GATE = 65535
 """Folded into the key of the gate's parameters."""
-PASSES = 30
-"""Times that the widest array is read or written while a frame is encoded."""
 
 
 _STATISTICS = ("latent_mean_C", "latent_scale_C")

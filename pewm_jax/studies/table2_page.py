@@ -28,7 +28,6 @@ COLUMNS: Mapping[str, tuple[str, int]] = {
     "spl": ("SPL, %", 1),
 }
 """Score → heading, decimals."""
-LOWER = ("ate", "rpe", "position_error", "yaw_error")
 PAPER = (
     ("NoMaD", 4.94, 4.86, 36.8),
     ("NWM × 8", 4.82, 3.62, 59.7),

@@ -19,10 +19,6 @@ from pewm_jax.types import Array, Params
 REPLICATED = P()
 
 
-STREAMS = (16, 40)
-"""How often element-wise work reads or writes a block's tokens: forward, backward."""
-
-
 @dataclasses.dataclass(frozen=True)
 class DiTBackbone(DiTConfig, Backbone):
     """The diffusion transformer of CogVideoX as the denoiser of a world model."""

@@ -13,11 +13,6 @@ from pewm_jax.models.cogvideox import vae
 from pewm_jax.models.cogvideox.config import VAEConfig
 from pewm_jax.types import Array, Params
 
-PASSES = 70
-"""How often encoding a clip reads or writes as many values as its widest array has."""
-HELD = 4.4
-"""Peak memory of encoding a chunk, in copies of its widest array."""
-
 
 @dataclasses.dataclass(frozen=True)
 class VAECodec(VAEConfig, Codec):

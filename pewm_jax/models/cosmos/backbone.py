@@ -25,8 +25,6 @@ from pewm_jax.types import Array, Params
 
 KNOWN_SIGMA = 1e-4
 """The noise level σ of observed frames in the network's input, as in the reference's pipeline."""
-STREAMS = (24, 60)
-"""How often element-wise work reads or writes a block's tokens: forward, backward."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,12 +27,6 @@ from pewm_jax.types import Array, Params
 REPLICATED = P()
 
 
-STREAMS = (14, 36)
-"""How often element-wise work reads or writes a residual block's output: forward, backward."""
-
-KEPT = {"resnet": 14, "attention": 80}
-"""Arrays of the size of a block's output that its backward pass needs; three feed-forward layers,
-with eight times as many channels inside, make up most of an attention's. A rough count."""
 BLOCK = {"resnet": 30, "attention": 160}
 """The same at the peak of its own backward pass."""
 

@@ -16,11 +16,6 @@ from pewm_jax.models.svd import vae as svd_vae
 from pewm_jax.models.svd.config import SVDVAEConfig
 from pewm_jax.types import Array, Params
 
-PASSES = 60
-"""How often encoding a frame reads or writes as many values as its widest array has."""
-HELD = 4
-"""Peak memory of encoding a clip, in copies of its widest array."""
-
 
 @dataclasses.dataclass(frozen=True)
 class SVDVAECodec(SVDVAEConfig, Codec):

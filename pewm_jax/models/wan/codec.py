@@ -13,13 +13,6 @@ from pewm_jax.models.wan import vae as wan_vae
 from pewm_jax.models.wan.config import WanVAEConfig
 from pewm_jax.types import Array, Params
 
-PASSES = 60
-"""How often encoding a frame reads or writes as many values as its widest array has."""
-HELD = 6.0
-"""Peak memory of encoding four frames, in copies of their widest array."""
-CHUNK = 4
-"""Frames that are encoded at a time."""
-
 
 @dataclasses.dataclass(frozen=True)
 class WanVAECodec(WanVAEConfig, Codec):

@@ -22,8 +22,6 @@ from pewm_jax.worlds.persist.step import reckoning
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 Measured = dict[str, Array]
-GRIDS = 2
-"""Grids of a clip from which the autoencoder learns: of its first and of its last frame."""
 STATISTICS = r"voxel_vae/latent_(mean|scale)_C"
 SMALL = 1e-4
 """The least scale of a latent."""
