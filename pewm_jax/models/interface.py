@@ -1,15 +1,17 @@
-"""What a backbone gets besides the noisy latents: conditioning, observed frames, memory readers."""
+"""What model families share: the inputs of a backbone, and published autoencoders as codecs."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import ModelConfig
+from pewm_jax.config.parts import Codec, Rules
 from pewm_jax.types import Array, Params
 
 
@@ -113,3 +115,30 @@ def held(conditioning: Conditioning, latents_BthwC: Array) -> Array:
         return latents_BthwC
     there = conditioning.known_Bt[:, :, None, None, None]
     return jnp.where(there, conditioning.known_BthwC, latents_BthwC)
+
+
+class PublishedVAE(Codec):
+    """A published autoencoder as a codec: colour and depth by the same frozen weights.
+
+    A subclass has the setting ``latent_channels`` and, if depth is optional, ``depth``.
+    """
+
+    SHARDING: ClassVar[Rules] = (
+        (r"codec/.*/kernel", P(None, "fsdp")),
+        (r"codec/.*/(scale|bias|mix)", P()),
+    )
+    """Weights are stored sharded and gathered for use; each device encodes its own clips."""
+    DEPTH_AS_GREY: ClassVar[bool] = True
+    CONVERTED: ClassVar[bool] = True
+    latent_channels: Any
+    depth: Any = True
+
+    @property
+    def rgb_channels(self) -> int:
+        """Latent channels of colour."""
+        return self.latent_channels
+
+    @property
+    def depth_channels(self) -> int:
+        """Latent channels of depth, which is encoded as a grey image."""
+        return self.latent_channels * self.depth

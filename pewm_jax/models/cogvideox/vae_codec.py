@@ -3,38 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
-from jax.sharding import PartitionSpec as P
-
-from pewm_jax.config.parts import Codec, Rules
 from pewm_jax.errors import require
 from pewm_jax.models.cogvideox import vae
 from pewm_jax.models.cogvideox.config import VAEConfig
+from pewm_jax.models.interface import PublishedVAE
 from pewm_jax.types import Array, Params
 
 
 @dataclasses.dataclass(frozen=True)
-class VAECodec(VAEConfig, Codec):
+class VAECodec(VAEConfig, PublishedVAE):
     """The video autoencoder of CogVideoX; its weights come from a converted checkpoint."""
-
-    SHARDING: ClassVar[Rules] = (
-        (r"codec/.*/kernel", P(None, "fsdp")),
-        (r"codec/.*/(scale|bias)", P()),
-    )
-    """Weights are stored sharded and gathered for use; each device encodes its own clips."""
-    DEPTH_AS_GREY: ClassVar[bool] = True
-    CONVERTED: ClassVar[bool] = True
-
-    @property
-    def rgb_channels(self) -> int:
-        """Latent channels of colour."""
-        return self.latent_channels
-
-    @property
-    def depth_channels(self) -> int:
-        """Latent channels of depth, which is encoded as a grey image."""
-        return self.latent_channels
 
     def check(self, model: Any) -> None:
         """Refuse clips that cannot be encoded, or decode to another number of frames."""

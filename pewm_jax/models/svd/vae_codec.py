@@ -7,42 +7,21 @@ not, as in the reference's pipeline.
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
-from jax.sharding import PartitionSpec as P
-
-from pewm_jax.config.parts import Codec, Rules
+from pewm_jax.models.interface import PublishedVAE
 from pewm_jax.models.svd import vae as svd_vae
 from pewm_jax.models.svd.config import SVDVAEConfig
 from pewm_jax.types import Array, Params
 
 
 @dataclasses.dataclass(frozen=True)
-class SVDVAECodec(SVDVAEConfig, Codec):
+class SVDVAECodec(SVDVAEConfig, PublishedVAE):
     """The autoencoder of Stable Video Diffusion; its weights come from a converted checkpoint."""
-
-    SHARDING: ClassVar[Rules] = (
-        (r"codec/.*/kernel", P(None, "fsdp")),
-        (r"codec/.*/(scale|bias|mix)", P()),
-    )
-    """Weights are stored sharded and gathered for use; each device encodes its own clips."""
-    DEPTH_AS_GREY: ClassVar[bool] = True
-    CONVERTED: ClassVar[bool] = True
 
     @property
     def framewise(self) -> bool:
         """Whether a latent frame is decoded by itself: no, with its neighbours."""
         return False
-
-    @property
-    def rgb_channels(self) -> int:
-        """Latent channels of colour."""
-        return self.latent_channels
-
-    @property
-    def depth_channels(self) -> int:
-        """Latent channels of depth."""
-        return self.latent_channels * self.depth
 
     def init(self, key: Array) -> Params:
         """Return random parameters."""

@@ -3,43 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
-from jax.sharding import PartitionSpec as P
-
-from pewm_jax.config.parts import Codec, Rules
 from pewm_jax.errors import require
+from pewm_jax.models.interface import PublishedVAE
 from pewm_jax.models.wan import vae as wan_vae
 from pewm_jax.models.wan.config import WanVAEConfig
 from pewm_jax.types import Array, Params
 
 
 @dataclasses.dataclass(frozen=True)
-class WanVAECodec(WanVAEConfig, Codec):
+class WanVAECodec(WanVAEConfig, PublishedVAE):
     """Wan's video autoencoder; its weights come from a converted checkpoint."""
-
-    SHARDING: ClassVar[Rules] = (
-        (r"codec/.*/kernel", P(None, "fsdp")),
-        (r"codec/.*/(scale|bias)", P()),
-    )
-    """Weights are stored sharded and gathered for use; each device encodes its own clips."""
-    DEPTH_AS_GREY: ClassVar[bool] = True
-    CONVERTED: ClassVar[bool] = True
 
     @property
     def framewise(self) -> bool:
         """Whether a latent frame is decoded by itself: no, with those before it."""
         return False
-
-    @property
-    def rgb_channels(self) -> int:
-        """Latent channels of colour."""
-        return self.latent_channels
-
-    @property
-    def depth_channels(self) -> int:
-        """Latent channels of depth."""
-        return self.latent_channels * self.depth
 
     def check(self, model: Any) -> None:
         """Refuse clips that are not encoded four frames at a time."""
