@@ -144,7 +144,8 @@ def register(section: str, name: str, settings: type | None = None, where: Any =
     """Register a kind, by a call or as a decorator: ``@register("codec", "turn")``.
 
     Registering the same class again replaces it: the same object, or the class that a notebook's
-    cell or a reloaded module defines again.
+    cell or a reloaded module defines again. A file that is run as two modules registers the class
+    of the first.
 
     Args:
         section: the part of a model, such as ``backbone``.
@@ -186,6 +187,8 @@ def register(section: str, name: str, settings: type | None = None, where: Any =
         found = taken.settings.__name__
     elif built_in is not None and built_in != _address(settings):
         found = built_in.partition(":")[2]
+    elif taken is not None and taken.settings.__module__ != settings.__module__:
+        return taken.settings  # one file run as two modules: both hold the first class
     else:
         if where is not None and built_in is None:
             _add_methods(section, settings)

@@ -395,3 +395,5 @@ def test_a_file_run_as_two_modules_registers_one_kind(tmp_path):
         spec = importlib.util.spec_from_file_location(name, path)
         module = sys.modules[name] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
+    by_name, by_file = (sys.modules.pop(f"twice_by_{how}") for how in ("name", "file"))
+    assert by_name.TwiceConfig is by_file.TwiceConfig, "what one made equals what the other loads"

@@ -162,9 +162,9 @@ def test_the_clip_before_leads_back_to_the_first_frame(monkeypatch):
     np.testing.assert_array_equal(got["conditioning"].camera.world_from_camera, poses)
     observed = got["conditioning"].backbone.joined_BthwC[:, 0, ..., : model.codec.channels]
     np.testing.assert_allclose(observed, ready.extras["latents_thwC"][:, -1], atol=1e-5)
-    np.testing.assert_array_equal(got["sight"].view.depth_THW[0, :, 0, 0], [5, 4, 3, 2, 1])
+    np.testing.assert_array_equal(got["readout"].view.depth_THW[0, :, 0, 0], [5, 4, 3, 2, 1])
     np.testing.assert_array_equal(
-        got["sight"].tokens.features_MF, ready.extras["readout"].tokens.features_MF
+        got["readout"].tokens.features_MF, ready.extras["readout"].tokens.features_MF
     )
 
 

@@ -161,7 +161,7 @@ def test_other_files_are_refused_in_a_sentence(made, tmp_path):
         metrics.load("dreamsim", folder)
     shutil.copy(folder / "open_clip_vitb16_pretrain.pth.tar", folder / "checkpoints" / "x")
     (folder / "checkpoints" / "x").replace(folder / "checkpoints" / "dino_vitbase16_pretrain.pth")
-    with pytest.raises(UserError, match="is no dino_vitb16 of DreamSim"):
+    with pytest.raises(UserError, match="is not DreamSim's dino_vitb16"):
         metrics.load("dreamsim", folder)
     (folder / "ensemble_lora" / "adapter_config.json").write_text("{}")
     with pytest.raises(UserError, match="does not give r and lora_alpha"):

@@ -236,7 +236,7 @@ def test_boxes_are_moved_and_copied_by_the_calls_of_the_voxel_map(state):
     with pytest.raises(UserError, match="no class 'sofa'"):
         class_grid.number_of(MODEL.memory, "sofa")
     assert class_grid.names(MODEL.memory)[class_grid.number_of(MODEL.memory, "door")] == "door"
-    with pytest.raises(UserError, match="takes in no pictures"):
+    with pytest.raises(UserError, match="takes no frames by itself"):
         MODEL.memory.insert(MODEL, {}, blank, None, None)
 
 
