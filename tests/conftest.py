@@ -111,7 +111,21 @@ def pytest_runtest_teardown(item, nextitem):
         LIMIT[0] = max(MOST_BYTES, resident() + MORE_BYTES)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Order the files for workers that take one file at a time."""
+    """Order the files for workers that take one file at a time, and find the cases that are slow.
+
+    Of a parametrized test, ``@pytest.mark.slow(but=…)`` marks all cases except those with these
+    ids, and ``@pytest.mark.slow(only=…)`` those whose ids contain one of these texts; each is a
+    text or a tuple of texts.
+    """
     first = {HERE / name: place for place, name in enumerate(FIRST)}
     items.sort(key=lambda item: first.get(item.path, len(first)))
+    for item in items:
+        mark = item.get_closest_marker("slow")
+        if mark is not None and mark.kwargs:
+            (how, texts), *_ = mark.kwargs.items()
+            texts = (texts,) if isinstance(texts, str) else texts
+            case = item.callspec.id
+            if case in texts if how == "but" else not any(text in case for text in texts):
+                item.own_markers.remove(mark)

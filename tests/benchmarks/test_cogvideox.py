@@ -25,6 +25,7 @@ def test_without_a_gpu_it_refuses_in_a_sentence(gpu, monkeypatch):
         gpu.main([])
 
 
+@pytest.mark.slow
 def test_a_train_step_runs_and_is_reported(gpu):
     setting = gpu.smoke()
     done = {

@@ -29,6 +29,7 @@ def test_without_a_gpu_it_refuses_in_a_sentence(gpu, monkeypatch):
         gpu.main([])
 
 
+@pytest.mark.slow
 def test_the_real_step_is_measured_beside_what_was_predicted(gpu, fake_model, monkeypatch):
     guess = {"predicted_s": 0.1, "predicted_mfu": 0.5, "held_gb": 1.0}
     monkeypatch.setattr(gpu, "predicted", lambda *_: guess)
@@ -74,6 +75,7 @@ def test_batches_grow_until_the_memory_ends_and_no_part_is_done_twice(
     assert len(asked) == 6
 
 
+@pytest.mark.slow
 def test_the_preset_fits_one_device_by_the_sums(gpu):
     for stage in pewm.STAGES[:2]:
         config = gpu.setting("pewm_2b", stage, 1)

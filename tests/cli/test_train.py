@@ -369,6 +369,7 @@ def data(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_training_real_episodes_stopped_by_ctrl_c_and_started_again(data, tmp_path):
     run = tmp_path / "runs" / "it"
     argv = ["tiny", "--data.path", data, "--train.run", run, "--train.save_every", "1000"]

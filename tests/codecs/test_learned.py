@@ -120,6 +120,7 @@ def test_colour_and_depth_go_through_the_same_weights(params):
     assert rgbd.measured(world, depth).shape == (2, *world.latent_shape, 1)
 
 
+@pytest.mark.slow
 def test_a_world_model_with_it_is_built_and_traced():
     world = model()
     assert isinstance(world.codec, LearnedCodecConfig)

@@ -148,6 +148,7 @@ def test_the_record_says_where_it_came_from(imported, images):
         assert record[part] == json.loads((images / part / "config.json").read_text())
 
 
+@pytest.mark.slow
 def test_prompts_are_encoded_as_the_pipeline_does(imported, images, widened):
     tokenizer = AutoTokenizer.from_pretrained(images / "tokenizer")
     encoder = T5EncoderModel.from_pretrained(images / "text_encoder")
@@ -196,6 +197,7 @@ def inputs(config, plan):
     return noisy, conditioning, tokens, video
 
 
+@pytest.mark.slow(but="2b-projective")
 @pytest.mark.parametrize(
     ("variant", "kind"),
     [("2b", "projective"), ("5b-I2V", "sinusoid"), ("1.5-5B-I2V", "projective")],
@@ -269,6 +271,7 @@ def test_the_video_model_in_a_training_run_is_exported(widened, tmp_path):
     require_equal(plain, pipelines.dit("5b-I2V"))
 
 
+@pytest.mark.slow
 def test_settings_of_the_world_model_can_be_given(images, tmp_path):
     settings = tmp_path / "settings.json"
     settings.write_text('{"memory": {"tokens": 32, "heads": 4, "head_dim": 8}}')
@@ -320,6 +323,7 @@ def test_an_imported_world_has_the_paper_s_training_and_small_blocks(widened):
     assert set(params) == {"backbone", "memory", "codec", "text"}
 
 
+@pytest.mark.slow(but="drop")
 @pytest.mark.parametrize("learned", ["interpolate", "drop", "reference"])
 def test_learned_positions_are_for_other_clips_by_choice(images, tmp_path, learned, capsys):
     small = ["--rgbd", "--camera", "--frames", "17"]

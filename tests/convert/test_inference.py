@@ -65,6 +65,7 @@ def export(run, dst):
     return (dst / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_every_leaf_is_there_in_bfloat16_and_the_world_rolls_on(run, params, tmp_path):
     card = export(run, tmp_path / "small")
     config, small = pewm_jax.load(tmp_path / "small")

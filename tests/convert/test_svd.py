@@ -71,6 +71,7 @@ def run(src, dst, **options):
     commands.import_svd(ImportSVD(src, dst, **options))
 
 
+@pytest.mark.slow
 def test_it_loads_with_every_tensor_and_can_be_imagined_and_trained(folder, tmp_path):
     run(folder, tmp_path / "world", height=32, width=48)
     config, params = pewm_jax.load(tmp_path / "world")

@@ -95,6 +95,7 @@ def test_what_is_collected_is_valid(whole):
     np.testing.assert_allclose(heights, 1.25, atol=0.01)
 
 
+@pytest.mark.slow
 def test_the_number_of_processes_leaves_no_trace(whole, tmp_path, mesh):
     collect(settings(tmp_path / "two", mesh, workers=2))
     assert fingerprints(tmp_path / "two") == whole[1]

@@ -117,6 +117,7 @@ def conditioning_of(model, params, clip):
     return world_model.condition(model, params, observed, Control(frames.camera))
 
 
+@pytest.mark.slow(but="v")
 @pytest.mark.parametrize("kind", ["x0", "v"])
 def test_the_loss_is_finite_and_stage_1_ignores_the_memory(kind):
     model, train = tiny_model(noise=DDPMConfig(target=kind)), TrainConfig()
@@ -144,6 +145,7 @@ def test_pixels_without_depth_do_not_train_depth():
     assert float(parts["loss_depth"]) > 0
 
 
+@pytest.mark.slow
 def test_invalid_context_frames_are_not_remembered():
     clip = make_clip()
     tokens = objective.clip_readout(TINY, {}, clip).tokens
@@ -248,6 +250,7 @@ def test_a_fixed_stride_differs_only_where_the_steps_do_not_divide():
     assert np.abs(path(7, "next") - path(7, "fixed")).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_the_world_model_samples_by_dpm_with_its_own_noise():
     model = tiny_model(noise=DDPMConfig(sampler="dpm", sample_steps=2))
     clip, key = make_clip(batch=1), jax.random.key(0)

@@ -266,6 +266,7 @@ def test_flow_draws_a_time_for_every_frame_if_asked():
         assert np.abs(np.diff(drawn, axis=1)).min() > 0
 
 
+@pytest.mark.slow
 def test_training_with_a_time_for_every_frame(monkeypatch):
     clip, key, train = make_clip(), jax.random.key(0), TrainConfig()
     params = randomise(init_world(TINY, memory=False))
@@ -285,6 +286,7 @@ def test_training_with_a_time_for_every_frame(monkeypatch):
     np.testing.assert_allclose(loss(FlowConfig()), one, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [EDMConfig(), FlowConfig(per_frame=True)], ids=["edm", "flow"])
 def test_both_stages_train_with_every_noise(config):
     model, clip = tiny_model(noise=config), make_clip()

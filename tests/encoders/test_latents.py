@@ -153,6 +153,7 @@ def test_features_are_the_latents_of_each_frame_s_colours():
     assert ENCODER.colours(found.reshape(-1, 4)).shape == (30, 3)
 
 
+@pytest.mark.slow
 @ALL
 def test_a_rollout_looks_as_training_does(kind):
     model, params, clips = model_of(kind), weights(kind), batch()
@@ -177,6 +178,7 @@ def test_a_rollout_looks_as_training_does(kind):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), alone, one)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["features of surfels", "picture and attention"])
 def test_worlds_imagine_with_them(kind):
     model, params = model_of(kind), weights(kind)
@@ -192,6 +194,7 @@ def test_worlds_imagine_with_them(kind):
     assert int(after.map.occupied) >= int(state.map.occupied) > 0
 
 
+@pytest.mark.slow
 @PICTURES
 def test_a_fresh_reader_and_an_empty_memory_change_nothing_bit_for_bit(kind):
     _, encoded, _ = inputs()
@@ -262,6 +265,7 @@ def test_a_view_is_encoded_as_frames_are_and_its_holes_do_not_count():
     np.testing.assert_allclose(found.latents_thwC[1], empty, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["features, attended to", "picture"])
 def test_a_prepared_batch_has_the_same_loss(kind):
     model, params, clips = model_of(kind), weights(kind), batch()

@@ -198,6 +198,7 @@ def test_what_is_no_pair_of_reports_is_refused(tmp_path, errors, capsys):
     assert "RUN_B is missing" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_lpips_of_different_networks_is_left_out(tmp_path, errors):
     for name, net in (("a", "alex"), ("b", "vgg")):
         folder = report(tmp_path / name, errors)
@@ -225,6 +226,7 @@ def test_lpips_of_different_networks_is_left_out(tmp_path, errors):
     assert "only one of the two was measured with it" in one.read_text()
 
 
+@pytest.mark.slow
 def test_sides_that_sample_differently_are_told_apart(tmp_path, errors):
     said = []
     for name, steps in (("a", 4), ("b", 2), ("c", 4)):

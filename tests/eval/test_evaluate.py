@@ -301,6 +301,7 @@ def test_a_complete_report_is_left_alone(run, command, capsys, monkeypatch):
     assert (run / "report" / "metrics.json").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_a_damaged_page_is_drawn_again_without_imagining(copied, monkeypatch):
     monkeypatch.setattr(ModelRunner, "run", None)
     page = copied / "report" / "index.html"
@@ -429,6 +430,7 @@ def test_a_model_without_a_memory_gets_a_row(copied, tmp_path):
     assert any("--none" in line for line in said)  # how to get the row
 
 
+@pytest.mark.slow
 def test_a_rival_that_cannot_be_compared_is_refused(copied, command, capsys, tmp_path):
     short = rival(copied, tmp_path / "short", steps=999)
     said = refused(command, [str(copied), "--none", str(short)], capsys)

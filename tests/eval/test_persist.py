@@ -44,6 +44,7 @@ def run(tmp_path_factory):
     return folder / "run"
 
 
+@pytest.mark.slow
 def test_a_world_of_voxels_has_the_report_that_every_world_has(run):
     page = Path(report.evaluate(run, log=lambda _: None))
     assert page.exists()

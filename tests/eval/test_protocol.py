@@ -156,6 +156,7 @@ MEMORIES = {
 }
 
 
+@pytest.mark.slow(but="voxel")
 @pytest.mark.parametrize("kind", MEMORIES)
 def test_padding_of_a_short_context_is_not_remembered(episodes, tmp_path, kind):
     """A context of 4 frames, padded to 6, makes the memory of the 4 frames alone."""
@@ -175,6 +176,7 @@ def test_padding_of_a_short_context_is_not_remembered(episodes, tmp_path, kind):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
+@pytest.mark.slow(only="up to")
 @pytest.mark.parametrize("settings", CANDIDATES, ids=str)
 def test_padding_of_a_short_context_is_not_reprojected_twice(episodes, tmp_path, settings):
     config = tiny(tmp_path)

@@ -104,6 +104,7 @@ def test_settings_have_distinct_names_and_are_checked():
         ReprojectSettings(footprint=0)
 
 
+@pytest.mark.slow
 def test_the_best_on_validation_is_taken_and_kept(tmp_path, monkeypatch):
     config = tiny(tmp_path)
     write_split(tmp_path / "data" / "validation", episodes=2)

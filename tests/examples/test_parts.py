@@ -138,6 +138,7 @@ def test_they_train_save_load_and_imagine(tmp_path, monkeypatch):
     assert not np.array_equal(turned.rgb_THWC, frames.rgb_THWC)
 
 
+@pytest.mark.slow
 def test_a_control_that_needs_actions_says_so():
     config = parts.experiment()
     params = init(config, jax.random.key(0))
@@ -155,6 +156,7 @@ def test_a_control_that_needs_actions_says_so():
         stage.loss(config.model, config.train, params, clip, jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_many_candidates_share_one_memory():
     config = parts.experiment()
     params = init(config, jax.random.key(0))

@@ -132,6 +132,7 @@ def test_a_memory_keeps_its_structure_so_that_a_rollout_can_carry_it(kind):
     assert jax.tree.leaves(before) == jax.tree.leaves(after)
 
 
+@pytest.mark.slow(but=("voxel", "surfels"))
 @EVERY_KIND
 def test_batched_memories_equal_single_ones(kind):
     model = model_of(kind)

@@ -51,6 +51,7 @@ def test_the_command_plans_from_settings_alone_and_writes_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_plan_need_not_be_compiled_and_is_not_where_that_takes_very_long(monkeypatch):
     def refused(*_):
         raise AssertionError("it is compiled")
@@ -131,6 +132,7 @@ def compiled(mesh, temporary):
     return Compiled(hlo.Program((), (), ()), 0.0, temporary, mesh, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("devices", [8, 64, 256])
 @pytest.mark.parametrize(
     ("name", "temporary"), [("pewm_2b", (67e9, 101e9)), ("pewm_5b", (120e9, 173e9))]

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 import pewm_jax
 from pewm_jax import presets
@@ -10,6 +11,7 @@ from tests.helpers import init_world
 from tests.planning.page import blocks
 
 
+@pytest.mark.slow
 def test_twenty_lines_plan(tmp_path, monkeypatch):
     code = blocks("Plan with a world model", "python")
     assert len(code.splitlines()) <= 22

@@ -132,6 +132,7 @@ def length(control):
     return len(getattr(control, "intrinsics_4", control))
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_are_the_loop(params):
     """Three states with their own actions and keys, stepped together and one by one."""
     states = [reset(CONFIG, params, seen(k % 2), KEY) for k in range(3)]

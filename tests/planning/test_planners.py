@@ -40,6 +40,7 @@ def test_cem_reaches_the_goals_within_its_horizon():
     assert successes(CEM()).mean() >= 0.95
 
 
+@pytest.mark.slow
 def test_with_random_costs_it_does_no_better_than_random_actions():
     starts, goals, _ = GRID.tasks(TASKS, HORIZON)
     random = jax.random.randint(KEY, (TASKS, 500, HORIZON), 0, 3)

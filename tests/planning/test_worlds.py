@@ -71,6 +71,7 @@ def equal(a, b, atol=0.0):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol), a, b)
 
 
+@pytest.mark.slow
 def test_batches_are_the_loop_after_several_clips_of_a_rendered_memory():
     model, params, state = world("surfels")
     rollout = ImaginedRollout(model, params, state, KEY, batch=3)
@@ -86,6 +87,7 @@ def test_batches_are_the_loop_after_several_clips_of_a_rendered_memory():
     assert int(kept.occupied) == int(all_.occupied) > 0
 
 
+@pytest.mark.slow
 def test_a_camera_is_rendered_once_whatever_came_before(monkeypatch):
     model, params, state = world("surfels")
     turns = np.array([[1, 2, 0], [2, 1, 0], [0, 0, 0], [0, 1, 2]])
@@ -105,6 +107,7 @@ def test_a_camera_is_rendered_once_whatever_came_before(monkeypatch):
     equal(many(model, params, one.state, turns, keys)[1], first, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_the_size_of_a_batch_changes_nothing_and_compiles_once():
     model, params, state = world("tiny")
     (whole, compiled), rollout = imagined(), ImaginedRollout(model, params, state, KEY, batch=BATCH)
@@ -372,6 +375,7 @@ def simulator(present):
     return lambda actions: seen_from(truly(present.camera.world_from_camera[-1], actions))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", [costs.Distance(costs.straight), costs.Pixels()])
 def test_with_the_true_renderer_goals_within_the_horizon_are_reached(cost):
     rng, config = np.random.default_rng(0), PlanConfig(horizon=6, rounds=8)

@@ -149,6 +149,7 @@ def test_what_is_erased_is_gone_from_the_map_and_from_what_is_seen():
     np.testing.assert_allclose(session.pose(after), session.pose(now), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_box_is_copied_and_moved():
     model, now = an_engine(), a_session()
     box = seen_box(now)

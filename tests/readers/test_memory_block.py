@@ -148,6 +148,7 @@ def test_attention_to_nothing_is_nothing_and_so_is_its_gradient():
     assert np.abs(by_logits[..., some]).min() > 0
 
 
+@pytest.mark.slow(but="projective")
 @BOTH
 def test_masked_tokens_may_hold_anything(positions):
     _, tokens, _ = inputs()
@@ -189,6 +190,7 @@ def lone_block(positions, kind=VoxelConfig):
     return lambda valid: gradient(*parts, valid)
 
 
+@pytest.mark.slow(but="sinusoid")
 @BOTH
 def test_masked_tokens_have_no_gradient_and_an_empty_map_a_finite_one(positions):
     gradient, valid = lone_block(positions), inputs()[1].valid_M
@@ -287,6 +289,7 @@ def test_a_denoiser_without_depth_neither_sees_nor_makes_any():
     assert np.abs(given[0].joined_BthwC[..., :split]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_without_depth_training_weighs_colour_alone_and_rollouts_add_nothing_to_the_map():
     model = model_of(depth=False)
     params = weights("projective")

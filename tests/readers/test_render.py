@@ -74,6 +74,7 @@ def hidden(readout):
     return MemoryReadout(tokens, dataclasses.replace(view, seen_THW=jnp.zeros_like(view.seen_THW)))
 
 
+@pytest.mark.slow(but="render")
 @ALL
 def test_a_fresh_reader_changes_nothing_bit_for_bit(kind):
     model, (_, readout, _) = model_of(kind), inputs()
@@ -129,6 +130,7 @@ def test_each_token_gets_the_pixels_that_it_stands_for():
         assert changed == [[1, (frame + 3) // 4, row // 8, column // 8]]
 
 
+@pytest.mark.slow
 def test_many_channels_are_reduced_and_a_token_in_time_may_hold_two_latent_frames():
     backbone = dataclasses.replace(TINY.backbone, patch_t=2)
     reader = RenderConfig(picture_width=16, reduced=2)
@@ -168,6 +170,7 @@ def batch_of(model, count=2):
     return Clip(frames, frames, jnp.ones((count, 9), bool))
 
 
+@pytest.mark.slow(but="VoxelConfig")
 @pytest.mark.parametrize("memory", [VoxelConfig, SurfelConfig])
 def test_a_rollout_looks_as_training_does(memory):
     model = model_of("both", memory)

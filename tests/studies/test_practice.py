@@ -207,6 +207,7 @@ def test_real_walks_end_at_walls_by_turning(home):
         assert (walk.actions_N != 0).any()  # a house is not 6 m wide everywhere
 
 
+@pytest.mark.slow
 def test_equal_seeds_walk_alike_and_other_seeds_do_not(world, home):
     config, params = world
     place, few = ImaginedEnvironment(config, params, home.context), Practice(walks=1, blocks=1)

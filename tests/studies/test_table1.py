@@ -390,6 +390,7 @@ def measured(tmp_path_factory):
         return base, table1_scoring.open_scorer(base, folder / "out", print), folder / "out"
 
 
+@pytest.mark.slow
 def test_every_measure_of_the_table_stands_beside_what_it_can_be(measured):
     base, judge, out = measured
     truth, copied = judge.truth(out), judge.baseline("copy", out)

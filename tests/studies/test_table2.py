@@ -117,6 +117,7 @@ def test_a_step_or_a_turn_short_is_there_and_two_are_not():
     assert reached == [True, True, False, False]
 
 
+@pytest.mark.slow
 def test_only_the_mind_with_a_memory_sees_the_past():
     config = presets.load("tiny")
     predictors = deciders.Predictors(
@@ -218,6 +219,7 @@ class _Spied(deciders.Predictors):
         return super().observe(mind, state, frames)
 
 
+@pytest.mark.slow(but="truth")
 @pytest.mark.parametrize("mind", ["truth", "reproject", "memory"])
 def test_a_closed_loop_observes_what_is_really_seen_after_each_clip(mind):
     config = presets.load("tiny")  # 4 actions at once

@@ -80,6 +80,7 @@ def loss(params, clip, **settings):
     return float(_loss(tuple(settings.items()), params, clip))
 
 
+@pytest.mark.slow
 def test_a_memory_hidden_from_all_clips_is_an_empty_one(world):
     params, ready = world
     empty = jax.tree.map(np.zeros_like, ready.extras["readout"])

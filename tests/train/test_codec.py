@@ -123,6 +123,7 @@ def test_descent_lowers_the_loss_and_then_the_latents_are_distributed_normally()
     assert moved == {"codec/latent_mean_C", "codec/latent_scale_C"}
 
 
+@pytest.mark.slow
 def test_depth_that_was_not_measured_does_not_count():
     config = experiment()
     params = init(config, jax.random.key(0))

@@ -88,6 +88,7 @@ def run_here(monkeypatch, argv, term_at=0):
     return program.main(["train", *map(str, argv)])
 
 
+@pytest.mark.slow
 def test_two_processes_of_two_devices_compute_the_losses_of_one(tmp_path, monkeypatch):
     data = tmp_path / "data"
     collect(CollectConfig(out=data, train=2, validation=0, test=0, frames=24, size=16, workers=1))

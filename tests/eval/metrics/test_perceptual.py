@@ -49,6 +49,7 @@ def blurred(truth, size):
     return np.stack([cv2.GaussianBlur(x, (0, 0), size) for x in flat]).reshape(truth.shape)
 
 
+@pytest.mark.slow(only="vgg")
 @pytest.mark.parametrize("distort", [noisy, blurred])
 @pytest.mark.parametrize("name", ["psnr", "ssim", "lpips_alex", "lpips_vgg"])
 def test_equal_clips_are_best_and_more_distortion_is_worse(name, distort, files):

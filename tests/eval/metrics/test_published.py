@@ -28,6 +28,7 @@ def spoilt(truth, distort, size):
 PER_CLIP = [name for name in metrics.NAMES if name not in (*WITHOUT, "fvd", "kvd")]
 
 
+@pytest.mark.slow(only=("vgg", "src", "mirror"))
 @pytest.mark.parametrize("name", PER_CLIP)
 def test_a_known_distortion_is_ordered_rightly(name):
     metric = metrics.load(name)
@@ -46,6 +47,7 @@ def test_a_known_distortion_is_ordered_rightly(name):
         assert (steps < 0).all() if higher else (steps > 0).all()
 
 
+@pytest.mark.slow(only=("vgg", "src", "mirror"))
 @pytest.mark.parametrize("name", ["lpips_vgg", "src[alex]", "src[vgg]", "mirror[lpips_alex]"])
 def test_batches_of_any_size_give_the_same_mean(name):
     metric = metrics.load(name)
@@ -58,6 +60,7 @@ def test_batches_of_any_size_give_the_same_mean(name):
     assert getattr(metric, "name", name) == name  # the package's weights go without a mark
 
 
+@pytest.mark.slow
 def test_sets_of_clips_are_further_from_the_truth_the_more_they_are_spoilt():
     fvd, kvd = metrics.load("fvd"), metrics.load("kvd")
     assert isinstance(fvd, VideoDistance)
@@ -73,6 +76,7 @@ def test_sets_of_clips_are_further_from_the_truth_the_more_they_are_spoilt():
             assert found[0] < found[1] < found[2]
 
 
+@pytest.mark.slow
 def test_the_fvd_of_two_halves_of_true_clips_falls_with_their_number_as_the_floor_says():
     fvd = metrics.load("fvd")
     assert isinstance(fvd, VideoDistance)

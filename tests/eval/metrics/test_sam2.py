@@ -67,6 +67,7 @@ def clip(size):
     return video, first
 
 
+@pytest.mark.slow(but="48")
 @pytest.mark.parametrize("size", [SIDE, 48])
 def test_it_is_given_the_exact_masks_of_the_first_frame(folder, size):
     video, first = clip(size)
@@ -77,6 +78,7 @@ def test_it_is_given_the_exact_masks_of_the_first_frame(folder, size):
     assert (both / either).min() > 0.8  # the network's masks are a quarter as large
 
 
+@pytest.mark.slow
 def test_it_follows_as_the_reference_does(folder):
     video, first = clip(SIDE)  # of its own size, so that nothing is resized before it
     network = transformers.Sam2VideoModel.from_pretrained(folder).eval()
@@ -105,6 +107,7 @@ def test_it_follows_as_the_reference_does(folder):
     assert np.ptp(found[1]) > 0
 
 
+@pytest.mark.slow
 def test_it_scores_a_clip(folder):
     video, first = clip(48)
     true = np.repeat(first[:, None], len(video), 1)
@@ -113,6 +116,7 @@ def test_it_scores_a_clip(folder):
     assert score.objects == 2
 
 
+@pytest.mark.slow
 def test_a_report_measures_scs_with_it_where_it_is_named(folder):
     measure, about = selection.select_scs(str(folder), ids=True)
     assert measure is not None

@@ -147,6 +147,7 @@ def test_the_memory_block_takes_a_time_for_each_frame():
     assert (heard.reshape(2, FRAMES, -1).max((0, 2)) > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("positions", "patch_t"), [("projective", 1), ("sinusoid", 2), ("projective", 2)]
 )

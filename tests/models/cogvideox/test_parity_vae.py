@@ -94,6 +94,7 @@ def test_it_encodes_and_decodes_as_the_reference(reference, ours, frames, height
     assert max(compare(reference, ours, video)) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_the_minimal_filtering_is_the_same(reference, ours):
     config, params = ours
     ours = dataclasses.replace(config, convolution="winograd"), params

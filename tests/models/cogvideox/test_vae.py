@@ -42,6 +42,7 @@ def reach(params, frames, latents):
     return np.asarray(jnp.abs(slopes).sum((1, 3, 4, 5)) > 0)
 
 
+@pytest.mark.slow
 def test_with_statistics_held_fixed_a_latent_depends_on_no_later_frame(params, monkeypatch):
     statistics = vae_layers.group_norm_affine
 
@@ -62,6 +63,7 @@ def test_statistics_reach_to_the_end_of_the_chunk_and_no_further(params):
     np.testing.assert_array_equal(seen[0], np.arange(17) < 9)
 
 
+@pytest.mark.slow(but="1")
 @pytest.mark.parametrize("frames", [1, 9])
 def test_weights_stored_in_fewer_bits_are_computed_with_in_full(params, frames):
     half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), params)

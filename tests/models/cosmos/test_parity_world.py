@@ -137,6 +137,7 @@ def test_what_the_pipeline_samples_the_world_samples(pipeline, model, params, mo
     assert not np.any(depth)
 
 
+@pytest.mark.slow
 def test_before_training_any_action_leaves_the_output_bit_for_bit(model, params):
     one = sampled(model, params, FIRST, MOVES, START)
     other = sampled(model, params, FIRST, -3 * MOVES, START)

@@ -149,6 +149,7 @@ def test_the_last_modules_output_equals_torchs(pair, shape):
     near(jax.jit(i3d.trunk)(params, x), want)
 
 
+@pytest.mark.slow
 def test_logits_equal_torchs(pair):
     reference, path = pair
     x = videos(1, 9, 224, 224)

@@ -104,6 +104,7 @@ def theirs(reference, a, b):
         return reference(*(torch.tensor(x.transpose(0, 3, 1, 2)) for x in (a, b))).numpy()
 
 
+@pytest.mark.slow(but="alex")
 def test_distances_equal_torchs(pair):
     net, reference, path = pair
     found, params = lpips_weights.read(path)
@@ -130,6 +131,7 @@ def test_a_file_of_ours_and_a_safetensors_of_torchs_are_the_same_weights(pair, t
         lpips_weights.read(path, other)
 
 
+@pytest.mark.slow(but="alex")
 @pytest.mark.parametrize("net", ["alex", "vgg"])
 def test_the_packages_weights_give_torchs_distances(net):
     _, params = lpips_weights.read(lpips_weights.find(net), net)
@@ -151,6 +153,7 @@ def test_the_packages_weights_give_torchs_distances(net):
     )
 
 
+@pytest.mark.slow
 def test_the_gradient_is_finite_and_torchs_where_torch_has_one():
     params = jax.jit(lpips.init, static_argnums=0)("alex", jax.random.key(0))
     a, b = (jnp.asarray(x) for x in pictures(40, 33, 2))

@@ -162,6 +162,7 @@ def test_slabs_change_nothing_and_drawn_cells_are_a_sample():
     np.testing.assert_allclose(some["cross_entropy"], parts["cross_entropy"], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_cubes_are_pieces_of_the_grid_with_something_in_them():
     config = dataclasses.replace(FOLDED, side=16, cube=8, cubes=64)
     side = config.side

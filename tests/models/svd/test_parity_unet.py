@@ -64,6 +64,7 @@ def test_it_predicts_as_the_reference_at_any_size(pair):
     assert distance(got, reference(network, *arguments)) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_modulation_is_added_per_frame_wherever_the_time_modulates(pair):
     network, _, (config, params) = pair
     arguments = inputs(3, 4, 2, tokens=3)
