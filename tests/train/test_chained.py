@@ -209,6 +209,7 @@ def test_shares_that_are_none_are_refused(setting, value):
         TrainConfig(**{setting: value})
 
 
+@pytest.mark.slow
 def test_the_forward_pass_of_chained_clips_is_counted():
     """A pass without gradients costs less than half of one with them."""
     clip = fakes.clip(CONFIG, 4, 0)

@@ -246,6 +246,7 @@ def test_lpips_without_weights_is_refused_before_anything_is_written(tmp_path, m
         CodecTrainConfig(lpips_weight=-1)
 
 
+@pytest.mark.slow
 def test_it_is_trained_stopped_in_the_middle_loaded_and_no_world_model(clips, tmp_path):
     config = experiment(tmp_path / "run")
     run = loop.train(config, log=lambda _line: None)
@@ -270,6 +271,7 @@ def test_it_is_trained_stopped_in_the_middle_loaded_and_no_world_model(clips, tm
         report.evaluate(run)
 
 
+@pytest.mark.slow
 def test_a_model_starts_from_it_and_is_refused_without_it(clips, tmp_path):
     run = loop.train(experiment(tmp_path / "run"), log=lambda _line: None)
     tiny = presets.load("tiny")
@@ -333,6 +335,7 @@ def recorded(folder, scenes, holes=False):
     write_manifest(folder, Manifest(folder.name, (describe_shard(shard),), {}, 3 * len(records)))
 
 
+@pytest.mark.slow
 def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
     run = loop.train(experiment(tmp_path / "run"), log=lambda _line: None)
     data = tmp_path / "data"

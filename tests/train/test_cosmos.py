@@ -70,6 +70,7 @@ def stepped():
     return config, stage, *trained(config, stage)
 
 
+@pytest.mark.slow
 def test_the_transformer_learns_with_actions_and_the_codec_stands_still(stepped):
     _, _, first, last, losses, _ = stepped
     assert losses[-1] < losses[0]

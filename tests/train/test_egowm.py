@@ -90,6 +90,7 @@ def svd():
     return config, stage, *trained(config, stage)
 
 
+@pytest.mark.slow
 def test_the_u_net_learns_with_actions_and_the_rest_stands_still(svd):
     _, _, first, last, losses, _ = svd
     assert losses[-1] < losses[0]

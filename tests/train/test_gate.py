@@ -142,6 +142,7 @@ def imagining(reader=None):
 LAST = worlds.stages(tiny_config())[3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "reader",
     [

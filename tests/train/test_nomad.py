@@ -85,6 +85,7 @@ def test_waypoints_are_the_places_of_the_next_steps():
         assert np.allclose(each, np.asarray(integrate(start, walk))[1:, :2, 3], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_it_learns_to_walk_as_it_was_shown(tmp_path, clips):
     run = loop.train(experiment(tmp_path / "run", steps=300, save_every=300), log=lambda _: None)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
@@ -100,6 +101,7 @@ def test_it_learns_to_walk_as_it_was_shown(tmp_path, clips):
     assert (told == np.array([1, 2, 0])[kinds]).mean() > 0.8  # chance: a third
 
 
+@pytest.mark.slow
 def test_training_goes_on_and_what_comes_out_is_read(tmp_path, clips):
     whole = loop.train(experiment(tmp_path / "whole"), log=lambda _: None)
     short = experiment(tmp_path / "halves")

@@ -120,6 +120,7 @@ def test_every_leaf_of_the_state_needs_a_sharding_rule(monkeypatch):
         sharding.of_state(model, sharding.make_mesh(), {"step": 0, "params": {"w": 0}})
 
 
+@pytest.mark.slow
 def test_freezing_the_backbone_makes_the_step_of_the_real_model_cheaper():
     small = configs.load("tiny")
     wide = DiTBackbone(layers=1, heads=16, head_dim=32, text_length=1, text_dim=8, time_dim=16)

@@ -58,6 +58,7 @@ def stage_2():
     return compiled(TWO)
 
 
+@pytest.mark.slow
 def test_a_step_of_stage_2_costs_at_most_three_quarters_of_training_everything(stage_2):
     """The same shape, and both compiled; a scanned body counts once in both."""
     everything = compiled(EVERYTHING)
@@ -106,6 +107,7 @@ def test_every_leaf_has_a_rule_and_one_without_fails(stage):
             fewer.labels(params)
 
 
+@pytest.mark.slow
 def test_stage_2_learns_from_pictures_and_changes_nothing_but_the_reader():
     """The clips are what was seen before, so that the pictures show the answer."""
     tiny = configs.load("tiny")

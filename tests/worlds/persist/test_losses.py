@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from pewm_jax.diffusion.flow import PERSIST_VOXELS
 from pewm_jax.geometry import cameras
@@ -144,6 +145,7 @@ def test_the_camera_learns_steps_and_does_not_see_where_the_next_grid_lies():
     assert run(params, last, seen.world_from_camera)[0] == loss
 
 
+@pytest.mark.slow
 def test_the_renderer_learns_to_fold_layers():
     config = VoxelRendererConfig(
         classes=5, height=2, width=4, latent_channels=3, layers=6, embed=4, fold=2, sides=True,

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from pewm_jax import worlds
 from pewm_jax.data import voxel_pictures
@@ -82,6 +83,7 @@ def test_the_light_that_is_read_is_the_light_that_was_drawn():
     assert np.quantile(off, 0.8) < 0.02
 
 
+@pytest.mark.slow
 def test_a_world_begins_on_the_lattice_of_recorded_cells_and_with_what_it_sees():
     frames = random_frames(np.random.default_rng(0), 1, 16, 16)
     params = jax.jit(lambda: worlds.init(MODEL, jax.random.key(0)))()

@@ -90,6 +90,7 @@ def test_imagined_twice_is_the_same_and_its_caches_have_grown(params, state, wal
     assert int(after.map.history.pictures.count) == 4
 
 
+@pytest.mark.slow
 def test_no_frame_depends_on_later_actions(params, state):
     @jax.jit
     def slope(moves):
@@ -166,6 +167,7 @@ def test_an_edit_is_the_world_that_goes_on(params, state):
     assert not (np.asarray(gone.map.classes_XYZ)[inside]).any()
 
 
+@pytest.mark.slow
 def test_the_next_voxels_depend_on_what_was_edited_elsewhere(params, state):
     free = dataclasses.replace(MODEL, persistence_logit=0.0)
     low = np.asarray(state.map.low_3) + 0.5 * np.asarray(state.map.history.start_3)
@@ -181,6 +183,7 @@ def test_the_next_voxels_depend_on_what_was_edited_elsewhere(params, state):
     assert (one != two)[beyond:].any()
 
 
+@pytest.mark.slow
 def test_the_cache_of_a_rollout_is_that_of_its_frames_at_once(params, state):
     clean = dataclasses.replace(NOISE, context_noise=0.0, smallest=0.0)
     model = dataclasses.replace(MODEL, voxel_noise=clean)
@@ -310,6 +313,7 @@ def test_without_its_memory_it_begins_anew_and_the_state_is_left(state, monkeypa
     equal(went_on, [state.map, anew])
 
 
+@pytest.mark.slow
 def test_it_is_an_environment(params):
     env = imagined_env.WorldModelEnv(CONFIG, params, render_mode="rgb_array")
     first, _ = env.reset(seed=0, options={"frames": seen(1, 2), "goal": seen(1, 3)})
@@ -318,6 +322,7 @@ def test_it_is_an_environment(params):
     assert not np.array_equal(after["rgb"], first["rgb"])
 
 
+@pytest.mark.slow
 def test_real_frames_carry_it_on(params):
     frames = seen(2, 2)
     whole = begin(MODEL, params, frames)
@@ -344,6 +349,7 @@ def recorded(count=2):
     return Clip(frames, context, np.ones((count, 1), bool), moves, extras)
 
 
+@pytest.mark.slow(but="camera")
 @pytest.mark.parametrize("stage", worlds.stages(MODEL), ids=lambda stage: stage.name)
 def test_a_stage_learns_what_it_names_from_what_was_prepared(params, stage):
     shapes = jax.eval_shape(lambda: stage.init(MODEL, KEY))
@@ -393,6 +399,7 @@ def test_a_latent_is_occupied_where_anything_is_known_in_its_cells():
     assert np.argwhere(found[0, 0]).tolist() == [[1, 2, 3]]
 
 
+@pytest.mark.slow
 def test_the_renderer_is_given_the_voxels_drawn_in_their_colours(params):
     cells = np.zeros((8, 8, 8), np.int32)
     cells[6] = class_grid.number_of(MODEL.memory, "furniture")

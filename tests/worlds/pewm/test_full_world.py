@@ -85,6 +85,7 @@ def clips(config, split="train", *, seed, batch, start_step=0, **_):
         start_step += 1
 
 
+@pytest.mark.slow
 def test_it_has_every_part_and_rolls_out(world):
     config, params = world
     assert set(params) == {"backbone", "memory", "codec", "encoder", "text"}
@@ -98,6 +99,7 @@ def test_it_has_every_part_and_rolls_out(world):
     assert int(after.map.occupied) >= int(state.map.occupied) > 0
 
 
+@pytest.mark.slow
 def test_text_and_encoder_matter_and_depth_goes_through_the_vae(world):
     config, params = world
     model = config.model

@@ -70,6 +70,7 @@ def remembered(model, memory, frames):
     return memories.insert(model, {}, memory, frames, features, observed=False)
 
 
+@pytest.mark.slow(but="3")
 @pytest.mark.parametrize("count", [1, LENGTH - 1, LENGTH, LENGTH + 2])
 def test_as_many_frames_are_imagined_as_are_asked_for(params, state, two_clips, count):
     """A clip that is cut is that of standing still after the last move."""
@@ -119,6 +120,7 @@ def test_cameras_steer_as_the_actions_that_lead_to_them(params, state, two_clips
     np.testing.assert_allclose(with_actions.rgb_THWC, seen_by.rgb_THWC, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_cameras_have_six_degrees_of_freedom(params, state):
     rng = np.random.default_rng(0)
     camera = random_camera(rng, 6)
