@@ -140,6 +140,7 @@ def predict(kind, params, readout):
     return apply(model_of(kind), params, noisy, conditioning, TIMES, readout)
 
 
+@pytest.mark.slow
 def test_features_are_the_latents_of_each_frame_s_colours():
     kind, frames = "features, rendered", batch().frames
     model, params, rgb = model_of(kind), weights(kind), frames.rgb_THWC[0] / 127.5 - 1

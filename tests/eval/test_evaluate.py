@@ -587,6 +587,7 @@ def test_an_interruption_is_said_and_has_its_own_exit_code(copied, command, caps
     assert "to resume" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_weights_that_diverged_are_refused(copied):
     params = weights.load(copied / "weights.safetensors")
     broken = jax.tree.map(lambda leaf: np.full_like(leaf, np.nan), params)

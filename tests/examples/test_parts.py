@@ -106,6 +106,7 @@ def test_a_user_trains_with_all_four_in_an_empty_folder(data, tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_they_train_save_load_and_imagine(tmp_path, monkeypatch):
     config = parts.experiment(run=str(tmp_path / "run"))
 

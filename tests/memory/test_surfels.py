@@ -187,6 +187,7 @@ def test_a_memory_is_told_what_is_imagined_where_it_asks():
         assert all(alike) != told
 
 
+@pytest.mark.slow
 def test_features_are_those_of_the_patch_a_pixel_lies_in():
     model = of(SMALL, cells=(24, 24, 24), capacity=4096, features=True, cell_m=(0.05,) * 3)
     model = of(model.memory, cells=(512, 512, 512))

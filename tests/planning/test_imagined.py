@@ -76,6 +76,7 @@ def away(pose, action):
     return pose_from_yaw(np.array([x, y, pose[2, 3]]), yaw)
 
 
+@pytest.mark.slow
 def test_after_reset_the_last_frame_is_what_is_seen(state):
     present = imagined.observation(state)
     np.testing.assert_array_equal(present["rgb"], seen().rgb_THWC[-1])

@@ -272,6 +272,7 @@ def test_an_ablation_varies_what_it_says_and_nothing_else(name):
     assert any(row.memory == voxel for row in found)  # the table's own value is among them
 
 
+@pytest.mark.slow
 def test_a_row_gets_as_many_steps_as_its_time_allows(monkeypatch, tmp_path):
     base = presets.load("table1")
     chosen = [row for row in table1_rows.main_rows(base) if row.name in ("none", "voxel-attend")]

@@ -98,6 +98,7 @@ def test_the_memory_is_hidden_clip_by_clip(world):
         assert tokens.all() == tokens.any() == seen.all() == seen.any() == whole
 
 
+@pytest.mark.slow
 def test_chained_clips_are_learnt_from_the_models_own_frame(world):
     """The same loss as that of clips in which the model's frames stand."""
     params, ready = world

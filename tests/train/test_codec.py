@@ -107,6 +107,7 @@ def descend(config, params, stage, count, rate, clips_of):
     return params, found
 
 
+@pytest.mark.slow
 def test_descent_lowers_the_loss_and_then_the_latents_are_distributed_normally():
     config = experiment()
     first, second = worlds.stages(config)

@@ -133,6 +133,7 @@ def test_every_leaf_has_its_place_on_many_devices():
         assert split or small or "codec" in path, f"{path} {leaf.shape} is whole"
 
 
+@pytest.mark.slow
 def test_before_training_any_action_leaves_the_u_net_s_output_bit_for_bit():
     @functools.partial(jax.jit, static_argnums=0)
     def run(config, params, x, time, given):

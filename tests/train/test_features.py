@@ -39,6 +39,7 @@ def batch(config, cache):
     return next(loader.clips(config, seed=0, batch=3, features=read))
 
 
+@pytest.mark.slow
 def test_the_map_of_kept_features_is_the_map_of_computed_ones(config):
     cache = loading.features(config, pewm.STAGES[1])
     kept, plain = batch(config, cache), batch(config, None)

@@ -92,6 +92,7 @@ def clips(monkeypatch):
     monkeypatch.setattr(loop.loader, "clips", given)
 
 
+@pytest.mark.slow
 def test_only_the_gate_learns_in_its_stage_and_the_run_can_be_loaded(clips, tmp_path):
     first = loop.train(experiment(tmp_path / "codec", codec=1, statistics=1), log=lambda _: None)
     before = tree.flatten(pewm_jax.load(first)[1])

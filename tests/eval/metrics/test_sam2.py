@@ -67,7 +67,7 @@ def clip(size):
     return video, first
 
 
-@pytest.mark.slow(but="48")
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [SIDE, 48])
 def test_it_is_given_the_exact_masks_of_the_first_frame(folder, size):
     video, first = clip(size)

@@ -58,12 +58,13 @@ def test_with_statistics_held_fixed_a_latent_depends_on_no_later_frame(params, m
     assert seen[(frame <= 4 * latent) & (frame > 4 * latent - 4)].all()
 
 
+@pytest.mark.slow
 def test_statistics_reach_to_the_end_of_the_chunk_and_no_further(params):
     seen = reach(params, 17, 1)
     np.testing.assert_array_equal(seen[0], np.arange(17) < 9)
 
 
-@pytest.mark.slow(but="1")
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [1, 9])
 def test_weights_stored_in_fewer_bits_are_computed_with_in_full(params, frames):
     half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), params)

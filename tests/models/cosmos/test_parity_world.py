@@ -156,6 +156,7 @@ def test_before_training_any_action_leaves_the_output_bit_for_bit(model, params)
     )
 
 
+@pytest.mark.slow
 def test_attention_over_time_is_not_causal_and_the_given_frame_and_earlier_chunks_stand(
     model, params
 ):

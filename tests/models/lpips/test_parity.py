@@ -104,7 +104,7 @@ def theirs(reference, a, b):
         return reference(*(torch.tensor(x.transpose(0, 3, 1, 2)) for x in (a, b))).numpy()
 
 
-@pytest.mark.slow(but="alex")
+@pytest.mark.slow
 def test_distances_equal_torchs(pair):
     net, reference, path = pair
     found, params = lpips_weights.read(path)

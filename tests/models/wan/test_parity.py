@@ -58,7 +58,7 @@ def require_equal(network, config, params, video):
     assert got.shape[1] == video.shape[1]
 
 
-@pytest.mark.slow(but="5")
+@pytest.mark.slow(but="1")
 @pytest.mark.parametrize("frames", [1, 5, 13])
 def test_clips_are_encoded_and_decoded_as_by_the_reference(pair, frames):
     """Rows and columns beyond the latents are read, too: 19 × 9 pixels, 2 × 1 latents."""

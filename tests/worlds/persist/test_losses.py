@@ -57,6 +57,7 @@ def test_whoever_knows_the_answer_has_no_error():
     assert asked == [(2, 5)]
 
 
+@pytest.mark.slow
 def test_world_frames_are_shown_the_picture_before_and_learn_from_everything():
     config = VoxelDiTConfig(
         latent_side=2, latent_channels=3, patch=1, actions=4, pixel_channels=5, blocks=BLOCKS

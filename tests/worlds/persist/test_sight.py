@@ -43,6 +43,7 @@ def furnished():
     return grid, rgb, seen.depth_THW[0], one
 
 
+@pytest.mark.slow
 def test_a_picture_tells_air_from_surfaces_and_their_colours():
     grid, rgb, depth, camera = furnished()
     evidence = persist_sight.seen(ROOM, LOW, rgb, depth, camera)

@@ -68,6 +68,7 @@ def walked(params, state):
     return imagine(MODEL, params, state, MOVES, KEY)
 
 
+@pytest.mark.slow
 def test_one_image_begins_a_world_whose_window_is_known(state):
     start = state.map.history.start_3
     inside = windows.window(MODEL, state.map.classes_XYZ, start)
@@ -264,6 +265,7 @@ def test_windows_move_by_tokens_and_what_leaves_is_kept(params, walked, state):
     assert not known[:, 3].any()
 
 
+@pytest.mark.slow
 def test_known_grids_are_begun_in_and_rendered(params):
     frames = seen()
     rng = np.random.default_rng(5)
