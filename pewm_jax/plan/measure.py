@@ -168,7 +168,7 @@ def trace(config: Config, stage: Stage, devices: Sequence[Any]) -> jax.stages.Tr
     """Trace a stage's real step from shapes alone."""
     config, mesh = as_on_chips(config), sharding.make_mesh(devices, config.train.mesh)
     clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
-    return step.trace_step(config, stage, mesh, clip, step.given_weights(config, stage, mesh))
+    return step.trace_step(config, stage, mesh, clip, step.load_extra_weights(config, stage, mesh))
 
 
 def compile_traced(traced: jax.stages.Traced, mesh: Mesh | MeshSizes) -> Compiled:

@@ -1,6 +1,5 @@
 """Training.
 
-Read in this order: ``stages`` (what trains when), ``optimizer``, ``state``, ``sharding``,
-``step`` (one pure function), ``checkpoint``, ``log``, ``loop`` (the only part with side effects
-and a clock).
+Reading order: ``stages`` (what is trained when), ``optimizer``, ``sharding``, ``step`` (one pure
+function), ``checkpoint``, ``log``, ``loop`` (the only module with side effects and a clock).
 """

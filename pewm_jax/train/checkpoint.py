@@ -1,12 +1,12 @@
-"""Checkpoints by Orbax: written in the background, whole or not at all, and checked when read.
+"""Orbax checkpoints: written in the background, published atomically, and verified when read.
 
 One folder per stage. Each checkpoint has four items: ``weights``, the inference weights, which can
-be loaded alone; ``state``, what else training needs (the trained parameters and the optimizer's
+be loaded alone; ``state``, the rest of the training state (trained parameters and optimizer
 moments; frozen parameters are in ``weights``); ``data``, the position in the data; ``config``, the
-experiment. Arrays restore to any mesh, any number of devices and of processes.
+experiment. Arrays can be restored to any mesh and any number of devices and processes.
 
-Orbax writes into a temporary folder; ``step_folders`` adds a manifest of checksums and renames it.
-A checkpoint that does not match its manifest is set aside, and the one before it is used.
+Orbax writes into a temporary folder; ``checkpoint_files`` adds a manifest of checksums and renames
+it. A checkpoint that does not match its manifest is moved aside, and the previous one is used.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ WEIGHTS_ITEM = checkpoint_files.WEIGHTS_ITEM
 STATE_ITEM, DATA_ITEM, CONFIG_ITEM = "state", "data", "config"
 
 _MOMENT_S, _SHARE = 2.0, 0.02
-"""How long ``settle`` waits: seconds, or if longer a share of the time between two saves."""
+"""Longest wait of ``settle``: the larger of these seconds and this share of the save interval."""
 
 
 class Checkpoints:
-    """The checkpoints of one stage of one run; a context manager that waits for writes.
+    """The checkpoints of one stage of one run; a context manager that waits for pending writes.
 
-    On construction, damaged checkpoints newer than the newest good one are set aside. All processes
-    of a job construct this, and call its methods in the same order.
+    On construction, damaged checkpoints newer than the newest intact one are moved aside. All
+    processes of a job construct this, and call its methods in the same order.
 
     Args:
         run: the run's folder.
-        config: the experiment, remembered in each checkpoint.
+        config: the experiment; saved in each checkpoint.
         stage: the stage.
         log: prints a line, for example about a damaged checkpoint.
 
     Raises:
-        UserError: there were checkpoints, and all are damaged.
+        UserError: checkpoints exist, and all are damaged.
     """
 
     def __init__(self, run: Path, config: Config, stage: Stage, log: Callable[[str], None] = print):
@@ -68,7 +68,7 @@ class Checkpoints:
         self._pool = concurrent.futures.ThreadPoolExecutor(1, "checkpoint")
         self._finishing: concurrent.futures.Future[None] | None = None
         self._began, self._interval, self._settled = time.monotonic(), 0.0, True
-        self._latest: int | None = processes.run_on_process_0(lambda: _tidied(self.folder, log))
+        self._latest: int | None = processes.run_on_process_0(lambda: _clean_up(self.folder, log))
         self._quiet, self._failed = Quiet(), False
 
     def __enter__(self) -> Self:
@@ -92,19 +92,19 @@ class Checkpoints:
                 raise
         finally:
             if processes.is_primary():
-                checkpoint_files.clear(self.folder)  # of a write that failed
-            if not self._failed:  # otherwise some threads may still print
+                checkpoint_files.clear(self.folder)  # left by a failed write
+            if not self._failed:  # after a failed write, threads may still print
                 self._quiet.end()
 
     def latest(self) -> int | None:
-        """Return the step of the newest whole checkpoint, if there is any."""
+        """Return the step of the newest complete checkpoint, or None."""
         return self._latest
 
     def save(self, state: TrainState) -> None:
-        """Copy the state off the devices and write it in the background.
+        """Copy the state to the host and write it in the background.
 
         Raises:
-            UserError: this checkpoint, or the one before in the background, cannot be written.
+            UserError: this checkpoint, or the previous one in the background, cannot be written.
         """
         self.wait()
         step = int(state.step)
@@ -135,7 +135,7 @@ class Checkpoints:
         self._interval, self._began, self._settled = now - self._began, now, False
 
     def wait(self, seconds: float | None = None) -> None:
-        """Block until everything is on disk, or some seconds have passed.
+        """Block until all writes are on disk, or ``seconds`` have passed.
 
         Raises:
             UserError: as ``save``.
@@ -149,11 +149,11 @@ class Checkpoints:
                 finished.result()
 
     def settle(self) -> None:
-        """Wait for a save in progress, within limits; called before each step is reported.
+        """Wait, up to a limit, for a save in progress; called before each step is reported.
 
-        So no reported step lies more than one save interval beyond the newest complete checkpoint:
-        a killed training loses no more than that. Waiting ends after two seconds or a fiftieth of
-        the interval, whichever is longer.
+        So a reported step is at most one save interval ahead of the newest complete checkpoint: a
+        killed run loses no more than that. The wait ends after two seconds or a fiftieth of the
+        interval, whichever is longer.
 
         Raises:
             UserError: as ``save``.
@@ -163,13 +163,14 @@ class Checkpoints:
         self._settled = True
 
     def restore(self, like: TrainState) -> TrainState:
-        """Read the newest checkpoint.
+        """Restore the newest checkpoint.
 
         Args:
-            like: the abstract state; arrays come back with its shardings.
+            like: the abstract state; arrays are restored with its shardings.
 
         Raises:
-            UserError: there is none, it is of another configuration, or it cannot be read.
+            UserError: there is no checkpoint, it belongs to another configuration, or it cannot be
+                read.
         """
         items = {
             WEIGHTS_ITEM: ocp.args.StandardRestore(inference_params(self.stage, like)),
@@ -194,7 +195,7 @@ class Checkpoints:
         """Write the newest checkpoint's weights to the run's ``weights.safetensors``.
 
         Args:
-            params: those weights. Used where there is one process; of several, the first reads them
+            params: those weights. Used if there is one process; otherwise process 0 reads them
                 from the checkpoint into host memory.
 
         Raises:
@@ -222,7 +223,7 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turn errors of writing into a sentence that says which checkpoint is kept."""
+        """Raise ``OSError`` as a ``UserError`` that names the newest intact checkpoint."""
         try:
             yield
         except (OSError, ValueError, RuntimeError) as error:
@@ -230,19 +231,23 @@ class Checkpoints:
                 raise
             self._failed = True
             whole = self._latest
-            kept = "none was written before" if whole is None else f"that of step {whole} is kept"
+            kept = (
+                "no earlier checkpoint exists"
+                if whole is None
+                else f"the checkpoint of step {whole} is kept"
+            )
             raise UserError(
                 f"A checkpoint in {self.folder} cannot be written ({_reason(error)}); {kept}: free "
-                "space or allow writing there, then run the same command again to go on."
+                "space or allow writing there, then run the same command again to resume."
             ) from None
 
     def _require_step(self) -> int:
         if self._latest is None:
-            raise UserError(f"{self.folder} holds no whole checkpoint; train this stage first.")
+            raise UserError(f"{self.folder} has no complete checkpoint; train this stage first.")
         return self._latest
 
     def _read(self, items: dict[str, Any]) -> Any:
-        """Read items of the newest checkpoint, if it is of this experiment."""
+        """Read items of the newest checkpoint; raise UserError if its configuration differs."""
         self.wait()
         folder = self.folder / str(self._require_step())
         with _reading(folder):
@@ -251,7 +256,7 @@ class Checkpoints:
             if wrong:
                 raise UserError(
                     f"{folder} is a checkpoint of another configuration ({runs.phrase(wrong)}): "
-                    "give this one its own folder with --train.run, or put the settings back."
+                    "choose another folder with --train.run, or restore the settings."
                 )
             return self._writer.restore(folder, args=ocp.args.Composite(**items))
 
@@ -267,13 +272,13 @@ def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[C
         The experiment and the weights, as NumPy arrays.
 
     Raises:
-        UserError: what is read is damaged.
+        UserError: the weights are damaged.
     """
     found = checkpoint_files.flaws(folder, (WEIGHTS_ITEM, DATA_ITEM, CONFIG_ITEM))
     if found:
         raise UserError(
             f"The checkpoint {folder} is damaged ({tree.listing(found, 2)}): copy it again, or "
-            "name another one."
+            "load another one."
         )
     with _reading(folder):
         config = configuration.from_dict(Config, _read_json(folder / CONFIG_ITEM))
@@ -295,8 +300,8 @@ def _read_arrays(folder: Path, like: Params) -> Params:
         )
 
 
-def _tidied(folder: Path, log: Callable[[str], None]) -> int | None:
-    """Clean up the folder of a stage; returns the step of its newest undamaged checkpoint."""
+def _clean_up(folder: Path, log: Callable[[str], None]) -> int | None:
+    """Clean up the folder of a stage and return the step of its newest intact checkpoint."""
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint_files.clear(folder)
     return checkpoint_files.newest(folder, log)
@@ -304,7 +309,7 @@ def _tidied(folder: Path, log: Callable[[str], None]) -> int | None:
 
 @contextlib.contextmanager
 def _reading(folder: Path) -> Iterator[None]:
-    """Turn errors of reading an undamaged checkpoint into a sentence."""
+    """Raise errors of reading an intact checkpoint as a ``UserError``."""
     try:
         yield
     except (ValueError, KeyError, TypeError, OSError) as error:
@@ -312,16 +317,16 @@ def _reading(folder: Path) -> Iterator[None]:
             raise
         raise UserError(
             f"{folder} cannot be read ({_reason(error)}): another version of the library may have "
-            "written it; go on with that one, or train in another --train.run."
+            "written it: resume with that version, or choose another folder with --train.run."
         ) from None
 
 
 def _reason(error: BaseException) -> str:
-    said = getattr(error, "strerror", None) or str(error)
+    message = getattr(error, "strerror", None) or str(error)
     full = os.strerror(errno.ENOSPC)
-    if full in said:  # at the end of a long message of Orbax
+    if full in message:  # Orbax puts it at the end of a long message
         return full
-    return " ".join(said.split())[:160]
+    return " ".join(message.split())[:160]
 
 
 def _training_state(stage: Stage, state: TrainState) -> dict[str, Any]:
@@ -337,7 +342,7 @@ _LOGGERS = ("absl", "asyncio")
 
 
 class Quiet:
-    """Keeps failures of Orbax's threads from being printed, until ``end``."""
+    """Suppresses printing of failures in Orbax's threads, until ``end``."""
 
     def __init__(self) -> None:
         self._before = sys.unraisablehook
@@ -346,7 +351,7 @@ class Quiet:
             logging.getLogger(name).addFilter(self._has_no_trace)
 
     def end(self) -> None:
-        """Let such failures be printed again."""
+        """Print such failures again."""
         for name in _LOGGERS:
             logging.getLogger(name).removeFilter(self._has_no_trace)
         if sys.unraisablehook == self._unraisable:

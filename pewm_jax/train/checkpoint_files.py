@@ -13,14 +13,14 @@ Orbax's ``CheckpointManager`` (orbax-checkpoint 0.12.8) was tried for this. It r
 checkpoints, and ``AnyPreservationPolicy([LatestN(keep), EveryNSteps(keep_every)])`` keeps what
 ``prune`` keeps. It is not used, because
 
-- a manifest of all files cannot be written before the checkpoint has its final name. The last
-  public hook, ``AsyncOptions.post_finalization_callback``, is called before Orbax updates
+- a manifest of all files cannot be written before the checkpoint is renamed to its final name. The
+  last public hook, ``AsyncOptions.post_finalization_callback``, is called before Orbax updates
   ``_CHECKPOINT_METADATA`` and adds ``commit_success.txt``; ``temporary_path_class`` is deprecated,
   and a class for it would repeat private code (``AtomicRenameTemporaryPath.finalize``);
 - ``latest_step`` returns a step as soon as ``save`` is called, before anything is on disk, and
-  also the step of a damaged checkpoint: which one counts would still be decided here;
-- old checkpoints are deleted under their own names, so one that was half deleted when the process
-  was killed still counts; ``todelete_subdir`` moves them away, and never deletes them;
+  also the step of a damaged checkpoint, so this module would still have to choose the valid one;
+- old checkpoints are deleted in place, so one that was half deleted when the process was killed
+  still counts; ``todelete_subdir`` moves them away, and never deletes them;
 - ``wait_until_finished`` has no timeout, which ``Checkpoints.settle`` needs.
 """
 
@@ -64,10 +64,10 @@ def writing(folder: Path, step: int) -> Path:
 
 
 def put(folder: Path, step: int) -> None:
-    """Write the manifest of a complete checkpoint, then rename it: from now on it counts.
+    """Write the manifest of a complete checkpoint, then rename it; from then on it counts.
 
     Raises:
-        OSError: that cannot be written.
+        OSError: the manifest cannot be written or the folder cannot be renamed.
     """
     seal(writing(folder, step))
     writing(folder, step).rename(folder / str(step))
@@ -79,8 +79,8 @@ def prune(folder: Path, keep: int, keep_every: int) -> None:
 
     Args:
         folder: the stage's checkpoints.
-        keep: how many of the newest stay.
-        keep_every: multiples of this many steps stay as well; 0 for none.
+        keep: number of newest checkpoints to keep.
+        keep_every: also keep multiples of this many steps; 0 for none.
     """
     for step in steps(folder)[:-keep]:
         if keep_every == 0 or step % keep_every:
@@ -97,14 +97,14 @@ def clear(folder: Path) -> None:
 
 
 def newest(folder: Path, log: Callable[[str], None]) -> int | None:
-    """Find the newest undamaged checkpoint; newer, damaged ones are moved to ``damaged/``.
+    """Return the step of the newest intact checkpoint; move newer, damaged ones to ``damaged/``.
 
     Args:
         folder: the stage's checkpoints.
-        log: called with a sentence for each that is moved.
+        log: called with a sentence for each one moved.
 
     Returns:
-        Its step, None if the folder has no checkpoint.
+        The step, or None if the folder has no checkpoint.
 
     Raises:
         UserError: all are damaged.
@@ -116,19 +116,19 @@ def newest(folder: Path, log: Callable[[str], None]) -> int | None:
         kept = _set_aside(folder, step)
         log(
             f"The checkpoint {folder / str(step)} is damaged ({tree.listing(found, 2)}): it is "
-            f"set aside as {kept}, and the one before it is used."
+            f"moved to {kept}, and the previous one is used."
         )
     damaged = folder / DAMAGED
     if damaged.is_dir() and any(damaged.iterdir()):
         raise UserError(
-            f"{folder} holds no whole checkpoint, only damaged ones in {damaged}: bring back a "
-            "copy of one, or delete that folder to train this stage from its start."
+            f"{folder} contains no intact checkpoint, only damaged ones in {damaged}: restore a "
+            "copy of one, or delete that folder to train this stage from the start."
         )
     return None
 
 
 def _set_aside(folder: Path, step: int) -> Path:
-    """Move a damaged checkpoint to ``damaged/``; returns its new path."""
+    """Move a damaged checkpoint to ``damaged/`` and return its new path."""
     damaged = folder / DAMAGED
     damaged.mkdir(exist_ok=True)
     names = (f"{step}" if n == 0 else f"{step}-{n}" for n in range(10**6))
@@ -140,7 +140,7 @@ def _set_aside(folder: Path, step: int) -> Path:
 MANIFEST = "manifest.json"
 
 LARGE = 2 * 10**9
-"""Bytes from which checking takes seconds, and progress is printed."""
+"""Size in bytes from which verification takes seconds and prints progress."""
 
 _EVERY_S = 10.0
 
@@ -149,7 +149,7 @@ def seal(folder: Path) -> None:
     """Write the manifest of a folder, and flush the folder to disk.
 
     Args:
-        folder: a folder that is complete.
+        folder: a complete folder.
 
     Raises:
         OSError: the manifest cannot be written.
@@ -176,11 +176,12 @@ def flaws(
 
     Args:
         folder: a folder that ``seal`` was called on.
-        parts: look only at what lies inside these subfolders; by default at everything.
-        log: prints progress where checking takes seconds.
+        parts: verify only these subfolders; all files by default.
+        log: prints progress if verification takes seconds.
 
     Returns:
-        What is wrong, such as ``state/d/3f is cut short (10 of 505 bytes)``; empty if nothing is.
+        Descriptions of the damage, such as ``state/d/3f is cut short (10 of 505 bytes)``; empty if
+        intact.
     """
     inside = tuple(f"{part}/" for part in parts)
     try:
@@ -192,7 +193,7 @@ def flaws(
         return [f"{MANIFEST} cannot be read ({error.strerror})"]
     listed = {n: entry for n, entry in listed.items() if not inside or n.startswith(inside)}
     found = [f"{name} is missing" for name in listed.keys() - paths.keys()]
-    found += [f"{name} was not written with it" for name in paths.keys() - listed.keys()]
+    found += [f"{name} is not listed in the manifest" for name in paths.keys() - listed.keys()]
     whole = {}
     for name in listed.keys() & paths.keys():
         have, want = paths[name].stat().st_size, listed[name]["bytes"]
@@ -206,13 +207,13 @@ def flaws(
         progress = _progress(f"checking {folder}", total, log)
         for name, digest in _digests(whole, _digest_if_readable):
             if digest != listed[name]["sha256"]:
-                found.append(f"{name} holds other bytes than were written")
+                found.append(f"{name} has a wrong checksum")
             progress(listed[name]["bytes"])
     return sorted(found)
 
 
 def sync(folder: Path) -> None:
-    """Flush a folder's list of entries to disk (fsync), so that it survives a power cut."""
+    """Flush a folder's directory entry to disk (fsync), so that it survives a power failure."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -221,7 +222,7 @@ def sync(folder: Path) -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return the files that a manifest lists; ValueError says what is wrong with it."""
+    """Return the files listed in a manifest; raise ValueError if it is missing or damaged."""
     try:
         found = json.loads(path.read_bytes())
         files, digest = found["files"], found["sha256"]
@@ -235,7 +236,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    """Return the files below a folder by relative name, all but the manifest."""
+    """Return the files below a folder by relative name, except the manifest."""
     found = {
         path.relative_to(folder).as_posix(): path
         for path in sorted(folder.rglob("*"))
@@ -259,7 +260,7 @@ def _digest_if_readable(path: Path) -> str:
 def _digests(
     paths: dict[str, Path], digest: Callable[[Path], str] = _digest
 ) -> Iterable[tuple[str, str]]:
-    """Hash files side by side: hashing leaves the other threads of Python running."""
+    """Hash files in parallel threads: hashlib releases the GIL."""
     threads = min(8, os.cpu_count() or 1)
     with concurrent.futures.ThreadPoolExecutor(threads) as pool:
         yield from zip(paths, pool.map(digest, paths.values()), strict=True)
@@ -270,7 +271,7 @@ def _digest_of(files: Any) -> str:
 
 
 def _progress(label: str, total: int, log: Callable[[str], None]) -> Callable[[int], None]:
-    """Return a function that counts bytes, and prints progress every ``_EVERY_S`` seconds."""
+    """Return a function that counts bytes and prints progress every ``_EVERY_S`` seconds."""
     began = printed = time.monotonic()
     done = 0
     if total >= LARGE:

@@ -1,8 +1,8 @@
-"""What kinds of devices can do, from their makers' data sheets.
+"""Peak compute, memory and network rates of accelerators, from their makers' data sheets.
 
-A device's utilisation (MFU) is counted against the peak given here, and a plan rests on it. All
-rates are per device and in one direction; peaks are of bfloat16 products with float32 sums, without
-the doubling that NVIDIA states for sparse matrices.
+Model FLOPs utilization (MFU) is relative to the peak listed here, and cost plans use all rates.
+Rates are per device and in one direction; peaks are dense bfloat16 products with float32
+accumulation, without NVIDIA's doubling for sparse matrices.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ class Chip:
     """One kind of device.
 
     Attributes:
-        name: what ``--chip`` calls it.
-        device_kind: a regular expression for what JAX calls it, and for how people write it.
+        name: value of ``--chip``.
+        device_kind: regular expression that matches JAX's ``device_kind`` and common spellings.
         flops: peak FLOP/s in bfloat16, dense.
         memory: bytes of device memory.
-        bandwidth: bytes/s of that memory.
-        island: devices that fast links join: a node of GPUs, a pod of TPUs.
+        bandwidth: memory bandwidth in bytes/s.
+        island: number of devices joined by fast links: a GPU node or a TPU pod.
         link: bytes/s that a device sends within the island in a collective along one mesh axis.
-        network: bytes/s that a device sends beyond it.
-        source: where the figures stand.
+        network: bytes/s that a device sends to other islands.
+        source: the data sheet of the figures.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Chip:
 
     @property
     def platform(self) -> str:
-        """JAX's name of its platform."""
+        """Return JAX's name of the platform."""
         return "tpu" if "TPU" in self.device_kind else "cuda"
 
 
@@ -79,8 +79,9 @@ CHIPS = (
         network=50e9,
         source="NVIDIA DGX B200 data sheet: an eighth of the system; 8 × 400 Gb/s",
     ),
-    # A collective along one mesh axis runs over one axis of the torus, both ways round: two of the
-    # 6 (v5p) or 4 (v6e) links, which share the bandwidth stated for the chip, in two directions.
+    # A collective along one mesh axis uses one axis of the torus in both directions: two of the
+    # 6 (v5p) or 4 (v6e) links. The links share the bandwidth stated per chip, which counts both
+    # directions.
     Chip(
         name="v5p",
         device_kind=r"TPU v5p?|v5p",
@@ -90,7 +91,7 @@ CHIPS = (
         island=8960,
         link=1200e9 / 2 / 3,
         network=50e9 / 8,
-        source="Google Cloud, TPU v5p: 1200 GB/s over 6 links both ways, network 50 Gb/s a chip",
+        source="Google Cloud, TPU v5p: 1200 GB/s over 6 links both ways, network 50 Gb/s per chip",
     ),
     Chip(
         name="v6e",
@@ -101,18 +102,18 @@ CHIPS = (
         island=256,
         link=800e9 / 2 / 2,
         network=100e9 / 8,
-        source="Google Cloud, TPU v6e: 800 GB/s over 4 links both ways, network 100 Gb/s a chip",
+        source="Google Cloud, TPU v6e: 800 GB/s over 4 links both ways, network 100 Gb/s per chip",
     ),
 )
-"""All that are known."""
+"""All known chips."""
 
 
 def find(device_kind: str) -> Chip | None:
-    """Return the chip that JAX, or a person, calls so; None where it is not known.
+    """Return the chip of a device kind, or None if it is unknown.
 
     Args:
-        device_kind: as ``jax.devices()[0].device_kind``: "NVIDIA H200", "TPU v6 lite"; or as in
-            "h200", "tpu-v5p".
+        device_kind: ``jax.devices()[0].device_kind``, such as "NVIDIA H200" or "TPU v6 lite", or a
+            common spelling, such as "h200" or "tpu-v5p".
     """
     plain = " ".join(re.split(r"[\s_-]+", device_kind.strip()))
     for chip in CHIPS:
@@ -122,13 +123,13 @@ def find(device_kind: str) -> Chip | None:
 
 
 def named(name: str) -> Chip:
-    """Return the chip that ``--chip`` names.
+    """Return the chip with the name given by ``--chip``.
 
     Raises:
-        ConfigError: it is not known.
+        ConfigError: the name is unknown.
     """
     chip = find(name)
     if chip is None:
         known = ", ".join(chip.name for chip in CHIPS)
-        raise ConfigError(f"--chip {name!r} is not known: choose one of {known}.")
+        raise ConfigError(f"--chip {name!r} is unknown: choose one of {known}.")
     return chip

@@ -1,4 +1,4 @@
-"""Batches placed on the devices ahead of time; each process reads its own rows."""
+"""Batches placed on the devices ahead of time, and clips that are prepared once."""
 
 from __future__ import annotations
 
@@ -32,51 +32,50 @@ _POLL_S = 0.2
 def rows_of(where: Sharding, batch: int) -> slice:
     """Return the rows of a batch that this process reads: all from its first to its last.
 
-    Processes whose devices hold the same rows (they share a clip's tokens or heads) get the same
-    slice. Where the mesh interleaves processes, the slice includes rows of others.
+    Processes whose devices need the same rows (they share a clip's tokens or heads) get the same
+    slice. If the mesh interleaves processes, the slice includes rows of other processes.
 
     Args:
         where: the sharding of the batch.
-        batch: its size in all processes together.
+        batch: the global batch size.
     """
     held = _held(where, batch)
     return slice(int(held[0]), int(held[-1]) + 1)
 
 
 def place(clip: Clip, where: Sharding, batch: int) -> Clip:
-    """Make a batch that is spread over all processes from the rows that each of them has.
+    """Make a global batch from the rows that each process has read.
 
     Args:
-        clip: the rows of this process, as ``rows_of`` says.
+        clip: the rows of this process (``rows_of``).
         where: the sharding of every array.
-        batch: the size of the batch in all processes together.
+        batch: the global batch size.
     """
     held = _held(where, batch)
     own = held - held[0]
-    if len(own) <= own[-1]:  # JAX takes a process's own rows only, without those in between
+    if len(own) <= own[-1]:  # JAX takes only the rows that the process owns
         clip = jax.tree.map(lambda rows: rows[own], clip)
     shapes = jax.tree.map(lambda rows: (batch, *rows.shape[1:]), clip)
     return jax.make_array_from_process_local_data(where, clip, shapes)
 
 
 def _held(where: Sharding, batch: int) -> np.ndarray:
-    """Return the numbers of the rows on this process's devices, ascending."""
+    """Return the indices of the rows on this process's devices, in ascending order."""
     parts = where.addressable_devices_indices_map((batch,)).values()
     return np.unique([row for index in parts if index for row in range(batch)[index[0]]])
 
 
 class Feed:
-    """Reads batches in a thread and places them on the devices, a few ahead.
+    """Reads batches in a thread and places a few of them on the devices ahead of time.
 
-    A context manager and an iterator; an error of the source is raised where the batch would have
-    been taken.
+    A context manager and an iterator; an error of the source is raised by ``next``.
 
     Args:
-        batches: the source; it is closed at the end when it has a ``close`` method.
-        where: the placement of every array of a batch.
-        batch: clips per batch, of which the source has this process's rows; None where there is
-            but one process.
-        ahead: batches kept ready.
+        batches: the source; closed at the end if it has a ``close`` method.
+        where: the sharding of every array of a batch.
+        batch: the global batch size if the source yields only this process's rows; None if there is
+            one process.
+        ahead: number of batches kept ready.
     """
 
     def __init__(
@@ -109,7 +108,7 @@ class Feed:
         return self
 
     def __next__(self) -> Clip:
-        """Take the next batch, waiting for it where the source is slower than training."""
+        """Return the next batch; wait if the source is slower than training."""
         item = self._ready.get()
         if isinstance(item, BaseException):
             raise item
@@ -121,8 +120,8 @@ class Feed:
                 if not self._put(self._placed(batch)):
                     break
             else:
-                self._put(UserError("The training data ended before the training did."))
-        except BaseException as error:  # noqa: BLE001 - handed to the thread that trains
+                self._put(UserError("The training data ended before the last training step."))
+        except BaseException as error:  # noqa: BLE001 - re-raised in the training thread
             self._put(error)
         finally:
             close = getattr(self._batches, "close", None)
@@ -135,7 +134,7 @@ class Feed:
         return place(clip, self._where, self._batch)
 
     def _put(self, item: Clip | BaseException) -> bool:
-        """Wait for room; False when the training is over."""
+        """Wait for space in the queue; return False if training has ended."""
         while not self._over.is_set():
             try:
                 self._ready.put(item, timeout=_POLL_S)
@@ -146,28 +145,29 @@ class Feed:
 
 
 PREPARED_DIGESTS = "prepared.json"
-"""In the run's folder: stage → digest of the weights that prepared its clips."""
+"""File in the run's folder: stage → digest of the weights that prepared its clips."""
 PREPARED_VERSION = 1
-"""Of what prepared clips hold; another one prepares them again."""
+"""Version of the format of prepared clips; clips of another version are prepared again."""
 
 
 def uses_prepared(config: Config, stage: Stage) -> bool:
-    """Tell whether a stage's clips are prepared once.
+    """Return whether a stage's clips are prepared once.
 
     Raises:
-        UserError: they should be, but the world cannot, or there are several processes.
+        UserError: ``data.prepared`` is set, but the world prepares nothing or there are several
+            processes.
     """
     if not config.data.prepared:
         return False
     if stage.prepare is None:
         raise UserError(
             f"data.prepared is {config.data.prepared}, but stage {stage.name} prepares nothing: "
-            "use data.prepared 0."
+            "set data.prepared to 0."
         )
     if jax.process_count() > 1:
         raise UserError(
             f"data.prepared is {config.data.prepared}, but there are {jax.process_count()} "
-            "processes: prepared clips are kept by one; use data.prepared 0."
+            "processes, and prepared clips need a single process: set data.prepared to 0."
         )
     return True
 
@@ -180,18 +180,18 @@ def prepare_clips(
     unless_stopped: Callable[[Callable[[], Any]], Any],
     digest: str = "",
 ) -> list[Clip] | None:
-    """Prepare at least ``data.prepared`` clips, no more than are drawn, or find them prepared.
+    """Prepare ``data.prepared`` clips (rounded up to batches, at most those drawn) or reuse them.
 
     Args:
         config: the experiment.
-        stage: says how (``Stage.prepare``).
+        stage: defines the preparation (``Stage.prepare``).
         params: the weights.
-        read: returns the batches of clips to prepare, from that of the given number on.
-        unless_stopped: calls what it is given, or returns None when training shall stop.
-        digest: from ``start_digest``; if empty, that of ``params``.
+        read: returns an iterator over the batches to prepare, starting at a batch number.
+        unless_stopped: calls its argument; returns None if training must stop.
+        digest: from ``start_digest``; if empty, the digest of ``params`` is used.
 
     Returns:
-        Batches of NumPy arrays, in memory or in files that are mapped; None if training shall stop.
+        Batches of NumPy arrays, in memory or memory-mapped; None if training must stop.
     """
     assert stage.prepare is not None
     make = jax.jit(functools.partial(stage.prepare, config.model))
@@ -224,16 +224,17 @@ def prepare_clips(
 
 
 def start_digest(run: Path, stage: Stage, params: Params, done: int) -> str:
-    """Return the digest of the weights that prepare clips, as the stage started with them.
+    """Return the digest of the weights that prepare clips, as they were at the start of the stage.
 
-    A stage may train some of them, as stage ``gate`` trains a part of the codec. So the digest is
-    written into the run's folder before the first step, and read when the stage is resumed.
+    A stage may train some of these weights: stage ``gate`` trains a part of the codec. So the
+    digest is written into the run's folder before the first step, and read when the stage is
+    resumed.
 
     Args:
         run: the run's folder.
         stage: the stage.
         params: all parameters after ``done`` steps.
-        done: steps of the stage done before.
+        done: number of steps of the stage already done.
     """
     file = run / PREPARED_DIGESTS
     known = json.loads(file.read_text("utf-8")) if file.is_file() else {}
@@ -250,12 +251,12 @@ def _digest(stage: Stage, params: Params) -> str:
 
 
 def prepared_seed(config: Config, stage: Stage) -> int:
-    """Return the seed by which clips to prepare are chosen, alike in stages that read a memory."""
+    """Return the seed that selects the clips to prepare, the same in all stages with a memory."""
     return config.train.seed + 1 + stage.memory
 
 
 def _folder(config: Config, stage: Stage, weights: str) -> Path:
-    """Return the folder of these clips, named after all that they depend on.
+    """Return the folder of prepared clips; its name is a hash of all that they depend on.
 
     Args:
         config: the experiment.
@@ -267,7 +268,7 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
         for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
             model.pop(part, None)
     reader = model.get("memory", {}).get("reader", {})
-    if reader.get("picture") == "pixels":  # as it was before there was a choice
+    if reader.get("picture") == "pixels":  # implied in earlier versions
         del reader["picture"]
     data = configuration.to_dict(config.data)
     split = read_manifest(Path(config.data.path) / "train")
@@ -291,7 +292,7 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
 
 
 def _named(clip: Clip) -> dict[str, Any]:
-    """Return the arrays of a clip by their names in files, which are those of earlier versions."""
+    """Return the arrays of a clip by their names in files, unchanged since earlier versions."""
     renamed = {"readout": "sight"}
     found = {}
     for path, leaf in tree.flatten(clip).items():
@@ -305,13 +306,13 @@ def _file(folder: Path, number: int) -> Path:
 
 
 def _mapped(file: Path, like: Clip) -> Clip:
-    """Map a file of prepared clips, and refuse one of other shapes."""
+    """Memory-map a file of prepared clips; raise UserError if its shapes differ."""
     found, names = tensor_files.mapped(file), _named(like)
     for name, leaf in names.items():
         if name not in found or found[name].shape != leaf.shape or found[name].dtype != leaf.dtype:
             raise UserError(
-                f"{file} does not hold the prepared clips that this run needs ({name} differs): "
-                "remove its folder, and they are prepared again."
+                f"{file} does not contain the prepared clips that this run needs ({name} differs): "
+                "delete its folder to prepare them again."
             )
     return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name in names])
 
@@ -319,14 +320,14 @@ def _mapped(file: Path, like: Clip) -> Clip:
 def draw_prepared(
     prepared: Sequence[Clip], batch: int, seed: int, start: int = 0
 ) -> Iterator[Clip]:
-    """Draw batches without end; batch k depends on the seed and on k alone.
+    """Yield batches endlessly; batch k depends only on the seed and k.
 
-    Every clip comes once before any comes again, in another order each time.
+    Each epoch contains every clip once, in a new order.
 
     Args:
-        prepared: from ``prepare_clips``: batches that hold N clips in all.
-        batch: clips in a batch, at most N.
-        seed: of the order.
+        prepared: batches from ``prepare_clips``, with N clips in total.
+        batch: clips per batch, at most N.
+        seed: seed of the order.
         start: number of the first batch.
     """
     sizes = [len(jax.tree.leaves(part)[0]) for part in prepared]
@@ -338,9 +339,9 @@ def draw_prepared(
 
 
 def prepared_rows(config: Config, stage: Stage, number: int) -> list[int]:
-    """Return which of the prepared clips are in batch ``number``; see ``draw_prepared``.
+    """Return the indices of the prepared clips in batch ``number``; see ``draw_prepared``.
 
-    Clip r was row r mod B of batch r div B of the loader, batches of B.
+    With loader batches of size B, clip r is row r mod B of loader batch r div B.
     """
     batch = stage.settings(config).batch
     count = _batches(config, stage) * batch
@@ -348,7 +349,7 @@ def prepared_rows(config: Config, stage: Stage, number: int) -> list[int]:
 
 
 def _batches(config: Config, stage: Stage) -> int:
-    """Return how many batches of clips are prepared."""
+    """Return the number of batches of clips to prepare."""
     settings = stage.settings(config)
     return min(-(-config.data.prepared // settings.batch), max(settings.steps, 1))
 

@@ -1,14 +1,14 @@
 """FLOPs of a training step, counted by walking its jaxpr.
 
-Matrix products and convolutions are counted, with 2 FLOPs per multiply-add; element-wise work is
-not. The body of a loop counts as often as it runs, and of the branches of a ``cond`` the most
-expensive one. Two numbers are of interest:
+Matrix products and convolutions are counted, with 2 FLOPs per multiply-add; element-wise operations
+are not. A loop body is counted once per iteration; of the branches of a ``cond``, only the most
+expensive one is counted. There are two counts:
 
 - ``executed``: the products in the jaxpr of the whole step. That includes what ``jax.checkpoint``
   recomputes in the backward pass.
-- ``needed``: what the mathematics needs. The jaxpr of the loss alone is walked, and each product is
-  counted once for its value and once for each operand that depends on trained parameters: these
-  operands need a gradient. Model FLOPs utilization (MFU) is based on this number.
+- ``needed``: the products that the mathematics requires. The jaxpr of the loss alone is walked, and
+  each product is counted once for its value and once for each operand that depends on trained
+  parameters, because these operands need a gradient. Model FLOPs utilization (MFU) uses this count.
 """
 
 from __future__ import annotations
@@ -32,32 +32,32 @@ from pewm_jax.train.step import create
 from pewm_jax.types import Params
 
 LINEAR, ATTENTION, CONVOLUTION = "linear", "attention", "convolution"
-"""Kinds of products, which hardware runs at different speeds. Products with a batch dimension in
-both operands count as attention."""
+"""Kinds of products, because hardware runs them at different speeds. Products with a batch
+dimension in both operands count as attention."""
 Axes = tuple[str | None, ...]
 """The mesh axis along which each dimension of a weight is sharded."""
 _FUSED = "dot_product_attention"
-"""Part of the names of cuDNN's attention primitives."""
+"""Substring of the names of cuDNN's attention primitives."""
 _SAME = ("convert_element_type", "copy", "optimization_barrier", "sharding_constraint")
 _SLICES = ("slice", "dynamic_slice")
 
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """The products of a program, of all devices together.
+    """The products of a program, summed over all devices.
 
     Attributes:
         flops: kind of product → FLOPs.
         traffic: bytes that linear products and convolutions read and write.
-        summed: bytes of results of products whose weight is sharded along ``tensor`` in a
-            contracted dimension: they are summed over those devices.
-        repeated: kind of product → those of its FLOPs that devices along ``tensor`` and ``context``
-            repeat: no weight is sharded along ``tensor`` and the input depends on nothing trained,
+        summed: bytes of results that are all-reduced along ``tensor``, because the weight is
+            sharded along it in a contracted dimension.
+        repeated: kind of product → FLOPs that devices along ``tensor`` and ``context`` repeat: no
+            weight is sharded along ``tensor`` and the input does not depend on trained parameters,
             as in encoders and embeddings.
-        unsplit: kind of product → those of the others that devices along ``tensor`` repeat: no
+        unsplit: kind of product → other FLOPs that devices along ``tensor`` repeat, because no
             weight is sharded along it.
         unknown: descriptions of loops with products whose number of iterations the jaxpr does not
-            tell; they count as one iteration.
+            determine; they count as one iteration.
     """
 
     flops: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -69,7 +69,7 @@ class Work:
 
     @property
     def total(self) -> float:
-        """The FLOPs of all kinds."""
+        """Return the FLOPs of all kinds."""
         return math.fsum(self.flops.values())
 
     def __add__(self, other: Work) -> Work:
@@ -83,7 +83,7 @@ class Work:
         )
 
     def times(self, count: float) -> Work:
-        """Return the work of so many repetitions."""
+        """Return the work of ``count`` repetitions."""
         flops, repeated, unsplit = (
             {kind: count * value for kind, value in part.items()}
             for part in (self.flops, self.repeated, self.unsplit)
@@ -101,7 +101,7 @@ def executed(step: Any, platform: str = "cpu") -> Work:
 
     Args:
         step: a closed jaxpr, such as ``jax.make_jaxpr(f)(…)`` or ``jax.jit(f).trace(…).jaxpr``.
-        platform: where it runs: "cpu", "cuda" or "tpu".
+        platform: the platform it runs on: "cpu", "cuda" or "tpu".
     """
     jaxpr, _ = partial_eval.dce_jaxpr(step.jaxpr, [True] * len(step.jaxpr.outvars))
     walk = _Walk(gradients=False, platform=platform)
@@ -114,7 +114,7 @@ def needed(loss: Any, trained: Sequence[bool], axes: Sequence[Axes | None] | Non
     Args:
         loss: the closed jaxpr of a function, not of its gradient. Its first result is the loss.
         trained: for each input of the jaxpr, whether a gradient with respect to it is needed.
-        axes: for each input the mesh axes of its dimensions, where it is a sharded weight.
+        axes: for each input that is a sharded weight, the mesh axes of its dimensions.
     """
     axes = [None] * len(trained) if axes is None else axes
     marks = [_Mark(*each) for each in zip(trained, axes, strict=True)]
@@ -129,7 +129,7 @@ def of_stage(config: Config, stage: Stage, clip: Any, given: Params | None = Non
         config: the experiment.
         stage: the stage.
         clip: the batch, or its shapes.
-        given: weights that only the loss needs, see ``Stage.extra_weights``.
+        given: weights needed only by the loss, see ``Stage.extra_weights``.
     """
     clip, given = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (clip, given or {})
@@ -147,7 +147,7 @@ def of_stage(config: Config, stage: Stage, clip: Any, given: Params | None = Non
     leaves = tree.flatten(params)
     others = len(jax.tree.leaves(args)) - len(leaves)
     marks = [path in trained for path in leaves] + [False] * others
-    # Rules name the mesh axes of a leaf's last dimensions.
+    # A rule gives the mesh axes of a leaf's last dimensions.
     axes: list[Axes | None] = [
         (None,) * (leaf.ndim - len(specs[path])) + tuple(specs[path])
         for path, leaf in leaves.items()
@@ -157,13 +157,13 @@ def of_stage(config: Config, stage: Stage, clip: Any, given: Params | None = Non
 
 @dataclasses.dataclass(frozen=True)
 class _Mark:
-    """What is known of a value.
+    """Properties of a value in a jaxpr.
 
     Attributes:
-        trained: whether it depends on something trained, so that it needs a gradient.
-        axes: how it is sharded, if it is a weight.
-        platforms: if it chooses between implementations for several platforms, these; None among
-            them stands for all others.
+        trained: whether it depends on trained parameters, so that it needs a gradient.
+        axes: the mesh axes of its dimensions, if it is a weight.
+        platforms: the platforms it selects between, if it is the index of a platform-dependent
+            branch; None among them stands for all other platforms.
     """
 
     trained: bool = False
@@ -172,13 +172,12 @@ class _Mark:
 
 
 class _Walk:
-    """A walk through a jaxpr.
+    """Counts the products in a jaxpr.
 
     Args:
-        gradients: whether products that gradients need are added.
-        platform: where there are implementations for several platforms, the one that counts:
-            "cpu", "cuda", "tpu". With ``gradients`` the cheapest one counts: all compute the same,
-            but some pad.
+        gradients: whether to add the products of the gradients.
+        platform: "cpu", "cuda" or "tpu"; selects among platform-dependent implementations. With
+            ``gradients`` the cheapest one is counted: all compute the same, but some pad.
     """
 
     def __init__(self, *, gradients: bool, platform: str = ""):
@@ -287,7 +286,7 @@ class _Walk:
         each: list[_Mark],
         wanted: list[bool],
     ) -> tuple[Work, list[_Mark]]:
-        """Walk the body of a loop until what it carries needs no further gradients."""
+        """Walk the body of a loop until the marks of its carry no longer change."""
         wanted = _wanted_in_loop(jaxpr, len(before), len(carry), wanted) if self.gradients else []
         while True:
             work, out = self.jaxpr(jaxpr, [*before, *carry, *each], wanted)
@@ -304,7 +303,7 @@ class _Walk:
         found = [self.jaxpr(branch.jaxpr, marks[1:], wanted) for branch in params["branches"]]
         works = [work for work, _ in found]
         platforms = params.get("branches_platforms") or marks[0].platforms
-        if platforms and self.gradients:  # equal mathematics: the one that pads least
+        if platforms and self.gradients:  # same mathematics: take the one with the least padding
             work = min(works, key=lambda work: work.total)
         elif platforms:
             work = works[self._choose(platforms)]
@@ -316,7 +315,7 @@ class _Walk:
     def _call(
         self, eqn: Any, inner: list[Any], marks: list[_Mark], wanted: list[bool]
     ) -> tuple[Work, list[_Mark]]:
-        """Walk what an equation calls once, such as ``jit`` and ``jax.checkpoint``."""
+        """Walk the inner jaxpr of an equation, such as ``jit`` and ``jax.checkpoint``."""
         trained = any(mark.trained for mark in marks)
         work, outs = Work(), [_Mark(trained)] * len(eqn.outvars)
         for jaxpr in inner:
@@ -348,7 +347,7 @@ def _is_product(name: str) -> bool:
 
 
 def _reaching(jaxpr: Any, wanted: Sequence[bool]) -> frozenset[Any]:
-    """Return the variables on which wanted results depend in a way that has a gradient."""
+    """Return the variables on which the wanted results depend differentiably."""
     found: set[Any] = set()
 
     def add(variables: Sequence[Any], flags: Sequence[bool]) -> None:
@@ -365,7 +364,7 @@ def _reaching(jaxpr: Any, wanted: Sequence[bool]) -> frozenset[Any]:
 
 
 def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
-    """Return the numbers of a scan's constants and of the values that it carries."""
+    """Return the number of a scan's constants and of its carry values."""
     if "num_consts" in params:
         return params["num_consts"], params["num_carry"]
     consts, carry, _ = params["ft_in"].unpack()  # JAX 0.12
@@ -373,7 +372,7 @@ def _scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def _wanted_inputs(eqn: Any, wanted: Sequence[bool]) -> list[bool]:
-    """Return which inputs of an equation wanted results depend on."""
+    """Return, per input of an equation, whether a wanted result depends on it."""
     name, params, count = eqn.primitive.name, eqn.params, len(eqn.invars)
     if name == "scan":
         body = params["jaxpr"].jaxpr
@@ -400,7 +399,7 @@ def _inputs_of(jaxpr: Any, wanted: Sequence[bool]) -> list[bool]:
 
 
 def _wanted_in_loop(jaxpr: Any, consts: int, carries: int, wanted: Sequence[bool]) -> list[bool]:
-    """Return which results of a loop's body are wanted, in any of its iterations."""
+    """Return, per result of a loop's body, whether it is wanted in any iteration."""
     wanted = list(wanted)
     while True:
         inputs = _inputs_of(jaxpr, wanted)[consts : consts + carries]
@@ -421,15 +420,15 @@ def _jaxprs(params: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def _names(part: Any) -> tuple[str, ...]:
-    """Return the mesh axes in a part of a ``PartitionSpec``."""
+    """Return the mesh axes in one entry of a ``PartitionSpec``."""
     return part if isinstance(part, tuple) else (part,) if part else ()
 
 
 def _copies(eqn: Any) -> int:
-    """Return in how many parts an equation does what it calls: devices, or points of a grid.
+    """Return the number of executions of an equation's inner jaxpr: devices, or points of a grid.
 
-    Along axes of the mesh that split neither inputs nor results, devices repeat the same work,
-    which counts once.
+    Devices along mesh axes that shard neither inputs nor results repeat the same work, which is
+    counted once.
     """
     name, params = eqn.primitive.name, eqn.params
     if name == "shard_map":
@@ -465,7 +464,7 @@ def _bytes(var: Any) -> float:
 
 
 def _trips(eqn: Any) -> int | None:
-    """Return how often a loop ``while i < n: …; i += step`` with constant bounds runs."""
+    """Return the iterations of ``while i < n: …; i += step`` with constant bounds, or None."""
     params = eqn.params
     cond, body = params["cond_jaxpr"].jaxpr, params["body_jaxpr"].jaxpr
     starts = eqn.invars[params["cond_nconsts"] + params["body_nconsts"] :]
@@ -490,7 +489,7 @@ def _trips(eqn: Any) -> int | None:
 
 
 def _sliced(mark: _Mark) -> _Mark:
-    """Return the mark of one of the slices along the first dimension."""
+    """Return the mark of a slice along the first dimension."""
     return _Mark(mark.trained, mark.axes[1:] if mark.axes else None)
 
 
@@ -512,7 +511,7 @@ def _moved(eqn: Any, axes: Axes | None) -> Axes | None:
 
 
 def _reshaped(before: Sequence[int], after: Sequence[int], axes: Axes) -> Axes:
-    """Return the mesh axes after a reshape; of dimensions that are split the first keeps it."""
+    """Return the mesh axes after a reshape; a split dimension passes its axis to the first part."""
     found: list[str | None] = [None] * len(after)
     done, ends = 1, {}
     for dim, size in enumerate(after):

@@ -1,4 +1,4 @@
-"""Load a world model from whatever training left: a finished run, an unfinished one, a checkpoint.
+"""Load a world model from a finished run, an unfinished run or a checkpoint.
 
 Only inference weights are read: a checkpoint's optimizer state may be missing or damaged.
 """
@@ -30,23 +30,22 @@ def load(path: str | Path) -> tuple[Config, Params]:
     """Load a world model.
 
     Args:
-        path: a run folder made by ``train.py``, finished or not: the newest weights in it are
-            taken, those of its newest whole checkpoint while a stage is being trained. Or a
-            checkpoint's own folder, such as ``runs/demo/checkpoints/stage1/200``. Or a folder of
-            converted weights. Or the name of weights that come with the library
-            (``shipped.names()``).
+        path: one of: a run folder made by ``train.py``, finished or not (the newest weights are
+            loaded; while a stage is being trained, those of its newest complete checkpoint); a
+            checkpoint folder, such as ``runs/demo/checkpoints/stage1/200``; a folder of converted
+            weights; the name of weights that ship with the library (``shipped.names()``).
 
     Returns:
-        ``(config, params)``; the averaged weights that inference uses, as NumPy arrays in the
-        dtype of the file.
+        ``(config, params)``: the averaged (EMA) inference weights as NumPy arrays, in the dtype of
+        the file.
 
     Raises:
-        UserError: something is absent or damaged, or the weights do not fit the configuration.
+        UserError: a file is missing or damaged, or the weights do not fit the configuration.
     """
     if not isinstance(path, str | os.PathLike):
         raise UserError(
-            f"load() got a path of type {type(path).__name__}: give the folder of a run, or the "
-            "name of weights that come with the library, such as 'small'."
+            f"load() got a path of type {type(path).__name__}: pass the folder of a run, or the "
+            "name of weights that ship with the library, such as 'small'."
         )
     folder = shipped.find(path)
     if (folder / checkpoint_files.WEIGHTS_ITEM).is_dir():
@@ -60,12 +59,12 @@ def load(path: str | Path) -> tuple[Config, Params]:
         except UserError as error:
             if number == len(newer) - 1 and not (folder / runs.WEIGHTS).exists():
                 raise
-            warnings.warn(f"{error} The one before it is loaded.", stacklevel=2)
+            warnings.warn(f"{error} The previous one is loaded.", stacklevel=2)
     return rollouts.load_finished(folder)
 
 
 def _checkpoints(run: Path) -> list[Path]:
-    """Return the checkpoints of a run that are newer than its file of weights, newest first."""
+    """Return the checkpoints of a run that are newer than its weights file, newest first."""
     path = run / runs.WEIGHTS
     facts = weights.metadata(path) if path.exists() else {}
     have = (int(facts.get("stage", 0)), int(facts.get("step", 0)))
@@ -94,7 +93,7 @@ def _shapes(config: Config, number: int) -> Params:
 def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
     """Return the planned stages from the last one that has a checkpoint.
 
-    Earlier ones are done: the checkpoints of the later stage hold their weights.
+    Earlier stages are complete: the checkpoints of the later stage contain their weights.
     """
     begun = [
         n
@@ -105,9 +104,9 @@ def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]
 
 
 def require_weights(config: Config) -> None:
-    """Refuse networks that are never trained, if there are no weights for them.
+    """Raise UserError if weights of networks that are never trained are missing.
 
-    Those of the model are named by ``train.start``; a stage's loss may need others.
+    ``train.start`` names those of the model; the loss of a stage may need others.
     """
     for stage in all_stages(config):
         if stage.extra_weights is not None and stage.settings(config).steps > 0:
@@ -118,13 +117,13 @@ def require_weights(config: Config) -> None:
         if getattr(part, "CONVERTED", False):
             convert = "convert a checkpoint (pewm-jax convert --help)"
             raise UserError(
-                f"{where} of kind {kinds.of(part).name} needs weights that are not trained here: "
-                f"{getattr(part, 'WEIGHTS_FROM', convert)} and name its folder by train.start."
+                f"{where} of kind {kinds.of(part).name} needs pretrained weights: "
+                f"{getattr(part, 'WEIGHTS_FROM', convert)} and set train.start to its folder."
             )
 
 
 def _parts(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Settings]]:
-    """List the parts that a model is put together of, and their parts, by their settings' names."""
+    """Yield the parts of a model, recursively, with the dotted names of their settings."""
     for field in dataclasses.fields(settings):  # type: ignore[arg-type]
         part = getattr(settings, field.name)
         if isinstance(part, Settings):
@@ -133,16 +132,16 @@ def _parts(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Settings
 
 
 def read_weights(config: Config, stage: Stage, log: Callable[[str], None]) -> Params | None:
-    """Return the weights in ``train.start``, mapped into memory; None if it is empty.
+    """Return the weights in ``train.start``, memory-mapped; None if it is empty.
 
-    What only later stages have is dropped, which is said: PEWM's memory blocks are trained further
-    where stage 2 is the first, and not after stage 1, which makes another backbone than theirs.
+    Weights of later stages are dropped, with a log line: PEWM's memory blocks are trained further
+    if stage 2 is the first stage, but not after stage 1, which trains a different backbone.
     """
     if not config.train.start:
         return None
     file = shipped.find(config.train.start) / runs.WEIGHTS
-    params = _given(config)
-    if file.exists():  # a checkpoint has been verified while reading
+    params = _start_weights(config)
+    if file.exists():  # a checkpoint is verified while it is read
         processes.run_on_process_0(lambda: weights.verify(file))
     for later in _later(config, stage):
         extra = (
@@ -150,8 +149,8 @@ def read_weights(config: Config, stage: Stage, log: Callable[[str], None]) -> Pa
         ) & params.keys()
         if extra:
             log(
-                f"{config.train.start}: its {' and '.join(sorted(extra))} blocks are left out; "
-                f"{later.title} begins with fresh ones"
+                f"{config.train.start}: its {' and '.join(sorted(extra))} blocks are ignored; "
+                f"{later.title} initializes new ones"
             )
         params = {name: part for name, part in params.items() if name not in extra}
     return params
@@ -167,14 +166,14 @@ def _stage_shapes(config: Config, stage: Stage) -> Params:
 
 
 def encoder(config: Config) -> Params:
-    """Return the image encoder's weights in ``train.start``, to compare kept features with."""
+    """Return the image encoder's weights in ``train.start``, for checking cached features."""
     if not config.model.memory.encoder.CONVERTED:
         return {}
-    return _given(config)["encoder"]
+    return _start_weights(config)["encoder"]
 
 
-def _given(config: Config) -> Params:
-    """Return the weights in ``train.start``: those of its file, or else of a checkpoint."""
+def _start_weights(config: Config) -> Params:
+    """Return the weights in ``train.start``, from its weights file or else from a checkpoint."""
     folder = shipped.find(config.train.start)
     if (folder / runs.WEIGHTS).exists():
         return rollouts.load_finished(folder, lazily=True)[1]
@@ -182,7 +181,7 @@ def _given(config: Config) -> Params:
 
 
 def features(config: Config, stage: Stage) -> feature_cache.FeatureCache | None:
-    """Open the kept features if the stage uses any, without comparing them with the weights."""
+    """Open the feature cache if the stage uses it, without checking it against the weights."""
     if not (config.data.features and stage.memory):
         return None
     return feature_cache.read(Path(config.data.features) / "train")

@@ -1,8 +1,8 @@
-"""The log of a training: a line of JSON and a TensorBoard event per logged step, and a live view.
+"""Training logs: one JSON line and one TensorBoard event per logged step, and a live view.
 
-Where ``train.wandb`` names a project, Weights & Biases gets the same scalars (``wandb_log``).
+If ``train.wandb`` names a project, the same scalars are sent to Weights & Biases (``WandbLog``).
 
-On a terminal the live view is a progress bar, elsewhere a line every ten seconds.
+The live view is a progress bar on a terminal, and otherwise a line every ten seconds.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ from pewm_jax.train import processes
 from pewm_jax.train.stages import Stage
 
 FLUSH_S = 10
-"""Seconds between writes of TensorBoard's events; lines of JSON are written at once."""
+"""Seconds between writes of TensorBoard events; JSON lines are written immediately."""
 LINE_EVERY_S = 10.0
-"""Seconds between lines of the live view where the output is not a terminal."""
+"""Seconds between lines of the live view if the output is not a terminal."""
 
 
 class MetricsLog:
     """Appends scalars to ``metrics.jsonl`` and to TensorBoard; a context manager.
 
-    Lines logged after the step that the run is resumed from are dropped, so that every step has
-    one line. Of several processes only the first writes.
+    Lines logged after the step from which the run is resumed are dropped, so that every step has
+    one line. Only process 0 writes.
 
     Args:
         run: the run's folder.
         stage: the stage about to be trained.
-        step: steps of it that are done.
-        config: the experiment, which may ask for Weights & Biases; without it there is none.
+        step: number of its steps already done.
+        config: the experiment, which may enable Weights & Biases; None disables it.
 
     Raises:
-        UserError: Weights & Biases is asked for and cannot begin.
+        UserError: Weights & Biases is enabled and cannot start.
     """
 
     def __init__(self, run: Path, stage: Stage, step: int, config: Config | None = None):
@@ -56,7 +56,7 @@ class MetricsLog:
         self._writes = processes.is_primary()
         if not self._writes:
             return
-        # Imported here and not above: it takes a second, and loads torch where that is installed.
+        # Imported lazily: it takes a second, and imports torch if that is installed.
         import tensorboardX  # noqa: PLC0415
 
         self._wandb = None
@@ -82,7 +82,7 @@ class MetricsLog:
     ) -> None:
         if not self._writes:
             return
-        # An error that is being raised matters more than a disk too full for the last lines.
+        # Do not let a full disk mask the error being raised.
         with contextlib.nullcontext() if error is None else contextlib.suppress(OSError):
             try:
                 self._file.close()
@@ -92,7 +92,7 @@ class MetricsLog:
                     self._wandb.close(failed=error is not None)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Log the scalars of one step; NaN and infinity, which JSON lacks, are written as null."""
+        """Log the scalars of one step; NaN and infinity, which JSON lacks, become null."""
         if not self._writes:
             return
         finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
@@ -107,7 +107,7 @@ class MetricsLog:
 
 
 def drop_after(path: Path, stage: int, step: int) -> None:
-    """Drop a log's lines after a step of a stage (its number), and a half-written last line."""
+    """Drop the log lines after ``step`` of stage number ``stage``, and a partial last line."""
     if not path.exists():
         return
     kept = []
@@ -122,9 +122,9 @@ def drop_after(path: Path, stage: int, step: int) -> None:
 
 
 class Pace:
-    """Seconds per step, smoothed, without the time spent on other work.
+    """Smoothed seconds per step, excluding time spent on other work.
 
-    The mean of the first ten steps, from then on a moving average of about as many.
+    The mean of the first ten steps, then an exponential moving average over about ten.
     """
 
     def __init__(self, now: float):
@@ -133,11 +133,11 @@ class Pace:
         self._mean = 0.0
 
     def pause(self, seconds: float) -> None:
-        """Leave out time in which no step was made."""
+        """Exclude time in which no step was done."""
         self._last += seconds
 
     def tick(self, now: float) -> float:
-        """Note that a step is done; returns the smoothed seconds per step."""
+        """Record a finished step and return the smoothed seconds per step."""
         seconds, self._last = max(now - self._last, 1e-9), now
         self._ticks += 1
         self._mean += (seconds - self._mean) / min(self._ticks, 10)
@@ -145,13 +145,13 @@ class Pace:
 
 
 class LiveView:
-    """Shows how far a stage is, how well it learns and how fast; a context manager.
+    """Shows progress, loss and speed of a stage; a context manager.
 
     Args:
         label: name of the stage.
-        total: its steps.
-        done: steps done before.
-        console: where to print; standard output by default.
+        total: number of its steps.
+        done: number of steps already done.
+        console: output; standard output by default.
     """
 
     def __init__(self, label: str, total: int, done: int, console: Console | None = None):
@@ -190,7 +190,7 @@ class LiveView:
         self._printed = time.monotonic()
 
     def update(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Show a step that is done; the last one is always shown."""
+        """Show a finished step; the last one is always shown."""
         text = describe(metrics, (self._total - step) * metrics["step_seconds"])
         if self._bar is not None:
             self._bar.update(self._task, completed=step, text=text)
@@ -199,7 +199,7 @@ class LiveView:
 
 
 def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
-    """Put the figures of a step into one line."""
+    """Format the metrics of a step as one line."""
     return (
         f"loss {metrics['loss']:.4f} · lr {metrics['learning_rate']:.2e} · "
         f"grad {metrics['grad_norm']:.3g} · {duration(metrics['step_seconds'])}/step · "
@@ -209,7 +209,7 @@ def describe(metrics: Mapping[str, float], seconds_left: float) -> str:
 
 
 def _work(metrics: Mapping[str, float]) -> str:
-    """Write the FLOP/s of each device, and the share of its peak (MFU) where that is known."""
+    """Format the FLOP/s per device, and the MFU if the peak is known."""
     rate = metrics["tflops_per_second_per_device"]
     text = f"{rate:.1f} TFLOP/s" if rate >= 1 else f"{rate * 1e3:.3g} GFLOP/s"
     share = f" · MFU {metrics['mfu']:.1%}" if "mfu" in metrics else ""
@@ -217,7 +217,7 @@ def _work(metrics: Mapping[str, float]) -> str:
 
 
 def _counts(metrics: Mapping[str, float]) -> str:
-    """Write how many updates were skipped and records were bad, if any."""
+    """Format the numbers of skipped updates and bad records, if any."""
     names = {"skipped": "skipped", "bad_records": "bad records"}
     return "".join(
         f"{name} {metrics[key]:.0f} · " for key, name in names.items() if metrics.get(key)
@@ -225,7 +225,7 @@ def _counts(metrics: Mapping[str, float]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Write a duration as people do: ``85 ms``, ``12.3 s``, ``4 min 05 s``, ``2 h 10 min``."""
+    """Format a duration, such as ``85 ms``, ``12.3 s``, ``4 min 05 s``, ``2 h 10 min``."""
     if seconds < 1:
         return f"{seconds * 1000:.0f} ms"
     if seconds < 60:
@@ -237,17 +237,17 @@ def duration(seconds: float) -> str:
 
 
 ID = "wandb.id"
-"""File in a run's folder: what the runs of its stages are called there."""
+"""File in a run's folder with the Weights & Biases run ids of its stages."""
 
 
 def require_wandb() -> Any:
-    """Import the package.
+    """Return the module ``wandb``.
 
     Raises:
         UserError: it is not installed.
     """
     try:
-        return importlib.import_module("wandb")  # takes a second: only where it is asked for
+        return importlib.import_module("wandb")  # the import takes a second, so only on demand
     except ImportError:
         raise UserError(
             "train.wandb needs Weights & Biases, which is not installed: "
@@ -256,15 +256,15 @@ def require_wandb() -> Any:
 
 
 class WandbLog:
-    """Sends the scalars of a stage; one process of a job has one.
+    """Sends the scalars of a stage to Weights & Biases; only one process of a job has one.
 
     Args:
-        config: the experiment, which is shown beside the curves; ``train.wandb`` is the project.
+        config: the experiment, sent as the run's config; ``train.wandb`` is the project.
         run: the run's folder.
         stage: the stage about to be trained.
 
     Raises:
-        UserError: the package is not installed, nobody is logged in, or it cannot begin.
+        UserError: the package is not installed, no user is logged in, or the run cannot be started.
     """
 
     def __init__(self, config: Config, run: Path, stage: Stage):
@@ -278,26 +278,26 @@ class WandbLog:
                 resume="allow",
                 dir=str(run),
                 config=configuration.to_dict(config),
-                settings=wandb.Settings(console="off"),  # the live view is ours
+                settings=wandb.Settings(console="off"),  # the live view prints already
             )
         except wandb.Error as error:
             reason = " ".join(str(error).split()).rstrip(".")
             raise UserError(
-                f"Weights & Biases does not begin ({reason}): run `wandb login` first, or set "
-                "WANDB_MODE=offline to keep everything here, or leave out --train.wandb."
+                f"Weights & Biases cannot start ({reason}): run `wandb login` first, set "
+                "WANDB_MODE=offline to log locally only, or omit --train.wandb."
             ) from None
 
     def write(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Log the scalars of one step; a step that was logged before is left as it was."""
+        """Log the scalars of one step; a step that was logged before is not changed."""
         self._run.log(dict(scalars), step=step)
 
     def close(self, *, failed: bool) -> None:
-        """Send or keep what is left, and end."""
+        """Flush and finish the run."""
         self._run.finish(exit_code=int(failed))
 
 
 def _id(run: Path) -> str:
-    """Return the name kept in the run's folder, made when it is first asked for."""
+    """Return the id stored in the run's folder; create it on first use."""
     path = run / ID
     if not path.exists():
         atomic.write_text(path, uuid.uuid4().hex[:12])
@@ -310,15 +310,15 @@ SKIPPED = 2
 
 
 class Profile:
-    """Traces some steps of a stage; does nothing where none are asked for.
+    """Traces some steps of a stage with JAX's profiler; does nothing for 0 steps.
 
     Args:
-        run: the run's folder; the trace goes to ``profile/stage1`` inside.
+        run: the run's folder; the trace is written to ``profile/stage1`` in it.
         stage: the stage.
-        steps: how many steps are traced, 0 for none.
-        first: the first step of this start.
-        last: the last step of the stage; a trace ends with it at the latest.
-        log: prints where the trace is and what opens it.
+        steps: number of steps to trace, 0 for none.
+        first: the first step after starting or resuming.
+        last: the last step of the stage; the trace ends there at the latest.
+        log: prints where the trace is and how to open it.
     """
 
     def __init__(
@@ -340,7 +340,7 @@ class Profile:
 
     @contextlib.contextmanager
     def around(self, step: int) -> Iterator[None]:
-        """Trace what is done inside, if this step is one of those."""
+        """Trace the body of the ``with`` statement if this step is to be traced."""
         if step not in self._steps:
             yield
             return
@@ -353,7 +353,7 @@ class Profile:
         self._traced += 1
 
     def after(self, step: int, result: Any) -> float:
-        """End the trace with its last step, once that is computed; returns seconds spent on it."""
+        """End the trace after its last step is computed; return the seconds spent on that."""
         if not (self._tracing and step == self._steps[-1]):
             return 0.0
         jax.block_until_ready(result)
@@ -362,7 +362,7 @@ class Profile:
         return time.monotonic() - began
 
     def close(self) -> None:
-        """Write what was traced so far, if anything."""
+        """Write the trace so far, if any."""
         if not self._tracing:
             return
         self._tracing = False

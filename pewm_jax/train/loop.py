@@ -1,4 +1,4 @@
-"""The loop: stages one after the other, resumable at any step. Everything with a clock is here.
+"""The training loop: stages in sequence, resumable at any step; the only module with a clock.
 
 The metrics of step k − 1 are read after step k is dispatched, batches are placed ahead, and
 checkpoints are written in the background, so the devices never wait for the host.
@@ -42,16 +42,16 @@ from pewm_jax.train.step import (
     TrainState,
     abstract_state,
     compile_step,
-    given_weights,
     inference_params,
     initial_state,
+    load_extra_weights,
     noise_key,
 )
 from pewm_jax.train.watch import Preview, Samples, Watch
 from pewm_jax.types import Clip, Params
 
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
-"""Errors of a disk that takes no more."""
+"""Error numbers of a full or failing disk."""
 
 
 def train(
@@ -61,29 +61,30 @@ def train(
     profile: int = 0,
     log: Callable[[str], None] = print,
 ) -> Path:
-    """Train all planned stages, going on where an earlier start of the same run stopped.
+    """Train all planned stages, resuming an earlier start of the same run.
 
     Args:
-        config: the experiment; ``config.train.run`` is the folder that is written.
-        preview: makes sample pictures every ``config.train.preview_every`` steps and at the end
-            of a stage.
-        profile: steps to trace in each stage, for ``profile/`` in the run's folder.
+        config: the experiment; ``config.train.run`` is the output folder.
+        preview: makes sample pictures every ``config.train.preview_every`` steps and at the end of
+            a stage.
+        profile: number of steps to trace in each stage, written to ``profile/`` in the run's
+            folder.
         log: prints a line.
 
     Returns:
         The run's folder, ready for ``pewm_jax.load``.
 
     Raises:
-        UserError: the folder is of another configuration or in use, the data do not fit, or the
-            loss is not finite.
-        Interrupted: Ctrl-C or SIGTERM came; everything is saved. (Where saving takes longer than
-            ``train.grace_s``, and at a second signal, the process ends itself.)
+        UserError: the folder belongs to another configuration or is in use, the data do not fit, or
+            the loss is not finite.
+        Interrupted: after Ctrl-C or SIGTERM, once everything is saved. (If saving takes longer than
+            ``train.grace_s``, or at a second signal, the process exits itself.)
     """
     config = runs.resumed(config, log if processes.is_primary() else _silent)
     planned = stages.planned(config)
     loading.require_weights(config)
     if config.train.wandb:
-        training_log.require_wandb()  # refused now, and not after the data are prepared
+        training_log.require_wandb()  # fail before the data are prepared
     mesh = sharding.make_mesh(arranged=config.train.mesh)
     for stage in planned:
         sharding.require_divisible(config, stage, mesh)
@@ -103,7 +104,7 @@ def train(
             worker = _Worker(
                 config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, log=log
             )
-            worker.start, weights = weights, None  # so they are freed once a state is made of them
+            worker.start, weights = weights, None  # freed once the state is made from them
             weights = worker.train()
             if stop.requested and stage is not planned[-1]:
                 raise stop.interrupted(stage.title, stage.settings(config).steps)
@@ -112,7 +113,7 @@ def train(
 
 
 def _print_error(line: str) -> None:
-    """Print what only this process knows; standard output belongs to the first process."""
+    """Print an error of this process to stderr; stdout belongs to process 0."""
     print(line, file=sys.stderr, flush=True)
 
 
@@ -124,7 +125,7 @@ class _Worker:
     """Trains one stage.
 
     Attributes:
-        start: weights of the stage before; None to begin with those in ``train.start``, if any.
+        start: weights of the previous stage; None to use those in ``train.start``, if any.
     """
 
     start: Params | None = None
@@ -157,10 +158,10 @@ class _Worker:
         return self.stage.settings(self.config)
 
     def train(self) -> Params:
-        """Train the stage, or find it done; returns its inference weights."""
+        """Train the stage unless it is done; return its inference weights."""
         config, stage, run, steps = self.config, self.stage, self.path, self.settings.steps
         with Checkpoints(run, config, stage, self.log) as self.checkpoints, self._writing():
-            self.stop.at_once, self.stop.kept = True, self._kept
+            self.stop.at_once, self.stop.kept = True, self._saved_phrase
             done = self.checkpoints.latest() or 0
             if done >= steps:
                 params = self.checkpoints.restore_weights(self.like)
@@ -194,7 +195,7 @@ class _Worker:
             return params
 
     def run(self, done: int) -> TrainState:
-        """Do the steps after ``done``, once the first batch is there; returns the last state."""
+        """Run the steps after ``done`` and return the last state."""
         config, settings = self.config, self.settings
         cache = loading.features(config, self.stage)
         where = sharding.of_batch(self.mesh)
@@ -259,7 +260,7 @@ class _Worker:
         return state
 
     def _prepare(self, done: int, state: TrainState) -> Iterator[Clip]:
-        """Prepare clips, the same however often training stopped, and draw from them."""
+        """Prepare clips, independently of interruptions, and yield batches of them."""
         seed = self.stage.data_seed(self.config)
         batch = self.settings.batch
 
@@ -280,36 +281,36 @@ class _Worker:
         return draw_prepared(clips, batch, seed, done)
 
     def _compile(self, done: int, clip: Clip, state: TrainState | None):
-        """Make the state, whose first weights are compiled too, and compile the step."""
+        """Make the state (its initialization is compiled, too) and compile the step."""
         self.view.log(f"{self.stage.title}: compiling the training step …")
         began = time.monotonic()
         state = self._make_state(done) if state is None else state
-        given = given_weights(self.config, self.stage, self.mesh)
-        step_fn = compile_step(self.config, self.stage, self.mesh, clip, given)
-        self.watch.flops = flops.of_stage(self.config, self.stage, clip, given).total
+        extra = load_extra_weights(self.config, self.stage, self.mesh)
+        step_fn = compile_step(self.config, self.stage, self.mesh, clip, extra)
+        self.watch.flops = flops.of_stage(self.config, self.stage, clip, extra).total
         took = duration(time.monotonic() - began)
         self.view.log(f"{self.stage.title}: compiled the training step in {took}")
         return state, step_fn
 
     def _make_state(self, done: int) -> TrainState:
-        """Make the state of the stage's start, or read that after ``done`` steps."""
+        """Return the stage's initial state, or restore the checkpoint of step ``done``."""
         if done:
-            self.view.log(f"{self.stage.title}: going on after step {done}")
+            self.view.log(f"{self.stage.title}: resuming after step {done}")
             return self.checkpoints.restore(self.like)
         start, self.start = self.start, None
         if start is None:
             start = loading.read_weights(self.config, self.stage, self.log)
         return initial_state(self.config, self.stage, self.mesh, start)
 
-    def _report(self, step: int, metrics: Metrics, shown: TrainState | None = None) -> None:
-        """Read a step's metrics; check, show and log them, with samples of the state if given."""
+    def _report(self, step: int, metrics: Metrics, sampled: TrainState | None = None) -> None:
+        """Read, check, show and log a step's metrics; make samples if a state is passed."""
         with self._paused():
             self.checkpoints.settle()
-        values = self.watch.read(step, metrics, self._kept_in_the_end)
+        values = self.watch.read(step, metrics, self._final_saved_phrase)
         samples: dict[str, float] = {}
-        if shown is not None:
+        if sampled is not None:
             with self._paused():
-                samples = self.samples.make(inference_params(self.stage, shown), step)
+                samples = self.samples.make(inference_params(self.stage, sampled), step)
         self.watch.write(step, values | samples, always=bool(samples))
 
     def _save(self, state: TrainState) -> None:
@@ -317,28 +318,28 @@ class _Worker:
             self.checkpoints.save(state)
 
     def _leave(self, step: int, state: TrainState, pending: tuple[int, Metrics] | None) -> NoReturn:
-        """Save what is not saved yet, and leave."""
+        """Save the state and raise ``Interrupted``."""
         if pending is not None:
             self._report(*pending)
         self._save(state)
         self.checkpoints.wait()
         raise self.stop.interrupted(self.stage.title, step)
 
-    def _kept(self) -> str:
-        """Say what is safely on disk."""
+    def _saved_phrase(self) -> str:
+        """Return a phrase that names the newest checkpoint on disk."""
         step, title = self.checkpoints.latest(), self.stage.title
         if step is not None:
             return f"{title}'s checkpoint of step {step} is intact"
         first = self.stage.number == 1
-        return "nothing was saved yet" if first else f"of {title} nothing is saved yet"
+        return "nothing was saved yet" if first else f"nothing of {title} was saved yet"
 
-    def _kept_in_the_end(self) -> str:
+    def _final_saved_phrase(self) -> str:
         self.checkpoints.wait()
-        return self._kept()
+        return self._saved_phrase()
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turn a disk that is full, or fails, into a sentence that says what is safe on it."""
+        """Raise errors of a full or failing disk as ``UserError``, naming the newest checkpoint."""
         try:
             yield
         except OSError as error:
@@ -346,13 +347,13 @@ class _Worker:
                 raise
             raise UserError(
                 f"{error.filename or self.path} cannot be written ({error.strerror}); "
-                f"{self._kept_in_the_end()}: free space there, then run the same command again to "
-                "go on."
+                f"{self._final_saved_phrase()}: free space there, then run the same command "
+                "again to resume."
             ) from None
 
     @contextmanager
     def _paused(self) -> Iterator[None]:
-        """Do not count what is done inside as time of the steps."""
+        """Exclude the body of the ``with`` statement from the step time."""
         began = time.monotonic()
         yield
         self.watch.pace.pause(time.monotonic() - began)

@@ -1,9 +1,8 @@
-"""Adam or Muon with warm-up, clipping and decoupled weight decay, masked to what a stage trains.
+"""Adam or Muon with warm-up, clipping and decoupled weight decay, masked to the trained parameters.
 
-``optax.partition`` sends every leaf to one of two transformations by the stage's labels: to the
-optimizer, with the clipping inside, or to zero. So frozen leaves have no moments and their
-gradients do not enter the norm that is clipped. (``optax.masked`` alone would pass raw gradients
-through to them.)
+``optax.partition`` routes every leaf by the stage's labels: to the optimizer, including the
+clipping, or to zero. So frozen leaves have no moments and their gradients do not enter the clipped
+norm. (``optax.masked`` alone would pass raw gradients through to them.)
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ DECAYED = (
     (r"(.*/)?kernel", True),
     (r".*", False),
 )
-"""Which leaves weight decay pulls to zero: matrices, and not biases, scales, gates, embeddings."""
+"""Leaves with weight decay: matrices, but not biases, scales, gates or embeddings."""
 
 
 def schedule(settings: StageConfig) -> optax.Schedule:
     """Return the learning rate as a function of the number of steps done (0 at the first).
 
-    Linear warm-up that is already above zero at the first step and reaches the peak after
-    ``warmup`` steps, then constant or a half cosine that would reach zero one step after the last.
+    The warm-up is linear: already above zero at the first step, at the peak after ``warmup`` steps.
+    Then the rate is constant, or a half cosine that would reach zero one step after the last.
     """
     warmup = optax.linear_schedule(
         settings.learning_rate / (settings.warmup + 1), settings.learning_rate, settings.warmup
@@ -48,7 +47,7 @@ def schedule(settings: StageConfig) -> optax.Schedule:
 
 
 def rate(settings: StageConfig, opt_state: optax.OptState) -> Array:
-    """Return the learning rate of the next update; skipped ones have not counted."""
+    """Return the learning rate of the next update; skipped updates are not counted."""
     counted = optax.tree_utils.tree_get(opt_state, "ScaleByScheduleState")
     return jnp.asarray(schedule(settings)(counted.count))
 
@@ -84,20 +83,20 @@ MATRICES = (
     (r"(.*/)?kernel", True),
     (r".*", False),
 )
-"""Which leaves Muon changes: matrices between hidden layers, and not the first and the last."""
+"""Leaves that Muon updates: matrices of hidden layers, but not the first and last layers."""
 STACKED = "blocks"
-"""Folder of parameters whose first axis counts layers."""
+"""Name of parameter subtrees whose first axis is the layer."""
 MUON_RMS = 0.2
-"""Root mean square of Muon's updates, as Adam's are in practice, so that one learning rate does for
-both (Liu et al. 2025, "Muon is scalable for LLM training", Eq. 4)."""
+"""Root mean square of Muon's updates, matched to Adam's typical value, so that both can use one
+learning rate (Liu et al. 2025, "Muon is scalable for LLM training", Eq. 4)."""
 
 
 def muon(adam: optax.GradientTransformation) -> optax.GradientTransformation:
-    """Return Muon for the matrices of hidden layers, and ``adam`` for everything else.
+    """Return Muon for the matrices of hidden layers, and ``adam`` for all other leaves.
 
     Muon steps along the nearest orthogonal matrix to the momentum (Jordan 2024; ``optax.contrib``).
-    A convolution is a matrix from all its inputs to its outputs; layers that are stacked count one
-    by one.
+    A convolution is treated as a matrix from all its inputs to its outputs; stacked layers are
+    orthogonalized separately.
     """
 
     def names(trained: Params) -> Params:
@@ -122,18 +121,18 @@ def _axes(updates: Any) -> Any:
 
 
 def _sized(path: Any, update: Array) -> Array:
-    """Give an orthogonal update the size of Adam's."""
+    """Scale an orthogonal update to the RMS of Adam's."""
     inputs = math.prod(update.shape[_first(path) : -1])
     return MUON_RMS * math.sqrt(max(inputs, update.shape[-1])) * update
 
 
 def _first(path: Any) -> int:
-    """Return the first axis of a matrix that is at this path: 1 where layers are stacked."""
+    """Return the first matrix axis of the leaf at this path: 1 if layers are stacked."""
     return int(any(getattr(key, "key", None) == STACKED for key in path))
 
 
 def _rates(stage: Stage) -> optax.GradientTransformation:
-    """Multiply updates by the stage's factors for their paths."""
+    """Multiply updates by the stage's learning-rate factors."""
     rules = (*stage.rates, (r".*", 1.0))
 
     def scaled(updates: Any, params: Any = None) -> Any:

@@ -1,7 +1,7 @@
-"""The processes of one job: joining, agreeing on values, and ending together.
+"""The processes of one job: joining, agreeing on values, and exiting together.
 
-All of them run the same program in the same order. Only process 0 writes files. Decisions that must
-be the same everywhere are made by ``agree`` and ``Votes``.
+All processes run the same program in the same order. Only process 0 writes files. Decisions that
+must be the same in all processes are made by ``agree`` and ``Votes``.
 """
 
 from __future__ import annotations
@@ -29,36 +29,36 @@ from pewm_jax.config import Join, UserError
 from pewm_jax.errors import report
 
 HEARTBEAT_S = 20
-"""Seconds of silence after which a process counts as dead, and all others end."""
+"""Seconds without a heartbeat after which a process counts as dead and all others exit."""
 GONE = (
-    "Another process of this job is gone, or cannot be reached: see what the others say, and start "
-    "all of them again to go on from what was kept (the last checkpoint)."
+    "Another process of this job has exited or cannot be reached: read the output of the other "
+    "processes, then start all of them again to resume from the last checkpoint."
 )
-"""What a process says when it notices that another is gone."""
+"""Printed when a process notices that another one is gone."""
 _LEAVE_S = 60
-"""Seconds that a process which is done waits for the others to be done too."""
+"""Seconds that a finished process waits for the others to finish."""
 _REPORT_S = 5
-"""Seconds that a process which has reported an error waits for the others to report theirs."""
+"""Seconds that a process that has reported an error waits for the others to report theirs."""
 _COMMUNICATION = ("gloo", "nccl", "unavailable", "deadline", "connect", "coordination", "socket")
-"""Parts of the messages of errors that JAX raises when another process is gone."""
+"""Parts of the messages that JAX raises when another process is gone."""
 
 BARRIER_S = 7 * 24 * 3600
-"""Seconds that processes wait in ``barrier``: one that is gone is noticed sooner."""
+"""Timeout of ``barrier`` in seconds; a process that is gone is noticed earlier."""
 
 T = TypeVar("T")
 
 
 @contextlib.contextmanager
 def joined(launch: Join) -> Iterator[None]:
-    """Join the processes of a job while this is entered, if the launch asks for it.
+    """Join the processes of a job for the duration of the context, if ``launch`` asks for it.
 
     Inside, only process 0 prints. An error ends this process, with one sentence and the exit code
     of ``errors.report``, as soon as the others have reported one too, or after ``_REPORT_S``; the
-    others notice within ``HEARTBEAT_S``. JAX may write more to standard error, or end this process
-    itself (SIGABRT) when process 0 is gone.
+    others notice within ``HEARTBEAT_S``. JAX may write more to standard error, or abort this
+    process (SIGABRT) when process 0 is gone.
 
     Raises:
-        UserError: there is nothing to join.
+        UserError: there are no processes to join.
     """
     if not launch.distributed:
         yield
@@ -76,18 +76,18 @@ def joined(launch: Join) -> Iterator[None]:
                 if not is_lost(error):
                     _let_others_report()
             finally:
-                os._exit(code)  # a normal exit waits for processes that wait for this one
+                os._exit(code)  # a normal exit would wait for processes that wait for this one
 
 
 def start(launch: Join) -> None:
-    """Join the other processes of the job, if the launch asks for it; before any device is used.
+    """Join the other processes of the job, if ``launch`` asks for it; call before using any device.
 
-    If the launch names no coordinator, JAX reads it from the environment (SLURM, Kubernetes, Cloud
-    TPU, Open MPI). If not all processes have joined within ``launch.patience`` seconds, this one
-    prints so and exits. Without ``--distributed`` nothing happens.
+    If ``launch`` names no coordinator, JAX reads it from the environment (SLURM, Kubernetes, Cloud
+    TPU, Open MPI). If not all processes have joined within ``launch.patience`` seconds, this
+    process prints an error and exits. Without ``--distributed`` nothing happens.
 
     Raises:
-        UserError: there is nothing to join, or the coordinator's port is taken.
+        UserError: there are no processes to join, or the coordinator's port is in use.
     """
     if not launch.distributed:
         return
@@ -108,7 +108,7 @@ def start(launch: Join) -> None:
     try:
         jax.distributed.initialize(
             **given,
-            initialization_timeout=launch.patience + 60,  # ``late`` comes first
+            initialization_timeout=launch.patience + 60,  # ``_give_up`` must come first
             heartbeat_timeout_seconds=HEARTBEAT_S,
             shutdown_timeout_seconds=_LEAVE_S,
         )
@@ -116,38 +116,38 @@ def start(launch: Join) -> None:
         reason = " ".join(str(error).split())[:160]
         raise UserError(
             f"--distributed found no processes to join ({reason}): name them with --coordinator, "
-            "--processes and --process, or leave out --distributed."
+            "--processes and --process, or omit --distributed."
         ) from None
     finally:
         late.cancel()
 
 
 def is_primary() -> bool:
-    """Tell whether this is process 0, which writes logs, pictures and unsharded files."""
+    """Return whether this is process 0, which writes logs, pictures and unsharded files."""
     return jax.process_index() == 0
 
 
 def wait(name: str) -> None:
-    """Wait until all processes have reached the barrier of this name."""
+    """Wait until all processes have reached the barrier ``name``."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(name)
 
 
 def barrier(name: str, patience_s: float = BARRIER_S) -> None:
-    """Wait until all processes have reached the barrier of this name, however long one takes.
+    """Wait until all processes have reached the barrier ``name``, without using devices.
 
-    ``wait`` is for steps of one program: it uses devices, whose collectives time out. This one is
-    for processes whose shares of some work take minutes or hours.
+    ``wait`` is for steps of one program: it uses devices, whose collectives time out. ``barrier``
+    is for processes whose parts of some work take minutes or hours.
     """
     if jax.process_count() > 1:
         multihost.get_barrier_sync_fn()(key=name, timeout_ms=int(1000 * patience_s))
 
 
 def agree(value: Any) -> Any:
-    """Return the first process's value in all processes.
+    """Return process 0's value in all processes.
 
     Args:
-        value: anything that JSON can hold; the values of other processes are ignored.
+        value: any JSON-serializable value; ignored in other processes.
     """
     if jax.process_count() == 1:
         return value
@@ -161,10 +161,10 @@ def run_on_process_0(work: Callable[[], Any]) -> Any:
     """Call a function in process 0 only, and return its result in all processes.
 
     Args:
-        work: returns something that JSON can hold.
+        work: returns a JSON-serializable value.
 
     Raises:
-        UserError: in all processes, if the function raised it or ``OSError`` in process 0.
+        UserError: in all processes, if the function raises it or ``OSError`` in process 0.
     """
     outcome: dict[str, Any] = {}
     if is_primary():
@@ -193,7 +193,7 @@ def on_process_0(context: contextlib.AbstractContextManager[Any]) -> Iterator[No
 
 
 def is_lost(error: BaseException) -> bool:
-    """Tell whether an error is about another process that is gone or cannot be reached."""
+    """Return whether an error means that another process is gone or cannot be reached."""
     status, _, reason = str(error).partition(": ")
     return (
         jax.process_count() > 1
@@ -204,12 +204,12 @@ def is_lost(error: BaseException) -> bool:
 
 
 def gather(tree: T) -> T:
-    """Gather arrays that are sharded over processes in the first one; called by all.
+    """Gather arrays that are sharded over processes to process 0; called by all processes.
 
-    Leaf by leaf, so no device holds more than one gathered array.
+    Leaves are gathered one by one, so no device holds more than one gathered array.
 
     Returns:
-        In the first process the same tree with NumPy arrays, in the others a tree of empty arrays.
+        In process 0 the same tree with NumPy arrays, in the others a tree of empty arrays.
     """
     if jax.process_count() == 1:
         return tree
@@ -243,11 +243,11 @@ class Votes:
         """Vote, and return the result of the previous vote.
 
         Args:
-            number: the signal that this process received, or None.
+            number: the signal received by this process, or None.
 
         Returns:
-            The largest number that any process gave, or None. With one process, its own number at
-            once.
+            The largest number that any process voted, or None. With one process, its own number,
+            immediately.
         """
         if jax.process_count() == 1:
             return number
@@ -256,7 +256,7 @@ class Votes:
 
 
 def _largest_of_all() -> Callable[[int], jax.Array]:
-    """Return a function that gives the largest of all processes' numbers, on every device."""
+    """Return a function that returns the maximum of all processes' numbers, on every device."""
     mesh = Mesh(np.asarray(jax.devices()), ("all",))
     each = NamedSharding(mesh, P("all"))
     largest = jax.jit(jnp.max, out_shardings=NamedSharding(mesh, P()))
@@ -270,16 +270,16 @@ def _largest_of_all() -> Callable[[int], jax.Array]:
 
 
 def _finish() -> None:
-    """Wait until all processes are done, each with all of its devices.
+    """Wait until all devices of all processes are done.
 
-    ``wait`` waits for the first device of each. Another one that is still connecting when JAX's
-    coordinator leaves would wait for ever, and its process with it.
+    ``wait`` waits for the first device of each process only. A device that is still connecting when
+    JAX's coordinator exits would hang, and its process with it.
     """
     jax.block_until_ready(_largest_of_all()(0))
 
 
 def _require_free(coordinator: str) -> None:
-    """Refuse an address at which something else listens."""
+    """Raise UserError if another program listens at the coordinator's address."""
     port = int(coordinator.rpartition(":")[2])
     try:
         with socket.socket() as trial:
@@ -289,18 +289,18 @@ def _require_free(coordinator: str) -> None:
     except OSError as error:
         raise UserError(
             f"--coordinator {coordinator}: port {port} cannot be used here ({error.strerror}); "
-            "give all processes another one."
+            "choose another port for all processes."
         ) from None
 
 
 def _give_up(launch: Join) -> NoReturn:
-    """Print that the processes have not met, and exit; JAX would print a stack trace."""
+    """Print that not all processes have joined, and exit; JAX would print a stack trace."""
     where = f" at {launch.coordinator}" if launch.coordinator else ""
     who = f"process {launch.process} of {launch.processes}" if launch.coordinator else "this one"
     sys.stderr.write(
-        f"error: The processes of this training have not met{where} within {launch.patience} s of "
-        f"waiting by {who}: start all of them, make sure that they can reach the first one there, "
-        "or wait longer with --patience.\n"
+        f"error: Not all processes of this training have joined{where} within {launch.patience} s, "
+        f"says {who}: start all of them, make sure that they can reach process 0 there, or wait "
+        "longer with --patience.\n"
     )
     sys.stderr.flush()
     os._exit(2)
@@ -308,7 +308,7 @@ def _give_up(launch: Join) -> NoReturn:
 
 @contextlib.contextmanager
 def _quiet_but_first() -> Iterator[None]:
-    """Let only the first process print to standard output, and not from C++, as Gloo does."""
+    """Allow only process 0 to print to stdout, and suppress C++ output (Gloo)."""
     sys.stdout.flush()
     before, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 1)
@@ -325,15 +325,15 @@ def _quiet_but_first() -> Iterator[None]:
 
 
 def _let_others_report() -> None:
-    """Wait for the other processes to report the same error: JAX aborts them without the first."""
-    with contextlib.suppress(Exception):  # it is not theirs, or they are gone
+    """Wait until other processes report the same error: JAX aborts them when process 0 exits."""
+    with contextlib.suppress(Exception):  # the error is not shared, or they are gone
         multihost.get_barrier_sync_fn()(key="reported", timeout_ms=1000 * _REPORT_S)
         if is_primary():
-            time.sleep(0.5)  # the others leave first
+            time.sleep(0.5)  # let the others exit first
 
 
 def _report(error: BaseException) -> int:
-    """Print an error as the command line does; returns the exit code."""
+    """Print an error as the command line does and return the exit code."""
     if is_lost(error):
         error = UserError(GONE)
     if not isinstance(error, (UserError, OSError, KeyboardInterrupt)):

@@ -1,15 +1,15 @@
-"""The folder of a run: its configuration, its finished weights, and a lock on it.
+"""The folder of a run: its configuration, its finished weights, and its lock.
 
 ::
 
-    runs/demo/config.json           written first: what this run is
+    runs/demo/config.json           the experiment, written first
               metrics.jsonl         one line per logged step
               tensorboard/          the same for TensorBoard
-              wandb/, wandb.id      the same for Weights & Biases, where `train.wandb` asks for it
+              wandb/, wandb.id      the same for Weights & Biases, if `train.wandb` is set
               checkpoints/stage1/   by Orbax, see ``checkpoint``
               previews/             sample pictures
-              weights.safetensors   inference weights, written when a stage is finished
-              base.json             which converted checkpoint it started from, if any
+              weights.safetensors   inference weights, written at the end of each stage
+              base.json             the converted checkpoint it started from, if any
 """
 
 from __future__ import annotations
@@ -62,25 +62,25 @@ MUTABLE_FIELDS = (
     "train.preview_every",
     "train.wandb",
 )
-"""Settings that may change between one start of a run and the next: none alters what is learnt.
+"""Settings that may change when a run is resumed: none affects what is learned.
 
-``data.features`` is one: the features are checked by their hashes when they are opened. So is
-``data.prepared_path``: folders in it are named by what the clips in them depend on.
-"""
+``data.features`` is one: features are checked by their hashes when they are opened. So is
+``data.prepared_path``: its subfolders are named by hashes of all that the clips depend on."""
 KEPT = ("noise_key", "beta1", "beta2", "epsilon")
-"""Settings of ``train`` that versions up to 3 did not have; ``resumed`` keeps a run's own."""
+"""Settings of ``train`` that versions up to 3 did not have; ``resumed`` keeps a run's own
+values."""
 
 
 def identity(config: Config) -> dict[str, Any]:
-    """Return the settings that make a run what it is, flat: ``{"train.seed": 0, …}``."""
+    """Return the settings that identify a run, flattened: ``{"train.seed": 0, …}``."""
     flat = _flatten(json.loads(json.dumps(configuration.to_dict(config))))
     return {name: value for name, value in flat.items() if not _is_mutable(name)}
 
 
 def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
-    """List the settings in which two identities differ, with both values.
+    """Return descriptions of the settings in which two identities differ, with both values.
 
-    Settings in ``MUTABLE_FIELDS`` are ignored, also those that older versions compared.
+    Settings in ``MUTABLE_FIELDS`` are ignored, including those that older versions compared.
     """
     return [
         f"{name} {there.get(name)} there, {here.get(name)} here"
@@ -90,18 +90,18 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
 
 
 def phrase(wrong: list[str]) -> str:
-    """Join differences for a message, the first few in full."""
+    """Join differences for a message; list only the first few."""
     more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
     return "; ".join(wrong[:4]) + more
 
 
 def check(config: Config) -> Path:
-    """Make the run's folder, or make sure that an existing one is of this configuration.
+    """Create the run's folder, or check that an existing one has this configuration.
 
-    Writes nothing into it; see ``prepare``.
+    Writes no file; see ``prepare``.
 
     Raises:
-        ConfigError: the folder holds training of another configuration.
+        ConfigError: the folder contains a run of another configuration.
         UserError: the path is not a folder.
     """
     run = Path(config.train.run)
@@ -109,7 +109,7 @@ def check(config: Config) -> Path:
         run.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(
-            f"train.run {run} cannot be made ({error.strerror}); choose another."
+            f"train.run {run} cannot be created ({error.strerror}): choose another folder."
         ) from None
     path = run / CONFIG
     if has_begun(run):
@@ -117,22 +117,22 @@ def check(config: Config) -> Path:
         wrong = differences(identity(there), identity(here))
         if wrong:
             raise ConfigError(
-                f"{run} was trained with another configuration ({phrase(wrong)}): give this one "
-                f"its own folder with --train.run, or put the settings back, or delete {run}."
+                f"{run} was trained with another configuration ({phrase(wrong)}): choose another "
+                f"folder with --train.run, restore the settings, or delete {run}."
             )
     return run
 
 
 def has_begun(run: Path) -> bool:
-    """Return whether a folder holds weights or checkpoints of a training."""
+    """Return whether a folder holds weights or checkpoints of a run."""
     return (run / WEIGHTS).exists() or any(run.glob("checkpoints/*/[0-9]*"))
 
 
 def resumed(config: Config, log: Callable[[str], None] = print) -> Config:
     """Return the settings with which a run is resumed.
 
-    A run begun by version 3 or earlier has the settings ``KEPT`` as they were fixed then; where a
-    preset has other values now, the run's own are kept, and ``log`` gets a line.
+    A run begun by version 3 or earlier used fixed values for the settings ``KEPT``. If a preset now
+    has other values, the run's own are kept, and ``log`` gets a line.
     """
     run = Path(config.train.run)
     if not has_begun(run):
@@ -143,12 +143,12 @@ def resumed(config: Config, log: Callable[[str], None] = print) -> Config:
     if there.noise_key != "weights" or not kept:
         return config
     listed = ", ".join(f"train.{name} {value}" for name, value in kept.items())
-    log(f"{run} keeps the settings that it was begun with: {listed}")
+    log(f"{run} keeps the settings that it was started with: {listed}")
     return dataclasses.replace(config, train=dataclasses.replace(config.train, **kept))
 
 
 def prepare(config: Config) -> Path:
-    """Check the run's folder and write down its configuration; only within ``alone``."""
+    """Check the run's folder and write its configuration; call only within ``alone``."""
     run = check(config)
     configuration.save(config, run / CONFIG)
     base = Path(config.train.start) / BASE
@@ -158,13 +158,13 @@ def prepare(config: Config) -> Path:
 
 
 def is_finished(run: Path, config: Config) -> bool:
-    """Tell whether the weights of the last planned stage are published and undamaged."""
+    """Return whether the weights of the last planned stage are published and undamaged."""
     last = stages.planned(config)[-1]
     return is_published(run, last, last.settings(config).steps)
 
 
 def is_published(run: Path, stage: stages.Stage, step: int) -> bool:
-    """Tell whether the run's file of weights is of this stage and step, and undamaged."""
+    """Return whether the run's weights file is of this stage and step, and undamaged."""
     path = run / WEIGHTS
     try:
         if (
@@ -179,12 +179,12 @@ def is_published(run: Path, stage: stages.Stage, step: int) -> bool:
 
 
 def publish(run: Path, stage: stages.Stage, step: int, params: Params) -> Path:
-    """Write the weights that ``pewm_jax.load`` reads; returns the file. Called by all processes."""
+    """Write the weights file for ``pewm_jax.load`` and return its path; called by all processes."""
     path = run / WEIGHTS
     params = processes.gather(params)
     if processes.is_primary():
         for partial in run.glob(f"{WEIGHTS}.*partial"):
-            atomic.remove(partial)  # of a process that was killed
+            atomic.remove(partial)  # left by a killed process
         weights.save(path, params, _metadata(stage, step))
     return path
 
@@ -195,7 +195,7 @@ def _metadata(stage: stages.Stage, step: int) -> dict[str, str]:
 
 @contextlib.contextmanager
 def alone(run: Path) -> Iterator[None]:
-    """Lock the folder against other trainings; the lock ends with the process.
+    """Lock the folder against other training processes; the lock ends with the process.
 
     Raises:
         UserError: another process is training there.

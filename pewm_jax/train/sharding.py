@@ -1,8 +1,8 @@
-"""Where the state lives: a mesh with four axes, and rules from paths to placements.
+"""Sharding of the training state: a mesh with four axes, and rules by parameter path.
 
-``data`` holds copies of the weights, ``fsdp`` splits weights, optimizer and average (a layer's
-weights are gathered when it computes), ``tensor`` splits heads and feed-forward channels,
-``context`` splits tokens and no weights. Where activations live is said in ``nn.placement``.
+``data`` replicates the weights, ``fsdp`` shards weights, optimizer state and EMA (a layer's weights
+are gathered when it computes), ``tensor`` shards heads and feed-forward channels, ``context``
+shards tokens but no weights. ``nn.placement`` defines the sharding of activations.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ WHOLE = P()
 
 
 def rules(model: World) -> tuple[tuple[str, P], ...]:
-    """Return the rules of a ``TrainState``: average and moments lie with their parameter.
+    """Return the sharding rules of a ``TrainState``; EMA and moments follow their parameter.
 
-    A rule leads from the path of a parameter to the mesh axes of its *last* axes; those before them
-    (stacked layers, taps of a convolution) are never split. The first match wins, and every
-    parameter must be matched. Each network says its own (``SHARDING``, beside its functions).
+    A rule maps the path of a parameter to the mesh axes of its *last* dimensions; earlier
+    dimensions (stacked layers, taps of a convolution) are never sharded. The first match applies,
+    and every parameter must be matched. Each network defines its own rules (``SHARDING``, beside
+    its functions).
     """
     parameters = worlds.sharding(model)
     return (
@@ -46,10 +47,10 @@ def rules(model: World) -> tuple[tuple[str, P], ...]:
 
 
 def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_DATA) -> Mesh:
-    """Make the mesh over the given devices, by default all there are, all along ``data``.
+    """Make the mesh over the given devices; by default all devices, all along ``data``.
 
     Raises:
-        ConfigError: the devices cannot be arranged as asked.
+        ConfigError: the number of devices does not fit the requested mesh.
     """
     devices = jax.devices() if devices is None else devices
     types = (AxisType.Auto,) * len(AXES)
@@ -57,13 +58,13 @@ def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_D
 
 
 def of_state(model: World, mesh: Mesh | AbstractMesh, state: Any) -> Any:
-    """Return the shardings of a (possibly abstract) state, as a tree of its structure.
+    """Return the shardings of a (possibly abstract) state, as a tree of the same structure.
 
-    An axis of the mesh that does not divide its axis of a leaf is left out for that leaf;
-    ``left_out`` lists these.
+    A mesh axis that does not divide its dimension of a leaf is dropped for that leaf; ``left_out``
+    lists these.
 
     Raises:
-        TreeError: leaves that no rule matches.
+        TreeError: no rule matches some leaves.
     """
     return jax.tree.map(
         lambda leaf, spec: NamedSharding(mesh, _fitted(mesh, leaf, spec)[0]),
@@ -73,7 +74,7 @@ def of_state(model: World, mesh: Mesh | AbstractMesh, state: Any) -> Any:
 
 
 def constrain(model: World, params: Params) -> Params:
-    """Keep a tree of parameters, or of their gradients, where the table says; within a step."""
+    """Constrain parameters or their gradients to the sharding rules; call inside a jitted step."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty or mesh.size == 1:
         return params
@@ -86,10 +87,10 @@ def constrain(model: World, params: Params) -> Params:
 
 
 def left_out(model: World, mesh: Mesh | AbstractMesh, state: Any) -> dict[str, tuple[str, ...]]:
-    """Return the leaves that are not split as their rule says, and the mesh axes left out.
+    """Return the leaves that are not sharded as their rule says, and the mesh axes dropped.
 
     Args:
-        model: says where its parameters lie.
+        model: defines the sharding rules.
         mesh: the devices.
         state: a (possibly abstract) state.
     """
@@ -103,7 +104,7 @@ def _specs(model: World, state: Any) -> Any:
 
 
 def _fitted(mesh: Mesh | AbstractMesh, leaf: Any, spec: P) -> tuple[P, tuple[str, ...]]:
-    """Align a spec to a leaf's last axes; returns it, and the mesh axes that do not divide them."""
+    """Align a spec to a leaf's last axes; also return the mesh axes that do not divide them."""
     shape = tuple(getattr(leaf, "shape", ()))
     kept: list[str | None] = [None] * len(shape)
     missed: list[str] = []
@@ -119,17 +120,17 @@ def _fitted(mesh: Mesh | AbstractMesh, leaf: Any, spec: P) -> tuple[P, tuple[str
 
 
 def of_batch(mesh: Mesh) -> NamedSharding:
-    """Return the sharding of every array of a batch: split along B."""
+    """Return the sharding of every array of a batch: sharded along B."""
     return NamedSharding(mesh, P(BATCH))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Return the sharding of an array that every device holds whole."""
+    """Return the sharding of a replicated array."""
     return NamedSharding(mesh, P())
 
 
 def abstract(shapes: Any, shardings: Any) -> Any:
-    """Attach shardings to a tree of abstract arrays, as restoring and compiling want them."""
+    """Attach shardings to a tree of abstract arrays, as needed to restore and compile."""
     return jax.tree.map(
         lambda leaf, where: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where),
         shapes,
@@ -138,11 +139,11 @@ def abstract(shapes: Any, shardings: Any) -> Any:
 
 
 def place(values: Any, like: Any) -> Any:
-    """Put weights where they belong: leaf by leaf, and of each leaf only this process's parts.
+    """Place weights on the devices: leaf by leaf, and only this process's shards of each leaf.
 
     Args:
-        values: nested dictionaries of arrays: NumPy arrays, also of files that are mapped and not
-            read yet (``weights.lazy``), or JAX arrays, which move between devices.
+        values: nested dictionaries of arrays: NumPy arrays, including memory-mapped ones
+            (``weights.lazy``), or JAX arrays, which are moved between devices.
         like: abstract arrays with shardings, for at least these paths.
 
     Returns:
@@ -172,17 +173,17 @@ def _part(leaf: np.ndarray, dtype: np.dtype, index: tuple[slice, ...] | None) ->
 
 
 def require_divisible(config: Config, stage: Stage, mesh: Mesh | AbstractMesh) -> None:
-    """Refuse what cannot be split evenly.
+    """Raise an error if the batch, heads or channels cannot be sharded evenly.
 
     Raises:
-        ConfigError: the batch is not a multiple of the devices that share it, or heads and hidden
-            channels are no multiple of those that share them.
+        ConfigError: the batch is not a multiple of the devices that share it, or the heads and
+            hidden channels are not multiples of those that share them.
     """
     batch, devices = stage.settings(config).batch, math.prod(mesh.shape[axis] for axis in BATCH)
     if batch % devices:
         raise ConfigError(
-            f"train.{stage.name}.batch is {batch}, which {devices} devices cannot share evenly: "
-            f"use a multiple of {devices}."
+            f"train.{stage.name}.batch is {batch}, which cannot be split evenly over "
+            f"{devices} devices: use a multiple of {devices}."
         )
     tensor = mesh.shape["tensor"]
     heads: Mapping[str, int] = worlds.split_heads(config.model, stage)

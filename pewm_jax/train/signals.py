@@ -1,8 +1,8 @@
 """Ctrl-C and SIGTERM: finish the step, save, and exit within ``train.grace_s`` seconds.
 
-Signals are noticed even while Python is inside a long call of compiled code: the interpreter writes
-their numbers to a pipe (``signal.set_wakeup_fd``), which a thread reads. That thread ends the
-process if the main thread has not exited in time.
+Signals are noticed even during a long call of compiled code: the interpreter writes their numbers
+to a pipe (``signal.set_wakeup_fd``), which a thread reads. That thread ends the process if the main
+thread has not exited in time.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from typing import NoReturn, Self, TypeVar
 T = TypeVar("T")
 
 LINGER_S = 2.0
-"""Seconds that the main thread may take to exit where there is nothing to save."""
+"""Seconds that the main thread may take to exit if there is nothing to save."""
 MARGIN = 0.05
 """Share of the grace period reserved for exiting."""
 ONE_S = 0.1
-"""Seconds within which signals count as one: a launcher may signal a process and its group."""
+"""Seconds within which signals count as one: a launcher may signal both a process and its group."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -39,24 +39,24 @@ class Interrupted(KeyboardInterrupt):
         self.exit_code = 128 + number
 
 
-class _BrokenOff(BaseException):
-    """Raised by a signal in work that may be interrupted; see ``Stop.unless_requested``."""
+class _InterruptedWork(BaseException):
+    """Raised by a signal during interruptible work; see ``Stop.unless_requested``."""
 
 
 class Stop:
-    """Handles stop signals while it is entered: the first asks to stop, the second exits at once.
+    """Handles stop signals while entered: the first requests a stop, the second exits immediately.
 
     Args:
         grace_s: seconds from the first signal to the end of the process.
-        agreed: called after every step with the signal this process received, or None; returns the
-            signal for which all processes stop after this step, or None.
-        alone: whether this is the only process; only then work may be interrupted, since other
+        agreed: called after every step with the signal received by this process, or None; returns
+            the signal for which all processes stop after this step, or None.
+        alone: whether this is the only process; otherwise work is not interrupted, because other
             processes would wait for it.
 
     Attributes:
-        number: the signal received, None before.
-        at_once: set while there is nothing new to save: then the first signal exits at once.
-        kept: returns a sentence part that says which checkpoint is on disk.
+        number: the signal received, or None.
+        at_once: set while there is nothing new to save: then the first signal exits immediately.
+        kept: returns a phrase that names the newest checkpoint on disk.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -107,7 +107,7 @@ class Stop:
         os.close(self._write)
 
     def due(self) -> bool:
-        """Tell whether training stops after this step; asked once a step by all processes."""
+        """Return whether training stops after this step; called once per step by all processes."""
         agreed = self._agreed(self.number)
         if agreed is not None:
             self.number, self._requested = agreed, True
@@ -115,11 +115,11 @@ class Stop:
 
     @property
     def requested(self) -> bool:
-        """Whether training will stop, as far as this process knows without asking others."""
+        """Return whether this process knows that training will stop, without communication."""
         return self._requested or (self._alone and self.number is not None)
 
     def unless_requested(self, work: Callable[[], T]) -> T | None:
-        """Do work that a signal may interrupt; returns None if one came before or meanwhile."""
+        """Call interruptible work; return None if a signal came before or during it."""
         if not self._alone:
             return work()
         try:
@@ -128,29 +128,29 @@ class Stop:
                 return work() if self.number is None else None
             finally:
                 self._breakable = False
-        except _BrokenOff:
+        except _InterruptedWork:
             return None
 
     def interrupted(self, stage: str, step: int) -> Interrupted:
-        """Return the error that ends training after a step, to be raised once all is saved."""
+        """Return the error that ends training after a step; raise it once everything is saved."""
         return Interrupted(
-            f"Stopped after step {step} of {stage}; everything is saved: the same command "
-            "goes on from there.",
+            f"Stopped after step {step} of {stage}; everything is saved: run the same command "
+            "again to resume.",
             self.number or 0,
         )
 
     def _note(self, number: int, _frame: types.FrameType | None) -> None:
-        """Handle a signal in the main thread, as soon as that runs Python again."""
+        """Handle a signal in the main thread, once that executes Python code again."""
         if self.number is None:
             self.number = number
         if self.at_once:
             raise Interrupted(self._nothing_new(), self.number)
         if self._breakable:
             self._breakable = False
-            raise _BrokenOff
+            raise _InterruptedWork
 
     def _watch(self) -> None:
-        """Wait for signals and for the deadline; runs in a thread of its own."""
+        """Wait for signals and for the deadline; runs in its own thread."""
         while True:
             left = None if self._deadline is None else max(self._deadline - time.monotonic(), 0.0)
             ready, _, _ = select.select([self._read], [], [], left)
@@ -166,11 +166,11 @@ class Stop:
                     self._ask(number)
                 elif time.monotonic() - self._asked > ONE_S:
                     self._leave(
-                        f"Left at once ({self.kept()}); the same command goes on from there."
+                        f"Exited immediately ({self.kept()}); run the same command again to resume."
                     )
 
     def _ask(self, number: int) -> None:
-        """Note the first signal and set the deadline."""
+        """Record the first signal and set the deadline."""
         self.number, self._asked = number, time.monotonic()
         if self.at_once:
             self._deadline = self._asked + LINGER_S
@@ -182,8 +182,8 @@ class Stop:
         assert self._asked is not None
         self._deadline = self._asked + self._grace_s * (1 - MARGIN)
         _write_line(
-            f"Stopping: saves after this step and leaves within {self._grace_s:g} s; once more to "
-            "leave without saving."
+            f"Stopping: saves after this step and exits within {self._grace_s:g} s; send the "
+            "signal again to exit without saving."
         )
 
     def _late(self) -> None:
@@ -195,12 +195,14 @@ class Stop:
             self._grant()  # the first step ended just when the signal came
             return
         self._leave(
-            f"Left before saving was done, for the {self._grace_s:g} s of train.grace_s are over "
-            f"({self.kept()}); the same command goes on from there."
+            f"Exited before saving was done, because the {self._grace_s:g} s of train.grace_s are "
+            f"over ({self.kept()}); run the same command again to resume."
         )
 
     def _nothing_new(self) -> str:
-        return f"Stopped with nothing new to save ({self.kept()}); the same command goes on."
+        return (
+            f"Stopped with nothing to save ({self.kept()}); run the same command again to resume."
+        )
 
     def _leave(self, sentence: str) -> NoReturn:
         _write_line(sentence)

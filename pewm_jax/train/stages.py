@@ -1,4 +1,4 @@
-"""Which of a world's stages are trained."""
+"""The stages of a world that are trained."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["FREEZE", "TRAIN", "Stage", "all_stages", "planned"]
 
 
 def all_stages(config: Config) -> tuple[Stage, ...]:
-    """Return the stages that the experiment's world names, in order.
+    """Return the stages that the experiment's world defines, in order.
 
     Optional ones without steps are left out.
     """
@@ -22,19 +22,19 @@ def all_stages(config: Config) -> tuple[Stage, ...]:
 
 
 def planned(config: Config) -> tuple[Stage, ...]:
-    """Return the stages that have steps to do, in order.
+    """Return the stages with steps to train, in order.
 
     Raises:
-        ConfigError: no stage has any.
-        UserError: the model has nothing that one of them could train.
+        ConfigError: no stage has steps.
+        UserError: the model has no parameters that one of them could train.
     """
     known = all_stages(config)
     stages = tuple(stage for stage in known if stage.settings(config).steps > 0)
     if not stages:
         names = " and ".join(f"train.{stage.name}.steps" for stage in known)
         raise ConfigError(
-            f"{names} are {'both' if len(known) == 2 else 'all'} 0: nothing would be trained; give "
-            "one of them steps."
+            f"{names} are {'both' if len(known) == 2 else 'all'} 0, so nothing would be trained: "
+            "set one of them."
         )
     for stage in stages:
         if stage.require is not None:

@@ -1,10 +1,10 @@
-"""One step of training: the state, a pure function, and the one place where it is compiled.
+"""One training step: the state, a pure function, and the single place where it is compiled.
 
 Only the trained subtree is differentiated and updated. Frozen leaves stay bit-identical, and no
 gradient of frozen weights is computed: the optimizer's mask gets zeros in their place.
 
-The state has no random part. The randomness of a step is folded from the seed and the step's
-number, which is also the position in the data: a restored state continues exactly as it would have.
+The state contains no random key. The randomness of a step is folded from the seed and the step
+number, which is also the position in the data, so a restored state continues exactly.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class TrainState:
 
     Attributes:
         params: all parameters of the stage: trained ones in float32, frozen ones in the model's
-            ``dtype``, which is all that computing with them takes.
+            compute ``dtype``.
         ema: exponential moving average of the trained parameters only.
         opt_state: optimizer state; moments of the trained parameters only.
         step: () int32, steps done; also the position in the data.
@@ -49,13 +49,13 @@ class TrainState:
 
 
 def create(config: Config, stage: Stage, key: Array, start: Params | None = None) -> TrainState:
-    """Make the state before the first step. Pure and jittable (``config``, ``stage`` static).
+    """Return the initial state. Pure and jittable (``config``, ``stage`` static).
 
     Args:
         config: the experiment.
         stage: the stage to begin.
-        key: PRNG key of the fresh weights.
-        start: weights to begin with, in place of fresh ones; see ``require_start``.
+        key: PRNG key of the initial weights.
+        start: weights to start from instead of random ones; see ``require_start``.
 
     Raises:
         TreeError: ``start`` has other paths or shapes.
@@ -63,10 +63,10 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
     params = stage.init(config.model, key)
     if start is not None:
         require_start(config, stage, start, params)
-        given = tree.flatten(start)
+        leaves = tree.flatten(start)
         params = tree.unflatten(
             {
-                path: jnp.asarray(given[path], leaf.dtype) if path in given else leaf
+                path: jnp.asarray(leaves[path], leaf.dtype) if path in leaves else leaf
                 for path, leaf in tree.flatten(params).items()
             }
         )
@@ -81,37 +81,36 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
 
 
 def require_start(config: Config, stage: Stage, start: Any, like: Params) -> None:
-    """Insist that weights are those that a stage can start from.
+    """Raise an error unless a stage can start from these weights.
 
-    Leaves may be absent where ``train.fresh`` says so, and begin at random then: the memory blocks
-    of stage 2, which the weights of stage 1 do not hold.
+    Leaves that match ``train.fresh`` may be missing and are initialized randomly: the memory blocks
+    of stage 2, which the weights of stage 1 do not contain.
 
     Args:
         config: the experiment.
         stage: the stage to begin.
-        start: the weights, or anything of their paths and shapes.
+        start: the weights, or any tree with their paths and shapes.
         like: all parameters of the stage, or their shapes.
 
     Raises:
-        TreeError: another leaf is absent, one is unexpected, or one has another shape; with the
-            list.
+        TreeError: another leaf is missing, a leaf is unexpected or has another shape; lists them.
     """
-    given = tree.flatten(start)
+    leaves = tree.flatten(start)
     wanted = {
         path: leaf
         for path, leaf in tree.flatten(like).items()
-        if path in given or not any(re.fullmatch(rule, path) for rule in config.train.fresh)
+        if path in leaves or not any(re.fullmatch(rule, path) for rule in config.train.fresh)
     }
     allowed = ", ".join(config.train.fresh) or "none"
-    what = f"What {stage.title} starts from (train.fresh, what it may lack: {allowed})"
-    tree.require_like(given, wanted, what)
+    what = f"Initial weights of {stage.title} (may lack, by train.fresh: {allowed})"
+    tree.require_like(leaves, wanted, what)
 
 
 def update_ema(ema: Params, trained: Params, step: Array, decay: float) -> Params:
-    """Move the average towards the trained parameters.
+    """Update the exponential moving average of the trained parameters.
 
-    The decay grows from 2/11 at the first step to ``decay`` (min(decay, (1 + n) / (10 + n)) after
-    n steps), so that short runs are not weighed down by their random start.
+    The decay grows from 2/11 at the first step to ``decay`` (min(decay, (1 + n) / (10 + n)) after n
+    steps), so that the random initialization does not dominate short runs.
     """
     done = step.astype(jnp.float32) + 1.0
     decay_now = jnp.minimum(decay, (1.0 + done) / (10.0 + done))
@@ -119,7 +118,7 @@ def update_ema(ema: Params, trained: Params, step: Array, decay: float) -> Param
 
 
 def inference_params(stage: Stage, state: TrainState) -> Params:
-    """Return what inference uses: the average where trained, the frozen weights elsewhere."""
+    """Return the inference weights: the EMA of trained parameters, and the frozen ones."""
     frozen = tree.exclude(state.params, stage.trained)
     return tree.merge(state.ema, frozen)
 
@@ -130,29 +129,28 @@ def train_step(
     state: TrainState,
     clip: Clip,
     key: Array,
-    given: Params | None = None,
+    extra: Params | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Do one optimizer step.
 
     Args:
         config: the experiment (static).
-        stage: what is trained (static).
-        state: the state before.
+        stage: the stage (static).
+        state: the state before the step.
         clip: a batch with leading B, uint8 colours and metric depth.
-        key: from ``noise_key``, the same for all steps; the step's number is folded in.
-        given: weights that only the loss needs, see ``Stage.extra_weights``.
+        key: from ``noise_key``, the same for all steps; the step number is folded in.
+        extra: weights needed only by the loss, see ``Stage.extra_weights``.
 
     Returns:
-        The state after, and scalars: ``loss``, ``grad_norm`` (before clipping),
-        ``learning_rate``, and what the objective measures. Where ``train.on_nonfinite`` is
-        ``skip`` also ``skipped``: 1 where loss or gradient is not finite, and the state after is
-        the state before but for its ``step``.
+        The new state, and scalars: ``loss``, ``grad_norm`` (before clipping), ``learning_rate``,
+        and the metrics of the objective. If ``train.on_nonfinite`` is ``skip``, also ``skipped``:
+        1 if loss or gradient is not finite; then only ``step`` of the state changes.
     """
     trained, frozen = tree.split(state.params, stage.trained)
     step_key = jax.random.fold_in(key, state.step)
 
     def loss_of(trained: Params) -> tuple[Array, Metrics]:
-        params = tree.merge(trained, frozen, given or {})
+        params = tree.merge(trained, frozen, extra or {})
         return stage.loss(config.model, config.train, params, clip, step_key)
 
     (loss, measured), gradients = jax.value_and_grad(loss_of, has_aux=True)(trained)
@@ -194,7 +192,7 @@ def noise_key(config: Config, stage: Stage) -> Array:
 
 
 def _keys(config: Config, stage: Stage) -> tuple[Array, Array]:
-    """Return the keys of weights and noise; both are one key in runs of versions up to 3."""
+    """Return the keys of weights and noise; the same key in runs of versions up to 3."""
     key = jax.random.fold_in(jax.random.key(config.train.seed), stage.number)
     if config.train.noise_key == "weights":
         return key, key
@@ -203,7 +201,7 @@ def _keys(config: Config, stage: Stage) -> tuple[Array, Array]:
 
 
 def abstract_state(config: Config, stage: Stage, mesh: Mesh) -> Any:
-    """Return the state's shapes, types and placements without computing anything."""
+    """Return the state's shapes, dtypes and shardings without computing anything."""
     shapes = jax.eval_shape(functools.partial(create, config, stage), weights_key(config, stage))
     return sharding.abstract(shapes, sharding.of_state(config.model, mesh, shapes))
 
@@ -211,10 +209,10 @@ def abstract_state(config: Config, stage: Stage, mesh: Mesh) -> Any:
 def initial_state(
     config: Config, stage: Stage, mesh: Mesh, start: Params | None = None
 ) -> TrainState:
-    """Create the state in its place on the devices; see ``state.create``.
+    """Create the state, sharded on the devices; see ``create``.
 
-    Nothing is whole anywhere in between: fresh weights are drawn where they belong, and of those
-    to start from each device is given its part.
+    No array is ever materialized whole: random weights are drawn in place, and each device gets
+    only its shard of the start weights.
     """
     like = abstract_state(config, stage, mesh)
     shardings = jax.tree.map(lambda leaf: leaf.sharding, like)
@@ -225,33 +223,33 @@ def initial_state(
     return make(weights_key(config, stage), start)
 
 
-def given_weights(config: Config, stage: Stage, mesh: Mesh) -> Params | None:
-    """Read what only the stage's loss needs, onto every device; None for most stages.
+def load_extra_weights(config: Config, stage: Stage, mesh: Mesh) -> Params | None:
+    """Load the weights needed only by the stage's loss, onto every device; None for most stages.
 
     Raises:
-        UserError: it is absent or damaged.
+        UserError: they are missing or damaged.
     """
-    given = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
-    if given is None:
+    extra = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
+    if extra is None:
         return None
     everywhere = sharding.replicated(mesh)
     like = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), given
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), extra
     )
-    return sharding.place(given, like)
+    return sharding.place(extra, like)
 
 
 def trace_step(
-    config: Config, stage: Stage, mesh: Mesh, clip: Any, given: Params | None = None
+    config: Config, stage: Stage, mesh: Mesh, clip: Any, extra: Params | None = None
 ) -> jax.stages.Traced:
-    """Trace ``train_step`` for one batch shape; it can be lowered and its jaxpr read.
+    """Trace ``train_step`` for one batch shape, for lowering or reading its jaxpr.
 
     Args:
         config: the experiment.
-        stage: what is trained.
+        stage: the stage.
         mesh: the devices.
         clip: a batch, or the shapes of one.
-        given: from ``given_weights``.
+        extra: from ``load_extra_weights``.
     """
     state = abstract_state(config, stage, mesh)
     everywhere = sharding.replicated(mesh)
@@ -259,7 +257,7 @@ def trace_step(
     split = sharding.of_batch(mesh)
     batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split), clip)
     key = noise_key(config, stage)
-    extra = () if given is None else (given,)
+    extra = () if extra is None else (extra,)
     step = jax.jit(
         functools.partial(train_step, config, stage),
         in_shardings=(placed, split, everywhere, *(everywhere for _ in extra)),
@@ -267,31 +265,31 @@ def trace_step(
         donate_argnums=0,
     )
     abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
-    with jax.set_mesh(mesh):  # which ``nn.placement`` asks for
+    with jax.set_mesh(mesh):  # read by ``nn.placement``
         return step.trace(state, batch, abstract_key, *extra)
 
 
 def compile_step(
-    config: Config, stage: Stage, mesh: Mesh, clip: Any, given: Params | None = None
+    config: Config, stage: Stage, mesh: Mesh, clip: Any, extra: Params | None = None
 ) -> Callable[[TrainState, Clip, Array], tuple[TrainState, Metrics]]:
     """Compile ``train_step`` ahead of time for one batch shape.
 
     Args:
         config: the experiment.
-        stage: what is trained.
+        stage: the stage.
         mesh: the devices.
         clip: a batch, or the shapes of one.
-        given: from ``given_weights``, which is called here if this is None.
+        extra: from ``load_extra_weights``; loaded here if None.
 
     Returns:
-        The compiled ``(state, clip, key) -> (state, metrics)``; it consumes the state it is given
-        (its buffers are donated) and wants clip and key placed as ``sharding`` says.
+        The compiled ``(state, clip, key) -> (state, metrics)``; it consumes the state (its buffers
+        are donated) and expects clip and key placed as ``sharding`` defines.
     """
-    given = given_weights(config, stage, mesh) if given is None else given
-    compiled = trace_step(config, stage, mesh, clip, given).lower().compile()
-    if given is None:
+    extra = load_extra_weights(config, stage, mesh) if extra is None else extra
+    compiled = trace_step(config, stage, mesh, clip, extra).lower().compile()
+    if extra is None:
         return compiled
-    return lambda state, clip, key: compiled(state, clip, key, given)
+    return lambda state, clip, key: compiled(state, clip, key, extra)
 
 
 def _norm(gradients: Params) -> Array:
@@ -299,5 +297,5 @@ def _norm(gradients: Params) -> Array:
 
 
 def _unless(good: Array, new: Array, old: Array) -> Array:
-    """Choose the new leaf or the old; what was passed through is left alone."""
+    """Select the new leaf or the old one; leaves that were passed through are unchanged."""
     return new if new is old else jnp.where(good, new, old)

@@ -1,6 +1,6 @@
-"""Checks, shows and logs the metrics of each step: loss and gradient finite, speed, MFU.
+"""Checks, displays and logs the metrics of each step: finite loss and gradient, speed, MFU.
 
-Only the first process of a job writes and shows; all of them stop when a value is not finite.
+Only process 0 writes and displays; all processes stop when a value is not finite.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from pewm_jax.train.step import Metrics
 from pewm_jax.types import Params
 
 SKIPPED = "nonfinite.jsonl"
-"""In the run's folder: a line for every update that was skipped."""
+"""File in the run's folder with a line for every skipped update."""
 
 
 class Watch:
-    """Reads, checks, shows and logs the metrics of one stage.
+    """Reads, checks, displays and logs the metrics of one stage.
 
     Args:
         config: the experiment.
         stage: the stage.
         run: the run's folder.
-        done: steps of the stage done before.
-        devices: how many train.
-        view: shows the metrics.
+        done: number of steps of the stage already done.
+        devices: number of devices.
+        view: displays the metrics.
         log: writes them to files.
-        bad: the records that do not decode.
+        bad: counts the records that cannot be decoded.
 
     Attributes:
         flops: FLOPs that a step needs (``train.flops``), set when the first batch is known.
@@ -68,15 +68,15 @@ class Watch:
         self._skipped = self._skipped_before(done)
 
     def read(self, step: int, metrics: Metrics, kept: Callable[[], str]) -> dict[str, float]:
-        """Wait for a step's metrics, check and show them.
+        """Wait for a step's metrics, check and display them.
 
         Args:
             step: its number.
-            metrics: what the step returned.
-            kept: returns a sentence part that says which checkpoint is on disk.
+            metrics: returned by the step.
+            kept: returns a phrase that names the newest checkpoint on disk.
 
         Raises:
-            UserError: loss or gradient is not finite, and that is not to be skipped.
+            UserError: loss or gradient is not finite, and such steps are not to be skipped.
         """
         values = {name: float(value) for name, value in jax.device_get(metrics).items()}
         skipped = bool(values.pop("skipped", 0.0))
@@ -99,14 +99,14 @@ class Watch:
         return values
 
     def write(self, step: int, values: Mapping[str, float], always: bool = False) -> None:
-        """Log a step where it is time for that, or ``always``."""
+        """Log a step every ``train.log_every`` steps, or ``always``."""
         if always or step in (1, self.settings.steps) or step % self.config.train.log_every == 0:
             self.log.write(step, values)
 
     def _not_finite(
         self, step: int, values: Mapping[str, float], skipped: bool, kept: Callable[[], str]
     ) -> None:
-        """Write down the records of the step's batch; stop, unless its update was skipped."""
+        """Save the names of the batch's records; raise unless the update was skipped."""
         what = f"loss {values['loss']} and gradient norm {values['grad_norm']}"
         self._skipped += skipped
         name = SKIPPED if skipped else f"nonfinite-{self.stage.name}-{step}.json"
@@ -127,19 +127,19 @@ class Watch:
                 atomic.write_text(path, json.dumps(entry, ensure_ascii=False, indent=2) + "\n")
         if skipped:
             self.view.log(
-                f"{self.stage.title}: step {step} is skipped, {what} are not both finite; "
-                f"{path} names its records"
+                f"{self.stage.title}: step {step} is skipped because {what} are not both finite; "
+                f"{path} lists its records"
             )
             return
         raise UserError(
             f"{self.stage.title.capitalize()} stopped at step {step}: {what} are not both finite "
-            f"({kept()}); {path} names the batch's records: skip such steps with "
+            f"({kept()}); {path} lists the batch's records: skip such steps with "
             "--train.on_nonfinite skip, or train again in another --train.run with a lower "
             f"--train.{self.stage.name}.learning_rate."
         )
 
     def _records(self, step: int) -> dict[str, object]:
-        """Return the names of the records in a step's batch, or why they cannot be found."""
+        """Return the names of the records in a step's batch, or the reason why they are unknown."""
         once, batch = self.config.data.prepared > 0, self.settings.batch
         seed = (
             feed.prepared_seed(self.config, self.stage)
@@ -161,7 +161,7 @@ class Watch:
         return {"records": names}
 
     def _skipped_before(self, done: int) -> int:
-        """Drop the updates skipped after the step resumed from; returns how many remain."""
+        """Drop records of updates skipped after step ``done``; return how many remain."""
         path = self.run / SKIPPED
         if processes.is_primary():
             drop_after(path, self.stage.number, done)
@@ -169,21 +169,22 @@ class Watch:
 
 
 def _number(value: float) -> float | str:
-    """Return a finite number as it is, others as text: JSON has no NaN and no infinity."""
+    """Return a finite number unchanged, others as text: JSON has no NaN or infinity."""
     return value if math.isfinite(value) else str(value)
 
 
 IMAGINED = {"model": "model", "memory": "with its map", "empty": "empty map"}
-"""Who imagines: a model without a memory, one with its map, the same weights with an empty map."""
+"""Labels of samples: a model without a memory, one with its map, the same weights with an empty
+map."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Previewed:
-    """What a preview made.
+    """The output of a preview.
 
     Attributes:
         files: pictures and videos.
-        psnr: key of ``IMAGINED`` → decibels against what was recorded.
+        psnr: key of ``IMAGINED`` → PSNR in dB against the recording.
     """
 
     files: tuple[Path, ...]
@@ -195,14 +196,14 @@ Preview = Callable[[Params, Stage, int], Previewed]
 
 
 class Samples:
-    """Makes a stage's samples, shows and measures them.
+    """Makes, displays and measures the samples of a stage.
 
     Args:
         config: the experiment.
         stage: the stage.
-        preview: makes them; None for none.
-        log: prints what is compiled and made.
-        unless_stopped: does what a stop signal may break off, ``Stop.unless_requested``.
+        preview: makes them, or None.
+        log: prints progress.
+        unless_stopped: calls work that a stop signal may interrupt (``Stop.unless_requested``).
     """
 
     def __init__(
@@ -217,41 +218,41 @@ class Samples:
         self._every = config.train.preview_every
         self._steps = stage.settings(config).steps
         self._stage, self._preview = stage, preview
-        self._say, self._unless_stopped = log, unless_stopped
+        self._log, self._unless_stopped = log, unless_stopped
         self._made = False
 
     def due(self, step: int) -> bool:
-        """Tell whether a step has samples: every ``train.preview_every``-th and the last."""
+        """Return whether a step has samples: every ``train.preview_every``-th and the last."""
         wanted = self._preview is not None and self._every > 0
         return wanted and (step % self._every == 0 or step == self._steps)
 
     def make(self, params: Params, step: int) -> dict[str, float]:
-        """Make samples, unless a signal breaks that off or they do not fit into memory.
+        """Make samples, unless a signal interrupts it or they do not fit into memory.
 
-        All processes come here; the first one, which gets the weights of all, makes them.
+        Called by all processes; process 0, to which the weights are gathered, makes them.
 
         Args:
             params: inference weights.
             step: the number of the step.
 
         Returns:
-            Their PSNR in decibels, by names for the log.
+            PSNR in dB, by metric name for the log.
         """
         params, preview = processes.gather(params), self._preview
         if preview is None or not processes.is_primary():
             return {}
         if not self._made:
-            self._say(f"{self._stage.title}: compiling the sampler for pictures …")
+            self._log(f"{self._stage.title}: compiling the sampler for sample pictures …")
         self._made = True
         try:
             made = self._unless_stopped(lambda: preview(params, self._stage, step))
         except (jax.errors.JaxRuntimeError, UserError) as error:
             reason = " ".join(str(error).split())[:160]
-            self._say(f"{self._stage.title}: no sample pictures of step {step} ({reason})")
+            self._log(f"{self._stage.title}: no sample pictures of step {step} ({reason})")
             return {}
         if made is None:
             return {}
         scores = ", ".join(f"{IMAGINED[name]} {value:.1f} dB" for name, value in made.psnr.items())
         files = f"sample pictures {' and '.join(map(str, made.files))}"
-        self._say(f"{self._stage.title}: {f'{scores}; {files}' if scores else files}")
+        self._log(f"{self._stage.title}: {f'{scores}; {files}' if scores else files}")
         return {f"psnr_{name}": value for name, value in made.psnr.items()}

@@ -386,7 +386,7 @@ def test_training_real_episodes_stopped_by_ctrl_c_and_started_again(data, tmp_pa
 
     code, out, err = finish(start(*argv))
     assert (code, err) == (0, "")
-    assert f"stage 1: going on after step {stopped}" in out
+    assert f"stage 1: resuming after step {stopped}" in out
     assert re.search(r"stage 1 200/200 loss .* clips/s · .* GFLOP/s/device", out)
     assert out.splitlines()[-1] == f"Trained: {run / 'weights.safetensors'}"
     steps = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
@@ -429,7 +429,8 @@ def test_told_to_end_while_it_compiles_then_trained_without_a_record_that_is_dam
     code, _, err = finish(process)
     assert code == 143
     assert err.strip() == (
-        "Stopped with nothing new to save (nothing was saved yet); the same command goes on."
+        "Stopped with nothing to save (nothing was saved yet); run the same command again to "
+        "resume."
     )
 
     code, out, err = finish(start(*argv, "--profile", "1"))

@@ -98,7 +98,7 @@ def test_it_loads_with_every_tensor_and_can_be_imagined_and_trained(folder, tmp_
     assert frames.rgb_THWC.shape == (10, 32, 48, 3)
     train = dataclasses.replace(config.train, start=str(tmp_path / "world"))
     loading.require_weights(dataclasses.replace(config, train=train))
-    with pytest.raises(UserError, match=r"name its folder by train\.start"):
+    with pytest.raises(UserError, match=r"set train\.start to its folder"):
         loading.require_weights(config)
 
 

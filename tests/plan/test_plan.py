@@ -86,7 +86,7 @@ def test_the_u_net_of_svd_has_too_many_arrays_to_compile():
 def test_what_cannot_be_planned_is_refused_before_anything_is_compiled(monkeypatch):
     monkeypatch.setattr(measure, "trace", None)
     tiny = configs.load("tiny")
-    with pytest.raises(ConfigError, match="--chip 'h900' is not known"):
+    with pytest.raises(ConfigError, match="--chip 'h900' is unknown"):
         plan.show(tiny, launch(chip="h900"))
     with pytest.raises(ConfigError, match=r"train\.stage1\.batch is 2, which 8 devices cannot"):
         plan.show(tiny, launch())

@@ -107,7 +107,7 @@ def test_what_was_added_and_what_is_gone_together_are_listed(run):
     (newest(run) / "weights" / "more").write_text("")
     found = checkpoint_files.flaws(newest(run))
     assert "state/_METADATA is missing" in found
-    assert "weights/more was not written with it" in found
+    assert "weights/more is not listed in the manifest" in found
     assert checkpoint_files.flaws(newest(run), ["config", "data"]) == []
 
 
@@ -131,7 +131,7 @@ def test_training_goes_on_from_the_checkpoint_before_and_ends_the_same(run, trai
     said = train(run)
     (line,) = [text for text in said if "damaged" in text]
     assert f"stage1/4 is damaged ({inside} " in line or f"({inside} is" in line
-    assert "the one before it is used" in line
+    assert "the previous one is used" in line
     assert (newest(run).parent / "damaged" / "4").is_dir()
     assert results(run) == results(trained / "undisturbed")
 
@@ -147,7 +147,9 @@ def test_with_no_whole_checkpoint_left_a_sentence_asks_what_to_do(run, trained):
     for step in ("2", "4"):
         flip(newest(run).parent / step / "state" / "_METADATA")
     for _ in range(2):
-        with pytest.raises(UserError, match=r"no whole checkpoint, only damaged ones in .*damaged"):
+        with pytest.raises(
+            UserError, match=r"no intact checkpoint, only damaged ones in .*damaged"
+        ):
             train(run)
     damaged = newest(run).parent / "damaged"
     assert {path.name for path in damaged.iterdir()} == {"2", "4"}

@@ -94,7 +94,7 @@ def test_the_real_program_killed_as_it_saves_goes_on_and_ends_the_same(folder):
     (_, step), (_, saved) = kills.told(run), kills.newest(run)
     assert 5 <= saved <= step <= saved + 10  # 5 where the disk is not slow
     out = finish(start(folder, "killed"))
-    assert f"stage 1: going on after step {saved}" in out
+    assert f"stage 1: resuming after step {saved}" in out
     assert logged(run) == logged(folder / "runs" / "undisturbed")
     whole = [folder / "runs" / name / "weights.safetensors" for name in ("killed", "undisturbed")]
     assert whole[0].read_bytes() == whole[1].read_bytes()

@@ -104,7 +104,7 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_is_loaded(run):
     folder = run / "checkpoints" / "stage2"
     _, before = pewm_jax.load(folder / "2")
     spoil(folder / "4" / "weights")
-    with pytest.warns(UserWarning, match=r"stage2/4 is damaged .* The one before it is loaded"):
+    with pytest.warns(UserWarning, match=r"stage2/4 is damaged .* The previous one is loaded"):
         same(pewm_jax.load(run)[1], before)
     assert (folder / "4").exists()
     with pytest.raises(UserError, match=r"stage2/4 is damaged \(weights/.* and \d+ more\)"):
@@ -118,7 +118,7 @@ def test_where_no_checkpoint_is_whole_the_stage_before_is_loaded_or_a_sentence_g
     (run / "weights.safetensors").unlink()
     spoil(run / "checkpoints" / "stage1")
     with (
-        pytest.warns(UserWarning, match="one before"),
+        pytest.warns(UserWarning, match="the previous one"),
         pytest.raises(UserError, match=r"manifest\.json is damaged"),
     ):
         pewm_jax.load(run)
@@ -130,7 +130,7 @@ def test_a_damaged_file_of_weights_is_a_sentence_and_training_writes_it_again(ru
     path = run / "weights.safetensors"
     whole = path.read_bytes()
     path.write_bytes(whole[:-3] + bytes([whole[-3] ^ 1]) + whole[-2:])
-    with pytest.raises(UserError, match=r"weights.safetensors is damaged .* other bytes"):
+    with pytest.raises(UserError, match=r"weights.safetensors is damaged .* wrong checksum"):
         pewm_jax.load(run)
     train(config)
     assert path.read_bytes() == whole

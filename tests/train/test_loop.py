@@ -126,7 +126,7 @@ def test_memory_blocks_of_the_start_go_on_in_stage_2_alone(undisturbed, tmp_path
     now = weights.load(tmp_path / "on" / "weights.safetensors")["memory"]
     near = all(np.allclose(now[name], kept[name], atol=1e-6) for name in kept)
     assert near == (stage1 == 0)
-    assert any("memory blocks are left out" in line for line in said) == (stage1 > 0)
+    assert any("memory blocks are ignored" in line for line in said) == (stage1 > 0)
 
 
 def test_a_finished_run_says_so_and_does_nothing(undisturbed, monkeypatch):
@@ -219,7 +219,7 @@ def test_two_trainings_in_one_folder_are_refused(fake_model, tmp_path):
 
 def test_a_run_folder_that_is_a_file_is_refused(fake_model, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot be made"):
+    with pytest.raises(UserError, match="cannot be created"):
         train(fakes.config(tmp_path / "file"))
 
 
@@ -244,7 +244,7 @@ def test_nothing_is_compiled_unannounced(fake_model, tmp_path, monkeypatch):
         "stage 1: compiling the training step …",
         "initial_state",
         "compile_step",
-        "stage 1: compiling the sampler for pictures …",
+        "stage 1: compiling the sampler for sample pictures …",
         "preview 1",
         "stage 1: sample pictures picture.png",
         "preview 2",

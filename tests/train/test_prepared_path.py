@@ -129,7 +129,9 @@ def test_what_is_not_whole_or_not_ours_is_refused_with_its_name(tmp_path):
     size = dataclasses.replace(other.model.clip, height=32)
     gather(other.with_model(clip=size))
     file.write_bytes(next(iter(files(tmp_path / "other"))).read_bytes())
-    with pytest.raises(UserError, match=rf"{file.name} does not hold the prepared clips .* remove"):
+    with pytest.raises(
+        UserError, match=rf"{file.name} does not contain the prepared clips .* delete"
+    ):
         gather(config)
     file.write_bytes(whole)
     assert gather(config)[1] == [0]
@@ -221,7 +223,7 @@ def test_a_resumed_stage_finds_its_clips_although_it_trains_what_prepares_them(
         if int(step.name) > 4:
             shutil.rmtree(step)
     train(config("resumed"))
-    assert "going on after step 4" in capsys.readouterr().out
+    assert "resuming after step 4" in capsys.readouterr().out
     assert list((tmp_path / "clips").iterdir()) == [folder]
     assert files(folder) == written
     assert losses(tmp_path / "resumed") == losses(tmp_path / "undisturbed")

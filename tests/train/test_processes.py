@@ -144,8 +144,8 @@ def test_a_signal_to_one_stops_all_after_the_same_step(tmp_path):
     done = len(jobs.metrics(run))
     for told in errors:
         assert (
-            f"Stopped after step {done} of stage 1; everything is saved: the same command goes on "
-            "from there.\n"
+            f"Stopped after step {done} of stage 1; everything is saved: run the same command "
+            "again to resume.\n"
         ) in told
     assert (run / "checkpoints" / "stage1" / str(done)).is_dir()
 
@@ -198,4 +198,4 @@ def test_processes_that_do_not_meet_say_so_in_time(process):
     ):
         codes, _, errors = job.end()
     assert codes == [2]
-    assert "error: The processes of this training have not met at localhost:" in errors[0]
+    assert "error: Not all processes of this training have joined at localhost:" in errors[0]

@@ -54,11 +54,12 @@ def test_where_saving_outlasts_the_grace_the_process_ends_by_itself():
     assert code == 143
     asked, left = err.split("\n")[1::2]
     assert asked == (
-        "Stopping: saves after this step and leaves within 1 s; once more to leave without saving."
+        "Stopping: saves after this step and exits within 1 s; send the signal again to exit "
+        "without saving."
     )
     assert left == (
-        "Left before saving was done, for the 1 s of train.grace_s are over (the checkpoint of "
-        "step 30 is intact); the same command goes on from there."
+        "Exited before saving was done, because the 1 s of train.grace_s are over (the checkpoint "
+        "of step 30 is intact); run the same command again to resume."
     )
 
 
@@ -66,8 +67,8 @@ def test_with_nothing_to_save_it_ends_soon():
     code, err = told(3600, True, signal.SIGINT)
     assert code == 130
     assert err.strip() == (
-        "Stopped with nothing new to save (the checkpoint of step 30 is intact); the same command "
-        "goes on."
+        "Stopped with nothing to save (the checkpoint of step 30 is intact); run the same command "
+        "again to resume."
     )
 
 
@@ -75,7 +76,8 @@ def test_a_second_signal_leaves_at_once():
     code, err = told(3600, False, signal.SIGTERM, signal.SIGINT)
     assert code == 143
     assert err.split("\n")[-2] == (
-        "Left at once (the checkpoint of step 30 is intact); the same command goes on from there."
+        "Exited immediately (the checkpoint of step 30 is intact); run the same command again to "
+        "resume."
     )
 
 
@@ -105,7 +107,7 @@ def test_what_may_be_broken_off_is_and_all_else_is_not():
 
 def test_before_the_first_step_the_first_signal_is_the_end():
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(Interrupted, match="nothing new to save") as left, Stop():
+    with pytest.raises(Interrupted, match="nothing to save") as left, Stop():
         os.kill(os.getpid(), signal.SIGINT)
     assert left.value.exit_code == 130
     assert signal.getsignal(signal.SIGINT) == before

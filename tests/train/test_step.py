@@ -102,7 +102,7 @@ def test_the_noise_of_a_step_depends_on_its_number_and_on_nothing_else(fake_mode
 def test_weights_that_a_stage_cannot_start_from_are_refused(fake_model):
     config, key = fakes.config(), jax.random.key(0)
     wrong = {"backbone": {"kernel": jnp.zeros((3, 4)), "bias": jnp.zeros(3)}}
-    with pytest.raises(tree.TreeError, match=r"stage 2 starts from .* \(3, 4\)"):
+    with pytest.raises(tree.TreeError, match=r"Initial weights of stage 2 .* \(3, 4\)"):
         state.create(config, TWO, key, wrong)
 
 

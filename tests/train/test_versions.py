@@ -338,6 +338,6 @@ def test_a_run_of_an_earlier_version_is_resumed_with_its_own_settings(fake_model
     for _ in range(2):  # the second start finds what the first one wrote
         now = fakes.with_train(begun, noise_key="own", beta2=0.95)
         said = "\n".join(map(str, train(now)))
-        assert "keeps the settings that it was begun with: " in said
+        assert "keeps the settings that it was started with: " in said
         assert "train.beta2 0.999" in said
     assert losses(run) == whole

@@ -204,7 +204,7 @@ def test_it_loads_with_every_tensor_and_can_be_trained(world, folder, where):
         stored = tree.flatten(read(folder)[1])
         for path, leaf in tree.flatten(params[part]).items():
             np.testing.assert_array_equal(leaf, stored[path], err_msg=path)
-    with pytest.raises(UserError, match=r"name its folder by train\.start"):
+    with pytest.raises(UserError, match=r"set train\.start to its folder"):
         loading.require_weights(config)
     loading.require_weights(
         dataclasses.replace(config, train=dataclasses.replace(config.train, start=str(where)))
