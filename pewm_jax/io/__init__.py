@@ -1,1 +1,1 @@
-"""Files: atomic writing, tensor files, weights that ship with the package."""
+"""File input and output: atomic writes, tensor files, weights, resumable results, progress."""

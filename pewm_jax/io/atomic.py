@@ -1,4 +1,4 @@
-"""Write aside, then rename: a reader sees the old file or the new one, never half of one."""
+"""Atomic writes by renaming: a reader sees the old file or the new one, never a partial one."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path to write to; when the block ends well, what lies there becomes ``path``.
+    """Yield a temporary path that replaces ``path`` when the block ends without an error.
 
-    Several processes may do this to one path at once: each writes a file of its own, and the last
-    rename wins. When the block fails, what it wrote is removed and ``path`` stays as it was.
+    Several processes may do this to one path at once: each writes its own file, and the last rename
+    wins. If the block fails, the temporary file is removed and ``path`` is unchanged.
 
     Args:
-        path: a file, which may exist already, or a folder, which must not.
+        path: a file, which may already exist, or a folder, which must not.
 
     Yields:
-        A path beside it, ending in ``.partial``, where nothing exists yet.
+        A path in the same folder, ending in ``.partial``, where nothing exists yet.
 
     Raises:
-        OSError: writing failed; the error names ``path`` if it names no other file (that of a full
-            disk names none).
+        OSError: writing failed; the error names ``path`` if it names no other file (the error of a
+            full disk names none).
     """
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    remove(partial)  # left by a process of the same number that was killed
+    remove(partial)  # left by a killed process with the same id
     try:
         yield partial
         partial.replace(path)
@@ -39,13 +39,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in UTF-8, whole or not at all."""
+    """Write a text file in UTF-8, atomically."""
     with replacing(path) as partial:
         partial.write_text(text, "utf-8")
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder with all that is in it, if it exists."""
+    """Remove a file or a folder with its contents, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:

@@ -1,9 +1,9 @@
-"""Tensors that others pickled, read as data: nothing in such a file is executed.
+"""Safe reading of pickled tensors of other libraries: nothing in the file is executed.
 
-A pickle is a program; ``pickle.load`` lets it call anything. Here the only things that it may name
-are stand-ins of our own that build tables and arrays: neither NumPy nor torch is called with what
-the file says. Two kinds of files are read: tables of NumPy arrays, and what ``torch.save`` writes
-since torch 1.6 (a zip with a pickle and one member per storage); torch is not needed.
+``pickle.load`` lets a file call any function. Here a pickle may only name stand-ins defined in this
+module, which build tables and arrays; NumPy and torch are never called with data from the file. Two
+kinds of files are read: tables of NumPy arrays, and the format of ``torch.save`` since torch 1.6 (a
+zip with a pickle and one member per storage); torch is not needed.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _STORAGES = {
     "BoolStorage": np.dtype("?"),
 }
 _KINDS = "fiub"
-"""Kinds of NumPy's dtypes that are read: numbers and truth values, no objects."""
+"""Kinds of NumPy dtypes that are read: numbers and booleans, no objects."""
 
 
 def read(path: Path) -> Tensors:
-    """Read the nested tables of arrays in a pickle.
+    """Read nested tables of arrays from a pickle.
 
     Args:
         path: a pickle of NumPy arrays, or a file of ``torch.save``.
@@ -51,11 +51,11 @@ def read(path: Path) -> Tensors:
         Nested dictionaries; every leaf is a NumPy array.
 
     Raises:
-        UserError: the file is absent or damaged, holds anything but tensors in tables, or is of
+        UserError: the file is missing or damaged, contains anything but tensors in tables, or has
             torch's format before 1.6.
     """
     if not path.is_file():
-        raise UserError(f"{path} does not exist; name a file of weights.")
+        raise UserError(f"{path} does not exist; give the path of a weights file.")
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
@@ -71,7 +71,7 @@ def read(path: Path) -> Tensors:
 
 @dataclasses.dataclass
 class _Maker:
-    """A stand-in for something callable that a pickle names; it cannot be changed by the pickle."""
+    """A stand-in for a callable named in a pickle; the pickle cannot modify it."""
 
     make: Callable[..., Any]
 
@@ -79,23 +79,23 @@ class _Maker:
         return self.make(*arguments)
 
     def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError("it changes what it should only use")
+        raise pickle.UnpicklingError("it sets the state of a callable")
 
 
 class _Table(dict):
-    """A table of torch's, whose notes on versions are dropped."""
+    """A table of torch, without its version metadata."""
 
     def __setstate__(self, state: Any) -> None:
         del state
 
 
 class _Dtype:
-    """NumPy's dtype: a code, and a byte order that comes later."""
+    """A NumPy dtype: a type code; the byte order is set later."""
 
     def __init__(self, code: Any, *_: Any):
         self.dtype = np.dtype(code if isinstance(code, str) and len(code) <= 3 else "O")
         if self.dtype.kind not in _KINDS:
-            raise pickle.UnpicklingError(f"it holds {code!r}, which is no kind of number")
+            raise pickle.UnpicklingError(f"it contains dtype {code!r}, which is not numeric")
 
     def __setstate__(self, state: Any) -> None:
         if state[1] in ("<", ">"):
@@ -103,20 +103,20 @@ class _Dtype:
 
 
 class _Array:
-    """A NumPy array, whose content comes later."""
+    """A NumPy array whose content is set later."""
 
     array: np.ndarray | None = None
 
     def __setstate__(self, state: Any) -> None:
         _, shape, dtype, fortran, raw = state
         if not (isinstance(dtype, _Dtype) and isinstance(raw, bytes)):
-            raise pickle.UnpicklingError("an array is not written as its bytes")
+            raise pickle.UnpicklingError("an array is not stored as raw bytes")
         flat = np.frombuffer(raw, dtype.dtype)
         self.array = flat.reshape(shape, order="F" if fortran else "C")
 
 
 class _Reader(pickle.Unpickler):
-    """An unpickler that knows arrays and tables, and nothing else."""
+    """An unpickler restricted to arrays and tables."""
 
     def __init__(self, file: io.BytesIO, storages: Mapping[str, bytes]):
         super().__init__(file)
@@ -126,16 +126,16 @@ class _Reader(pickle.Unpickler):
         if module == "torch" and name in _STORAGES:
             return _STORAGES[name]
         if (module, name) not in _NAMES:
-            raise pickle.UnpicklingError(f"it names {module}.{name}, which is no tensor")
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which is not a tensor type")
         return _Maker(_NAMES[module, name])
 
     def persistent_load(self, pid: Any) -> np.ndarray:
         word, dtype, key, _, count = pid
         if word != "storage" or not isinstance(dtype, np.dtype) or key not in self._storages:
-            raise pickle.UnpicklingError("it refers to what is not in the file")
+            raise pickle.UnpicklingError("it refers to a storage that is not in the file")
         flat = np.frombuffer(self._storages[key], dtype)
         if len(flat) != count:
-            raise pickle.UnpicklingError("a storage has another length than announced")
+            raise pickle.UnpicklingError("a storage has another length than declared")
         return flat
 
 
@@ -144,7 +144,7 @@ def _read_zip(archive: zipfile.ZipFile) -> Any:
     (program,) = [name for name in archive.namelist() if name.endswith("/data.pkl")]
     root = program.removesuffix("data.pkl")
     if f"{root}byteorder" in archive.namelist() and archive.read(f"{root}byteorder") != b"little":
-        raise pickle.UnpicklingError("its bytes are in big-endian order")
+        raise pickle.UnpicklingError("it is big-endian")
     prefix = f"{root}data/"
     storages = {
         name.removeprefix(prefix): archive.read(name)
@@ -155,14 +155,14 @@ def _read_zip(archive: zipfile.ZipFile) -> Any:
 
 
 def _tensor(storage: Any, offset: int, size: tuple, stride: tuple, *_: Any) -> np.ndarray:
-    """Return a torch tensor: a part of a storage, by steps in elements."""
+    """Return a torch tensor: a view of a storage, with offset and strides in elements."""
     reach = 1 + offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
     if not isinstance(storage, np.ndarray) or min((0, offset, *size, *stride)) < 0:
         raise pickle.UnpicklingError("a tensor has no storage or an impossible shape")
     if 0 in size:
         return np.zeros(size, storage.dtype)
     if max(reach, math.prod(size)) > len(storage):
-        raise pickle.UnpicklingError("a tensor reaches beyond its storage")
+        raise pickle.UnpicklingError("a tensor extends beyond its storage")
     steps = tuple(step * storage.itemsize for step in stride)
     return np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False).copy()
 
@@ -172,9 +172,9 @@ def _parameter(tensor: Any, *_: Any) -> Any:
 
 
 def _finished(found: Any) -> Tensors:
-    """Return tables of arrays, of what was read; refuse all else."""
+    """Return the unpickled tables of arrays; raise an error for anything else."""
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
-        raise pickle.UnpicklingError("it holds no table of tensors by name")
+        raise pickle.UnpicklingError("it contains no table of named tensors")
     made: Tensors = {}
     for name, part in found.items():
         array = part.array if isinstance(part, _Array) else part
@@ -191,4 +191,4 @@ _NAMES: dict[tuple[str, str], Callable[..., Any]] = {
     ("torch._utils", "_rebuild_tensor_v2"): _tensor,
     ("torch._utils", "_rebuild_parameter"): _parameter,
 }
-"""All that a pickle may name, and what stands for it."""
+"""All names that a pickle may use, and their stand-ins."""

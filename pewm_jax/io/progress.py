@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 EVERY_S = 10.0
-"""Seconds between lines where standard output is not a terminal."""
+"""Seconds between lines if standard output is not a terminal."""
 
 
 class Meter:
@@ -43,7 +43,7 @@ class Meter:
         return self
 
     def advance(self, count: int) -> None:
-        """Add to the work done."""
+        """Add to the count of finished units."""
         self.done += count
         now = time.monotonic()
         rate = self.done / max(now - self._start, 1e-6)
@@ -60,7 +60,7 @@ class Meter:
             )
 
     def summary(self) -> str:
-        """Return one line: work done, time and rate."""
+        """Return one line with count, time and rate."""
         seconds = max(time.monotonic() - self._start, 1e-6)
         return (
             f"{self.label}: {self.done} {self.unit} in {seconds:.1f} s "

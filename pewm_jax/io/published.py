@@ -2,8 +2,8 @@
 
 Each network that can be converted has a ``Network`` in ``models/<family>/convert.py``. Its table is
 a list of ``Entry``: one per published tensor, with the path of our leaf and the transform between
-the two layouts. The same table reads (published → ours), writes (ours → published), and says which
-names and shapes are expected before any weight is read. ``convert.pipeline`` does the work.
+the two layouts. The same table is used to read (published → ours), to write (ours → published), and
+to check names and shapes before any weight is read. ``convert.pipeline`` does the work.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pewm_jax.types import Array, Params
 
 @dataclasses.dataclass(frozen=True)
 class Transform:
-    """A change of a tensor's layout and its inverse; both are views or permutations.
+    """A layout transform and its inverse; both are views or permutations.
 
     Attributes:
         read: published tensor → our layout.
@@ -57,9 +57,9 @@ class Entry:
 
     Attributes:
         name: its name in the published file.
-        path: our leaf, keys joined by slashes (see ``pewm_jax.io.tree``).
-        transform: the change of layout.
-        layer: position on the leading axis of our leaf where layers are stacked, else None.
+        path: path of our leaf, keys joined by slashes (see ``pewm_jax.io.tree``).
+        transform: the layout transform.
+        layer: index on the leading axis of our leaf if layers are stacked, else None.
     """
 
     name: str
@@ -70,19 +70,19 @@ class Entry:
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """The form of a network in published checkpoints.
+    """A network's format in published checkpoints.
 
     Attributes:
-        folder: its folder in a pipeline, theirs and ours.
+        folder: its folder in a pipeline, published and ours.
         class_name: its class in the library that published it.
-        config_class: our configuration's class.
+        config_class: our configuration class.
         read_config: ``(values of config.json) -> config``.
-        write_config: the inverse.
+        write_config: the inverse of ``read_config``.
         entries: ``(config) -> table``.
         init: ``(config, key) -> params``.
-        unused: published tensors that no network reads, left out without complaint.
+        unused: published tensors that no network uses; ignored silently.
         class_key: the setting of config.json that names the class.
-        weights_file: the file of weights that is written.
+        weights_file: name of the weights file that is written.
     """
 
     folder: str
@@ -105,7 +105,7 @@ class Network:
 
         Args:
             values: the JSON object.
-            where: the file, for messages.
+            where: the file, for error messages.
 
         Raises:
             UserError: a setting is unknown or unsupported.
@@ -117,22 +117,22 @@ class Network:
 
 
 def rename(path: str, rules: Sequence[tuple[str, Any]]) -> str:
-    """Apply regular expressions to a path, one after the other."""
+    """Apply regular expressions to a path, in sequence."""
     for pattern, name in rules:
         path = re.sub(pattern, name, path)
     return path
 
 
 def require_class(values: Mapping[str, Any], what: str, name: str) -> None:
-    """Check that settings name a class, or none.
+    """Raise an error if settings name another class.
 
     Args:
         values: the JSON object.
         what: what they describe, for the message: ``The U-Net``.
-        name: the class that can be read.
+        name: the supported class.
 
     Raises:
-        UserError: another class.
+        UserError: they name another class. Naming none is allowed.
     """
     kind = values.get("_class_name", name)
     if kind != name:
@@ -140,15 +140,15 @@ def require_class(values: Mapping[str, Any], what: str, name: str) -> None:
 
 
 def require_known(values: Mapping[str, Any], what: str, known: Collection[str]) -> None:
-    """Check that every setting is known; those that begin with ``_`` are notes of the writer.
+    """Raise an error for unknown settings; those that begin with ``_`` are metadata and ignored.
 
     Raises:
-        UserError: with the list of those that are not.
+        UserError: some settings are unknown; lists them.
     """
     unknown = sorted(key for key in values if not key.startswith("_") and key not in known)
     if unknown:
         raise UserError(
-            f"{what} has settings that are not known: {', '.join(unknown)}; known are "
+            f"{what} has settings that are unknown: {', '.join(unknown)}; known are "
             f"{', '.join(sorted(known))}."
         )
 
@@ -160,17 +160,17 @@ def read_settings(
     defaults: Mapping[str, Any],
     without_effect: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Return the settings of a network of one class; absent ones have the class's defaults.
+    """Return the settings of a network of one class, with the class's defaults for missing ones.
 
     Args:
         values: the JSON object.
         what: what they describe, for messages.
-        name: the class that can be read.
-        defaults: the settings that matter, and what the class takes for absent ones.
-        without_effect: settings that are allowed and have no effect.
+        name: the supported class.
+        defaults: the settings that matter, with the class's defaults.
+        without_effect: settings that are allowed and ignored.
 
     Raises:
-        UserError: another class, or a setting that is not known.
+        UserError: another class, or an unknown setting.
     """
     require_class(values, what, name)
     require_known(values, what, {*defaults, *without_effect})
@@ -178,10 +178,10 @@ def read_settings(
 
 
 def require_only(given: Mapping[str, Any], what: str, only: Mapping[str, Any]) -> None:
-    """Check settings of which only one value is supported.
+    """Raise an error for settings with another value than the only supported one.
 
     Raises:
-        UserError: another value.
+        UserError: a setting has another value.
     """
     for key, value in only.items():
         if _plain(given.get(key, value)) != _plain(value):
@@ -189,13 +189,13 @@ def require_only(given: Mapping[str, Any], what: str, only: Mapping[str, Any]) -
 
 
 def require_kinds(given: Mapping[str, Any], what: str, examples: Mapping[str, Any]) -> None:
-    """Check that settings have the types of examples.
+    """Raise an error for settings whose types differ from those of examples.
 
-    A whole number is accepted for a number. A list must be as long as a tuple in the examples; for
+    An integer is accepted for a float. A list must have the length of a tuple in the examples; for
     a list in the examples it may have any length.
 
     Raises:
-        UserError: a setting of another kind.
+        UserError: a setting has another type.
     """
     for key, example in examples.items():
         if not _alike(given[key], example):

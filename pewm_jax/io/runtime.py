@@ -1,4 +1,4 @@
-"""Set up the process of a command: glibc's ``malloc``, and the cache of compiled programs.
+"""Process setup of a command: glibc's ``malloc``, and JAX's compilation cache.
 
 ``keep_small`` and ``keep_large`` must run before libraries start threads, and so before NumPy is
 imported. With other C libraries they do nothing.
@@ -13,38 +13,39 @@ from pathlib import Path
 from typing import Any
 
 TRIM_THRESHOLD, TOP_PAD, MMAP_THRESHOLD, MMAP_MAX, ARENA_MAX = -1, -2, -3, -4, -8
-"""The names of these settings in glibc's ``malloc.h``: ``M_TRIM_THRESHOLD`` and so on."""
+"""Numbers of these parameters in glibc's ``malloc.h``: ``M_TRIM_THRESHOLD`` and so on."""
 ARENAS = 2
-"""Arenas for all threads. By default there are up to eight for each core, and each keeps what was
-once free in it, so that a page whose threads imagine, draw and serve grows as it is used."""
+"""Number of arenas for all threads. By default there are up to eight per core, and each keeps its
+freed memory, so the memory use of a page with threads for imagining, drawing and serving grows over
+time."""
 LARGE = 1 << 20
-"""Bytes from which a block is taken from the system and given back when it is free. By default that
-limit grows up to 32 MB with what is freed, and maps of steps that are past leave holes."""
+"""Size in bytes from which blocks are mapped separately and returned to the system when freed. The
+default threshold grows up to 32 MB as blocks are freed; then freed maps leave holes in the heap."""
 NEVER = -1
-"""The trim threshold at which memory is never given back."""
+"""The trim threshold at which memory is never returned to the system."""
 PAD = 1 << 28
-"""Bytes that are taken from the system at once."""
+"""Number of bytes requested from the system at once."""
 
 
 def keep_small() -> bool:
-    """Let all threads of this process share ``ARENAS`` arenas, and give ``LARGE`` blocks back.
+    """Limit this process to ``ARENAS`` malloc arenas, and return freed blocks from ``LARGE`` bytes.
 
-    For pages that are served for days.
+    For servers that run for days.
 
     Returns:
-        Whether that was possible.
+        Whether the settings were accepted.
     """
     return _set({ARENA_MAX: ARENAS, MMAP_THRESHOLD: LARGE})
 
 
 def keep_large() -> bool:
-    """Keep what was once taken, large blocks as well, and take it again.
+    """Keep freed memory in the process, including large blocks, and reuse it.
 
-    For trainings on processors. By default each large array is mapped anew at every step, and the
-    system clears its pages one by one (``benchmarks/heap.py`` says what that takes).
+    For training on CPUs. By default each large array is mapped again at every step, and the system
+    zeroes its pages one by one (``benchmarks/heap.py`` measures the cost).
 
     Returns:
-        Whether that was possible.
+        Whether the settings were accepted.
     """
     return _set({ARENA_MAX: 1, MMAP_MAX: 0, TRIM_THRESHOLD: NEVER, TOP_PAD: PAD})
 
@@ -60,12 +61,12 @@ def _set(values: dict[int, int]) -> bool:
 def cache_compilation(folder: str | Path) -> None:
     """Make JAX cache compiled programs in a folder, so that the next start is faster.
 
-    There is one cache per set of processor features, for which programs are compiled. Call this
-    from commands only: it sets a global option of JAX. A folder that the caller has chosen, by
-    ``JAX_COMPILATION_CACHE_DIR`` or ``jax.config``, stays, and so does a cache that the caller has
-    switched off (``JAX_ENABLE_COMPILATION_CACHE``).
+    There is one cache per set of CPU features, because programs are compiled for them. Call this
+    from commands only: it sets a global option of JAX. A cache folder chosen by the caller
+    (``JAX_COMPILATION_CACHE_DIR`` or ``jax.config``) is kept, and so is a cache that the caller has
+    disabled (``JAX_ENABLE_COMPILATION_CACHE``).
     """
-    import jax  # noqa: PLC0415 - takes seconds, and refusals do not need it
+    import jax  # noqa: PLC0415 - noqa: PLC0415 - takes seconds, and error paths do not need it
 
     chosen: Any = jax.config
     if chosen.jax_compilation_cache_dir or not chosen.jax_enable_compilation_cache:

@@ -1,7 +1,7 @@
 """Sources of published tensors: one safetensors file, shards with an index, or memory.
 
-Headers are read at once and checked against the files' sizes; tensors are read one by one, when
-asked for, so at most one of them is in memory.
+Headers are read immediately and checked against the file sizes; tensors are read one by one on
+demand, so at most one of them is in memory.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Source(Protocol):
 
     @property
     def where(self) -> str:
-        """The file or folder, for messages."""
+        """Return the file or folder, for error messages."""
         ...
 
     def names(self) -> Iterable[str]:
@@ -46,7 +46,7 @@ class Source(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Arrays:
-    """Tensors that are in memory already, as a ``Source``."""
+    """Tensors in memory, as a ``Source``."""
 
     tensors: Mapping[str, Array]
     where: str
@@ -99,11 +99,11 @@ class Files:
 
 @dataclasses.dataclass(frozen=True)
 class Renamed:
-    """Another source's tensors, or equal parts of their first axis, under other names.
+    """A view of another source with renamed tensors, or with equal parts of their first axis.
 
     Attributes:
-        inner: where the tensors are.
-        views: name → (name there, which part, of how many).
+        inner: the other source.
+        views: name → (name in ``inner``, index of the part, number of parts).
     """
 
     inner: Source
@@ -111,7 +111,7 @@ class Renamed:
 
     @property
     def where(self) -> str:
-        """The file or folder, for messages."""
+        """Return the file or folder, for error messages."""
         return self.inner.where
 
     def names(self) -> Iterable[str]:
@@ -140,19 +140,19 @@ def open_folder(folder: Path) -> Files:
     """Open the weights of one network in the layout of diffusers and transformers.
 
     Args:
-        folder: holds ``*.safetensors.index.json`` and the shards it names, or one
-            ``*.safetensors``. Where there are several precisions (``model.fp16.safetensors``), the
-            plain one is taken.
+        folder: contains ``*.safetensors.index.json`` and the shards it names, or one
+            ``*.safetensors``. If there are several precisions (``model.fp16.safetensors``), the
+            file without a precision in its name is used.
 
     Returns:
-        The tensors, none of them read yet.
+        The tensors, not read yet.
 
     Raises:
-        UserError: no weights, an index that names absent files or tensors, shards without their
-            index, tensors outside of the index, a truncated or damaged file.
+        UserError: no weights, an index that names missing files or tensors, shards without their
+            index, tensors missing from the index, a truncated or damaged file.
     """
     if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder; give the folder that holds the weights.")
+        raise UserError(f"{folder} is not a folder; give the folder that contains the weights.")
     indices = list(folder.glob("*.safetensors.index*.json"))
     files = list(folder.glob("*.safetensors"))
     whole = [path for path in files if "-of-" not in path.name]
@@ -165,23 +165,23 @@ def open_folder(folder: Path) -> Files:
     beside = [p.name for p in files if p not in used and _precision(p) == _precision(chosen)]
     if beside:
         raise UserError(
-            f"{folder} holds {tree.listing(beside)} besides the weights of {chosen.name}; move "
-            "away what is not of this network."
+            f"{folder} contains {tree.listing(beside)} besides the weights of {chosen.name}; move "
+            "the files of other networks away."
         )
     return source
 
 
 def _without_weights(folder: Path, shards: Sequence[Path]) -> UserError:
-    """Return the error for a folder without an index or a whole file."""
+    """Return the error for a folder without an index or a single file."""
     if shards:
         return UserError(
-            f"{folder} holds shards such as {min(shards).name} but no *.safetensors.index.json "
+            f"{folder} contains shards such as {min(shards).name} but no *.safetensors.index.json "
             "that lists them; copy the index there too."
         )
     pickled = [p.name for p in sorted(folder.glob("*.bin")) + sorted(folder.glob("*.pt*"))]
     instead = f", only {tree.listing(pickled)}, which can run code when loaded" * bool(pickled)
     return UserError(
-        f"{folder} holds no safetensors file{instead}; save the network there with "
+        f"{folder} contains no safetensors file{instead}; save the network there with "
         "save_pretrained(…, safe_serialization=True)."
     )
 
@@ -190,7 +190,7 @@ def open_file(path: Path) -> Files:
     """Open one safetensors file.
 
     Raises:
-        UserError: it is absent, truncated or damaged.
+        UserError: the file is missing, truncated or damaged.
     """
     return Files(str(path), {n: (path, p) for n, p in tensor_files.places(path).items()})
 
@@ -212,7 +212,7 @@ def _open_shards(folder: Path, index: Path) -> Files:
         if inside.keys() != wanted:
             lacking, extra = wanted - inside.keys(), inside.keys() - wanted
             what = f"lacks {tree.listing(lacking)}" if lacking else f"holds {tree.listing(extra)}"
-            word = "which the index places there" if lacking else "which the index does not name"
+            word = "listed in the index" if lacking else "not listed in the index"
             raise UserError(f"{folder / shard} {what}, {word}; copy the whole folder again.")
         places |= {name: (folder / shard, place) for name, place in inside.items()}
     return Files(str(folder), places)
@@ -222,7 +222,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON table.
 
     Raises:
-        UserError: the file is absent, unreadable, not JSON or not a table.
+        UserError: the file is missing, unreadable, not JSON or not a table.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -233,7 +233,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise UserError(f"{path} is not valid JSON ({error}); copy it again.") from None
     if not isinstance(values, dict):
-        raise UserError(f"{path} holds no table of settings; copy it again.")
+        raise UserError(f"{path} contains no table of settings; copy it again.")
     return values
 
 
@@ -242,11 +242,11 @@ def read_config(path: Path, classes: Sequence[str], key: str = "_class_name") ->
 
     Args:
         path: ``config.json``, ``scheduler_config.json`` or ``model_index.json``.
-        classes: the class names that can be read.
+        classes: the supported class names.
         key: the setting that names the class.
 
     Returns:
-        The settings as they are in the file, the class name included.
+        The settings in the file, including the class name.
 
     Raises:
         UserError: the file cannot be read or names another class.
@@ -261,10 +261,10 @@ def read_config(path: Path, classes: Sequence[str], key: str = "_class_name") ->
 
 
 def component(folder: Path, name: str) -> Path:
-    """Return the folder of one network, given it or the pipeline's folder around it.
+    """Return the folder of one network, given that folder or the pipeline's folder around it.
 
     Raises:
-        UserError: neither is there.
+        UserError: it does not exist.
     """
     inside = folder / name
     if inside.is_dir():

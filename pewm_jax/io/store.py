@@ -2,15 +2,15 @@
 
 A long loop over independent pieces (clips to score, decisions of a study, episodes to encode) keeps
 the result of each piece in a ``ResultCache``. If it is interrupted, the same call resumes: it reads
-the finished pieces and computes only the others::
+the finished pieces and computes only the rest::
 
     cache = ResultCache(folder)
     results = map_resumable(clips, name_of_clip, score_clips, cache=cache)
 
-What a result depends on is either part of the piece's name (``inputs_hash``), or of the folder's
-(``ResultCache.for_weights``), or is written beside the results and compared with
-(``require_same_inputs``). A half-written file counts as absent. ``ProgressFile`` keeps the state of
-a loop whose rounds build on one another.
+What a result depends on is part of the piece's name (``inputs_hash``), part of the folder's name
+(``ResultCache.for_weights``), or written beside the results and compared (``require_same_inputs``).
+A partial file counts as missing. ``ProgressFile`` keeps the state of a loop whose rounds build on
+one another.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from pewm_jax.errors import UserError
 from pewm_jax.io import atomic
 
 SETTINGS = "settings.json"
-"""The file in which ``require_same_inputs`` keeps the inputs of a folder's results."""
+"""File that stores the inputs of a folder's results (``require_same_inputs``)."""
 PATIENCE_S = 60.0
-"""Seconds to wait for a file that another process has written to become visible."""
+"""Seconds to wait until a file written by another process becomes visible."""
 DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
     struct.error,
     EOFError,
     KeyError,
-    RuntimeError,  # zipfile: a damaged header names a method of compression that does not exist
+    RuntimeError,  # zipfile: a damaged header names an unknown compression method
     ValueError,  # NumPy, JSON, UTF-8
 )
-"""What readers of NumPy and JSON files raise if a file is damaged or cut short."""
+"""Exceptions raised by readers of NumPy and JSON files if a file is damaged or truncated."""
 
 Arrays = dict[str, np.ndarray]
 K = TypeVar("K", bound=Hashable)
@@ -54,7 +54,7 @@ T = TypeVar("T")
 
 
 class _NotWholeError(ValueError):
-    """A file holds something else than a result."""
+    """A file contains no result."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,9 +62,9 @@ class Format:
     """How a result is stored.
 
     Attributes:
-        suffix: of the file.
+        suffix: the file's suffix.
         write: writes a result to a path.
-        read: reads it; raises one of ``DAMAGED`` if the file is not whole.
+        read: reads it; raises one of ``DAMAGED`` if the file is damaged.
     """
 
     suffix: str
@@ -83,11 +83,11 @@ def _write_compressed(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _read_arrays(path: Path) -> Arrays:
-    # From memory: in a damaged file, zipfile may look for a part before the file's beginning, which
-    # is an OSError in a file, as errors of the disk are.
+    # Read from memory: for a damaged file, zipfile may seek before its beginning, which raises
+    # OSError on a file, like an error of the disk.
     found = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
     if isinstance(found, np.ndarray):
-        raise _NotWholeError("it holds one array without a name")
+        raise _NotWholeError("it contains one unnamed array")
     with found as arrays:
         return {key: arrays[key] for key in arrays.files}
 
@@ -99,14 +99,14 @@ def _write_table(path: Path, table: Mapping[str, Any]) -> None:
 def _read_table(path: Path) -> dict[str, Any]:
     found = json.loads(path.read_text("utf-8"))
     if not isinstance(found, dict):
-        raise _NotWholeError("it holds no table")
+        raise _NotWholeError("it contains no table")
     return found
 
 
 ARRAYS = Format(".npz", _write_arrays, _read_arrays)
 """Named NumPy arrays."""
 COMPRESSED = Format(".npz", _write_compressed, _read_arrays)
-"""Named NumPy arrays in files that a repository can hold."""
+"""Named NumPy arrays, compressed, for files in a repository."""
 TABLE = Format(".json", _write_table, _read_table)
 """A table of plain values."""
 
@@ -115,7 +115,7 @@ def inputs_hash(inputs: Any) -> str:
     """Return a hash of what a result depends on.
 
     Args:
-        inputs: plain values: anything that JSON can hold. The order of keys does not matter.
+        inputs: JSON-serializable values. The order of keys does not matter.
     """
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
@@ -130,7 +130,7 @@ class ResultCache:
     """Named results in a folder, one file each.
 
     Args:
-        folder: the folder, which is made when the first result is written.
+        folder: the folder; created when the first result is written.
         kind: how a result is stored.
     """
 
@@ -143,9 +143,9 @@ class ResultCache:
     ) -> ResultCache:
         """Return the cache of results that depend on weights and on a protocol.
 
-        It lies in ``folder/WEIGHTS/FINGERPRINT``. Results of other weights are deleted. Results of
-        other protocols stay, so a quick evaluation with fewer clips does not discard the results of
-        the full one.
+        Its folder is ``folder/WEIGHTS/FINGERPRINT``. Results of other weights are deleted. Results
+        of other protocols are kept, so a quick evaluation with fewer clips does not discard the
+        results of the full one.
 
         Args:
             folder: the folder of all results of a report.
@@ -161,7 +161,7 @@ class ResultCache:
         return cache
 
     def path(self, name: str) -> Path:
-        """Return the file of a result, whether it exists or not; ``name`` may contain slashes."""
+        """Return the file of a result, whether or not it exists; ``name`` may contain slashes."""
         return self.folder / f"{name}{self.format.suffix}"
 
     def get(self, name: str) -> Any | None:
@@ -185,18 +185,18 @@ class ResultCache:
         return self.put(name, work()) if found is None else found
 
     def wait_for(self, name: str, patience_s: float = PATIENCE_S) -> Any:
-        """Return a result that another process of this job has finished.
+        """Return a result computed by another process of this job.
 
         Raises:
-            UserError: the file does not appear: the processes share no folder.
+            UserError: the file does not appear, because the processes share no folder.
         """
         until = time.monotonic() + patience_s
         while (found := self.get(name)) is None:
             if time.monotonic() > until:
                 raise UserError(
-                    f"{self.path(name)}, which another process of this job has written, is "
-                    "not there: all processes must see the same folders; put the run on a disk "
-                    "that they share."
+                    f"{self.path(name)} was written by another process of this job but is not "
+                    "visible here: all processes must share the run's folder; put the run on a "
+                    "shared disk."
                 )
             time.sleep(min(0.5, patience_s))
         return found
@@ -204,7 +204,7 @@ class ResultCache:
 
 @dataclasses.dataclass(frozen=True)
 class Workers:
-    """The processes that share the work of a loop; by default this one alone.
+    """The processes that share the work of a loop; by default only this one.
 
     Attributes:
         count: number of processes.
@@ -221,12 +221,12 @@ class Workers:
     ) -> list[K]:
         """Return this process's pieces: every P-th heavy one and every P-th light one.
 
-        The choice depends only on a piece's place in the list, so all processes agree on it without
-        communication, also when the job is resumed.
+        The assignment depends only on a piece's position in the list, so all processes agree on it
+        without communication, even when the job is resumed.
 
         Args:
             keys: all pieces, in the same order in all processes.
-            is_light: whether a piece costs little compared with the others.
+            is_light: whether a piece is cheap compared with the others.
         """
         light = {key: bool(is_light and is_light(key)) for key in keys}
         chosen: set[K] = set()
@@ -238,7 +238,7 @@ class Workers:
         """Call a function in process 0 before all other processes call it; return its result.
 
         Args:
-            work: stores its result in a file, and reads it there if it is called again.
+            work: stores its result in a file; a second call reads that file.
             what: name of the work, a different one for each call.
         """
         result = work() if self.index == 0 else None
@@ -262,22 +262,22 @@ def map_resumable(
     group_of: Callable[[K], Hashable] | None = None,
     is_light: Callable[[K], bool] | None = None,
 ) -> dict[K, T]:
-    """Compute the results of all pieces of work that the cache does not hold.
+    """Compute the results of all pieces of work that are not in the cache.
 
     Args:
         keys: the pieces; with several workers in the same order in all of them.
         key_of_inputs: the name of a piece's result. It contains all that the result depends on
-            beside the cache's folder, for instance by ``inputs_hash``.
+            in addition to the cache's folder, for instance by ``inputs_hash``.
         work: called once with the pieces that this process must compute, in order, if there are
             any. It yields each with its result, which is written before the next one is computed.
         cache: where results are stored.
         what: name of the work for messages, a different one for each call of a job.
-        log: shows a line that says how many results are reused.
-        is_usable: whether a stored result is enough, or must be computed again.
+        log: prints how many results are reused.
+        is_usable: whether a stored result can be used, or must be recomputed.
         workers: the processes that share the work. All of them get all results.
-        group_of: pieces of one group are computed by one process, such as the measures of one
+        group_of: pieces of one group are computed by one process, such as the metrics of one
             rollout. By default every piece is a group of its own.
-        is_light: whether a piece, and its group, costs little compared with the others.
+        is_light: whether a piece, and its group, is cheap compared with the others.
 
     Returns:
         The result of every piece, in the order of ``keys``.
@@ -293,7 +293,7 @@ def map_resumable(
         if found is not None and is_usable(key, found):
             known[key] = found
     if known and log is not None:
-        log(f"{len(known)} of {len(keys)} {what} were computed before and are reused")
+        log(f"{len(known)} of {len(keys)} {what} are reused from an earlier run")
     first_of_group: dict[Hashable, K] = {}
     group = {key: group_of(key) if group_of else key for key in keys}
     for key in keys:
@@ -313,7 +313,7 @@ def require_same_inputs(
     what: str,
     ignored: Collection[str] = (),
 ) -> None:
-    """Refuse a folder whose results have other inputs; otherwise write the inputs there.
+    """Raise an error if a folder's results have other inputs; otherwise write the inputs there.
 
     Args:
         folder: the folder of the results.
@@ -322,33 +322,33 @@ def require_same_inputs(
         ignored: names that no stored result depends on.
 
     Raises:
-        UserError: naming the inputs that differ.
+        UserError: some inputs differ; names them.
     """
     cache = ResultCache(folder, TABLE)
     file = folder / SETTINGS
     now = json.dumps({n: value for n, value in inputs.items() if n not in ignored}, indent=1)
     if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder} is a file: name a folder by --out.")
+        raise UserError(f"{folder} is a file: choose a folder with --out.")
     if file.exists():
         before = cache.get(file.stem)
         if before is None:
-            raise UserError(f"{file} is damaged: delete it, if its settings are still these.")
+            raise UserError(f"{file} is damaged: delete it if the settings have not changed.")
         wrong = [name for name, value in json.loads(now).items() if before.get(name) != value]
         if wrong:
             raise UserError(
-                f"{folder} holds {what} of other settings ({', '.join(wrong)}): name another "
-                "folder by --out, or put them back."
+                f"{folder} contains {what} of other settings ({', '.join(wrong)}): choose another "
+                "folder with --out, or restore the settings."
             )
     folder.mkdir(parents=True, exist_ok=True)
     atomic.write_text(file, now + "\n")
 
 
 def make_once(mark: Path, inputs: Any, make: Callable[[], None]) -> None:
-    """Call a function, unless a mark file says that it was called with the same inputs.
+    """Call a function, unless a marker file records a call with the same inputs.
 
     Args:
-        mark: a JSON file, written when the function has returned.
-        inputs: what its result depends on, as plain values.
+        mark: a JSON file, written after the function returns.
+        inputs: what the result depends on, as plain values.
         make: writes files.
     """
     try:
@@ -371,7 +371,7 @@ class ProgressFile:
     """
 
     IDENTITY = "who"
-    """The array that holds the identity."""
+    """Name of the array with the identity."""
 
     def __init__(self, path: Path, identity: str, what: str):
         self.path, self.identity, self.what = path, identity, what
@@ -380,7 +380,7 @@ class ProgressFile:
         """Return the arrays of the last ``write``, or None if there is no file.
 
         Raises:
-            UserError: the file is damaged, or belongs to another loop.
+            UserError: the file is damaged, or belongs to a loop with another identity.
         """
         try:
             arrays = _read_arrays(self.path)
@@ -389,13 +389,13 @@ class ProgressFile:
             return None
         except (OSError, *DAMAGED) as error:
             raise UserError(
-                f"{self.path} is no checkpoint of {self.what}, or damaged "
-                f"({type(error).__name__}): remove it to begin anew."
+                f"{self.path} is not a checkpoint of {self.what}, or it is damaged "
+                f"({type(error).__name__}): delete it to start again."
             ) from None
         if found != self.identity:
             raise UserError(
-                f"{self.path} belongs to {self.what} with other inputs: name another file, or "
-                "remove it."
+                f"{self.path} belongs to {self.what} with other inputs: choose another file, or "
+                "delete it."
             )
         return arrays
 

@@ -1,13 +1,14 @@
-"""Safetensors files: flat tables of named arrays, with checksums in the header of our own.
+"""Safetensors files: flat tables of named arrays, with checksums in our header.
 
-The ``safetensors`` library reads files and checks that header and size agree. Three things that it
-does not do (0.8) are done here:
+The ``safetensors`` library reads files and checks that header and size agree. This module adds
+three functions that the library (0.8) lacks:
 
-- Writing tensor by tensor. ``serialize_file`` wants all tensors in host memory at once; here no
-  more than one is held beside what the caller holds.
-- Checksums. The header of our files has the SHA-256 of every tensor and of itself.
-- Mapping a file, so that only the indexed part of an array is read. ``get_slice`` returns no array:
-  it has neither ``shape`` nor ``dtype``, and cannot be indexed by a list.
+- Writing tensor by tensor. ``serialize_file`` needs all tensors in host memory at once; here at
+  most one is held in addition to those of the caller.
+- Checksums. The header of our files contains the SHA-256 of every tensor and of the header itself.
+- Memory-mapping a file, so that only the indexed part of an array is read. The result of
+  ``get_slice`` is not an array: it has neither ``shape`` nor ``dtype``, and cannot be indexed by a
+  list.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ from pewm_jax.io import atomic, tree
 from pewm_jax.types import Array
 
 OURS = "pewm_jax"
-"""The key of our own metadata, one JSON text with sorted keys: equal weights are equal files."""
+"""The key of our metadata, one JSON text with sorted keys, so that equal weights give equal
+files."""
 _TENSORS, _HEADER = "sha256", "header_sha256"
 """The keys of checksums: of each tensor, and of the header with zeros in place of this one."""
 _NO_DIGEST = "0" * 64
@@ -57,14 +59,14 @@ _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where one tensor lies in a safetensors file.
+    """Location of one tensor in a safetensors file.
 
     Attributes:
         name: its name.
         shape: its shape.
         dtype: its dtype.
-        begin: its first byte in the file.
-        sha256: of its bytes, empty if the file does not say.
+        begin: offset of its first byte in the file.
+        sha256: hash of its bytes, empty if the file has none.
     """
 
     name: str
@@ -75,12 +77,12 @@ class Place:
 
     @property
     def size(self) -> int:
-        """Return the bytes it takes."""
+        """Return its size in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
 def header(metadata: Mapping[str, str]) -> dict[str, str]:
-    """Return what ``write`` takes to write a file of ours, with metadata and checksums."""
+    """Return the ``metadata`` argument of ``write`` for a file with our metadata and checksums."""
     return {OURS: json.dumps(dict(metadata), sort_keys=True)}
 
 
@@ -91,17 +93,18 @@ def write(
     metadata: Mapping[str, str],
     progress: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Write a safetensors file tensor by tensor, whole or not at all.
+    """Write a safetensors file tensor by tensor, atomically.
 
     Args:
-        path: the file; its folder is made.
+        path: the file; its folder is created.
         like: name → anything with the tensor's shape and dtype.
         tensors: the tensors, in any order, each once.
-        metadata: the ``__metadata__`` of the header. Checksums are added if it is of ``header``.
+        metadata: the ``__metadata__`` of the header. Checksums are added if it comes from
+            ``header``.
         progress: called after every tensor with the bytes just written.
 
     Raises:
-        ValueError: the tensors are not those announced.
+        ValueError: the tensors differ from ``like``.
     """
     order = sorted(like, key=lambda name: (-like[name].dtype.itemsize, name))
     facts, ours = dict(metadata), OURS in metadata
@@ -129,16 +132,16 @@ def write(
                 tuple(like[name].shape),
                 np.dtype(like[name].dtype),
             ):
-                raise ValueError(f"{name} {array.shape} {array.dtype} was not announced so.")
+                raise ValueError(f"{name} {array.shape} {array.dtype} differs from ``like``.")
             left.remove(name)
             file.seek(start + table[name]["data_offsets"][0])
             raw = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             file.write(raw)
             digests[name] = hashlib.sha256(raw).hexdigest() if ours else ""
             progress(array.nbytes)
-            del tensor, array, raw  # before the next one is made
+            del tensor, array, raw  # free memory before the next one is made
         if left:
-            raise ValueError(f"{tree.listing(left)} were announced and not given.")
+            raise ValueError(f"{tree.listing(left)} are in ``like`` but were not yielded.")
         if ours:
             facts[_TENSORS] = json.dumps(digests)
             facts[_HEADER] = hashlib.sha256(_text(table)).hexdigest()
@@ -149,21 +152,21 @@ def write(
 
 
 def _text(table: Mapping[str, object]) -> bytes:
-    """Return a header as it stands in the file, padded to words of 8 bytes."""
+    """Return a header as stored in the file, padded to a multiple of 8 bytes."""
     text = json.dumps(table, separators=(",", ":")).encode()
     return text + b" " * (-len(text) % 8)
 
 
 def size(like: Mapping[str, Array | jax.ShapeDtypeStruct]) -> int:
-    """Return the bytes that tensors take, of anything with shape and dtype by name."""
+    """Return the size in bytes of tensors, given anything with shape and dtype by name."""
     return sum(math.prod(x.shape) * np.dtype(x.dtype).itemsize for x in like.values())
 
 
 def places(path: Path) -> dict[str, Place]:
-    """Return where each tensor of a safetensors file lies, having read its header only.
+    """Return the location of each tensor of a safetensors file; reads only its header.
 
     Raises:
-        UserError: the file is absent, truncated or damaged, or of a dtype that is not known.
+        UserError: the file is missing, truncated or damaged, or has an unsupported dtype.
     """
     with _opened(path) as file:
         return _places(path, file)
@@ -179,17 +182,17 @@ def metadata(path: Path) -> dict[str, str]:
 def read(
     path: Path, wanted: Callable[[str], bool] = lambda _: True
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Read tensors one by one, each into memory of its own.
+    """Read tensors one by one, each into its own memory.
 
     Args:
         path: a safetensors file.
-        wanted: tells by its name whether a tensor is read; by default all are.
+        wanted: returns, by name, whether to read a tensor; all by default.
 
     Yields:
         Names and arrays.
 
     Raises:
-        UserError: the file is absent or damaged, or holds other bytes than were written.
+        UserError: the file is missing or damaged, or a checksum is wrong.
     """
     with _opened(path) as file:
         for name, place in _places(path, file).items():
@@ -198,7 +201,7 @@ def read(
 
 
 def mapped(path: Path) -> dict[str, np.ndarray]:
-    """Map a file into memory: what is not indexed is not read, and checksums are not compared.
+    """Memory-map a file: only indexed parts are read, and checksums are not verified.
 
     Raises:
         UserError: as ``places``.
@@ -212,10 +215,10 @@ def mapped(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_at(path: Path, place: Place) -> np.ndarray:
-    """Read one tensor into memory of its own.
+    """Read one tensor into its own memory.
 
     Raises:
-        UserError: the file is absent or damaged, or holds other bytes than were written.
+        UserError: the file is missing or damaged, or a checksum is wrong.
     """
     with _opened(path) as file:
         return _read(path, file, place)
@@ -223,11 +226,11 @@ def read_at(path: Path, place: Place) -> np.ndarray:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a file with the library, and turn what goes wrong in reading it into a sentence."""
+    """Open a file with the library; raise its errors as ``UserError``."""
     if not path.is_file():
-        raise UserError(f"{path} does not exist; train.py writes it when a stage is finished.")
+        raise UserError(f"{path} does not exist; train.py writes it at the end of a stage.")
     try:
-        # Not mapped into memory: of a mapped file, an error of the disk ends the process (SIGBUS).
+        # Not memory-mapped: a disk error in a mapped file kills the process (SIGBUS).
         with safetensors.safe_open(path, framework="numpy", backend="pread") as file:
             yield file
     except OSError as error:
@@ -238,7 +241,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _places(path: Path, file: Any) -> dict[str, Place]:
-    """Compute the places of an opened file; the library has checked that there are no gaps."""
+    """Return the locations in an opened file; the library has checked that there are no gaps."""
     begin, text = _header(path)
     facts = file.metadata() or {}
     digests = json.loads(facts[_TENSORS]) if _has_checksums(path, facts, text) else {}
@@ -248,7 +251,7 @@ def _places(path: Path, file: Any) -> dict[str, Place]:
         kind = part.get_dtype()
         if kind not in _DTYPES:
             raise UserError(
-                f"{path} holds {name} in {kind}, which cannot be read here; save it in float32, "
+                f"{path} contains {name} in {kind}, which is not supported; save it in float32, "
                 "bfloat16 or float16."
             )
         place = Place(name, tuple(part.get_shape()), _DTYPES[kind], begin, digests.get(name, ""))
@@ -258,32 +261,32 @@ def _places(path: Path, file: Any) -> dict[str, Place]:
 
 
 def _header(path: Path) -> tuple[int, bytes]:
-    """Return the byte at which the tensors begin, and the text before it."""
+    """Return the offset at which the tensors begin, and the header's bytes."""
     with path.open("rb") as file:
         (length,) = struct.unpack("<Q", file.read(8))
         return 8 + length, file.read(length)
 
 
 def _has_checksums(path: Path, facts: Mapping[str, str], text: bytes) -> bool:
-    """Tell whether a file has checksums; refuse a header that is not the one they were made of."""
+    """Return whether a file has checksums; raise UserError if the header's checksum is wrong."""
     if _TENSORS not in facts and _HEADER not in facts:
         return False
     digest = facts.get(_HEADER, "")
     zeroed = text.replace(digest.encode(), _NO_DIGEST.encode())
     if hashlib.sha256(zeroed).hexdigest() != digest:
-        raise _damaged(path, "its header is not what was written")
+        raise _damaged(path, "its header has a wrong checksum")
     return True
 
 
 def _read(path: Path, file: Any, place: Place) -> np.ndarray:
-    """Read one tensor of an opened file and compare it with its checksum."""
+    """Read one tensor of an opened file and verify its checksum."""
     array = file.get_tensor(place.name)
     if place.sha256:
         raw = array.reshape(-1).view(np.uint8).data
         if hashlib.sha256(raw).hexdigest() != place.sha256:
-            raise _damaged(path, "a tensor holds other bytes than were written")
+            raise _damaged(path, "a tensor has a wrong checksum")
     return array
 
 
 def _damaged(path: Path, why: str) -> UserError:
-    return UserError(f"{path} is damaged or cut short ({why}); copy it again or make it again.")
+    return UserError(f"{path} is damaged or truncated ({why}); copy it again or create it again.")

@@ -1,8 +1,8 @@
 """Strict selection of leaves in parameter trees, by regular expressions over their paths.
 
-A leaf's path is its keys joined by slashes: ``{"memory": {"gate": x}}`` holds ``memory/gate``. A
+A leaf's path is its keys joined by slashes: ``{"memory": {"gate": x}}`` contains ``memory/gate``. A
 pattern must match a whole path (``re.fullmatch``). Trained parameters, weight decay, sharding and
-conversion are all chosen this way. A leaf that no pattern matches, or a pattern that matches no
+conversion are all selected this way. A leaf that no pattern matches, or a pattern that matches no
 leaf, is an error that lists them.
 """
 
@@ -28,13 +28,13 @@ class TreeError(UserError):
 
 
 def flatten(tree: Any) -> dict[str, Any]:
-    """Turn any pytree into ``{path: leaf}``, in the tree's order."""
+    """Convert any pytree to ``{path: leaf}``, in the tree's order."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {_path(keys): leaf for keys, leaf in leaves}
 
 
 def unflatten(leaves: Mapping[str, Any]) -> Params:
-    """Turn ``{path: leaf}`` into nested dictionaries; the inverse of ``flatten``.
+    """Convert ``{path: leaf}`` to nested dictionaries; the inverse of ``flatten``.
 
     Raises:
         TreeError: a path is both a leaf and a branch.
@@ -46,15 +46,15 @@ def unflatten(leaves: Mapping[str, Any]) -> Params:
         for key in branch:
             node = node.setdefault(key, {})
             if not isinstance(node, dict):
-                raise TreeError(f"{path} runs through {key}, which is a leaf and not a branch.")
+                raise TreeError(f"{path} has the prefix {key}, which is a leaf and not a branch.")
         if name in node:
-            raise TreeError(f"{path} occurs twice, once as a branch.")
+            raise TreeError(f"{path} is both a leaf and a branch.")
         node[name] = leaf
     return tree
 
 
 def assign(rules: Sequence[tuple[str, T]], tree: Any, what: str = "rules") -> Any:
-    """Give every leaf the value of the first rule whose pattern matches its path.
+    """Replace every leaf by the value of the first rule whose pattern matches its path.
 
     Example::
 
@@ -69,7 +69,7 @@ def assign(rules: Sequence[tuple[str, T]], tree: Any, what: str = "rules") -> An
         A tree of the same structure with values in place of leaves.
 
     Raises:
-        TreeError: leaves that no rule matches.
+        TreeError: no rule matches some leaves.
     """
     compiled = [(re.compile(pattern), value) for pattern, value in rules]
     unmatched: list[str] = []
@@ -94,7 +94,7 @@ def split(tree: Params, patterns: Sequence[str]) -> tuple[Params, Params]:
     Both halves keep their paths; ``merge`` joins them again.
 
     Raises:
-        TreeError: a pattern that matches no leaf.
+        TreeError: a pattern matches no leaf.
     """
     leaves = flatten(tree)
     chosen: set[str] = set()
@@ -122,20 +122,20 @@ def merge(*trees: Params) -> Params:
     """Join nested dictionaries that have no leaf in common; the inverse of ``split``.
 
     Raises:
-        TreeError: leaves that occur in more than one tree.
+        TreeError: a leaf occurs in more than one tree.
     """
     leaves: dict[str, Any] = {}
     for tree in trees:
         more = flatten(tree)
         twice = leaves.keys() & more.keys()
         if twice:
-            raise TreeError(f"Trees to be merged both hold {listing(twice)}.")
+            raise TreeError(f"Trees to merge both contain {listing(twice)}.")
         leaves |= more
     return unflatten(leaves)
 
 
 def mismatches(tree: Any, like: Any) -> list[str]:
-    """List the differences between two trees in paths and shapes; empty if there are none."""
+    """Return the differences between two trees in paths and shapes, as phrases."""
     have, want = flatten(tree), flatten(like)
     out = [f"{path} is missing" for path in want if path not in have]
     out += [f"{path} is unexpected" for path in have if path not in want]
@@ -147,7 +147,7 @@ def mismatches(tree: Any, like: Any) -> list[str]:
 
 
 def require_like(tree: Any, like: Any, what: str) -> None:
-    """Refuse a tree that has other paths or shapes than another.
+    """Raise an error if two trees differ in paths or shapes.
 
     Raises:
         TreeError: they differ; the message names ``what`` and lists the differences.
@@ -158,7 +158,7 @@ def require_like(tree: Any, like: Any, what: str) -> None:
 
 
 def digest(tree: Any) -> str:
-    """Return a hash of paths, shapes and values as float32, whatever dtype they are stored in."""
+    """Return a hash of paths, shapes and values, cast to float32, so independent of dtype."""
     found = hashlib.sha256()
     for path, leaf in sorted(flatten(tree).items()):
         values = np.ascontiguousarray(jax.device_get(leaf), np.float32)
@@ -168,7 +168,7 @@ def digest(tree: Any) -> str:
 
 
 def listing(items: Iterable[str], most: int = _LISTED) -> str:
-    """Join up to ``most`` items for a message, and count the others."""
+    """Join up to ``most`` items for a message, and append the number of the others."""
     items = sorted(items)
     more = len(items) - most
     return ", ".join(items[:most]) + (f" and {more} more" if more > 0 else "")

@@ -1,6 +1,6 @@
-"""Network weights as one safetensors file: flat ``a/b/c`` keys, nothing to execute on loading.
+"""Network weights as one safetensors file with flat ``a/b/c`` keys; loading executes no code.
 
-Trees of arrays in files of ``tensor_files``.
+Trees of arrays, stored by ``tensor_files``.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ def save(
     metadata: Mapping[str, str] | None = None,
     progress: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Write parameters to ``path``, whole or not at all.
+    """Write parameters to ``path``, atomically.
 
     Args:
-        path: the file to write, by custom ``weights.safetensors``; its folder is made.
+        path: the file, usually ``weights.safetensors``; its folder is created.
         params: nested dictionaries of arrays, on any device.
-        metadata: a few facts about them, kept in the file's header.
+        metadata: metadata, stored in the file's header.
         progress: called after every leaf with the bytes just written.
     """
     leaves = tree.flatten(params)
@@ -42,13 +42,13 @@ def load(path: Path, part: str = "") -> Params:
 
     Args:
         path: a safetensors file.
-        part: read only this branch of the tree, such as ``backbone``; by default all of it.
+        part: read only this branch of the tree, such as ``backbone``; by default the whole tree.
 
     Returns:
         Nested dictionaries of NumPy arrays.
 
     Raises:
-        UserError: the file is absent or damaged, or holds no such branch.
+        UserError: the file is missing or damaged, or has no such branch.
     """
     prefix = f"{part}/" if part else ""
     found = {
@@ -56,65 +56,65 @@ def load(path: Path, part: str = "") -> Params:
         for name, array in tensor_files.read(path, lambda name: name.startswith(prefix))
     }
     if part and not found:
-        raise UserError(f"{path} holds no {part}; give weights that have it.")
+        raise UserError(f"{path} contains no {part}; use weights that have it.")
     return tree.unflatten(found)
 
 
 def lazy(path: Path) -> Params:
-    """Map a file of weights into memory: of each array only the part that is indexed is read.
+    """Memory-map a weights file: only the indexed part of each array is read.
 
-    Like ``load`` otherwise, but checksums are not compared; ``verify`` does that.
+    Otherwise like ``load``, but checksums are not verified; ``verify`` does that.
     """
     return tree.unflatten(tensor_files.mapped(path))
 
 
 def read_others(path: Path, of: str) -> dict[str, np.ndarray]:
-    """Read the tensors of a file that others wrote, by their names.
+    """Read the tensors of another library's file, by their names.
 
     Args:
-        path: a safetensors file, or a pickle of tensors (``pickled_tensors.read``).
-        of: whose weights they are, for the refusal.
+        path: a safetensors file, or a pickle of tensors (``pickles.read``).
+        of: the owner of the weights, for the error message.
 
     Raises:
-        UserError: the file is absent or damaged.
+        UserError: the file is missing or damaged.
     """
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "does not exist"
-        raise UserError(f"{path} {what}; name a file with the weights of {of}.")
+        raise UserError(f"{path} {what}; give the path of a file with the weights of {of}.")
     if path.suffix == ".safetensors":
         return dict(tensor_files.read(path))
     return dict(tree.flatten(pickled_tensors.read(path)))
 
 
 def verify(path: Path) -> None:
-    """Read a whole file, tensor by tensor, and compare it with the checksums in its header.
+    """Read a whole file, tensor by tensor, and verify its checksums.
 
     Raises:
-        UserError: the file is absent or damaged.
+        UserError: the file is missing or damaged.
     """
     for _ in tensor_files.read(path):
         pass
 
 
 def check(params: Params, like: Params, where: str) -> None:
-    """Insist that parameters have the paths and shapes that a configuration gives them.
+    """Raise an error if parameters do not have the expected paths and shapes.
 
     Args:
-        params: what was read.
-        like: arrays, or abstract arrays (``jax.eval_shape``), of the expected paths and shapes.
+        params: the loaded parameters.
+        like: arrays, or abstract arrays (``jax.eval_shape``), with the expected paths and shapes.
         where: the file, for the message.
 
     Raises:
-        TreeError: with the list of differences.
+        TreeError: they differ; lists the differences.
     """
     tree.require_like(params, like, where)
 
 
 def metadata(path: Path) -> dict[str, str]:
-    """Read only the metadata that ``save`` put in the header.
+    """Read only the metadata in the header.
 
     Raises:
-        UserError: the file is absent or damaged.
+        UserError: the file is missing or damaged.
     """
     return json.loads(tensor_files.metadata(path).get(tensor_files.OURS, "{}"))
 

@@ -117,7 +117,7 @@ def test_files_that_are_absent_or_damaged_are_refused(folder, tmp_path):
         dinov2.read(empty)
     whole = (folder / "model.safetensors").read_bytes()
     (folder / "model.safetensors").write_bytes(whole[:-4])
-    with pytest.raises(UserError, match="damaged or cut short"):
+    with pytest.raises(UserError, match="damaged or truncated"):
         dinov2.read(folder)
 
 

@@ -160,7 +160,7 @@ def class_of(part, file, name):
 
 FAULTS = {
     "missing shard": (drop_shard, "names files that do not exist: diffusion_pytorch_model-00001"),
-    "truncated": (cut_short, "is damaged or cut short (incomplete metadata, file not"),
+    "truncated": (cut_short, "is damaged or truncated (incomplete metadata, file not"),
     "truncated in its header": (cut_header, "invalid header length"),
     "no safetensors": (not_safetensors, "invalid JSON in header"),
     "no index": (drop_index, "no *.safetensors.index.json"),
@@ -197,7 +197,7 @@ FAULTS = {
     ),
     "no tokenizer": (drop_tokenizer, "src/tokenizer does not; copy both or neither"),
     "another text encoder": (narrow_text, "d_model 16 and the transformer takes text of 12"),
-    "truncated text encoder": (cut_text, "is damaged or cut short"),
+    "truncated text encoder": (cut_text, "is damaged or truncated"),
     "unreadable tokenizer": (no_tokenizer_files, "cannot be read as a tokenizer"),
 }
 

@@ -368,7 +368,7 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
 def test_more_seeds_keep_what_was_scored(copied):
     said = []
     report.evaluate(copied, log=said.append, seeds=(0, 1, 2))
-    assert any("12 of 16 scores were computed before" in line for line in said)
+    assert any("12 of 16 scores are reused" in line for line in said)
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     assert metrics["protocol"]["seeds"] == [0, 1, 2]
 
@@ -391,7 +391,7 @@ def test_other_weights_start_anew(copied):
     weights.save(copied / "weights.safetensors", changed)
     said = []
     report.evaluate(copied, log=said.append)
-    assert not any("computed before" in line for line in said)
+    assert not any("are reused" in line for line in said)
     assert len(list((copied / "report" / "partial").iterdir())) == 1
 
 
@@ -416,7 +416,7 @@ def test_a_model_without_a_memory_gets_a_row(copied, tmp_path):
     none = rival(copied, tmp_path / "none", steps=1000)
     said = []
     report.evaluate(copied, log=said.append, none=none)
-    assert any("12 of 16 scores were computed before" in line for line in said)
+    assert any("12 of 16 scores are reused" in line for line in said)
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     assert set(metrics["results"]) == {"memory", "empty", "none", "reproject", "copy"}
     assert metrics["results"]["none"] != metrics["results"]["empty"]

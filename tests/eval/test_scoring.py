@@ -124,7 +124,7 @@ def test_scored_pieces_are_not_done_again(monkeypatch, knowing_model, episodes, 
     )
     # Two batches × two seeds × two sampled methods, each imagined exactly once (plus the cut one).
     assert len(calls) == 8 + 1
-    assert "computed before" in said[0]
+    assert "are reused" in said[0]
     for method in whole.sums:
         np.testing.assert_array_equal(whole.sums[method], resumed.sums[method])
 

@@ -102,19 +102,19 @@ def test_the_stand_ins_cannot_be_changed(tmp_path):
     out.write(pickle.EMPTY_DICT + pickle.BUILD + pickle.STOP)
     pickletools.dis(out.getvalue(), io.StringIO())
     (tmp_path / "x").write_bytes(out.getvalue())
-    with pytest.raises(UserError, match="it changes what it should only use"):
+    with pytest.raises(UserError, match="it sets the state of a callable"):
         pickled_tensors.read(tmp_path / "x")
 
 
 @pytest.mark.parametrize(
     ("value", "said"),
     [
-        ([np.ones(2)], "no table of tensors"),
-        ({"x": 1.0}, "no table of tensors"),
-        ({3: np.ones(2)}, "no table of tensors"),
-        ({"x": np.array([{}, "text"], object)}, "no kind of number"),
-        ({"x": np.array(["text"])}, "no kind of number"),
-        ({"x": collections.Counter()}, "collections.Counter, which is no tensor"),
+        ([np.ones(2)], "no table of named tensors"),
+        ({"x": 1.0}, "no table of named tensors"),
+        ({3: np.ones(2)}, "no table of named tensors"),
+        ({"x": np.array([{}, "text"], object)}, "not numeric"),
+        ({"x": np.array(["text"])}, "not numeric"),
+        ({"x": collections.Counter()}, "collections.Counter, which is not a tensor type"),
     ],
 )
 def test_all_but_tables_of_tensors_is_refused(tmp_path, value, said):

@@ -88,7 +88,7 @@ def test_an_interrupted_loop_resumes_with_what_is_missing(tmp_path):
     done, results = run(cache, log=lines.append, what="numbers")
     assert done == [3, 4]
     assert results == {0: 0, 1: 1, 2: 4, 3: 9, 4: 16}
-    assert lines == ["3 of 5 numbers were computed before and are reused"]
+    assert lines == ["3 of 5 numbers are reused from an earlier run"]
     assert list(results) == list(range(5))
     assert run(cache)[0] == []
 

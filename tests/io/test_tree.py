@@ -66,11 +66,11 @@ def test_paths_of_other_pytrees_read_the_same_way():
 
 
 def test_merge_refuses_overlap_and_unflatten_refuses_a_leaf_used_as_a_branch():
-    with pytest.raises(tree.TreeError, match="both hold memory/block/gate"):
+    with pytest.raises(tree.TreeError, match="both contain memory/block/gate"):
         tree.merge(PARAMS, {"memory": {"block": {"gate": 1}}})
     with pytest.raises(tree.TreeError, match="leaf and not a branch"):
         tree.unflatten({"a": 1, "a/b": 2})
-    with pytest.raises(tree.TreeError, match="occurs twice"):
+    with pytest.raises(tree.TreeError, match="both a leaf and a branch"):
         tree.unflatten({"a/b": 2, "a": 1})
 
 

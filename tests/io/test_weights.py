@@ -58,7 +58,7 @@ def test_a_flipped_bit_is_noticed_wherever_it_is(tmp_path):
             whole[:place] + bytes([whole[place] ^ 1 << place % 8]) + whole[place + 1 :]
         )
         for read in (weights.load, weights.verify):
-            with pytest.raises(UserError, match=r"is damaged|holds .* which cannot be read"):
+            with pytest.raises(UserError, match=r"is damaged|contains .* which is not supported"):
                 read(path)
 
 
@@ -86,14 +86,14 @@ def test_equal_weights_are_equal_files(tmp_path):
 def test_one_branch_can_be_read_alone(tmp_path):
     weights.save(tmp_path / "w", PARAMS)
     assert list(weights.load(tmp_path / "w", "memory")) == ["gate"]
-    with pytest.raises(UserError, match="holds no codec"):
+    with pytest.raises(UserError, match="contains no codec"):
         weights.load(tmp_path / "w", "codec")
 
 
 def test_tensors_that_were_not_announced_leave_no_file(tmp_path):
     one = np.ones(3, np.float32)
     for tensors in ([("b", one)], [("a", one[:2])], [("a", one), ("a", one)], []):
-        with pytest.raises(ValueError, match="announced"):
+        with pytest.raises(ValueError, match=r"differs from ``like``|in ``like`` but"):
             tensor_files.write(tmp_path / "w", {"a": one}, tensors, {})
         assert not list(tmp_path.iterdir())
 
@@ -121,5 +121,5 @@ def test_a_header_that_does_not_hold_together_is_refused(tmp_path, table):
 def test_a_dtype_that_is_not_known_is_named(tmp_path):
     table = b'{"a": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}}'
     (tmp_path / "w").write_bytes(len(table).to_bytes(8, "little") + table + b"1234")
-    with pytest.raises(UserError, match="holds a in F8_E4M3, which cannot be read here"):
+    with pytest.raises(UserError, match="contains a in F8_E4M3, which is not supported"):
         weights.load(tmp_path / "w")

@@ -143,7 +143,7 @@ def test_damaged_files_are_refused(params, data, tmp_path):
     cache = feature_build.build(CONFIG, params, data, out, log=quiet)
     file = out / cache.files["episode-0"][0]
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(UserError, match="damaged or cut short"):
+    with pytest.raises(UserError, match="damaged or truncated"):
         feature_cache.features(cache, "episode-0", [0])
     for text, words in (("{", "not valid JSON"), ("[]", "no table"), ("{}", "does not parse")):
         (out / "cache.json").write_text(text)

@@ -154,7 +154,7 @@ def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
     with pytest.raises(UserError, match="use more --blocks"):
         study.run(folder / "world", folder / "policy", tmp_path / "o", short, log=lambda _: None)
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="is a file: name a folder"):
+    with pytest.raises(UserError, match="is a file: choose a folder"):
         study.run(folder / "world", folder / "policy", tmp_path / "file", ERRAND)
     with pytest.raises(UserError, match="trained no policy"):
         deciders.open_policy(folder / "world")

@@ -60,7 +60,7 @@ def found(tmp_path_factory):
         (
             "save",
             2,
-            r"A checkpoint in .* cannot .* \(No space left on device\); the checkpoint of step 2 is kept",
+            r"A checkpoint in .* cannot .* \(No space left.*\); the checkpoint of step 2 is kept",
         ),
         ("log", 2, "step 2 is (kept|intact): free space .* then run the same command"),
         ("publish", 6, "checkpoint of step 6 is intact: free space there"),

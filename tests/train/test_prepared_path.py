@@ -123,7 +123,7 @@ def test_what_is_not_whole_or_not_ours_is_refused_with_its_name(tmp_path):
     whole = file.read_bytes()
     for damaged in (whole[: len(whole) // 2], whole[:20], b"", b"something else entirely"):
         file.write_bytes(damaged)
-        with pytest.raises(UserError, match=rf"{file.name} is damaged or cut short"):
+        with pytest.raises(UserError, match=rf"{file.name} is damaged or truncated"):
             gather(config)
     other = experiment(tmp_path / "other")
     size = dataclasses.replace(other.model.clip, height=32)

@@ -195,7 +195,9 @@ def test_a_torchscript_file_is_refused(tmp_path):
     torch.jit.trace(nn.ReLU(), torch.zeros(1)).save(tmp_path / "i3d_torchscript.pt")
     with pytest.raises(UserError, match=r"i3d_torchscript.pt cannot be read as a table of tensors"):
         i3d_weights.read(tmp_path / "i3d_torchscript.pt")
-    with pytest.raises(UserError, match="gone does not exist; name a file with the weights of I3D"):
+    with pytest.raises(
+        UserError, match="gone does not exist; give the path of a file with the weights of I3D"
+    ):
         i3d_weights.read(tmp_path / "gone")
 
 
